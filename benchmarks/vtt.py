@@ -19,7 +19,7 @@ from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import run_case
 from marsyard.sim.measurements import RoverMeasurements, RoverTarget
 from marsyard.sim.streams import Streams
-from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, navcam, pose, waves
+from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, draw_waves, navcam, pose
 
 TARGET = np.array([10.0, 0.1, 0.2])
 #: Runs averaged into one measurement, because one run is near the resolution of the clock.
@@ -29,7 +29,7 @@ BATCH = 20
 def _stops(options: VttOptions) -> tuple[RoverMeasurements, RoverMeasurements]:
     """Two stops, 10 % of the distance apart, in front of a slanted face."""
     face = Plane(TARGET, np.array([-0.8, 0.0, 0.6]))
-    drive = Drive(Scene((face,), waves(1), TARGET), navcam(), VisualTargetTracker(options))
+    drive = Drive(Scene((face,), draw_waves(1), TARGET), navcam(), VisualTargetTracker(options))
     drive.tracker.designate(RoverTarget(TARGET), pose(0.0, 0.0))
     for x in (0.0, 0.97):
         drive.stop(pose(x, 0.0))

@@ -1,4 +1,4 @@
-"""Outcomes of cases, and errors that a user can fix: one message without a traceback, exit status 2."""
+"""Outcomes of unfinished cases, and errors that a user can fix (one message without a traceback, exit status 2)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ class CampaignError(Exception):
 
 
 class StoreError(CampaignError):
-    """A campaign folder that cannot be written, or whose requested contents are missing."""
+    """A campaign folder that cannot be written, or that does not contain the requested data."""
 
 
 @contextmanager
 def report_write_errors(target: object) -> Iterator[None]:
-    """Raise StoreError with the name of `target` if the operating system fails to write it inside the context."""
+    """Convert an OSError inside the context to a StoreError which reports that `target` cannot be written."""
     try:
         yield
     except OSError as error:
@@ -34,7 +34,7 @@ class Problem:
     message: str
 
     def __str__(self) -> str:
-        """One line, with the control characters of a file escaped."""
+        """Format the problem in one line; control characters are escaped."""
         text = ": ".join(part for part in (self.location, self.key, self.message) if part)
         return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
@@ -47,17 +47,17 @@ class ConfigurationError(CampaignError):
         super().__init__("\n".join(str(problem) for problem in self.problems))
 
 
-def near_match(word: str, allowed: Iterable[str]) -> str:
-    """``(did you mean 'x'?)`` with a leading blank if an allowed word is similar, otherwise empty."""
+def suggest_similar(word: str, allowed: Iterable[str]) -> str:
+    """Return ``(did you mean 'x'?)`` with a leading space if an allowed word is similar; otherwise an empty text."""
     matches = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.6)
     return f" (did you mean '{matches[0]}'?)" if matches else ""
 
 
 def unknown_name_message(kind: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
-    """Message for an unknown word, with a similar word and the allowed words, or those of `listed_only`."""
+    """Create the message about an unknown word, with a similar word and the allowed words (or `listed_only`)."""
     allowed_words = sorted(allowed)
     listed = ", ".join(allowed_words if listed_only is None else sorted(listed_only)) or "none"
-    return f"unknown {kind} '{word}'{near_match(word, allowed_words)}; allowed: {listed}"
+    return f"unknown {kind} '{word}'{suggest_similar(word, allowed_words)}; allowed: {listed}"
 
 
 #: The case raised an exception, or its worker process died.
@@ -73,16 +73,16 @@ BAD_ANSWER = "BAD_ANSWER"
 #: Outcomes by their command-line names (`--retry`).
 _OUTCOMES = (CRASHED, TIMED_OUT, OUT_OF_MEMORY, TOO_MUCH_OUTPUT, BAD_ANSWER)
 RETRYABLE: Mapping[str, str] = {outcome.lower().replace("_", "-"): outcome for outcome in _OUTCOMES}
-#: Cases with these outcomes fail requirements on all cases, and cause exit status 1.
+#: Cases with these outcomes fail the requirements on all cases, and result in exit status 1.
 ENGINE_FAILURES = frozenset(RETRYABLE.values())
 
 
 class WorkerExitError(Exception):
     """The worker process ended before its task finished.
 
-    outcome: one of this module's outcomes. reason: deterministic text, equal for equal causes. trace: Python stack of
-    the process and its last output, as far as available. note: diagnostic text recorded by the task
-    (`worker_process.record_note`).
+    - outcome: one of this module's outcomes; reason: text that is equal for equal causes
+    - trace: Python stack of the process and its last output, as far as available
+    - note: text recorded by the task (`worker_process.record_note`)
     """
 
     def __init__(self, outcome: str, reason: str, trace: str, note: str = "") -> None:

@@ -37,7 +37,7 @@ COMMON_SECTIONS: tuple[SectionMaker, ...] = (
 #: Maximum number of sites and algorithms in `report.json`.
 _MAX_LISTED = 24
 
-#: Version of the layout of `report.json`, raised by removals and changes of meaning, and its JSON Schema.
+#: Version of the layout of `report.json`, increased if a field is removed or changes its meaning, and its JSON Schema.
 SCHEMA = 5
 SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
 #: Properties of a verdict that `report.json` contains next to its fields.
@@ -49,9 +49,9 @@ JUNIT_FILE = "junit.xml"
 
 
 def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Path:
-    """Write a campaign's report into its folder from the files there; returns the path of the self-contained page.
+    """Write the report of the campaign in a folder into that folder; returns the path of the self-contained page.
 
-    requirements: replace the campaign's own
+    requirements: requirements to evaluate instead of the campaign's own; None for the campaign's own
     Raises StoreError if the folder contains no rows, OSError if the report cannot be written.
     """
     return write_evaluation(evaluate_run(directory, requirements))
@@ -61,6 +61,7 @@ def write_evaluation(evaluation: Evaluation) -> Path:
     """Write the report of an evaluated campaign into its folder."""
     run, verdicts, overall_verdict = evaluation.run, evaluation.verdicts, evaluation.overall_verdict
     directory = run.directory
+    # statistics use only random cases
     exclude_nominal = evaluation.sampling.exclude_nominal_case
     random_run = replace(run, frame=exclude_nominal(run.frame), all_cases=exclude_nominal(run.all_cases))
     metric = primary_metric(random_run.frame, run.requirements)
@@ -79,7 +80,7 @@ def write_evaluation(evaluation: Evaluation) -> Path:
 
 
 def section_makers() -> list[SectionMaker]:
-    """Makers of the sections of every campaign and of every system, in the order of the page."""
+    """List the functions that create the sections of all campaigns and of all systems, in the order of the page."""
     systems = presentations()
     first = [make for system in systems for make in system.first]
     return [*first, *COMMON_SECTIONS, *(make for system in systems for make in system.sections), conditions_section]
@@ -88,10 +89,10 @@ def section_makers() -> list[SectionMaker]:
 def page_context(
     run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], overall: OverallVerdict, extra: Sequence[Section]
 ) -> dict[str, Any]:
-    """Context of the page's template: statistics use the cases of `subject`, everything else uses all cases."""
+    """Create the context of the page's template; statistics use the cases of `subject`, other values all cases."""
     metric, bound = subject.metric, subject.bound
-    text = f"{count(overall.crashed, 'case')} crashed: fix this before you use the verdict."
-    cautions = [text] if overall.crashed else []
+    crash_text = f"{count(overall.crashed, 'case')} crashed. Fix the cause before you use the verdict."
+    cautions = [crash_text] if overall.crashed else []
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.recorded("description") or ""),
@@ -109,8 +110,8 @@ def page_context(
         "crashed": sections.crashed_rows(run),
         "dispersions": sections.dispersion_grid(subject.run),
         "showcases": showcase_views(run),
-        "provenance": sections.provenance(run),
-        "versions": sections.versions(run),
+        "provenance": sections.list_provenance(run),
+        "versions": sections.list_versions(run),
         "configuration": json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str),
         "algorithms": tested_algorithms(run.record),
         "rerun": sections.rerun_commands(run),
@@ -125,7 +126,7 @@ def page_context(
         return context | {"explorer": None, "worst": empty_table, "unanswered": empty_table}
     context["explorer"], random_run = None, subject.run
     if np.isfinite(numbers(random_run.frame, metric)).any():
-        data, script = sections.explorer_data(random_run, metric, bound, cases_with_images), sections.script()
+        data, script = sections.explorer_data(random_run, metric, bound, cases_with_images), sections.read_script()
         content_hash = sections.script_hash(script)
         context["explorer"] = {"data": data, "json": sections.embed_json(data), "script": script, "hash": content_hash}
     return context | {
@@ -138,7 +139,7 @@ def page_context(
 
 
 def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
-    """Warnings about the sampling: designs without probabilities, very many cases, a nominal case."""
+    """List warnings about the sampling: a design that is not random, plots of a part of the cases, a nominal case."""
     sampling = read_sampling_design(run.configuration)
     texts = []
     if not sampling.independent:
@@ -161,7 +162,7 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
 
 
 def summary(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> dict[str, Any]:
-    """The report as plain data; NaN and infinities are null."""
+    """Create the data of `report.json`; NaN and infinities become null."""
     run, sampling, overall_verdict = evaluation.run, evaluation.sampling, evaluation.overall_verdict
     metric = subject.metric
     summaries = error_summaries(subject.all_cases, metric) if metric is not None else []
@@ -194,7 +195,7 @@ def _unique_values(frame: pd.DataFrame, column: str) -> list[str]:
 
 
 def page_environment() -> Environment:
-    """Jinja environment that escapes all values."""
+    """Create a Jinja environment that escapes all values."""
     return Environment(
         autoescape=True,
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
@@ -215,7 +216,7 @@ def _to_json_types(value: Any) -> Any:
 
 
 def write_atomic(path: Path, text: str) -> None:
-    """Write a file atomically."""
+    """Write a text file atomically: write a temporary file, then rename it."""
     partial = path.with_suffix(path.suffix + ".partial")
     # JSON can contain lone surrogates, which cannot be encoded as UTF-8
     partial.write_text(text, encoding="utf-8", errors="replace")

@@ -32,7 +32,7 @@ from marsyard.reports.section import (
     new_axes,
     svg_figure,
 )
-from marsyard.reports.statistics.changes import holm
+from marsyard.reports.statistics.changes import correct_holm
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
 from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import circular_error, error_ellipse, mean_interval, quantile_bounds
@@ -59,7 +59,7 @@ FEASIBLE_OVERLAP = "feasible_overlap"
 
 
 def answers_section(subject: Subject) -> Section | None:
-    """Availability, feasible overlap, and wrong answers; None if the rows contain no answers."""
+    """Create the section on availability, feasible overlap and wrong answers; None if the rows contain no answers."""
     fractions = answer_fractions(subject)
     if not fractions:
         return None
@@ -81,14 +81,14 @@ def answers_section(subject: Subject) -> Section | None:
 
 
 def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
-    """Compute the fractions for which the rows have columns, by name."""
+    """Compute the fractions of answered cases and of wrong answers by name, as far as the rows have the columns."""
     frame = subject.all_cases
     if not rates.is_flag(frame, "answered") or frame.empty:
         return {}
-    answered = rates.members(frame, "valid")
+    answered = rates.population_mask(frame, "valid")
     fractions = {"answered (of all cases)": rates.fraction_of(answered, frame)}
     if rates.is_flag(frame, FEASIBLE_OVERLAP):
-        overlap, completed = rates.members(frame, FEASIBLE_OVERLAP), rates.members(frame, "completed")
+        overlap, completed = rates.population_mask(frame, FEASIBLE_OVERLAP), rates.population_mask(frame, "completed")
         fractions["answered, of cases with feasible overlap"] = rates.fraction_of(answered[overlap], frame[overlap])
         fractions["no feasible overlap (of completed cases)"] = rates.fraction_of(~overlap[completed], frame[completed])
     if subject.metric is not None and subject.bound is not None:
@@ -103,7 +103,7 @@ PROBABILITIES = (0.5, 0.95, 0.99)
 
 
 def scatter_section(subject: Subject) -> Section | None:
-    """Error ellipse and circular errors of a metric with x and y parts; None without them or for too few cases."""
+    """Create the section on error ellipse and circular errors; None without x and y errors or for too few cases."""
     metric = subject.metric
     if metric is None:
         return None
@@ -139,7 +139,7 @@ MAX_CONDITIONS, MAX_CASES = 12, 20_000
 
 
 def drivers_section(subject: Subject) -> Section | None:
-    """Conditions ranked by the variance of errors and failures that they explain; None if none can be ranked."""
+    """Rank conditions by the explained variance of errors and of failures; None if no condition can be ranked."""
     metric = subject.metric
     if metric is None:
         return None
@@ -152,14 +152,15 @@ def drivers_section(subject: Subject) -> Section | None:
     if not ranked:
         return None
     note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
-    headings = ["Condition", "Cases", "Correlation", "Its interval", "Variance fraction", "Fraction interval", "p"]
+    headings = ["Condition", "Cases", "Rank correlation", "Interval of the correlation"]
+    headings += ["Fraction of variance", "Interval of the fraction", "p"]
     blocks = []
     for name, drivers in ranked.items():
         rows = []
         for column, result, p in drivers:
             ranks = [coefficient(result.correlation), f"{coefficient(result.lower)} to {coefficient(result.upper)}"]
-            fraction = [percent(result.share), rates.range_text(result.share_lower, result.share_upper)]
-            rows.append([label(column), f"{result.n:,}", *ranks, *fraction, p_text(p)])
+            fractions = [percent(result.share), rates.range_text(result.share_lower, result.share_upper)]
+            rows.append([label(column), f"{result.n:,}", *ranks, *fractions, p_text(p)])
         blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(headings, rows)))
     data = {
         name: [{"condition": column, **asdict(result), "corrected_p": p} for column, result, p in drivers]
@@ -180,7 +181,7 @@ def rank_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray, "
         for column in driver_columns(frame, metric, MAX_CONDITIONS)
         if (result := estimate_driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
     }
-    p_values = dict(zip(drivers, holm([result.p_value for result in drivers.values()]), strict=True))
+    p_values = dict(zip(drivers, correct_holm([result.p_value for result in drivers.values()]), strict=True))
     order = sorted(drivers, key=lambda column: (-drivers[column].share, column))
     return [(column, drivers[column], p_values[column]) for column in order]
 
@@ -203,7 +204,7 @@ class Point:
 
 
 def convergence_section(subject: Subject) -> Section | None:
-    """Success rates, mean and 95 % quantile of the errors against the number of cases; None for fewer than 16."""
+    """Plot success rates, mean and 95 % quantile of the errors against the number of cases; None for fewer than 16."""
     frame = subject.all_cases
     if len(frame) < 2 * MIN_CASES:
         return None
@@ -326,7 +327,7 @@ def evaluate_consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def consistency_section(subject: Subject) -> Section | None:
-    """Consistency of reported covariances with errors; None if no algorithm reports covariances."""
+    """Compare reported covariances with the errors; None if no algorithm reports covariances."""
     results = evaluate_consistencies(subject.frame)
     if not results:
         return None
@@ -341,32 +342,35 @@ def consistency_section(subject: Subject) -> Section | None:
 
 
 def _classify_answers(rows: Rows, subject: Subject) -> dict[str, Bool[np.ndarray, " n"]]:
-    answered = rates.members(rows, "valid")
+    """Create masks of valid, missing and wrong answers."""
+    answered = rates.population_mask(rows, "valid")
     is_correct = rates.success_mask(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
     return {"valid": answered & is_correct, "invalid": ~answered, "wrong": answered & ~is_correct}
 
 
-def frequent_refusal(rows: Rows) -> str:
-    """Return the most frequent outcome of cases without an answer; empty if all have one."""
+def find_frequent_refusal(rows: Rows) -> str:
+    """Return the most frequent outcome of cases without an answer; empty if all cases have an answer."""
     if "outcome" not in rows:
         return ""
-    refusals = rows.loc[~rates.members(rows, "valid"), "outcome"].value_counts()
+    refusals = rows.loc[~rates.population_mask(rows, "valid"), "outcome"].value_counts()
     return str(refusals.index[0]) if len(refusals) else ""
 
 
-#: Off-nominal cases: valid, missing and wrong answers by fault and its size.
+#: Valid, missing and wrong answers of off-nominal cases, by fault and its size.
 FAULT_OUTCOMES = OutcomesBySize(
     outcomes=_classify_answers,
     styles={"valid": ("valid", "full"), "invalid": ("invalid", "hatched"), "wrong": ("wrong", "crossed")},
     cases="Cases",
-    caption="Full: answers within the bound. Hatched: no answer. Crossed: wrong answers.",
+    caption="Solid bars: answers within the bound. Hatched bars: no answer. Cross-hatched bars: wrong answers.",
     wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == "none" else f"{size:g}"),
-    extra_columns=(("Most frequent refusal", "commonest_refusal", frequent_refusal, lambda text: text or NOTHING),),
+    extra_columns=(
+        ("Most frequent refusal", "commonest_refusal", find_frequent_refusal, lambda text: text or NOTHING),
+    ),
 )
 
 
 def faults_section(subject: Subject) -> Section | None:
-    """Outcomes by fault and size; None without faults or bound."""
+    """Create the section on outcomes by fault and size; None without faults or bound."""
     if subject.metric is None or subject.bound is None or not rates.is_flag(subject.frame, "answered"):
         return None
     note = note_text(

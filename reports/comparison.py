@@ -22,7 +22,13 @@ from marsyard.reports import rates
 from marsyard.reports.rates import CONFIDENCE, success_mask
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
-from marsyard.reports.statistics.changes import Sample, compare_errors, compare_successes, difference_p, holm
+from marsyard.reports.statistics.changes import (
+    Sample,
+    compare_errors,
+    compare_successes,
+    correct_holm,
+    difference_p_value,
+)
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.wording import (
     NOTHING,
@@ -42,8 +48,8 @@ from marsyard.reports.wording import (
 class AlgorithmResult:
     """Results of one algorithm.
 
-    failed: cases in which it crashed or exceeded a resource limit succeeded: cases within the bound; None without a
-    bound median, p95: of the metric's magnitude over the answered cases
+    - failed, succeeded: number of unfinished cases, and of cases with an error within the bound (None without a bound)
+    - median, p95: median and 95 % quantile of the error's magnitude over the answered cases
     """
 
     name: str
@@ -57,12 +63,12 @@ class AlgorithmResult:
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """Another algorithm compared with the one under test on the same cases; p-values are corrected by Holm's method.
+    """Another algorithm compared with the tested one on the same cases; p-values are corrected by Holm's method.
 
-    only_first, only_other: cases within the bound only for the tested or only for the other one; None without a bound
-    success_p: two-sided p-value of the difference in successes (`compare_successes`) pairs: number of cases that both
-    answered mean, lower, upper: mean magnitude of the other minus that of the algorithm under test, with its interval
-    error_p: two-sided p-value of Wilcoxon's signed-rank test of the differences
+    - only_first, only_other: cases within the bound only for the tested or only for the other algorithm; may be None
+    - success_p, error_p: two-sided p-values of successes (`compare_successes`) and of errors (`compare_errors`)
+    - pairs: number of cases that both algorithms answered
+    - mean, lower, upper: mean of the other algorithm's error minus the tested one's (magnitudes), with its interval
     """
 
     name: str
@@ -77,7 +83,7 @@ class PairedComparison:
 
 
 def compared_names(frame: pd.DataFrame) -> list[str]:
-    """Labels of the compared algorithms in the rows."""
+    """List the names of the compared algorithms in the rows."""
     names = [str(column).removesuffix(".answered") for column in frame.columns if str(column).endswith(".answered")]
     return [name for name in names if rates.is_flag(frame, f"{name}.answered")]
 
@@ -91,18 +97,18 @@ def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
 
 
 def summarize_algorithm(frame: pd.DataFrame, name: str, metric: str | None, bound: float | None) -> AlgorithmResult:
-    """Summarize the results of the algorithm under test in the rows."""
+    """Summarize the rows of one algorithm; `name` is its label in the result."""
     magnitude = np.abs(numbers(frame, metric)) if metric is not None else np.full(len(frame), np.nan)
     finite = magnitude[np.isfinite(magnitude)]
-    within = None
+    n_within_bound = None
     if metric is not None and bound is not None:
-        within = int(success_mask(frame, metric, bound).sum()) if metric in frame else 0
+        n_within_bound = int(success_mask(frame, metric, bound).sum()) if metric in frame else 0
     return AlgorithmResult(
         name=name,
         cases=len(frame),
         answered=int(frame["answered"].eq(True).sum()),
         failed=int(frame["outcome"].isin(rates.ENGINE_FAILURES).sum()),
-        succeeded=within,
+        succeeded=n_within_bound,
         median=float(np.median(finite)) if finite.size else math.nan,
         p95=float(np.quantile(finite, 0.95)) if finite.size else math.nan,
     )
@@ -138,7 +144,10 @@ def compare_algorithms(
     if metric is None:
         return results, []
     differences = [compare_with_baseline(frame, rows, n, metric, bound) for n, rows in frames.items() if metric in rows]
-    success_p, error_p = holm([d.success_p for d in differences]), holm([d.error_p for d in differences])
+    success_p, error_p = (
+        correct_holm([d.success_p for d in differences]),
+        correct_holm([d.error_p for d in differences]),
+    )
     corrected = zip(differences, success_p, error_p, strict=True)
     return results, [replace(difference, success_p=p, error_p=q) for difference, p, q in corrected]
 
@@ -165,7 +174,7 @@ def comparison_section(subject: Subject) -> Section | None:
 def comparison_grids(
     results: Sequence[AlgorithmResult], differences: Sequence[PairedComparison], metric: str | None
 ) -> tuple[Grid, Grid]:
-    """Tables of results and of differences."""
+    """Create the tables of results and of differences."""
     unit = f" ({split_unit(metric)[1]})" if metric is not None and split_unit(metric)[1] else ""
     first = build_grid(
         results,
@@ -196,9 +205,10 @@ def comparison_grids(
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric of a campaign, case by case.
+    """One metric of a campaign, with a value for each case.
 
-    larger_is_better: whether it is a success rate values: 0 and 1 of a rate, or magnitudes; NaN for excluded cases
+    - larger_is_better: whether the metric is a success rate, not an error
+    - values: 0 or 1 for a rate, otherwise the error's magnitude; NaN for excluded cases
     """
 
     name: str
@@ -240,7 +250,7 @@ class MetricComparison:
 
 
 def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
-    """Return the random cases of a campaign and its metrics (success by requirement, answers, completion, errors)."""
+    """Return the rows without the nominal case, and metrics: successes by requirement, answers, completion, errors."""
     frame = read_sampling_design(run.configuration).exclude_nominal_case(run.frame)
     metrics: dict[str, Metric] = {}
     error_columns = dict.fromkeys([primary_metric(frame, run.requirements)])
@@ -251,11 +261,11 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
         if metric not in frame or not (is_bounded or rates.is_flag(frame, metric)):
             continue
         try:
-            population = rates.members(frame, str(requirement.get("population", "all")))
+            population = rates.population_mask(frame, str(requirement.get("population", "all")))
         except ValueError:
             continue
-        numbers_or_none = (bound, requirement.get("scale", 1))
-        limit, scale = (float(x) if isinstance(x, int | float) else math.nan for x in numbers_or_none)
+        values = (bound, requirement.get("scale", 1))
+        limit, scale = (float(x) if isinstance(x, int | float) else math.nan for x in values)
         success = success_mask(frame, metric, limit, scale)
         metrics[name] = Metric(name, True, np.where(population, success.astype(np.float64), np.nan))
         if is_bounded:
@@ -264,19 +274,20 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
         magnitude = np.abs(numbers(frame, column))
         metrics[column] = Metric(label(column), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
     if rates.is_flag(frame, "answered"):
-        metrics["answered"] = Metric("answered", True, rates.members(frame, "valid").astype(np.float64))
-    metrics["came to an end"] = Metric("came to an end", True, rates.members(frame, "completed").astype(np.float64))
+        metrics["answered"] = Metric("answered", True, rates.population_mask(frame, "valid").astype(np.float64))
+    completed = rates.population_mask(frame, "completed").astype(np.float64)
+    metrics["came to an end"] = Metric("came to an end", True, completed)
     return frame, list(metrics.values())
 
 
 def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[MetricComparison]]:
-    """Return whether the campaigns' cases are pairs, and the comparisons of the metrics that both have."""
+    """Return whether the campaigns' cases are paired, and the comparisons of the metrics of both campaigns."""
     frames, metrics = zip(*(list_metrics(run) for run in (first, second)), strict=True)
     paired = same_draws(first, second)
     second_metrics = {metric.name: metric for metric in metrics[1]}
     metric_pairs = [(metric, second_metrics[metric.name]) for metric in metrics[0] if metric.name in second_metrics]
     test = _paired_p_value if paired else partial(_unpaired_p_value, common=have_same_terrains(first, second))
-    p_values = holm([test(frames[0], a, frames[1], b) for a, b in metric_pairs])
+    p_values = correct_holm([test(frames[0], a, frames[1], b) for a, b in metric_pairs])
     return paired, [MetricComparison(a.name, a, b, p) for (a, b), p in zip(metric_pairs, p_values, strict=True)]
 
 
@@ -331,12 +342,12 @@ def _unpaired_p_value(
     first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric, *, common: bool
 ) -> float:
     first_sample, second_sample = build_sample(first, first_metric), build_sample(second, second_metric)
-    if not common:  # equal numbers are different terrains, so renumber them
+    if not common:  # equal numbers mean different terrains: shift the second campaign's numbers above the first's
         if not first_sample.terrains.size or not second_sample.terrains.size:
             return math.nan
         renumbered = second_sample.terrains + (1 + int(first_sample.terrains.max()) - int(second_sample.terrains.min()))
         second_sample = Sample(second_sample.values, renumbered)
-    return difference_p(first_sample, second_sample)
+    return difference_p_value(first_sample, second_sample)
 
 
 def _paired_p_value(first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric) -> float:

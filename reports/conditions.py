@@ -42,7 +42,7 @@ QUANTILE = 0.99
 
 
 def conditions_section(subject: Subject) -> Section | None:
-    """Errors by condition; None without errors, answers or a condition that varies."""
+    """Create the section on errors by condition; None without errors, answers or a condition that varies."""
     frame, metric = subject.frame, subject.metric
     if metric is None or not rates.is_flag(frame, "answered"):
         return None
@@ -71,7 +71,7 @@ def conditions_section(subject: Subject) -> Section | None:
 
 
 def bin_conditions(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.ndarray, " n"]]]]]:
-    """Yield the conditions that vary: column, and names and masks of the bins."""
+    """Yield each condition that varies: its column, and the names and masks of its bins."""
     for prefix in CONDITIONS:
         columns = [str(name) for name in frame.columns if name == prefix or str(name).startswith(f"{prefix}_")]
         for column in columns[:1]:
@@ -101,7 +101,7 @@ def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
     """
     groups = rates.terrain_groups(frame)
     values = numbers(frame, part)
-    finite = np.isfinite(values) & rates.members(frame, "valid")
+    finite = np.isfinite(values) & rates.population_mask(frame, "valid")
     if groups is None or not finite.any():
         return None
     _, index = np.unique(groups[finite], return_inverse=True)
@@ -112,6 +112,7 @@ def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
     means = np.bincount(index, weights=errors) / sizes
     within = float(((errors - means[index]) ** 2).sum()) / (n - k)
     between = float((sizes * (means - errors.mean()) ** 2).sum()) / (k - 1)
+    # effective number of cases per terrain for terrains of unequal size
     size = (n - float((sizes**2).sum()) / n) / (k - 1)
     variance = max(between - within, 0.0) / size
     return {
@@ -126,7 +127,7 @@ def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
 
 def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
     """Summarize a bin: answers, mean and standard deviation of the signed errors, bound of the 99 % quantile."""
-    answered = rates.members(rows, "valid")
+    answered = rates.population_mask(rows, "valid")
     valid = rows[answered]
     magnitude, groups = np.abs(numbers(valid, metric)), rates.terrain_groups(valid)
     finite = np.isfinite(magnitude)
@@ -161,5 +162,5 @@ def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]
 
 
 def _signed_parts(frame: pd.DataFrame, metric: str) -> list[str]:
-    """Return the metric's signed parts; the metric itself if it has none."""
+    """Return the columns of the metric's signed parts (x, y), or the metric itself if it has no parts."""
     return axis_columns(metric, [str(name) for name in frame.columns]) or [metric]

@@ -1,4 +1,4 @@
-"""Figure of the sampled inputs before a run: marginal distributions and all pairs."""
+"""Figure of the sampled parameters before a run: marginal distributions and all pairs (`marsyard show --figure`)."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from matplotlib.ticker import MaxNLocator
 from marsyard.reports.section import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
 from marsyard.reports.wording import count, rank_correlation, split_unit
 
-#: Size of a marginal, height of a heading, margin of the figure, inches; minimum number of marginals in a row.
-_WIDTH, _HEIGHT, _HEADING_HEIGHT, _MARGIN, _MIN_PER_ROW = 3.0, 1.9, 0.45, 0.15, 4
-#: Side of a pair's cell, inches, and maximum number of paired parameters.
-_CELL_SIDE, MAX_PAIRED = 0.95, 24
+#: Size of a marginal, height of a heading and margin of the figure, inches; minimum number of marginals in a row.
+_WIDTH_IN, _HEIGHT_IN, _HEADING_HEIGHT_IN, _MARGIN_IN, _MIN_PER_ROW = 3.0, 1.9, 0.45, 0.15, 4
+#: Side of the cell of a pair, inches, and maximum number of parameters in the pairs.
+_CELL_SIDE_IN, MAX_PAIRED = 0.95, 24
 _CENTERED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "color": INK}
 #: Maximum number of labelled bars, and of bins.
 _MAX_LABELS, _BINS = 8, 24
@@ -36,8 +36,8 @@ Values = Float[np.ndarray, " _"]
 class ParameterSample:
     """Sampled values of one parameter.
 
-    values: value of each case
-    expected: quantiles of the distribution at evenly spaced probabilities; None if it differs between cases
+    - values: value of each case
+    - expected: quantiles of the distribution at evenly spaced probabilities; None if it differs between cases
     """
 
     path: str
@@ -75,23 +75,23 @@ class ParameterSample:
 def draws_figure(title: str, samples: Sequence[ParameterSample]) -> Figure:
     """Draw the marginal distributions of at least one parameter, and below them all pairs of parameters that vary."""
     varying = [sample for sample in samples if len(set(sample.numbers(sample.values).tolist())) > 1][:MAX_PAIRED]
-    side = len(varying) * _CELL_SIDE if len(varying) > 1 else 0.0
-    width = max(min(len(samples), _MIN_PER_ROW) * _WIDTH, side, 2.0 * _WIDTH)
-    per_row = min(len(samples), int(width / _WIDTH))
+    side = len(varying) * _CELL_SIDE_IN if len(varying) > 1 else 0.0
+    width = max(min(len(samples), _MIN_PER_ROW) * _WIDTH_IN, side, 2.0 * _WIDTH_IN)
+    per_row = min(len(samples), int(width / _WIDTH_IN))
     rows = math.ceil(len(samples) / per_row)
-    upper_height, lower_height = rows * _HEIGHT + _HEADING_HEIGHT, side + _HEADING_HEIGHT if side else 0.0
-    figure = Figure(figsize=(width + 2.0 * _MARGIN, upper_height + lower_height))
+    upper_height, lower_height = rows * _HEIGHT_IN + _HEADING_HEIGHT_IN, side + _HEADING_HEIGHT_IN if side else 0.0
+    figure = Figure(figsize=(width + 2.0 * _MARGIN_IN, upper_height + lower_height))
     cases = count(len(samples[0].values), "case")
     heading = f"{title}: {cases} as sampled. Line: expected from the distribution"
     _write_heading(figure, upper_height + lower_height, heading)
     for index, sample in enumerate(samples):
         row, column = divmod(index, per_row)
-        box = (_MARGIN + column * width / per_row + 0.3, lower_height + (rows - 1 - row) * _HEIGHT + 0.45)
-        _draw_marginal(_add_axes(figure, box, (width / per_row - 0.55, _HEIGHT - 0.85)), sample)
+        box = (_MARGIN_IN + column * width / per_row + 0.3, lower_height + (rows - 1 - row) * _HEIGHT_IN + 0.45)
+        _draw_marginal(_add_axes(figure, box, (width / per_row - 0.55, _HEIGHT_IN - 0.85)), sample)
     if side:
         _write_heading(figure, lower_height, "Pairs. Lower left: values; upper right: Spearman's rank correlation")
-        left = _MARGIN + 0.5 * (width - side)
-        _draw_pairs(_add_axes(figure, (left, 0.5 * _MARGIN), (side, side)), varying)
+        left = _MARGIN_IN + 0.5 * (width - side)
+        _draw_pairs(_add_axes(figure, (left, 0.5 * _MARGIN_IN), (side, side)), varying)
     return figure
 
 
@@ -103,7 +103,7 @@ def _add_axes(figure: Figure, corner: tuple[float, float], size: tuple[float, fl
 
 def _write_heading(figure: Figure, top: float, text: str) -> None:
     width, height = figure.get_size_inches()
-    figure.text(_MARGIN / width, (top - 0.1) / height, text, fontsize=12, fontweight="bold", color=INK, va="top")
+    figure.text(_MARGIN_IN / width, (top - 0.1) / height, text, fontsize=12, fontweight="bold", color=INK, va="top")
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -155,7 +155,7 @@ def _draw_pairs(axes: Axes, samples: Sequence[ParameterSample]) -> None:
         correlation = rank_correlation(numbers[row], numbers[column])
         if math.isnan(correlation):
             continue
-        # bold: above 3.3 / sqrt(n - 1), which is unlikely by chance
+        # bold above 3.3 standard deviations 1 / sqrt(n - 1) of the correlation of independent values (p = 0.001)
         is_significant = abs(correlation) > 3.3 / math.sqrt(max(numbers[0].size - 1, 1))
         text = f"{correlation + 0.0:+.2f}".replace("-", "−") if abs(correlation) >= 0.005 else "0.00"
         weight, color = ("bold", SERIES[1]) if is_significant else ("normal", MUTED)

@@ -25,7 +25,7 @@ from marsyard.reports.wording import count
 
 @dataclass(frozen=True)
 class OverallVerdict:
-    """A campaign's verdict in one word and one sentence; `status` is None without requirements."""
+    """Verdict of a campaign: status (None without requirements), number of crashed cases, and a sentence."""
 
     status: Status | None
     crashed: int
@@ -40,7 +40,7 @@ class OverallVerdict:
 def combine_verdicts(
     verdicts: Sequence[Verdict], frame: pd.DataFrame, sampling: SamplingDesign = INDEPENDENT
 ) -> OverallVerdict:
-    """Return the verdict of the worst requirement, in the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
+    """Combine the verdicts to the worst of them, in the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
     crashed = int(engine_failed(frame).sum())
     statuses = [verdict.status for verdict in verdicts]
     crash_text = f" {count(crashed, 'case')} crashed." if crashed else ""
@@ -66,7 +66,7 @@ def combine_verdicts(
 def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
     """Return the exit code: 1 for a failed requirement or a crashed case, 3 for an undecided one, 0 otherwise.
 
-    MET BY RATE gives 3, unless the requirement has `accept_rate`.
+    MET BY RATE results in 3, unless the requirement has `accept_rate`.
     """
     if crashed or any(verdict.status is Status.FAIL for verdict in verdicts):
         return 1
@@ -75,7 +75,7 @@ def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
 
 
 def _remedy_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe how many additional cases decide all requirements, or why more cases cannot; may be empty."""
+    """Describe how many additional cases would decide all requirements, or why more cases cannot; may be empty."""
     limited = next((verdict for verdict in verdicts if verdict.advice), None)
     if limited is not None:
         return f" {limited.advice}"
@@ -104,7 +104,7 @@ class Evaluation:
 
 
 def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Evaluation:
-    """Evaluate a campaign; `requirements` replace its own. Raises StoreError if the folder contains no rows."""
+    """Evaluate the campaign in a folder, or other requirements on its rows. Raises StoreError without rows."""
     run = read_run(directory, requirements)
     sampling = read_sampling_design(run.configuration)
     verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling)
@@ -112,10 +112,10 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
 
 
 def next_look(verdicts: Sequence[Verdict], sampling: SamplingDesign, cases: int) -> int | None:
-    """Number of cases at the next look (planned evaluation); None if the campaign may stop.
+    """Return the number of cases at the next look (planned evaluation); None if the campaign may stop.
 
-    It may stop if every requirement is decided, or if the results of the remaining cases cannot decide it. Requirements
-    that are decided by the estimate are ignored.
+    The campaign may stop if every requirement is decided or can no longer be decided by the remaining cases.
+    Requirements that are evaluated by the observed rate (`decide_by = "estimate"`) are ignored.
     """
     if sampling.max_cases is None or cases >= sampling.max_cases:
         return None

@@ -34,11 +34,11 @@ from marsyard.reports.wording import count as count_text
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95
-#: Maximum error on the axis in multiples of the bound; larger errors are counted, not drawn to scale.
-_MAX_BOUNDS = 3.0
-#: If a larger fraction of the errors would lie beyond the axis, the axis ends at this quantile of the errors.
+#: Maximum error on the axis divided by the bound; larger errors are counted, not drawn to scale.
+_MAX_EDGE_RATIO = 3.0
+#: If more than this fraction of the errors lies beyond that axis, the axis ends at this quantile of the errors instead.
 _MAX_FRACTION_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
-#: Number of cases per point of a conditional curve, and minimum and maximum number of points.
+#: Number of cases per point of the curves of median and 95 % quantile; minimum and maximum number of points.
 _CASES_PER_POINT, _MIN_POINTS, _MAX_POINTS = 25, 4, 16
 _LEGEND_BELOW: Mapping[str, Any] = {"loc": "upper center", "ncols": 2, "handletextpad": 0.2}
 
@@ -71,9 +71,9 @@ def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Ca
 
 @in_page_style
 def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, enlarged: bool = False) -> Figure | None:
-    """Signed errors x against y with the requirement's circle (the paper's Fig. 10); None without both parts.
+    """Draw signed errors x against y with the requirement's circle (as DIMES Fig. 10); None without x and y errors.
 
-    enlarged: fit the axes to the errors, even if the circle lies outside them
+    enlarged: fit the axes to the errors, even if the circle lies outside the axes
     """
     parts = axis_columns(metric, [str(column) for column in frame.columns])[:2]
     if len(parts) < 2:
@@ -118,20 +118,20 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, enla
 def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
     """Compute the end of an axis of magnitudes: the maximum, limited to 1.1 to 3 times the bound.
 
-    If more than a quarter of the magnitudes lie beyond 3 times the bound, it is their 95 % quantile.
+    If more than a quarter of the magnitudes exceed 3 times the bound, the axis ends at their 95 % quantile.
     """
     if magnitudes.size == 0:
         return bound or 1.0
     largest = float(magnitudes.max())
     if bound is None or bound <= 0.0:
         return largest or 1.0
-    if float(np.mean(magnitudes > _MAX_BOUNDS * bound)) > _MAX_FRACTION_BEYOND:
+    if float(np.mean(magnitudes > _MAX_EDGE_RATIO * bound)) > _MAX_FRACTION_BEYOND:
         return float(np.quantile(magnitudes, _EDGE_QUANTILE, method="higher"))
-    return min(max(largest, 1.1 * bound), _MAX_BOUNDS * bound)
+    return min(max(largest, 1.1 * bound), _MAX_EDGE_RATIO * bound)
 
 
 def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
-    """Whether all errors are so small relative to the bound that an enlarged figure is needed."""
+    """Whether all errors are below 60 % of the bound, so that an enlarged figure is needed."""
     magnitude = np.abs(numbers(frame, metric))
     finite = magnitude[np.isfinite(magnitude)]
     return bound is not None and finite.size > 0 and 0.0 < float(finite.max()) < 0.6 * bound
@@ -139,8 +139,8 @@ def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None)
 
 @in_page_style
 def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Figure | None:
-    """Histogram of error magnitudes, with a bar for errors beyond the axis; None without errors."""
-    magnitude, edge = _magnitudes(frame, metric, bound)
+    """Draw a histogram of error magnitudes with a bar for errors beyond the axis; None without errors."""
+    magnitude, edge = _finite_magnitudes(frame, metric, bound)
     if magnitude.size == 0:
         return None
     figure, axes = new_axes(5.0, 2.7)
@@ -158,15 +158,15 @@ def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Fi
         axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= edge])
         axes.set_xlim(0.0, 1.18 * edge)
         axes.margins(y=0.25)
-    _bound_line(axes, metric, bound, 0.98)
+    _draw_bound(axes, metric, bound, 0.98)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
 
 @in_page_style
 def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) -> Figure | None:
-    """Fraction of cases with an error up to each magnitude, and the number beyond the axis; None without errors."""
-    magnitude, edge = _magnitudes(frame, metric, bound)
+    """Draw the fraction of cases with an error up to each magnitude; None without errors."""
+    magnitude, edge = _finite_magnitudes(frame, metric, bound)
     if magnitude.size == 0:
         return None
     figure, axes = new_axes(5.0, 2.7)
@@ -177,7 +177,7 @@ def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) ->
     steps = np.concatenate([[0.0], ordered, [max(edge, float(ordered[-1]))]])
     axes.plot(steps, np.concatenate([[0.0], fraction, [1.0]]), drawstyle="steps-post", color=SERIES[0], linewidth=1.8)
     axes.set(xlabel=magnitude_label(metric), ylabel="fraction of cases with an error", xlim=(0.0, edge * 1.02))
-    _bound_line(axes, metric, bound, 0.2)
+    _draw_bound(axes, metric, bound, 0.2)
     axes.set_ylim(0.0, 1.03)
     note_beyond(axes, int((magnitude > edge).sum()))
     return figure
@@ -192,9 +192,9 @@ def note_beyond(axes: Axes, beyond: int) -> None:
 
 @in_page_style
 def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> Figure | None:
-    """Scatter of errors against a condition; None without numbers.
+    """Draw errors against a condition; None without cases that have a number for the condition.
 
-    Cases without an error are ticks at the upper edge; errors beyond the axis are hollow markers below it.
+    Cases without an error are ticks at the upper edge; errors beyond the axis are hollow markers just below that edge.
     """
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
     finite = np.isfinite(x) & np.isfinite(magnitude)
@@ -231,7 +231,7 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
 
 
 def _scatter_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
-    """Largest magnitude drawn to scale; the axis includes the bound if the errors approach it."""
+    """Compute the largest magnitude drawn to scale; the axis includes the bound if the errors approach the bound."""
     edge = axis_edge(magnitudes, bound)
     largest = float(magnitudes.max()) if magnitudes.size else 0.0
     includes_bound = bound is not None and 1.12 * largest > 0.6 * bound
@@ -247,7 +247,7 @@ def count_beyond_axis(frame: pd.DataFrame, metric: str, driver: str, bound: floa
 
 @in_page_style
 def outcome_bars(frame: pd.DataFrame) -> Figure | None:
-    """Number of cases by outcome; None without rows."""
+    """Draw the number of cases by outcome; None without rows."""
     counts = outcome_counts(frame)
     if not counts:
         return None
@@ -266,11 +266,14 @@ def outcome_bars(frame: pd.DataFrame) -> Figure | None:
 
 
 def _annotate(axes: Axes, text: str, position: tuple[Any, Any], offset: tuple[int, int], **style: Any) -> None:
+    """Write a text at a position, shifted by an offset in points."""
     style = {"fontsize": 9, **style}
     axes.annotate(text, position, xytext=offset, textcoords="offset points", color=INK, **style)
 
 
-def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[Float[np.ndarray, " known"], float]:
+def _finite_magnitudes(
+    frame: pd.DataFrame, metric: str, bound: float | None
+) -> tuple[Float[np.ndarray, " known"], float]:
     magnitude = np.abs(numbers(frame, metric))
     finite = magnitude[np.isfinite(magnitude)]
     return finite, axis_edge(finite, bound)
@@ -287,7 +290,7 @@ def _draw_points(
     )  # fmt: skip
 
 
-def _bound_line(axes: Axes, metric: str, bound: float | None, height: float) -> None:
+def _draw_bound(axes: Axes, metric: str, bound: float | None, height: float) -> None:
     """Draw the requirement, with its text at a height in fractions of the axes."""
     if bound is None:
         return
@@ -313,10 +316,11 @@ def cumulative_figure(
     bound: float | None = None,
     limits: Mapping[str, Sequence[float]] | None = None,
 ) -> Figure:
-    """Fraction of cases up to each value, or above it if `complementary`; curves without values are omitted.
+    """Draw the fraction of cases up to each value, or above it if `complementary`; curves without values are omitted.
 
-    labels: labels of the x and y axes bound: a requirement; the x axis ends close to it, and values beyond the axis are
-    counted limits: positions of additional vertical lines by name
+    - labels: labels of the x and y axes
+    - bound: bound of a requirement; the x axis ends close to it, and values beyond the axis are counted
+    - limits: positions of additional vertical lines by name
     """
     figure, axes = new_axes(6.4, 3.4)
     all_values = np.concatenate([*curves.values()])
@@ -346,7 +350,7 @@ def cumulative_figure(
 
 @dataclass(frozen=True)
 class RateLine:
-    """Rates at values of a condition, and the rates of a paper by value."""
+    """Rates at values `x` of a condition, and the rates of a paper by value of the condition."""
 
     name: str
     x: Sequence[float]
@@ -373,7 +377,7 @@ def draw_rates(axes: Axes, lines: Sequence[RateLine], linestyle: str = "-") -> N
 
 @in_page_style
 def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple[str, float] | None = None) -> Figure:
-    """Rates against a condition; `limit` is the name and position of a vertical line."""
+    """Draw rates against a condition; `limit` is the name and position of a vertical line."""
     figure, axes = new_axes(6.4, 3.7)
     draw_rates(axes, lines)
     if limit is not None:
@@ -385,7 +389,7 @@ def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple
 
 @in_page_style
 def stacked_bars(names: Sequence[str], percentages: Mapping[str, tuple[str, Sequence[float]]], xlabel: str) -> Figure:
-    """A bar of percentages for each name; `percentages` contains a style of `BARS` and the values by outcome."""
+    """Draw a bar of percentages for each name; `percentages` contains a style of `BARS` and the values by outcome."""
     figure, axes = new_axes(7.4, 1.0 + 0.27 * len(names))
     positions, left = np.arange(len(names)), np.zeros(len(names))
     for name, (style, values) in percentages.items():
@@ -399,13 +403,13 @@ def stacked_bars(names: Sequence[str], percentages: Mapping[str, tuple[str, Sequ
     return figure
 
 
-#: The x and y of points, or of the medians of their bins.
+#: x and y coordinates of points.
 Points = tuple[Sequence[float] | Values, Sequence[float] | Values]
 
 
 @in_page_style
 def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, logarithmic: bool = False) -> Figure:
-    """Panels of cases and of medians of their bins by x and y labels: a row for each y, a column for each x."""
+    """Draw panels with cases and medians of bins, by x and y labels: a row for each y, a column for each x."""
     columns, rows = (list(dict.fromkeys(pair[k] for pair in panels)) for k in (0, 1))
     size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(rows))
     figure = Figure(figsize=size, layout="constrained")

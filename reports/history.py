@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.reports.statistics.changes import Sample, difference_p, holm
+from marsyard.reports.statistics.changes import Sample, correct_holm, difference_p_value
 from marsyard.reports.wording import count, format_fraction, number, percent
 
 #: Version of the tables, as `PRAGMA user_version`.
@@ -43,12 +43,12 @@ class NightCampaign:
 
 
 @dataclass(frozen=True)
-class NightFigure:
-    """One metric of a campaign in a night: its name, whether it is a rate, rate or median error, and its cases."""
+class NightMetric:
+    """One metric of a campaign in a night; `value` is the rate or the median error, `sample` contains the cases."""
 
-    figure: str
-    rate: bool
-    level: float
+    name: str
+    is_rate: bool
+    value: float
     sample: Sample
 
 
@@ -100,13 +100,13 @@ class History:
             )
         return int(row[0])
 
-    def add(self, night: int, campaign: NightCampaign, figures: Sequence[NightFigure]) -> None:
+    def add(self, night: int, campaign: NightCampaign, metrics: Sequence[NightMetric]) -> None:
         """Store the result of a campaign in a night."""
         rows, head = [], (campaign.name, campaign.definition, campaign.directory)
-        for figure in figures:
-            values, terrains = figure.sample.values[:MAX_CASES], figure.sample.terrains[:MAX_CASES]
+        for metric in metrics:
+            values, terrains = metric.sample.values[:MAX_CASES], metric.sample.terrains[:MAX_CASES]
             blobs = values.astype("<f4").tobytes(), terrains.astype("<i8").tobytes()
-            rows.append((night, campaign.name, figure.figure, figure.rate, figure.level, *blobs))
+            rows.append((night, campaign.name, metric.name, metric.is_rate, metric.value, *blobs))
         with self._transaction():
             self._connection.execute(
                 "INSERT INTO campaigns VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -125,11 +125,11 @@ class History:
             )
 
     def nights(self) -> list[Night]:
-        """All nights, the latest first."""
+        """List all nights, the latest first."""
         return [Night(*row) for row in self._connection.execute("SELECT * FROM nights ORDER BY night DESC")]
 
     def campaigns(self, night: int) -> list[NightCampaign]:
-        """Results of the campaigns of a night, in the order in which they ended."""
+        """List the results of the campaigns of a night, in the order in which the campaigns ended."""
         rows = self._connection.execute(
             "SELECT name, definition, directory, verdict, exit_code, sentence FROM campaigns WHERE night = ? "
             "ORDER BY rowid",
@@ -137,20 +137,20 @@ class History:
         )
         return [NightCampaign(*row) for row in rows]
 
-    def figures(self, night: int, campaign: str) -> list[NightFigure]:
-        """A campaign's metrics in a night."""
+    def metrics(self, night: int, campaign: str) -> list[NightMetric]:
+        """List the metrics of a campaign in a night."""
         rows = self._connection.execute(
             "SELECT figure, rate, level, amounts, terrains FROM figures WHERE night = ? AND campaign = ? "
             "ORDER BY rowid",
             (night, campaign),
         )
         return [
-            NightFigure(name, bool(rate), float("nan") if level is None else level, _unpack(values, terrains))
-            for name, rate, level, values, terrains in rows
+            NightMetric(name, bool(is_rate), float("nan") if value is None else value, _unpack(values, terrains))
+            for name, is_rate, value, values, terrains in rows
         ]
 
-    def earlier_samples(self, night: int, campaign: NightCampaign, figure: str) -> list[Sample]:
-        """A metric in earlier finished nights of the same campaign, the latest first, back to its last change."""
+    def earlier_samples(self, night: int, campaign: NightCampaign, metric: str) -> list[Sample]:
+        """Read the samples of a metric in earlier finished nights since its last change, the latest first."""
         rows = self._connection.execute(
             """
             SELECT f.amounts, f.terrains FROM figures f
@@ -161,7 +161,7 @@ class History:
                 (SELECT MAX(night) FROM changes WHERE campaign = f.campaign AND figure = f.figure AND night < ?), 0)
             ORDER BY f.night DESC LIMIT ?
             """,
-            (night, campaign.name, figure, campaign.definition, FINISHED, night, WINDOW),
+            (night, campaign.name, metric, campaign.definition, FINISHED, night, WINDOW),
         )
         return [_unpack(*row) for row in rows]
 
@@ -181,7 +181,7 @@ class History:
 
 
 def utc_now() -> str:
-    """Current time, to the second."""
+    """Return the current time in UTC with a resolution of one second."""
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
@@ -189,9 +189,9 @@ def _unpack(values: bytes, terrains: bytes) -> Sample:
     return Sample(np.frombuffer(values, "<f4").astype(np.float64), np.frombuffer(terrains, "<i8").astype(np.int64))
 
 
-#: Maximum probability of at least one false alarm in a night without changes.
+#: Maximum probability of at least one false alarm in a night in which no metric has changed.
 FALSE_ALARMS = 0.01
-#: Significance level of changes; the other half is for the nights after a false alarm.
+#: Significance level of changes; the other half of the probability is for the nights after a false alarm.
 _SIGNIFICANCE = 0.5 * FALSE_ALARMS
 #: Expected number of permutations that exceed a change at the significance level.
 _MIN_EXCEEDANCES = 10
@@ -201,13 +201,15 @@ _MIN_EXCEEDANCES = 10
 class Change:
     """A changed metric.
 
-    rate: whether it is a success rate (larger is better); else an error before, now: rate or median in the earlier
-    nights and tonight p_value: corrected for the number of metrics compared tonight nights: number of earlier nights
+    - is_rate: whether the metric is a success rate (larger is better), not an error
+    - before, now: rate or median error in the earlier nights and in this night
+    - p_value: p-value with Holm correction for the number of metrics compared in this night
+    - nights: number of earlier nights
     """
 
     campaign: str
-    figure: str
-    rate: bool
+    metric: str
+    is_rate: bool
     before: float
     now: float
     p_value: float
@@ -216,15 +218,15 @@ class Change:
     @property
     def worse(self) -> bool:
         """Whether the change is a regression."""
-        return self.now < self.before if self.rate else self.now > self.before
+        return self.now < self.before if self.is_rate else self.now > self.before
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A metric of tonight with its samples in earlier nights."""
+    """A metric of one night, and its samples in earlier nights."""
 
     campaign: str
-    figure: NightFigure
+    metric: NightMetric
     before: Sequence[Sample]
 
 
@@ -235,19 +237,19 @@ def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
         parts = ([getattr(sample, part) for sample in comparison.before] for part in ("values", "terrains"))
         pooled.append(Sample(*map(np.concatenate, parts)) if comparison.before else None)
     permutations = math.ceil(_MIN_EXCEEDANCES * len(comparisons) / _SIGNIFICANCE)
-    p_values = holm(
+    p_values = correct_holm(
         [
-            math.nan if earlier is None else difference_p(comparison.figure.sample, earlier, permutations)
+            math.nan if earlier is None else difference_p_value(comparison.metric.sample, earlier, permutations)
             for comparison, earlier in zip(comparisons, pooled, strict=True)
         ]
     )
     return [
         Change(
             campaign=comparison.campaign,
-            figure=comparison.figure.figure,
-            rate=comparison.figure.rate,
-            before=summary_value(earlier, comparison.figure.rate),
-            now=summary_value(comparison.figure.sample, comparison.figure.rate),
+            metric=comparison.metric.name,
+            is_rate=comparison.metric.is_rate,
+            before=summary_value(earlier, comparison.metric.is_rate),
+            now=summary_value(comparison.metric.sample, comparison.metric.is_rate),
             p_value=p,
             nights=len(comparison.before),
         )
@@ -259,18 +261,18 @@ def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
 def list_comparisons(history: History, night: int) -> list[Comparison]:
     """List every metric of a night with its samples in earlier nights."""
     return [
-        Comparison(campaign.name, figure, history.earlier_samples(night, campaign, figure.figure))
+        Comparison(campaign.name, metric, history.earlier_samples(night, campaign, metric.name))
         for campaign in history.campaigns(night)
-        for figure in history.figures(night, campaign.name)
+        for metric in history.metrics(night, campaign.name)
     ]
 
 
-def summary_value(sample: Sample, rate: bool) -> float:
+def summary_value(sample: Sample, is_rate: bool) -> float:
     """Compute the rate or the median; NaN for no cases."""
     values = sample.finite_cases().values
     if values.size == 0:
         return math.nan
-    return float(values.mean() if rate else np.median(values))
+    return float(values.mean() if is_rate else np.median(values))
 
 
 def night_text(
@@ -278,7 +280,8 @@ def night_text(
 ) -> str:
     """Format the night's page in Markdown.
 
-    earlier: previous nights, the latest first changes, compared: changed metrics, and number of compared metrics
+    - earlier: previous nights, the latest first
+    - changes, compared: changed metrics, and number of compared metrics
     """
     regressions = [change for change in changes if change.worse]
     improvements = [change for change in changes if not change.worse]
@@ -290,18 +293,18 @@ def night_text(
         end = f"ended {night.finished_utc}"
     lines = [f"# Night {night.night}: {headline}", ""]
     lines.append(f"Begun {night.started_utc}, {end}; commit {night.git_commit or 'not known'}.")
-    unfinished = list(takewhile(lambda night: night.state != FINISHED, earlier))
+    unfinished = list(takewhile(lambda earlier_night: earlier_night.state != FINISHED, earlier))
     lines += [""] * bool(unfinished)
-    lines += [f"Night {night.night}, begun {night.started_utc}, was {night.state}." for night in unfinished]
+    lines += [f"Night {previous.night}, begun {previous.started_utc}, was {previous.state}." for previous in unfinished]
     lines += ["", "| Campaign | Verdict | |", "|---|---|---|"]
     lines += [f"| {_escape(run.name)} | {_escape(run.verdict)} | {_escape(run.sentence)} |" for run in campaigns]
     for title, group in (("Regressions", regressions), ("Improvements", improvements)):
         if group:
             lines += ["", f"## {title}", ""]
         for change in group:
-            before, now = ((percent if change.rate else number)(value) for value in (change.before, change.now))
+            before, now = ((percent if change.is_rate else number)(value) for value in (change.before, change.now))
             values = f"{before} in {count(change.nights, 'earlier night')}, {now} now (p = {change.p_value:.1g})"
-            lines.append(f"- **{_escape(change.campaign)}: {_escape(change.figure)}**: {values}")
+            lines.append(f"- **{_escape(change.campaign)}: {_escape(change.metric)}**: {values}")
     text = (
         f"{count(compared, 'metric')} compared with earlier nights; the probability of a false alarm is at most "
         f"{format_fraction(FALSE_ALARMS)}.{'' if changes else ' No metric has changed.'}"
@@ -311,5 +314,6 @@ def night_text(
 
 
 def _escape(text: str) -> str:
+    """Escape characters with a meaning in Markdown or HTML."""
     marks = {letter: f"&#{ord(letter)};" for letter in "&<>|"} | {letter: f"\\{letter}" for letter in "\\`*_[]#"}
     return "".join(marks.get(letter, letter) for letter in " ".join(text.split()))

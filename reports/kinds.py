@@ -1,7 +1,7 @@
-"""Kinds of report sections as data: a `SectionDeclaration` of parts, each of which creates blocks and their numbers.
+"""Declared report sections: a `SectionDeclaration` consists of parts, which create tables, figures and their numbers.
 
 Parts: `RateTable`, `RateByCondition`, `OutcomesBySize`, `Distribution`, `Statistics`, `Quantiles`, `Scatter`, and
-`CustomBlocks`. `marsyard.reports.papers.PaperFacts` is a separate section. Example: `docs/reports.md`.
+`CustomBlocks`. `marsyard.reports.papers.PaperFacts` is a separate section. `docs/reports.md` contains an example.
 """
 
 from __future__ import annotations
@@ -42,10 +42,11 @@ class Part(Protocol):
 
 @dataclass(frozen=True)
 class SectionDeclaration:
-    """A section declared by its parts; call it with a `Subject` to make the section.
+    """A section declared by its parts; call it with a `Subject` to create the section.
 
-    requires: columns that must exist and contain a value rows: function that selects or extends the rows of the
-    section; None for no section note: text below all parts
+    - requires: columns that must exist and contain a value
+    - rows: function that selects or extends the rows of the section; it returns None for no section
+    - note: text below all parts
     """
 
     key: str
@@ -80,13 +81,13 @@ class CustomBlocks:
     function: Callable[[Rows, Subject, str], BlocksAndData]
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
-        """Call the function."""
+        """Create the blocks by the function."""
         return self.function(frame, subject, key)
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of numbers with its name for readers (default: the column in words) and a scale."""
+    """A column of numbers with its name on the page (default: the column in words) and a scale."""
 
     column: str
     name: str = ""
@@ -94,7 +95,7 @@ class Quantity:
 
     @property
     def title(self) -> str:
-        """The name for readers."""
+        """The name on the page."""
         return self.name or label(self.column)
 
     def values(self, frame: Rows) -> Float[np.ndarray, " n"]:
@@ -103,24 +104,25 @@ class Quantity:
 
 
 def flag_rate(name: str, *among: str, wanted: bool = True) -> RateOf:
-    """Fraction of rows whose flag equals `wanted`, among the rows where all flags of `among` are true."""
+    """Create a function: fraction of rows whose flag equals `wanted`, of the rows where all flags `among` are true."""
 
-    def rate(frame: Rows) -> CaseFraction:
+    def compute_rate(frame: Rows) -> CaseFraction:
         all_rows = np.ones(len(frame), dtype=np.bool_)
-        selected = frame[np.logical_and.reduce([all_rows, *(rates.flag(frame, other) for other in among)])]
-        return rates.fraction_of(rates.flag(selected, name) == wanted, selected)
+        masks = (rates.flag_mask(frame, condition) for condition in among)
+        selected = frame[np.logical_and.reduce([all_rows, *masks])]
+        return rates.fraction_of(rates.flag_mask(selected, name) == wanted, selected)
 
-    return rate
+    return compute_rate
 
 
 def pooled_fraction(hits: str, of: str) -> RateOf:
-    """Fraction of one column of counts in another, pooled over the rows."""
+    """Create a function: sum of the counts `hits` divided by the sum of the counts `of`, pooled over the rows."""
     return lambda frame: rates.pooled_rate(frame, hits, of)
 
 
 @dataclass(frozen=True)
 class Rate:
-    """A rate of rows: key in `report.json`, name for readers, function, and whether figures show it."""
+    """A rate: key in `report.json`, name on the page, function that computes it, and whether figures show it."""
 
     key: str
     name: str
@@ -132,8 +134,9 @@ class Rate:
 class RateTable:
     """A table of rates with their intervals.
 
-    rates: declared rates, or a function that computes them from the rows
-    shared: whether the intervals allow for cases on shared terrains
+    - rates: declared rates, or a function that computes rates by name from the rows
+    - shared: whether the intervals allow for cases on shared terrains
+    - data: key of the rates in `report.json`
     """
 
     rates: Sequence[Rate] | Callable[[Rows], Mapping[str, CaseFraction]]
@@ -160,9 +163,10 @@ class RateTable:
 class RateByCondition:
     """Rates against a condition, as a table and as curves.
 
-    by: the condition: single values, or bins of equally many cases for many values cases, ylabel, text, note, caption:
-    heading of the table's cases, label of the figure's axis, and texts limit: name of a vertical line, and its position
-    by campaign data: key of the list in `report.json`
+    - by: the condition; each value has a row, or each bin of equally many cases if there are many values
+    - cases, ylabel: heading of the number of cases in the table, and label of the figure's vertical axis
+    - limit: name of a vertical line, and function that returns its position for a campaign
+    - data: key of the list in `report.json`
     """
 
     by: Quantity
@@ -208,7 +212,7 @@ class RateByCondition:
 
 
 def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _BINS) -> list[Bool[np.ndarray, " n"]]:
-    """Masks of the single values if they are few, else of bins of equally many cases; no mask contains NaN."""
+    """Create a mask for each value, or for bins of equally many cases if there are many values; NaN is in no mask."""
     finite = np.isfinite(values)
     distinct = np.unique(values[finite])
     if distinct.size <= max_values:
@@ -223,10 +227,12 @@ def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _BINS) -> 
 class OutcomesBySize:
     """Outcomes of cases by a kind and its size (a fault and its severity): a table and stacked bars.
 
-    outcomes: masks of the rows by key of `report.json`, in the order of the bars; the last has an interval styles: name
-    for readers and style of `marsyard.reports.section.BARS` by outcome cases: heading of the rows wording: kind and
-    size in words; an unknown size is empty extra_columns: heading, key of `report.json`, value of the rows, and its
-    text
+    - outcomes: function that returns masks of the rows by key of `report.json`; the last outcome has an interval
+    - styles: name on the page and style of `marsyard.reports.section.BARS` by outcome, in the order of the bars
+    - cases: heading of the number of rows
+    - wording: function that returns kind and size in words; an unknown size is empty
+    - extra_columns: heading, key of `report.json`, function of the rows, and function that formats its value
+    - kind, size, none: columns of kind and size, and name of the kind of cases without a fault
     """
 
     outcomes: Callable[[Rows, Subject], Mapping[str, Bool[np.ndarray, " n"]]]
@@ -245,11 +251,12 @@ class OutcomesBySize:
         records = []
         for kind, size, rows in rates.group_by_size(frame, self.kind, self.size, self.none):
             masks = self.outcomes(rows, subject)
-            last = rates.fraction_of(masks[[*self.styles][-1]], rows)
+            last_outcome = [*self.styles][-1]
+            last_fraction = rates.fraction_of(masks[last_outcome], rows)
             counts = {name: int(mask.sum()) for name, mask in masks.items()}
             values = {name: value(rows) for _, name, value, _ in self.extra_columns}
-            key = f"{[*self.styles][-1]}_share"
-            records.append({self.kind: kind, "size": size, "n": len(rows), **counts, key: last, **values})
+            head = {self.kind: kind, "size": size, "n": len(rows)}
+            records.append({**head, **counts, f"{last_outcome}_share": last_fraction, **values})
         return records
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
@@ -286,7 +293,7 @@ class OutcomesBySize:
 
 @dataclass(frozen=True)
 class Distribution:
-    """Cumulative curves of quantities, or of values by name; see `marsyard.reports.figures.cumulative_figure`."""
+    """Cumulative curves of quantities, or of values by name that a function computes (`figures.cumulative_figure`)."""
 
     curves: Sequence[Quantity] | Callable[[Rows], Mapping[str, Float[np.ndarray, " n"]]]
     labels: tuple[str, str]
@@ -392,9 +399,8 @@ class Scatter:
         head = ["Rank correlation", *(response.title for response in self.y)]
         grid = Grid(head, [[name, *cells] for name, cells in texts.items()])
         figure = scatter_panels(panels, logarithmic=self.logarithmic)
-        note = (
-            f"Intervals at {format_fraction(CONFIDENCE)} confidence; a dash below {MIN_CASES} cases or for constants."
-        )
+        confidence_text = f"The intervals are at {format_fraction(CONFIDENCE)} confidence."
+        note = f"{confidence_text} A dash means that there are fewer than {MIN_CASES} cases or only one value."
         svg_figures = [svg_figure(figure, key, self.caption, wide=len(effects) > 1)]
         return [Block(heading=self.heading, figures=svg_figures, grid=grid, note=note)], {"effects": effects}
 

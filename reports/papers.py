@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from marsyard.reports.kinds import Part, Rows
-from marsyard.reports.rates import all_flags, finite_values, flag_fraction, fraction_text, spread_text
+from marsyard.reports.rates import all_flags, finite_values, flag_fraction, fraction_text, median_text
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.wording import NOTHING
 
@@ -30,9 +30,9 @@ class PaperFacts:
 
     Keys: `campaign` (that repeats the run), `title`, `source`, `note`, and `rows`. Keys of a row: `name` (with its
     unit), `paper` (text, a dash by default), `column`, and optionally `statistic` (``spread``, the median with minimum
-    and maximum, or ``rate``), `among` (flags that choose rows), `scale`, `digits`, and `magnitude` (drop signs).
+    and maximum, or ``rate``), `among` (flags that select rows), `scale`, `digits`, and `magnitude` (remove signs).
 
-    extra_parts: additional parts by campaign
+    extra_parts: additional parts of the section by campaign name
     """
 
     path: Path
@@ -56,7 +56,9 @@ class PaperFacts:
         return Section("paper", "Paper comparison", facts["title"], blocks, data)
 
 
-_MEDIANS = "Ours: median over all cases, minimum to maximum in brackets. A dash: not in the paper."
+_MEDIANS = (
+    '"Ours" is the median over all cases, with minimum to maximum in brackets. A dash means that no value is printed.'
+)
 
 
 def format_simulated_value(frame: Rows, row: Mapping[str, Any]) -> str:
@@ -65,4 +67,4 @@ def format_simulated_value(frame: Rows, row: Mapping[str, Any]) -> str:
     if row.get("statistic") == "rate":
         return fraction_text(flag_fraction(rows, column)) if column in rows else NOTHING
     values = finite_values(rows, column, row.get("scale", 1.0))
-    return spread_text(np.abs(values) if row.get("magnitude") else values, row.get("digits"))
+    return median_text(np.abs(values) if row.get("magnitude") else values, row.get("digits"))

@@ -1,6 +1,6 @@
-"""Presentation of a system: its report sections, and the cases whose images are on the report's page.
+"""Presentation of a system (DIMES, for example): its report sections, and the views of its cases on the page.
 
-`marsyard.scenarios.systems.System.report` is its import path; reports find systems in `marsyard.scenarios.systems`.
+Each system of `marsyard.scenarios.systems` defines the import path of its presentation in `System.report`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from marsyard.reports.rates import members
+from marsyard.reports.rates import population_mask
 from marsyard.reports.section import SectionMaker, SvgFigure
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import NOTHING, numbers, primary_metric
@@ -30,7 +30,7 @@ Products = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of a case's table, and whether the item in it succeeded."""
+    """A row of a case's table, and whether its item (a track or a stage, for example) succeeded."""
 
     values: Sequence[str]
     succeeded: bool
@@ -51,8 +51,9 @@ class CaseView:
 class CaseKind:
     """Functions that draw the cases of one kind from their products.
 
-    view: create the view for the page; the text argument prefixes the identifiers of figures
-    write: write the figures into a folder and return the paths; raises OSError if they cannot be written
+    - is_case: return whether the products are those of this kind of case
+    - view: create the view for the page; the text argument prefixes the identifiers of figures
+    - write: write the figures into a folder and return the paths; raises OSError if they cannot be written
     """
 
     is_case: Callable[[Products], bool]
@@ -65,9 +66,9 @@ class CaseKind:
 class Presentation:
     """Report sections and case figures of a system.
 
-    cases: kinds of case; the first kind that matches the products is used
-    sections, first: sections after and in front of those of every campaign; None for rows of other systems
-    outcomes: enumerations of the outcomes; the values describe them
+    - cases: kinds of case; the first kind that matches the products is used
+    - first, sections: functions that create sections in front of and after those of every campaign
+    - outcomes: enumerations of the outcomes; the values describe the outcomes
     """
 
     cases: Sequence[CaseKind] = ()
@@ -78,7 +79,7 @@ class Presentation:
 
 @cache
 def presentations() -> tuple[Presentation, ...]:
-    """Import the presentations of all systems in the order of the registry; omit an unusable one with a warning."""
+    """Import the presentations of all systems in the order of the registry; omit an invalid one with a warning."""
     selected: list[Presentation] = []
     for system in systems():
         if not system.report:
@@ -101,7 +102,7 @@ def _warn(reason: str) -> None:
     warnings.warn(f"{reason}; its sections and images are omitted", stacklevel=3)
 
 
-def case_kind(products: Products) -> CaseKind | None:
+def find_case_kind(products: Products) -> CaseKind | None:
     """Find the kind of case of these products; None if no system recognizes them."""
     kinds = (kind for presentation in presentations() for kind in presentation.cases)
     return next((kind for kind in kinds if kind.is_case(products)), None)
@@ -143,7 +144,7 @@ def check_shape(value: object, *shape: int | None) -> Float[np.ndarray, "..."] |
 def read_arrays(
     products: Products, shapes: Mapping[str, tuple[int | None, ...]], *, finite: bool = False
 ) -> list[Float[np.ndarray, "..."]] | None:
-    """Read products by name and shape, optionally finite; None if one of them is missing or invalid."""
+    """Read products by name and shape; None if a product is missing, invalid, or not finite if `finite` is set."""
     arrays = [check_shape(products.get(name), *shape) for name, shape in shapes.items()]
     valid = [array for array in arrays if array is not None and (not finite or np.isfinite(array).all())]
     return valid if len(valid) == len(shapes) else None
@@ -171,7 +172,7 @@ def showcase_views(run: StoredRun) -> list[ShowcaseView]:
 
 
 def gallery_cases(run: StoredRun) -> list[int]:
-    """List the cases of the page: the one selected for the report, then largest errors, no answer, and random cases."""
+    """List the cases of the page: the case selected for the report, largest errors, no answer, and random cases."""
     stored_cases = list(run.showcases)
     metric = primary_metric(run.frame, run.requirements)
     if len(stored_cases) <= 1 or metric is None or "case" not in run.all_cases:
@@ -184,7 +185,7 @@ def gallery_cases(run: StoredRun) -> list[int]:
 
 def notable_cases(run: StoredRun) -> list[int]:
     """List completed cases: the largest errors, the first cases without an error, and random cases."""
-    rows = run.all_cases[members(run.all_cases, "completed")]
+    rows = run.all_cases[population_mask(run.all_cases, "completed")]
     metric = primary_metric(run.frame, run.requirements)
     if "case" not in rows or metric is None:
         return []
@@ -202,7 +203,7 @@ def _sort_by_error(rows: pd.DataFrame, metric: str) -> tuple[list[int], list[int
 
 
 def _select_cases(first: list[int], *kinds: list[int]) -> list[int]:
-    """The first cases, then up to `CASES_OF_A_KIND` further ones of each kind."""
+    """List the first cases, then up to `CASES_PER_KIND` further cases of each kind."""
     selected = list(first)
     for kind in kinds:
         selected += [case for case in dict.fromkeys(kind) if case not in selected][:CASES_PER_KIND]
@@ -212,7 +213,7 @@ def _select_cases(first: list[int], *kinds: list[int]) -> list[int]:
 def showcase_view(run: StoredRun, case: int) -> ShowcaseView | None:
     """Create the view of a stored case; None if no system recognizes its products."""
     products = run.products(case)
-    kind = case_kind(products)
+    kind = find_case_kind(products)
     if kind is None:
         return None
     view = kind.view(products, f"case{case}")
@@ -227,5 +228,5 @@ def write_case_figures(directory: Path, products: Mapping[str, Any]) -> list[Pat
 
     Raises OSError if they cannot be written.
     """
-    kind = case_kind(products)
+    kind = find_case_kind(products)
     return [] if kind is None else kind.write(directory, products)

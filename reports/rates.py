@@ -1,4 +1,4 @@
-"""Populations of stored rows; their rates and numbers with intervals, and texts of these."""
+"""Populations of stored rows; rates with intervals, and their texts."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ ENGINE_FAILURES = errors.ENGINE_FAILURES
 
 
 def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
-    """Mask of the cases with |scale * metric| <= bound, or with a true metric if the bound is NaN.
+    """Create the mask of the cases with |scale * metric| <= bound, or with a true metric if the bound is NaN.
 
-    False for missing values and unfinished cases. A metric may be a sum of columns, joined by " + ".
+    Missing values and unfinished cases are no successes. A metric may be a sum of columns, joined by " + ".
     """
     finished = ~engine_failed(frame)
     if math.isnan(bound):
-        return np.asarray(flag(frame, metric) & finished, dtype=np.bool_)
+        return np.asarray(flag_mask(frame, metric) & finished, dtype=np.bool_)
     values = sum((numbers(frame, part) for part in metric.split(" + ")), np.zeros(len(frame)))
     return np.asarray((np.abs(scale * values) <= bound) & finished, dtype=np.bool_)
 
 
-def members(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """Mask of a population: `all`, `completed`, `valid`, a column of true and false, or several joined by " and ".
+def population_mask(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
+    """Create the mask of a population: `all`, `completed`, `valid`, a flag column, or several joined by " and ".
 
-    A case of unknown membership, such as a crashed case, is a member. Raises ValueError if no row has the column.
+    A case with a missing flag, such as a crashed case, belongs to the population. Raises ValueError without the column.
     """
-    return members_and_unknown(frame, population.split(" and "))[0]
+    return population_and_unknown_masks(frame, population.split(" and "))[0]
 
 
-def members_and_unknown(
+def population_and_unknown_masks(
     frame: pd.DataFrame, parts: Sequence[str]
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Masks of the members of the intersection of populations, and of members of unknown membership."""
+    """Create the masks of the intersection of populations, and of its cases with a missing flag."""
     member, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
     for part in parts:
         if part == "completed":
@@ -51,31 +51,33 @@ def members_and_unknown(
             if not is_flag(frame, column):
                 raise ValueError(f"the rows have no column '{column}' of true and false, which defines a population")
             missing = frame[column].isna().to_numpy(dtype=np.bool_)
-            member &= flag(frame, column) | missing
+            member &= flag_mask(frame, column) | missing
             unknown |= missing
     return member, member & unknown
 
 
 def is_flag(frame: pd.DataFrame, column: str) -> bool:
-    """Whether a column holds only true, false and missing values."""
+    """Whether a column exists and contains only true, false and missing values."""
     return column in frame and all(isinstance(value, bool | np.bool_) for value in frame[column].dropna().unique())
 
 
 def engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-    """Mask of the cases that the engine could not finish."""
+    """Create the mask of the cases that the engine could not finish."""
     if "outcome" not in frame:
         return np.zeros(len(frame), dtype=np.bool_)
     return frame["outcome"].isin(ENGINE_FAILURES).to_numpy(dtype=np.bool_)
 
 
-def members_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """Mask of the members of a population, and of unfinished cases that would be members with a valid answer."""
+def population_mask_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
+    """Create the mask of a population, extended by unfinished cases that a valid answer would add to it."""
     flags = [part for part in population.split(" and ") if part not in ("valid", "completed")]
-    return np.asarray(members(frame, population) | (members_and_unknown(frame, flags)[0] & engine_failed(frame)))
+    return np.asarray(
+        population_mask(frame, population) | (population_and_unknown_masks(frame, flags)[0] & engine_failed(frame))
+    )
 
 
 def terrain_groups(frame: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
-    """Terrain index of each case from 0; None if unknown for all. A case of unknown terrain has its own index."""
+    """Return each case's terrain index from 0; None if no terrain is known. An unknown terrain has its own index."""
     if "terrain" not in frame or bool(frame["terrain"].isna().all()):
         return None
     codes, terrain_names = pd.factorize(frame["terrain"])
@@ -94,10 +96,11 @@ _SEED = 2005
 
 @dataclass(frozen=True)
 class CaseFraction:
-    """A fraction of cases with its two-sided intervals at `CONFIDENCE`; NaN for no cases.
+    """A fraction of cases with its two-sided intervals at `CONFIDENCE`; `share` is NaN for no cases.
 
-    lower, upper: Clopper-Pearson interval for independent cases
-    shared_lower, shared_upper: interval that allows for shared terrains; None if no terrain is shared
+    - n, hits, share: number of cases, number of counted cases, and their fraction
+    - lower, upper: Clopper-Pearson interval for independent cases
+    - shared_lower, shared_upper: interval that allows for shared terrains; None if no terrain is shared
     """
 
     n: int
@@ -135,10 +138,11 @@ def flag_fraction(frame: pd.DataFrame, name: str, *, wanted: bool = True) -> Cas
 
 @dataclass(frozen=True)
 class PooledRate:
-    """A fraction of items counted in every case, pooled over cases; items within a case are correlated.
+    """A fraction of items (pixels or features, for example), pooled over cases; items of one case are correlated.
 
-    hits, of: number of counted items, and of all items lower, upper: bootstrap interval over cases, or over shared
-    terrains; NaN if no case has a hit flights, flights_hit: number of cases with items, and with a hit
+    - hits, of, share: number of counted items, number of all items, and the fraction
+    - lower, upper: bootstrap interval over cases, or over shared terrains; NaN if no item is counted
+    - flights, flights_hit: number of cases with items, and with counted items
     """
 
     hits: int
@@ -169,33 +173,33 @@ def pooled_rate(frame: pd.DataFrame, hits: str, of: str) -> PooledRate:
 
 
 def bootstrap_weights(groups: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray, "resamples n"]:
-    """Multiplicity of each case if entire groups are drawn with replacement; the first row is the sample itself."""
-    count = int(groups.max()) + 1
-    multiplicities = rng.multinomial(count, np.full(count, 1.0 / count), size=_N_RESAMPLES)
+    """Draw groups with replacement and return the multiplicity of each case; the first row is the sample itself."""
+    n_groups = int(groups.max()) + 1
+    multiplicities = rng.multinomial(n_groups, np.full(n_groups, 1.0 / n_groups), size=_N_RESAMPLES)
     return np.concatenate([np.ones((1, groups.size)), multiplicities[:, groups]]).astype(np.float64)
 
 
 def percentile_interval(resampled: Float[np.ndarray, " b"]) -> Interval:
-    """Two-sided percentile interval of a resampled statistic."""
+    """Compute the two-sided percentile interval of a resampled statistic."""
     low, high = np.quantile(resampled, (0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)))
     return float(low), float(high)
 
 
-def flag(frame: pd.DataFrame, name: str) -> Bool[np.ndarray, " n"]:
-    """Mask of the true values of a column; missing values are false."""
+def flag_mask(frame: pd.DataFrame, name: str) -> Bool[np.ndarray, " n"]:
+    """Create the mask of the true values of a column; missing values are false."""
     if not is_flag(frame, name):
         return np.zeros(len(frame), dtype=np.bool_)
     return np.asarray(frame[name].eq(True).fillna(False).to_numpy(dtype=np.bool_))
 
 
 def all_flags(frame: pd.DataFrame, *names: str) -> Bool[np.ndarray, " n"]:
-    """Mask of the rows where all flags that exist as columns are true."""
-    masks = [flag(frame, name) for name in names if is_flag(frame, name)]
+    """Create the mask of the rows in which all flags are true; names that are not flag columns are ignored."""
+    masks = [flag_mask(frame, name) for name in names if is_flag(frame, name)]
     return np.asarray(np.logical_and.reduce([np.ones(len(frame), dtype=np.bool_), *masks]))
 
 
 def finite_values(frame: pd.DataFrame, column: str, scale: float = 1.0) -> Float[np.ndarray, " n"]:
-    """Finite numbers of a column, scaled."""
+    """Return the finite numbers of a column, multiplied by `scale`."""
     values = numbers(frame, column)
     return np.asarray(scale * values[np.isfinite(values)])
 
@@ -207,23 +211,23 @@ def varies(frame: pd.DataFrame, name: str) -> bool:
 
 
 def rms(values: Float[np.ndarray, " n"]) -> float:
-    """Root mean square; NaN for none."""
+    """Compute the root mean square; NaN for no values."""
     return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
 
 def quantile(values: Float[np.ndarray, " n"], probability: float) -> float:
-    """Quantile; NaN for no values."""
+    """Compute a quantile; NaN for no values."""
     return float(np.quantile(values, probability)) if values.size else math.nan
 
 
 def group_by_size(frame: pd.DataFrame, column: str, size: str, first: str) -> Iterator[tuple[str, float, pd.DataFrame]]:
-    """Group rows by kind and size in order; the kind named `first` comes first."""
+    """Group rows by the columns of kind and size, in sorted order; the kind named `first` comes first."""
     sizes = numbers(frame, size)
     for kind in sorted(frame[column].dropna().unique(), key=lambda name: (name != first, str(name))):
-        of_kind = frame[column].eq(kind).fillna(False).to_numpy(dtype=np.bool_)
-        for value in np.unique(sizes[of_kind]):
-            same_size = np.isnan(sizes) if np.isnan(value) else sizes == value
-            yield str(kind), float(value), frame[of_kind & same_size]
+        has_kind = frame[column].eq(kind).fillna(False).to_numpy(dtype=np.bool_)
+        for value in np.unique(sizes[has_kind]):
+            has_size = np.isnan(sizes) if np.isnan(value) else sizes == value
+            yield str(kind), float(value), frame[has_kind & has_size]
 
 
 def fraction_text(fraction: CaseFraction) -> str:
@@ -251,7 +255,7 @@ def rate_text(rate: PooledRate) -> str:
     return text if math.isnan(rate.lower) else f"{text} ({range_text(rate.lower, rate.upper)})"
 
 
-def spread_text(values: Float[np.ndarray, " n"], digits: int | None = None) -> str:
+def median_text(values: Float[np.ndarray, " n"], digits: int | None = None) -> str:
     """Format the median, and minimum to maximum in brackets; one number for equal values, a dash for no values."""
     if values.size == 0:
         return NOTHING

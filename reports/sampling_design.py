@@ -22,10 +22,10 @@ RANDOM = "random"
 
 @dataclass(frozen=True)
 class TerrainSupply:
-    """The terrains that a campaign's cases can use.
+    """Number of terrains that the cases of a campaign can use.
 
-    key: parameter that sets their number: size of the bank, or dispersion of the terrain's number
-    in_turn: whether the cases use the terrains in turn; otherwise terrains are drawn at random with replacement
+    - key: parameter that sets this number: size of the terrain bank, or range of the dispersed terrain number
+    - in_turn: whether the cases use the terrains in turn; otherwise terrains are drawn at random with replacement
     """
 
     terrains: int
@@ -33,13 +33,13 @@ class TerrainSupply:
     in_turn: bool = False
 
     def advice(self, needed: int, probability: float, confidence: float) -> str:
-        """Explain why additional cases cannot help, and which change does; `needed` terrains are required."""
+        """Explain that the campaign needs more terrains (`needed`), not more cases, and how to configure them."""
         level = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
         text = f"The campaign draws from {count(self.terrains, 'terrain')} ({self.key} = {self.terrains}); {level}"
         text = f"{text} needs at least {count(needed, 'terrain')}"
         if not self.key.endswith(".bank"):
             return f"{text}: widen the range of {self.key}, and the bank, and run the campaign again."
-        # random draws from ten times as many terrains rarely repeat: 1.1 cases per terrain suffice
+        # random draws from ten times as many terrains rarely repeat a terrain, so 1.1 cases per terrain are sufficient
         bank, cases = (needed, needed) if self.in_turn else (10 * needed, math.ceil(1.1 * needed))
         return f"{text}: run the campaign again with --set {self.key}={bank} -n {cases}."
 
@@ -48,10 +48,12 @@ class TerrainSupply:
 class SamplingDesign:
     """The sampling design of a campaign.
 
-    design: `random`, `latin-hypercube` or `sobol` grids: paths of the parameters that were swept as a grid nominal:
-    whether case 0 is the nominal one, without draws max_cases: number of cases at the last look (planned evaluation) of
-    a sequential campaign; else None first_look: number of cases at the first verdict if cases were appended after it;
-    else None terrains: the terrains that the cases draw from; None if unknown
+    - design: `random`, `latin-hypercube` or `sobol`
+    - grids: paths of the parameters that were swept as a grid
+    - nominal: whether case 0 is the nominal case, with nominal parameters instead of sampled ones
+    - max_cases: number of cases at the last look (planned evaluation) of a sequential campaign; otherwise None
+    - first_look: number of cases at the first verdict if cases were appended after it; otherwise None
+    - terrains: the terrains that the cases can use; None if unknown
     """
 
     design: str = RANDOM
@@ -73,22 +75,22 @@ class SamplingDesign:
 
     @property
     def no_probability(self) -> str:
-        """Explain why the cases allow no probability statement; empty if they allow one."""
+        """Explain why the cases allow no probability statement; empty for independent random samples."""
         if self.independent:
             return ""
         steps = [] if self.design == RANDOM else ['set design.kind = "random"']
-        remedy = " and ".join([*steps, *(f"give '{path}' a random distribution" for path in self.grids)])
+        remedy = " and ".join([*steps, *(f"define a random distribution for '{path}'" for path in self.grids)])
         return (
             f"No probability statement: the design is {describe_design(self.design, self.grids, nominal=False)}, and "
             f"only independent random samples allow one. {remedy[:1].upper()}{remedy[1:]}, and run it again."
         )
 
-    def risk_share(self, cases: int) -> float:
-        """Fraction of the risk that a look at `cases` cases may spend."""
+    def risk_fraction_at(self, cases: int) -> float:
+        """Fraction of the risk of a wrong verdict (1 - confidence) that a look at `cases` cases may use."""
         return 1.0 if self.max_cases is None else spent_fraction(planned_looks(self.max_cases), cases)
 
     def mask_first_look(self, frame: pd.DataFrame, selected: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
-        """Mask of the rows of `selected` that an earlier first look used; None at the first look."""
+        """Create the mask of the rows of `selected` that were used in an earlier first look; None at the first look."""
         if self.first_look is None or self.max_cases is not None or "case" not in frame:
             return None
         if not bool((frame["case"] >= self.first_look).any()):

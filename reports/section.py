@@ -67,7 +67,7 @@ def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
 
 @contextmanager
 def _page_style(**settings: str) -> Iterator[None]:
-    """Use the page's style; ignore warnings about characters that are missing from the font."""
+    """Apply the page's style in a context; ignore warnings about characters that are missing from the font."""
     with mpl.style.context(["default", _STYLE, settings]), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -103,21 +103,21 @@ def svg_markup(figure: Figure, key: str, description: str) -> str:
     return head + content.strip()
 
 
-def show_picture(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
-    """Draw a picture in grey, its contrast stretched between the 1 % and the 99 % quantile."""
-    finite = picture[np.isfinite(picture)]
+def show_image(axes: Axes, image: Float[np.ndarray, "_ _"]) -> None:
+    """Draw an image in grey, its contrast stretched between the 1 % and the 99 % quantile."""
+    finite = image[np.isfinite(image)]
     low, high = np.quantile(finite, (0.01, 0.99)) if finite.size else (0.0, 1.0)
-    axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="antialiased")
+    axes.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="antialiased")
     axes.set_facecolor(INK)
     axes.autoscale(enable=False)
     _hide_frame(axes)
 
 
-def show_subframe(axes: Axes, picture: Float[np.ndarray, "_ _"], quantiles: tuple[float, float] = (0.01, 0.99)) -> None:
-    """Draw a picture in grey pixel by pixel, its contrast stretched between two quantiles."""
-    finite = picture[np.isfinite(picture)]
+def show_subframe(axes: Axes, image: Float[np.ndarray, "_ _"], quantiles: tuple[float, float] = (0.01, 0.99)) -> None:
+    """Draw an image in grey pixel by pixel, its contrast stretched between two quantiles."""
+    finite = image[np.isfinite(image)]
     low, high = np.quantile(finite, quantiles) if finite.size else (0.0, 1.0)
-    levels = np.clip((np.nan_to_num(picture, nan=low) - low) / max(float(high - low), 1e-9), 0.0, 1.0)
+    levels = np.clip((np.nan_to_num(image, nan=low) - low) / max(float(high - low), 1e-9), 0.0, 1.0)
     grey = np.round(255.0 * levels).astype(np.uint8)
     axes.imshow(np.repeat(grey[..., None], 3, axis=2), interpolation="none", aspect="equal")
     _hide_frame(axes)
@@ -130,14 +130,14 @@ def _hide_frame(axes: Axes) -> None:
 
 
 @in_page_style
-def draw_pictures(pictures: Sequence[Float[np.ndarray, "_ _"]]) -> Figure:
-    """Draw numbered pictures in a row, as delivered: for a case whose algorithm provides no details to draw."""
-    rows, columns = pictures[0].shape
-    height = 12.0 / len(pictures) * rows / columns + 0.35
+def draw_images(images: Sequence[Float[np.ndarray, "_ _"]]) -> Figure:
+    """Draw numbered images in a row, for a case without details of the algorithm."""
+    rows, columns = images[0].shape
+    height = 12.0 / len(images) * rows / columns + 0.35
     figure = Figure(figsize=(12.0, height), layout="constrained")
-    for number, (axes, picture) in enumerate(zip(figure.subplots(1, len(pictures)), pictures, strict=True), start=1):
-        show_picture(axes, picture)
-        axes.set_title(f"Picture {number}", fontsize=9)
+    for number, (axes, image) in enumerate(zip(figure.subplots(1, len(images)), images, strict=True), start=1):
+        show_image(axes, image)
+        axes.set_title(f"Image {number}", fontsize=9)
     return figure
 
 
@@ -150,7 +150,7 @@ class Grid:
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
-    left_out: int = 0
+    n_omitted: int = 0
 
 
 def build_grid(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> Grid:
@@ -188,7 +188,7 @@ class Subject:
 
     @property
     def all_cases(self) -> pd.DataFrame:
-        """The rows of all cases; of a large campaign, only some columns."""
+        """The rows of all cases; in a large campaign they have only some columns."""
         return self.run.all_cases
 
 
@@ -207,8 +207,9 @@ class Block:
 class Section:
     """A section of the page.
 
-    key: its anchor and its key in `report.json`: letters, digits and hyphens name: its entry in the page's menu data:
-    its numbers, for `report.json`
+    - key: anchor of the section and key in `report.json`: letters, digits and hyphens
+    - name: entry in the page's menu
+    - data: numbers of the section in `report.json`
     """
 
     key: str

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from marsyard.algorithms.answers import Fault
 from marsyard.reports import figures
 from marsyard.reports.presentation import presentations
-from marsyard.reports.rates import CONFIDENCE, engine_failed, members, terrain_groups
+from marsyard.reports.rates import CONFIDENCE, engine_failed, population_mask, terrain_groups
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid, SvgFigure, svg_figure
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
@@ -66,16 +66,17 @@ class CaseTable:
 
     head: Sequence[str]
     rows: Sequence[CaseRow]
-    left_out: int = 0
+    n_omitted: int = 0
 
 
 def verdict_row(verdict: Verdict) -> dict[str, Any]:
-    """Format a verdict for the page; `strip` is its interval to scale, in per cent of the strip's width."""
+    """Format a verdict for the page; `strip` contains its bounds and rates in per cent of the width of a scale."""
     bounds_text, strip = f"{percent(verdict.lower)} to {percent(verdict.upper)}", None
     if math.isnan(verdict.lower):
         bounds_text = NOTHING if math.isnan(verdict.estimate) else f"{percent(verdict.estimate)} observed"
     else:
         lowest = min(verdict.lower, verdict.probability)
+        # the scale starts below the lower bound and the required rate, and ends at 100 %
         start = max(0.0, lowest - 0.25 * (1.0 - lowest))
         rates = {"estimate": verdict.estimate, "asked": verdict.probability}
         rates |= {"lower": verdict.lower, "upper": verdict.upper}
@@ -111,14 +112,14 @@ def worst_cases(run: StoredRun, metric: str, with_images: Collection[str] = ()) 
 
 
 def unanswered_cases(run: StoredRun, metric: str, with_images: Collection[str] = ()) -> CaseTable:
-    """List the completed cases without an error."""
-    order = np.flatnonzero(~np.isfinite(numbers(run.all_cases, metric)) & members(run.all_cases, "completed"))
+    """List the completed cases without a value of the metric."""
+    order = np.flatnonzero(~np.isfinite(numbers(run.all_cases, metric)) & population_mask(run.all_cases, "completed"))
     return _case_table(run, order, _condition_columns(run, metric), with_images)
 
 
 def crashed_rows(run: StoredRun) -> CaseTable:
     """List the cases that the engine could not finish, with their error messages."""
-    return _case_table(run, np.flatnonzero(~members(run.all_cases, "completed")), ())
+    return _case_table(run, np.flatnonzero(~population_mask(run.all_cases, "completed")), ())
 
 
 def _condition_columns(run: StoredRun, metric: str) -> list[str]:
@@ -144,11 +145,11 @@ _NOT_PARAMETERS = ("distribution", "source", "unit", "description")
 
 
 def dispersion_grid(run: StoredRun) -> Grid:
-    """Table of the dispersions, and of their sampled values in the rows."""
+    """Create a table of the dispersions, with the values in the rows."""
     rows = []
     for path, entry in table(run.recorded("dispersions")).items():
         dispersion, parts = table(entry), str(path).split(".")
-        # the column name is the parameter's path or the end of it
+        # the column name is the path of the parameter or the end of the path
         names = [str(path), *("_".join(parts[start:]) for start in range(len(parts)))]
         column = next((name for name in names if name in run.frame), None)
         items = [f"{key}={x}" for key, x in dispersion.items() if key not in _NOT_PARAMETERS and x is not None]
@@ -163,15 +164,15 @@ def dispersion_grid(run: StoredRun) -> Grid:
     return Grid(["Parameter", "Distribution", "Minimum", "Mean", "Maximum", "Source"], rows)
 
 
-def provenance(run: StoredRun) -> list[tuple[str, str]]:
-    """List facts about campaign, algorithms, program and machine."""
+def list_provenance(run: StoredRun) -> list[tuple[str, str]]:
+    """List name and value of properties of campaign, algorithms, program and machine."""
     environment, times = table(run.recorded("environment")), numbers(run.frame, "cpu_time_s")
     times = times[np.isfinite(times)]
     algorithms: list[tuple[str, Any]] = []
     for item in tested_algorithms(run.record):
         title = "Algorithm under test" if item.tested else "Algorithm compared"
         algorithms += [(title, item.name), (f"{title}: class or file", item.path), (f"{title}: version", item.version)]
-        algorithms += [(f"{title}: sources", item.source_hash), (f"{title}: options", item.options_text)]
+        algorithms += [(f"{title}: source hash", item.source_hash), (f"{title}: options", item.options_text)]
     facts = [
         ("Campaign", run.name),
         ("Scenario", run.recorded("scenario")),
@@ -194,7 +195,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
     return [(name, _format_value(value)) for name, value in facts if value not in (None, "")]
 
 
-def versions(run: StoredRun) -> list[tuple[str, str]]:
+def list_versions(run: StoredRun) -> list[tuple[str, str]]:
     """List packages and their versions."""
     return [(str(name), _format_value(version)) for name, version in table(run.recorded("versions")).items()]
 
@@ -207,7 +208,7 @@ def replay_command(run: StoredRun, case: str) -> str:
 def rerun_commands(run: StoredRun) -> list[str]:
     """Return shell commands that run the campaign again in a new folder, with a command for each appended block.
 
-    Records of earlier versions do not contain the original command: name, cases and seed replace it.
+    Records of earlier versions do not contain the original command, so it is built from name, cases and seed.
     """
     if run.command is None:
         words = ["marsyard", "run", run.name]
@@ -247,8 +248,8 @@ def _distinct_values(frame: pd.DataFrame, column: str) -> str | None:
 
 def error_figures(frame: pd.DataFrame, all_cases: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
     """Draw a scatter plot of a metric for `frame`, and its histogram and distribution for `all_cases`."""
-    scatter = "Error of each case. Dashed circle: the requirement. Hollow marks: cases beyond the axes."
-    histogram = "Histogram of the error magnitude. Hatched: values beyond the axis."
+    scatter = "Error of each case. The dashed circle is the requirement. Hollow marks are cases beyond the axes."
+    histogram = "Histogram of the error magnitude. The hatched bar counts values beyond the axis."
     entries: list[tuple[str, Figure | None, str]] = [("scatter", figures.error_scatter(frame, metric, bound), scatter)]
     if figures.needs_enlarged_figure(frame, metric, bound):
         figure = figures.error_scatter(frame, metric, bound, enlarged=True)
@@ -267,7 +268,7 @@ def driver_figures(frame: pd.DataFrame, metric: str, bound: float | None) -> lis
         caption = f"{label(column)}." if result is None else f"{label(column)}: rank correlation {rank_text(result)}."
         n_beyond = figures.count_beyond_axis(frame, metric, column, bound)
         if n_beyond:
-            caption = f"{caption} {count(n_beyond, 'error')} beyond the axis: hollow, at its upper edge."
+            caption = f"{caption} Hollow marks at the upper edge: {count(n_beyond, 'error')} beyond the axis."
         entries.append((f"driver{k}", figures.error_scatter_against(frame, metric, column, bound), caption))
     return _svg_figures(entries)
 
@@ -280,7 +281,9 @@ def rank_text(result: Driver) -> str:
 
 def outcome_figures(frame: pd.DataFrame) -> list[SvgFigure]:
     """Draw the number of cases by outcome."""
-    caption = "Solid bars: answer given. Hatched: no answer from the algorithm. Cross-hatched: the case crashed."
+    caption = (
+        "Solid bars: cases with an answer. Hatched bars: cases without an answer. Cross-hatched bars: crashed cases."
+    )
     return _svg_figures([("outcomes", figures.outcome_bars(frame), caption)])
 
 
@@ -288,7 +291,7 @@ def _svg_figures(entries: Sequence[tuple[str, Figure | None, str]]) -> list[SvgF
     return [svg_figure(figure, key, caption) for key, figure, caption in entries if figure is not None]
 
 
-#: Maximum number of points; of these, always the first of each group: largest errors, no answer, crashed.
+#: Maximum number of points of the explorer, and of notable cases per kind (largest errors, no answer, crashed).
 MAX_POINTS, MAX_NOTABLE = 2000, 150
 _SCRIPT = Path(__file__).parent / "templates" / "explorer.js"
 
@@ -332,8 +335,8 @@ def choose_points(frame: pd.DataFrame, metric: str) -> Int[np.ndarray, " n"]:
     return np.sort(pd.unique(np.concatenate([*notable, np.arange(len(frame))]))[:MAX_POINTS])
 
 
-def script() -> Markup:
-    """Read the explorer's script, unescaped."""
+def read_script() -> Markup:
+    """Read the explorer's JavaScript, marked as safe for the template."""
     return Markup(_SCRIPT.read_text(encoding="utf-8"))  # noqa: S704
 
 

@@ -1,4 +1,4 @@
-"""Read a campaign's folder: rows, record, and products of stored cases."""
+"""Reader of a campaign's folder for reports: rows, record, and products of stored cases."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ RECORD_FILE = "campaign.json"
 class StoredRun:
     """Contents of a campaign's folder.
 
-    frame: rows in the order of the cases; of more than `MAX_FULL_CASES` cases, the first ones all_cases: rows of all
-    cases; of more than `MAX_FULL_CASES`, only the columns of verdicts, outcomes and errors record: `campaign.json`;
-    empty if it cannot be read showcases: cases with stored products, the one selected for the report first
+    - frame: rows with all columns in the order of the cases; only the first rows of more than `MAX_FULL_CASES` cases
+    - all_cases: rows of all cases; of more than `MAX_FULL_CASES`, only the columns of verdicts, outcomes and errors
+    - record: contents of `campaign.json`; empty if the file cannot be read
+    - showcases: cases with stored products; the case selected for the report is the first
     """
 
     directory: Path
@@ -39,17 +40,17 @@ class StoredRun:
 
     @property
     def sampled_from(self) -> int | None:
-        """Number of all cases if `frame` contains only the first ones; else None."""
+        """Number of all cases if `frame` contains only the first cases; otherwise None."""
         return len(self.all_cases) if len(self.all_cases) > len(self.frame) else None
 
     @property
     def configuration(self) -> Mapping[str, Any]:
-        """The configuration as run."""
+        """The configuration with which the campaign was run."""
         return table(self.record.get("configuration"))
 
     @property
     def name(self) -> str:
-        """The campaign's name; the folder's if the record has none."""
+        """Name of the campaign, or of its folder if the record contains no name."""
         return str(self.recorded("name") or self.directory.resolve().name)
 
     @property
@@ -72,19 +73,19 @@ class StoredRun:
         return str(stored.get("folder") or ""), tuple(str(word) for word in words)
 
     def recorded(self, key: str) -> Any:
-        """Value of a key in the record or in its configuration; None if missing."""
+        """Return the value of a key in the record or in its configuration; None if missing."""
         value = self.record.get(key)
         return value if value is not None else self.configuration.get(key)
 
     def parameter(self, *path: str) -> Any:
-        """A parameter of the campaign's file; None if missing."""
+        """Return a parameter of the campaign's file; None if missing."""
         value: Any = self.configuration.get("parameters")
         for name in path:
             value = table(value).get(name)
         return value
 
     def products(self, case: int) -> dict[str, Any]:
-        """The products of a case; empty if they cannot be read."""
+        """Read the products of a case; empty if they cannot be read."""
         try:
             return load_products(self.directory / "cases" / str(case))
         except (StoreError, AttributeError, TypeError):
@@ -92,7 +93,7 @@ class StoredRun:
 
 
 def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> StoredRun:
-    """Read a campaign's folder; `requirements` replace the campaign's own. Raises StoreError without rows."""
+    """Read a campaign's folder; `requirements` replace the campaign's requirements. Raises StoreError without rows."""
     path = directory / TABLE_FILE
     if not path.is_file():
         raise StoreError(f"{directory} contains no {TABLE_FILE}; a report needs the rows of a campaign")
@@ -119,7 +120,7 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
 
 
 def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Read the rows with all columns, and the rows of all cases; both are the same up to `MAX_FULL_CASES` cases."""
+    """Read `frame` and `all_cases` of `StoredRun`; they are the same up to `MAX_FULL_CASES` cases."""
     import pyarrow.parquet as pq
 
     file = pq.ParquetFile(path)
@@ -148,5 +149,5 @@ def _sort_columns(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def table(value: object) -> Mapping[str, Any]:
-    """Return the value if it is a table, else an empty table."""
+    """Return the value if it is a table; otherwise return an empty table."""
     return value if isinstance(value, Mapping) else {}

@@ -1,4 +1,4 @@
-"""Verdicts as a Rich table, outcomes and error statistics; texts from files are `Text` objects, never markup."""
+"""Tables of verdicts (for the terminal; texts are `Text` objects, not markup), outcomes and error statistics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from marsyard.reports.rates import ENGINE_FAILURES, is_flag, members, terrain_groups
+from marsyard.reports.rates import ENGINE_FAILURES, is_flag, population_mask, terrain_groups
 from marsyard.reports.section import Grid
 from marsyard.reports.statistics.samples import ErrorSummary, summarize
 from marsyard.reports.verdicts import Status, Verdict
@@ -35,7 +35,7 @@ _STYLES = {
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> Table:
-    """Table of requirements with verdicts and evidence, for terminals of at least 80 columns."""
+    """Create a table of requirements with verdicts and evidence, for terminals of at least 80 columns."""
     table = Table(title="Verdict", box=box.SIMPLE_HEAD, expand=False, title_justify="left", caption_justify="left")
     table.add_column("Requirement", overflow="fold", ratio=None, min_width=18)
     table.add_column("Verdict", no_wrap=True)
@@ -56,7 +56,8 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
         table.add_row(Text("no requirement"), "", "", "", "", "")
     lines = []
     if any(not math.isnan(verdict.lower) for verdict in verdicts):
-        lines.append("Bounds: one-sided Clopper-Pearson at the required confidence. Needed: cases without failure.")
+        lines.append("Bounds: one-sided Clopper-Pearson bounds at the required confidence.")
+        lines.append("Needed: additional cases, all without failure, that would lead to PASS.")
     if len(verdicts) > 1 and verdicts[0].note and len({verdict.note for verdict in verdicts}) == 1:
         lines.append(verdicts[0].note)
     else:
@@ -66,7 +67,7 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
 
 
 def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
-    """Number of cases by outcome: answers first, unfinished cases last, then by number."""
+    """Count cases by outcome: answers first, unfinished cases last, larger numbers first."""
     if "outcome" not in frame:
         return []
     counts = frame["outcome"].astype("object").fillna("(none)").astype(str).value_counts()
@@ -76,27 +77,27 @@ def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
 
 
 def answered_outcomes(frame: pd.DataFrame) -> set[str]:
-    """Outcomes of cases with an answer; VALID if the rows have no column `answered`."""
+    """Return the outcomes of cases with an answer; VALID if the rows have no column `answered`."""
     if "outcome" not in frame or not is_flag(frame, "answered"):
         return {"VALID"}
-    return {str(name) for name in frame.loc[members(frame, "valid"), "outcome"].dropna().unique()}
+    return {str(name) for name in frame.loc[population_mask(frame, "valid"), "outcome"].dropna().unique()}
 
 
 def error_summaries(frame: pd.DataFrame, metric: str) -> list[tuple[str, ErrorSummary]]:
-    """Statistics of a metric and of its signed parts over all cases with a value."""
+    """Compute statistics of a metric and of its signed parts (x, y), with labels, over all cases with a value."""
     parts = [metric, *axis_columns(metric, [str(column) for column in frame.columns])]
     groups = terrain_groups(frame)
     return [(label(part), summarize(numbers(frame, part), groups=groups)) for part in parts]
 
 
 def statistics_grid(frame: pd.DataFrame, metric: str) -> Grid:
-    """Table of statistics with a column for the metric and each of its parts."""
+    """Create a table of statistics with a column for the metric and for each of its parts."""
     summaries = error_summaries(frame, metric)
     return Grid(["", *(name for name, _ in summaries)], statistics_rows([summary for _, summary in summaries]))
 
 
 def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
-    """Rows of a table of statistics: name, then the value of each summary."""
+    """Create the rows of a table of statistics: name of the statistic, then its value in each summary."""
     if not summaries:
         return []
     confidence = format_fraction(summaries[0].confidence)

@@ -1,4 +1,4 @@
-"""Algorithms under test, the traceability matrix of requirements (CSV), and verdicts as JUnit XML."""
+"""Algorithms of a campaign, traceability matrix of requirements (`verification.csv`), and verdicts as JUnit XML."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from marsyard.reports.wording import count
 class Algorithm:
     """An algorithm of a campaign; text that is missing from the record is empty.
 
-    name: as in the campaign: name of a built-in algorithm, `module:Class`, or a program tested: whether it is under
-    test; False if it is only compared path: its class as `module:name`, or its file version: of its installed
-    distribution, or its `version` attribute
+    - name: name in the campaign: a built-in algorithm, `module:Class`, or a program
+    - tested: whether the algorithm is under test; False if it is only compared
+    - path: class of the algorithm as `module:name`, or its file
+    - version: version of the installed distribution, or attribute `version` of the algorithm
     """
 
     name: str
@@ -67,7 +68,7 @@ def tested_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
 
 
 def format_tested_algorithms(algorithms: Sequence[Algorithm]) -> str:
-    """Names and versions of the algorithm under test."""
+    """Format names and versions of the algorithms under test."""
     return ", ".join(algorithm.title for algorithm in algorithms if algorithm.tested)
 
 
@@ -82,14 +83,14 @@ def _algorithms_from_parameters(parameters: Mapping[str, Any]) -> list[Algorithm
     return next((algorithms for algorithms in nested if algorithms), [])
 
 
-#: Verdicts of requirements that are neither met nor missed at their confidence.
-_SKIPPED = (Status.INSUFFICIENT, Status.MET_BY_RATE)
+#: Verdicts of requirements that are neither met nor failed at their confidence; JUnit tests with them are skipped.
+_UNDECIDED = (Status.INSUFFICIENT, Status.MET_BY_RATE)
 #: Characters that XML 1.0 does not allow.
 _INVALID_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
-    """Columns of the matrix that identify the algorithm under test, joined by "; "."""
+    """Create the columns that identify the algorithms under test; several algorithms are joined by "; "."""
     tested = [algorithm for algorithm in algorithms if algorithm.tested]
     cells = {
         "algorithm": [algorithm.name for algorithm in tested],
@@ -100,7 +101,7 @@ def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
     return {column: "; ".join(value for value in values if value) for column, values in cells.items()}
 
 
-#: Columns of the matrix in front of and after those of the algorithm, and the properties of the verdict in them.
+#: Columns of the matrix in front of and after those of the algorithm, and the verdict's property in each column.
 _REQUIREMENT = {"requirement": "requirement_id", "statement": "statement", "kind": "kind", "source": "source"}
 _EVIDENCE = {
     "verdict": "status", "metric": "metric", "bound": "bound", "population": "population", "probability": "probability",
@@ -114,7 +115,7 @@ COLUMNS = (*_REQUIREMENT, "campaign", *algorithm_cells(()), *_EVIDENCE)
 def requirement_evidence(
     campaign: str, verdicts: Iterable[Verdict], algorithms: Sequence[Algorithm] = ()
 ) -> list[dict[str, Any]]:
-    """Rows of the traceability matrix: the evidence of a campaign for each requirement."""
+    """Create the rows of the traceability matrix: the evidence of a campaign for each requirement."""
     cells = {"campaign": campaign, **algorithm_cells(algorithms)}
     rows = []
     for verdict in verdicts:
@@ -126,15 +127,15 @@ def requirement_evidence(
 
 
 def verification_csv(rows: Iterable[Mapping[str, Any]]) -> str:
-    """The traceability matrix; missing values and NaN are empty."""
+    """Format the traceability matrix as CSV; missing values and NaN are empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
-    writer.writerows([_cell(row.get(column)) for column in COLUMNS] for row in rows)
+    writer.writerows([_format_cell(row.get(column)) for column in COLUMNS] for row in rows)
     return text.getvalue()
 
 
-def _cell(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     text = f"{value:.9g}" if isinstance(value, float) else str(value)
@@ -155,7 +156,7 @@ def junit_xml(
         name=_text(campaign),
         tests=str(len(verdicts) + 1),
         failures=str(statuses.count(Status.FAIL) + bool(overall.crashed)),
-        skipped=str(sum(status in _SKIPPED for status in statuses)),
+        skipped=str(sum(status in _UNDECIDED for status in statuses)),
     )
     cells = {name: value for name, value in algorithm_cells(algorithms).items() if value}
     if cells:
@@ -172,7 +173,7 @@ def junit_xml(
         )
         if verdict.status is Status.FAIL:
             Xml.SubElement(test_case, "failure", message=message, type=str(verdict.status))
-        elif verdict.status in _SKIPPED:
+        elif verdict.status in _UNDECIDED:
             Xml.SubElement(test_case, "skipped", message=f"{verdict.status}: {message}")
         Xml.SubElement(test_case, "system-out").text = _text(f"{tested_text}{verdict.statement} {message}")
     completion = Xml.SubElement(suite, "testcase", classname=_text(campaign), name="all cases end")
@@ -183,4 +184,5 @@ def junit_xml(
 
 
 def _text(text: str) -> str:
+    """Replace characters that XML does not allow."""
     return _INVALID_XML.sub("�", text)

@@ -1,11 +1,12 @@
-"""Verdicts on requirements: status, confidence and further evidence needed, from stored rows.
+"""Verdicts on requirements, computed from stored rows: status, bounds, and number of additional cases needed.
 
-A requirement asks that `|metric| <= bound`, or a true column, holds for a fraction of a population at a confidence. Its
-status follows from one-sided Clopper-Pearson bounds of the success rate. MET BY RATE: decided by the estimate; the
-rate reaches the fraction, but not at the confidence. Bounds of cases on shared terrains allow for correlation
-(`marsyard.reports.statistics.proportions`). All looks at appended cases together keep the risk (`LaterLook`); each
-planned look spends a fraction of it. Cases that are not independent random samples (Latin hypercube, Sobol, grids)
-have neither bounds nor confidence: their rate decides only requirements that are decided by the estimate.
+A requirement specifies that `|metric| <= bound`, or a true column, holds for a fraction of a population at a
+confidence. Its status follows from one-sided Clopper-Pearson bounds of the success rate. Bounds of cases on shared
+terrains allow for correlation (`marsyard.reports.statistics.proportions`). If a campaign is evaluated repeatedly, the
+probability of a wrong verdict in any evaluation is at most 1 - confidence: each planned look (evaluation) uses a
+fraction of this risk, and looks at appended cases use `LaterLook`. MET BY RATE: the requirement has
+`decide_by = "estimate"`, and the observed rate is sufficient, but the lower bound is not. Cases that are not
+independent random samples (Latin hypercube, Sobol, grids) have no bounds; only such requirements can be decided.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ ESTIMATE = "estimate"
 
 
 class Status(StrEnum):
-    """Result of evaluating a requirement."""
+    """Result of the evaluation of a requirement."""
 
     PASS = "PASS"  # noqa: S105  (a verdict, not a password)
     MET_BY_RATE = "MET BY RATE"
@@ -49,19 +50,19 @@ class Status(StrEnum):
 class Verdict:
     """One requirement with its verdict; numbers that the requirement does not define are NaN.
 
-    status: PASS if the lower bound reaches the probability, FAIL if the upper bound is below it, else INSUFFICIENT.
-        Where the estimate decides and the bounds do not pass: FAIL if the rate is below the probability, else MET BY
-        RATE, but INSUFFICIENT for fewer cases than `min_cases_for_rate`
-    failures: cases whose metric is missing, NaN or out of bound, unfinished cases, and cases of unknown membership
-    estimate, lower, upper: success rate and its one-sided bounds; NaN for no cases, bounds also for other designs
-    further_cases: additional cases without failure that give PASS, on new terrains where terrains are counted; or None
-    reason: why the requirement is not evaluated, or the verdict is withheld
-    advice: why more cases cannot help, and which change does
-    accept_rate: whether MET BY RATE gives the exit status 0
-    terrains: distinct terrains of the population; None if unknown
-    clustered: evidence of shared terrains; None where no terrain is shared
-    plain_lower, plain_upper: bounds for independent cases
-    bounds_confidence, upper_confidence: of the two bounds; above the requirement's for repeated evaluations
+    - status: PASS if the lower bound is at least the probability, FAIL if the upper bound is below it, otherwise
+      INSUFFICIENT. If `decide_by` is "estimate" and the bounds do not result in PASS: FAIL if the rate is below the
+      probability, INSUFFICIENT for fewer cases than `min_cases_for_rate`, otherwise MET BY RATE
+    - failures: cases with a missing, NaN or too large metric, unfinished cases, cases with a missing population flag
+    - estimate, lower, upper: success rate and its one-sided bounds; NaN for no cases; no bounds for other designs
+    - further_cases: additional cases without failure for PASS, on new terrains if terrains are counted; None if unknown
+    - reason: why the requirement is not evaluated, or why the verdict is withheld
+    - advice: why more cases cannot lead to PASS, and which change of the campaign can
+    - accept_rate: whether MET BY RATE results in the exit status 0
+    - terrains: number of distinct terrains of the population; None if unknown
+    - clustered: evidence from shared terrains; None if no terrain is shared
+    - plain_lower, plain_upper: bounds for independent cases
+    - bounds_confidence, upper_confidence: confidence of lower and upper bound; increased for repeated evaluations
     """
 
     requirement_id: str
@@ -94,7 +95,7 @@ class Verdict:
 
     @property
     def plain_status(self) -> Status | None:
-        """The status for independent cases; None where no terrain is shared or the estimate decides."""
+        """The status for independent cases; None if no terrain is shared or the observed rate decides."""
         if self.clustered is None or self.decide_by == ESTIMATE:
             return None
         return compare_bounds(self.plain_lower, self.plain_upper, self.probability)
@@ -106,7 +107,7 @@ class Verdict:
 
     @property
     def consumer_risk(self) -> float:
-        """Probability of evidence at least as good if the true rate equals the required one; NaN without bounds."""
+        """Probability of this result or a better one if the true rate equals the required rate; NaN without bounds."""
         if math.isnan(self.lower):
             return math.nan
         shared = self.clustered
@@ -116,12 +117,12 @@ class Verdict:
 
     @property
     def design_effect(self) -> float:
-        """The design effect of shared terrains; NaN where no terrain is shared."""
+        """The design effect of shared terrains; NaN if no terrain is shared."""
         return math.nan if self.clustered is None else self.clustered.design_effect
 
     @property
     def margin(self) -> float:
-        """Deciding bound or estimate, minus the required rate; NaN without bounds."""
+        """Lower bound (or rate, if the observed rate decides) minus the required rate; NaN without bounds."""
         decisive = self.estimate if self.decide_by == ESTIMATE else self.lower
         return decisive - self.probability
 
@@ -165,12 +166,12 @@ class Verdict:
         if math.isnan(self.bounds_confidence) or self.bounds_confidence == self.upper_confidence == self.confidence:
             return ""
         lower, upper = (f"{100.0 * level:.4g} %" for level in (self.bounds_confidence, self.upper_confidence))
-        joint_note = f"so that all evaluations together keep {format_fraction(self.confidence)}"
+        joint_note = f"so that all evaluations together have {format_fraction(self.confidence)} confidence"
         if lower == upper:
-            return f"The campaign is evaluated more than once: its bounds are at {lower} confidence, {joint_note}."
+            return f"The campaign is evaluated more than once. Its bounds are at {lower} confidence, {joint_note}."
         return (
-            f"The campaign is evaluated more than once: its lower bound is at {lower} confidence, its upper bound at "
-            f"{upper}, {joint_note}."
+            f"The campaign is evaluated more than once. Its lower bound is at {lower} confidence and its upper bound "
+            f"at {upper} confidence, {joint_note}."
         )
 
 
@@ -180,10 +181,10 @@ Groups = Int[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class Looks:
-    """Earlier and planned looks at a campaign.
+    """Earlier and planned looks (evaluations) of a campaign.
 
-    in_first_look: mask of the cases of an earlier first look; None at a first look
-    risk_fraction: fraction of the risk that this look may spend; 1 where no looks were planned
+    - in_first_look: mask of the cases that an earlier first look used; None at the first look
+    - risk_fraction: fraction of the risk of a wrong verdict that this look may use; 1 if no looks were planned
     """
 
     in_first_look: Success | None = None
@@ -193,7 +194,7 @@ class Looks:
 def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks: Looks) -> tuple[Verdict, int]:
     """Add bounds of the success rate of at least one case; also return the additional cases without failure for PASS.
 
-    groups: terrains numbered from 0; None if unknown. Where terrains are counted, they replace the cases.
+    groups: terrain of each case, numbered from 0; None if unknown
     """
     n, failures, probability, confidence = success.size, verdict.failures, verdict.probability, verdict.confidence
     first_n = n if looks.in_first_look is None else int(looks.in_first_look.sum())
@@ -212,7 +213,7 @@ def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks:
     by_level = [clustered_evidence(success, groups, level) for level in levels]
     evidence = replace(by_level[0], upper=by_level[1].upper)
     if evidence.method is ClusterMethod.TERRAIN_COUNT:
-        # the tolerance keeps integers unchanged by rounding
+        # the tolerance prevents that a rounding error increases an integer by 1
         size, weight = evidence.terrains, 1.0
         failed = math.ceil(evidence.terrains - evidence.effective_successes - 1e-9)
     else:
@@ -220,6 +221,7 @@ def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks:
         size, failed = math.floor(evidence.effective_n), math.ceil(failures * weight)
     needed = _cases_needed(first_n, size, failed, probability, confidence, looks)
     verdict = replace(verdict, lower=evidence.lower, upper=evidence.upper, clustered=evidence)
+    # convert effective cases to cases
     additional = math.ceil((needed - size) / weight)
     return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), additional
 
@@ -227,7 +229,7 @@ def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks:
 def _confidences(
     first_n: int, n: float | int, probability: float, confidence: float, looks: Looks
 ) -> tuple[float, float]:
-    """Confidences of the lower and of the upper bound."""
+    """Compute the confidences of the lower and of the upper bound."""
     if looks.in_first_look is None:
         level = confidence_at(confidence, looks.risk_fraction)
         return level, level
@@ -236,7 +238,7 @@ def _confidences(
 
 
 def _cases_needed(first_n: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:
-    """Total number of cases that pass the requirement without an additional failure."""
+    """Compute the total number of cases that would lead to PASS without an additional failure."""
     if looks.risk_fraction < 1.0:
         level = confidence_at(confidence, looks.risk_fraction)
         return n + proportions.further_cases_needed(n, failures, probability, level)
@@ -246,7 +248,7 @@ def _cases_needed(first_n: int, n: int, failures: int, probability: float, confi
 def evaluate_requirements(
     frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], sampling: SamplingDesign = INDEPENDENT
 ) -> list[Verdict]:
-    """Evaluate every requirement on all rows of a campaign; missing columns or numbers give INSUFFICIENT, no exception.
+    """Evaluate each requirement on all rows of a campaign; missing columns or numbers result in INSUFFICIENT.
 
     sampling: the sampling design; without independent random samples, verdicts have no bounds
     """
@@ -259,8 +261,8 @@ def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: Sam
     if fault:
         return replace(verdict, reason=fault)
     try:
-        population = frame[rates.members(frame, verdict.population)]
-        population_and_unfinished = frame[rates.members_if_answered(frame, verdict.population)]
+        population = frame[rates.population_mask(frame, verdict.population)]
+        population_and_unfinished = frame[rates.population_mask_if_answered(frame, verdict.population)]
     except ValueError as error:
         text = str(error)
         return replace(verdict, reason=f"{text[:1].upper()}{text[1:]}.")
@@ -268,27 +270,29 @@ def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: Sam
         needed = LaterLook(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
         return replace(verdict, reason=reason, further_cases=needed if sampling.independent else None)
-    return _withhold(*(_decide(verdict, cases, sampling, frame) for cases in (population, population_and_unfinished)))
+    verdicts = (_decide(verdict, cases, sampling, frame) for cases in (population, population_and_unfinished))
+    return _withhold_if_uncertain(*verdicts)
 
 
-def _withhold(verdict: Verdict, with_unfinished: Verdict) -> Verdict:
-    """Withhold a good verdict that changes if unfinished cases are counted as failures.
+def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdict:
+    """Replace PASS or MET BY RATE by INSUFFICIENT if the verdict changes with unfinished cases as failures.
 
-    `valid` and `completed` exclude unfinished cases, so that a crash instead of a wrong answer could give a PASS.
+    `valid` and `completed` exclude unfinished cases. Without this check, crashes instead of wrong answers could lead to
+    PASS.
     """
     if verdict.status in (Status.FAIL, Status.INSUFFICIENT, with_unfinished.status):
         return verdict
     unfinished = with_unfinished.n - verdict.n
     reason = (
         f"{count(unfinished, 'case')} did not finish and {'belongs' if unfinished == 1 else 'belong'} to no population "
-        f"of answers. Counted as failures they change the verdict {verdict.status}, which is withheld."
+        f"of answers. If they are counted as failures, the verdict is not {verdict.status}. It is therefore withheld."
     )
     return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
 
 
 def _decide(verdict: Verdict, population: pd.DataFrame, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:
-    """Decide the verdict from `population`, the members of its population (at least one), and `frame`, all cases."""
-    _, unknown = rates.members_and_unknown(population, verdict.population.split(" and "))
+    """Decide the verdict from the cases of its population (at least one) and from all cases (`frame`)."""
+    _, unknown = rates.population_and_unknown_masks(population, verdict.population.split(" and "))
     success = np.asarray(rates.success_mask(population, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
     n, failures, groups = success.size, int((~success).sum()), rates.terrain_groups(population)
     rate, by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
@@ -298,7 +302,7 @@ def _decide(verdict: Verdict, population: pd.DataFrame, sampling: SamplingDesign
         reason = f"{'Decided by the rate of these cases. ' if by_rate else ''}{sampling.no_probability}"
         status = _status_by_rate(rate, n, verdict.probability) if by_rate else verdict.status
         return replace(counted, status=status, reason=reason)
-    looks = Looks(sampling.mask_first_look(frame, population), sampling.risk_share(len(frame)))
+    looks = Looks(sampling.mask_first_look(frame, population), sampling.risk_fraction_at(len(frame)))
     evaluated, additional = add_bounds(counted, success, groups, looks)
     status = evaluated.confident_status
     by_rate = by_rate and status is not Status.PASS
@@ -309,7 +313,7 @@ def _decide(verdict: Verdict, population: pd.DataFrame, sampling: SamplingDesign
         return evaluated
     if by_rate:
         return replace(evaluated, further_cases=min_cases_for_rate(verdict.probability) - n)
-    # additional cases, or the advice why these cannot help
+    # number of additional cases, or advice if the campaign has too few terrains for them
     evidence, terrain_supply = evaluated.clustered, sampling.terrains
     counts_terrains = evidence is not None and evidence.method is ClusterMethod.TERRAIN_COUNT
     if not counts_terrains or terrain_supply is None or (terrains or 0) + additional <= terrain_supply.terrains:
@@ -326,7 +330,7 @@ def _status_by_rate(rate: float, n: int, probability: float) -> Status:
 
 def min_cases_for_rate(probability: float) -> int:
     """Minimum number of cases for MET BY RATE: 1 / (1 - probability), of which one may fail."""
-    # the tolerance keeps 1 / (1 - 0.9), which is 10.000000000000002, at 10
+    # the tolerance is for rounding errors: 1 / (1 - 0.9) is 10.000000000000002, which must result in 10
     return math.ceil(1.0 / (1.0 - probability) - 1e-9)
 
 

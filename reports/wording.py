@@ -1,4 +1,4 @@
-"""Texts of reports: numbers, fractions, requirements, and names of columns with units."""
+"""Formatted texts of reports: numbers, fractions, requirements, names of columns with units, and notes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jaxtyping import Float
 #: Text of a missing value.
 NOTHING = "–"
 
-#: Magnitudes below this are rounding errors of double precision in any unit that rows have (metres, degrees, pixels).
+#: Magnitudes below this value are rounding errors in all units of the rows (metres, degrees, pixels).
 _ROUNDING = 1e-9
 
 #: Built-in populations in words; other populations are columns of true and false.
@@ -92,7 +92,7 @@ def interval(lower: float, upper: float) -> str:
 def percent(fraction: float) -> str:
     """Format a measured fraction in per cent, never rounded up to 100 or down to 0; a dash for NaN.
 
-    Fractions can exceed 1: the slip of a wheel that slides back does.
+    Fractions can exceed 1, for example the slip of a wheel that slides back.
     """
     if math.isnan(fraction):
         return NOTHING
@@ -142,12 +142,12 @@ _UNITS = {
 }  # fmt: skip
 _AXES = ("x", "y", "z")
 #: Columns that describe the run or results, not the conditions of the case.
-_NOT_A_CONDITION = re.compile(
+_NO_CONDITION = re.compile(
     r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|^place_|estimated|_true_"
     r"|^firing_|^touchdown_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
     r"|\.|^algorithm$|^stderr$|^velocity_(?:nees|normalised|sd|correlation)"
 )
-#: Prefixes of the conditions that come first.
+#: Prefixes of the condition columns that `driver_columns` lists first.
 _PREFERRED_DRIVERS = (
     "off_nadir_max", "attitude_rate_max", "altitude_1", "wind_speed", "horizontal_speed", "sun_elevation", "slip_mean",
     "pose_error_fraction", "rock_diameter", "disparity_error_goal",
@@ -168,27 +168,27 @@ def split_unit(column: str) -> tuple[str, str]:
 
 
 def label(column: str) -> str:
-    """The column in words, with its unit: ``velocity error (m/s)``."""
+    """Return the column in words, with its unit: ``velocity error (m/s)``."""
     name, unit = split_unit(column)
     words = _notes()["labels"].get(column, _words(name))
     return f"{words} ({unit})" if unit else words
 
 
 def magnitude_label(column: str) -> str:
-    """The magnitude of a column in words, with its unit: ``|velocity error| (m/s)``."""
+    """Return the magnitude of a column in words, with its unit: ``|velocity error| (m/s)``."""
     name, unit = split_unit(column)
     return f"|{_words(name)}| ({unit})" if unit else f"|{_words(name)}|"
 
 
 def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
-    """The signed parts of a metric among the columns: ``velocity_error_x_m_s`` for ``velocity_error_m_s``."""
+    """List the signed parts of a metric among the columns: ``velocity_error_x_m_s`` for ``velocity_error_m_s``."""
     name, _ = split_unit(metric)
     ending = metric[len(name) :]
     return [part for axis in _AXES if (part := f"{name}_{axis}{ending}") in columns]
 
 
 def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the page's metric: that of the first requirement, else the first error column; None without one."""
+    """Return the page's metric: the first numeric metric of a requirement, or the first error column; may be None."""
     required = [str(requirement.get("metric", "")) for requirement in requirements]
     error_columns = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
     # rows of earlier versions have an empty column for a sum
@@ -197,7 +197,7 @@ def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]
 
 
 def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
-    """A column as float64; NaN for missing numbers or a missing column."""
+    """Return a column as float64; NaN for missing numbers or a missing column."""
     if column not in frame:
         return np.full(len(frame), np.nan)
     values = pd.to_numeric(frame[column], errors="coerce")
@@ -212,7 +212,7 @@ def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6) -> li
         name
         for name in names
         if name not in excluded
-        and not _NOT_A_CONDITION.search(name)
+        and not _NO_CONDITION.search(name)
         and _is_number(frame, name)
         and frame[name].nunique() > 1
     ]
@@ -226,7 +226,7 @@ def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6) -> li
 
 
 def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
-    """Spearman's rank correlation of the finite pairs; NaN for fewer than four pairs or for a constant."""
+    """Compute Spearman's rank correlation of the finite pairs; NaN for fewer than four pairs or for a constant."""
     finite = np.isfinite(x) & np.isfinite(y)
     if finite.sum() < 4:
         return float("nan")
@@ -235,8 +235,8 @@ def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> 
 
 
 def category_column(frame: pd.DataFrame) -> str | None:
-    """Return the column with few distinct values (text, else terrains); None without one."""
-    types = {str(name): dtype for name, dtype in frame.dtypes.items() if not _NOT_A_CONDITION.search(str(name))}
+    """Return the first column with 2 to 6 distinct values: a column of text, or the terrain; None if there is none."""
+    types = {str(name): dtype for name, dtype in frame.dtypes.items() if not _NO_CONDITION.search(str(name))}
     is_text = (pd.api.types.is_string_dtype, pd.api.types.is_object_dtype)
     names = [name for name, dtype in types.items() if any(check(dtype) for check in is_text)]
     names += ["terrain"] if "terrain" in frame else []

@@ -26,7 +26,7 @@ from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_con
 Answer = TypeVar("Answer")
 Inputs = TypeVar("Inputs")
 
-#: Columns of the algorithm under test, and of an external program's standard error.
+#: Names of two columns: label of the algorithm under test, and standard error of an external program.
 ALGORITHM, STDERR = "algorithm", "stderr"
 
 
@@ -36,17 +36,17 @@ class AlgorithmRun(Generic[Answer]):
 
     - answer: valid answer; None for a failure
     - failure: None for an answer
-    - row: computation time (processor; of a program, wall-clock), and a program's standard error
+    - row: columns: computation time (processor time; wall-clock time of an external program), and standard error
     """
 
     answer: Answer | None
     failure: Failure | None
     row: Mapping[str, Scalar]
 
-    def outcome(self, of_answer: Callable[[Answer], str]) -> str:
-        """Return the name of the answer's outcome, or of the fault."""
+    def outcome(self, outcome_of_answer: Callable[[Answer], str]) -> str:
+        """Return the name of the answer's outcome, or of the fault if there is no answer."""
         if self.answer is not None:
-            return of_answer(self.answer)
+            return outcome_of_answer(self.answer)
         return self.failure.outcome if self.failure is not None else Fault.CRASHED.name
 
 
@@ -95,7 +95,7 @@ def hash_inputs(value: Any, excluded: tuple[str, ...] = ()) -> str:
 
 
 def _parts(value: Any, excluded: tuple[str, ...] = ()) -> Iterator[Any]:
-    """Yield the arrays, poses and other values in data classes, lists and tuples, and the names of the types."""
+    """Walk through data classes, lists and tuples; yield the class names, lengths, arrays, poses and other values."""
     if is_dataclass(value) and not isinstance(value, type):
         yield type(value).__name__
         for field in fields(value):
@@ -136,11 +136,11 @@ def run_algorithm_on_copy(
     """Run an algorithm on a separate copy of the measurements, which it must not change; see `run_algorithm`."""
     input_copy = InputCopy(measurements)
 
-    def check_both(answer: object) -> Answer:
+    def check_inputs_and_answer(answer: object) -> Answer:
         input_copy.check()
         return check(answer)
 
-    return run_algorithm(lambda: call(input_copy.inputs), check_both)
+    return run_algorithm(lambda: call(input_copy.inputs), check_inputs_and_answer)
 
 
 def answer_time_s(answer: object, processor_s: float) -> float:

@@ -1,4 +1,4 @@
-"""Base classes of scenarios: typed parameters, and terrains of a bank as shared inputs."""
+"""Base classes of scenarios: scenarios with typed parameters, and scenarios on the terrains of a bank."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class BaseScenario(Generic[ParametersType]):
 
 
 class TerrainScenario(BaseScenario[ParametersType], ABC):
-    """A scenario whose shared inputs are terrains; keeps the most recently used terrains in memory.
+    """A scenario whose shared inputs are terrains; the most recently used terrains are cached in memory.
 
     By default, algorithms and scores are selected at the top level of the parameters.
     """

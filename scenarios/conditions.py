@@ -1,4 +1,4 @@
-"""Columns of a case: conditions, provenance of the images, and injected faults."""
+"""Columns common to several scenarios (conditions, provenance of the images, faults), and injection of faults."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def optics_columns(optics: OpticsParameters) -> dict[str, Scalar]:
     return optics.model_dump(include={"defocus_px", "stray_light", "dust_discs"})
 
 
-def contrast_columns(picture: UInt16[np.ndarray, "rows columns"], detector: DetectorParameters) -> dict[str, Scalar]:
-    """Return the local contrast of a delivered picture and its spread (see `marsyard.sim.image_statistics`)."""
-    low, middle, high = local_contrast(np.maximum(picture - detector.offset_dn, 0.0))
-    return {"image_contrast": middle, "image_patchiness": high / low if low > 0.0 else np.nan}
+def contrast_columns(image: UInt16[np.ndarray, "rows columns"], detector: DetectorParameters) -> dict[str, Scalar]:
+    """Return median and 90 % / 10 % percentile of a delivered image's local contrast (see `local_contrast`)."""
+    p10, median, p90 = local_contrast(np.maximum(image - detector.offset_dn, 0.0))
+    return {"image_contrast": median, "image_patchiness": p90 / p10 if p10 > 0.0 else np.nan}
 
 
 def off_nadir_deg(state: State) -> float:
@@ -62,9 +62,9 @@ def attitude_rate_deg_s(state: State) -> float:
     return float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
 
 
-def hash_images(pictures: Iterable[UInt16[np.ndarray, "rows columns"]]) -> str:
+def hash_images(images: Iterable[UInt16[np.ndarray, "rows columns"]]) -> str:
     """Compute the SHA-256 of the counts of images."""
-    return hashlib.sha256(b"".join(counts.tobytes() for counts in pictures)).hexdigest()
+    return hashlib.sha256(b"".join(counts.tobytes() for counts in images)).hexdigest()
 
 
 def image_columns(backend: Backend, image_hash: str) -> dict[str, Scalar]:
@@ -77,7 +77,7 @@ def image_columns(backend: Backend, image_hash: str) -> dict[str, Scalar]:
     }
 
 
-Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
+Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
 class SizedFaults(Parameters):
@@ -113,19 +113,19 @@ def add_detector_faults(faults: SizedFaults, detector: DetectorParameters) -> De
     return detector.model_copy(update=changes)
 
 
-def corrupt_images(pictures: Pictures, repeated: int, black: int, lost_rows: float = 0.0) -> list[np.ndarray]:
+def corrupt_images(images: Images, repeated: int, black: int, lost_rows: float = 0.0) -> list[np.ndarray]:
     """Return images with transmission faults.
 
     - repeated: number, from 1, of the image that is replaced by the previous image; 0: none
     - black: number, from 1, of the image that is replaced by a black image; 0: none
     - lost_rows: fraction of the second image's rows that is lost, counted from the bottom
     """
-    images = [image.copy() for image in pictures]
+    corrupted = [image.copy() for image in images]
     if repeated > 1:
-        images[repeated - 1] = images[repeated - 2].copy()
+        corrupted[repeated - 1] = corrupted[repeated - 2].copy()
     if black:
-        images[black - 1][:] = 0
-    lost_count = round(lost_rows * len(images[1])) if lost_rows else 0
+        corrupted[black - 1][:] = 0
+    lost_count = round(lost_rows * len(corrupted[1])) if lost_rows else 0
     if lost_count:
-        images[1][-lost_count:] = 0
-    return images
+        corrupted[1][-lost_count:] = 0
+    return corrupted

@@ -1,8 +1,8 @@
-"""Algorithms under test: those of Marsyard, of installed packages, and of the user.
+"""Create algorithms by name: algorithms of Marsyard, of installed packages, and of the user.
 
 An algorithm is specified by
 
-- a name of Marsyard (`dimes`) or, if there is none, of the entry point group `marsyard.algorithms` of other packages;
+- the name of an algorithm of Marsyard (`dimes`), or of an entry point in the group `marsyard.algorithms`;
 - ``module:Class`` or ``module:function``, called without arguments; the module may be in the current folder;
 - ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: an external program (docs/custom-algorithms.md);
   ``exec-stream:`` or ``serve-stream:``: a program that receives images one by one;
@@ -54,13 +54,13 @@ class Task(Generic[Algorithm, Options]):
     """A task of a system and its algorithms.
 
     - name: name on the command line and in the exchange with programs
-    - what: noun phrase for its algorithms
+    - what: noun for its algorithms in messages
     - methods: required methods of an algorithm
-    - shipped: constructors of Marsyard's algorithms from the options of the published algorithm
-    - options: options of the published algorithm
-    - executable: wraps an external program; None if programs are not accepted
+    - shipped: functions that create Marsyard's algorithms from the options of the published algorithm
+    - options: class of the options of the published algorithm
+    - executable: function that wraps an external program; None if programs are not accepted
     - offline: format of the answers in a table; None if an answer determines the next inputs
-    - streamed: wraps an algorithm that receives images one by one; None if streams are not accepted
+    - streamed: function that wraps an algorithm that receives images one by one; None if streams are not accepted
     """
 
     name: str
@@ -73,7 +73,7 @@ class Task(Generic[Algorithm, Options]):
     streamed: Callable[[Any], Algorithm] | None = None
 
     def check(self, spec: str) -> None:
-        """Raise ValueError with the allowed algorithms if the task has no algorithm of this name."""
+        """Raise ValueError, with the allowed algorithms in the message, if the task has no algorithm of this name."""
         if spec in self.shipped:
             return
         command = exchange.parse_command(spec)
@@ -224,7 +224,7 @@ def list_installed() -> Mapping[str, EntryPoint]:
 
 
 def algorithm_sources(spec: str) -> list[tuple[str, Path]]:
-    """Return the source files of a user's Python algorithm; empty for all other algorithms."""
+    """Return names and paths of the source files of a user's Python algorithm; empty for all other algorithms."""
     path = list_installed()[spec].value if spec in list_installed() else spec
     is_external = is_offline(spec) or spec.startswith(tuple(exchange.PREFIXES))
     return list(source_files(path)) if ":" in path and not is_external and spec not in shipped_names() else []

@@ -1,4 +1,4 @@
-"""Camera optics, calibrated cameras with errors, images of a body camera, and samples with the truth of pixels."""
+"""Functions common to all imaging scenarios: optics, calibration errors, rendering, haze, samples with ground truth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from marsyard.sim.terrain import Environment
 
 @dataclass(frozen=True)
 class Optics:
-    """A camera in the body frame, the rays of its pixels and the fall-off of its lens."""
+    """A camera in the body frame, the rays of its pixels and the relative illumination (fall-off) of its lens."""
 
     camera: CameraModel
     rays: PixelRays
@@ -40,7 +40,7 @@ def camera_optics(camera: CameraModel) -> Optics:
 class CalibrationParameters(Parameters):
     """Errors of the calibrated camera that an algorithm receives.
 
-    Assumed: the errors of the descent camera's calibration, in pixels and as a fraction of the focal length.
+    The values of the descent camera are assumed for all cameras.
     """
 
     focal_error: Annotated[float, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")] = (
@@ -66,7 +66,7 @@ def add_calibration_error(
     recentred = camera.magnify(1.0 + focal_error).recentre(*centre_error_px)
     if isinstance(recentred, Cahv):
         recentred = Cahvor.from_cahv(recentred, r=np.zeros(3))
-    # R1 displaces a point outwards in proportion to the cube of its angle
+    # R1 displaces a point outwards by R1 chi^3; chi is the radial coordinate of its ray (`marsyard.sim.camera.models`)
     corner = float(np.hypot(0.5 * (recentred.size[0] - 1), 0.5 * (recentred.size[1] - 1)))
     radial = cast(Cahvor | Cahvore, recentred)
     chi = corner / (recentred.focal_lengths[0] * (1.0 + float(radial.r[0])))
@@ -74,7 +74,7 @@ def add_calibration_error(
 
 
 def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.random.Generator) -> CameraModel:
-    """Draw a calibrated camera with normally distributed errors."""
+    """Return a camera with normally distributed calibration errors."""
     focal, column, row, distortion = rng.standard_normal(4)
     centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))
     return add_calibration_error(camera, p.focal_error * focal, centre, p.distortion_error_px * distortion)
@@ -87,7 +87,7 @@ class Sample:
     - image: counts of `bits` bits, as delivered
     - range_m: distance along the pixel's ray to the surface; infinite for the sky
     - normal: unit normal of the surface, world axes
-    - rocks: 1 for a rock or another body, 0 for ground
+    - rocks: 1 for a rock or another object, 0 for ground
     - hazard: footprint hazard of a lander: 0 safe, 1 hazard, 255 not completely visible; None without a lander
     - camera: camera in body axes
     - about: pose, sun and other metadata; plain data
@@ -132,14 +132,14 @@ def render_state(
 def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> Float32[np.ndarray, "rows columns"]:
     """Compute the radiance factor of an image through a homogeneous layer of dusty air between ground and camera.
 
-    The ground's light is attenuated by ``T = exp(-extinction x range)``; ``1 - T`` of the air's source function is
-    added: single scattering of sunlight (Henyey & Greenstein 1941) and of the mean light from sky and ground. Contrast
-    decreases, brightness changes less. The sky is not changed.
+    The light from the ground is attenuated by the transmission ``T = exp(-extinction_m * range_m)``. The air adds
+    ``(1 - T)`` times its source function: single scattering of sunlight (phase function of Henyey & Greenstein 1941)
+    and of the mean light from sky and ground. Sky pixels are not changed.
     """
     if extinction_m == 0.0:
         return frame.radiance
     transmission = np.exp(np.float32(-extinction_m) * frame.range_m.astype(np.float32))
-    # sunlight travels along -sun and is scattered along -direction, towards the camera
+    # sunlight travels along -sun and is scattered along -direction, towards the camera; `cosine`: scattering angle
     sun_body = frame.world_from_body.rotation.inv().apply(sun.direction).astype(np.float32)
     cosine = (frame.rays.directions.astype(np.float32) @ sun_body).reshape(frame.radiance.shape)
     g = np.float32(air.asymmetry)
@@ -153,7 +153,7 @@ def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> F
 
 
 def sunlight_ratio(air: Environment, elevation_rad: float, detector: DetectorParameters) -> float:
-    """Return the ratio of the sunlight at the ground to the reference of the detector's responsivity."""
+    """Return direct sunlight at the ground divided by the reference sunlight of the detector's responsivity."""
     return air.direct_share(elevation_rad) * air.solar_irradiance / detector.sunlight
 
 
@@ -165,7 +165,7 @@ def pixel_sample(
     about: Mapping[str, Any],
     hazard: UInt8[np.ndarray, "rows columns"] | None = None,
 ) -> Sample:
-    """Assemble a picture and the truth of its pixels; `camera` is that of the delivered picture."""
+    """Assemble an image and the truth of its pixels; `camera` is that of the delivered image."""
     rows = select_middle_rows(detector.rows_summed)
     return Sample(
         image=counts,

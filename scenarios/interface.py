@@ -26,8 +26,9 @@ _recorder: ContextVar[Callable[[Mapping[str, Scalar]], None] | None] = ContextVa
 def record_conditions(columns: Mapping[str, Scalar]) -> None:
     """Record columns of the running case that do not depend on an algorithm, before an algorithm runs.
 
-    The engine stores them even if the case raises or its process is killed: they determine the populations of the case.
-    `CaseResult.row` must contain them as well. A case may call this several times; no effect outside of a campaign.
+    The engine stores these columns even if the case raises an exception or its process is killed, because they
+    determine the populations of the case. `CaseResult.row` must contain them as well. A case may call this function
+    several times. It has no effect outside of a campaign.
     """
     recorder = _recorder.get()
     if recorder is not None:
@@ -36,7 +37,7 @@ def record_conditions(columns: Mapping[str, Scalar]) -> None:
 
 @contextmanager
 def conditions_recorded_by(recorder: Callable[[Mapping[str, Scalar]], None]) -> Iterator[None]:
-    """Pass the columns of `record_conditions` to a recorder."""
+    """Pass the columns of `record_conditions` to a recorder while the context is active."""
     token = _recorder.set(recorder)
     try:
         yield
@@ -59,12 +60,12 @@ class Failure:
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One case, run and scored.
+    """Result of a case that was run and scored.
 
     - outcome: a member of the estimate's enumeration, or the name of the failure
     - answered: whether the algorithm under test reported an answer (the population `valid` of requirements)
-    - row: scored errors (NaN without an answer) and the sampled values as read back from the simulated objects. Columns
-      that may differ between two runs of one case have `time` in their name.
+    - row: columns: errors (NaN without an answer) and sampled values, read from the simulated objects. Columns that may
+      differ between two runs of one case have `time` in their name.
     - products: arrays and texts for the case's figures; stored only for cases that the campaign retains
     - failure: None if the algorithm under test answered
     """

@@ -1,6 +1,6 @@
 """User-defined meshes on the ground (rocks, landers, landmarks), in the formats of trimesh.
 
-They appear once on the periodic terrain: in images with their shadows, and in the truth (range, bodies, landing site
+A mesh appears once per period of the terrain: in images with its shadow, and in the truth (range, bodies, landing site
 truth).
 """
 
@@ -27,18 +27,18 @@ from marsyard.sim.terrain import Surface
 
 #: Maximum size of a file, and maximum number of triangles.
 MAX_BYTES, MAX_FACES = 1 << 28, 1_000_000
-#: Archives, which are not supported; and formats that are zip archives themselves.
+#: Suffixes of archives, which are not supported, and of mesh formats that are zip archives.
 _ARCHIVES = frozenset({"zip", "bz2", "gz", "tar.gz", "tar.bz2"})
 _ZIPPED = frozenset({"3mf", "3dxml", "zae"})
 #: Numbers in an element of a glTF accessor.
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-#: First body number of meshes; rocks of a field count from 0.
+#: First body number of meshes; the body numbers of rocks start at 0.
 FIRST_MESH_NUMBER = 1 << 30
-#: Default albedo: rock, painted structure, bright target.
+#: Default albedo by kind: rock, painted structure, bright target.
 _ALBEDO = {"rock": 0.15, "lander": 0.5, "landmark": 0.6}
 
 
-#: Rotations that make an axis of the file point up. Rotations that make an axis of the file point up.
+#: Rotations from the file's axes, by the axis that points up, to axes whose z axis points up.
 _UPRIGHT = {
     "x": Rotation.from_euler("y", -90.0, degrees=True),
     "y": Rotation.from_euler("x", 90.0, degrees=True),
@@ -51,9 +51,11 @@ class MeshFileError(ValueError):
 
 
 class MeshParameters(UserFile):
-    """A mesh whose lowest point is `sink_m` below the ground."""
+    """A user's mesh, and its position on the ground; its lowest point is `sink_m` below the ground."""
 
-    kind: Annotated[Literal["rock", "lander", "landmark"], Field(description="object; rocks are smooth")] = "rock"
+    kind: Annotated[
+        Literal["rock", "lander", "landmark"], Field(description="kind of object; rocks have smooth normals")
+    ] = "rock"
     east_m: Annotated[float, Field(allow_inf_nan=False, description="position of the origin")] = 0.0
     north_m: Annotated[float, Field(allow_inf_nan=False)] = 0.0
     heading_deg: Annotated[float, Field(ge=-720.0, le=720.0, description="rotation about up, clockwise")] = 0.0
@@ -71,7 +73,7 @@ class MeshParameters(UserFile):
         return read_mesh(file).sha256
 
     def place_on_ground(self, surface: Surface, point: tuple[float, float]) -> Objects:
-        """Place the mesh on the ground, at its repetition nearest to a point (x, y)."""
+        """Place the mesh on the ground; of its periodic positions, use the nearest to a point (x, y)."""
         mesh = read_mesh(self.file)
         corners = _UPRIGHT[self.up].apply(mesh.triangles.reshape(-1, 3))
         extent = float(np.ptp(corners[:, :2], axis=0).max())
@@ -108,7 +110,7 @@ class Mesh:
 
 
 def add_meshes(scene: Scene, meshes: Sequence[MeshParameters], point: tuple[float, float]) -> Scene:
-    """Add meshes to a scene, each at its repetition nearest to a point (x, y)."""
+    """Add meshes to a scene, each at its periodic position nearest to a point (x, y)."""
     if not meshes:
         return scene
     placed = Objects.join([mesh.place_on_ground(scene.surface, point) for mesh in meshes])

@@ -1,8 +1,8 @@
 """Algorithms that run outside of Marsyard: export the cases, and read the answers from a table.
 
-Both replace an algorithm of a campaign: ``export:FOLDER`` (or ``export:FOLDER::bits-per-pixel=B`` with lossy
-compression of the images) writes its inputs and returns no answer,
-``answers:FILE.csv`` returns the answer in its table.
+Both replace an algorithm of a campaign. ``export:FOLDER`` writes the inputs of the algorithm and returns a failure;
+``export:FOLDER::bits-per-pixel=B`` writes images after lossy compression. ``answers:FILE.csv`` returns the answers of a
+table.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor.compression import compress
 
 EXPORT, ANSWERS = "export:", "answers:"
-#: Between the folder of an export and the bits per pixel of its compressed images.
+#: Separator between the folder of an export and the bits per pixel of its compressed images.
 LOSSY = "::bits-per-pixel="
 
 #: Folder of the cases in an export.
@@ -35,7 +35,7 @@ CASES = "cases"
 
 #: Maximum number of rows of a table of answers.
 MAX_ROWS = 10_000_000
-#: Maximum magnitudes; larger numbers probably have another unit than the suffix of the column's name.
+#: Maximum magnitudes by suffix of the column; larger numbers are probably in another unit.
 _MAX_MAGNITUDE = {"_m_s": 1e3, "_m2_s2": 1e6, "_m": 1e6, "_s": 1e6}
 
 Answer = TypeVar("Answer")
@@ -45,12 +45,12 @@ Answer = TypeVar("Answer")
 class AnswerFormat(Generic[Answer]):
     """Format of a task's answers in a table.
 
-    - required: numeric columns next to `case` and `outcome`: all are filled, or none
-    - optional: groups of further numeric columns: all of a group are filled, or none
-    - outcomes: allowed outcomes; an empty outcome with numbers means the first of them
+    - required: numeric columns in addition to `case` and `outcome`; a row contains all their values, or none
+    - optional: groups of further numeric columns; a row contains all values of a group, or none
+    - outcomes: allowed outcomes; an empty outcome with numbers means the first outcome
     - create_answer: creates a valid answer from outcome and numbers. Raises AlgorithmError.
-    - create_empty: creates the answer of an export
-    - add_inputs: adds the inputs that a failed answer contains
+    - create_empty: creates the failure that an export returns
+    - add_inputs: adds inputs of the case to an answer that needs them, such as the a-priori site
     - note: explanation of the columns for the user
     """
 
@@ -112,7 +112,7 @@ SITE_FORMAT: AnswerFormat[SiteEstimate] = AnswerFormat(
 
 
 def is_offline(spec: str) -> bool:
-    """Return whether a name is an export or a table of answers."""
+    """Return whether a name specifies an export or a table of answers."""
     return spec.startswith((EXPORT, ANSWERS))
 
 
@@ -122,7 +122,7 @@ def answers_file(spec: str) -> Path | None:
 
 
 def create_offline(spec: str, answer_format: AnswerFormat[Any], case: int) -> Any:
-    """Create the replacement of an algorithm in a case."""
+    """Create the object that replaces the algorithm in a case."""
     file = answers_file(spec)
     if file is None:
         folder, _, bits = spec.removeprefix(EXPORT).partition(LOSSY)
@@ -133,7 +133,7 @@ def create_offline(spec: str, answer_format: AnswerFormat[Any], case: int) -> An
 
 @dataclass(frozen=True)
 class Recorder:
-    """Writes its inputs into a folder atomically, and returns an empty answer."""
+    """Replaces an algorithm: writes its inputs into a folder atomically, and returns a failure."""
 
     folder: Path
     answer_format: AnswerFormat[Any]
@@ -157,7 +157,7 @@ class Recorder:
 
 @dataclass(frozen=True)
 class RecordedAnswer(Generic[Answer]):
-    """Returns the answer of a table."""
+    """Replaces an algorithm: returns the answer of a table; `missing` is the error message without an answer."""
 
     answer: Answer | None
     missing: str

@@ -29,7 +29,7 @@ SCENARIOS_FOLDER = Path(__file__).resolve().parent
 
 @dataclass(frozen=True)
 class Ingested:
-    """Cases converted from recorded data: text of the campaign file, numbers, and a note for the user."""
+    """Result of `marsyard ingest`: text of the campaign file, numbers of cases and images, and a note for the user."""
 
     campaign: str
     cases: int
@@ -45,7 +45,8 @@ class System:
     `marsyard.systems` (`marsyard.scenarios.systems`).
 
     - name: short unique name; the dashboard groups campaigns by it
-    - title, summary: title for a reader, and one sentence on the tests
+    - title: title in reports
+    - summary: one sentence on the tests
     - scenarios: classes that implement `marsyard.scenarios.interface.Scenario`, by the names in campaign files
     - tasks: each a `marsyard.scenarios.estimators.Task`: the published algorithm, the baselines, and the accepted forms
       of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
@@ -56,9 +57,9 @@ class System:
     - compiled_by: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small: one case of each
       calls all numeric kernels of its scenario (`marsyard compile`)
     - templates: each a `marsyard.scenarios.template.CampaignTemplate`, by the values of ``marsyard new --system``
-    - ingest: function that converts recorded data into cases (`marsyard ingest`). Arguments: the folder of the data, a
-      folder to write into, and the folder to which that is moved. Returns `Ingested`.
-    - report: a `marsyard.reports.presentation.Presentation`: report sections, and the pictures of a case
+    - ingest: function that converts recorded data into cases (`marsyard ingest`). Arguments: folder of the data, folder
+      for the new cases, and folder to which the new cases are moved. Returns `Ingested`.
+    - report: a `marsyard.reports.presentation.Presentation`: report sections, and the figures of a case
     """
 
     name: str
@@ -89,12 +90,12 @@ GROUP = "marsyard.systems"
 _CATALOGUE = SCENARIOS_FOLDER / "catalogue"
 _REQUIREMENTS, _COLUMNS = SCENARIOS_FOLDER / "requirements.toml", SCENARIOS_FOLDER / "columns.toml"
 
-#: The systems of Marsyard. Recorded pictures come first: other systems also have their products.
+#: The systems of Marsyard. Recorded images come first, because their cases also contain products of other systems.
 BUILT_IN = (
     System(
         name="measured",
-        title="Recorded pictures",
-        summary="Algorithms on real pictures, compared with the measured poses.",
+        title="Recorded images",
+        summary="Algorithms on real images, compared with the measured poses.",
         scenarios={
             "measured-velocity": "marsyard.scenarios.measured.scenarios:MeasuredVelocityScenario",
             "measured-landing": "marsyard.scenarios.measured.scenarios:MeasuredLandingScenario",
@@ -231,7 +232,7 @@ def _load(point: EntryPoint, earlier_systems: list[System]) -> System:
 
 @dataclass(frozen=True)
 class RowColumns:
-    """Columns of a scenario's rows; a star in `flags` and `numbers` matches any text.
+    """Columns of a scenario's rows; `flags` and `numbers` contain names or patterns, in which `*` matches any text.
 
     - flags: boolean columns
     - numbers: numeric columns
@@ -254,7 +255,7 @@ class RowColumns:
 
 @cache
 def row_columns(scenario: str) -> RowColumns | None:
-    """Return the columns of a scenario; None if its system declares none. Raises ValueError for an invalid file."""
+    """Return the columns of a scenario; None if its system has no such file. Raises ValueError for an invalid file."""
     system = find_system(scenario)
     if system is None or system.columns is None:
         return None

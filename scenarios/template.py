@@ -15,7 +15,7 @@ from marsyard.scenarios.descent.parameters import binned_size_for
 from marsyard.scenarios.systems import SCENARIOS_FOLDER
 from marsyard.sim.camera import read_camera
 
-#: Number of terrains of a new campaign's bank: enough for appended cases; maximum of a bank.
+#: Minimum number of terrains of a new campaign's bank, enough for cases appended later, and maximum of a bank.
 MIN_TERRAINS, MAX_TERRAINS = 10_000, 100_000
 
 
@@ -47,11 +47,11 @@ class CampaignTemplate:
     - file: receives the fields of `Choices`, `bank` (number of terrains) and the entries of `values`; its filter
       ``toml`` formats a value as TOML. It may extend ``campaign.toml.j2``.
     - scale: scale of the site's terrain, ``descent`` or ``ground``
-    - site, bound: defaults
+    - site, bound: default site, and default bound of the requirement
     - bound_text: meaning of the bound, for the dialogue
     - max_bound: upper limit of the bound, exclusive
     - refused: reasons why options (``camera``, ``detector``, ``flight``) are not accepted
-    - values: further values for the file. Raises ValueError if a user's file is invalid.
+    - values: function that returns further values for the file. Raises ValueError if a user's file is invalid.
     """
 
     file: Path

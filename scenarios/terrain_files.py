@@ -1,7 +1,8 @@
-"""Validate a user's terrain files by their headers before `marsyard.sim.terrain` reads them, and use them as sites.
+"""Validate a user's terrain files before `marsyard.sim.terrain` reads them, and create sites from them.
 
-A GeoTIFF must have a projection in metres (or another length unit, which is converted) that preserves lengths,
-square cells with grid north up, a no-data value if it has gaps, and heights in metres; likewise an .npz archive.
+A GeoTIFF must have a projection in metres or another length unit, which preserves lengths, and square cells with grid
+north up. Its heights must be in metres, and gaps need a no-data value. An .npz archive must have heights and cell sizes
+in metres.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator
 
-from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, npz_headers
+from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, read_npz_headers
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, choose_grid, read_rasters
 
-#: Maximum number of DTM posts and of picture pixels along a side: limits of the largest terrain and of memory.
+#: Maximum number of DTM posts along a side (largest terrain), and of orthoimage pixels along a side (memory).
 _MAX_POSTS, _MAX_PIXELS = 5461, 8192
 #: Maximum relative distortion of lengths by the projection.
 _MAX_STRETCH = 0.02
@@ -43,7 +44,7 @@ CheckedTerrain = Annotated[TerrainParameters, AfterValidator(_check_terrain)]
 
 
 def site_validator(user: str, scale: str) -> AfterValidator:
-    """Return a validator of a site's name: a preset with a terrain at the scale; messages contain the site's user."""
+    """Return a validator of site names: presets with a terrain at the scale; `user` is a noun for messages."""
 
     def check(name: str | None) -> str | None:
         allowed = [item.name for item in sites().values() if getattr(item, scale) is not None]
@@ -94,7 +95,7 @@ def _check_present(path: Path) -> os.stat_result:
 def _npz_problems(source: RealTerrain) -> Iterator[str]:
     """Yield problems of an archive's headers."""
     try:
-        headers = npz_headers(source.dtm)
+        headers = read_npz_headers(source.dtm)
     except ARCHIVE_ERRORS as error:
         raise TerrainFileError(f"{source.dtm}: is not a valid .npz archive of arrays ({error})") from error
     missing = [name for name in ("dem", "dem_gsd") if name not in headers]
@@ -120,7 +121,7 @@ def _npz_problems(source: RealTerrain) -> Iterator[str]:
 
 
 def _geotiff_problems(file: Any, max_side: int, are_heights: bool) -> Iterator[str]:
-    """Yield problems of a file's size, cells and projection, and of the unit and type of heights."""
+    """Yield problems of a GeoTIFF's size, cells and projection and, for heights, of their unit and type."""
     if min(file.width, file.height) < 4:
         yield f"has {file.width} x {file.height} values; allowed: at least 4 x 4"
     if max(file.width, file.height) > max_side:
@@ -149,7 +150,7 @@ def _geotiff_problems(file: Any, max_side: int, are_heights: bool) -> Iterator[s
     if not are_heights:
         return
     if file.dtypes[0] == "uint8":
-        yield "contains 8-bit values, as in a picture; allowed: heights in metres"
+        yield "contains 8-bit values, as in an image; allowed: heights in metres"
     if (file.units[0] or "").strip().lower() not in _METRES:
         yield f"its heights are in {file.units[0]!r}; allowed: metres (rio calc)"
     if file.scales[0] != 1.0 or file.offsets[0] != 0.0:
@@ -157,7 +158,7 @@ def _geotiff_problems(file: Any, max_side: int, are_heights: bool) -> Iterator[s
 
 
 def _raise_first(path: Path, problems: Iterator[str]) -> None:
-    """Raise TerrainFileError for the first problem; later checks depend on it."""
+    """Raise TerrainFileError for the first problem only: later checks assume that earlier checks passed."""
     problem = next(problems, None)
     if problem is not None:
         raise TerrainFileError(f"{path}: {problem}")

@@ -1,4 +1,4 @@
-"""Files of a user: hashed input files, CSV parsing, import paths, and error lists."""
+"""Read a user's files: hashed input files, tables, imports, axes of recorded poses, and lists of problems."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FORMER_PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports")
 
 
 def current_module(module: str) -> str:
-    """Return the current name of a module that a stored campaign or an older file contains by its former name.
+    """Return the current name of a module whose former name a stored campaign or an older file contains.
 
     ``algorithms.dimes`` becomes ``marsyard.algorithms.dimes``; names of other packages are returned unchanged.
     """
@@ -86,7 +86,7 @@ _MAX_PROBLEMS = 20
 
 @runtime_checkable
 class HasInputFiles(Protocol):
-    """Parameters with input files; options of a user's algorithm may have the method as well."""
+    """An object with input files: parameters, or options of a user's algorithm."""
 
     def input_files(self) -> Sequence[str]:
         """Return the paths of the files, as written."""
@@ -112,7 +112,7 @@ def _find_files(value: Any) -> Iterator[str]:
 
 
 class UserFile(Parameters):
-    """A file with its hash, which is added when the campaign is read and checked in each case."""
+    """A user's file with its hash; the hash is added when the campaign is read, and checked in each case."""
 
     file: Annotated[str, Field(description="path of the file")]
     sha256: Annotated[str | None, Field(description="SHA-256 of the file; set automatically")] = None
@@ -154,10 +154,11 @@ def parse_table(
     hint: str,
     parse: Callable[[int, Mapping[str, str]], Row],
 ) -> tuple[list[Row], list[str]]:
-    """Parse the rows of a table by line and cells; return them, and the problems of invalid rows by line.
+    """Parse the rows of a comma-separated table; return the valid rows, and one message for each invalid row.
 
     Raises ValueError if the file is unreadable or not comma-separated, has too many rows, or has missing or unknown
-    columns; `hint` contains the allowed columns. `parse` raises ValueError or AlgorithmError.
+    columns; `hint` contains the allowed columns. `parse` receives the line number and the cells by column; it raises
+    ValueError or AlgorithmError for an invalid row.
     """
     header, lines = _read_lines(path, max_rows)
     problems = list(_header_problems(header, required, allowed, hint))
@@ -221,7 +222,7 @@ def finite_number(name: str, text: str, hint: str = "") -> float:
 
 
 def check_column_groups(groups: Iterable[Sequence[str]], values: Mapping[str, float]) -> None:
-    """Raise ValueError if only some columns of a group are given."""
+    """Raise ValueError if a row contains only some values of a group of columns."""
     for names in groups:
         filled = [name for name in names if name in values]
         missing = [name for name in names if name not in values]

@@ -21,15 +21,15 @@ Span = tuple[float, float]
 #: Indices of three images.
 Triple = tuple[int, int, int]
 
-_THREE: Triple = (0, 1, 2)
+_FIRST_TRIPLE: Triple = (0, 1, 2)
 
 
 def run_estimator(
-    make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: Triple | None = _THREE
+    make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: Triple | None = _FIRST_TRIPLE
 ) -> AlgorithmRun[VelocityEstimate]:
     """Run an estimator on a descent; the answer contains its span.
 
-    Streams and recorders receive all images. Other estimators receive three of them, and fail without a triple.
+    Streams, exports and recorded answers use all images. Other estimators use three images; they fail without a triple.
     """
     tags = measurements.tags_s
 
@@ -61,7 +61,7 @@ def check_last_interval(answer: object, measurements: DescentMeasurements) -> Ve
 def _answers_after_images(
     estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]
 ) -> list[tuple[Span, Horizontal, Horizontal]]:
-    """Return span, velocity and truth after each image, NaN without a velocity; empty for other estimators."""
+    """Return a stream's span, velocity and truth after each image, NaN without a velocity; empty without a stream."""
     missing = ((np.nan, np.nan), np.full(2, np.nan), np.full(2, np.nan))
     return [
         missing
@@ -72,7 +72,7 @@ def _answers_after_images(
 
 
 def stream_row(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, Scalar]:
-    """Return the errors of a stream after each image, NaN without a velocity; empty for other estimators.
+    """Return the error columns of a stream after each image, NaN without a velocity; empty for other estimators.
 
     `pictures_before_answer` is the number of images before the first velocity, 0 if there is none.
     """
@@ -117,10 +117,10 @@ def consistency_row(estimate: VelocityEstimate | None, true: Horizontal) -> dict
 
 
 def velocity_products(
-    pictures: Sequence[UInt16[np.ndarray, "rows columns"]], estimate: VelocityEstimate | None, true: Horizontal
+    images: Sequence[UInt16[np.ndarray, "rows columns"]], estimate: VelocityEstimate | None, true: Horizontal
 ) -> dict[str, object]:
     """Return the arrays for a case's figures."""
-    arrays: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(pictures, start=1)}
+    arrays: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(images, start=1)}
     if estimate is not None and isinstance(estimate.details, DimesDetails):
         arrays.update(dimes_products(estimate.details))
     arrays["velocity_true_m_s"] = true

@@ -1,7 +1,7 @@
 """Scenes of a site for cameras: ground, visible rocks, light, and camera poses.
 
 A `SiteGround` is a terrain of the bank with its rocks, an `Eye` the position and resolution of a camera; `site_scene`
-combines both into the scene for the renderer. One scene serves all pictures near its eye, as those of a stereo pair.
+combines both into the scene for the renderer. All images near the eye can use one scene, for example a stereo pair.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ Scale = Literal["descent", "ground"]
 
 #: Smallest rendered rocks, pixels.
 SMALLEST_ROCK_PX = 1.5
-#: Maximum triangles of coarse rocks in a scene; beyond it smaller rocks are left out.
+#: Approximate maximum number of triangles of coarse rocks in a scene; smaller rocks are omitted to satisfy it.
 ROCK_TRIANGLES = 600_000
-#: Maximum additional triangles of near, fine rocks, without those outside of the eye's sector; beyond it all rocks are
-#: coarser than the camera resolves.
+#: Maximum number of additional triangles of detailed rocks in the eye's sector; to satisfy it, all rocks are rendered
+#: with less detail than the camera resolves.
 DETAIL_TRIANGLES = 1_200_000
-#: Triangles of a coarse rock.
+#: Number of triangles of a coarse rock.
 _COARSE_TRIANGLES = 20
-#: Rocks outside of the sector are kept, for their shadows, within this many heights of the eye, and metres.
+#: Maximum distance of rocks outside of the sector, included for their shadows: in heights of the eye, and minimum in m.
 _NEAR_HEIGHTS, _NEAR_M = 3.0, 5.0
 #: Ratio of the diameters of neighbouring size classes.
 _CLASS_RATIO = float(np.sqrt(2.0))
-#: Mesh spacing over the height of the eye, its growth with distance, and minimum extent in heights and metres.
+#: Ground mesh: spacing divided by the eye's height, relative growth per line, minimum extent in heights and in m.
 _MESH_FINEST, _MESH_GROWTH, _MESH_REACH_HEIGHTS, _MESH_REACH_M = 0.0085, 0.012, 14.0, 700.0
-#: Radius of Mars, for the distance of the horizon.
+#: Radius of Mars, m, for the distance of the horizon.
 _MARS_RADIUS_M = 3.39e6
-#: Maximum height of an eye among the rocks.
+#: Maximum height of an eye, m, at which it is among the rocks (`Scene.among_objects`).
 _LOW_M = 100.0
 
 
 @dataclass(frozen=True)
 class SiteGround:
-    """The ground of a site at one scale: its surface, and its rocks (None without)."""
+    """The ground of a site at one scale: its surface, and its rocks (None without rocks)."""
 
     site: Site
     terrain: TerrainParameters
@@ -61,7 +61,7 @@ class SiteGround:
     def of(cls, site: Site, scale: Scale | None = None, *, seed: int = 1, number: int = 0) -> SiteGround:
         """Load or build terrain `number` of a site's bank; by default at the site's coarsest scale.
 
-        Raises ValueError where the site has no terrain at that scale.
+        Raises ValueError if the site has no terrain at that scale.
         """
         return cls.from_bank(site, site.terrain(scale), seed, number)
 
@@ -94,11 +94,11 @@ class SiteGround:
 class Eye:
     """Position, sector and resolution of a camera, which determine the detail of a scene.
 
-    - east_m, north_m, height_m: position, height above the ground
+    - east_m, north_m, height_m: position, and height above the ground
     - pixel_rad: angle of a pixel
-    - azimuth_rad, half_width_rad: middle and half width of the sector that it sees, clockwise from north; a half width
-      of pi is all round
-    - reach_m: maximum horizontal distance of visible ground; infinite where the horizon is visible
+    - azimuth_rad, half_width_rad: centre, clockwise from north, and half width of the visible sector; a half width of
+      pi is the full circle
+    - reach_m: maximum horizontal distance of visible ground; infinite if the horizon is visible
     """
 
     east_m: float
@@ -117,11 +117,11 @@ class Eye:
         axis = world_from_body.rotation.apply(rays.axis)
         elevation, half_angle = float(np.arcsin(np.clip(axis[2], -1.0, 1.0))), rays.half_angle_rad
         horizontal = float(np.cos(elevation))
-        sees_all_round = np.sin(half_angle) >= horizontal or half_angle >= np.pi / 2
-        half_width = np.pi if sees_all_round else np.arcsin(np.sin(half_angle) / horizontal)
+        is_full_circle = np.sin(half_angle) >= horizontal or half_angle >= np.pi / 2
+        half_width = np.pi if is_full_circle else np.arcsin(np.sin(half_angle) / horizontal)
         half_width = float(min(half_width + np.radians(3.0), np.pi))
         highest = elevation + half_angle
-        # twice the distance of level ground, for descending slopes
+        # twice the maximum distance on level ground, because slopes may descend
         reach = 2.0 * height / np.tan(-highest) + _NEAR_M if highest < -np.radians(5.0) else np.inf
         return cls(east, north, height, rays.pixel_rad, float(np.arctan2(axis[0], axis[1])), half_width, float(reach))
 
@@ -150,7 +150,7 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
 
 
 def micro_relief(ground: SiteGround) -> MicroRelief:
-    """Relief of this ground finer than its samples, for the renderer."""
+    """Create the relief that is finer than the samples of the surface, for the renderer."""
     p, cover = ground.terrain, ground.surface.cover
     slope = float(np.radians(p.rms_slope_deg))
     coarsest, heights = octave_heights(p.hurst, slope, p.slope_baseline_m, p.outer_scale_m, p.spacing_m)
@@ -159,11 +159,11 @@ def micro_relief(ground: SiteGround) -> MicroRelief:
 
 
 def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Objects:
-    """Select the rocks that the eye resolves, and near ones for their shadows; bodies carry the rocks' numbers.
+    """Select the rocks that the eye resolves, and near rocks for their shadows; body numbers are the rocks' numbers.
 
-    Where rocks of `SMALLEST_ROCK_PX` need more than about `ROCK_TRIANGLES`, only larger ones are taken. Rocks are so
-    fine that they look the same as their finest shape (`marsyard.sim.terrain.rocks.shapes.DEVIATION_PX`), within the
-    limit of `DETAIL_TRIANGLES`.
+    If rocks of `SMALLEST_ROCK_PX` need more than about `ROCK_TRIANGLES`, only larger rocks are selected. The level of
+    detail makes rocks look like their finest shape (`marsyard.sim.terrain.rocks.shapes.DEVIATION_PX`), within the limit
+    of `DETAIL_TRIANGLES`.
     """
     field = ground.rocks
     if field is None or len(field) == 0:
@@ -174,9 +174,9 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
     size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
     meshes = []
     for number in np.unique(size_class):
-        members, low = np.flatnonzero(size_class == number), smallest_m * _CLASS_RATIO ** int(number)
-        # the height of the eye is part of the distance
-        horizontal = np.sqrt(max((low * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - eye.height_m**2, 0.0))
+        members, min_diameter_m = np.flatnonzero(size_class == number), smallest_m * _CLASS_RATIO ** int(number)
+        # horizontal part of the maximum distance of this size class
+        horizontal = np.sqrt(max((min_diameter_m * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - eye.height_m**2, 0.0))
         radius = float(min(horizontal, reach))
         selected = members[_near_sector(field, members, eye, radius)]
         if selected.size:
@@ -185,56 +185,57 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
             meshes.append(replace(mesh, rock_of_face=selected[mesh.rock_of_face].astype(np.int32)))
     if not meshes:
         return Objects.none()
-    # the triangles that lie in the eye's sector or near the eye
-    visible = [_in_sector(mesh, eye) for mesh in meshes]
-    vertices = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
-    bodies = np.cumsum([0] + [int(mesh.body_of_face.max(initial=-1)) + 1 for mesh in meshes])
-    kept = list(zip(meshes, visible, vertices.astype(np.int32), bodies.astype(np.int32), strict=False))
+    # keep only triangles in the eye's sector or near the eye; offsets number vertices and bodies of the joined meshes
+    masks = [_in_sector(mesh, eye) for mesh in meshes]
+    vertex_offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    body_offsets = np.cumsum([0] + [int(mesh.body_of_face.max(initial=-1)) + 1 for mesh in meshes])
+    offsets = vertex_offsets.astype(np.int32), body_offsets.astype(np.int32)
+    pieces = list(zip(meshes, masks, *offsets, strict=False))
     return Objects.of_mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.vertex_normals for mesh in meshes]),
-        np.concatenate([mesh.faces[some] + first for mesh, some, first, _ in kept]),
-        np.concatenate([mesh.rock_of_face[some] for mesh, some, _, _ in kept]),
+        np.concatenate([mesh.faces[mask] + offset for mesh, mask, offset, _ in pieces]),
+        np.concatenate([mesh.rock_of_face[mask] for mesh, mask, _, _ in pieces]),
         np.minimum(ground.site.photometry.rock_albedo * field.albedo, 1.0),
-        np.concatenate([mesh.body_of_face[some] + first for mesh, some, _, first in kept]),
+        np.concatenate([mesh.body_of_face[mask] + offset for mesh, mask, _, offset in pieces]),
     )
 
 
 def smallest_rock_rad(field: RockField, eye: Eye) -> float:
     """Return the angular size of the smallest rocks in a scene.
 
-    Rocks of diameter D are rendered up to the distance D / angle: n per square metre in a sector of half width w have
-    ``20 w D**2 n / angle**2`` triangles.
+    Rocks of diameter D are rendered up to the distance D / angle. With n rocks per square metre and a sector of half
+    width w, they have ``20 w D**2 n / angle**2`` triangles. The result limits this number to `ROCK_TRIANGLES`.
     """
     if np.isfinite(eye.reach_m):
         return SMALLEST_ROCK_PX * eye.pixel_rad
-    squares = float(np.sum(field.diameter_m**2)) / field.period_m**2
-    affordable = np.sqrt(_COARSE_TRIANGLES * eye.half_width_rad * squares / ROCK_TRIANGLES)
-    return float(max(SMALLEST_ROCK_PX * eye.pixel_rad, affordable))
+    squared_diameters_per_m2 = float(np.sum(field.diameter_m**2)) / field.period_m**2
+    limit_rad = np.sqrt(_COARSE_TRIANGLES * eye.half_width_rad * squared_diameters_per_m2 / ROCK_TRIANGLES)
+    return float(max(SMALLEST_ROCK_PX * eye.pixel_rad, limit_rad))
 
 
 def _pixel_of_detail_rad(field: RockField, eye: Eye) -> float:
-    """Return the pixel angle for the detail of rocks: the eye's, or the smallest that `DETAIL_TRIANGLES` allow.
+    """Return the pixel angle for the detail of rocks: that of the eye, or the smallest that `DETAIL_TRIANGLES` allows.
 
-    Level k of a rock of diameter D is sufficient up to p_k pixels: the next level's additional triangles are needed up
-    to the distance ``D / (p_k pixel)``.
+    Detail level k of a rock of diameter D is sufficient up to a size of p_k pixels. The additional triangles of the
+    next level are therefore needed up to the distance ``D / (p_k * pixel angle)``.
     """
     triangles = np.array([rock_shapes(detail).faces.shape[0] for detail in range(FINEST + 1)])
-    added = (np.diff(triangles) / max_pixels() ** 2).sum(axis=1)
-    per_m2 = float(np.sum(field.diameter_m**2 * added[field.shape])) / field.period_m**2
+    added_triangles = (np.diff(triangles) / max_pixels() ** 2).sum(axis=1)
+    per_m2 = float(np.sum(field.diameter_m**2 * added_triangles[field.shape])) / field.period_m**2
     return float(max(eye.pixel_rad, np.sqrt(eye.half_width_rad * per_m2 / DETAIL_TRIANGLES)))
 
 
 @dataclass(frozen=True)
 class Stance:
-    """Typical terrain scale, height and elevation above the horizon of a camera."""
+    """Typical terrain scale, height above the ground, and elevation of the optical axis of a camera."""
 
     scale: Scale
     height_m: float
     elevation_deg: float
 
 
-#: Typical stances of the cameras of `marsyard.sim.sensor.PRESETS`: first picture of a descent, masts of 1.5 m, MER's
+#: Typical stances of the cameras of `marsyard.sim.sensor.PRESETS`: first image of a descent, masts of 1.5 m, MER's
 #: hazcams 0.53 m above the ground (Maki et al. 2003), a helicopter at 10 m.
 STANCES: Mapping[str, Stance] = {
     "mer-descent-flown": Stance("descent", 2000.0, -90.0),
@@ -275,7 +276,7 @@ def nadir_pose(
 ) -> RigidTransform:
     """Return the pose of a body whose camera looks along -z, down or tilted forward towards the azimuth.
 
-    The azimuth, clockwise from north, is that of the picture's upper edge.
+    The azimuth, clockwise from north, is that of the image's upper edge.
     """
     rotation = Rotation.from_euler("ZX", [-azimuth_deg, tilt_deg], degrees=True)
     return rigid(rotation, _above(surface, east_m, north_m, altitude_m))
@@ -288,29 +289,29 @@ def _above(surface: Surface, east_m: float, north_m: float, height_m: float) -> 
 def _near_sector(
     field: RockField, members: Int64[np.ndarray, "members"], eye: Eye, radius_m: float
 ) -> Bool[np.ndarray, "members"]:
-    """Select rocks, with their repetitions within a radius of the eye, of which `_in_sector` may keep triangles."""
+    """Select rocks with a periodic position, within a radius of the eye, whose triangles `_in_sector` may select."""
     period, selected = field.period_m, np.zeros(members.size, dtype=np.bool_)
     # larger than any shape on the steepest ground
     extent = field.diameter_m[members] + field.height_m[members]
     near_m = max(_NEAR_HEIGHTS * eye.height_m, _NEAR_M)
-    here = np.array([eye.east_m, eye.north_m])
-    first = field.position_m[members, :2] + np.floor(here / period) * period - here
+    eye_m = np.array([eye.east_m, eye.north_m])
+    base_offsets = field.position_m[members, :2] + np.floor(eye_m / period) * period - eye_m
     repetitions = range(-int(np.ceil(radius_m / period)), int(np.ceil(radius_m / period)) + 1)
     for column, row in product(repetitions, repetitions):
-        away = first + np.array([column, row]) * period
-        distance = np.hypot(*away.T)
-        bearing = np.abs((np.arctan2(away[:, 0], away[:, 1]) - eye.azimuth_rad + np.pi) % (2.0 * np.pi) - np.pi)
+        offsets = base_offsets + np.array([column, row]) * period
+        distance = np.hypot(*offsets.T)
+        bearing = np.abs((np.arctan2(offsets[:, 0], offsets[:, 1]) - eye.azimuth_rad + np.pi) % (2.0 * np.pi) - np.pi)
         widening = np.arcsin(np.minimum(extent / np.maximum(distance, 1e-9), 1.0))
-        within = (bearing <= eye.half_width_rad + widening) | (distance <= near_m + extent)
-        selected |= within & (distance <= radius_m)
+        is_relevant = (bearing <= eye.half_width_rad + widening) | (distance <= near_m + extent)
+        selected |= is_relevant & (distance <= radius_m)
     return selected
 
 
 def _in_sector(mesh: RockMesh, eye: Eye) -> Bool[np.ndarray, "triangles"]:
     """Select the triangles whose first corner is in the eye's sector or near the eye."""
-    away = mesh.vertices[:, :2] - (eye.east_m, eye.north_m)
-    bearing = np.arctan2(away[:, 0], away[:, 1]) - eye.azimuth_rad
+    offsets = mesh.vertices[:, :2] - (eye.east_m, eye.north_m)
+    bearing = np.arctan2(offsets[:, 0], offsets[:, 1]) - eye.azimuth_rad
     bearing = np.abs((bearing + np.pi) % (2.0 * np.pi) - np.pi)
     near_m = max(_NEAR_HEIGHTS * eye.height_m, _NEAR_M)
-    corners = (bearing <= eye.half_width_rad) | (np.hypot(*away.T) <= near_m)
-    return np.asarray(corners[mesh.faces[:, 0]])
+    is_selected = (bearing <= eye.half_width_rad) | (np.hypot(*offsets.T) <= near_m)
+    return np.asarray(is_selected[mesh.faces[:, 0]])

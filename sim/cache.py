@@ -1,4 +1,4 @@
-"""Cached arrays on disk: location, size limit, eviction, atomic writing and checksums."""
+"""Disk cache of arrays: location, size limit, eviction, atomic writing and checksums."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-#: Default size limit if ``MARSYARD_CACHE_GB`` is not set: fraction of the free space, and maximum.
+#: Default size limit if ``MARSYARD_CACHE_GB`` is not set: a fraction of the free space, at most `LIMIT_GB` gigabytes.
 FREE_FRACTION, LIMIT_GB = 0.4, 10.0
 GIGA = 10**9
 #: Suffix of files that are being written, and the age after which such a file belongs to an interrupted process.
@@ -29,22 +29,22 @@ class CacheWarning(UserWarning):
 
 
 def cache_directory(kind: str) -> Path:
-    """Return the cache folder for files of this kind and create it; below ``MARSYARD_CACHE`` or the user's cache."""
+    """Create and return the cache folder `kind`, a subfolder of ``MARSYARD_CACHE`` or of the user's cache folder."""
     default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "marsyard"
     directory = Path(os.environ.get("MARSYARD_CACHE") or default) / kind
     directory.mkdir(parents=True, exist_ok=True)
     return directory
 
 
-def limit_bytes(folder: Path, kept_bytes: int) -> int:
-    """Return the size limit of a cache folder whose files take `kept_bytes` now.
+def limit_bytes(folder: Path, stored_bytes: int) -> int:
+    """Return the size limit of a cache folder whose files have the total size `stored_bytes`.
 
     ``MARSYARD_CACHE_GB`` if it is set; otherwise 40 % of the space that is free without the cached files, at most
     10 GB. Raises ValueError if the variable is not a positive number.
     """
     configured = os.environ.get("MARSYARD_CACHE_GB")
     if not configured:
-        return int(min(FREE_FRACTION * (shutil.disk_usage(folder).free + kept_bytes), LIMIT_GB * GIGA))
+        return int(min(FREE_FRACTION * (shutil.disk_usage(folder).free + stored_bytes), LIMIT_GB * GIGA))
     try:
         gigabytes = float(configured)
     except ValueError:
@@ -63,11 +63,11 @@ def cached_bytes(folder: Path) -> int:
     return total
 
 
-def evict_files(folder: Path, wanted_bytes: int, in_use: Collection[Path] = ()) -> None:
-    """Delete the least recently used files of a folder until a file of `wanted_bytes` fits under the limit.
+def evict_files(folder: Path, new_file_bytes: int, in_use: Collection[Path] = ()) -> None:
+    """Delete the least recently used files of a folder until a file of `new_file_bytes` fits under the limit.
 
     Files `in_use` are never deleted. Unfinished files are deleted once they are a day old. Other processes may delete
-    files at the same time, or hold a deleted file open. Raises ValueError as `limit_bytes` does.
+    files at the same time, or still read a deleted file. Raises ValueError under the same condition as `limit_bytes`.
     """
     entries, stored_bytes = [], 0
     for path in folder.iterdir():
@@ -80,7 +80,7 @@ def evict_files(folder: Path, wanted_bytes: int, in_use: Collection[Path] = ()) 
                 path.unlink()
     limit = limit_bytes(folder, stored_bytes)
     for _, path, size in sorted(entries):
-        if stored_bytes + wanted_bytes <= limit:
+        if stored_bytes + new_file_bytes <= limit:
             break
         if path not in in_use:
             path.unlink(missing_ok=True)
@@ -88,7 +88,7 @@ def evict_files(folder: Path, wanted_bytes: int, in_use: Collection[Path] = ()) 
 
 
 def touch(path: Path) -> None:
-    """Set a file's access time to now, if the folder is writable; the modification time identifies verified files."""
+    """Set a file's access time to now and leave its modification time unchanged; does nothing if not permitted."""
     with contextlib.suppress(OSError):
         os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
 
@@ -96,17 +96,17 @@ def touch(path: Path) -> None:
 def save_array(path: Path, array: np.ndarray) -> np.ndarray:
     """Write an array with its checksum atomically; return it memory-mapped and read-only.
 
-    File and folder are synced, so that a power loss leaves the whole file or none. The file is mapped before it is
-    renamed, because another process may delete it at once. Raises OSError if it cannot be written.
+    File and folder are synced, so that after a power loss the file is either complete or missing. The file is mapped
+    before it is renamed, because another process may delete it at once. Raises OSError if it cannot be written.
     """
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=UNFINISHED, delete=False) as part:
         try:
             np.save(part.file, array)
-            part.write(_checksum(array))
+            part.write(_compute_checksum(array))
             part.flush()
             os.fsync(part.fileno())
             mapped: np.ndarray = np.load(part.name, mmap_mode="r").view(np.ndarray)
-            state = _file_state(Path(part.name))
+            state = _read_file_state(Path(part.name))
             Path(part.name).replace(path)
         except BaseException:
             Path(part.name).unlink(missing_ok=True)
@@ -122,17 +122,17 @@ def save_array(path: Path, array: np.ndarray) -> np.ndarray:
 def load_array(path: Path) -> np.ndarray | None:
     """Map an array written by `save_array`, read-only; return None if the file is missing or damaged.
 
-    The first use of a file in a process verifies its checksum (about 0.3 s per GB of cached pages). Later uses compare
-    the file's state only. Issues a `CacheWarning` for a damaged file.
+    The first load of a file in a process verifies its checksum (about 0.3 s per GB if the file is in memory). Later
+    loads compare only the file's state (`_VERIFIED`). Issues a `CacheWarning` for a damaged file.
     """
     try:
-        state = _file_state(path)
+        state = _read_file_state(path)
         mapped: np.ndarray = np.load(path, mmap_mode="r").view(np.ndarray)
         if _VERIFIED.get(path) != state:
             with path.open("rb") as file:
                 file.seek(-_CHECKSUM_BYTES, os.SEEK_END)
                 stored = file.read()
-            if stored != _checksum(mapped):
+            if stored != _compute_checksum(mapped):
                 raise ValueError("its checksum does not match its content")
     except FileNotFoundError:
         return None
@@ -143,10 +143,10 @@ def load_array(path: Path) -> np.ndarray | None:
     return mapped
 
 
-def _file_state(path: Path) -> tuple[int, int, int, int]:
+def _read_file_state(path: Path) -> tuple[int, int, int, int]:
     status = path.stat()
     return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
 
 
-def _checksum(array: np.ndarray) -> bytes:
+def _compute_checksum(array: np.ndarray) -> bytes:
     return zlib.crc32(np.ascontiguousarray(array).data).to_bytes(_CHECKSUM_BYTES, "little")

@@ -26,8 +26,8 @@ ArrayHeader = tuple[tuple[int, ...], np.dtype[Any]]  #: Shape and type of an arr
 def check_regular(path: str | Path) -> os.stat_result:
     """Return the status of a regular file or of the target of a link.
 
-    Raises OSError if the file is missing, a folder, a named pipe or a device: opening a pipe may block for ever, and a
-    device may have no end.
+    Raises OSError if the file is missing, a folder, a named pipe or a device: opening a pipe can block for ever, and a
+    device can contain infinitely many bytes.
     """
     status = Path(path).stat()
     if stat.S_ISDIR(status.st_mode):
@@ -44,7 +44,7 @@ def open_regular(path: str | Path) -> BinaryIO:
     return Path(path).open("rb")
 
 
-def npz_headers(path: str | Path) -> dict[str, ArrayHeader]:
+def read_npz_headers(path: str | Path) -> dict[str, ArrayHeader]:
     """Read shape and type of each array of an .npz archive without expanding it; raises one of `ARCHIVE_ERRORS`."""
     check_regular(path)
     headers: dict[str, ArrayHeader] = {}
@@ -52,22 +52,22 @@ def npz_headers(path: str | Path) -> dict[str, ArrayHeader]:
         for entry in archive.infolist():
             if entry.filename.endswith(".npy"):
                 with archive.open(entry) as member:
-                    headers[entry.filename.removesuffix(".npy")] = npy_header(member)
+                    headers[entry.filename.removesuffix(".npy")] = read_npy_header(member)
     return headers
 
 
-def npy_header(file: Any) -> ArrayHeader:
+def read_npy_header(file: Any) -> ArrayHeader:
     """Read shape and type from the header of an open .npy file. Raises ValueError if it has no valid header."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"version {version} of .npy files is not read")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
+        raise ValueError(f"version {version} of .npy files is not supported")
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(file)
     return tuple(int(side) for side in shape), dtype
 
 
 def expanded_bytes(path: str | Path) -> int:
-    """Return the expanded size of a zip archive by its directory. Raises OSError or zipfile.BadZipFile."""
+    """Sum the expanded sizes in the directory of a zip archive. Raises OSError or zipfile.BadZipFile."""
     check_regular(path)
     with zipfile.ZipFile(path) as archive:
         return sum(entry.file_size for entry in archive.infolist())

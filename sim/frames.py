@@ -1,4 +1,4 @@
-"""Frames, rotations and rigid transforms: the conventions of all other modules.
+"""Coordinate frames, rotations and rigid transforms: conventions and helper functions for all other modules.
 
 - world: local level, right-handed: x east, y north, z up, metres. Terrain heights are z.
 - body: fixed to the vehicle. With the identity attitude its axes are those of the world: x east ("forward"), y north
@@ -16,17 +16,17 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-#: Site axes (north, east, down) from world axes (east, north, up); its own inverse.
+#: Rotation from world axes (east, north, up) to site axes (north, east, down); it is equal to its inverse.
 SITE_FROM_WORLD = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))
 
 
 def rigid(rotation: Rotation, translation: Float[np.ndarray, "3"]) -> RigidTransform:
-    """The transform ``x -> rotation x + translation``."""
+    """Create the transform ``x -> rotation x + translation``."""
     return rigid_from_axes(rotation.as_matrix(), translation)
 
 
 def rigid_from_axes(axes: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> RigidTransform:
-    """The transform ``x -> axes x + translation``; `axes` must be a rotation matrix, which is not checked."""
+    """Create the transform ``x -> axes x + translation``; it is not checked that `axes` is a rotation matrix."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = axes, translation
     return RigidTransform(matrix, normalize=False, copy=False)  # ten times faster than with the check
@@ -43,7 +43,7 @@ def rotation_matrix(transform: RigidTransform) -> Float[np.ndarray, "3 3"]:
 
 
 def direction(azimuth_rad: float, elevation_rad: float) -> Float[np.ndarray, "3"]:
-    """Unit vector in the world frame; azimuth clockwise from north, elevation above the horizon, both in radians."""
+    """Return a unit vector in the world frame; azimuth clockwise from north, elevation above the horizon, radians."""
     horizontal = np.cos(elevation_rad)
     east, north = horizontal * np.sin(azimuth_rad), horizontal * np.cos(azimuth_rad)
     return np.array([east, north, np.sin(elevation_rad)], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Statistics of pictures of ground that need no calibration, to compare rendered pictures with flown ones."""
+"""Statistics of terrain images to compare rendered images with real ones; the camera need not be calibrated."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-#: Side of the compared pictures, pixels: that at which DIMES works. Side of the blocks of local contrast.
+#: Side of the resized images, pixels, as in DIMES; and side of the blocks for the local contrast.
 SIDE, BLOCK = 256, 16
-#: Range of the fit of the power spectrum, cycles per picture.
-LOWEST, HIGHEST = 4, 63
+#: Frequency range of the fit to the power spectrum, cycles per image.
+MIN_FREQUENCY, MAX_FREQUENCY = 4, 63
 
 
 class ImageStatistics(NamedTuple):
-    """Statistics of a picture's central square, area-averaged to `SIDE` pixels.
+    """Statistics of an image's central square, area-averaged to `SIDE` x `SIDE` pixels.
 
     - rms: standard deviation divided by the mean
-    - slope: exponent of the radially averaged power spectrum between `LOWEST` and `HIGHEST`, with a Hann window
-    - local_p10, local_p50, local_p90: percentiles over blocks of a block's standard deviation divided by its mean
+    - slope: exponent of the radially averaged power spectrum from `MIN_FREQUENCY` to `MAX_FREQUENCY`, Hann window
+    - local_p10, local_p50, local_p90: percentiles over all blocks of (standard deviation / mean of a block)
     - patchiness: local_p90 / local_p10
-    - corner: mean beyond 0.9 of the half diagonal, divided by the mean within 0.25 of it
+    - corner: mean at distances above 0.9 half diagonals from the centre, divided by the mean below 0.25
     """
 
     rms: float
@@ -33,12 +33,12 @@ class ImageStatistics(NamedTuple):
     corner: float
 
 
-def image_statistics(picture: Float[np.ndarray, "rows columns"]) -> ImageStatistics:
-    """Compute the statistics of a picture in any unit proportional to radiance."""
-    rows, columns = picture.shape
+def compute_image_statistics(image: Float[np.ndarray, "rows columns"]) -> ImageStatistics:
+    """Compute the statistics of an image in any unit proportional to radiance."""
+    rows, columns = image.shape
     side = min(rows, columns)
     top, left = (rows - side) // 2, (columns - side) // 2
-    square = np.asarray(picture[top : top + side, left : left + side], dtype=np.float64)
+    square = np.asarray(image[top : top + side, left : left + side], dtype=np.float64)
     small = cv2.resize(square, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
     p10, p50, p90 = local_contrast(small)
     offset = np.arange(SIDE) - 0.5 * (SIDE - 1)
@@ -48,12 +48,12 @@ def image_statistics(picture: Float[np.ndarray, "rows columns"]) -> ImageStatist
     return ImageStatistics(rms, spectral_slope(small), p10, p50, p90, p90 / p10, corner)
 
 
-def local_contrast(picture: Float[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
-    """Compute the 10, 50 and 90 % percentiles of a block's standard deviation divided by its mean.
+def local_contrast(image: Float[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
+    """Compute the 10, 50 and 90 % percentiles over all blocks of (standard deviation / mean of a block).
 
-    The picture is resized to `SIDE` x `SIDE` pixels; NaN if all blocks are black.
+    The image is resized to `SIDE` x `SIDE` pixels first. The result is NaN if all blocks are black.
     """
-    small = cv2.resize(np.asarray(picture, dtype=np.float64), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(np.asarray(image, dtype=np.float64), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
     blocks = small.reshape(SIDE // BLOCK, BLOCK, SIDE // BLOCK, BLOCK)
     deviation, mean = blocks.std(axis=(1, 3)), blocks.mean(axis=(1, 3))
     if not np.any(mean > 0.0):
@@ -62,14 +62,14 @@ def local_contrast(picture: Float[np.ndarray, "rows columns"]) -> tuple[float, f
     return float(p10), float(p50), float(p90)
 
 
-def spectral_slope(picture: Float[np.ndarray, "side side"]) -> float:
-    """Exponent of the radially averaged power spectrum of a square picture."""
-    side = len(picture)
+def spectral_slope(image: Float[np.ndarray, "side side"]) -> float:
+    """Fit the exponent of the radially averaged power spectrum of a square image."""
+    side = len(image)
     window = np.hanning(side)
-    relative = picture / picture.mean() - 1.0
+    relative = image / image.mean() - 1.0
     power = np.abs(np.fft.fft2(relative * window[:, None] * window)) ** 2
     frequency = np.fft.fftfreq(side, 1.0 / side)
     ring = np.hypot(frequency[:, None], frequency).astype(int).ravel()
-    radial = np.bincount(ring, power.ravel()) / np.bincount(ring)
-    k = np.arange(LOWEST, HIGHEST + 1)
-    return float(np.polyfit(np.log(k), np.log(radial[k]), 1)[0])
+    radial_mean = np.bincount(ring, power.ravel()) / np.bincount(ring)
+    k = np.arange(MIN_FREQUENCY, MAX_FREQUENCY + 1)
+    return float(np.polyfit(np.log(k), np.log(radial_mean[k]), 1)[0])

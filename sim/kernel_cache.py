@@ -1,7 +1,7 @@
-"""Cache folder of compiled kernels: one folder per version of the kernel sources.
+"""Cache folder of kernels compiled by numba: one folder per version of the kernel sources.
 
-numba recompiles a function when its file changes, but not when a function that it calls in another file changes. A
-stale kernel would return old results. Therefore a change of any kernel source selects a new folder.
+numba recompiles a function when its file changes, but not when a function that it calls in another file changes. The
+cached function would then return outdated results. Therefore a change of any kernel source selects a new folder.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _FOLDERS = ("sim", "algorithms", "scenarios")
 
 
 def set_cache_folder() -> None:
-    """Set numba's cache folder from a hash of the kernel sources, without importing numba, if the user sets none."""
+    """Set numba's cache folder by a hash of the kernel sources, unless the user sets it; numba is not imported."""
     if "NUMBA_CACHE_DIR" in os.environ:
         return
     root, digest = Path(__file__).parents[1], hashlib.sha256(sys.version.encode())
@@ -49,13 +49,13 @@ def set_cache_folder() -> None:
 
 
 def kernels_are_ready(user: str) -> bool:
-    """Whether a user of the kernels (a scenario) has completed a run with the cached kernels on this processor type."""
+    """Return whether a scenario (`user`) has completed a run with the cached kernels on this type of processor."""
     marker = _marker_path(user)
     return marker is not None and marker.exists()
 
 
 def mark_ready(user: str) -> None:
-    """Record that the kernels of this user (a scenario) are compiled."""
+    """Record that all kernels of a scenario (`user`) are compiled, by a marker file."""
     if (marker := _marker_path(user)) is not None:
         with suppress(OSError):
             marker.parent.mkdir(parents=True, exist_ok=True)

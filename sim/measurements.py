@@ -20,13 +20,13 @@ from marsyard.sim.frames import rigid_from_axes
 
 @dataclass(frozen=True)
 class DetectorCalibration:
-    """Calibration of an image detector before flight.
+    """Calibration of a detector, determined before flight and used by the algorithms.
 
     - flat_field: relative response of each image pixel (maximum 1)
     - exposure_s: exposure time
     - transfer_row_s: time per physical row during the charge transfer to the storage area
     - clear_row_s: time per physical row while the detector is cleared before the exposure
-    - rows_summed: physical rows summed on the chip into one image row
+    - rows_summed: number of physical rows that are summed on the chip into one image row
     - offset_dn: counts without light
     - full_scale_dn: maximum count (4095 for 12 bits)
     """
@@ -42,13 +42,13 @@ class DetectorCalibration:
 
 @dataclass(frozen=True)
 class DetectorImage:
-    """A picture as read out from a camera.
+    """An image as read out from a camera.
 
-    Row 0 is nearest to the storage area and is shifted out first. The charge of row r passes the rows r-1, r-2, ... 0.
+    Row 0 is next to the storage area and is shifted out first. The charge of row r passes the rows r-1, r-2, ... 0.
 
     - counts: detector counts, after summing on the chip
     - time_s: time tag of the middle of the exposure
-    - camera: the calibrated camera model of this picture, in the body frame
+    - camera: the calibrated camera model of this image, in the body frame
     """
 
     counts: UInt16[np.ndarray, "rows columns"]
@@ -59,7 +59,7 @@ class DetectorImage:
 
 @dataclass(frozen=True)
 class AttitudeMeasurement:
-    """Attitude as propagated on board: rotation from body axes to the world frame, with its time tag."""
+    """Attitude estimated on board: rotation from body axes to world axes, with its time tag."""
 
     world_from_body: Rotation
     time_s: float
@@ -75,13 +75,13 @@ class AltitudeMeasurement:
 
 @dataclass(frozen=True)
 class DescentFrame:
-    """Measurements available to the lander's computer when one descent picture is taken.
+    """Measurements available to the lander's computer when one descent image is taken.
 
-    Both velocities contain the same unknown error: that of the initial velocity of inertial navigation.
+    Both velocities contain the same unknown error, which is the error of inertial navigation's initial velocity.
 
     - sun_direction: unit vector to the sun, world axes
-    - inertial_velocity_m_s: inertial velocity of the camera at the picture, world axes; None if not recorded
-    - interval_velocity_m_s: mean inertial velocity since the previous picture, world axes; None at the first picture
+    - inertial_velocity_m_s: inertial velocity of the camera at the image, world axes; None if not recorded
+    - interval_velocity_m_s: mean inertial velocity since the previous image, world axes; None at the first image
     """
 
     image: DetectorImage
@@ -94,14 +94,14 @@ class DescentFrame:
 
 @dataclass(frozen=True)
 class DescentMeasurements:
-    """Measurements available to the lander's computer after the last descent picture (DIMES takes three).
+    """Measurements available to the lander's computer after the last descent image (DIMES takes three).
 
-    - images, attitudes, altitudes: one of each per picture, in the order of exposure
-    - interval_velocities_m_s: mean inertial velocities of the camera between successive pictures, world axes. All
+    - images, attitudes, altitudes: one of each per image, in the order of exposure
+    - interval_velocities_m_s: mean inertial velocities of the camera between successive images, world axes. All
       contain the unknown error of the initial velocity of inertial navigation; only their differences are accurate
       (the paper's "biased IMU horizontal velocities")
     - sun_direction: unit vector to the sun, world axes
-    - inertial_velocities_m_s: inertial velocities at the pictures, with the same error; None if not recorded
+    - inertial_velocities_m_s: inertial velocities at the images, with the same error; None if not recorded
     """
 
     images: tuple[DetectorImage, ...]
@@ -109,20 +109,20 @@ class DescentMeasurements:
     altitudes: tuple[AltitudeMeasurement, ...]
     interval_velocities_m_s: Float[np.ndarray, "intervals 3"]
     sun_direction: Float[np.ndarray, "3"]
-    inertial_velocities_m_s: Float[np.ndarray, "pictures 3"] | None = None
+    inertial_velocities_m_s: Float[np.ndarray, "images 3"] | None = None
 
     @property
     def tags_s(self) -> tuple[float, ...]:
-        """The pictures' time tags."""
+        """Time tags of the images."""
         return tuple(image.time_s for image in self.images)
 
     @property
     def last_interval_s(self) -> tuple[float, float]:
-        """Time tags of the last two pictures."""
+        """Time tags of the last two images."""
         return self.images[-2].time_s, self.images[-1].time_s
 
     def frames(self) -> tuple[DescentFrame, ...]:
-        """Return the measurements of each picture."""
+        """Return the measurements of each image."""
         velocities = self.inertial_velocities_m_s
         return tuple(
             DescentFrame(
@@ -137,7 +137,7 @@ class DescentMeasurements:
         )
 
     def select(self, indices: tuple[int, ...]) -> DescentMeasurements:
-        """Select pictures by ascending indices; the mean velocities are those between the selected pictures."""
+        """Select images by ascending indices; the mean velocities are those between the selected images."""
         velocities = self.inertial_velocities_m_s
         mean_velocities = [self._mean_velocity(first, second) for first, second in pairwise(indices)]
         return replace(
@@ -160,8 +160,8 @@ class DescentMeasurements:
 class MastGeometry:
     """Geometry of a pan-tilt mast, as surveyed before flight.
 
-    The azimuth axis is parallel to the rover's z axis. The elevation axis is the y axis of the camera head. With both
-    angles zero the head's axes are parallel to the rover's: x forward, y left, z up.
+    The azimuth axis is parallel to the rover's z axis. The elevation axis is the y axis of the camera head. If both
+    angles are zero, the head's axes are parallel to the rover's: x forward, y left, z up.
 
     - base_m: a point of the azimuth axis in the rover (body) frame
     - elbow_m: vector from the base to the elevation axis, in axes that rotate with the azimuth
@@ -177,7 +177,7 @@ class MastGeometry:
     elevation_limits_rad: tuple[float, float] = (-0.5 * np.pi, 0.5 * np.pi)
 
     def rover_from_head(self, azimuth_rad: float, elevation_rad: float) -> RigidTransform:
-        """Pose of the head in the rover frame at these angles; the limits are not checked."""
+        """Compute the pose of the head in the rover frame for these angles; the limits are not checked."""
         (sa, ca), (se, ce) = ((math.sin(angle), math.cos(angle)) for angle in (azimuth_rad, elevation_rad))
         pan = np.array([[ca, sa, 0.0], [-sa, ca, 0.0], [0.0, 0.0, 1.0]])
         rotation = pan @ np.array([[ce, 0.0, -se], [0.0, 1.0, 0.0], [se, 0.0, ce]])
@@ -205,8 +205,8 @@ class MastImage:
 class RoverMeasurements:
     """Measurements available to the rover's computer at a stop: a stereo pair of the mast cameras.
 
-    - left, right: the pictures, taken at the same time
-    - azimuth_rad, elevation_rad: the mast's angles as read by its encoders
+    - left, right: the images, taken at the same time
+    - azimuth_rad, elevation_rad: angles of the mast measured by its encoders
     - world_from_rover: pose of the rover as estimated on board; exact at the start, later with slip and drift errors
     """
 
@@ -222,10 +222,10 @@ class RoverMeasurements:
 class DriveCommand:
     """A drive command: motion with constant velocity and turn rate over a path.
 
-    Straight ahead is ``(d, 0, 0)``, backward ``(-d, 0, 0)``, crabbing ``(0, d, 0)``, a turn in place ``(0, 0, t)``, an
-    arc of radius d / t ``(d, 0, t)``. ``(0, -r * t, t)`` is an arc around a point at distance r straight ahead.
+    Examples: ``(d, 0, 0)`` straight ahead, ``(-d, 0, 0)`` backward, ``(0, d, 0)`` sideways (crabbing), ``(0, 0, t)`` a
+    turn in place, ``(d, 0, t)`` an arc of radius d / t, ``(0, -r * t, t)`` an arc about a point r straight ahead.
 
-    - forward_m, left_m: path along the rover's x and y axes, which turn with the rover
+    - forward_m, left_m: path along the rover's x and y axes, which rotate with the rover
     - turn_left_rad: turn about the rover's z axis, counterclockwise seen from above
     """
 
@@ -242,21 +242,21 @@ class DriveCommand:
     def displacement_m(self) -> Float[np.ndarray, "2"]:
         """Displacement without slip, in the rover's axes at the start (forward, left)."""
         # chord of an arc: the path length times sin(t/2) / (t/2), rotated by t/2
-        half = 0.5 * self.turn_left_rad
-        sine, cosine = np.sin(half), np.cos(half)
+        half_turn = 0.5 * self.turn_left_rad
+        sine, cosine = np.sin(half_turn), np.cos(half_turn)
         path = np.array([[cosine, -sine], [sine, cosine]]) @ np.array([self.forward_m, self.left_m])
-        return np.asarray(float(np.sinc(half / np.pi)) * path)
+        return np.asarray(float(np.sinc(half_turn / np.pi)) * path)
 
     def part(self, fraction: float) -> DriveCommand:
-        """The motion over a fraction of its duration."""
+        """Return the command for a fraction of this motion."""
         return DriveCommand(fraction * self.forward_m, fraction * self.left_m, fraction * self.turn_left_rad)
 
 
 @dataclass(frozen=True)
 class PixelTarget:
-    """A target designated by a full-frame pixel (u, v) in a picture of the left camera at the rover's current position.
+    """A target designated by a full-frame pixel (u, v) in an image of the left camera at the rover's current position.
 
-    The angles are the mast's azimuth and elevation when the picture was taken.
+    The angles are the mast's azimuth and elevation when the image was taken.
     """
 
     pixel: Float[np.ndarray, "2"]
@@ -294,11 +294,11 @@ class PoseMeasurement:
 class LandingMeasurements:
     """Measurements available to the helicopter's computer for the selection of a landing site.
 
-    - images: two overlapping pictures of the ground, in order of exposure, each with its camera in the body frame
-    - poses: the on-board filter's pose at each picture
-    - slant_range_m: laser altimeter range at the first picture, from the camera's centre along the optical axis to the
+    - images: two overlapping images of the ground, in order of exposure, each with its camera in the body frame
+    - poses: the on-board filter's pose at each image
+    - slant_range_m: laser altimeter range at the first image, from the camera's centre along the optical axis to the
       ground; NaN without a return
-    - up_body: unit vector upwards at the first picture as measured by the inclinometers, body axes
+    - up_body: unit vector upwards at the first image as measured by the inclinometers, body axes
     - apriori_site_world: landing site used if no better one is detected; world frame, metres
     """
 

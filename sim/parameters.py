@@ -1,4 +1,4 @@
-"""Base class and common field types of all parameters, and deprecated names of keys, columns and options."""
+"""Base class and field types of all user parameters, and replacement of deprecated names of keys, columns, options."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ class DeprecatedNameWarning(FutureWarning):
 
 
 @cache
-def _names(section: str) -> Mapping[str, str]:
+def _read_renamed(section: str) -> Mapping[str, str]:
+    """Read the current names by deprecated name: keys, columns, options or streams."""
     with Path(__file__).with_name("renamed.toml").open("rb") as file:
         names: dict[str, str] = tomllib.load(file)[section]
     return names
@@ -26,7 +27,7 @@ def _names(section: str) -> Mapping[str, str]:
 
 def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[str] = ()) -> str:
     """Return the current name of a key; the name itself if it is valid, or if the input contains both names."""
-    current = _names("keys").get(name)
+    current = _read_renamed("keys").get(name)
     if current is None or name in valid_keys or current not in valid_keys or current in input_keys:
         return name
     return _warn_deprecated(name, current)
@@ -35,7 +36,7 @@ def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[s
 def current_column(name: str, exists: Callable[[str], bool]) -> str:
     """Return the current name of a column; the name may have the prefix "<algorithm>." of a comparison."""
     algorithm, dot, column = name.rpartition(".")
-    for deprecated, current in _names("columns").items():
+    for deprecated, current in _read_renamed("columns").items():
         match = re.fullmatch(deprecated.replace("*", r"(\d+)"), column)
         renamed = current.replace("*", match[1]) if match and match.groups() else current
         if match and exists(renamed):
@@ -45,12 +46,12 @@ def current_column(name: str, exists: Callable[[str], bool]) -> str:
 
 def current_options(words: Sequence[str]) -> list[str]:
     """Replace deprecated names of options in the words of a command line."""
-    return [_warn_deprecated(word, _names("options").get(word, word)) for word in words]
+    return [_warn_deprecated(word, _read_renamed("options").get(word, word)) for word in words]
 
 
 def stream_name(path: str) -> str:
-    """Random stream name of a dispersed parameter; renamed parameters keep their old stream."""
-    return _names("streams").get(path, path)
+    """Return the random stream name of a dispersed parameter; a renamed parameter uses the stream of its old name."""
+    return _read_renamed("streams").get(path, path)
 
 
 def _warn_deprecated(name: str, current: str) -> str:
@@ -65,12 +66,12 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 def bounded_field(low: float, high: float, description: str) -> Any:
-    """Field of a number from `low` to `high`, both included."""
+    """Create a field of a number from `low` to `high`, both included."""
     return Field(ge=low, le=high, description=description)
 
 
 class Parameters(BaseModel):
-    """User parameters. Unknown keys are errors; deprecated keys are accepted. Validated objects are immutable."""
+    """Base class of user parameters: unknown keys are errors, deprecated keys are accepted, objects are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -27,7 +27,7 @@ def stream_key(campaign: str, case: int, name: str) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Streams:
-    """The random streams of one case: root seed and name of the campaign, and number of the case from zero."""
+    """Random streams of one case: root seed and name of the campaign, and number of the case, counted from zero."""
 
     seed: int
     campaign: str

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.validation.records import Check, Measure
 from marsyard.cli.pictures import ImageRequest, render_images
-from marsyard.sim.image_statistics import ImageStatistics, image_statistics
+from marsyard.sim.image_statistics import ImageStatistics, compute_image_statistics
 
 #: Altitudes of two of Spirit's descent pictures, metres.
 ALTITUDES_M = (1433.0, 1983.0)
@@ -22,7 +22,7 @@ AZIMUTHS_DEG, ELEVATION_DEG = (0.0, 90.0, 180.0, 270.0), -35.0
 
 def _measure(site: str, camera: str, **settings: float | int) -> ImageStatistics:
     image = render_images(ImageRequest.from_defaults(site, camera, **settings), both=False)[0]
-    return image_statistics(image.to_uint16().astype(np.float64))
+    return compute_image_statistics(image.to_uint16().astype(np.float64))
 
 
 def run_descent(quick: bool) -> Iterator[Measure]:

@@ -13,7 +13,7 @@ from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import GroundTruth, World, measure, take_pictures
+from marsyard.scenarios.landing.pictures import GroundTruth, World, measure, take_images
 from marsyard.scenarios.landing.score import map_row, motion_row
 from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
 from marsyard.sim.streams import Streams
@@ -81,9 +81,9 @@ def errors(number: int) -> dict[str, dict[str, Scalar]]:
     p = exact(SITES[number % len(SITES)], streams.generator("pair"))
     world = World.from_parameters(p)
     flight = Flight.from_parameters(p, world.ground.surface, streams)
-    pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
+    pair = take_images(p, world, flight, camera_optics(p.optics), streams)
     measurements = measure(p, flight, pair, streams)
-    truth = GroundTruth.from_pictures(world, flight, pair, p.lander.limits)
+    truth = GroundTruth.from_images(world, flight, pair, p.lander.limits)
     rows: dict[str, dict[str, Scalar]] = {}
     for name, options in (("paper", PAPER), ("ours", OPTIONS)):
         estimate = HdaEstimator(options).estimate(measurements)

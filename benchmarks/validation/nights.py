@@ -12,7 +12,7 @@ from marsyard.reports.history import (
     Comparison,
     History,
     NightCampaign,
-    NightFigure,
+    NightMetric,
     find_changes,
     list_comparisons,
 )
@@ -40,7 +40,7 @@ class Yard:
         self._bank = self._list_drawn_terrains(12)
         self._number = 0
 
-    def night(self, kind: str, worse: float = 1.0) -> list[NightFigure]:
+    def night(self, kind: str, worse: float = 1.0) -> list[NightMetric]:
         """Draw the figures of a campaign in one night; `worse` multiplies every error."""
         self._number += 1
         terrains, (scale_m, answer) = self._terrains(kind)
@@ -51,9 +51,9 @@ class Yard:
         within = (answered & (errors < _BOUND_M)).astype(np.float64)
         errors = np.where(answered, errors, np.nan)
         return [
-            NightFigure("within the bound", True, float(within.mean()), Sample(within, names)),
-            NightFigure("answered", True, float(answered.mean()), Sample(answered.astype(np.float64), names)),
-            NightFigure("error (m)", False, float(np.nanmedian(errors)), Sample(errors, names)),
+            NightMetric("within the bound", True, float(within.mean()), Sample(within, names)),
+            NightMetric("answered", True, float(answered.mean()), Sample(answered.astype(np.float64), names)),
+            NightMetric("error (m)", False, float(np.nanmedian(errors)), Sample(errors, names)),
         ]
 
     def _terrains(self, kind: str) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
@@ -81,7 +81,7 @@ def quiet_nights(nights: int, seed: int) -> int:
             for kind in KINDS:
                 history.add(night, NightCampaign(kind, "", "", "PASS", 0, ""), yard.night(kind))
             flagged = find_changes(list_comparisons(history, night))
-            history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in flagged])
+            history.finish(night, FINISHED, [(one.campaign, one.metric, one.p_value, one.worse) for one in flagged])
             alarms += bool(flagged)
     return alarms
 
@@ -95,5 +95,5 @@ def planted_found(worsened: str, nights: int, seed: int) -> int:
             before = [yard.night(kind) for _ in range(BEFORE)]
             for place, figure in enumerate(yard.night(kind, WORSE if kind == worsened else 1.0)):
                 comparisons.append(Comparison(kind, figure, [night[place].sample for night in before]))
-        named += (worsened, "error (m)") in {(one.campaign, one.figure) for one in find_changes(comparisons)}
+        named += (worsened, "error (m)") in {(one.campaign, one.metric) for one in find_changes(comparisons)}
     return named

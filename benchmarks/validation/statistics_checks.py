@@ -19,7 +19,12 @@ from marsyard.reports.statistics.proportions import (
     proportion_lower,
     proportion_upper,
 )
-from marsyard.reports.statistics.samples import error_ellipse, mean_interval, quantile_bounds, spread_interval
+from marsyard.reports.statistics.samples import (
+    error_ellipse,
+    mean_interval,
+    quantile_bounds,
+    standard_deviation_interval,
+)
 
 CONFIDENCE = 0.9
 #: Cases per terrain.
@@ -45,7 +50,7 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
     )
     intervals: tuple[tuple[str, Callable[[np.ndarray, float], Interval]], ...] = (
         ("mean", mean_interval),
-        ("standard deviation", spread_interval),
+        ("standard deviation", standard_deviation_interval),
     )
     for name, draw, mean, spread in draws:
         for what, interval in intervals:
@@ -131,7 +136,7 @@ def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, f
     covered: dict[str, tuple[bool, ...]] = {
         "95 % quantile": (lower <= truths["95 % quantile"], upper >= truths["95 % quantile"])
     }
-    for what, interval in (("mean", mean_interval), ("standard deviation", spread_interval)):
+    for what, interval in (("mean", mean_interval), ("standard deviation", standard_deviation_interval)):
         low, high = interval(errors, 0.95, terrain)
         covered[what] = (low <= truths[what] <= high,)
     return covered

@@ -1,4 +1,4 @@
-"""A campaign, and the parameters of each case: the campaign's parameters with the sampled values inserted."""
+"""A campaign and the parameters of each of its cases: the campaign's parameters with the case's sampled values."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from marsyard.sim.streams import Streams
 class Campaign:
     """A campaign ready to run.
 
-    configuration: contents of the campaign file and of the command-line options, with complete parameters.
-    scenario: scenario of the campaign's cases.
-    command: words of the command that repeats the campaign; empty if no command started it.
+    - configuration: contents of the campaign file, changed by command-line options, with complete parameters
+    - scenario: scenario of the campaign's cases
+    - command: words of the command that repeats the campaign; empty if no command started it
     """
 
     configuration: CampaignConfiguration
@@ -40,14 +40,14 @@ class Campaign:
     command: tuple[str, ...] = ()
 
     def streams(self, case: int) -> Streams:
-        """Random streams of a case."""
+        """Create the random streams of a case."""
         return Streams(seed=self.configuration.seed, campaign=self.configuration.name, case=case)
 
     def draws(self, case: int) -> dict[str, Any]:
-        """Sampled values of a case by parameter path, in the order of the file.
+        """Compute the sampled values of a case by parameter path, in the order of the file.
 
-        The nominal case samples nothing: its values are the campaign's parameters, except derived ones.
-        Raises ValueError if a formula is undefined for the sampled values or yields an invalid distribution.
+        The values of the nominal case are the campaign's parameters; only fixed and derived values are computed.
+        Raises ValueError if a formula is undefined for the sampled values or results in an invalid distribution.
         """
         parameters = self.configuration.parameters
         probabilities = self.probabilities(case)
@@ -66,7 +66,7 @@ class Campaign:
         return {path: values[path] for path in self.marginals}
 
     def probabilities(self, case: int) -> dict[str, float] | None:
-        """Uniform number of each sampled or swept dispersion of a case; None for the nominal case."""
+        """Compute the uniform number of each random or grid dispersion of a case; None for the nominal case."""
         setup, paths = self.configuration, self.drawn_paths
         position = locate_case(setup.design, setup.blocks, setup.grid_size, case)
         if position is None:
@@ -93,7 +93,7 @@ class Campaign:
 
     @cached_property
     def marginals(self) -> Mapping[str, Dispersion]:
-        """Dispersions by path; members of a covariance have its standard deviations."""
+        """Dispersions by path; dispersions in a covariance matrix have the standard deviations of the matrix."""
         marginals: dict[str, Dispersion] = dict(self.configuration.dispersions)
         for group in self.configuration.correlations:
             for index, row in enumerate(group.covariance or ()):
@@ -109,27 +109,27 @@ class Campaign:
 
     @cached_property
     def order(self) -> tuple[str, ...]:
-        """Paths of the dispersions; each follows those in its formulas. Raises ValueError if formulas form a cycle."""
-        needs = {path: dispersion.names for path, dispersion in self.configuration.dispersions.items()}
+        """Paths in the order of evaluation: a path follows those in its formulas. Raises ValueError for a cycle."""
+        inputs = {path: dispersion.names for path, dispersion in self.configuration.dispersions.items()}
         sequence: dict[str, None] = {}
-        while len(sequence) < len(needs):
-            cycle = [path for path in needs if path not in sequence]
-            ready = [path for path in cycle if all(name in sequence for name in needs[path] if name in needs)]
+        while len(sequence) < len(inputs):
+            remaining = [path for path in inputs if path not in sequence]
+            ready = [path for path in remaining if all(name in sequence for name in inputs[path] if name in inputs)]
             if not ready:
-                raise ValueError(f"formulas depend on each other in a cycle: {', '.join(cycle)}")
+                raise ValueError(f"formulas depend on each other in a cycle: {', '.join(remaining)}")
             sequence.update(dict.fromkeys(ready))
         return tuple(sequence)
 
     def base_parameters(self) -> BaseModel:
-        """Parameters of the campaign without sampled values."""
+        """Create the parameters of the campaign without sampled values."""
         return self.scenario.parameters_type.model_validate(self.configuration.parameters)
 
     def parameters(self, case: int) -> BaseModel:
-        """Parameters of a case. Raises ValueError if sampling fails or the scenario rejects the values."""
+        """Create the parameters of a case. Raises ValueError if sampling fails or the scenario rejects the values."""
         return self.with_values(self.draws(case))
 
     def with_values(self, values: Mapping[str, Any]) -> BaseModel:
-        """Campaign's parameters with the given values at some paths."""
+        """Create the campaign's parameters with other values at some paths."""
         tree: Any = self.configuration.parameters
         for path, value in values.items():
             tree = replace_value(tree, path.split("."), value)
@@ -148,7 +148,7 @@ def replace_value(tree: Any, path: Sequence[str], value: Any) -> Any:
 
 
 def value_at(tree: Any, path: str) -> Any:
-    """Value at a dotted path in nested tables and lists. Raises ValueError if there is no such path."""
+    """Return the value at a dotted path in nested tables and lists. Raises ValueError if there is no such path."""
     node = tree
     for part in path.split("."):
         try:
@@ -159,7 +159,7 @@ def value_at(tree: Any, path: str) -> Any:
 
 
 def find_value(tree: Any, path: str) -> Any:
-    """Value at a dotted path in nested tables and lists; an empty tuple if there is no such path."""
+    """Return the value at a dotted path in nested tables and lists; an empty tuple if there is no such path."""
     try:
         return value_at(tree, path)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Contents of a campaign file: scenario, cases, parameters, dispersions, requirements, limits; renamed keys."""
+"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits), and renamed keys."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from marsyard.campaigns.errors import ConfigurationError, Problem, near_match
+from marsyard.campaigns.errors import ConfigurationError, Problem, suggest_similar
 from marsyard.campaigns.sampling.design import Correlation, Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Grid, Normal
 from marsyard.scenarios.interface import Scenario
@@ -29,7 +29,7 @@ Key = tuple[str | int, ...]
 MAX_CASES = 1_000_000_000
 _Cases = Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)]
 _Count = Annotated[int, Field(strict=True, ge=1)]
-_Amount = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
+_PositiveNumber = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
 _Fraction = Annotated[float, Field(strict=True, gt=0.0, lt=1.0)]
 _Text = Annotated[str, Field(min_length=1)]
 #: Populations of every campaign; any other name in a population is a boolean column.
@@ -37,15 +37,16 @@ POPULATIONS = ("all", "completed", "valid")
 
 
 class Requirement(Parameters):
-    """A condition on a minimum fraction of a population of cases, at a confidence level.
+    """A condition that at least a fraction `probability` of a population of cases must meet, at a confidence.
 
-    With a `bound`, the metric's absolute value must not exceed it; a case without a number fails. Without a bound, the
-    metric is a boolean column (`answered`, for example) that must be true.
+    With a `bound`, the metric's absolute value must not exceed the bound; a case without a number fails. Without a
+    bound, the metric is a boolean column (`answered`, for example) that must be true.
 
     `population` is `all`, `completed`, `valid` (answered cases) or a boolean column; several are joined by " and ". A
     metric with a bound may be a sum of columns, joined by " + "; it is multiplied by `scale` before the comparison.
-    `decide_by = "estimate"` compares the observed rate with the probability, regardless of its interval,
-    for requirements without a confidence. Its best verdict is MET BY RATE, with exit status 3, or 0 with `accept_rate`.
+    `decide_by = "estimate"` is for requirements whose source defines no confidence: if the bounds do not result in
+    PASS, the observed rate is compared with the probability. The verdict is then at best MET BY RATE, with exit status
+    3, or 0 with `accept_rate`.
     """
 
     id: _Text
@@ -57,13 +58,13 @@ class Requirement(Parameters):
     population: Annotated[str, Field(pattern=r"^[A-Za-z]\w*( and [A-Za-z]\w*)*$")] = "all"
     decide_by: Literal["confidence", "estimate"] = "confidence"
     accept_rate: Annotated[bool, Field(strict=True)] = Field(
-        default=False, description="whether MET BY RATE, where the estimate decides, gives the exit status 0"
+        default=False, description="whether the verdict MET BY RATE results in the exit status 0"
     )
     source: str = ""
     kind: Literal["requirement", "observation", "ours"] | None = Field(
-        default=None, description="of a paper: its requirement, or what it observed; or ours"
+        default=None, description="requirement of a paper, observation of a paper, or our own requirement"
     )
-    scale: _Amount = 1.0
+    scale: _PositiveNumber = 1.0
 
     @model_validator(mode="after")
     def _check_accept_rate(self) -> Requirement:
@@ -83,35 +84,34 @@ class Requirement(Parameters):
 
 
 class Retain(Parameters):
-    """Cases that keep their products (histories, images, intermediate results); rows are always kept.
+    """Selection of the cases whose products (histories, images, intermediate results) are stored.
 
     `showcase` is the case shown in the report: the answered case with the worst metric of the first requirement, the
-    first case, or none.
+    first case, or none. The rows of all cases are stored.
     """
 
     showcase: Literal["worst", "first", "none"] = "worst"
     products: Literal["none", "failed", "worst", "every", "all"] = Field(
         default="none",
-        description="of no case except the showcase, of those that fail a requirement, of the `worst` by the metric of "
-        "the first requirement with a bound, of every `every`-th case, or of all",
+        description="cases in addition to the showcase: none, those that fail a requirement, the `worst` by the metric "
+        "of the first requirement with a bound, every `every`-th case, or all",
     )
     worst: _Count = 10
     every: _Count = 100
     budget_gb: Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)] = Field(
-        default=10.0, description="maximum disk space of the kept products; no more are kept once it is used"
+        default=10.0, description="maximum disk space of the stored products; further products are not stored"
     )
 
 
 class Limits(Parameters):
-    """Limits of one case. A case that exceeds a limit is terminated, and its outcome names the limit."""
+    """Limits of one case. A case that exceeds a limit is terminated; its outcome identifies the limit."""
 
-    case_time_s: _Amount = Field(default=600.0, description="wall-clock time of a case")
-    prepare_time_s: _Amount = Field(default=3600.0, description="wall-clock time of building a shared input")
-    memory_gb: _Amount | None = Field(
-        default=None,
-        description="memory that a worker has to itself; by default an equal fraction of 80 % of the free memory",
+    case_time_s: _PositiveNumber = Field(default=600.0, description="wall-clock time of a case")
+    prepare_time_s: _PositiveNumber = Field(default=3600.0, description="wall-clock time to build a shared input")
+    memory_gb: _PositiveNumber | None = Field(
+        default=None, description="private memory of a worker; by default an equal fraction of 80 % of the free memory"
     )
-    output_mb: _Amount = Field(default=10.0, description="maximum size of a case's standard output and error")
+    output_mb: _PositiveNumber = Field(default=10.0, description="maximum size of a case's standard output and error")
 
 
 class CampaignConfiguration(Parameters):
@@ -131,8 +131,8 @@ class CampaignConfiguration(Parameters):
     limits: Limits = Limits()
     max_cases: _Cases | None = Field(
         default=None,
-        description="cases at the last interim analysis of a campaign that stops when its verdicts are decided; set by "
-        "--until-decided",
+        description="cases at the last planned evaluation of a campaign that stops when its verdicts are decided; set "
+        "by --until-decided",
     )
     appended: tuple[_Cases, ...] = Field(
         default=(), strict=False, description="sizes of the blocks of cases that were added after the first"
@@ -167,7 +167,7 @@ class CampaignConfiguration(Parameters):
         return (self.cases, *self.appended)
 
     def find_sampling_problems(self) -> list[tuple[Key, str]]:
-        """Problems of the design, the correlated groups and their dispersions: keys and messages."""
+        """List problems of the design, the correlated groups and their dispersions: keys and messages."""
         problems: list[tuple[Key, str]] = []
         if (problem := self.design.find_invalid_block(self.blocks, self.grid_size)) is not None:
             block, message = problem
@@ -175,7 +175,7 @@ class CampaignConfiguration(Parameters):
         group_indices: dict[str, int] = {}
         for number, group in enumerate(self.correlations):
             for index, path in enumerate(group.parameters):
-                reason = self._check_member(group, path)
+                reason = self._find_correlation_problem(group, path)
                 if path in group_indices:
                     reason = f"'{path}' is in correlations[{group_indices[path]}] already"
                 if reason:
@@ -190,11 +190,11 @@ class CampaignConfiguration(Parameters):
                 problems.append((("dispersions", path), f"its table '{parent}' is already dispersed as a whole"))
         return problems
 
-    def _check_member(self, group: Correlation, path: str) -> str:
-        """Reason why a dispersion cannot be correlated; empty if it can be."""
+    def _find_correlation_problem(self, group: Correlation, path: str) -> str:
+        """Return the reason why a dispersion cannot be correlated; empty if there is none."""
         dispersion = self.dispersions.get(path)
         if dispersion is None:
-            return f"'{path}' is not dispersed{near_match(path, self.dispersions)}"
+            return f"'{path}' is not dispersed{suggest_similar(path, self.dispersions)}"
         if not dispersion.continuous:
             return f"'{path}' has no density: only continuous distributions can be correlated"
         if dispersion.formulas:
@@ -229,14 +229,14 @@ def read_table(path: Path, model: type[Model]) -> Model:
 
 
 def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
-    """Problems of a validation: keys as in the file, and messages with the allowed values."""
+    """List the problems of a validation: keys as in the file, and messages with the allowed values."""
     problems: list[tuple[Key, str]] = []
     for detail in error.errors(include_url=False):
         location, value, message = detail["loc"], detail["input"], str(detail["msg"])
         if detail["type"] == "extra_forbidden":
             models = _list_models(reduce(_find_inner_type, location[:-1], model))
             allowed = sorted({name for option in models for name in option.model_fields})
-            message = f"unknown key{near_match(str(location[-1]), allowed)}; allowed: {', '.join(allowed)}"
+            message = f"unknown key{suggest_similar(str(location[-1]), allowed)}; allowed: {', '.join(allowed)}"
         elif detail["type"] == "missing":
             message = "required, but missing"
         elif detail["type"] == "value_error":
@@ -258,7 +258,7 @@ def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[
 
 
 def key_text(key: Iterable[str | int]) -> str:
-    """A key in TOML syntax: ``dispersions."wind.east_m_s".low`` or ``requirements[0].bound``."""
+    """Format a key in TOML syntax: ``dispersions."wind.east_m_s".low`` or ``requirements[0].bound``."""
     text = ""
     for part in key:
         if isinstance(part, int):
@@ -270,14 +270,14 @@ def key_text(key: Iterable[str | int]) -> str:
 
 
 def description_at(model: type[BaseModel], path: str) -> str:
-    """Description of a model's field at a dotted path; empty if it has none."""
+    """Return the description of a model's field at a dotted path; empty if the field has none."""
     *tables, name = path.split(".")
     models = _list_models(reduce(_find_inner_type, (int(part) if part.isdigit() else part for part in tables), model))
     return next((option.model_fields[name].description or "" for option in models if name in option.model_fields), "")
 
 
 def current_path(model: type[BaseModel], path: str) -> str:
-    """Dotted path of a model's field in its current names; unchanged if the model has no such field."""
+    """Replace former names in the dotted path of a model's field by current names; unknown names are unchanged."""
     kind: Any = model
     parts = []
     for part in path.split("."):
@@ -288,7 +288,7 @@ def current_path(model: type[BaseModel], path: str) -> str:
 
 
 def _find_inner_type(kind: Any, part: str | int) -> Any:
-    """Type at one part of a location."""
+    """Find the type of the field, entry or element `part` of a type; None if there is none."""
     inner_types: list[Any] = []
     for choice in _list_alternatives(kind):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
@@ -304,12 +304,12 @@ def _find_inner_type(kind: Any, part: str | int) -> Any:
 
 
 def _list_models(kind: Any) -> list[type[BaseModel]]:
-    """Pydantic models among the alternatives of a type."""
+    """List the pydantic models among the alternatives of a type."""
     return [item for item in _list_alternatives(kind) if isinstance(item, type) and issubclass(item, BaseModel)]
 
 
 def _list_alternatives(kind: Any) -> list[Any]:
-    """Members of a union; annotations are removed."""
+    """List the members of a union, or the type itself; annotations are removed."""
     origin = get_origin(kind)
     if origin is Annotated:
         return _list_alternatives(get_args(kind)[0])
@@ -320,21 +320,23 @@ def _list_alternatives(kind: Any) -> list[Any]:
 
 _NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
 #: Keys of a dispersion whose texts are not formulas.
-_TEXTS = ("distribution", "source", "description", "unit")
+_TEXT_KEYS = ("distribution", "source", "description", "unit")
 
 
 def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str, Any]:
-    """Tables of a campaign file with the current names of dispersed parameters and columns; warn of former names.
+    """Replace former names of dispersed parameters and columns in the tables of a campaign file, with warnings.
 
-    The parameter models rename the keys of the parameters themselves.
+    The parameter models replace the former keys of the parameters themselves.
     """
     path = partial(current_path, selected.parameters_type)
-    column = _column_names(str(tables.get("scenario")))
+    column = _column_renamer(str(tables.get("scenario")))
     current = dict(tables)
     dispersions, correlations = tables.get("dispersions"), tables.get("correlations")
     if isinstance(dispersions, Mapping):
         current["dispersions"] = {
-            path(name): {key: _replace(value, path) if key not in _TEXTS else value for key, value in table.items()}
+            path(name): {
+                key: _rename_in_value(value, path) if key not in _TEXT_KEYS else value for key, value in table.items()
+            }
             if isinstance(table, Mapping)
             else table
             for name, table in dispersions.items()
@@ -348,7 +350,7 @@ def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str
 
 
 def update_stored_configuration(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Configuration of a stored campaign in the current names, without a warning."""
+    """Replace former names in the configuration of a stored campaign, without warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecatedNameWarning)
         stored = {current_key(key, CampaignConfiguration.model_fields): value for key, value in stored.items()}
@@ -362,14 +364,15 @@ def update_stored_configuration(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def find_renamed_columns(names: Iterable[str], scenario_name: str) -> dict[str, str]:
-    """Stored columns with a former name, each with its current name; without a warning."""
-    column = _column_names(scenario_name)
+    """Map stored columns that have a former name to their current names, without warnings."""
+    column = _column_renamer(scenario_name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecatedNameWarning)
         return {name: current for name in names if (current := column(name)) != name}
 
 
-def _column_names(scenario_name: str) -> Callable[[str], str]:
+def _column_renamer(scenario_name: str) -> Callable[[str], str]:
+    """Create the function that returns the current name of a column of a scenario."""
     try:
         columns = row_columns(scenario_name)
     except ValueError:
@@ -379,14 +382,14 @@ def _column_names(scenario_name: str) -> Callable[[str], str]:
     return lambda name: current_column(name, lambda key: columns.has_flag(key) or columns.has_number(key))
 
 
-def _replace(value: Any, rename: Callable[[str], str]) -> Any:
-    """Value with renamed names in its formula or in its list of names."""
+def _rename_in_value(value: Any, rename: Callable[[str], str]) -> Any:
+    """Rename all names in a formula, or in a list of names or formulas."""
     if isinstance(value, str):
         return _NAME.sub(lambda match: rename(match[0]), value)
-    return [_replace(item, rename) for item in value] if isinstance(value, list) else value
+    return [_rename_in_value(item, rename) for item in value] if isinstance(value, list) else value
 
 
 def _rename_entries(entry: Any, keys: Iterable[str], rename: Callable[[str], str]) -> Any:
     if not isinstance(entry, Mapping):
         return entry
-    return {key: _replace(value, rename) if key in keys else value for key, value in entry.items()}
+    return {key: _rename_in_value(value, rename) if key in keys else value for key, value in entry.items()}

@@ -1,6 +1,6 @@
 """Identity of a campaign: hashes and versions of all inputs, except the case number, that determine its rows.
 
-The record also describes the algorithms under test: class, version, options, and a hash of the sources.
+The module also describes the algorithms of a campaign for its record: class, version, options, hash of the sources.
 """
 
 from __future__ import annotations
@@ -30,21 +30,22 @@ from marsyard.scenarios.offline import answers_file, is_offline
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
 from marsyard.scenarios.user_files import import_object, input_files, relative_to, source_files
 
-#: Packages whose code determines rows; reports and commands change no row.
-_CODE = ("sim", "algorithms", "scenarios", "campaigns")
-#: Keys of a configuration that change no row of a finished case.
+#: Folders of the packages whose code determines rows; reports and commands do not affect rows.
+_CODE_FOLDERS = ("sim", "algorithms", "scenarios", "campaigns")
+#: Keys of a configuration that do not affect the row of a finished case.
 _KEYS_WITHOUT_EFFECT = frozenset({"appended", "description", "limits", "max_cases", "requirements", "retain"})
-_HOME = Path(__file__).resolve().parents[2]
+_PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
 class Identity:
-    """All values that must be equal for two runs of a case to give the same row, on one machine.
+    """All values that must be equal so that two runs of a case on one machine have the same row.
 
-    configuration: hash of the keys that determine the cases. code: hash of the sources of `sim`, `algorithms`,
-    `scenarios`, `campaigns`, and of custom scenarios, algorithms and parts. versions: versions of Python, Marsyard and
-    the packages that it requires. inputs: hashes of the parameters' input files, by path as written; missing files are
-    omitted. None if the record of an earlier version contains none, so that changes are unknown.
+    - configuration: hash of the keys that determine the cases
+    - code: hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of custom code
+    - versions: versions of Python, Marsyard and the packages that Marsyard requires
+    - inputs: hashes of the parameters' input files, by path as in the parameters; missing files are omitted. None for a
+      record of an earlier version without hashes, so that changes of the files are unknown
     """
 
     configuration: str
@@ -54,12 +55,12 @@ class Identity:
 
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> Self:
-        """Identity stored in a record."""
+        """Read an identity from a record."""
         inputs = None if stored.get("inputs") is None else dict(stored["inputs"])
         return cls(str(stored["configuration"]), str(stored["code"]), dict(stored["versions"]), inputs)
 
     def differences(self, other: Identity) -> list[str]:
-        """Differences from another identity, each in a few words."""
+        """Describe the differences from another identity, each in a few words."""
         pairs = {name: (getattr(self, name)[:12], getattr(other, name)[:12]) for name in ("configuration", "code")}
         for name in sorted({*self.versions, *other.versions}):
             pairs[name] = (str(self.versions.get(name)), str(other.versions.get(name)))
@@ -69,7 +70,7 @@ class Identity:
 
 
 def create_identity(configuration: CampaignConfiguration) -> Identity:
-    """Identity of a campaign if it were run now.
+    """Create the identity of a campaign with the current code, versions and input files.
 
     Raises CampaignError if an input file is no longer valid.
     """
@@ -79,7 +80,7 @@ def create_identity(configuration: CampaignConfiguration) -> Identity:
 
 
 def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
-    """SHA-256 of each input file of the parameters or their dispersions, by path.
+    """Compute the SHA-256 of each input file of the parameters or their dispersions, by path.
 
     Raises CampaignError if the scenario rejects the parameters, for example because a file is missing or has changed.
     """
@@ -104,7 +105,7 @@ def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
 
 
 def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
-    """Algorithms under test in a configuration or its dispersions."""
+    """List the algorithms in a configuration or its dispersions: under test, then compared."""
     selected = find_scenario(configuration.scenario)
     if not isinstance(selected, HasAlgorithms):
         return ()
@@ -116,7 +117,7 @@ def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
 
 
 def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
-    """Import paths (``module:name``) of the custom parts in a configuration or its dispersions."""
+    """List the import paths (``module:name``) of the custom parts in a configuration or its dispersions."""
     selected = find_scenario(configuration.scenario)
     if not isinstance(selected, HasParts):
         return ()
@@ -137,7 +138,7 @@ def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
 
 
 def find_scenario(name: object) -> Scenario | None:
-    """Scenario of a name; None if the name is invalid or unknown."""
+    """Return the scenario with a name; None if the name is invalid or unknown."""
     try:
         return scenario(name) if isinstance(name, str) and name else None
     except UnknownScenarioError:
@@ -145,23 +146,23 @@ def find_scenario(name: object) -> Scenario | None:
 
 
 def configuration_hash(configuration: CampaignConfiguration) -> str:
-    """Hash of the configuration keys that determine the cases."""
+    """Compute the hash of the configuration keys that determine the cases."""
     values = configuration.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 @cache
 def hash_code(components: tuple[str, ...]) -> str:
-    """Hash of the sources that determine rows; `components` are the scenario, algorithms and parts."""
+    """Compute the hash of the sources that determine rows; `components`: names of scenario, algorithms and parts."""
     sources: list[tuple[str, Path]] = []
-    for folder in _CODE:
+    for folder in _CODE_FOLDERS:
         for pattern in ("*.py", "*.json"):
-            sources += relative_to(_HOME, sorted((_HOME / folder).rglob(pattern)))
+            sources += relative_to(_PACKAGE_FOLDER, sorted((_PACKAGE_FOLDER / folder).rglob(pattern)))
     return hash_sources((*sources, *(source for name in components for source in custom_sources(name))))
 
 
 def hash_sources(sources: Iterable[tuple[str, Path]]) -> str:
-    """SHA-256 of the names and contents of source files."""
+    """Compute the SHA-256 of the names and contents of source files."""
     digest = hashlib.sha256()
     for name, path in sources:
         contents = path.read_bytes()
@@ -171,7 +172,7 @@ def hash_sources(sources: Iterable[tuple[str, Path]]) -> str:
 
 
 def custom_sources(spec: str) -> Iterator[tuple[str, Path]]:
-    """Source files of a custom scenario, algorithm or part: package or module, program, or table of answers."""
+    """Yield the source files of a custom scenario, algorithm or part: package or module, program, or answer table."""
     table = answers_file(spec)
     try:
         command = None if table is not None else parse_command(spec)
@@ -187,7 +188,7 @@ def custom_sources(spec: str) -> Iterator[tuple[str, Path]]:
 
 
 def read_versions() -> dict[str, str]:
-    """Versions of Python, of Marsyard and of the packages that it requires."""
+    """Return the versions of Python, of Marsyard and of the packages that Marsyard requires."""
     try:
         requirements = metadata.requires("marsyard") or []
     except metadata.PackageNotFoundError:
@@ -224,8 +225,8 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
         shipped = spec in selected.task.shipped
         sources = list(source_files("algorithms:") if shipped else custom_sources(spec))
         if shipped:
-            options_given = (value for _, value in parameters if isinstance(value, selected.task.options))
-            algorithm = selected.task.shipped[spec](next(options_given, selected.task.options()))
+            configured_options = (value for _, value in parameters if isinstance(value, selected.task.options))
+            algorithm = selected.task.shipped[spec](next(configured_options, selected.task.options()))
             kind, version = type(algorithm), _distribution_version("marsyard")
             path = f"{kind.__module__}:{kind.__qualname__}"
             options = _plain_options(getattr(algorithm, "options", None))
@@ -245,7 +246,7 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
 
 
 def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
-    """Class or file, version and options of a custom algorithm."""
+    """Return class or file, version and options of a custom algorithm."""
     command = parse_command(spec)
     if command is not None or is_offline(spec):
         return (spec.partition(":")[2] if command is None else command.words[0]), None, {}
@@ -258,7 +259,7 @@ def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
 
 
 def _plain_options(options: object) -> dict[str, Any]:
-    """Options as JSON values; empty without options, or if JSON cannot represent them."""
+    """Convert options to JSON values; empty without options, or if JSON cannot represent the options."""
     try:
         if isinstance(options, BaseModel):
             options = options.model_dump(mode="json")

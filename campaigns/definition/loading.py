@@ -1,6 +1,6 @@
-"""Loading of a campaign: read its file, apply the command-line options, and report all problems at once.
+"""Loading of a campaign: read its file, apply the command-line options, and report all problems together.
 
-Dispersions, and columns of requirements, are checked against the scenario before any case runs.
+Dispersions and the columns of requirements are checked against the scenario before any case runs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from marsyard.scenarios.systems import RowColumns, UnknownScenarioError, row_col
 
 
 def catalogue() -> dict[str, Path]:
-    """Campaign files of all systems by campaign name, sorted."""
+    """Return the campaign files of all systems by campaign name, sorted."""
     return dict(sorted((name, path) for system in systems() for name, path in system.campaigns.items()))
 
 
@@ -49,9 +49,9 @@ _FILE_KEYS = (
     *("parameters", "dispersions", "design", "retain", "limits"),
     *("cases", "seed", "name", "description", "scenario", "correlations"),
 )
-#: Number of cases whose sampled values are validated before the campaign starts; ranges are checked in full.
+#: Number of cases whose sampled values are validated before the campaign starts; ranges are always checked.
 _CHECKED_CASES = 32
-#: Maximum number of varying parameters in the formulas of one dispersion: all combinations of extremes are checked.
+#: Maximum number of dispersed parameters in the formulas of a dispersion: all combinations of extremes are checked.
 _MAX_VARYING = 8
 #: Kinds of columns in requirements.
 FLAGS, NUMBERS = "column of true and false", "column of numbers"
@@ -61,7 +61,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def find_campaign(name_or_path: str) -> Path:
-    """File of a campaign given by its name in the catalogue or by the path of a TOML file.
+    """Return the file of a campaign, from its name in the catalogue or from the path of a TOML file.
 
     Raises ConfigurationError if there is no such file.
     """
@@ -84,13 +84,14 @@ def load_campaign(
     seed: int | None = None,
     algorithms: Sequence[str] = (),
 ) -> Campaign:
-    """Read a campaign and check it as a whole.
+    """Read and check a campaign.
 
-    name_or_path: a name from the catalogue, or the path of a TOML file. overrides: ``KEY=VALUE`` each. KEY is a dotted
-    path into the parameters or a top-level key of the file (`cases`, `seed`); VALUE is in TOML syntax or plain text. An
-    overridden parameter is no longer dispersed. cases, seed: replace those of the file. algorithms: replace those of
-    the file: the algorithm under test, then those compared with it. Raises ConfigurationError with every problem: file
-    (or option), key and allowed values.
+    - name_or_path: a name from the catalogue, or the path of a TOML file
+    - overrides: options ``KEY=VALUE``. KEY is a dotted path of a parameter or a top-level key of the file; VALUE is in
+      TOML syntax or plain text. An overridden parameter is no longer dispersed
+    - cases, seed, algorithms: replace those of the file; the first algorithm is under test, the others are compared
+
+    Raises ConfigurationError with all problems: file (or option), key and allowed values.
     """
     path = find_campaign(name_or_path)
     tables = read_tables(path)
@@ -133,7 +134,7 @@ def _parse_override(override: str, option: str, selected: Scenario | None) -> di
 def _select_algorithms(
     tables: dict[str, Any], algorithms: Sequence[str], source: str, overridden: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
-    """Tables with the given algorithms; unchanged for an unknown scenario, which is reported later."""
+    """Replace the algorithms in the tables; no change for an unknown scenario, which is reported later."""
     options = [f"--algorithm {spec}" for spec in algorithms]
     selected = find_scenario(tables.get("scenario"))
     if selected is None:
@@ -155,7 +156,7 @@ def _select_algorithms(
 def _apply_option(
     tables: Mapping[str, Any], settings: Mapping[str, Any], option: str, overridden: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
-    """Tables merged with those of an option; parameters set by the option are no longer dispersed."""
+    """Merge the tables with those of an option; parameters that the option sets are no longer dispersed."""
     merged = _merge(tables, settings)
     paths = _list_paths(settings)
     overridden.update(dict.fromkeys(paths, option))
@@ -172,7 +173,7 @@ def _apply_option(
 
 
 def _remove_members(group: Any, removed: set[str]) -> Any:
-    """Correlated group without removed dispersions; empty if none remains; unchanged if it is invalid."""
+    """Remove dispersions from a correlated group; an empty table if none remains; an invalid group is unchanged."""
     names = group.get("parameters") if isinstance(group, Mapping) else None
     if not isinstance(names, list):
         return group
@@ -203,11 +204,11 @@ def _merge(tables: Mapping[str, Any], updates: Mapping[str, Any]) -> dict[str, A
 
 
 def _validate(source: str, tables: Mapping[str, Any], overridden: Mapping[tuple[str, ...], str]) -> Campaign:
-    """Campaign from the tables of a file; defaults complete its parameters."""
+    """Create a campaign from the tables of a file; missing parameters have default values."""
     problems: list[Problem] = []
 
     def add_problems(new_problems: Iterable[tuple[Key, str]], prefix: Key = ()) -> None:
-        """Append problems at keys, located in the file or in the command-line option that sets the key."""
+        """Add problems at keys; their location is the file, or the command-line option that sets the key."""
         for key, message in new_problems:
             key, location = (*prefix, *key), source
             for path, option in overridden.items():
@@ -248,7 +249,7 @@ def _validate(source: str, tables: Mapping[str, Any], overridden: Mapping[tuple[
 
 
 def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
-    """Problems of the campaign's dispersions: keys, and messages with the allowed values."""
+    """List problems of the campaign's dispersions: keys, and messages with the allowed values."""
     problems = [*campaign.configuration.find_sampling_problems(), *_check_names(campaign)] or _check_ranges(campaign)
     if problems or not campaign.configuration.dispersions:
         return problems
@@ -263,7 +264,7 @@ def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
 
 
 def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
-    """Unknown parameters in dispersions or formulas, and cycles of formulas."""
+    """List unknown parameters in dispersions or formulas, and cycles of formulas."""
     parameters = dict(leaves(campaign.configuration.parameters))
     dispersions = campaign.configuration.dispersions
     problems: list[tuple[Key, str]] = []
@@ -291,7 +292,7 @@ def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
 
 
 def _describe_unknown(path: str, parameters: Iterable[str]) -> str:
-    """Message that lists the parameters in the innermost existing table of a path; subtables by name only."""
+    """Create the message about an unknown path: it lists the parameters in the innermost existing table of the path."""
     allowed = names = list(parameters)
     table = path
     while table:
@@ -305,12 +306,12 @@ def _describe_unknown(path: str, parameters: Iterable[str]) -> str:
 
 
 def _check_ranges(campaign: Campaign) -> list[tuple[Key, str]]:
-    """Invalid parameter values and undefined formulas at the limits of the dispersions."""
+    """List invalid parameter values and undefined formulas at the limits of the dispersions."""
     problems: list[tuple[Key, str]] = []
     extremes: dict[str, list[Any]] = {}
     for path in campaign.order:
         if any(name in campaign.marginals and name not in extremes for name in campaign.marginals[path].names):
-            continue  # a dispersion in its formulas has a problem already
+            continue  # the problem of a dispersion in its formulas is already in the list
         try:
             values = _check_extremes(campaign, path, extremes)
         except ValueError as error:
@@ -323,7 +324,7 @@ def _check_ranges(campaign: Campaign) -> list[tuple[Key, str]]:
 
 
 def _check_extremes(campaign: Campaign, path: str, extremes: Mapping[str, list[Any]]) -> list[Any]:
-    """Extreme values of a dispersion at all combinations of the extremes of the parameters in its formulas.
+    """Compute the extreme values of a dispersion for all combinations of extremes of the parameters in its formulas.
 
     Raises ValueError for the first invalid value.
     """
@@ -347,7 +348,7 @@ def _check_extremes(campaign: Campaign, path: str, extremes: Mapping[str, list[A
 
 
 def _find_validation_error(campaign: Campaign, values: Mapping[str, Any]) -> str:
-    """Validation error of the parameters with these values; empty if valid."""
+    """Return the validation error of the parameters with these values; empty if they are valid."""
     infinite = [path for path, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
     if infinite:
         return f"{infinite[0]} must be finite"
@@ -366,9 +367,9 @@ def _extract_message(error: ValueError) -> str:
 
 
 def _check_metrics(campaign: Campaign) -> list[tuple[Key, str]]:
-    """Columns used by requirements but not declared by the scenario: keys, and messages with the allowed columns.
+    """List columns of requirements that the scenario does not declare: keys, and messages with the allowed columns.
 
-    Columns of custom scores are accepted by their prefix. Columns of a custom scenario are unknown before a run: its
+    Columns of custom scores are accepted by their prefix. Columns of a custom scenario are unknown before a run, so its
     first finished case is checked instead (`marsyard.campaigns.running.engine.check_metrics`).
     """
     try:
@@ -392,7 +393,7 @@ def find_unknown_columns(
     numbers: Sequence[str],
     is_known: Callable[[str, str], bool],
 ) -> list[tuple[Key, str]]:
-    """Columns of requirements with an unknown name or kind: keys, and messages with the allowed columns."""
+    """List columns of requirements with an unknown name or kind: keys, and messages with the allowed columns."""
     problems: list[tuple[Key, str]] = []
     for index, requirement in enumerate(requirements):
         kind, allowed = (FLAGS, flags) if requirement.bound is None else (NUMBERS, numbers)
@@ -405,7 +406,7 @@ def find_unknown_columns(
 
 
 def _collect_columns(campaign: Campaign) -> RowColumns | None:
-    """Columns of the scenario and of the campaign's parameters; None if unknown."""
+    """Collect the columns of the scenario and of the campaign's parameters; None if they are unknown."""
     configuration = campaign.configuration
     columns = row_columns(configuration.scenario)
     if columns is None:

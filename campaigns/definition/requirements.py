@@ -1,4 +1,4 @@
-"""Requirement files: campaigns refer to requirements by id, and stored rows can be evaluated against them again."""
+"""Requirement files: campaigns refer to requirements by id, and stored campaigns can be evaluated against them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CHANGEABLE = ("statement", "population", "probability", "confidence", "decide_b
 
 
 class SharedRequirement(Requirement):
-    """A requirement of a requirements file, with name patterns of the campaigns that verify it."""
+    """A requirement of a requirements file, with name patterns of the campaigns that test it."""
 
     campaigns: Annotated[tuple[str, ...], Field(strict=False)] = ()
 
@@ -29,7 +29,7 @@ class SharedRequirement(Requirement):
         return self.model_dump(mode="json", exclude={"campaigns"})
 
 
-class _File(Parameters):
+class _RequirementsFile(Parameters):
     requirements: Annotated[tuple[SharedRequirement, ...], Field(strict=False)]
 
 
@@ -38,7 +38,7 @@ def read_requirements(path: Path) -> tuple[SharedRequirement, ...]:
 
     Raises ConfigurationError if it is unreadable or invalid; every problem has its key.
     """
-    requirements = read_table(path, _File).requirements
+    requirements = read_table(path, _RequirementsFile).requirements
     ids = [requirement.id for requirement in requirements]
     repeated = sorted({name for name in ids if ids.count(name) > 1})
     if repeated:
@@ -48,13 +48,13 @@ def read_requirements(path: Path) -> tuple[SharedRequirement, ...]:
 
 @cache
 def shipped_requirements() -> Mapping[str, SharedRequirement]:
-    """Requirements of all systems by id; the first wins where an id repeats."""
+    """Return the requirements of all systems by id; if two systems use the same id, the first requirement is used."""
     return _read_shipped()[0]
 
 
 @cache
 def _read_shipped() -> tuple[Mapping[str, SharedRequirement], tuple[str, ...]]:
-    """Requirements of the systems' files, and the problems of unreadable files."""
+    """Read the requirements of all systems; also return the problems of invalid files."""
     by_id: dict[str, SharedRequirement] = {}
     problems: list[str] = []
     for path in dict.fromkeys(system.requirements for system in systems() if system.requirements):
@@ -66,14 +66,14 @@ def _read_shipped() -> tuple[Mapping[str, SharedRequirement], tuple[str, ...]]:
 
 
 def select_applicable(requirements: Sequence[SharedRequirement], campaign: str) -> list[dict[str, Any]]:
-    """Requirements verified by a campaign of this name, as entries of a campaign file."""
+    """List the requirements that a campaign of this name tests, as entries of a campaign file."""
     return [item.to_table() for item in requirements if any(fnmatchcase(campaign, name) for name in item.campaigns)]
 
 
 def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key, str]]]:
-    """Tables of a campaign with its requirements filled in by id, and the problems of the ids.
+    """Complete the requirements of a campaign's tables by id; also return the problems.
 
-    An entry without a metric refers to a requirement by its `id`, and may override the keys in `_CHANGEABLE`.
+    An entry without a metric refers to a shared requirement by its `id`, and may override the keys in `_CHANGEABLE`.
     """
     entries = tables.get("requirements")
     if not isinstance(entries, list):
@@ -84,12 +84,12 @@ def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[t
         if not isinstance(entry, Mapping) or "metric" in entry or "id" not in entry:
             entries_filled.append(entry)
             continue
-        shipped, unusable = _read_shipped()
+        shipped, file_problems = _read_shipped()
         requirement = shipped.get(str(entry["id"]))
         fixed_keys = [key for key in entry if key not in ("id", *_CHANGEABLE)]
         if requirement is None:
-            message = "; ".join((unknown_name_message("requirement", str(entry["id"]), shipped), *unusable))
-            problems.append((("requirements", index, "id"), f"{message}; or give a metric"))
+            message = "; ".join((unknown_name_message("requirement", str(entry["id"]), shipped), *file_problems))
+            problems.append((("requirements", index, "id"), f"{message}; or define a metric"))
         problems += [(("requirements", index, key), "is already defined in requirements.toml") for key in fixed_keys]
         if requirement is not None and not fixed_keys:
             entries_filled.append({**requirement.to_table(), **entry})

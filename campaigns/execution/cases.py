@@ -1,4 +1,4 @@
-"""Execution of one case in a worker process: the only module that calls a scenario."""
+"""Execution of single cases in worker processes, and their rows; only this module runs scenarios."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _MAX_TEXT = 8000
 
 @dataclass(frozen=True)
 class CompletedCase:
-    """Row of a case and, if kept, the products of its scenario.
+    """Row of a case and, if they are stored, its products.
 
-    `note` gives the reason if products could not be kept, and changes of the worker process by the case.
+    `note` describes why products could not be stored, and how the case changed its worker process.
     """
 
     row: Row
@@ -45,13 +45,13 @@ class CompletedCase:
 
 
 def configuration_text(configuration: CampaignConfiguration) -> str:
-    """Configuration as sent to the workers and stored in `campaign.json`."""
+    """Convert a configuration to the JSON text that is sent to the workers."""
     return configuration.model_dump_json()
 
 
 @lru_cache(maxsize=1)
 def _load_campaign(configuration: str) -> Campaign:
-    """Campaign of a configuration, cached because loading is slow."""
+    """Create the campaign of a configuration text; the result is cached because loading is slow."""
     worker_process.start_clock(grace_s=worker_process.LOADING_S)
     contents = CampaignConfiguration.model_validate_json(configuration)
     selected = scenario(contents.scenario)
@@ -62,11 +62,11 @@ def _load_campaign(configuration: str) -> Campaign:
 
 
 def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
-    """Run one case of a `configuration_text`; any exception becomes part of its row.
+    """Run one case of the campaign of a `configuration_text`; the row of a failed case contains its exception.
 
-    `keep` decides whether the scenario's products are returned with the row.
+    `keep` decides whether the products of the case are returned with the row.
     """
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
     products: Mapping[str, Any] = {}
     conditions: dict[str, Scalar] = {}
 
@@ -76,7 +76,7 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
 
     try:
         campaign = _load_campaign(configuration)
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
         with conditions_recorded_by(record):
             result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
         row = _build_finished_row(case, result, campaign.configuration.requirements)
@@ -84,19 +84,20 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
     except BaseException as error:
         outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
         row = make_unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), conditions)
-    row = {**row, "wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
+    wall_time_s, cpu_time_s = time.perf_counter() - wall_start_s, time.process_time() - cpu_start_s
+    row = {**row, "wall_time_s": wall_time_s, "cpu_time_s": cpu_time_s}
     if row["outcome"] in (CRASHED, OUT_OF_MEMORY):
         worker_process.request_fresh_worker()
-    if not products or not keep.wants(row):
+    if not products or not keep.selects(row):
         return CompletedCase(row)
     try:
         return CompletedCase(row, pack_products(products))
     except TypeError as error:
-        return CompletedCase(row, None, f"the products of case {case} could not be kept: {error}")
+        return CompletedCase(row, None, f"the products of case {case} could not be stored: {error}")
 
 
 def prepare_input(configuration: str, shared_input: int) -> str:
-    """Build or verify an input shared by cases; return the warnings of the cache, empty if there are none."""
+    """Build or verify an input shared by cases; return the warnings of the cache as one text, or an empty text."""
     campaign = _load_campaign(configuration)
     with warnings.catch_warnings(record=True) as cache_warnings:
         warnings.simplefilter("always", CacheWarning)
@@ -112,7 +113,7 @@ def run_cases(
     keep: Keep,
     total: int | None = None,
 ) -> Iterator[list[CompletedCase]]:
-    """Run cases and yield them as they end; a case whose worker died or was terminated has a row as well."""
+    """Run cases and yield them as they end, also cases whose worker died or was terminated."""
     task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
     note_counts: Counter[str] = Counter()
     limits = work_limits(configuration.limits, configuration.limits.case_time_s)
@@ -127,13 +128,13 @@ def run_cases(
 
 
 def work_limits(limits: Limits, time_s: float) -> WorkLimits:
-    """Limits of one case, or of building one shared input, with a time limit."""
+    """Create the limits of one case, or of the preparation of one shared input, with a time limit in seconds."""
     memory = None if limits.memory_gb is None else limits.memory_gb * 1e9
     return WorkLimits(time_s, memory, limits.output_mb * 1e6)
 
 
 def _build_lost_row(case: int, error: Exception | None) -> Row:
-    """Row of a case that did not return, with the conditions recorded before its process ended."""
+    """Create the row of a case whose process ended, with the conditions that the case recorded before."""
     if not isinstance(error, WorkerExitError):
         return make_unfinished_row(case, CRASHED, describe_error(error), "")
     trace, conditions = error.trace, {}
@@ -143,7 +144,7 @@ def _build_lost_row(case: int, error: Exception | None) -> Row:
         # remove the frames above the engine's call of the scenario
         next_thread = next((k for k in range(call + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
         trace = "\n".join([*lines[: call + 1], *lines[next_thread:]])
-    # the process may have ended while writing, and other code may have written to the file
+    # the process may have ended while writing the note, and other code may have written to the file
     with suppress(ValueError, TypeError, LookupError, AttributeError, RecursionError):
         recorded = json.loads(error.note)
         conditions = _convert_columns(recorded["conditions"]) if recorded["case"] == case else {}
@@ -153,7 +154,7 @@ def _build_lost_row(case: int, error: Exception | None) -> Row:
 def make_unfinished_row(
     case: int, outcome: str, error: str, trace: str, conditions: Mapping[str, Scalar] | None = None
 ) -> Row:
-    """Row of an unfinished case, with the conditions that it recorded."""
+    """Create the row of an unfinished case, with the conditions that the case recorded."""
     return {
         "case": case,
         "outcome": outcome,
@@ -165,7 +166,7 @@ def make_unfinished_row(
 
 
 def _clean_text(text: str) -> str:
-    """Shortened text in UTF-8, without object addresses, which change from run to run."""
+    """Shorten a text, and remove lone surrogates and object addresses, which change from run to run."""
     if len(text) > _MAX_TEXT:
         half = _MAX_TEXT // 2
         text = f"{text[:half]}\n... {len(text) - 2 * half} characters omitted ...\n{text[-half:]}"
@@ -174,10 +175,10 @@ def _clean_text(text: str) -> str:
 
 
 def _build_finished_row(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
-    """Row of a finished case, in plain Python values.
+    """Create the row of a finished case, in plain Python values.
 
-    Raises TypeError or ValueError if a column cannot be stored, or a metric or population column has another type in
-    this case: one such value would turn the stored column into text, and the requirement could not be decided.
+    Raises TypeError or ValueError if a column cannot be stored, or if a metric or population column has a wrong type.
+    One value of a wrong type would convert the stored column to text, so that the requirement could not be evaluated.
     """
     failure = result.failure
     if (result.outcome in ENGINE_FAILURES) != (failure is not None):
@@ -187,19 +188,19 @@ def _build_finished_row(case: int, result: CaseResult, requirements: Sequence[Re
         metrics, has_bound = requirement.metric_columns, requirement.bound is not None
         for name in (*requirement.population_columns, *(() if has_bound else metrics)):
             if type(columns.get(name, True)) is not bool:
-                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {requirement.id} needs true or false")
+                raise TypeError(f"column {name} contains {columns[name]!r:.100}; {requirement.id} needs true or false")
         for name in metrics if has_bound else ():
             if type(columns.get(name, 0.0)) is str:
-                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {requirement.id} needs a number")
+                raise TypeError(f"column {name} contains {columns[name]!r:.100}; {requirement.id} needs a number")
     error, trace = ("", "") if failure is None else (_clean_text(failure.error), _clean_text(failure.trace))
     engine: Row = {"case": case, "outcome": _replace_surrogates(str(result.outcome)), "answered": bool(result.answered)}
     return {**engine, **columns, "error": error, "traceback": trace}
 
 
 def _convert_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
-    """Columns of a scenario in plain Python values; NumPy scalars are unwrapped.
+    """Convert the columns of a scenario, including NumPy scalars, to plain Python values.
 
-    Raises ValueError or TypeError if they cannot be stored.
+    Raises ValueError or TypeError if a column cannot be stored.
     """
     clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(row))
     if clashes:
@@ -208,16 +209,16 @@ def _convert_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
     for name, value in row.items():
         scalar = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
         if type(scalar) not in (float, int, bool, str):
-            raise TypeError(f"column {name} holds a {type(value).__name__}; allowed: float, int, str, bool")
+            raise TypeError(f"column {name} contains a {type(value).__name__}; allowed: float, int, str, bool")
         if type(scalar) is int and scalar.bit_length() > _MAX_INT_BITS:
             bits = scalar.bit_length()
-            raise ValueError(f"column {name} holds an integer of {bits} bits, beyond the range of a float")
+            raise ValueError(f"column {name} contains an integer of {bits} bits, beyond the range of a float")
         columns[_replace_surrogates(str(name))] = _replace_surrogates(scalar) if isinstance(scalar, str) else scalar
     return columns
 
 
 def _replace_surrogates(text: str) -> str:
-    """Text with lone surrogates replaced."""
+    """Replace lone surrogates, which UTF-8 cannot represent."""
     return text.encode("utf-8", errors="replace").decode("utf-8")
 
 
@@ -228,9 +229,9 @@ _MAX_NOTES = 3
 def _describe_changes(run: TaskResult[Any], note_counts: Counter[str]) -> Iterator[str]:
     """Yield notes on a case that changed its worker process; `note_counts` limits the notes of each kind in one run."""
     notes = [(part.partition(" (")[0], f"case {run.item} changed its worker process: {part}") for part in run.changed]
-    if run.spoiled_by is not None:
-        text = f"case {run.item} crashed in the worker of case {run.spoiled_by}, but not in a fresh worker"
-        notes.append(("spoiled", f"{text}: an earlier case changed the state of that worker"))
+    if run.crashed_only_after is not None:
+        text = f"case {run.item} crashed in the worker of case {run.crashed_only_after}, but not in a fresh worker"
+        notes.append(("crashed only after", f"{text}: an earlier case changed the state of that worker"))
     for kind, text in notes:
         note_counts[kind] += 1
         if note_counts[kind] <= _MAX_NOTES:

@@ -1,10 +1,10 @@
 """Execution of cases on a Dask cluster, with the same isolation as on one machine.
 
-A Dask worker runs no case in its own process. It monitors one worker process per thread, and runs its batches there
-with the same limits (`marsyard.campaigns.execution.workers`). A case that hangs, exhausts memory or kills its process
-thus affects that process only, and its cause is identified as on one machine. If a Dask worker itself is lost, Dask
-gives its batches to other workers. A batch that lost several workers (Dask's `allowed-failures`, by default 3) is
-divided into single cases; a case that fails in this way again counts as crashed.
+Dask workers do not run cases themselves. For each thread, a Dask worker starts and monitors one worker process, which
+runs the batches with the same limits as on one machine (`marsyard.campaigns.execution.workers`). A case that hangs,
+exhausts memory or kills its process therefore affects only that process. If a Dask worker itself is lost, Dask sends
+its batches to other workers. If a batch was lost with several workers (Dask's `allowed-failures`, by default 3), it is
+divided into single cases; a case that is lost again in this way counts as crashed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from marsyard.campaigns.execution.worker_process import TaskResult, Work
 from marsyard.campaigns.execution.workers import Batches, LocalExecutor
 
 Result = TypeVar("Result")
-#: Seconds to wait for a scheduler, and for a first worker.
+#: Seconds to wait for a scheduler, and for the first worker.
 _TIMEOUT_S = 30
 #: Batches queued at each Dask worker, so that no worker waits for the network.
 _QUEUED_BATCHES = 2
@@ -33,9 +33,9 @@ _thread_state = threading.local()
 
 
 class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
-    """Workers of a Dask cluster, as a context.
+    """Executor on the workers of a Dask cluster, as a context.
 
-    address: address of a scheduler (`tcp://host:8786`), or `local:N` for a cluster of N workers on this machine.
+    address: address of a scheduler (`tcp://host:8786`), or `local:N` for a cluster of N workers on this machine
     Raises CampaignError if Dask is missing, the cluster cannot be reached, or its workers run other code.
     """
 
@@ -50,11 +50,11 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
             try:
                 cluster: Any = None
                 if number == address:
-                    # Dask leaves a client with an invalid address to garbage collection, which can block the next
-                    # client for 10 s: the address is checked first.
+                    # Check the address first. Dask does not close a client with an invalid address; its later garbage
+                    # collection can block the next client for 10 s.
                     distributed.comm.get_address_host_port(address)
                 else:
-                    cluster = _local_cluster(address, number)
+                    cluster = _start_local_cluster(address, number)
                     stack.callback(cluster.close)
                 self._client = distributed.Client(cluster or address, timeout=_TIMEOUT_S, set_as_default=False)
                 stack.callback(self._client.close)
@@ -79,7 +79,7 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         self._stack.close()
 
     def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
-        """See `Executor.run`."""
+        """Run work as described in `Executor.run`."""
         machines: Counter[str] = Counter()
         for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
             machines[worker["host"]] += worker["nthreads"]
@@ -88,21 +88,21 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         threads = sum(self._client.nthreads().values())
         batches = Batches(work.items, work.total, threads)
         pending = self._distributed.as_completed(loop=self._client.loop)
-        sent: dict[Any, Sequence[int]] = {}
+        batches_by_future: dict[Any, Sequence[int]] = {}
 
         def send(batch: Sequence[int]) -> None:
             if batch:
                 batch_work = replace(work, items=tuple(batch), total=len(batch))
                 future = self._client.submit(_run_batch_isolated, batch_work, executors, pure=False)
-                sent[future] = batch
+                batches_by_future[future] = batch
                 pending.add(future)
 
         try:
             for _ in range(_QUEUED_BATCHES * threads):
                 send(batches.next())
-            while sent:
+            while batches_by_future:
                 future = next(pending)
-                batch = sent.pop(future)
+                batch = batches_by_future.pop(future)
                 results = self._collect(future, batch, batches)
                 if results is None:
                     for item in batch:
@@ -113,10 +113,10 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
                 if results:
                     yield results
         finally:
-            self._client.cancel(list(sent))
+            self._client.cancel(list(batches_by_future))
 
     def _collect(self, future: Any, batch: Sequence[int], batches: Batches) -> list[TaskResult[Any]] | None:
-        """Results of a batch; None if it was lost with its workers and must be divided into single cases."""
+        """Return the results of a batch; None if it was lost with its workers and must be divided into cases."""
         error = future.exception() if future.status != "cancelled" else CancelledError("the cluster abandoned it")
         if error is None:
             seconds, results = future.result()
@@ -131,7 +131,7 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
 
-def _local_cluster(address: str, number: str) -> Any:
+def _start_local_cluster(address: str, number: str) -> Any:
     from distributed import LocalCluster
 
     if not (number.isdecimal() and int(number) >= 1):
@@ -146,12 +146,12 @@ def _identify_code() -> tuple[str, dict[str, str]]:
 
 
 def _run_batch_isolated(work: Work[Result], executors: int) -> tuple[float, list[TaskResult[Result]]]:
-    """Run a batch in the worker process of this Dask thread; return the seconds and the results."""
+    """Run a batch in the worker process of this Dask thread; return the duration in seconds and the results."""
     start_s = time.perf_counter()
     workers: LocalExecutor | None = getattr(_thread_state, "workers", None)
     if workers is None:
-        # Dask's workers are daemons of `multiprocessing`, which may not have children. The kernel terminates their
-        # children with the thread that started them.
+        # Dask's workers are daemons of `multiprocessing`, which must not have children. The kernel ends the children
+        # together with the thread that started them.
         multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
         workers = _thread_state.workers = LocalExecutor(1, executors)
     results = [result for batch in workers.run(work) for result in batch]

@@ -1,7 +1,7 @@
-"""State of a worker process that one case could pass to the next: compared after each case, restored, and reported.
+"""State of a worker process by which a case could affect later cases: it is compared and restored after each case.
 
-If a change cannot be restored (a thread, a child process, a signal handler), the next case runs in a fresh worker.
-The global random generators of Python, NumPy and OpenCV are seeded before each case.
+Changes are reported. If a change cannot be restored (a thread, a child process, a signal handler), the next case runs
+in a fresh worker. The global random generators of Python, NumPy and OpenCV are seeded before each case.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ import numpy as np
 
 from marsyard.algorithms.processes import children
 
-#: Seconds to wait for threads and processes to end.
-_ENDING_S = 0.2
+#: Maximum seconds to wait for threads and processes to end.
+_MAX_ENDING_S = 0.2
 FileIdentity = tuple[int, int] | None
 _SIGNALS = tuple(range(1, signal.SIGSYS + 1))
 
@@ -50,25 +50,25 @@ def _read_folder() -> str:
         return ""
 
 
-#: Variable that the first rendered image sets for the rest of the process.
-_OPENGL = b"PYOPENGL_PLATFORM"
+#: Variable that is set when the first image is rendered; it is not compared.
+_OPENGL_VARIABLE = b"PYOPENGL_PLATFORM"
 
 
 def _read_environment() -> dict[bytes, bytes]:
-    # the mapping behind `os.environ`: ten times as fast, because nothing is decoded
+    # the undecoded mapping inside `os.environ`, which is ten times as fast
     variables: dict[bytes, bytes] = dict(os.environ._data)  # type: ignore[attr-defined]
-    variables.pop(_OPENGL, None)
+    variables.pop(_OPENGL_VARIABLE, None)
     return variables
 
 
 def _set_environment(saved: dict[bytes, bytes]) -> None:
-    for name in set(os.environb) - {*saved, _OPENGL}:
+    for name in set(os.environb) - {*saved, _OPENGL_VARIABLE}:
         del os.environb[name]
     os.environb.update(saved)
 
 
 def _set_filters(saved: list[Any]) -> None:
-    # clears the cache of the module's previous filters
+    # `resetwarnings` also clears the cache of the previous filters
     warnings.resetwarnings()
     warnings.filters[:] = saved  # type: ignore[index]
 
@@ -86,7 +86,7 @@ def _read_decimals() -> tuple[Any, ...]:
 
 
 def _read_opencv() -> tuple[bool, int]:
-    """OpenCV's optimisation flag and threads; those of a fresh worker if OpenCV is not loaded."""
+    """Return OpenCV's optimisation flag and number of threads; those of a fresh worker if OpenCV is not loaded."""
     cv2: Any = sys.modules.get("cv2")
     return (True, 1) if cv2 is None else (cv2.useOptimized(), cv2.getNumThreads())
 
@@ -98,8 +98,8 @@ def _set_opencv(saved: tuple[bool, int]) -> None:
 
 
 def _read_arithmetic() -> tuple[bool, ...]:
-    """Rounding mode of floating-point numbers, and whether subnormal numbers are flushed to zero."""
-    # sums with less than half the distance from 1 to the next number reveal the rounding mode
+    """Determine the rounding mode of floating-point numbers, and whether subnormal numbers are flushed to zero."""
+    # the rounding mode determines whether adding less than half the distance to the next float changes the number 1
     unit, increment, min_normal = float("1"), 2.0**-60, sys.float_info.min
     return unit + increment == unit, -unit - increment == -unit, unit - increment == unit, min_normal * 0.5 > 0.0
 
@@ -131,19 +131,19 @@ _CHANGED_BY_IMPORTS = (1, 2, 3)
 
 
 def _read_signals() -> tuple[Any, ...]:
-    """Handlers, blocked signals and timers; `_signal` avoids building enumerations, which is slow."""
+    """Return signal handlers, blocked signals and timers; `_signal` is faster since it builds no enumerations."""
     handlers = tuple(_signal.getsignal(number) for number in _SIGNALS)
     return handlers, _signal.pthread_sigmask(_signal.SIG_BLOCK, ()), _signal.getitimer(_signal.ITIMER_REAL)
 
 
 def _read_streams() -> tuple[Any, ...]:
-    """Standard output and error, whether they are closed, and their files."""
+    """Return standard output and error, whether they are closed, and the identities of their files."""
     objects = [(stream, getattr(stream, "closed", True)) for stream in (sys.stdout, sys.stderr)]
     return (*objects, file_identity(1), file_identity(2))
 
 
 class ProcessState:
-    """Reference state of this process at one moment; an import hook excludes the changes by imports."""
+    """Reference state of this process; an import hook adds the changes by imports of modules to the reference."""
 
     def __init__(self) -> None:
         self._parts = [part.read() for part in _PARTS]
@@ -155,7 +155,7 @@ class ProcessState:
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Find a top-level import with the other finders, and execute it so that its changes are accepted."""
+        """Find a module with the other finders; changes by its import are added to the reference state."""
         if self._importing:
             return None
         finders = [finder for finder in sys.meta_path if finder is not self and hasattr(finder, "find_spec")]
@@ -167,9 +167,9 @@ class ProcessState:
         return spec
 
     def _import(self, execute: Callable[[ModuleType], None], module: ModuleType) -> None:
-        """Execute an imported module and accept its changes to the environment, `sys.path` and warning filters.
+        """Execute an imported module; add its changes of environment, `sys.path` and warning filters to the reference.
 
-        An import happens once per process, in the case that needs it first: its changes are not attributed to the case.
+        A module is imported once per process, in the first case that needs it. The case has not caused its changes.
         """
         earlier = {index: _PARTS[index].read() for index in _CHANGED_BY_IMPORTS}
         self._importing = True
@@ -180,13 +180,14 @@ class ProcessState:
             for index, old in earlier.items():
                 new, saved = _PARTS[index].read(), self._parts[index]
                 if isinstance(saved, dict):
-                    kept = {name: value for name, value in saved.items() if name in new or name not in old}
-                    self._parts[index] = kept | {name: value for name, value in new.items() if old.get(name) != value}
+                    unremoved = {name: value for name, value in saved.items() if name in new or name not in old}
+                    changed = {name: value for name, value in new.items() if old.get(name) != value}
+                    self._parts[index] = unremoved | changed
                 elif saved == old:
                     self._parts[index] = new
 
     def restore(self) -> tuple[list[str], list[str]]:
-        """Restore all changed parts; return the names of the restored parts, and of the lasting changes."""
+        """Restore all changed parts; return the names of the restored parts, and of changes that cannot be restored."""
         restored: list[str] = []
         lasting = self._find_leftovers()
         for part, reference in zip(_PARTS, self._parts, strict=True):
@@ -198,27 +199,27 @@ class ProcessState:
         return restored, lasting
 
     def _find_leftovers(self) -> list[str]:
-        """Lasting changes: signals, streams, threads that prevent a process from ending, and child processes."""
+        """List changes that cannot be restored: signals, streams, non-daemon threads, and child processes."""
         signals, streams = self._lasting
         names = ["handlers of signals, or timers"] if _read_signals() != signals else []
         if _read_streams() != streams:
             names.append("standard output or error")
-        deadline = time.monotonic() + _ENDING_S
+        deadline = time.monotonic() + _MAX_ENDING_S
         while True:
             threads = [item.name for item in threading.enumerate() if item not in self._threads and not item.daemon]
             running = {"threads": threads, "child processes": _list_child_processes()}
             if not any(running.values()) or time.monotonic() >= deadline:
                 leftovers = {kind: ", ".join(sorted(set(items))) for kind, items in running.items() if items}
                 return [*names, *(f"{kind} that are still running ({items})" for kind, items in leftovers.items())]
-            # finalizers of unreferenced objects end their processes
+            # finalizers of unreferenced objects can end their child processes
             gc.collect()
             time.sleep(0.01)
 
 
 def _list_child_processes() -> list[str]:
-    """Names of the child processes, except idle programs under test; ended processes are reaped."""
+    """List the names of running child processes, except idle programs under test; collect ended child processes."""
     try:
-        # takes a microsecond without child processes
+        # fast path: without child processes this call raises after a microsecond
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:
         return []
@@ -250,8 +251,8 @@ def generators_were_used(item: int) -> bool:
     return numbers != (random.random(), np.random.random_sample())  # noqa: NPY002, S311
 
 
-def open_files() -> dict[int, FileIdentity]:
-    """Descriptors that a worker needs: its output and the pipes to its parent, without the standard streams."""
+def list_open_files() -> dict[int, FileIdentity]:
+    """List the open descriptors except the standard streams: the worker's output and the pipes to its parent."""
     numbers = [int(path.name) for path in Path("/proc/self/fd").glob("*")]
     identities = {number: file_identity(number) for number in numbers if number > 2}
     # without the descriptor of the listing itself
@@ -259,7 +260,7 @@ def open_files() -> dict[int, FileIdentity]:
 
 
 def file_identity(number: int) -> FileIdentity:
-    """Device and inode of a file descriptor; None if it is closed."""
+    """Return device and inode of a file descriptor; None if it is closed."""
     try:
         status = os.fstat(number)
     except OSError:

@@ -1,8 +1,7 @@
-"""Supervisor process between the parent and a worker: it outlives the worker and kills the worker's descendants.
+"""Supervisor process between the parent and a worker: it kills all descendants of the worker when the worker ends.
 
-A worker and the parent may end at any moment. The supervisor runs no code of cases, adopts orphaned processes below it,
-and ends only after it has killed them all. The parent signals only the supervisor, whose process number the executor
-provides.
+A worker and the parent may end at any moment. The supervisor runs no code of cases. It becomes the parent of orphaned
+descendants, and ends after it has killed all descendants. The parent sends signals only to the supervisor.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from typing import NoReturn
 
 from marsyard.algorithms.processes import descendants
 
-#: Signal that makes a worker write its stack trace; the supervisor forwards it.
+#: Signal on which a worker writes its stack trace; the supervisor forwards it.
 DUMP_SIGNAL = signal.SIGUSR2
-#: Signal that makes the supervisor kill all descendants and end.
+#: Signal on which the supervisor kills all descendants and ends.
 END_SIGNAL = signal.SIGTERM
 #: Sent by Linux when the parent ends; it also resumes a supervisor that a case has stopped.
 _PARENT_SIGNAL = signal.SIGCONT
@@ -31,35 +30,35 @@ _PARENT_SIGNAL = signal.SIGCONT
 def become_supervised(parent: int, folder: Path) -> None:
     """Fork into a supervisor, which does not return, and a worker, which returns.
 
-    parent: the process that started this one; when the parent ends, both end.
-    folder: shared by all workers of the parent; removed if the parent ended without removing it.
+    - parent: process that started this process; supervisor and worker end when the parent ends
+    - folder: folder of all workers of the parent; the supervisor removes it if the parent ended without removing it
     """
     if sys.platform != "linux":
         return
     adopt_orphans()
     # a process-group leader sends SIGHUP when it ends
-    handled = {DUMP_SIGNAL, END_SIGNAL, _PARENT_SIGNAL, signal.SIGCHLD, signal.SIGHUP}
-    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, handled)
+    handled_signals = {DUMP_SIGNAL, END_SIGNAL, _PARENT_SIGNAL, signal.SIGCHLD, signal.SIGHUP}
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, handled_signals)
     end_with_parent(parent, _PARENT_SIGNAL)
     supervisor = os.getpid()
     worker = os.fork()
     if worker:
-        _supervise(worker, parent, folder, handled)
+        _supervise(worker, parent, folder, handled_signals)
     signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
     end_with_parent(supervisor, signal.SIGKILL)
     adopt_orphans()
 
 
-def _supervise(worker: int, parent: int, folder: Path, handled: set[signal.Signals]) -> NoReturn:
+def _supervise(worker: int, parent: int, folder: Path, handled_signals: set[signal.Signals]) -> NoReturn:
     """Wait for the worker's end or the end signal; then kill all descendants and end with the worker's status."""
     import resource
 
     status: int | None = None
     while status is None:
-        number = signal.sigwait(handled)
-        if number == DUMP_SIGNAL:
+        received_signal = signal.sigwait(handled_signals)
+        if received_signal == DUMP_SIGNAL:
             os.kill(worker, DUMP_SIGNAL)
-        elif number == END_SIGNAL or os.getppid() != parent:
+        elif received_signal == END_SIGNAL or os.getppid() != parent:
             status = -signal.SIGKILL
         else:
             with suppress(ChildProcessError):
@@ -68,7 +67,7 @@ def _supervise(worker: int, parent: int, folder: Path, handled: set[signal.Signa
                         status = os.waitstatus_to_exitcode(child[1])
     deadline = time.monotonic() + _KILLING_S
     with suppress(ChildProcessError):
-        # until this process has no children
+        # `waitpid` raises ChildProcessError as soon as this process has no children
         while time.monotonic() < deadline:
             kill(descendants(os.getpid()))
             while os.waitpid(-1, os.WNOHANG)[0]:
@@ -78,7 +77,7 @@ def _supervise(worker: int, parent: int, folder: Path, handled: set[signal.Signa
         shutil.rmtree(folder, ignore_errors=True)
     if status >= 0:
         os._exit(status)
-    # end with the worker's signal, without a core dump
+    # end by the same signal as the worker, without a core dump
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
     if -status not in (signal.SIGKILL, signal.SIGSTOP):
@@ -87,9 +86,9 @@ def _supervise(worker: int, parent: int, folder: Path, handled: set[signal.Signa
     os._exit(128 - status)
 
 
-#: Options of Linux's `prctl`: signal at the parent's end, and adoption of orphaned descendants.
+#: Options of Linux's `prctl`: send a signal at the parent's end; become the parent of orphaned descendants.
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
-#: Seconds during which killing is repeated, because processes may start others meanwhile.
+#: Maximum seconds of repeated killing, since processes may start other processes meanwhile.
 _KILLING_S = 10.0
 #: Seconds between two checks of killed processes.
 _PAUSE_S = 0.005
@@ -101,26 +100,26 @@ def adopt_orphans() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
-def end_with_parent(parent: int, number: int) -> None:
-    """Request a signal for the parent's end; end now if the parent has already ended."""
+def end_with_parent(parent: int, signal_number: int) -> None:
+    """Request a signal at the parent's end; end this process now if the parent has already ended."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal_number)
         if os.getppid() != parent:
             os._exit(1)
 
 
 def kill(processes: Iterable[int]) -> None:
-    """Kill processes; never process 1 and never a process group."""
+    """Kill single processes, except process 1; numbers below 1, which mean process groups, are ignored."""
     for process in processes:
         if process > 1:
             with suppress(ProcessLookupError, PermissionError):
                 os.kill(process, signal.SIGKILL)
 
 
-def marked_processes(mark: str) -> list[int]:
-    """Processes with a variable (`NAME=value`) in their environment, and processes forked from them.
+def find_marked_processes(mark: str) -> list[int]:
+    """Find processes with a variable (`NAME=value`) in the environment with which they were started.
 
-    Includes processes that lost their supervisor, but none that was started with another environment.
+    This also finds descendants without a supervisor, but not processes that were started with another environment.
     """
     processes = []
     pattern = mark.encode() + b"\0"

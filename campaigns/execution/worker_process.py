@@ -1,4 +1,4 @@
-"""Work of the worker processes and its results; code inside a worker: setup, batches and status."""
+"""Tasks of the worker processes and their results, and the code inside a worker: setup, batches and status."""
 
 from __future__ import annotations
 
@@ -20,25 +20,27 @@ from marsyard.campaigns.execution import process_state
 from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, become_supervised
 
 Result = TypeVar("Result")
-#: Added by Linux to a worker's badness (of 1000) when memory runs out: workers are killed before their parent.
+#: Linux's `oom_score_adj` of a worker (at most 1000): if memory runs out, workers are killed before their parent.
 _OOM_SCORE = 800
-#: Time for loading a campaign's code, in addition to the case's limit.
+#: Seconds for loading a campaign's code, in addition to the time limit of the case.
 LOADING_S = 300.0
-#: Duration of items whose process state is checked together: a check takes 0.1 ms.
+#: Maximum duration, seconds, of a group of items whose process state is checked together; a check takes 0.1 ms.
 _CHECKED_TOGETHER_S = 0.005
 #: Exit status of a worker whose files were closed by an item.
 FILES_CLOSED = 97
-_LAYOUT = struct.Struct("=qd")
-_NOTHING = -1
+#: Layout of the status board: item number (`_NO_ITEM` between items), and start time in seconds.
+_BOARD_LAYOUT = struct.Struct("=qd")
+_NO_ITEM = -1
 
 
 @dataclass(frozen=True)
 class TaskResult(Generic[Result]):
-    """Result of a task for one item, or the error that prevented it.
+    """Result of a task for one item, or the error that prevented the result.
 
-    changed: names of the parts of the process state that the task changed. crashed: whether the task requested a fresh
-    worker (`request_fresh_worker`). previous_item: item that ran before it in the same process; None for the first
-    item. spoiled_by: item after which it crashed, if it did not crash in a fresh process, which gave its result.
+    - changed: names of the parts of the process state that the task changed
+    - crashed: whether the task requested a fresh worker (`request_fresh_worker`)
+    - previous_item: item that ran before this item in the same process; None for the first item of a process
+    - crashed_only_after: earlier item after which this item crashed, although it did not crash in a fresh process
     """
 
     item: int
@@ -47,16 +49,17 @@ class TaskResult(Generic[Result]):
     changed: tuple[str, ...] = ()
     crashed: bool = False
     previous_item: int | None = None
-    spoiled_by: int | None = None
+    crashed_only_after: int | None = None
 
 
 @dataclass(frozen=True)
 class WorkLimits:
     """Limits of one task.
 
-    time_s: wall-clock time. memory_bytes: private memory of its worker and of the processes that it started, without
-    mapped files and shared libraries; None for an equal fraction of 80 % of the free memory at the start of the work.
-    output_bytes: bytes on standard output and standard error.
+    - time_s: wall-clock time
+    - memory_bytes: private memory of the worker and its descendants, without mapped files and shared libraries; None
+      for an equal fraction of 80 % of the free memory at the start of the work
+    - output_bytes: bytes on standard output and standard error
     """
 
     time_s: float = math.inf
@@ -68,8 +71,8 @@ class WorkLimits:
 class Work(Generic[Result]):
     """A task to be run on many items.
 
-    task: a pure, picklable function of the item. items: consumed only when workers need them. limits: limits of the
-    task for one item. total: number of items, if known.
+    - task: a pure, picklable function of the item; limits: limits of the task for one item
+    - items: iterator that is advanced only when workers need items; total: number of items, if known
     """
 
     task: Callable[[int], Result]
@@ -82,7 +85,7 @@ class Executor(Protocol):
     """Processes that run tasks, on this machine or on a cluster."""
 
     def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
-        """Run the task on every item, and yield results as they arrive, in no particular order.
+        """Run the task on each item, and yield results as they arrive, in any order.
 
         An error is the exception that the task raised, or a `WorkerExitError`.
         """
@@ -92,9 +95,9 @@ class Executor(Protocol):
 class BatchResult(Generic[Result]):
     """Results of a batch.
 
-    seconds: duration. results: results of the finished items. to_isolate: items to be run again one by one: they were
-    checked together, and one of them changed their process. not_started: items that were not started. must_replace:
-    whether the process must run no further item.
+    - seconds: duration; results: results of the finished items; not_started: items that were not started
+    - to_isolate: items that must run again one by one, since one item of their group changed the process state
+    - must_replace: whether the process must be replaced before the next item
     """
 
     seconds: float
@@ -105,32 +108,32 @@ class BatchResult(Generic[Result]):
 
 
 class StatusBoard:
-    """Shared memory that a worker writes and its parent reads, even if the worker hangs or has died.
+    """Shared memory with the status of a worker, which its parent can read even if the worker hangs or has died.
 
-    It contains the item that the worker runs (None between items), and its start time (monotonic).
+    The status is the item that the worker runs (None between items), and the start time of the item (monotonic).
     """
 
     def __init__(self, path: Path) -> None:
         with path.open("r+b") as file:
-            self._bytes = mmap.mmap(file.fileno(), _LAYOUT.size)
+            self._bytes = mmap.mmap(file.fileno(), _BOARD_LAYOUT.size)
 
     @staticmethod
     def create(path: Path) -> StatusBoard:
         """Create the board of an idle worker."""
-        path.write_bytes(_LAYOUT.pack(_NOTHING, math.inf))
+        path.write_bytes(_BOARD_LAYOUT.pack(_NO_ITEM, math.inf))
         return StatusBoard(path)
 
     def write(self, item: int | None, since_s: float) -> None:
         """Publish the worker's status."""
-        self._bytes[:] = _LAYOUT.pack(_NOTHING if item is None else item, since_s)
+        self._bytes[:] = _BOARD_LAYOUT.pack(_NO_ITEM if item is None else item, since_s)
 
     def read(self) -> tuple[int | None, float]:
-        """Worker's status; reads until two readings agree, because the worker may be writing."""
+        """Read the worker's status; read until two readings agree, because the worker may be writing."""
         first = bytes(self._bytes)
         while (second := bytes(self._bytes)) != first:
             first = second
-        item, since_s = _LAYOUT.unpack(first)
-        return None if item == _NOTHING else item, since_s
+        item, since_s = _BOARD_LAYOUT.unpack(first)
+        return None if item == _NO_ITEM else item, since_s
 
     def close(self) -> None:
         """Release the memory."""
@@ -139,7 +142,7 @@ class StatusBoard:
 
 @dataclass
 class _WorkerContext:
-    """Context of this worker process: status board, output and trace files, and reference process state."""
+    """Context of this worker process: status board, files, current item, and reference process state."""
 
     board: StatusBoard
     trace: Path
@@ -158,8 +161,9 @@ _context: _WorkerContext | None = None
 def start_worker(parent: int, folder: str) -> None:
     """Set up a fresh worker process.
 
-    It leads a process group below a supervisor (`marsyard.campaigns.execution.supervisor`), which ends with the parent
-    and kills the worker's descendants. A fatal signal makes it write its stack trace. Its output goes to a file.
+    The worker leads a process group below a supervisor (`marsyard.campaigns.execution.supervisor`), which ends with the
+    parent and kills the worker's descendants. The worker writes its output, and its stack trace on a fatal signal, to
+    files in `folder`.
     """
     from joblib.externals.loky import process_executor
 
@@ -177,10 +181,10 @@ def start_worker(parent: int, folder: str) -> None:
     trace_descriptor = os.open(trace, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
     faulthandler.enable(trace_descriptor)
     faulthandler.register(DUMP_SIGNAL, trace_descriptor, all_threads=False, chain=False)
-    # loky would end workers that grow by 300 MB: cached terrains need more, and the parent enforces limits
+    # loky would end workers that grow by 300 MB; cached terrains need more memory, and the parent enforces the limits
     process_executor._USE_PSUTIL = False
     _context = _WorkerContext(
-        StatusBoard(Path(folder, "board")), trace, output, Path(folder, "note"), process_state.open_files()
+        StatusBoard(Path(folder, "board")), trace, output, Path(folder, "note"), process_state.list_open_files()
     )
     _context.board.write(None, math.inf)
 
@@ -188,8 +192,8 @@ def start_worker(parent: int, folder: str) -> None:
 def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResult[Result]:
     """Run a task on each item, until all are finished or the process must be replaced.
 
-    After each item, the process state is compared with its earlier state. Items of some milliseconds are checked
-    together, and run again one by one if the check shows a change.
+    After each item, the process state is compared with its reference. Items of some milliseconds are checked in groups;
+    if a group has changed the state, its items run again one by one.
     """
     start_s = checked_s = time.perf_counter()
     results: list[TaskResult[Result]] = []
@@ -215,11 +219,11 @@ def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResul
 
 
 def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
-    """Whether the process must be replaced after some items, and the changes; None if their item is unknown."""
+    """Check the process after items; return whether to replace it, and its changes (None if their item is unknown)."""
     if _context is None:
         return False, ()
     if any(process_state.file_identity(number) != identity for number, identity in _context.files.items()):
-        # results can no longer be delivered: the status board identifies the item
+        # results can no longer be sent; the parent identifies the item by the status board
         _context.trace.write_text("Fatal: the files that the worker process needs were closed\n")
         os._exit(FILES_CLOSED)
     restored, lasting = _context.state.restore()
@@ -232,7 +236,7 @@ def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
 
 
 def _run_item(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
-    """Run a task on one item; the output file is emptied first, so that its size is that of the item's output."""
+    """Empty the output file, so that its size is the size of the item's output, and run a task on one item."""
     previous_item = None
     if _context is not None:
         for stream in (sys.stdout, sys.stderr):
@@ -251,13 +255,13 @@ def _run_item(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
 
 
 def request_fresh_worker() -> None:
-    """Request a fresh process for the next item: the current item crashed, and the process state is unknown."""
+    """Request a fresh process for the next item, because the current item crashed and may have damaged the process."""
     if _context is not None:
         _context.crashed = True
 
 
 def start_clock(grace_s: float = 0.0) -> None:
-    """Start the time limit of the current item now, or `grace_s` later."""
+    """Start the time of the current item now, or `grace_s` seconds later."""
     if _context is not None:
         _context.board.write(_context.item, time.monotonic() + grace_s)
 

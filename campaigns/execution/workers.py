@@ -1,8 +1,8 @@
 """Isolated worker processes: a crash, hang or memory overrun of one case cannot affect another.
 
-Each worker is a loky executor (joblib's) of one process, also for `jobs=1`. If a worker breaks, the executor identifies
-its batch and the worker's status board identifies the case; the other workers continue. The parent checks every worker
-about twenty times a second, and terminates a worker whose case exceeds a limit.
+Each worker is a loky executor (of joblib) with one process, also for `jobs=1`. If a worker dies, its executor
+identifies the batch, and its status board identifies the case; the other workers continue. The parent checks each
+worker about twenty times per second, and terminates a worker whose case exceeds a limit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 from marsyard.algorithms.processes import descendants, used_memory
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, WorkerExitError
 from marsyard.campaigns.execution import supervisor, worker_process
-from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, kill, marked_processes
+from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, find_marked_processes, kill
 from marsyard.campaigns.execution.worker_process import BatchResult, Executor, TaskResult, Work, WorkLimits, run_batch
 
 Result = TypeVar("Result")
@@ -43,21 +43,21 @@ _THREAD_VARIABLES = (
 _WORKER_ENVIRONMENT = dict.fromkeys(_THREAD_VARIABLES, "1") | {"PYTHONHASHSEED": "0", "PYTHONOPTIMIZE": ""}
 #: Seconds between two checks of a worker.
 _POLL_INTERVAL_S = 0.05
-#: Maximum bytes of the last output of a dead process, and of a task's note.
+#: Maximum bytes of the stored output of a dead process, and of a task's note.
 _MAX_OUTPUT, _MAX_NOTE = 2000, 1_000_000
 #: Maximum seconds for a worker to write its stack trace.
 _DUMP_S = 0.3
 #: Maximum seconds for a worker to end after all work, and for its supervisor to kill all descendants.
 _EXIT_S, _KILLING_S = 5.0, 2.0
-#: Environment variable of a worker, which identifies its descendants even without their supervisor.
+#: Environment variable by which the descendants of a worker are found, even if their supervisor has ended.
 _MARK = "MARSYARD_WORKER"
-#: Attempts before a crash or lack of memory is attributed to the task, the last in a fresh worker: an earlier task may
-#: have damaged or filled the worker, or an external process may have killed it.
+#: Number of attempts before a crash or lack of memory is attributed to the task; the last attempt is in a fresh worker.
+#: An earlier task may have damaged the worker or used its memory, or an external process may have killed the worker.
 _MAX_ATTEMPTS = 2
 #: Maximum number of consecutive deaths of workers before they start a task.
 _MAX_START_DEATHS = 3
 _PREFIX = "marsyard-"
-#: Lock file, held by the owner of a folder while it runs.
+#: Lock file in the folder of an executor; the process of the executor locks it while it runs.
 _LOCK = "lock"
 #: Default memory limit of all workers together, as a fraction of the memory that is free at the start.
 _MEMORY_FRACTION = 0.8
@@ -68,19 +68,20 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-#: Target duration of a batch: sending one costs 3 ms, and a worker that dies loses at most one batch.
+#: Target duration of a batch: sending a batch takes 3 ms, and a worker that dies loses at most one batch.
 _BATCH_S = 1.0
 #: Maximum number of items in a batch.
 MAX_BATCH = 1000
 #: Weight of the latest batch in the running mean of the time per item.
-_WEIGHT = 0.3
+_LATEST_WEIGHT = 0.3
 
 
 class Batches:
     """Batches of items, sized by the measured time per item.
 
-    items: consumed only when batches are requested. total: number of items, if known: the last batches are then small,
-    so that all workers end together. workers: number of workers that share the items.
+    - items: iterator that is advanced only when a batch is requested
+    - total: number of items, if known; the last batches are then small, so that all workers end together
+    - workers: number of workers that run the batches
     """
 
     def __init__(self, items: Iterable[int], total: int | None, workers: int) -> None:
@@ -91,7 +92,7 @@ class Batches:
         self._item_s = math.nan
 
     def next(self) -> list[int]:
-        """Next batch; empty if no items remain."""
+        """Return the next batch; empty if no items remain."""
         size = max(1, int(min(self._size, self._remaining / (2 * self._workers))))
         batch = list(itertools.islice(self._source, size))
         self._remaining -= len(batch)
@@ -100,15 +101,15 @@ class Batches:
     def record_time(self, items: int, seconds: float) -> None:
         """Update the time per item from a finished batch; a batch is at most twice as large as the previous one."""
         latest, mean = seconds / items, self._item_s
-        self._item_s = latest if math.isnan(mean) else mean + _WEIGHT * (latest - mean)
+        self._item_s = latest if math.isnan(mean) else mean + _LATEST_WEIGHT * (latest - mean)
         target_size = MAX_BATCH if self._item_s <= 0.0 else int(_BATCH_S / self._item_s)
         self._size = max(1, min(target_size, 2 * self._size, MAX_BATCH))
 
 
 class WatchedWorker:
-    """One worker process, monitored, and replaced when it dies.
+    """One worker process, which is monitored, and replaced when it dies.
 
-    Signals go only to the process that the executor started, the worker's supervisor; it ends after its descendants.
+    Signals are sent only to the process that loky started: the worker's supervisor, which ends after its descendants.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -118,7 +119,7 @@ class WatchedWorker:
         self._start()
 
     def _start(self) -> None:
-        """Prepare a new process with its own folder; loky starts it with the first batch."""
+        """Prepare a new process with a new folder; loky starts the process with the first batch."""
         self._generation += 1
         self._folder = self._home / str(self._generation)
         (self._folder / "tmp").mkdir(parents=True)
@@ -151,24 +152,24 @@ class WatchedWorker:
         if self._termination is not None or now - self._checked_s < _POLL_INTERVAL_S:
             return
         self._checked_s = now
-        if not self._alive():
-            # loky waits for its pipe, which descendants that survive their supervisor keep open: kill them
-            kill(marked_processes(self._mark))
+        if not self._is_alive():
+            # descendants without a supervisor keep loky's pipe open, so loky waits for their end: kill them
+            kill(find_marked_processes(self._mark))
             return
         item, since_s = self._board.read()
         if item is None:
             return
         output = self._folder / "output"
         if now - since_s > limits.time_s:
-            self._end(item, TIMED_OUT, f"took longer than its limit of {limits.time_s:g} s")
+            self._terminate(item, TIMED_OUT, f"took longer than its limit of {limits.time_s:g} s")
         elif used_memory(descendants(self._process.pid), memory_bytes) > memory_bytes:
             limit = "its default limit" if limits.memory_bytes is None else f"its limit of {memory_bytes / 1e9:g} GB"
-            self._end(item, OUT_OF_MEMORY, f"used more memory than {limit}")
+            self._terminate(item, OUT_OF_MEMORY, f"used more memory than {limit}")
         elif output.exists() and output.stat().st_size > limits.output_bytes:
-            self._end(item, TOO_MUCH_OUTPUT, f"wrote more than its limit of {limits.output_bytes / 1e6:g} MB")
+            self._terminate(item, TOO_MUCH_OUTPUT, f"wrote more than its limit of {limits.output_bytes / 1e6:g} MB")
 
-    def _end(self, item: int, outcome: str, reason: str) -> None:
-        """Make the process write its stack trace, then kill it."""
+    def _terminate(self, item: int, outcome: str, reason: str) -> None:
+        """Request the stack trace of the process, then kill the process."""
         trace = self._folder / "trace"
         self._signal(DUMP_SIGNAL)
         deadline = time.monotonic() + _DUMP_S
@@ -177,30 +178,31 @@ class WatchedWorker:
         self._termination = (item, WorkerExitError(outcome, reason, self._last_trace(with_output=False)))
         self._kill()
 
-    def _alive(self) -> bool:
+    def _is_alive(self) -> bool:
         return self._process is not None and self._process.is_alive()
 
     def _signal(self, number: int) -> None:
-        """Signal the supervisor; its process id cannot be reused until loky has registered its end."""
-        if self._alive():
+        """Send a signal to the supervisor; its process id cannot be reused until loky has registered its end."""
+        if self._is_alive():
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, number)
 
     def _kill(self) -> None:
         self._signal(END_SIGNAL)
-        if self._process is None or self._ends_within(_KILLING_S):
+        if self._process is None or self._wait_for_end(_KILLING_S):
             return
-        # the supervisor was stopped or is busy
-        kill([*descendants(self._process.pid), self._process.pid, *marked_processes(self._mark)])
+        # the supervisor was stopped or is busy, so its processes are killed directly
+        kill([*descendants(self._process.pid), self._process.pid, *find_marked_processes(self._mark)])
 
-    def _ends_within(self, seconds: float) -> bool:
-        deadline = time.monotonic() + seconds
-        while self._alive() and time.monotonic() < deadline:
+    def _wait_for_end(self, max_seconds: float) -> bool:
+        """Wait for the end of the process; return whether it has ended."""
+        deadline = time.monotonic() + max_seconds
+        while self._is_alive() and time.monotonic() < deadline:
             time.sleep(0.005)
-        return not self._alive()
+        return not self._is_alive()
 
     def handle_death(self, error: BaseException) -> tuple[int | None, WorkerExitError]:
-        """Identify the task of the dead process (None without a task) and the cause of death; prepare a new process."""
+        """Identify the item of the dead process (may be None) and the cause of death; prepare a new process."""
         item: int | None
         if self._termination is not None:
             item, cause = self._termination
@@ -219,7 +221,7 @@ class WatchedWorker:
         return item, cause
 
     def _last_trace(self, *, with_output: bool) -> str:
-        """Fatal error, stack of the failed thread, and last output of the process."""
+        """Return the fatal error, the stack of the failed thread, and the last output of the process."""
         trace, output = (self._folder / name for name in ("trace", "output"))
         text = trace.read_text(errors="replace") if trace.exists() else ""
         parts = [part.strip() for part in text.split("\n\n") if part.strip()]
@@ -241,26 +243,26 @@ class WatchedWorker:
         self._start()
 
     def stop(self, *, kill: bool) -> None:
-        """End the process, after some seconds by force, and wait for its end."""
+        """End the process and wait for its end; kill it now if `kill` is set, otherwise after some seconds."""
         manager = self._executor._executor_manager_thread
         if kill:
             self._kill()
         self._executor.shutdown(wait=False)
-        if not self._ends_within(_EXIT_S):
+        if not self._wait_for_end(_EXIT_S):
             self._kill()
         if manager is not None:
             manager.join(_KILLING_S)
             if manager.is_alive():
-                supervisor.kill(marked_processes(self._mark))
+                supervisor.kill(find_marked_processes(self._mark))
                 manager.join(_KILLING_S)
         self._board.close()
 
 
 class LocalExecutor(AbstractContextManager["LocalExecutor"]):
-    """Worker processes on this machine, as a context: they end at its exit, and are killed after an exception.
+    """Executor with worker processes on this machine, as a context; an exception in the context kills the processes.
 
-    jobs: number of workers.
-    executors: number of such executors, including this one, that use the memory of the machine.
+    - jobs: number of workers
+    - executors: number of executors that share the memory of the machine, including this executor
     """
 
     def __init__(self, jobs: int, executors: int = 1) -> None:
@@ -268,7 +270,7 @@ class LocalExecutor(AbstractContextManager["LocalExecutor"]):
         try:
             _remove_abandoned_folders()
             self._folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
-            # renamed after it is locked
+            # the lock file is locked before it gets its final name, so that no other process can lock it first
             partial = self._folder / "lock.partial"
             self._lock = os.open(partial, os.O_RDWR | os.O_CREAT, 0o600)
             fcntl.flock(self._lock, fcntl.LOCK_EX)
@@ -288,12 +290,12 @@ class LocalExecutor(AbstractContextManager["LocalExecutor"]):
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
-        """See `Executor.run`."""
+        """Run work as described in `Executor.run`."""
         yield from _Run(work, work.limits.memory_bytes or self._default_memory_bytes, self._workers).results()
 
 
 class _Run:
-    """Progress of one piece of work: batches at workers, retries, and results."""
+    """Progress of one `Work`: batches at workers, items to be run again, and results."""
 
     def __init__(self, work: Work[Any], memory_bytes: float, workers: Sequence[WatchedWorker]) -> None:
         self._work = work
@@ -307,7 +309,7 @@ class _Run:
         self._deaths_at_start = 0
 
     def results(self) -> Iterator[list[TaskResult[Any]]]:
-        """See `Executor.run`."""
+        """Run the work as described in `Executor.run`."""
         while True:
             self._submit_batches()
             if not self._running:
@@ -317,7 +319,7 @@ class _Run:
             for worker, _ in self._running.values():
                 worker.enforce_limits(self._work.limits, self._memory_bytes)
             if results:
-                # done before the caller stores the results, so that no worker waits
+                # submit before the caller stores the results, so that no worker waits
                 self._submit_batches()
                 yield results
 
@@ -356,7 +358,7 @@ class _Run:
             worker.replace()
         suspects = [result for result in batch_result.results if result.crashed and result.previous_item is not None]
         for suspect in suspects:
-            # at most one, the last of the batch; it runs again in the fresh process
+            # there is at most one, the last item of the batch; it runs again in the fresh process
             self._suspect_predecessors[suspect.item] = suspect.previous_item
             self._submit(worker, [suspect.item])
         if not suspects:
@@ -364,7 +366,10 @@ class _Run:
         finished = [result for result in batch_result.results if result not in suspects]
         pairs = [(result, self._suspect_predecessors.pop(result.item, None)) for result in finished]
         # an item that does not crash in a fresh process crashed because of the previous item
-        return [result if result.crashed else replace(result, spoiled_by=predecessor) for result, predecessor in pairs]
+        return [
+            result if result.crashed else replace(result, crashed_only_after=predecessor)
+            for result, predecessor in pairs
+        ]
 
     def _handle_worker_crash(
         self, worker: WatchedWorker, batch: Sequence[int], error: BaseException
@@ -392,6 +397,7 @@ class _Run:
 
 
 def _remove_abandoned_folders() -> None:
+    """Remove the folders of executors whose processes have ended, so that their lock is free."""
     for lock in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*/{_LOCK}"):
         with suppress(OSError):
             descriptor = os.open(lock, os.O_RDWR)
@@ -403,7 +409,7 @@ def _remove_abandoned_folders() -> None:
 
 
 def free_memory() -> float:
-    """Available memory in bytes; infinite if Linux does not report it."""
+    """Return the available memory in bytes; infinite if the operating system does not report it."""
     try:
         text = Path("/proc/meminfo").read_text()
     except OSError:
@@ -414,7 +420,7 @@ def free_memory() -> float:
 
 @dataclass(frozen=True)
 class ExecutorConfig:
-    """Choice of an executor: `jobs` worker processes on this machine, or a cluster if its address is given.
+    """Configuration of an executor: `jobs` worker processes on this machine, or a cluster if `cluster` is set.
 
     `cluster` is the address of a Dask scheduler (`tcp://host:8786`), or `local:N` for a new local cluster of N workers.
     """
@@ -423,12 +429,12 @@ class ExecutorConfig:
     cluster: str | None = None
 
     def describe(self) -> str:
-        """Text for the campaign record."""
+        """Describe the executor for the campaign's record."""
         return f"{self.jobs} on this machine" if self.cluster is None else f"cluster {self.cluster}"
 
 
 def create_executor(config: ExecutorConfig) -> AbstractContextManager[Executor]:
-    """Executor as a context; its workers are killed after an exception, and end otherwise.
+    """Create an executor as a context; at the end its workers end, or are killed after an exception.
 
     Raises CampaignError if the cluster cannot be reached or Dask is not installed.
     """

@@ -1,4 +1,4 @@
-"""Campaign engine: run a campaign in a folder, resume it, or append cases; prepare shared inputs and store rows."""
+"""Campaign engine: run a campaign in a folder, resume it, or append cases; store rows and products."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from marsyard.sim.kernel_cache import mark_ready
 
 
 class Watch(Protocol):
-    """Receiver of a campaign's progress."""
+    """Receiver of progress reports of a campaign."""
 
     def begin(self, stage: str, total: int) -> None:
         """Start a stage with a number of steps."""
@@ -46,6 +46,8 @@ class Watch(Protocol):
 
 @dataclass(frozen=True)
 class _Run:
+    """A campaign with its folder, its executor and the receiver of its progress."""
+
     campaign: Campaign
     directory: Path
     executor: ExecutorConfig
@@ -55,9 +57,9 @@ class _Run:
 def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
     """Run a campaign in a new folder.
 
-    Rows are stored in `cases.sqlite` as cases end; `cases.parquet` is written after the last case.
-    Raises CampaignError if the folder is occupied or not writable, or a column of a requirement is missing.
-    Raises KeyboardInterrupt again after the rows and the record are stored.
+    Rows are stored in `cases.sqlite` as soon as cases end; `cases.parquet` is written after the last case.
+    Raises CampaignError if the folder contains a campaign or is not writable, or a column of a requirement is missing.
+    On KeyboardInterrupt, rows and record are stored before the exception is raised again.
     """
     record.claim(directory)
     with folder_lock(directory):
@@ -80,12 +82,13 @@ def resume_campaign(
     case_time_s: float | None = None,
     allow_changed: bool = False,
 ) -> None:
-    """Run the cases of a stored campaign that have no row yet; finished cases keep their rows.
+    """Run the cases of a stored campaign that have no row yet; the rows of finished cases do not change.
 
-    retry: keys of `RETRYABLE`: cases with these outcomes run again; their old rows stay until then.
-    case_time_s: replaces the campaign's time limit for the remaining cases.
-    allow_changed: continue with a different program or versions, and record the difference.
-    Raises CampaignError if the folder contains no campaign that can be continued; it stays unchanged.
+    - retry: keys of `RETRYABLE`; cases with these outcomes run again, and their new rows replace the old rows
+    - case_time_s: time limit of the remaining cases instead of the campaign's
+    - allow_changed: continue with another program or other versions, and record the differences
+
+    Raises CampaignError if the folder contains no campaign that can be continued; the folder is then unchanged.
     """
     record.read(directory)  # no lock file is created in a folder without a campaign
     with folder_lock(directory):
@@ -105,7 +108,8 @@ def append_cases(
 ) -> None:
     """Append a block of cases to a finished campaign, and run it.
 
-    Raises CampaignError as `resume_campaign` does, if the campaign is unfinished, or the block does not fit its design.
+    Raises CampaignError like `resume_campaign`, for an unfinished campaign, and for a block that does not fit the
+    sampling design.
     """
     record.read(directory)  # no lock file is created in a folder without a campaign
     with folder_lock(directory):
@@ -117,7 +121,7 @@ def append_cases(
 
 
 def campaign_with_block(directory: Path, cases: int) -> Campaign:
-    """Stored campaign with an additional block of cases; runs nothing. Raises CampaignError as `append_cases` does."""
+    """Load a stored campaign with an additional block of cases. Raises CampaignError like `append_cases`."""
     configuration = record.stored_configuration(directory)
     appended = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
     problems = [message for _, message in appended.find_sampling_problems()]
@@ -127,7 +131,7 @@ def campaign_with_block(directory: Path, cases: int) -> Campaign:
 
 
 def _continue_campaign(run: _Run, command: str, allow_changed: bool, retry: Sequence[str] = ()) -> None:
-    """Run the missing cases of a stored campaign, and those to be retried."""
+    """Run the missing cases of a stored campaign, and cases with the outcomes in `retry` again."""
     campaign, directory, watch = run.campaign, run.directory, run.watch
     configuration, stored = campaign.configuration, record.read(directory)
     if "identity" not in stored:
@@ -171,7 +175,7 @@ def _continue_campaign(run: _Run, command: str, allow_changed: bool, retry: Sequ
 
 
 def _execute(run: _Run, store: RowStore, retries: Sequence[int]) -> None:
-    """Run the missing cases and those of `retries`; write the table, keep products, and record the progress."""
+    """Run the missing cases and those of `retries`; write the table, store products, and record the progress."""
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
 
     def record_end(state: str) -> None:
@@ -186,9 +190,9 @@ def _execute(run: _Run, store: RowStore, retries: Sequence[int]) -> None:
                     _prepare_inputs(run, executor, itertools.chain(*missing, retries))
                     _run_cases(run, store, executor, [*missing, retries], first_case_ended)
             write_table(table, store, numeric_metrics(configuration.requirements))
-            _keep_worst(run, store, executor)
+            _rerun_for_products(run, store, executor)
     except BaseException:
-        # on a full disk the record keeps the state "running"; the released lock shows that no process runs
+        # on a full disk the state in the record stays "running"; the released lock shows that no process runs
         with suppress(StoreError):
             record_end("interrupted")
         raise
@@ -230,7 +234,7 @@ def _run_cases(
     is_checked = False
     for batch in run_cases(executor, configuration, cases, keep=select_kept_cases(configuration), total=total):
         for completed in batch:
-            _keep_products(products, completed, watch)
+            _store_products(products, completed, watch)
         store.add(completed.row for completed in batch)
         finished = next((item.row for item in batch if item.row["outcome"] not in ENGINE_FAILURES), None)
         if not is_checked and finished is not None:
@@ -242,40 +246,40 @@ def _run_cases(
             watch.step()
 
 
-def _keep_products(products: ProductStore, completed: CompletedCase, watch: Watch) -> None:
+def _store_products(products: ProductStore, completed: CompletedCase, watch: Watch) -> None:
     if completed.note:
         watch.note(completed.note)
     if completed.products is None or products.full:
         return
     case = int(completed.row["case"])
     if not products.save(case, completed.products, completed.row):
-        watch.note(f"the budget for kept products (retain.budget_gb) is used: none is kept from case {case} on")
+        watch.note(f"the disk space for products (retain.budget_gb) is used: none are stored from case {case} on")
 
 
 def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Path) -> None:
     """Check the columns of the requirements against a finished case, before more cases run.
 
-    A row may lack columns that the scenario declares: these are checked when the campaign is loaded
+    Columns that the scenario declares may be missing in the row; they were checked when the campaign was loaded
     (`marsyard.campaigns.definition.loading`). Raises ConfigurationError if a column of a requirement is missing or has
-    the wrong type: numbers for a metric with a bound, booleans for a metric without a bound and for a population.
+    the wrong type: a metric with a bound needs numbers, a metric without a bound and a population need booleans.
     """
     declared = row_columns(configuration.scenario) or RowColumns((), ())
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
 
     def is_known(name: str, kind: str) -> bool:
-        absent = name not in row and (declared.has_flag(name) or declared.has_number(name))
-        return absent or name in (numbers if kind == NUMBERS else flags)
+        is_declared = name not in row and (declared.has_flag(name) or declared.has_number(name))
+        return is_declared or name in (numbers if kind == NUMBERS else flags)
 
     unknown_columns = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
     problems = [Problem(configuration.name, key_text(key), message) for key, message in unknown_columns]
     if problems:
-        consequence = Problem(str(directory), "", "the campaign was stopped; the rows so far are kept")
+        consequence = Problem(str(directory), "", "the campaign was stopped; its rows are stored")
         raise ConfigurationError([*problems, consequence])
 
 
-def _keep_worst(run: _Run, store: RowStore, executor: Executor) -> None:
-    """Run the showcase and, if they are kept, the worst cases again for their products."""
+def _rerun_for_products(run: _Run, store: RowStore, executor: Executor) -> None:
+    """Run the showcase again, and the worst cases if the campaign stores their products, to store the products."""
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
     showcase = find_showcase(configuration, table, store)
     cases = [] if showcase is None else [showcase]
@@ -291,6 +295,6 @@ def _keep_worst(run: _Run, store: RowStore, executor: Executor) -> None:
         if replayed.differing:
             record.update(run.directory, {"showcase_differs": list(replayed.differing)})
             run.watch.note(f"case {case}, run again, differs from its stored row in: {', '.join(replayed.differing)}")
-        _keep_products(products, CompletedCase(replayed.row, replayed.products, replayed.note), run.watch)
+        _store_products(products, CompletedCase(replayed.row, replayed.products, replayed.note), run.watch)
         run.watch.step()
     record.update(run.directory, {"showcase": showcase})

@@ -1,7 +1,7 @@
-"""Offline campaigns: cases are exported without their truth, and the answers to them are scored.
+"""Offline campaigns: cases are exported without their truth to another team, and its answers are scored.
 
-Both are ordinary campaigns. The exporting campaign writes to the folder of the truth: its rows contain the truth of
-each case. The scoring campaign runs the same cases again, with a table of answers in place of the algorithm.
+The export and the scoring are campaigns. The rows of the export campaign contain the truth and are stored in a separate
+folder. The scoring campaign runs the same cases again, with a table of answers instead of an algorithm.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.offline import ANSWERS, CASES, read_answers
 from marsyard.scenarios.systems import scenario
 
-#: Description of an exported folder, for programs and for the team under test.
+#: Files that describe an exported folder, for programs and for the team under test.
 MANIFEST_FILE, README_FILE = "export.json", "README.md"
 SCHEMA = 1
 
 
 def truth_folder(directory: Path) -> Path:
-    """Default folder of the truth: next to the exported folder."""
+    """Return the default folder of the truth, next to the exported folder."""
     return directory.with_name(f"{directory.name}-truth")
 
 
 def export_campaign(campaign: Campaign, directory: Path, truth: Path, executor: ExecutorConfig, watch: Watch) -> None:
-    """Export a campaign's cases; continue an interrupted earlier export of the same campaign.
+    """Export a campaign's cases, or continue an interrupted export of the same campaign.
 
-    The campaign's algorithm is `export:` with the folder. Raises CampaignError if the folders have other contents or
+    The campaign's algorithm is `export:` with the folder. Raises CampaignError if the folders contain other files, or
     are not writable.
     """
     if truth.resolve().is_relative_to(directory.resolve()):
-        raise CampaignError(f"--truth {truth}: is inside {directory}, which is given to the team under test")
+        raise CampaignError(f"--truth {truth}: is inside {directory}, which the team under test receives")
     if (truth / record.RECORD_FILE).is_file():
         stored = record.stored_configuration(truth)
         if configuration_hash(stored) != configuration_hash(campaign.configuration):
@@ -78,8 +78,8 @@ outcome and no numbers; outcomes: {", ".join(answer_format.outcomes.__members__)
         (directory / README_FILE).write_text(text, encoding="utf-8")
 
 
-def scored_campaign(directory: Path, truth: Path, answers: Path) -> Campaign:
-    """Exported campaign with the answers of a table in place of its algorithm.
+def create_scoring_campaign(directory: Path, truth: Path, answers: Path) -> Campaign:
+    """Create the campaign that scores the answers in a table: the exported campaign with the table as its algorithm.
 
     Raises CampaignError if the folders contain no finished export, or the table does not answer each case once.
     """
@@ -128,6 +128,7 @@ def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, a
 
 
 def _list_first(cases: Sequence[int]) -> str:
+    """Format up to eight case numbers."""
     return ", ".join(str(case) for case in cases[:8]) + (", ..." if len(cases) > 8 else "")
 
 
@@ -138,7 +139,7 @@ def _find_task(campaign: Campaign) -> Task[Any, Any]:
 
 
 def find_cases_with_changed_images(truth: Path, scored: Path) -> list[int]:
-    """Cases whose images differ between export and scoring."""
+    """Return the cases whose images differ between export and scoring."""
     exported = {row["case"]: row.get("image_hash") for row in read_rows(truth / TABLE_FILE)}
     rows = read_rows(scored / TABLE_FILE)
     return [int(row["case"]) for row in rows if row.get("image_hash") != exported.get(row["case"])]

@@ -1,4 +1,4 @@
-"""Preparation of a campaign: shared inputs (terrains), compiled kernels, and an estimate of time and disk space."""
+"""Preparation of a campaign: plan of shared inputs (terrains), compilation, estimate of time and disk space."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ REPORT_INTERVAL_S = 10.0
 #: Maximum number of trial cases; the first is excluded from the mean, since it loads code and terrains.
 _MAX_TRIALS = 9
 #: Seconds after which no further trial case is started.
-_TRIAL_S = 20.0
-#: Bytes of SQLite and of the table per byte of a row's text: pages, index and compressed columns.
+_MAX_TRIAL_TIME_S = 20.0
+#: Bytes of SQLite file and table per byte of a row's JSON text: pages, index and compressed columns.
 _ROW_OVERHEAD = 1.6
 
 
@@ -36,8 +36,9 @@ _ROW_OVERHEAD = 1.6
 class InputPlan:
     """Shared inputs of some cases.
 
-    present: numbers of the inputs on disk, if the scenario reports them. to_build: numbers of the inputs to be built,
-    each with its bytes on disk (0 if the scenario does not report them). limit_bytes: size limit of the cache.
+    - present: numbers of the inputs on disk, if the scenario reports them
+    - to_build: numbers of the inputs to be built, with their bytes on disk (0 if the scenario does not report them)
+    - limit_bytes: size limit of the cache
     """
 
     present: tuple[int, ...]
@@ -51,7 +52,7 @@ class InputPlan:
 
     @property
     def to_prepare(self) -> tuple[int, ...]:
-        """Inputs to be prepared before the cases: existing ones, to be verified, then new ones up to the cache's limit.
+        """Inputs to be prepared before the cases: existing inputs are verified, new inputs are built up to the limit.
 
         The cases build the remaining inputs when they need them.
         """
@@ -73,7 +74,7 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
     if not numbers:
         return InputPlan((), {}, 0)
     scenario, base = campaign.scenario, campaign.base_parameters()
-    selects = isinstance(scenario, SelectsInputs)
+    reports_inputs = isinstance(scenario, SelectsInputs)
     try:
         folder = cache_directory("terrain")
         limit = limit_bytes(folder, cached_bytes(folder))
@@ -82,15 +83,15 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
         raise CampaignError(f"the cache cannot be used: {error}") from error
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    present = tuple(n for n in numbers if selects and sizes[n] == 0)
+    present = tuple(n for n in numbers if reports_inputs and sizes[n] == 0)
     return InputPlan(present, {n: size for n, size in sizes.items() if n not in present}, limit)
 
 
 def find_used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...]:
-    """Numbers of the shared inputs that cases use, ascending; all if the scenario does not report those of a case.
+    """Find the numbers of the shared inputs that cases use; all inputs if the scenario does not report those of a case.
 
-    The sampled values are a function of the case's number. The search ends when all inputs have occurred: for 250
-    terrains after about 1,500 cases of two milliseconds each.
+    The sampled values depend only on the number of the case. The search ends when all inputs have occurred: for 250
+    terrains after about 1,500 cases, each of which takes two milliseconds.
     """
     all_inputs = campaign.scenario.shared_inputs(campaign.base_parameters())
     if not all_inputs or not isinstance(campaign.scenario, SelectsInputs):
@@ -108,9 +109,9 @@ def find_used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...
 
 @contextmanager
 def report_compilation(scenario: str, note: Callable[[str], None]) -> Iterator[Callable[[], None]]:
-    """Report the compilation of kernels until the context ends; report nothing if the kernels are compiled already.
+    """Report the compilation of kernels until the context ends; report nothing if the kernels are already compiled.
 
-    Yields a function to be called when the first case has ended and compilation is complete.
+    Yields a function that must be called when the first case has ended: then the compilation is complete.
     """
     if scenario not in scenario_paths() or kernels_are_ready(scenario):
         yield lambda: None
@@ -139,14 +140,14 @@ def report_compilation(scenario: str, note: Callable[[str], None]) -> Iterator[C
 
 @dataclass(frozen=True)
 class Estimate:
-    """Time and disk space of a campaign.
+    """Estimated time and disk space of a campaign.
 
-    trials, unfinished: number of trial cases, and of unfinished cases among them. case_s, case_range_s: mean wall-clock
-    time of a trial case on one worker, and its range. inputs, input_s, inputs_bytes: number of shared inputs (terrains)
-    to be built, mean time of building one, and total bytes on disk (0 if the scenario does not report them).
-    cache_limit_bytes: size limit of the inputs' cache. time_s: time of the whole campaign with the requested workers,
-    if there is a core for each. rows_bytes, products_bytes: bytes on disk of SQLite and table, and of the kept products
-    (within their budget).
+    - trials, unfinished: number of trial cases, and number of these that did not finish
+    - case_s, case_range_s: mean wall-clock time of a trial case on one worker, and its range
+    - inputs, input_s, inputs_bytes: number of shared inputs (terrains) to be built, mean time to build one, and total
+      bytes on disk (0 if the scenario does not report them); cache_limit_bytes: size limit of their cache
+    - time_s: time of the complete campaign with the requested workers, if each has a processor core
+    - rows_bytes, products_bytes: bytes on disk of SQLite file and table, and of the stored products within their budget
     """
 
     trials: int
@@ -163,7 +164,7 @@ class Estimate:
 
 
 def estimate(campaign: Campaign, jobs: int) -> Estimate:
-    """Run trial cases, evenly spaced over the campaign, in one worker; keep only the shared inputs built for them."""
+    """Estimate a campaign from evenly spaced trial cases in one worker; only their shared inputs remain on disk."""
     configuration, total = campaign.configuration, campaign.configuration.total_cases
     plan = plan_inputs(campaign, range(total))
     trials: list[CompletedCase] = []
@@ -173,7 +174,7 @@ def estimate(campaign: Campaign, jobs: int) -> Estimate:
     with create_executor(ExecutorConfig()) as executor:
         start_s = time.monotonic()
         for case in (index * total // number for index in range(number)):
-            if trials and time.monotonic() - start_s > _TRIAL_S:
+            if trials and time.monotonic() - start_s > _MAX_TRIAL_TIME_S:
                 break
             build_times += _build_inputs(campaign, executor, case)
             case_start_s = time.monotonic()
@@ -185,7 +186,7 @@ def estimate(campaign: Campaign, jobs: int) -> Estimate:
     row_bytes = statistics.fmean(len(json.dumps(list(trial.row.values()))) for trial in trials)
     product_bytes = statistics.fmean(trial.products.size if trial.products else 0 for trial in trials)
     retain = configuration.retain
-    # the number of failed cases is unknown before the campaign: all cases are the upper bound
+    # the number of failed cases is unknown before the campaign, so the upper bound (all cases) is used
     kept_cases = {"none": 0, "worst": retain.worst, "every": -(-total // retain.every), "all": total, "failed": total}
     products = min(total, kept_cases[retain.products] + int(retain.showcase != "none")) * product_bytes
     return Estimate(
@@ -206,7 +207,7 @@ def estimate(campaign: Campaign, jobs: int) -> Estimate:
 def _build_inputs(campaign: Campaign, executor: Executor, case: int) -> list[float]:
     """Build the missing shared inputs of a case; return the time of each.
 
-    If the scenario does not report the inputs of a case, the first input represents all, and is built for case 0.
+    If the scenario does not report the inputs of a case, only the first input is built, for case 0.
     """
     missing = list(plan_inputs(campaign, [case]).to_build)
     if not isinstance(campaign.scenario, SelectsInputs):

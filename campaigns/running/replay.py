@@ -1,4 +1,4 @@
-"""Stored campaigns loaded again, single cases compared with their stored rows, and conformance checks of algorithms."""
+"""Loading of stored campaigns, replay of single cases, and conformance checks of algorithms in worker processes."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ from marsyard.scenarios.systems import UnknownScenarioError, scenario
 
 @dataclass(frozen=True)
 class Replay:
-    """A case that was run a second time.
+    """A case that was run again.
 
-    row, stored: its new row, and the stored row (None if it has none yet). differing: columns in which the two rows
-    differ, except those with `time` in their name. products: products for figures; None if the scenario returned none,
-    or none that can be stored. note: reason why there are no products; empty without a problem. changed: differences in
-    configuration, code and package versions from the stored campaign.
+    - row, stored: new row and stored row of the case (None if no row is stored)
+    - differing: columns in which the two rows differ, except those with `time` in their name
+    - products: products for figures; None if the scenario returned none, or none that can be stored
+    - note: reason why there are no products; empty without a problem
+    - changed: differences in configuration, code and package versions from the stored campaign
     """
 
     case: int
@@ -51,7 +52,7 @@ class Replay:
 
     @property
     def failed(self) -> bool:
-        """Whether the case is unfinished now, although its stored row is finished."""
+        """Whether the case did not finish in the replay, although it finished in the stored campaign."""
         was_finished = self.stored is not None and self.stored["outcome"] not in ENGINE_FAILURES
         return was_finished and self.row["outcome"] in ENGINE_FAILURES
 
@@ -60,7 +61,7 @@ def replay(directory: Path, case: int) -> Replay:
     """Run one case of a stored campaign again, in a worker process.
 
     Raises CampaignError if the folder contains no campaign, the case does not exist, or the scenario or an algorithm
-    cannot be imported; no case is run then.
+    cannot be imported.
     """
     configuration = stored_configuration(directory)
     if not 0 <= case < configuration.total_cases:
@@ -80,16 +81,16 @@ def replay_with(
     stored: Row | None,
     changed: tuple[str, ...] = (),
 ) -> Replay:
-    """Run one case again with the given workers, and compare it with a row."""
+    """Run one case again in an executor, and compare it with its stored row."""
     ((completed,),) = run_cases(executor, configuration, [case], keep=KEEP_ALL)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
     return Replay(case, completed.row, stored, differing, completed.products, completed.note, changed)
 
 
 def differing_columns(row: Row, stored: Row) -> tuple[str, ...]:
-    """Columns in which two rows differ bit for bit, except times; a missing number equals NaN.
+    """List the columns in which two rows are not bit-identical, except times; a missing number equals NaN.
 
-    The traceback of an unfinished case is not compared: a process never ends twice at the same instruction.
+    The traceback of an unfinished case is not compared, since a process is not always terminated at the same line.
     """
     excluded = {"traceback"} if row.get("outcome") in ENGINE_FAILURES else set()
     differing = []
@@ -102,7 +103,7 @@ def differing_columns(row: Row, stored: Row) -> tuple[str, ...]:
 
 
 def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:
-    """Campaign of a stored configuration; its scenario and algorithms are imported.
+    """Create the campaign of a stored configuration; imports its scenario and algorithms.
 
     Raises ConfigurationError if the scenario or an algorithm cannot be imported, or a parameter is invalid.
     """
@@ -114,19 +115,20 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
         if isinstance(error, ValidationError):
             errors = validation_problems(error, campaign.scenario.parameters_type)
             problems = [(key_text(("parameters", *key)), message) for key, message in errors]
-        hint = "custom modules are searched for in the current folder: start the command in the campaign's first folder"
+        hint = "custom modules are imported from the current folder: start the command in the campaign's first folder"
         problems.append(("", f"nothing was run or changed; {hint}"))
         raise ConfigurationError([Problem(str(directory), *problem) for problem in problems]) from error
     return campaign
 
 
-#: Limits of output and memory of a check.
+#: Limits of output and memory of a conformance check.
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
 def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject:
-    """Algorithm or part of a name, for a given task, or for the task that its interface determines.
+    """Create the subject of conformance checks from the name of an algorithm or a part.
 
+    task: task of the algorithm; None for the task that its interface determines.
     Raises CampaignError if the name or the task is unknown.
     """
     if task is not None and task not in suite.SUBJECT_KINDS:
@@ -140,8 +142,8 @@ def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject
 
 
 def run_conformance_checks(subject: suite.Subject) -> Iterator[suite.Finding]:
-    """Run all checks in order; stop after the first check, the ordinary case, if its worker process ends."""
-    # the time limit of an answer, the same again for the other work of the check, and 5 s
+    """Run all checks in order; stop after the first check (an ordinary case) if its worker process dies."""
+    # the time limit of an answer, the same time for the other work of the check, and 5 s
     limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalExecutor(1) as workers:
         for number, (name, requirement) in enumerate(suite.check_names(subject)):
@@ -154,7 +156,7 @@ def run_conformance_checks(subject: suite.Subject) -> Iterator[suite.Finding]:
                 finding = suite.Finding(name, requirement, problem, advice)
             elif finding is None:
                 problem = f"{type(error).__name__}: {error}"
-                advice = "this is a defect of the suite or of the answer's types"
+                advice = "this is a defect of the checks or of the types in the answer"
                 finding = suite.Finding(name, requirement, problem, advice)
             elif finding.passed and result.changed:
                 problem = f"it changed the state of its process: {'; '.join(result.changed)}"

@@ -1,19 +1,19 @@
-"""Sampling designs and correlated groups: how the uniform random numbers of the cases are generated.
+"""Sampling designs and correlated groups: they define the uniform random numbers of the cases.
 
-``random`` draws every number independently: the only design that supports probability statements.
-``latin-hypercube`` and ``sobol`` are stratified, which gives sharper means and sensitivities with fewer cases; their
-cases are not independent, so they give statistics and no verdict. Dispersions of kind ``grid`` form a full factorial
-under any design, which is not random either.
+``random`` draws every number independently. Only this design allows probability statements. ``latin-hypercube`` and
+``sobol`` are stratified: means and sensitivities have smaller errors with the same number of cases, but the cases are
+not independent, so there is no verdict at a confidence. Dispersions of kind ``grid`` form a full factorial with any
+design, which is not random either.
 
-Any case can be drawn alone. The number of the case determines its block (the first, or an appended one), its point
-of the grid (its number within the block, modulo the grid's size), and its index in the design of this block and grid
-point. A stratified design is built as a whole, from one stream per dispersion; its size is part of its definition.
+Each case can be drawn alone. The number of the case determines its block (the first, or an appended block), its point
+of the grid (its number within the block, modulo the size of the grid), and its index in the design of this block and
+grid point. A stratified design is computed for all its cases, from one random stream per dispersion.
 
-Correlated groups are defined by a covariance, a correlation or a rank correlation. All three are one Gaussian copula
-(Nelsen, An Introduction to Copulas, 2006, section 2.3). The independent uniform numbers u of the members become normal,
-z = Phi^-1(u). The normals are mixed, z' = L z with the Cholesky factor L L^T = R of their correlation. Phi(z') replaces
-u. Every member keeps its distribution for any R. As L is lower triangular, the first member is sampled as if alone,
-and a member added at the end changes no earlier member.
+Correlated groups are defined by a covariance, a correlation or a rank correlation. In all three cases the members are
+coupled by a Gaussian copula (Nelsen, An Introduction to Copulas, 2006, section 2.3). Independent uniform numbers u are
+converted to normal numbers z = Phi^-1(u), which are correlated, z' = L z, with the Cholesky factor of their correlation
+R = L L^T. Phi(z') then replaces u. The distribution of each member does not depend on R. Since L is lower triangular, a
+member that is added at the end of a group does not change the numbers of the other members.
 
 - ``covariance`` and ``correlation`` (Pearson's) are for normal dispersions without truncation, whose draws are exactly
   multivariate normal: R is the correlation itself. A covariance also defines the standard deviations.
@@ -35,15 +35,15 @@ from scipy.special import ndtr, ndtri
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
 
-#: Minimum draw, half the step of `Generator.random`: unbounded distributions have no value at 0.
+#: Minimum draw, half the step of `Generator.random`, since unbounded distributions have no value at 0.
 MIN_DRAW = 2.0**-54
 #: Maximum draw, the largest float below 1.
 MAX_DRAW = 1.0 - 2.0**-53
-#: Maximum number of cases of one stratified design, which takes eight bytes for each case and dispersion.
+#: Maximum number of cases of one stratified design, which needs eight bytes for each case and dispersion.
 MAX_STRATIFIED = 2**20
 #: Bits of a Sobol point, as many as in a float's fraction.
 _SOBOL_BITS = 52
-#: Number of designs that a process caches: successive cases share a design.
+#: Number of designs that a process caches, since successive cases use the same design.
 _CACHED_DESIGNS = 4
 Kind = Literal["random", "latin-hypercube", "sobol"]
 #: Indices of a correlated group's members among the dispersions, and the rows of its factor L.
@@ -60,7 +60,7 @@ class Design(Parameters):
     nominal: Annotated[bool, Field(strict=True)] = False
 
     def find_invalid_block(self, blocks: Sequence[int], grid_size: int) -> tuple[int, str] | None:
-        """Index of the first block whose size does not fit the design, and the reason; None if all fit."""
+        """Find the first block whose size does not fit the design; return its index and the reason, or None."""
         for number, block in enumerate(blocks):
             nominal = int(self.nominal and number == 0)
             cases = block - nominal
@@ -83,10 +83,10 @@ class Design(Parameters):
 
 
 def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int) -> tuple[int, int, int, int] | None:
-    """Position of a case in blocks of given sizes; None for the nominal case.
+    """Return the position of a case in blocks of the sizes `blocks`; None for the nominal case.
 
-    Returns the index of its point of the grid, the first case and the number of cases at this point in its block, and
-    the index of the case among them.
+    The position consists of the index of the case's grid point, the first case and the number of cases at this point in
+    the block, and the index of the case among these cases.
     """
     if design.nominal and case == 0:
         return None
@@ -105,17 +105,19 @@ def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int
 def build_stratified_design(
     kind: Kind, seed: int, campaign: str, first: int, size: int, paths: tuple[str, ...], groups: tuple[Group, ...]
 ) -> Float64[np.ndarray, "cases dispersions"]:
-    """Uniform numbers of a stratified design, each above 0 and below 1.
+    """Create the uniform numbers of a stratified design, each above 0 and below 1.
 
-    kind: `latin-hypercube` or `sobol`. seed, campaign, first: identify the random streams; `first` is the first case of
-    the design. size: number of cases. paths: dispersions, in the order of their dimensions. groups: see `Group`.
+    - kind: `latin-hypercube` or `sobol`
+    - seed, campaign, first: identify the random streams; `first` is the first case of the design
+    - size: number of cases; paths: dispersions, in the order of their dimensions; groups: see `Group`
 
-    Every dispersion has its own stream. A Latin hypercube is a random permutation of the strata for each dispersion,
-    independent of the others. The dimensions of a Sobol sequence follow the order of the file; each is scrambled
-    (Matousek 1998, in SciPy) from its own stream, and depends on its position only.
+    Each dispersion has its own stream. A Latin hypercube is an independent random permutation of the strata for each
+    dispersion. The dimensions of a Sobol sequence follow the order of the file; each dimension is scrambled (Matousek
+    1998, in SciPy) with its own stream, and depends only on its position.
 
-    Members of a correlated group keep their strata in a Latin hypercube: their numbers are sorted into the rank order
-    of the mixed numbers (Stein 1987, Technometrics 29, 143-151). For a Sobol sequence the numbers themselves are mixed.
+    In a Latin hypercube, the numbers of a correlated group are sorted into the rank order of the correlated numbers, so
+    that each stratum still contains one number (Stein 1987, Technometrics 29, 143-151). In a Sobol sequence, the
+    correlated numbers replace the original numbers.
     """
     from scipy.stats import qmc
 
@@ -127,7 +129,7 @@ def build_stratified_design(
             points[:, k] = qmc.LatinHypercube(d=1, rng=rng).random(size)[:, 0]
         else:
             sequence = qmc.Sobol(d=k + 1, scramble=True, bits=_SOBOL_BITS, rng=rng).random(size)
-            # centre of the step, never 0
+            # use the centre of the step, which is never 0
             points[:, k] = sequence[:, k] + 2.0 ** -(_SOBOL_BITS + 1)
     points = np.clip(points, MIN_DRAW, MAX_DRAW)
     for members, factor in groups:
@@ -144,18 +146,18 @@ def build_stratified_design(
 def correlate_uniform(
     uniform: Float64[np.ndarray, "*cases members"], factor: Float64[np.ndarray, "members members"]
 ) -> Float64[np.ndarray, "*cases members"]:
-    """Correlated uniform numbers of a group from independent numbers: Phi(L Phi^-1(u))."""
+    """Correlate independent uniform numbers u of a group: Phi(L Phi^-1(u)) with the factor L."""
     return np.asarray(np.clip(ndtr(ndtri(uniform) @ factor.T), MIN_DRAW, MAX_DRAW))
 
 
 def compute_grid_quantiles(sizes: Mapping[str, int], point: int) -> dict[str, float]:
-    """Probability (bin centre) of each grid's level at a point of the full factorial; the last grid varies fastest."""
+    """Compute the probability (bin centre) of each grid's level at a point of the full factorial, last grid fastest."""
     levels = np.unravel_index(point, tuple(sizes.values())) if sizes else ()
     return {path: (int(level) + 0.5) / size for (path, size), level in zip(sizes.items(), levels, strict=True)}
 
 
 def describe_design(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
-    """Sampling design in words."""
+    """Describe a sampling design in words."""
     names = {"random": "random draws", "latin-hypercube": "Latin hypercube", "sobol": "scrambled Sobol"}
     text = names.get(kind, kind)
     if kind == "random" and not grids:
@@ -166,7 +168,7 @@ def describe_design(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
 
 
 _Matrix = tuple[tuple[Annotated[float, Field(strict=True, allow_inf_nan=False)], ...], ...]
-#: Relative tolerance of symmetry: files contain rounded numbers.
+#: Relative tolerance of the check for symmetry, since files contain rounded numbers.
 _ROUNDING = 1e-9
 #: Minimum eigenvalue of a correlation matrix; below it, members are numerically functions of each other.
 _MIN_EIGENVALUE = 1e-10
@@ -175,7 +177,7 @@ MATRICES = ("covariance", "correlation", "rank")
 
 
 class Correlation(Parameters):
-    """Dispersed parameters that are drawn together, with one matrix in their order."""
+    """Correlated group of dispersed parameters, with one matrix in the order of the parameters."""
 
     parameters: Annotated[tuple[str, ...], Field(min_length=1, max_length=200)]
     covariance: _Matrix | None = None
@@ -213,7 +215,7 @@ class Correlation(Parameters):
 
     @property
     def kind(self) -> str:
-        """Kind of the given matrix."""
+        """Kind of the matrix: `covariance`, `correlation` or `rank`."""
         return next(name for name in MATRICES if getattr(self, name) is not None)
 
     @property

@@ -1,9 +1,8 @@
 """Base class of the dispersions, types of their fields, formulas, and quantiles of truncated distributions.
 
-A dispersion is a parameter's distribution over the cases, as an inverse distribution function. It maps one uniform
-number to a value. The values of a case therefore depend on one number per dispersion, whether these numbers are
-independent, correlated or stratified. Numbers of a distribution may be formulas of other parameters;
-`Dispersion.insert_values` inserts the values of a case.
+A dispersion defines the distribution of a parameter over the cases by its inverse distribution function, which maps one
+uniform number to a value. The uniform numbers can be independent, correlated or stratified. The parameters of a
+distribution can be formulas of other parameters of the campaign; `Dispersion.insert_values` evaluates the formulas.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from pydantic import Field, PlainValidator
 from pydantic_core import PydanticKnownError
 from scipy.special import ndtr, ndtri
 
-from marsyard.campaigns.errors import near_match
+from marsyard.campaigns.errors import suggest_similar
 from marsyard.sim.parameters import Parameters
 
 #: Maximum number of characters of a formula.
@@ -33,7 +32,7 @@ _BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
-    ast.Pow: math.pow,  # no complex numbers, no integers of a million digits
+    ast.Pow: math.pow,  # unlike **, it results in no complex numbers and no integers of a million digits
 }
 _UNARY: Mapping[type[ast.unaryop], Callable[[float], float]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
 #: Functions by name, with the minimum and maximum number of arguments.
@@ -51,7 +50,7 @@ _CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 
 @dataclass(frozen=True)
 class Formula:
-    """Text of a formula, and the paths of the parameters in it, each once."""
+    """A parsed formula: its text, and the paths of the parameters in it, each once."""
 
     text: str
     names: tuple[str, ...]
@@ -85,7 +84,7 @@ def formula(text: str) -> Formula:
     if len(text) > MAX_LENGTH:
         raise ValueError(f"a formula has at most {MAX_LENGTH} characters, not {len(text)}")
     try:
-        with warnings.catch_warnings():  # the parser warns about unusual texts
+        with warnings.catch_warnings():  # ignore warnings of the parser about invalid syntax
             warnings.simplefilter("ignore")
             root = ast.parse(text.strip(), mode="eval").body
         names = dict.fromkeys(_list_names(root))
@@ -96,7 +95,7 @@ def formula(text: str) -> Formula:
 
 
 def _list_names(node: ast.expr) -> list[str]:
-    """Paths of the parameters below a node. Raises ValueError for syntax that formulas do not support."""
+    """List the paths of the parameters below a node. Raises ValueError for syntax that formulas do not support."""
     match node:
         case ast.Constant(value=value) if type(value) in (int, float):
             return []
@@ -111,7 +110,9 @@ def _list_names(node: ast.expr) -> list[str]:
             _, minimum, maximum = _FUNCTIONS.get(name, (None, 0, 0))
             if not maximum:
                 allowed = sorted(_FUNCTIONS)
-                raise ValueError(f"unknown function '{name}'{near_match(name, allowed)}; allowed: {', '.join(allowed)}")
+                raise ValueError(
+                    f"unknown function '{name}'{suggest_similar(name, allowed)}; allowed: {', '.join(allowed)}"
+                )
             if not minimum <= len(arguments) <= maximum:
                 accepted = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
                 raise ValueError(f"{name} takes {accepted} arguments, not {len(arguments)}")
@@ -144,20 +145,20 @@ def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
     return _CONSTANTS[path] if path in _CONSTANTS else numbers[path]
 
 
-#: Tail probability omitted on either side when a distribution is checked against a parameter's allowed range.
+#: Probability of each tail that is ignored when a distribution is compared with the allowed range of a parameter.
 TAIL = 1e-12
 
 
 class Dispersion(Parameters, ABC):
-    """Fields of every dispersion: its distribution, and the source.
+    """Base class of the dispersions.
 
-    `unit` and `description` default to those of the parameter (the suffix of its name, its description in the
-    scenario).
+    By default, `unit` and `description` are those of the parameter: the suffix of its name, and its description in the
+    scenario.
     """
 
     #: Whether the distribution has a density; only then can its ranks be correlated.
     continuous: ClassVar[bool] = False
-    #: Fields that hold texts or literal values, never formulas.
+    #: Fields that contain texts or literal values, never formulas.
     _literals: ClassVar[set[str]] = {"distribution", "unit", "description", "source", "values", "value"}
 
     unit: str | None = None
@@ -166,19 +167,19 @@ class Dispersion(Parameters, ABC):
 
     @abstractmethod
     def quantile(self, probability: float) -> Any:
-        """Value below which a draw falls with this probability, 0 < probability < 1."""
+        """Return the quantile of the distribution at a probability, 0 < probability < 1."""
 
     def bounds(self) -> tuple[float, float] | None:
-        """Range of all values, infinite if unbounded; None if values are not numbers or depend on formulas."""
+        """Return the range of all values, infinite if unbounded; None if values are no numbers or use formulas."""
         return None
 
     def extremes(self) -> tuple[Any, ...]:
-        """Values to be checked against the parameter's allowed range."""
+        """Return the values that are compared with the allowed range of the parameter."""
         return self.quantile(TAIL), self.quantile(1.0 - TAIL)
 
     @cached_property
     def formulas(self) -> Mapping[tuple[str | int, ...], Formula]:
-        """Formulas used as numbers, by their keys."""
+        """Formulas in the fields of the dispersion, by their keys."""
         return dict(_find_formulas(self.model_dump(mode="json", exclude=self._literals)))
 
     @property
@@ -187,7 +188,7 @@ class Dispersion(Parameters, ABC):
         return tuple(dict.fromkeys(name for item in self.formulas.values() for name in item.names))
 
     def insert_values(self, values: Mapping[str, Any]) -> Self:
-        """Return the distribution for given values of the parameters in its formulas.
+        """Evaluate the formulas for parameter values by path, and return the resulting distribution.
 
         Raises ValueError if a formula is undefined, limits are in the wrong order, or a width is not positive.
         """
@@ -202,7 +203,7 @@ class Dispersion(Parameters, ABC):
         return type(self).model_validate(fields)
 
     def describe(self) -> str:
-        """Distribution and its parameters in one line."""
+        """Describe the distribution and its parameters in one line."""
         fields = self.model_dump(exclude={"distribution", "unit", "description", "source"}, exclude_none=True)
         texts = []
         for name, value in fields.items():
@@ -245,7 +246,7 @@ def _check_positive_number(value: Any) -> float | str:
 
 
 def _check_whole_number(value: Any) -> int | str:
-    """Integer that a float represents exactly, or the text of a formula."""
+    """Return an integer that a float represents exactly, or the text of a formula."""
     if isinstance(value, str):
         return formula(value).text
     if type(value) is not int:
@@ -256,7 +257,7 @@ def _check_whole_number(value: Any) -> int | str:
 
 
 def _check_literal(value: Any) -> Any:
-    """Value without formulas; numbers in it must be finite, because result files cannot store other numbers."""
+    """Return a value in which all numbers are finite, because result files cannot store other numbers."""
     items = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
     for inner in items:
         _check_literal(inner)
@@ -269,12 +270,12 @@ Number = Annotated[float | str, PlainValidator(_check_number)]
 PositiveNumber = Annotated[float | str, PlainValidator(_check_positive_number)]
 Limits = tuple[Number, Number]
 WholeNumber = Annotated[int | str, PlainValidator(_check_whole_number)]
-Literally = Annotated[Any, PlainValidator(_check_literal)]
+LiteralValue = Annotated[Any, PlainValidator(_check_literal)]
 Weight = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 
 
 def read_interval(low: float | str, high: float | str) -> tuple[float, float] | None:
-    """Limits as numbers; None if one of them is a formula."""
+    """Convert limits to numbers; None if one of them is a formula."""
     return None if isinstance(low, str) or isinstance(high, str) else (float(low), float(high))
 
 
@@ -282,8 +283,8 @@ def read_interval(low: float | str, high: float | str) -> tuple[float, float] | 
 class Shape:
     """A distribution of one variable.
 
-    evaluate: value of the function `cdf` or `sf` (survival function), or of an inverse, `ppf` or `isf`, by name.
-    support: minimum and maximum.
+    - evaluate: evaluates `cdf`, `sf` (survival function), or the inverse functions `ppf` and `isf`, by name
+    - support: minimum and maximum
     """
 
     evaluate: Callable[[str, float], float]
@@ -297,15 +298,15 @@ _NORMAL_FUNCTIONS: Mapping[str, Callable[[float], Any]] = {
     "ppf": ndtri,
     "isf": lambda q: -ndtri(q),
 }
-#: Standard normal distribution; avoids the import of `scipy.stats`, which takes a second.
+#: Standard normal distribution, without `scipy.stats`, whose import takes a second.
 STANDARD_NORMAL = Shape(lambda function, x: float(_NORMAL_FUNCTIONS[function](x)))
 
 
 @lru_cache(maxsize=1)
 def scipy_distributions() -> Mapping[str, bool]:
-    """Univariate distributions of `scipy.stats` by name: whether each is discrete.
+    """Return the univariate distributions of `scipy.stats` by name, and whether each is discrete.
 
-    `uniform` is excluded, since campaign files write it with other parameters.
+    `uniform` is excluded, since `Uniform` has other parameters.
     """
     from scipy import stats
 
@@ -315,7 +316,7 @@ def scipy_distributions() -> Mapping[str, bool]:
 
 
 def scipy_parameters(distribution: str) -> tuple[list[str], list[str]]:
-    """Parameters that a distribution of `scipy.stats` requires, and all parameters that it accepts."""
+    """Return the parameters that a distribution of `scipy.stats` requires, and all parameters that it accepts."""
     from scipy import stats
 
     shapes = getattr(stats, distribution).shapes
@@ -324,16 +325,16 @@ def scipy_parameters(distribution: str) -> tuple[list[str], list[str]]:
 
 
 def scipy_shape(distribution: str, parameters: Mapping[str, float]) -> Shape:
-    """Distribution of `scipy.stats` with given parameters.
+    """Create a distribution of `scipy.stats` with parameters.
 
-    Raises ValueError if it is not defined for them, now or when it is evaluated.
+    Raises ValueError if the distribution is not defined for the parameters, now or when it is evaluated.
     """
     from scipy import stats
 
     failure = f"{distribution} is not defined for {', '.join(f'{key} = {value}' for key, value in parameters.items())}"
 
     def call(function: Callable[[], Any]) -> Any:
-        # SciPy's warnings are suppressed: an invalid result is NaN
+        # SciPy's warnings are suppressed, since invalid results are recognized as NaN
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -355,10 +356,10 @@ def scipy_shape(distribution: str, parameters: Mapping[str, float]) -> Shape:
 
 
 def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probability: float) -> float | int:
-    """Quantile of a distribution truncated to `limits`, evaluated in the tail that preserves precision.
+    """Compute a quantile of a distribution F, truncated to `limits` [a, b] if they are defined.
 
-    The inverse of F truncated to [a, b] is F^-1(F(a) + p (F(b) - F(a))). If a exceeds the median, the survival function
-    replaces F, since its small values retain digits that 1 - F loses. Limits of discrete distributions are included.
+    The quantile at p is F^-1(F(a) + p (F(b) - F(a))). If a exceeds the median, the survival function replaces F, since
+    1 - F would lose digits of small values. The limits of discrete distributions are included.
 
     Raises ValueError if the limits are in the wrong order or the probability between them is zero.
     """
@@ -376,7 +377,7 @@ def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probabi
 
 @lru_cache(maxsize=1024)
 def _find_truncated_inverse(shape: Shape, low: float, high: float) -> tuple[str, float, float]:
-    """Name of the inverse function that preserves precision between two limits, and its arguments at the limits."""
+    """Return the name of the inverse function with the higher precision, and its arguments at the two limits."""
     if not (low <= high if shape.is_discrete else low < high):
         raise ValueError(f"truncate = [{low}, {high}]: the first limit must be below the second")
     start = math.ceil(low) - 1.0 if shape.is_discrete else low

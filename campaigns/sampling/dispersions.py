@@ -1,5 +1,5 @@
 # ruff: noqa: D102  (the base class `Dispersion` describes the methods)
-"""Dispersions of a campaign file: the built-in ones by name, others by their names in `scipy.stats`."""
+"""Dispersions of a campaign file: built-in distributions, and distributions of `scipy.stats` by name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
-from marsyard.campaigns.errors import near_match
+from marsyard.campaigns.errors import suggest_similar
 from marsyard.campaigns.sampling import dispersion as base
 
 #: Maximum number of levels of one grid.
@@ -48,13 +48,13 @@ class _Levels(base.Dispersion):
 
 
 class Choice(_Levels):
-    """One of `values`, with equal probabilities or in proportion to `weights`, which need not sum to one.
+    """One of `values`, with equal probabilities or with probabilities proportional to `weights`.
 
-    If the parameter is a table, each value is a complete table; keys without a value keep their defaults.
+    If the parameter is a table, each value is a table; keys that are missing in the table have default values.
     """
 
     distribution: Literal["choice"]
-    values: Annotated[list[base.Literally], Field(min_length=1)]
+    values: Annotated[list[base.LiteralValue], Field(min_length=1)]
     weights: list[base.Weight] | None = None
 
     @model_validator(mode="after")
@@ -79,10 +79,10 @@ class Choice(_Levels):
 
 
 class Fixed(_Levels):
-    """The same value in every case: a parameter that is listed with its source next to the dispersed ones."""
+    """The same value in every case; the parameter and its source are listed together with dispersed parameters."""
 
     distribution: Literal["fixed"]
-    value: base.Literally
+    value: base.LiteralValue
 
     @property
     def points(self) -> Sequence[Any]:
@@ -112,7 +112,7 @@ class Grid(_Levels):
     """
 
     distribution: Literal["grid"]
-    values: Annotated[list[base.Literally], Field(min_length=1, max_length=MAX_LEVELS)] | None = None
+    values: Annotated[list[base.LiteralValue], Field(min_length=1, max_length=MAX_LEVELS)] | None = None
     low: _Bound | None = None
     high: _Bound | None = None
     levels: Annotated[int, Field(strict=True, ge=2, le=MAX_LEVELS)] | None = None
@@ -142,7 +142,7 @@ class Grid(_Levels):
         return tuple(low + (high - low) * index / steps for index in range(steps + 1))
 
     def quantile(self, probability: float) -> Any:
-        """Level at a probability, for levels drawn with equal probabilities."""
+        """Return the level at a probability, for levels with equal probabilities."""
         return self.points[min(int(len(self.points) * probability), len(self.points) - 1)]
 
 
@@ -170,9 +170,9 @@ class Uniform(base.Dispersion):
 
 
 class Normal(base.Dispersion):
-    """Normal distribution with mean `mean` and standard deviation `sd`, truncated to `truncate` if given.
+    """Normal distribution with mean `mean` and standard deviation `sd`, truncated to `truncate` if defined.
 
-    `sd` is omitted if a group defines a covariance (`marsyard.campaigns.sampling.design`), and nowhere else.
+    `sd` must be omitted if a correlated group defines it by a covariance; otherwise it is required.
     """
 
     continuous = True
@@ -198,7 +198,7 @@ class Normal(base.Dispersion):
     @property
     def _sd(self) -> float:
         if self.sd is None:
-            raise ValueError("the standard deviation is defined by a group's covariance only")
+            raise ValueError("the standard deviation is only defined by the covariance of a group")
         return float(self.sd)
 
     def quantile(self, probability: float) -> float:
@@ -239,7 +239,7 @@ class _WholeNumbers(base.Dispersion):
 
 
 class Integer(_WholeNumbers):
-    """Every whole number from `low` to `high`, both included, with equal probabilities."""
+    """Whole numbers from `low` to `high`, both included, with equal probabilities."""
 
     distribution: Literal["integer"]
 
@@ -247,22 +247,22 @@ class Integer(_WholeNumbers):
 class InTurn(_WholeNumbers):
     """The whole numbers from `low` to `high`, both included, in sequence over the cases, then from `low` again.
 
-    No number repeats before all have occurred: a campaign uses as many terrains as possible. If the number only
-    selects one of many independent terrains, cases with different numbers are independent.
+    No number repeats before all numbers have occurred, so that a campaign uses as many terrains as possible. If the
+    number only selects one of many independent terrains, cases with different numbers are independent.
     """
 
     distribution: Literal["in-turn"]
 
     def value(self, case: int) -> int:
-        """Number of a case."""
+        """Return the number of a case."""
         low, high = int(self.low), int(self.high)
         return low + case % (high - low + 1)
 
 
 class Scipy(base.Dispersion):
-    """A distribution of `scipy.stats` by its name, with its parameters, truncated to `truncate` if given.
+    """A distribution of `scipy.stats` by its name, with its parameters, truncated to `truncate` if defined.
 
-    Discrete distributions (`poisson`, `binom`, ...) give whole numbers; their limits are included.
+    Values of discrete distributions (`poisson`, `binom`, ...) are whole numbers; their limits are included.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -276,7 +276,7 @@ class Scipy(base.Dispersion):
     def _check_name(cls, name: str) -> str:
         names = base.scipy_distributions()
         if name not in names:
-            hint = near_match(name, [*BUILT_IN, *names])
+            hint = suggest_similar(name, [*BUILT_IN, *names])
             alternative = "a univariate distribution of scipy.stats by its name (norm, beta, poisson, ...)"
             raise ValueError(f"unknown distribution '{name}'{hint}; allowed: {', '.join(BUILT_IN)}, or {alternative}")
         return name
@@ -285,7 +285,9 @@ class Scipy(base.Dispersion):
     def _check_parameters(self) -> Self:
         values = self.__pydantic_extra__ or {}
         required, allowed = base.scipy_parameters(self.distribution)
-        problems = [f"unknown parameter '{name}'{near_match(name, allowed)}" for name in values if name not in allowed]
+        problems = [
+            f"unknown parameter '{name}'{suggest_similar(name, allowed)}" for name in values if name not in allowed
+        ]
         problems += [f"parameter '{name}' is missing" for name in required if name not in values]
         if problems:
             raise ValueError(f"{', '.join(problems)}; {self.distribution} accepts {', '.join(allowed)}")

@@ -1,4 +1,4 @@
-"""Products of cases: selection of the kept ones, and files: arrays in `products.npz`, other data in `products.json`."""
+"""Products of cases: selection of the cases, and files (arrays in `products.npz`, other data in `products.json`)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ import numpy as np
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
 from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError, report_write_errors
 
-#: Key in `products.json` that represents an array by its name in `products.npz`.
-_ARRAY = "__array__"
-_OUTLINE = "products.json"
+#: Key of a table in `products.json` that refers to an array by its name in `products.npz`.
+_ARRAY_KEY = "__array__"
+_OUTLINE_FILE = "products.json"
 
 
 @dataclass(frozen=True)
 class PackedProducts:
-    """Products of a case as the contents of their two files."""
+    """Products of a case as the contents of their two files, `products.json` and `products.npz`."""
 
     outline: bytes
     arrays: bytes
@@ -37,7 +37,7 @@ class PackedProducts:
 
 
 def pack_products(products: Mapping[str, Any]) -> PackedProducts:
-    """Pack products into bytes: a worker compresses them, and another process writes them.
+    """Pack products into compressed bytes, which another process can write.
 
     Raises TypeError if a product is neither an array, a text, a number, a boolean, None, nor a table or list of these.
     """
@@ -61,12 +61,12 @@ def write_packed(folder: Path, packed: PackedProducts, row: Mapping[str, Any]) -
     """Write packed products and the row of their case into an existing folder. Raises OSError on failure."""
     (folder / "row.json").write_text(json.dumps(dict(row), indent=2) + "\n", encoding="utf-8")
     (folder / "products.npz").write_bytes(packed.arrays)
-    (folder / _OUTLINE).write_bytes(packed.outline)
+    (folder / _OUTLINE_FILE).write_bytes(packed.outline)
 
 
 @contextmanager
 def replace_files(directory: Path) -> Iterator[Path]:
-    """Temporary folder whose files replace those in `directory` at the end; after an exception nothing is replaced.
+    """Yield a temporary folder; at the end its files replace those in `directory`, except after an exception.
 
     Raises StoreError if the folder is not writable.
     """
@@ -75,8 +75,8 @@ def replace_files(directory: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(dir=directory, prefix=".partial-") as name:
             folder = Path(name)
             yield folder
-            # the outline is moved last: it marks a folder as complete
-            for path in sorted(folder.rglob("*"), key=lambda path: (path == folder / _OUTLINE, path)):
+            # the outline is moved last, since its presence marks a folder as complete
+            for path in sorted(folder.rglob("*"), key=lambda path: (path == folder / _OUTLINE_FILE, path)):
                 target = directory / path.relative_to(folder)
                 if path.is_dir():
                     target.mkdir(exist_ok=True)
@@ -89,14 +89,14 @@ def unpack_products(packed: PackedProducts) -> dict[str, Any]:
     with np.load(io.BytesIO(packed.arrays), allow_pickle=False) as arrays:
 
         def insert_array(table: dict[str, Any]) -> Any:
-            return arrays[table[_ARRAY]] if set(table) == {_ARRAY} else table
+            return arrays[table[_ARRAY_KEY]] if set(table) == {_ARRAY_KEY} else table
 
         products: dict[str, Any] = json.loads(packed.outline, object_hook=insert_array)
     return products
 
 
 def _move_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """Product whose arrays are moved to `arrays` and replaced by references."""
+    """Move the arrays of a product to `arrays`; return the product with references instead of arrays."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, np.ndarray):
@@ -106,10 +106,10 @@ def _move_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         while name in arrays:
             name += "_"
         arrays[name] = value
-        return {_ARRAY: name}
+        return {_ARRAY_KEY: name}
     if isinstance(value, Mapping):
-        if _ARRAY in value:
-            raise TypeError(f"{path} has a key {_ARRAY}, which is reserved")
+        if _ARRAY_KEY in value:
+            raise TypeError(f"{path} has a key {_ARRAY_KEY}, which is reserved")
         return {str(name): _move_arrays(inner, f"{path}.{name}", arrays) for name, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_move_arrays(inner, f"{path}.{index}", arrays) for index, inner in enumerate(value)]
@@ -119,36 +119,36 @@ def _move_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def load_products(directory: Path) -> dict[str, Any]:
-    """Products saved in a folder; tuples become lists. Raises StoreError if there are none."""
+    """Load the products in a folder; tuples become lists. Raises StoreError if there are none."""
     try:
-        files = [(directory / name).read_bytes() for name in (_OUTLINE, "products.npz")]
+        files = [(directory / name).read_bytes() for name in (_OUTLINE_FILE, "products.npz")]
         return unpack_products(PackedProducts(*files))
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise StoreError(f"{directory} contains no products of a case: {error}") from error
 
 
-#: Folder of the kept products, with a folder for each case.
+#: Folder of the stored products, with a folder for each case.
 CASES_FOLDER = "cases"
 
 
 def case_directory(directory: Path, case: int) -> Path:
-    """Folder of a case's products."""
+    """Return the folder of a case's products."""
     return directory / CASES_FOLDER / str(case)
 
 
 @dataclass(frozen=True)
 class Keep:
-    """Selection of cases whose products a worker returns.
+    """Selection of the cases whose products are stored.
 
-    every: step between the numbers of kept cases; 0 to keep none by number.
-    failed: requirements; a case that fails any of them is kept.
+    - every: step between the numbers of selected cases; 0 to select none by number
+    - failed: requirements; a case that fails any of them is selected
     """
 
     every: int = 0
     failed: tuple[Requirement, ...] = ()
 
-    def wants(self, row: Mapping[str, Any]) -> bool:
-        """Whether the products of the case with this row are kept."""
+    def selects(self, row: Mapping[str, Any]) -> bool:
+        """Whether the case with this row is selected."""
         if self.every and row["case"] % self.every == 0:
             return True
         return any(fails(row, requirement) for requirement in self.failed)
@@ -158,7 +158,7 @@ KEEP_ALL = Keep(every=1)
 
 
 def select_kept_cases(configuration: CampaignConfiguration) -> Keep:
-    """Selection during the campaign; the worst cases are run again at its end."""
+    """Create the selection for a campaign's first run of its cases; the worst cases run again at the end."""
     retain = configuration.retain
     if retain.products == "all":
         return KEEP_ALL
@@ -168,7 +168,7 @@ def select_kept_cases(configuration: CampaignConfiguration) -> Keep:
 
 
 def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
-    """Whether a row fails a requirement; an unfinished case fails in every population that may contain it."""
+    """Whether a row fails a requirement; an unfinished case fails if it may belong to the population."""
     unfinished = row["outcome"] in ENGINE_FAILURES
     memberships = {"all": True, "completed": not unfinished, "valid": row["answered"]}
     populations = requirement.population.split(" and ")
@@ -186,7 +186,7 @@ def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
 
 
 class ProductStore:
-    """Kept products of a campaign, within its disk budget."""
+    """Stored products of a campaign, within its limit of disk space."""
 
     def __init__(self, directory: Path, budget_gb: float) -> None:
         self._directory = directory
@@ -195,9 +195,9 @@ class ProductStore:
         self.full = False
 
     def save(self, case: int, packed: PackedProducts, row: Mapping[str, Any]) -> bool:
-        """Save a case's products unless they exceed the budget; after that, no products are saved.
+        """Save a case's products if the disk space suffices; after the first case that does not fit, none are saved.
 
-        Raises StoreError if they cannot be written.
+        Returns whether the products were saved. Raises StoreError if they cannot be written.
         """
         self.full = self.full or packed.size > self._free_bytes
         if self.full:

@@ -1,4 +1,4 @@
-"""Campaign folder: its record `campaign.json` (configuration, program, machine, progress) and its lock."""
+"""Record `campaign.json` of a campaign's folder (configuration, program, machine, progress), and the folder's lock."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
 RECORD_FILE = "campaign.json"
-#: Files of a campaign; a folder with any of them is never used for another campaign.
+#: Files of a campaign; a folder that contains any of them is never used for another campaign.
 _CAMPAIGN_FILES = (RECORD_FILE, "cases.parquet", ROWS_FILE, "report.html", "report.json", "cases")
 #: JSON types of the keys of a record that commands read.
 _TYPES: Mapping[str, tuple[type, str]] = {
@@ -37,14 +37,14 @@ _TYPES: Mapping[str, tuple[type, str]] = {
 
 
 def utc_now() -> str:
-    """Current time in ISO 8601, to the second."""
+    """Return the current time in ISO 8601 with a resolution of one second."""
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def claim(directory: Path) -> None:
-    """Create a folder for a campaign; the folder of a run that was killed before it wrote its record counts as free.
+    """Create the folder of a new campaign; the folder of a run that was killed before its first record can be reused.
 
-    Raises StoreError if it contains a campaign or is not writable.
+    Raises StoreError if the folder contains a campaign or is not writable.
     """
     with report_write_errors(directory):
         try:
@@ -67,8 +67,9 @@ def begin(
 ) -> None:
     """Write the record of a new campaign.
 
-    executor: description of its workers. command: words of the command that repeats the campaign, from the current
-    folder. algorithms: see `marsyard.campaigns.definition.identity.describe_algorithms`.
+    - executor: description of the workers
+    - command: words of the command that repeats the campaign in the current folder
+    - algorithms: see `marsyard.campaigns.definition.identity.describe_algorithms`
     """
     contents = configuration.model_dump(mode="json")
     write(
@@ -100,7 +101,7 @@ def begin(
 
 
 def describe_session(command: str, executor: str, cases_before: int) -> dict[str, Any]:
-    """Record entry of one session of work on a campaign."""
+    """Create the record's entry of one session (run, resume or append) of a campaign."""
     return {
         "command": command,
         "started_utc": utc_now(),
@@ -118,7 +119,7 @@ def update(directory: Path, changes: Mapping[str, Any]) -> None:
 def write(directory: Path, record: Mapping[str, Any]) -> None:
     """Write a campaign's record atomically.
 
-    Raises StoreError on failure; the previous record stays.
+    Raises StoreError on failure; the previous record then remains.
     """
     path = directory / RECORD_FILE
     partial = path.with_suffix(".partial")
@@ -133,8 +134,8 @@ def write(directory: Path, record: Mapping[str, Any]) -> None:
 def read(directory: Path) -> dict[str, Any]:
     """Read a campaign's record.
 
-    Raises StoreError if the folder contains no record, or a record of another version, or one with missing keys or keys
-    of another JSON type.
+    Raises StoreError if the folder contains no record, or if the record has another version, missing keys, or values of
+    another JSON type.
     """
     path = directory / RECORD_FILE
     if not directory.is_dir():
@@ -153,7 +154,7 @@ def read(directory: Path) -> dict[str, Any]:
         raise StoreError(f"{path} is damaged: {error}") from error
     if schema != SCHEMA:
         raise StoreError(f"{path} has schema {schema}; this version of Marsyard reads {SCHEMA}")
-    # records of versions without an identity lack the other keys as well, and can still be reported
+    # records of earlier versions have no identity and fewer keys; reports can still be created for them
     required = _TYPES if "identity" in record else ("name", "state", "cases", "configuration")
     problems = [f"it has no {key}" for key in required if key not in record]
     for key, (kind, type_text) in _TYPES.items():
@@ -171,7 +172,7 @@ def read(directory: Path) -> dict[str, Any]:
 
 
 def stored_configuration(directory: Path) -> CampaignConfiguration:
-    """Configuration of a stored campaign."""
+    """Read the configuration of a stored campaign. Raises StoreError if the record is missing or damaged."""
     try:
         return CampaignConfiguration.model_validate(update_stored_configuration(read(directory)["configuration"]))
     except (ValueError, KeyError) as error:
@@ -179,7 +180,7 @@ def stored_configuration(directory: Path) -> CampaignConfiguration:
 
 
 def git_commit() -> str | None:
-    """Commit of the checked-out program, with ``+changes`` if files were edited; None if unknown."""
+    """Return the git commit of the program, with ``+changes`` if tracked files were edited; None if unknown."""
     git, source = shutil.which("git"), Path(__file__).resolve()
     outputs = []
     commands = (["rev-parse", "HEAD"], ["ls-files", source.name], ["status", "--porcelain", "--untracked-files=no"])
@@ -197,7 +198,7 @@ def git_commit() -> str | None:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Python, platform and processor with a hash of its features: rows are equal bit for bit if these are equal."""
+    """Describe Python, platform and processor with a hash of its features; if equal, rows are bit-identical."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -216,7 +217,7 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
-#: Lock file of the process that works in the folder; the kernel releases the lock when the process ends.
+#: Lock file of the process that uses the folder; the kernel releases the lock when the process ends.
 _LOCK_FILE = "campaign.lock"
 
 
@@ -232,8 +233,8 @@ def folder_lock(directory: Path) -> Iterator[None]:
         except OSError as error:
             file.seek(0)
             holder = file.read().strip() or "another process"
-            raise StoreError(f"{directory} is in use: {holder} works in it; wait until it ends, or stop it") from error
-        # the text serves only messages of other processes, so a full disk is ignored
+            raise StoreError(f"{directory} is in use: {holder} uses it; wait until it ends, or stop it") from error
+        # a full disk is ignored, since the text is only used in messages of other processes
         with suppress(OSError):
             file.truncate(0)
             file.write(f"process {os.getpid()} on {platform.node()}\n")
@@ -242,7 +243,7 @@ def folder_lock(directory: Path) -> Iterator[None]:
 
 
 def is_locked(directory: Path) -> bool:
-    """Whether a process works in a folder."""
+    """Whether a process has locked a campaign's folder."""
     try:
         with (directory / _LOCK_FILE).open("r", encoding="utf-8") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

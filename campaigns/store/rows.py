@@ -1,11 +1,11 @@
-"""Rows of a campaign, stored while it runs: one SQLite file, written by one process.
+"""Rows of a campaign, stored during its run in one SQLite file by one process.
 
-The Parquet table can always be rebuilt from this file. A row is a JSON list of values; the column names are stored
-once per layout.
+The Parquet table can always be created again from this file. A row is a JSON list of values. Rows with the same columns
+have the same layout, and the column names are stored once for each layout.
 
-Durability: the journal is a write-ahead log with `synchronous = FULL`. A committed transaction survives a killed
-program, and also a power failure if the disk honours `fsync`. That takes one `fsync` per batch, some milliseconds for
-a second of work.
+The journal is a write-ahead log with `synchronous = FULL`. A committed transaction is not lost if the program is
+killed, nor at a power failure if the disk executes `fsync` correctly. Each batch (about one second of work) needs one
+`fsync`, which takes some milliseconds.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from marsyard.scenarios.interface import Scalar
 ROWS_FILE = "cases.sqlite"
 #: Version of the tables below, stored as `PRAGMA user_version`.
 STORE_VERSION = 2
-#: Identifies the file type (`PRAGMA application_id`): "Mars".
-_APPLICATION = int.from_bytes(b"Mars", "big")
+#: Identifier of the file type (`PRAGMA application_id`): "Mars".
+_APPLICATION_ID = int.from_bytes(b"Mars", "big")
 _TABLES = f"""
 PRAGMA journal_mode = DELETE;
-PRAGMA application_id = {_APPLICATION};
+PRAGMA application_id = {_APPLICATION_ID};
 PRAGMA user_version = {STORE_VERSION};
 BEGIN;
 CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -45,7 +45,7 @@ COMMIT;
 
 
 def create_store(path: Path, about: Mapping[str, str]) -> None:
-    """Create an empty store atomically; `about` identifies the campaign of its rows."""
+    """Create an empty store atomically; `about` contains texts by key that identify the campaign."""
     partial = path.with_name(f"{path.name}.partial")
     try:
         partial.unlink(missing_ok=True)
@@ -63,8 +63,10 @@ def create_store(path: Path, about: Mapping[str, str]) -> None:
 class RowStore(AbstractContextManager["RowStore"]):
     """Rows of a campaign, as a context.
 
-    path: a file created by `create_store`. thorough: check every page first, as required before more rows are written.
-    Raises StoreError if the file is missing, damaged, or of another version; nothing is written to it then.
+    - path: a file created by `create_store`
+    - thorough: check all pages of the file first; required before more rows are written
+
+    Raises StoreError if the file is missing, damaged, or of another version; the file is then unchanged.
     """
 
     def __init__(self, path: Path, *, thorough: bool = False) -> None:
@@ -80,7 +82,7 @@ class RowStore(AbstractContextManager["RowStore"]):
             (application,), (version,) = (
                 execute(f"PRAGMA {key}").fetchone() for key in ("application_id", "user_version")
             )
-            if application != _APPLICATION:
+            if application != _APPLICATION_ID:
                 raise StoreError(f"{path} is damaged, or is not a store of this version: wrong application id")
             if version != STORE_VERSION:
                 raise StoreError(f"{path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
@@ -115,19 +117,19 @@ class RowStore(AbstractContextManager["RowStore"]):
         return StoreError(f"{self._path}: {text}")
 
     def __exit__(self, *_: object) -> None:
-        # closing may fail after a failed write; the log then stays and is read the next time
+        # closing can fail after a failed write; the log file then remains and is read the next time
         with suppress(sqlite3.Error):
             self._connection.close()
 
     @property
     def about(self) -> dict[str, str]:
-        """Identification of the rows, as given to `create_store`."""
+        """Texts that identify the campaign (`create_store`)."""
         return dict(self._query("SELECT key, value FROM about"))
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Store rows in one transaction; an existing row of a case is replaced.
+        """Store rows in one transaction; a new row of a case replaces the existing row.
 
-        Raises StoreError on failure; then no row is stored.
+        Raises StoreError on failure; no row is then stored.
         """
         execute = self._connection.execute
         try:
@@ -153,35 +155,35 @@ class RowStore(AbstractContextManager["RowStore"]):
             raise self._store_error(error) from error
 
     def count(self) -> int:
-        """Number of cases that have a row."""
+        """Return the number of cases that have a row."""
         (number,) = self._query("SELECT count(*) FROM cases").fetchone()
         return int(number)
 
     def count_unfinished(self) -> int:
-        """Number of unfinished cases."""
+        """Return the number of unfinished cases."""
         return len(self.with_outcomes(ENGINE_FAILURES))
 
     def missing(self, total: int) -> list[range]:
-        """Cases below `total` that have no row."""
+        """List the cases below `total` that have no row, as ranges."""
         ends = [-1, *(number for (number,) in self._query("SELECT case_number FROM cases ORDER BY 1")), total]
         return [range(last + 1, next_row) for last, next_row in pairwise(ends) if next_row > last + 1]
 
     def with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
-        """Cases with one of the given outcomes."""
+        """List the cases with one of these outcomes."""
         values = sorted(outcomes)
         marks = ", ".join("?" * len(values))
         query = f"SELECT case_number FROM cases WHERE outcome IN ({marks}) ORDER BY 1"  # noqa: S608 (marks only)
         return [number for (number,) in self._query(query, values)]
 
     def first_completed(self) -> int | None:
-        """First finished case; None if no case is finished."""
+        """Return the first finished case; None if no case is finished."""
         marks = ", ".join("?" * len(ENGINE_FAILURES))
         query = f"SELECT min(case_number) FROM cases WHERE outcome NOT IN ({marks})"  # noqa: S608 (marks only)
         (case,) = self._query(query, sorted(ENGINE_FAILURES)).fetchone()
         return None if case is None else int(case)
 
     def row(self, case: int) -> Row | None:
-        """Row of a case; None if it has none."""
+        """Return the row of a case; None if it has none."""
         record = self._query("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
         try:
             columns = () if record is None else self.columns_by_layout()[record[0]]
@@ -190,7 +192,7 @@ class RowStore(AbstractContextManager["RowStore"]):
             raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
 
     def columns_by_layout(self) -> dict[int, tuple[str, ...]]:
-        """Columns of each layout, layouts in the order of their first cases."""
+        """Return the columns of each layout; the layouts are in the order of their first cases."""
         order = self._query("SELECT layout FROM cases GROUP BY layout ORDER BY min(case_number)")
         names = {layout: columns for columns, layout in self._layouts.items()}
         try:
@@ -199,17 +201,17 @@ class RowStore(AbstractContextManager["RowStore"]):
             raise StoreError(f"{self._path} is damaged: rows have the unknown layout {error}") from error
 
     def kinds(self) -> dict[str, set[str]]:
-        """Types of each column's values: any of `bool`, `int`, `big` (beyond 64 bits), `float`, `str`."""
+        """Return the types of each column's values: `bool`, `int`, `big` (beyond 64 bits), `float`, `str`."""
         values: dict[str, set[str]] = {}
         for name, kind in self._kinds:
             values.setdefault(name, set()).add(kind)
         return values
 
     def chunks(self, size: int) -> Iterator[list[tuple[int, list[Any]]]]:
-        """Layouts and values of all rows in the order of their cases, in chunks of `size`."""
+        """Yield layouts and values of all rows in the order of their cases, in chunks of `size` rows."""
         cursor = self._query("SELECT layout, row FROM cases ORDER BY case_number")
         while records := cursor.fetchmany(size):
-            # parsing one text takes half the time of parsing each row
+            # parsing one joined text takes half the time of parsing each row
             try:
                 values = json.loads(f"[{','.join(text for _, text in records)}]")
             except (ValueError, TypeError) as error:
@@ -234,10 +236,9 @@ def is_empty_store(path: Path) -> bool:
 
 @contextmanager
 def readable_store(path: Path) -> Iterator[RowStore]:
-    """Rows of a campaign for reading; if its folder is not writable, from a temporary copy.
+    """Open the rows of a campaign for reading; a temporary copy is opened if the folder is not writable.
 
-    SQLite needs its own files next to the log even for reading. Raises StoreError as `RowStore` does, and if the copy
-    fails.
+    SQLite creates files in the folder even for reading. Raises StoreError like `RowStore`, or if the copy fails.
     """
     with ExitStack() as stack:
         if not all(os.access(target, os.W_OK, effective_ids=True) for target in (path, path.parent)):
@@ -253,13 +254,13 @@ def readable_store(path: Path) -> Iterator[RowStore]:
 
 
 def classify_value(value: Any) -> str:
-    """Type of a value, as in `RowStore.kinds`."""
+    """Return the type of a value as in `RowStore.kinds`."""
     kind = type(value)
     return "big" if kind is int and not -(2**63) <= value < 2**63 else kind.__name__
 
 
 #: Row of one case as stored.
 Row = Mapping[str, Scalar]
-#: Columns that the engine writes, before and after those of the scenario.
+#: Columns that the engine writes in front of and after those of the scenario.
 LEADING_COLUMNS = ("case", "outcome", "answered")
 TRAILING_COLUMNS = ("wall_time_s", "cpu_time_s", "error", "traceback")

@@ -1,4 +1,4 @@
-"""Parquet table of a campaign, written from its store in row groups to limit memory; worst cases."""
+"""Parquet table of a campaign, written from its row store in row groups to limit memory, and selection of cases."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from marsyard.campaigns.store.rows import LEADING_COLUMNS, ROWS_FILE, TRAILING_C
 
 TABLE_FILE = "cases.parquet"
 #: Number of rows in a row group.
-_GROUP = 50_000
+_GROUP_ROWS = 50_000
 
 
 def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> None:
     """Write the rows of a store as a Parquet table in the order of the cases, atomically.
 
-    The engine's columns are the first and last. A missing number is NaN, any other missing value null. `measures` are
-    numeric columns that the table always contains.
+    The engine's columns are the first and the last. Missing numbers are NaN, other missing values are null. The table
+    always contains the numeric columns `measures`.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -35,25 +35,28 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
 
     layouts, kinds = store.columns_by_layout(), store.kinds()
     columns = dict.fromkeys((*itertools.chain.from_iterable(layouts.values()), *measures))
-    payload = [name for name in columns if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
-    types = {name: _choose_type(kinds.get(name, set())) for name in (*LEADING_COLUMNS, *payload, *TRAILING_COLUMNS)}
+    scenario_columns = [name for name in columns if name not in (*LEADING_COLUMNS, *TRAILING_COLUMNS)]
+    names = (*LEADING_COLUMNS, *scenario_columns, *TRAILING_COLUMNS)
+    types = {name: _choose_type(kinds.get(name, set())) for name in names}
     schema = pa.schema([(name, kind) for name, (kind, _) in types.items()])
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         with pq.ParquetWriter(partial, schema) as writer, ExitStack() as stack:
             if gc.isenabled():
-                # collection takes as long as reading millions of rows, and no row has cyclic references
+                # with millions of rows garbage collection takes as long as reading, and rows have no cyclic references
                 gc.disable()
                 stack.callback(gc.enable)
-            for chunk in store.chunks(_GROUP):
+            for chunk in store.chunks(_GROUP_ROWS):
                 arrays = []
-                for values, (kind, convert) in zip(_columns(chunk, layouts, list(types)), types.values(), strict=True):
+                for values, (kind, convert) in zip(
+                    _transpose(chunk, layouts, list(types)), types.values(), strict=True
+                ):
                     if convert is not None:
                         values = [None if value is None else convert(value) for value in values]
                     array = pa.array(values, kind)
                     needs_fill = array.null_count and pa.types.is_floating(kind)
                     arrays.append(pc.fill_null(array, math.nan) if needs_fill else array)
-                writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=_GROUP)
+                writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=_GROUP_ROWS)
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
@@ -64,9 +67,10 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
         raise StoreError(f"{path} cannot be written: {ROWS_FILE} is damaged: a row cannot be read: {error}") from error
 
 
-def _columns(
+def _transpose(
     chunk: Sequence[tuple[int, list[Any]]], layouts: Mapping[int, Sequence[str]], columns: Sequence[str]
 ) -> Iterator[Sequence[Any]]:
+    """Yield the values of each column from rows with their layouts; None for missing values."""
     indices: dict[int, list[int]] = {}
     for index, (layout, _) in enumerate(chunk):
         indices.setdefault(layout, []).append(index)
@@ -87,7 +91,7 @@ def _columns(
 
 
 def _choose_type(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
-    """Narrowest Arrow type that represents all values of a column, and the conversion to it."""
+    """Return an Arrow type that represents all values of a column, and the conversion to it (None if not needed)."""
     import pyarrow as pa
 
     if kinds == {"bool"}:
@@ -100,7 +104,7 @@ def _choose_type(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
 
 
 def read_rows(path: Path, case: int | None = None) -> list[dict[str, Any]]:
-    """Rows of a Parquet table without missing values; of all cases, or of one case.
+    """Read the rows of all cases or of one case from a Parquet table; missing values are omitted.
 
     Raises StoreError if there is no such table.
     """
@@ -121,7 +125,7 @@ def refresh_table(directory: Path) -> None:
     Raises StoreError if the store is unreadable or the table is not writable.
     """
     if not (directory / ROWS_FILE).exists() and (directory / TABLE_FILE).exists():
-        return  # folder of an earlier version, which wrote the table at an interruption
+        return  # the folder is of an earlier version, which wrote the table at an interruption
     requirements = stored_configuration(directory).requirements
     with RowStore(directory / ROWS_FILE) as store:
         write_table(directory / TABLE_FILE, store, numeric_metrics(requirements))
@@ -133,7 +137,7 @@ def numeric_metrics(requirements: Iterable[Requirement]) -> list[str]:
 
 
 def stored_row(directory: Path, case: int) -> Row | None:
-    """Row of a case of a stored campaign; None if it has none."""
+    """Read the row of a case of a stored campaign; None if it has none."""
     if (directory / ROWS_FILE).is_file():
         with readable_store(directory / ROWS_FILE) as store:
             return store.row(case)
@@ -142,7 +146,7 @@ def stored_row(directory: Path, case: int) -> Row | None:
 
 
 def find_showcase(configuration: CampaignConfiguration, table: Path, store: RowStore) -> int | None:
-    """Case whose products are kept for the report; None if no case is requested or finished."""
+    """Select the case that the report shows; None if the campaign requests none, or no case is finished."""
     if configuration.retain.showcase == "none":
         return None
     worst = find_worst_cases(configuration, table, 1) if configuration.retain.showcase == "worst" else []
@@ -150,8 +154,8 @@ def find_showcase(configuration: CampaignConfiguration, table: Path, store: RowS
 
 
 def find_worst_cases(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
-    """Answered cases with the largest metrics, worst first: metric of the first requirement with a single column."""
-    # a sum of columns is a sum of times, which does not rank cases
+    """List the answered cases with the largest metric of the first requirement with a single column, worst first."""
+    # sums of columns are sums of times, which are not suitable to rank cases
     ranking = (item for item in configuration.requirements if item.bound is not None and len(item.metric_columns) == 1)
     metric = next((item.metric for item in ranking), None)
     if metric is None:

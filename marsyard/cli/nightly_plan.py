@@ -24,7 +24,7 @@ from marsyard.cli.outcome import evaluate_and_store
 from marsyard.reports.campaign import write_atomic
 from marsyard.reports.comparison import build_sample, list_metrics
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.history import Change, History, NightCampaign, NightFigure, list_comparisons, night_text
+from marsyard.reports.history import Change, History, NightCampaign, NightMetric, list_comparisons, night_text
 from marsyard.sim.parameters import Parameters
 
 #: Files and folders in the output folder of `marsyard nightly`.
@@ -100,7 +100,7 @@ class NightlyRun:
 
 def run_scheduled_campaign(run: NightlyRun, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
     """Run a campaign, evaluate it, and store its metrics; its errors do not affect the other campaigns."""
-    figures = []
+    night_metrics = []
     try:
         campaign = planned.load(run.plan.seed, run.number, folder)
         name = campaign.configuration.name
@@ -108,15 +108,17 @@ def run_scheduled_campaign(run: NightlyRun, planned: PlannedCampaign, folder: Pa
         run_campaign(campaign, directory, run.executor, watch)
         evaluation, _ = evaluate_and_store(directory)
         frame, metrics = list_metrics(evaluation.run)
-        figures = [NightFigure(m.name, m.larger_is_better, m.summary_value, build_sample(frame, m)) for m in metrics]
+        night_metrics = [
+            NightMetric(m.name, m.larger_is_better, m.summary_value, build_sample(frame, m)) for m in metrics
+        ]
         verdict, definition = evaluation.overall_verdict, hash_definition(campaign)
         result = NightCampaign(name, definition, directory.name, verdict.word, evaluation.exit_code, verdict.sentence)
     except Exception as error:  # a defect in one campaign must not stop the others
-        figures = []
+        night_metrics = []
         if not isinstance(error, CampaignError):
             traceback.print_exc()
         result = NightCampaign(planned.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
-    run.history.add(run.number, result, figures)
+    run.history.add(run.number, result, night_metrics)
 
 
 def publish_page(history: History, night: int, out: Path, changes: Sequence[Change]) -> None:

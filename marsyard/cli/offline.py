@@ -71,12 +71,12 @@ def score(
 ) -> None:
     """Score the answers of an external algorithm; write verdicts and report."""
     from marsyard.campaigns.running.engine import Watch, run_campaign
-    from marsyard.campaigns.running.offline import find_cases_with_changed_images, scored_campaign, truth_folder
+    from marsyard.campaigns.running.offline import create_scoring_campaign, find_cases_with_changed_images, truth_folder
     from marsyard.reports.wording import count
 
     truth = truth_folder(directory) if truth is None else truth
     command = ("marsyard", "score", str(directory), str(answers), "--truth", str(truth))
-    campaign = replace(scored_campaign(directory, truth, answers), command=command)
+    campaign = replace(create_scoring_campaign(directory, truth, answers), command=command)
     target = out if out is not None else default_directory(campaign.configuration.name)
 
     def run(watch: Watch) -> None:

@@ -159,7 +159,7 @@ def nightly(
             plans.publish_page(history, night, out, ())
             raise typer.Exit(Exit.INTERRUPTED) from None
         significant = find_changes(list_comparisons(history, night))
-        rows = [(change.campaign, change.figure, change.p_value, change.worse) for change in significant]
+        rows = [(change.campaign, change.metric, change.p_value, change.worse) for change in significant]
         history.finish(night, FINISHED, rows)
         plans.publish_page(history, night, out, significant)
         statuses = {campaign.exit_code for campaign in history.campaigns(night)}

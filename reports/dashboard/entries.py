@@ -1,4 +1,4 @@
-"""Contents of the dashboard: stored campaigns, from their records and report data, and a table row per requirement."""
+"""Contents of the dashboard: stored campaigns, read from their records and reports, and a row for each requirement."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from marsyard.reports.verdicts import ESTIMATE
 from marsyard.reports.wording import NOTHING, percent
 from marsyard.scenarios.systems import find_system
 
-#: Maximum depth of campaigns below a folder.
-_DEPTH = 3
+#: Maximum depth of the search for campaigns below a folder.
+_MAX_DEPTH = 3
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class RequirementVerdict:
 class Entry:
     """A stored campaign, from its record and its report; fields are empty if not recorded.
 
-    slug: name of its folder in the site: letters, digits, dots and hyphens, with a hash of its path.
-    tested: algorithms with versions, options and sources: under test, then only compared.
-    showcases, worst: cases with stored products, and cases with the largest errors.
+    - slug: name of the campaign's folder in the site: letters, digits and hyphens, with a hash of the campaign's path
+    - tested: algorithms with versions, options and source hashes: those under test first, then those only compared
+    - showcases, worst: numbers of the cases with stored products, and of the cases with the largest errors
     """
 
     slug: str
@@ -85,7 +85,7 @@ class Entry:
 def find_campaigns(directories: Sequence[Path]) -> list[Path]:
     """Find campaigns in or below folders, each once, ordered by path."""
     campaigns: dict[Path, Path] = {}
-    for path in (path for directory in directories for path in _find_below(directory, _DEPTH)):
+    for path in (path for directory in directories for path in _find_below(directory, _MAX_DEPTH)):
         campaigns.setdefault(path.resolve(), path)
     return sorted(campaigns.values())
 
@@ -100,7 +100,7 @@ def _find_below(directory: Path, depth: int) -> Iterator[Path]:
 
 
 def read_entries(paths: Iterable[Path]) -> tuple[list[Entry], list[str]]:
-    """Read the campaigns, the latest first, and the problems of campaigns that cannot be displayed.
+    """Read the campaigns, the latest first; also return messages about campaigns that cannot be displayed.
 
     A report that is missing, older than the rows, or of another schema is written again.
     """
@@ -158,13 +158,13 @@ def _read_verdict(verdict: Mapping[str, Any]) -> RequirementVerdict:
 
 
 def make_slug(path: Path, name: str) -> str:
-    """Create a folder name that is unique and stays inside the site."""
+    """Create a unique folder name without path separators from a campaign's path and name."""
     safe_name = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:60].strip("-") or "campaign"
     return f"{safe_name}-{hashlib.sha256(str(path.resolve()).encode('utf-8', 'replace')).hexdigest()[:10]}"
 
 
 def _read_names(report: Mapping[str, Any], key: str, parameters: Mapping[str, Any], parameter: str) -> tuple[str, ...]:
-    """Names from the stored rows; else the name from the parameters."""
+    """Read names from the report; if there are none, read the name from the parameters."""
     names = tuple(str(name) for name in report.get(key) or () if str(name))
     name = _find_text(parameters, parameter)
     return names or ((name,) if name else ())
@@ -187,13 +187,13 @@ def _number(value: Any) -> float:
 
 #: Maximum number of other campaigns next to a requirement's verdict.
 MAX_OTHER_VERDICTS = 7
-#: Maximum number of campaigns in a sparkline, and its size in pixels.
-_MAX_TREND, _WIDTH, _HEIGHT = 24, 120.0, 26.0
+#: Maximum number of campaigns in a sparkline, and its width and height, pixels.
+_MAX_POINTS, _WIDTH_PX, _HEIGHT_PX = 24, 120.0, 26.0
 
 
 @dataclass(frozen=True)
 class Sparkline:
-    """Observed rates over time, oldest first: points of the line, the last one, and y of the required rate."""
+    """Observed rates over time, oldest first: points of the line, last point, y of the required rate, and a text."""
 
     points: str
     last: tuple[float, float]
@@ -211,10 +211,10 @@ class Cell:
 
 @dataclass(frozen=True)
 class RequirementRow:
-    """A requirement, the latest verdict of each campaign, and the trend of the campaign that was evaluated last.
+    """A requirement, its latest verdict for each campaign name, and the trend of the latest campaign.
 
-    `all_cells` are the verdicts of all campaigns, the latest first, unfinished campaigns last; `cells` the latest
-    verdict of each campaign name.
+    - cells: latest verdict for each campaign name
+    - all_cells: verdicts of all campaigns, the latest first, unfinished campaigns last
     """
 
     requirement: str
@@ -227,12 +227,12 @@ class RequirementRow:
 
     @property
     def latest(self) -> Cell | None:
-        """Verdict of the latest campaign, of a finished one if there is any."""
+        """Verdict of the latest campaign, preferably a finished campaign; None without a campaign."""
         return self.cells[0] if self.cells else None
 
 
 def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequirement]) -> list[RequirementRow]:
-    """Create a row for every requirement of `shared` and every other requirement of a campaign, in this order."""
+    """Create a row for each requirement of `shared`, then for each further requirement of the campaigns."""
     cells: dict[str, list[Cell]] = {name: [] for name in shared}
     for entry in entries:
         for verdict in entry.requirements:
@@ -254,21 +254,22 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
 
 
 def sparkline(verdicts: Sequence[RequirementVerdict]) -> Sparkline | None:
-    """Observed rates over time against the required rate; None for fewer than two campaigns."""
-    finite = [v for v in verdicts if math.isfinite(v.estimate) and math.isfinite(v.probability)][-_MAX_TREND:]
+    """Create the line of observed rates over time and of the required rate; None for fewer than two campaigns."""
+    finite = [v for v in verdicts if math.isfinite(v.estimate) and math.isfinite(v.probability)][-_MAX_POINTS:]
     if len(finite) < 2:
         return None
     rates = [verdict.estimate for verdict in finite]
     low = min(*rates, *(verdict.probability for verdict in finite))
     low -= 0.15 * (1.0 - low) + 1e-9
-    step = (_WIDTH - 8.0) / (len(finite) - 1)
+    # margins of 4 pixels on the left and right, of 3 pixels at the top and bottom
+    step_px = (_WIDTH_PX - 8.0) / (len(finite) - 1)
 
-    def height(rate: float) -> float:
-        return round(3.0 + (_HEIGHT - 6.0) * (1.0 - rate) / (1.0 - low), 2)
+    def compute_y(rate: float) -> float:
+        return round(3.0 + (_HEIGHT_PX - 6.0) * (1.0 - rate) / (1.0 - low), 2)
 
-    points = [(round(4.0 + step * k, 2), height(rate)) for k, rate in enumerate(rates)]
+    points = [(round(4.0 + step_px * k, 2), compute_y(rate)) for k, rate in enumerate(rates)]
     text = f"{len(finite)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
-    return Sparkline(" ".join(f"{x},{y}" for x, y in points), points[-1], height(finite[-1].probability), text)
+    return Sparkline(" ".join(f"{x},{y}" for x, y in points), points[-1], compute_y(finite[-1].probability), text)
 
 
 def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
@@ -287,7 +288,7 @@ def evidence_text(verdict: RequirementVerdict) -> str:
 
 
 def basis_text(verdict: RequirementVerdict) -> str:
-    """Describe the basis of a verdict without a confidence; empty otherwise."""
+    """Describe that a verdict is based on the observed rate; empty for a verdict at a confidence."""
     return "evaluated by observed rate" if verdict.decide_by == ESTIMATE else ""
 
 

@@ -1,7 +1,7 @@
 """Static site of the dashboard: an index of requirements and campaigns, and a page for each campaign and stored case.
 
-All pages lie in the site's folder and need no other files; reports of campaigns are linked or copied into it.
-Pages of unchanged campaigns are not rewritten, so the cost of an update depends on the new campaigns only.
+All pages are in the site's folder and need no other files; the reports of campaigns are linked or copied into it.
+Pages of unchanged campaigns are not written again, so an update only costs time for new campaigns.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ INDEX = "index.html"
 #: Maximum number of cases of a campaign with a page.
 _MAX_CASES = 24
 _TEMPLATES = Path(__file__).parents[1] / "templates"
-#: Functions of the templates that format numbers.
-_FORMATS = {"margin": margin_text, "basis": basis_text, "evidence": evidence_text, "percent": percent}
+#: Functions that the templates call to format numbers and verdicts.
+_FORMATTERS = {"margin": margin_text, "basis": basis_text, "evidence": evidence_text, "percent": percent}
 
 
 @dataclass(frozen=True)
 class Site:
-    """Result of writing: the index, the number of campaigns, and the problems of campaigns that were left out."""
+    """A written site: its index page, the number of campaigns, and messages about omitted campaigns."""
 
     index: Path
     campaigns: int
@@ -44,7 +44,7 @@ class Site:
 def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, SharedRequirement] | None = None) -> Site:
     """Write the dashboard of all campaigns in or below the folders `sources`.
 
-    shared: shared requirements by id; by default those of Marsyard
+    shared: shared requirements by id; None for the requirements that Marsyard installs
     """
     entries, problems = stored.read_entries(stored.find_campaigns(sources))
     rows = stored.requirement_rows(entries, shipped_requirements() if shared is None else shared)
@@ -52,7 +52,7 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
     for entry in entries:
         _write_campaign(directory / "c" / entry.slug, entry)
     script = (_TEMPLATES / "dashboard.js").read_text(encoding="utf-8")
-    values = {
+    filter_values = {
         "System": {entry.system for entry in entries},
         "Site": {site for entry in entries for site in entry.sites},
         "Algorithm": {algorithm for entry in entries for algorithm in entry.algorithms},
@@ -63,20 +63,21 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
         rows=rows,
         entries=entries,
         problems=problems,
-        filters=[(name.lower(), name, sorted(choices - {""})) for name, choices in values.items()],
-        most=stored.MAX_OTHER_VERDICTS,
+        filters=[(name.lower(), name, sorted(choices - {""})) for name, choices in filter_values.items()],
+        max_other=stored.MAX_OTHER_VERDICTS,
         coverage=stored.count_verdicts(rows),
-        data=embed_json(_data(rows)),
+        data=embed_json(_create_filter_data(rows)),
         script=script,
         hash=script_hash(script),
-        **_FORMATS,
+        **_FORMATTERS,
     )
     write_atomic(directory / INDEX, index)
-    write_atomic(directory / VERIFICATION_FILE, _matrix(rows))
+    write_atomic(directory / VERIFICATION_FILE, _create_traceability_csv(rows))
     return Site(directory / INDEX, len(entries), problems)
 
 
 def _write_campaign(folder: Path, entry: Entry) -> None:
+    """Write the pages of a campaign into its folder, unless they are newer than its report."""
     page, report = folder / INDEX, entry.directory / PAGE_FILE
     if page.is_file() and page.stat().st_mtime > (entry.directory / REPORT_JSON).stat().st_mtime:
         return
@@ -91,10 +92,11 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
             shutil.copyfile(report, partial)
         partial.replace(folder / PAGE_FILE)
     cases = _write_cases(folder, entry)
-    write_atomic(page, _render("dashboard_campaign.html.j2", entry=entry, cases=cases, **_FORMATS))
+    write_atomic(page, _render("dashboard_campaign.html.j2", entry=entry, cases=cases, **_FORMATTERS))
 
 
 def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
+    """Write a page for each stored case and return the links to these pages."""
     if not entry.showcases:
         return []
     run, links = read_run(entry.directory), []
@@ -120,8 +122,8 @@ def _rank_among_worst(entry: Entry, case: int) -> int:
     return entry.worst.index(str(case)) if str(case) in entry.worst else len(entry.worst)
 
 
-def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
-    """Data from which the page's script selects the latest verdict among the filtered campaigns."""
+def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
+    """Create the data with which the page's script selects the latest verdict among the filtered campaigns."""
     return {
         row.requirement: [
             {
@@ -144,8 +146,8 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
     }
 
 
-def _matrix(rows: Sequence[RequirementRow]) -> str:
-    """Traceability matrix as CSV: the latest verdict of each campaign, also requirements without a campaign."""
+def _create_traceability_csv(rows: Sequence[RequirementRow]) -> str:
+    """Create the traceability matrix as CSV: the latest verdicts, and requirements without a campaign."""
     exported: list[dict[str, Any]] = []
     fields = {"verdict": "status", "decided_by": "decide_by", "cases": "n", "rate": "estimate", "lower_bound": "lower"}
     fields |= {name: name for name in ("probability", "confidence", "failures", "note")}

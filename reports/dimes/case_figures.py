@@ -1,8 +1,8 @@
 """Figures of one DIMES case, laid out as Figs. 7 to 9 of the field test's paper (`papers/dimes-field-test.txt`).
 
-Two image pairs side by side. Below, the pictures as delivered, with templates (red) and tracked positions (green);
-above, the pictures rectified to a nadir view, with search windows (blue). Between them the correlated templates and
-windows, which the paper does not show. Dashed squares: tracks that failed a validity check.
+The two image pairs are drawn side by side. Top row: the images rectified to a nadir view, with search windows (blue).
+Middle row: the correlated templates and windows, which the paper does not show. Bottom row: the images as delivered,
+with templates (red) and tracked positions (green). Dashed squares mark tracks that failed a validity check.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from matplotlib.patches import Polygon, Rectangle
 from scipy import ndimage
 
 from marsyard.reports.presentation import numeric_product, save_figures, to_matrix
-from marsyard.reports.section import INK, draw_pictures, in_page_style, show_subframe
+from marsyard.reports.section import INK, draw_images, in_page_style, show_subframe
 
-Picture = Float[np.ndarray, "_ _"]
+Image = Float[np.ndarray, "_ _"]
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
-#: Side of a template's square on a delivered picture if it is missing from the products, pixels.
-_DEFAULT_SIDE = 15.0
+#: Side of a template's square on a delivered image if the products do not contain the side, pixels.
+_DEFAULT_SIDE_PX = 15.0
 _PAIRS = (0, 1)
 _MAX_TRACKS = 2
-#: Relative heights of the rows of a pair's figure, and inches per unit.
+#: Relative heights of the rows of a pair's figure, and inches per unit of relative height.
 _ROW_HEIGHTS = {"rectified": 1.95, "templates": 1.0, "delivered": 1.95}
-_INCHES = 8.3 / 4.9
-#: Side of a rectified picture as drawn, pixels.
+_IN_PER_UNIT = 8.3 / 4.9
+#: Side of a rectified image as drawn, pixels.
 _RECTIFIED_PX = 384
-#: Accepted template numbers. The figure shows at most `_MAX_TRACKS` templates per pair; the table lists all.
-_TEMPLATES = range(100)
+#: Valid template numbers. The figure shows at most `_MAX_TRACKS` templates per pair; the table lists all.
+_TEMPLATE_NUMBERS = range(100)
 _DASHED = (0, (2, 1.5))
 
 
@@ -43,7 +43,7 @@ class Track:
     """One template and its track.
 
     - pair, template: indices from 0; valid: whether the track passed the validity checks
-    - values: values of the track in the table of the products, by column
+    - values: row of the track in the table `tracks` of the products, by column name
     - patch, window: rectified template and search window; position: row and column of the match in the window
     """
 
@@ -51,13 +51,13 @@ class Track:
     template: int
     valid: bool
     values: Mapping[str, float]
-    patch: Picture | None
-    window: Picture | None
+    patch: Image | None
+    window: Image | None
     position: tuple[float, float] | None
 
 
 def is_dimes_case(products: Mapping[str, Any]) -> bool:
-    """Whether products contain the three pictures of a DIMES case."""
+    """Whether products contain the three images of a DIMES case."""
     return all(to_matrix(products.get(f"image_{number}")) is not None for number in (1, 2, 3))
 
 
@@ -72,7 +72,7 @@ def read_tracks(products: Mapping[str, Any]) -> list[Track]:
         return []
     case_tracks = []
     for row in (dict(zip(names, (float(value) for value in values), strict=True)) for values in table):
-        if row.get("pair") not in _PAIRS or row.get("template") not in _TEMPLATES:
+        if row.get("pair") not in _PAIRS or row.get("template") not in _TEMPLATE_NUMBERS:
             continue
         pair, template = int(row["pair"]), int(row["template"])
         patch, window = (to_matrix(products.get(f"{part}_{pair}_{template}")) for part in ("template", "window"))
@@ -84,7 +84,7 @@ def read_tracks(products: Mapping[str, Any]) -> list[Track]:
 
 @in_page_style
 def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
-    """Draw both image pairs of a case, side by side; raises ValueError without the three pictures."""
+    """Draw both image pairs of a case, side by side; raises ValueError without the three images."""
     figure = Figure(figsize=(12.0, max(_height_in(products, pair) for pair in _PAIRS)), layout="constrained")
     columns = figure.add_gridspec(1, 2)
     for pair in _PAIRS:
@@ -94,26 +94,26 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
 
 @in_page_style
 def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
-    """Draw one image pair of a case, 0 or 1; raises ValueError without its pictures."""
+    """Draw one image pair of a case, 0 or 1; raises ValueError without its images."""
     figure = Figure(figsize=(6.0, _height_in(products, pair)), layout="constrained")
     _draw_pair(figure, products, pair)
     return figure
 
 
-def draw_delivered_pictures(products: Mapping[str, Any]) -> Figure:
-    """Draw the three pictures with binned columns; raises ValueError if one is missing."""
-    return draw_pictures([_picture(products, f"image_{number}") for number in (1, 2, 3)])
+def draw_delivered_images(products: Mapping[str, Any]) -> Figure:
+    """Draw the three images with binned columns; raises ValueError if one is missing."""
+    return draw_images([_read_image(products, f"image_{number}") for number in (1, 2, 3)])
 
 
 def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     """Write `dimes.png` into a folder, or `pictures.png` if the algorithm has no DIMES details; returns the path."""
     if "tracks" in products:
         return save_figures(directory, {"dimes": draw_dimes_case(products)})
-    return save_figures(directory, {"pictures": draw_delivered_pictures(products)})
+    return save_figures(directory, {"pictures": draw_delivered_images(products)})
 
 
 def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:
-    """Relative heights of the non-empty rows of a pair, from top to bottom."""
+    """Return the relative heights of the non-empty rows of a pair's figure, from top to bottom."""
     has_content = {
         "rectified": any(numeric_product(products.get(f"rectified_{pair}_{side}")) is not None for side in (0, 1)),
         "templates": any(track.pair == pair and track.patch is not None for track in read_tracks(products)),
@@ -123,19 +123,19 @@ def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:
 
 
 def _height_in(products: Mapping[str, Any], pair: int) -> float:
-    return _INCHES * sum(_row_heights(products, pair).values())
+    return _IN_PER_UNIT * sum(_row_heights(products, pair).values())
 
 
 def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> None:
-    pictures = [_picture(products, f"image_{number}") for number in (pair + 1, pair + 2)]
+    images = [_read_image(products, f"image_{number}") for number in (pair + 1, pair + 2)]
     pair_tracks = [track for track in read_tracks(products) if track.pair == pair][:_MAX_TRACKS]
     heights = _row_heights(products, pair)
     cells = figure.add_gridspec(len(heights), 1, height_ratios=[*heights.values()])
     grid = {name: cells[index] for index, name in enumerate(heights)}
     if "rectified" in grid:
         rectified_cells = grid["rectified"].subgridspec(1, 2)
-        for side, picture in enumerate(pictures):
-            _draw_rectified(figure.add_subplot(rectified_cells[side]), products, picture, pair_tracks, pair, side)
+        for side, image in enumerate(images):
+            _draw_rectified(figure.add_subplot(rectified_cells[side]), products, image, pair_tracks, pair, side)
     if "templates" in grid:
         template_cells = grid["templates"].subgridspec(1, 2 * _MAX_TRACKS)
         for index in range(_MAX_TRACKS):
@@ -146,26 +146,24 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
                 for axes in panels:
                     axes.set_axis_off()
     delivered_cells = grid["delivered"].subgridspec(1, 2)
-    for side, (picture, stem, colour) in enumerate(
-        zip(pictures, ("template", "match"), (TEMPLATE, MATCH), strict=True)
-    ):
+    for side, (image, stem, colour) in enumerate(zip(images, ("template", "match"), (TEMPLATE, MATCH), strict=True)):
         axes = figure.add_subplot(delivered_cells[side])
-        show_subframe(axes, picture)
+        show_subframe(axes, image)
         axes.set_facecolor(INK)
         _mark_tracks(axes, pair_tracks, stem, colour)
         _outline_overlap(axes, products, pair, side)
-        axes.set_title(f"Picture {pair + side + 1}: {'templates' if side == 0 else 'tracked'}", fontsize=9)
+        axes.set_title(f"Image {pair + side + 1}: {'templates' if side == 0 else 'tracked'}", fontsize=9)
 
 
 def _draw_rectified(
-    axes: Axes, products: Mapping[str, Any], picture: Picture, pair_tracks: Sequence[Track], pair: int, side: int
+    axes: Axes, products: Mapping[str, Any], image: Image, pair_tracks: Sequence[Track], pair: int, side: int
 ) -> None:
     lattice = numeric_product(products.get(f"rectified_{pair}_{side}"))
     frame, gsd = numeric_product(products.get(f"rectified_frame_{pair}")), numeric_product(products.get(f"gsd_{pair}"))
     if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
         axes.set_axis_off()
         return
-    rectified = _rectify(picture, lattice)
+    rectified = _rectify(image, lattice)
     show_subframe(axes, rectified)
     axes.set_facecolor(INK)
     step = float(frame[2]) * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
@@ -188,28 +186,28 @@ def _draw_rectified(
                 centre = 0.5 * (len(track.window) - 1)
                 offset = np.array([track.position[1] - centre, centre - track.position[0]])
                 draw_square(ground + spacing_m * offset, len(track.patch), MATCH, track.valid)
-    axes.set_title(f"Picture {pair + side + 1} rectified{'' if side == 0 else ': windows'}", fontsize=9)
+    axes.set_title(f"Image {pair + side + 1} rectified{'' if side == 0 else ': windows'}", fontsize=9)
 
 
-def _rectify(picture: Picture, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
-    """Resample the picture at the interpolated pixels of a lattice; NaN outside the picture."""
+def _rectify(image: Image, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
+    """Resample the image at the interpolated pixels of a lattice; NaN outside the image."""
     indices = np.linspace(0.0, lattice.shape[0] - 1.0, _RECTIFIED_PX)
     v, u = np.meshgrid(indices, indices, indexing="ij")
     pixels = [ndimage.map_coordinates(lattice[..., k], [v, u], order=1, mode="nearest") for k in (1, 0)]
-    rows, columns = picture.shape
+    rows, columns = image.shape
     is_inside = (pixels[0] >= -0.5) & (pixels[0] <= rows - 0.5) & (pixels[1] >= -0.5) & (pixels[1] <= columns - 0.5)
-    values = ndimage.map_coordinates(picture, np.nan_to_num(pixels, nan=-1.0), order=1, mode="nearest")
+    values = ndimage.map_coordinates(image, np.nan_to_num(pixels, nan=-1.0), order=1, mode="nearest")
     return np.asarray(np.where(is_inside, values, np.nan))
 
 
 def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
     line = "-" if track.valid else _DASHED
     parts = ((track.patch, f"Template {track.template + 1}", TEMPLATE, line), (track.window, "Window", WINDOW, "-"))
-    for panel, (picture, title, colour, style) in zip(axes, parts, strict=True):
-        if picture is None:
+    for panel, (image, title, colour, style) in zip(axes, parts, strict=True):
+        if image is None:
             panel.set_axis_off()
             continue
-        show_subframe(panel, picture)
+        show_subframe(panel, image)
         panel.set_facecolor(INK)
         panel.spines[:].set(visible=True, edgecolor=colour, linewidth=2.2, linestyle=style)
         panel.set_title(title, fontsize=9)
@@ -221,7 +219,7 @@ def _mark_tracks(axes: Axes, pair_tracks: Sequence[Track], stem: str, colour: st
     box = {"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0}
     for track in pair_tracks:
         u, v = track.values.get(f"{stem}_u", np.nan), track.values.get(f"{stem}_v", np.nan)
-        side = track.values.get("template_side_px", _DEFAULT_SIDE)
+        side = track.values.get("template_side_px", _DEFAULT_SIDE_PX)
         if np.isfinite((u, v)).all():
             _draw_square(axes, (u, v), side, colour, track.valid)
             axes.annotate(
@@ -231,12 +229,12 @@ def _mark_tracks(axes: Axes, pair_tracks: Sequence[Track], stem: str, colour: st
 
 
 def _outline_overlap(axes: Axes, products: Mapping[str, Any], pair: int, side: int) -> None:
-    """Outline the overlap in the first picture, and mark the zero-phase point."""
-    polygon, spot = to_matrix(products.get(f"overlap_{pair}")), to_matrix(products.get(f"zero_phase_{pair}"))
+    """Outline the overlap in the first image, and mark the zero-phase point."""
+    polygon, zero_phase = to_matrix(products.get(f"overlap_{pair}")), to_matrix(products.get(f"zero_phase_{pair}"))
     if side == 0 and polygon is not None and polygon.shape[1] == 2:
         axes.add_patch(Polygon(polygon, fill=False, edgecolor="#f2e35a", linewidth=0.9, linestyle=":"))
-    if spot is not None and spot.shape == (2, 2) and np.isfinite(spot[side]).all():
-        u, v = (float(value) for value in spot[side])
+    if zero_phase is not None and zero_phase.shape == (2, 2) and np.isfinite(zero_phase[side]).all():
+        u, v = (float(value) for value in zero_phase[side])
         rows, columns = axes.get_images()[0].get_size()
         if 0 <= u < columns and 0 <= v < rows:
             axes.plot([u], [v], marker="x", color="#f2e35a", markersize=7)
@@ -248,10 +246,11 @@ def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: s
         axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=colour, linewidth=1.8, linestyle=line))
 
 
-def _picture(products: Mapping[str, Any], key: str) -> Picture:
+def _read_image(products: Mapping[str, Any], key: str) -> Image:
+    """Read an image and bin its columns to square size; raises ValueError if the image is missing."""
     counts = to_matrix(products.get(key))
     if counts is None:
-        raise ValueError(f"the products contain no picture '{key}'")
+        raise ValueError(f"the products contain no image '{key}'")
     rows, columns = counts.shape
     binning = columns // rows
     if binning < 2 or columns % rows:

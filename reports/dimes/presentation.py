@@ -22,12 +22,12 @@ _HIDDEN_COLUMNS = ("pair", "template", "valid", "ground_east_m", "ground_north_m
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """Create the view of a DIMES case; only its pictures if the algorithm provides no DIMES details."""
+    """Create the view of a DIMES case, without templates and tracks if the algorithm provides no DIMES details."""
     if "tracks" not in products:
-        pictures = figures.draw_delivered_pictures(products)
-        figure = svg_figure(pictures, f"{key}pictures", "The three pictures that the algorithm received.", wide=True)
+        images = figures.draw_delivered_images(products)
+        figure = svg_figure(images, f"{key}pictures", "The three images that the algorithm received.", wide=True)
         return CaseView(_velocities(products), [figure], [], [], note_text("dimes.plain_legend"))
-    pairs = enumerate(("first and second picture", "second and third picture"))
+    pairs = enumerate(("first and second image", "second and third image"))
     svg_figures = []
     for k, name in pairs:
         svg_figures.append(svg_figure(figures.draw_dimes_pair(products, k), f"{key}pair{k}", f"Pair {k + 1}: {name}."))
@@ -56,12 +56,12 @@ def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
     return facts
 
 
-#: Maximum number of pictures in a row of a stream's figure.
+#: Maximum number of images in a row of a stream's figure.
 _MAX_PER_ROW = 10
 
 
 def _read_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"] | None:
-    """Read start and end of the time span, estimate and truth (east, north) after each picture; NaN if missing."""
+    """Read a row for each image: start and end of the time span, estimate, truth (east, north); NaN if missing."""
     parts = presentation.read_arrays(
         products, dict.fromkeys(("after_spans_s", "after_velocities_m_s", "after_true_m_s"), (None, 2))
     )
@@ -71,21 +71,21 @@ def _read_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"] | None
 
 
 def is_stream_case(products: Mapping[str, Any]) -> bool:
-    """Whether products contain the answers of a velocity stream after each of its pictures."""
+    """Whether products contain the answers of a velocity stream after each of its images."""
     table = _read_stream(products)
     return table is not None and all(to_matrix(products.get(f"image_{k + 1}")) is not None for k in range(len(table)))
 
 
 def view_stream(products: Mapping[str, Any], key: str) -> CaseView:
-    """Create the view of a velocity stream: its pictures, and the estimate after each picture."""
+    """Create the view of a velocity stream: its images, and the estimate after each image."""
     rows = []
-    for picture_number, row in enumerate(_require_stream(products), start=1):
+    for image_number, row in enumerate(_require_stream(products), start=1):
         answered = bool(np.isfinite(row[2]))
         values = [number(float(value)) for value in (*row, np.hypot(row[2] - row[4], row[3] - row[5]))]
-        rows.append(TableRow([str(picture_number), *(values if answered else ["" for _ in values])], answered))
-    head = ["After picture", "From (s)", "To (s)", "East (m/s)", "North (m/s)"]
+        rows.append(TableRow([str(image_number), *(values if answered else ["" for _ in values])], answered))
+    head = ["After image", "From (s)", "To (s)", "East (m/s)", "North (m/s)"]
     head += ["True east", "True north", "Error (m/s)"]
-    caption = "Pictures, and the estimate after each."
+    caption = "Images of the stream, and the estimated velocity after each image."
     return CaseView([], [svg_figure(draw_stream_case(products), f"{key}stream", caption, wide=True)], head, rows)
 
 
@@ -98,7 +98,7 @@ def _require_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"]:
 
 @in_page_style
 def draw_stream_case(products: Mapping[str, Any]) -> Figure:
-    """Draw the pictures in rows, and both components of the velocity after each picture."""
+    """Draw the images in rows, and both components of the velocity after each image."""
     table = _require_stream(products)
     n_rows = -(-len(table) // _MAX_PER_ROW)
     figure = Figure(figsize=(12.0, 3.4 + 1.6 * n_rows), layout="constrained")
@@ -107,10 +107,10 @@ def draw_stream_case(products: Mapping[str, Any]) -> Figure:
     panels = upper.subplots(n_rows, min(len(table), _MAX_PER_ROW), squeeze=False)
     for index, axes in enumerate(panels.ravel()):
         axes.set_axis_off()
-        picture = to_matrix(products.get(f"image_{index + 1}"))
-        if picture is not None and index < len(table):
-            low, high = np.quantile(picture, (0.01, 0.99))
-            axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1.0), aspect="auto")
+        image = to_matrix(products.get(f"image_{index + 1}"))
+        if image is not None and index < len(table):
+            low, high = np.quantile(image, (0.01, 0.99))
+            axes.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1.0), aspect="auto")
             axes.set_box_aspect(1.0)
             axes.set_title(str(index + 1), fontsize=9)
     answered = table[np.isfinite(table[:, 2])]

@@ -1,4 +1,4 @@
-"""Sections about descents: the field test, errors at the thrusters' firing, landings, and conditions of errors."""
+"""Sections about descents: field test, velocity errors at thruster ignition, landings, influence of conditions."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
     for group in read_paper(Path(__file__).with_name("paper.toml"))["fig_11"]
     for row in group["runs"]
 }
-#: Minimum large difference from the paper, percentage points.
-LARGE_POINTS = 10.0
+#: A difference from the paper is marked as large above this value, percentage points.
+LARGE_DIFFERENCE_POINTS = 10.0
 
 
 def field_test_section(subject: Subject) -> Section | None:
-    """Field test runs and categories next to the paper's Figs. 10 and 11; None if they are not in the rows."""
+    """Create the section that compares the field test with the paper's Figs. 10 and 11; None for other campaigns."""
     frame, bound = subject.frame, subject.bound
     if not {"run", "category"}.issubset(frame.columns) or not rates.is_flag(frame, "answered"):
         return None
@@ -94,13 +94,13 @@ def field_test_section(subject: Subject) -> Section | None:
 
 
 def field_cells(subject: Subject) -> list[dict[str, Any]]:
-    """List the results of every category and run, first in the paper's order, then in the rows' order."""
+    """List the results of each category and run, first those of the paper in its order, then others."""
     frame, cells = subject.frame, []
     names = frame[["category", "run"]].dropna().drop_duplicates()
     pairs = [(str(category), str(run)) for category, run in names.itertuples(index=False)]
     for category, run in [*(pair for pair in FIG_11 if pair in pairs), *(pair for pair in pairs if pair not in FIG_11)]:
         rows = frame[frame["category"].eq(category) & frame["run"].eq(run)]
-        answered = rates.members(rows, "valid")
+        answered = rates.population_mask(rows, "valid")
         errors = np.abs(numbers(rows[answered], subject.metric)) if subject.metric else np.array([])
         errors = errors[np.isfinite(errors)]
         fraction, paper_percent = rates.fraction_of(answered, rows), FIG_11.get((category, run), {}).get("percent")
@@ -119,7 +119,7 @@ def field_cells(subject: Subject) -> list[dict[str, Any]]:
 
 
 def _difference_text(points: float) -> str:
-    mark = " (large)" if abs(points) > LARGE_POINTS else ""
+    mark = " (large)" if abs(points) > LARGE_DIFFERENCE_POINTS else ""
     return NOTHING if math.isnan(points) else f"{points:+.1f} pp{mark}".replace("-", "−")
 
 
@@ -135,12 +135,13 @@ def _field_note(cells: Sequence[Mapping[str, Any]]) -> str:
     ]
     totals = sum(row["total"] for row in FIG_11.values())
     counts = sum(row["valid"] + row["invalid"] for row in FIG_11.values())
-    large = [cell for cell in cells if abs(cell["difference_points"]) > LARGE_POINTS]
+    large = [cell for cell in cells if abs(cell["difference_points"]) > LARGE_DIFFERENCE_POINTS]
     names = "; ".join(f"{cell['category']}, {cell['run']}" for cell in large) or "none"
     return (
-        f"{definitions} Misprints of the paper's table: the rows {'; '.join(inconsistent_rows)}; its totals sum to "
-        f"{totals:,}, its counts to {counts:,}. We use the totals. For Pisgah Run 3, same direction, it prints 99 %; "
-        f"its counts give 97 %. Cells that differ from the paper by more than {LARGE_POINTS:g} points: {names}."
+        f"{definitions} The paper's table has misprints in the rows {'; '.join(inconsistent_rows)}. Its totals sum to "
+        f"{totals:,}, its counts to {counts:,}. This report uses the totals. For Pisgah Run 3, same direction, the "
+        f"paper prints 99 %, but its counts result in 97 %. These results differ from the paper by more than "
+        f"{LARGE_DIFFERENCE_POINTS:g} percentage points: {names}."
     )
 
 
@@ -183,7 +184,7 @@ def _draw_scatter(rows: kinds.Rows, parts: Sequence[str], subject: Subject, axis
 
 
 _FIRING = "firing_velocity_error_m_s"
-#: Error of the velocity propagated by the inertial unit to the thrusters' firing near 100 m (section I).
+#: Error of the velocity that the inertial unit propagates to thruster ignition at a height near 100 m (section I).
 FIRING = kinds.SectionDeclaration(
     "firing",
     "Firing",
@@ -199,13 +200,13 @@ FIRING = kinds.SectionDeclaration(
             heading="Time from the last image to thruster ignition",
         ),
     ),
-    note="The reported velocity is the mean over the second pair of pictures. The IMU propagates it to "
-    "the firing time. The error is relative to the true camera velocity at that time, including pendulum motion.",
+    note="The reported velocity is the mean between the second and the third image. The IMU propagates it to the time "
+    "of ignition. The error is relative to the true camera velocity at that time, including pendulum motion.",
 )
 
 SPEED_CORRECTED, SPEED_UNCORRECTED = "touchdown_speed_corrected_m_s", "touchdown_speed_uncorrected_m_s"
-#: Minimum speed change that counts as an improvement or a degradation, m/s.
-NOTABLE_M_S = 1.0
+#: Minimum change of speed that counts as an improvement or a degradation, m/s.
+MIN_SPEED_CHANGE_M_S = 1.0
 #: Speeds above which the table gives the fraction of cases, m/s.
 SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
 
@@ -217,15 +218,15 @@ def _landing_rows(subject: Subject) -> pd.DataFrame | None:
 
 
 def landing_fractions(landed: kinds.Rows) -> dict[str, rates.CaseFraction]:
-    """Fractions of landings that the answer improved and degraded, and of answers in time for the thrusters' firing."""
+    """Compute fractions of landings with a lower and a higher speed, and of answers available before ignition."""
     change = numbers(landed, SPEED_CORRECTED) - numbers(landed, SPEED_UNCORRECTED)
     fractions = {
-        f"slower by more than {NOTABLE_M_S:g} m/s": rates.fraction_of(change < -NOTABLE_M_S, landed),
-        f"faster by more than {NOTABLE_M_S:g} m/s": rates.fraction_of(change > NOTABLE_M_S, landed),
+        f"slower by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(change < -MIN_SPEED_CHANGE_M_S, landed),
+        f"faster by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(change > MIN_SPEED_CHANGE_M_S, landed),
     }
     if rates.is_flag(landed, "in_time_assumed"):
         name = "answer available before ignition (of all landings)"
-        fractions[name] = rates.fraction_of(rates.flag(landed, "in_time_assumed"), landed)
+        fractions[name] = rates.fraction_of(rates.flag_mask(landed, "in_time_assumed"), landed)
     return fractions
 
 
@@ -240,7 +241,7 @@ def _draw_speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Blocks
             bound = quantile_bounds(values, probability, CONFIDENCE, groups)[1]
             bound_text = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
             texts.append(f"{number(float(np.quantile(values, probability)))}{bound_text}")
-        rows.append([f"{format_fraction(probability)} quantile (its bound)", *texts])
+        rows.append([f"{format_fraction(probability)} quantile (upper bound)", *texts])
     rows += [
         [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
         for speed in SPEEDS_M_S
@@ -261,7 +262,7 @@ def _draw_speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Blocks
     return [Block(heading="Horizontal speed at touchdown", grid=grid, note=note)], data
 
 
-#: Effect of an estimator's answer on the landing: horizontal speed at touchdown with and without it.
+#: Horizontal speed at touchdown with and without the correction by the estimated velocity.
 LANDING = kinds.SectionDeclaration(
     "landing",
     "Landing",
@@ -279,7 +280,7 @@ LANDING = kinds.SectionDeclaration(
     ),
 )
 
-#: Conditions that the paper compares, all of which must vary; and additional conditions.
+#: Conditions that the paper compares (all of them must vary), and additional conditions.
 PAPER_CONDITIONS = ("descent_rate_m_s", "altitude_1_m", "attitude_rate_max_deg_s")
 ADDITIONAL_CONDITIONS = ("off_nadir_max_deg", "horizontal_speed_m_s", "sun_elevation_deg")
 MIN_CASES = 50
@@ -289,11 +290,11 @@ _SEED = 20050815
 
 @dataclass(frozen=True)
 class ConditionEffect:
-    """Effect of one condition on the error's magnitude, each with its interval.
+    """Effect of one condition on the magnitude of the error; each triple contains a value and its interval.
 
-    low, high: 5 % and 95 % quantile of the condition
-    coefficient: coefficient of a regression on all conditions, in standard deviations of condition and magnitude
-    effect: change of the mean magnitude from `low` to `high` in that regression, in the error's unit
+    - low, high: 5 % and 95 % quantile of the condition
+    - coefficient: coefficient of a regression on all conditions, in standard deviations of condition and magnitude
+    - effect: change of the mean magnitude from `low` to `high` in that regression, in the error's unit
     """
 
     column: str
@@ -305,7 +306,7 @@ class ConditionEffect:
 
 
 def sensitivity_section(subject: Subject) -> Section | None:
-    """Rank correlations and a standardised regression of the error on all conditions, with bootstrap intervals.
+    """Create the section on rank correlations and a standardised regression of the error on all conditions.
 
     None for too few errors, or if the paper's conditions do not vary. Paper (section III.C): "vertical velocity of the
     lander had much less of an effect on DIMES performance when compared to altitude and attitude rates".
@@ -330,7 +331,7 @@ def sensitivity_section(subject: Subject) -> Section | None:
 
 
 def estimate_effects(subject: Subject, metric: str) -> list[ConditionEffect]:
-    """Estimate the effects of the conditions, the paper's first; empty for constant ones of these or too few errors."""
+    """Estimate the effects of the conditions; empty if one of the paper's is constant, or for too few errors."""
     frame = subject.frame
     magnitude = np.abs(numbers(frame, metric))
     columns = [name for name in (*PAPER_CONDITIONS, *ADDITIONAL_CONDITIONS) if rates.varies(frame, name)]
@@ -358,18 +359,18 @@ def estimate_effects(subject: Subject, metric: str) -> list[ConditionEffect]:
 def regress_weighted(
     x: Float[np.ndarray, "n k"], y: Float[np.ndarray, " n"], weights: Float[np.ndarray, "b n"]
 ) -> Float[np.ndarray, "b k"]:
-    """Slopes of the weighted least-squares fit of y to all columns of x with a constant, for every row of weights."""
+    """Fit y to all columns of x and a constant by weighted least squares; returns slopes for each row of weights."""
     design = np.column_stack([np.ones(y.size), x - x.mean(axis=0)])
     normal = np.einsum("bn,ni,nj->bij", weights, design, design, optimize=True)
     right = np.einsum("bn,ni->bi", weights, design * y[:, None])
-    # in a resample of few terrains a condition may be constant: the pseudo-inverse gives slope 0
+    # a condition can be constant in a resample of few terrains; the pseudo-inverse then results in slope 0
     return np.asarray(np.einsum("bij,bj->bi", np.linalg.pinv(normal, hermitian=True), right)[:, 1:])
 
 
 def correlate_weighted(
     x: Float[np.ndarray, "n k"], y: Float[np.ndarray, " n"], weights: Float[np.ndarray, "b n"]
 ) -> Float[np.ndarray, "b k"]:
-    """Correlations of y with each column of x, for every row of weights; ranks are those in the original sample."""
+    """Correlate y with each column of x for each row of weights; inputs are ranks in the original sample."""
     w = weights / weights.sum(axis=1, keepdims=True)
     x, y = x - x.mean(axis=0), y - y.mean()
     mean_x, mean_y = w @ x, (w @ y)[:, None]

@@ -1,8 +1,8 @@
 """Figures of one landing as Figs. 1 to 5 and 7 of `papers/vision-guided-landing.txt`.
 
 Colours follow the paper's text, in tones for colour-blind readers: cameras red and green, features white; structure
-pixels red, segments green, matches blue; maps green, yellow and red; a-priori site a black X, safe site a purple plus.
-Not in the paper: the true maps of Fig. 5, the true motion of Fig. 2. Missing products raise ValueError.
+pixels red, segments green, matches blue; maps green, yellow and red. A black X marks the a-priori site, a purple plus
+the safe site. The true maps in Fig. 5 and the true motion in Fig. 2 are additions. Missing products raise ValueError.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from marsyard.reports.hda import products as stages
 from marsyard.reports.presentation import save_figures
-from marsyard.reports.section import MUTED, in_page_style, show_picture
+from marsyard.reports.section import MUTED, in_page_style, show_image
 
 T = TypeVar("T")
 
@@ -35,7 +35,7 @@ HAZARD_COLOURS = LinearSegmentedColormap.from_list(
 SAFETY_COLOURS = ListedColormap([GREEN, YELLOW, RED])
 #: High ground is dark, low ground is bright.
 ELEVATION_COLOURS = "gray_r"
-#: Maximum number of structure pixels drawn: Table I has 600.
+#: Maximum number of drawn structure pixels; the paper's Table I has 600.
 _MAX_MATCHES = 600
 #: Maximum number of drawn cells along the terrain's longer side.
 _MAX_DRAWN_CELLS = 90
@@ -46,14 +46,14 @@ _BACKGROUND = "#15191e"
 
 @in_page_style
 def draw_tracks(products: Mapping[str, Any]) -> Figure:
-    """Draw Fig. 1: features in the first picture, their tracks in the second."""
-    figure, left, right = _draw_picture_pair(products)
+    """Draw Fig. 1: features in the first image, their tracks in the second."""
+    figure, left, right = _draw_image_pair(products)
     tracks = _require(stages.read_tracked_features(products), "tracks")
     _draw_features(left, tracks.first, tracks)
     _draw_segments(right, tracks.first[tracks.accepted], tracks.second[tracks.accepted], TRACKED_COLOUR, alpha=0.9)
     _draw_features(right, tracks.second, tracks, lost=False)
-    left.set_title(f"First picture: {len(tracks.first)} features", fontsize=9)
-    right.set_title(f"Second picture: {int(tracks.accepted.sum())} tracks", fontsize=9)
+    left.set_title(f"First image: {len(tracks.first)} features", fontsize=9)
+    right.set_title(f"Second image: {int(tracks.accepted.sum())} tracks", fontsize=9)
     left.legend(loc="lower left", labelcolor=WHITE, frameon=True, facecolor=BLACK, framealpha=0.5, fontsize=8)
     return figure
 
@@ -62,23 +62,23 @@ def draw_tracks(products: Mapping[str, Any]) -> Figure:
 def draw_motion(products: Mapping[str, Any]) -> Figure:
     """Draw Fig. 2: three orthographic views of motion and structure."""
     motion, maps = _require(stages.read_motion(products), "motion"), stages.read_landing_maps(products)
-    # without a map the vertical is unknown: the first camera's optical axis replaces it
+    # without a map the vertical is unknown, so the first camera's optical axis replaces it
     upright = np.diag([1.0, -1.0, -1.0]) if maps is None else maps.surface_from_camera
     figure = Figure(figsize=(9.0, 3.6), layout="constrained", facecolor="none")
     views = (("from above", 0, 1), ("along y", 0, 2), ("along x", 1, 2))
     for axes, (name, *pair) in zip(figure.subplots(1, 3), views, strict=True):
         _draw_motion_view(axes, motion, upright, pair)
-        axes.set_title(f"Seen {name}", fontsize=9)
+        axes.set_title(f"View {name}", fontsize=9)
     figure.axes[0].legend(loc="upper left", fontsize=7, labelcolor=WHITE)
     return figure
 
 
 @in_page_style
 def draw_epipolar(products: Mapping[str, Any]) -> Figure:
-    """Draw Fig. 3: structure pixels in the first picture, their segments and matches in the second."""
-    figure, left, right = _draw_picture_pair(products)
+    """Draw Fig. 3: structure pixels in the first image, their segments and matches in the second."""
+    figure, left, right = _draw_image_pair(products)
     matches = _require(stages.read_matches(products), "matches")
-    # on a coarser grid, so that at most `_MAX_MATCHES` are drawn
+    # draw every `step`-th row and column of the grid, so that at most `_MAX_MATCHES` are drawn
     step, indices = 1, np.arange(len(matches.grid))
     v, u = (np.unique(matches.grid[:, k], return_inverse=True)[1] for k in (1, 0))
     while len(indices) > _MAX_MATCHES:
@@ -88,8 +88,8 @@ def draw_epipolar(products: Mapping[str, Any]) -> Figure:
     _draw_segments(right, matches.starts[indices], matches.ends[indices], "#35d46b")
     _draw_squares(right, matches.matched[indices][matches.accepted[indices]], BLUE)
     count_text = "" if len(indices) == len(matches.grid) else f", {len(indices)} shown"
-    left.set_title(f"First picture: {len(matches.grid):,} structure pixels{count_text}", fontsize=9)
-    right.set_title(f"Second: segments, {int(matches.accepted.sum()):,} matches", fontsize=9)
+    left.set_title(f"First image: {len(matches.grid):,} structure pixels{count_text}", fontsize=9)
+    right.set_title(f"Second image: segments, {int(matches.accepted.sum()):,} matches", fontsize=9)
     return figure
 
 
@@ -106,7 +106,7 @@ def draw_elevation(products: Mapping[str, Any]) -> Figure:
 
 @in_page_style
 def draw_maps(products: Mapping[str, Any]) -> Figure:
-    """Draw Fig. 5 (A): elevation, roughness, slope and safe landing map; below, the truth in the same coordinates."""
+    """Draw Fig. 5 (A): elevation, roughness, slope and safe landing map; bottom row: truth in the same coordinates."""
     maps = _require(stages.read_landing_maps(products), "maps")
     truth = _require(stages.read_ground_truth(products), "truth")
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
@@ -153,7 +153,7 @@ def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, tru
     safety = np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
     truth_axes.pcolormesh(cells[..., 1], cells[..., 0], safety, shading="nearest", rasterized=True, **scale)
     map_axes.set_title("Safe landing map", fontsize=9)
-    truth_axes.set_title("Truth: a lander's centre", fontsize=9)
+    truth_axes.set_title("Truth of footprints", fontsize=9)
     for name, colour in (("safe", GREEN), ("unknown", YELLOW), ("hazard", RED)):
         truth_axes.plot([], [], "s", color=colour, label=name)
     for marker, label in zip(_SITE_MARKERS.values(), ("a-priori site", "safe site"), strict=True):
@@ -163,28 +163,28 @@ def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, tru
 
 @in_page_style
 def draw_site(products: Mapping[str, Any]) -> Figure:
-    """Draw Fig. 7 and Fig. 5 (B): the first picture, the safe landing map and the site on it and on the terrain."""
-    images = _require(stages.read_images(products), "pictures")
+    """Draw Fig. 7 and Fig. 5 (B): the first image, the safe landing map and the site on it and on the terrain."""
+    images = _require(stages.read_images(products), "images")
     maps = _require(stages.read_landing_maps(products), "maps")
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    plain, overlay = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
-    for axes in (plain, overlay):
-        show_picture(axes, images[0])
-    limits = {"xlim": overlay.get_xlim(), "ylim": overlay.get_ylim()}
+    image_axes, overlay_axes = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
+    for axes in (image_axes, overlay_axes):
+        show_image(axes, images[0])
+    limits = {"xlim": overlay_axes.get_xlim(), "ylim": overlay_axes.get_ylim()}
     if np.isfinite(maps.pixels).all():
         finite = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
-        overlay.pcolormesh(
+        overlay_axes.pcolormesh(
             maps.pixels[..., 0], maps.pixels[..., 1], finite, shading="nearest", alpha=0.38,
             vmin=0, vmax=2, cmap=SAFETY_COLOURS, rasterized=True, linewidth=0.0,
         )  # fmt: skip
-    overlay.set(**limits)
-    for axes in (plain, overlay):
+    overlay_axes.set(**limits)
+    for axes in (image_axes, overlay_axes):
         for name, cell in (("apriori", maps.apriori), ("site", maps.site)):
             pixel = _value_at_cell(maps.pixels, cell)
             if pixel is not None:
                 _mark_site(axes, pixel, name)
-    plain.set_title("First picture", fontsize=9)
-    overlay.set_title("Safe landing map on it", fontsize=9)
+    image_axes.set_title("First image", fontsize=9)
+    overlay_axes.set_title("Safe landing map on the first image", fontsize=9)
     terrain = figure.add_subplot(1, 3, 3, projection="3d", computed_zorder=False)
     colours = SAFETY_COLOURS(np.clip(np.nan_to_num(maps.safety, nan=1.0), 0, 2).astype(np.int64))[..., :3]
     _draw_terrain(terrain, maps, colours, -115.0)
@@ -192,7 +192,7 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
 
 
 Products = Mapping[str, Any]
-#: Function that reads the figure's products, and function that draws it, by file name in the paper's order.
+#: For each file name, in the paper's order: function that reads the products, and function that draws the figure.
 _FIGURES: Mapping[str, tuple[Callable[[Products], object], Callable[[Products], Figure]]] = {
     "fig1-tracks": (stages.read_tracked_features, draw_tracks),
     "fig2-motion": (stages.read_motion, draw_motion),
@@ -236,12 +236,12 @@ def _draw_segments(axes: Axes, starts: stages.Pixels, ends: stages.Pixels, colou
     axes.plot(*np.stack([starts, ends]).transpose(2, 0, 1), color=colour, linewidth=0.8, alpha=alpha)
 
 
-def _draw_picture_pair(products: Mapping[str, Any]) -> tuple[Figure, Axes, Axes]:
-    images = _require(stages.read_images(products), "pictures")
+def _draw_image_pair(products: Mapping[str, Any]) -> tuple[Figure, Axes, Axes]:
+    images = _require(stages.read_images(products), "images")
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    show_picture(left, images[0])
-    show_picture(right, images[1])
+    show_image(left, images[0])
+    show_image(right, images[1])
     return figure, left, right
 
 
@@ -263,10 +263,10 @@ def _draw_motion_view(
     for number, (rotation, translation, colour, line, name) in enumerate(poses):
         centre = -rotation.T @ translation
         rays = motion.corner_rays[min(number, 1)] * depth
-        field = centre + rays @ rotation
-        axes.plot(*project(field[[0, 1, 2, 3, 0]]).T, color=colour, linestyle=line, linewidth=1.1, label=name)
+        footprint = centre + rays @ rotation
+        axes.plot(*project(footprint[[0, 1, 2, 3, 0]]).T, color=colour, linestyle=line, linewidth=1.1, label=name)
         if line == "-":
-            for corner in field:
+            for corner in footprint:
                 axes.plot(*project(np.array([centre, corner])).T, color=colour, linewidth=0.5, alpha=0.5)
             for axis in 0.12 * depth * rotation:
                 axes.plot(*project(np.array([centre, centre + axis])).T, color=colour, linewidth=1.8)
@@ -289,7 +289,7 @@ def _draw_terrain(
     heights = maps.elevation_m - np.nanmedian(maps.elevation_m)
     sides = maps.cell_m * np.array([columns, rows])
     height_range_m = float(np.nanmax(heights) - np.nanmin(heights))
-    # heights are exaggerated so that gentle ground shows its relief
+    # exaggerate heights so that the relief of flat ground is visible
     scale = next((k for k in (1.0, 2.0, 5.0) if k * height_range_m >= _MIN_RELIEF * sides.max()), 10.0)
     style: dict[str, Any] = {"vert_exag": scale, "dx": maps.cell_m, "dy": maps.cell_m, "blend_mode": "soft"}
     shaded = LightSource(315.0, 45.0).shade_rgb(np.asarray(colours), np.nan_to_num(heights), **style)
@@ -307,7 +307,7 @@ def _draw_terrain(
     axes.set_box_aspect((sides[0], sides[1], max(scale * height_range_m, 0.05 * sides.max())), zoom=1.3)
     axes.view_init(elev=38.0, azim=azimuth_deg)
     axes.set(xlabel="x (m)", ylabel="y (m)")
-    axes.set_title("Heights in m" if scale == 1.0 else f"Heights in m, drawn {scale:g} times as high", fontsize=9)
+    axes.set_title("Heights in m" if scale == 1.0 else f"Heights in m, exaggerated {scale:g} times", fontsize=9)
     axes.tick_params(labelsize=6, pad=-2, colors=MUTED)
     for name, axis, bins in (("x", axes.xaxis, 4), ("y", axes.yaxis, 4), ("z", axes.zaxis, 3)):
         axes.locator_params(axis=name, nbins=bins)

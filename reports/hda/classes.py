@@ -1,4 +1,4 @@
-"""Missed hazards by size, and tracked features by the change between the pictures."""
+"""Section parts of hazard detection: missed hazards by size, and tracked features by the change between the images."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from marsyard.reports import section
 from marsyard.reports.figures import RateLine, draw_rates
 from marsyard.reports.hda.sections import PAPER, landing_rows
 from marsyard.reports.kinds import BlocksAndData, Rows
-from marsyard.reports.rates import CONFIDENCE, PooledRate, flag, pooled_rate, rate_text
+from marsyard.reports.rates import CONFIDENCE, PooledRate, flag_mask, pooled_rate, rate_text
 from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, build_grid, in_page_style
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, numbers, percent
 from marsyard.scenarios.landing.pictures import CLASS_BOUNDS, CLASS_NAMES
@@ -26,8 +26,10 @@ from marsyard.scenarios.landing.pictures import CLASS_BOUNDS, CLASS_NAMES
 class HazardClass:
     """Hazards of one size class.
 
-    kind: `roughness` (their height) or `slope` low, high: bounds in units of the lander's limit called_safe, unflagged:
-    footprints that are safe in the map, and footprints without a mapped hazard before growth
+    - kind: `roughness` (the height of the hazard) or `slope`
+    - low, high: bounds of the class divided by the lander's limit
+    - called_safe: fraction of footprints that are classified as safe in the map
+    - unflagged: fraction of footprints without a detected hazard before hazard growth
     """
 
     kind: str
@@ -44,12 +46,11 @@ class HazardClass:
         return f"> {self.low:g}" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
 
 
-_GROSS_RATE = "large hazard, of footprints classified as safe"
-#: Rates of footprints over all flights by name: columns of hits and of all footprints.
+#: Rates of footprints over all flights: columns of the counted and of all footprints, by name.
 RATES: Mapping[str, tuple[str, str]] = {
     "detected hazard, of truly safe footprints (false alarms)": ("false_alarms", "footprints_truly_safe"),
     "not truly safe, of footprints classified as safe": ("footprints_called_safe_unsafe", "footprints_called_safe"),
-    _GROSS_RATE: ("gross_hazards_called_safe", "footprints_called_safe"),
+    "large hazard, of footprints classified as safe": ("gross_hazards_called_safe", "footprints_called_safe"),
     "classified as safe, of footprints with a large hazard": ("gross_hazards_called_safe", "gross_hazards"),
     "no detected hazard, of footprints with a large hazard": ("gross_hazards_unflagged", "gross_hazards"),
 }
@@ -99,7 +100,7 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
 
 @in_page_style
 def class_figure(classes: Sequence[HazardClass]) -> Figure:
-    """Draw the fractions called safe and not flagged against the hazards' size, by roughness and by slope."""
+    """Draw the fractions of missed hazards against their size, by roughness and by slope."""
     figure = Figure(figsize=(7.2, 3.3), layout="constrained")
     for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("roughness", "slope"), strict=True):
         kind_classes = [item for item in classes if item.kind == kind]
@@ -118,14 +119,15 @@ def class_figure(classes: Sequence[HazardClass]) -> Figure:
 
 #: Minimum fraction of tracked features for good tracking.
 GOOD_FRACTION = 0.9
-#: Minimum change relative to the paper's limit; smaller changes are treated as zero.
+#: Minimum change divided by the paper's limit; smaller changes are treated as zero.
 _MIN_RELATIVE_CHANGE = 0.02
+#: Minimum number of distinct sizes of a change for a curve.
 _MIN_SIZES = 3
 
 
 @dataclass(frozen=True)
 class SizeResult:
-    """Correctly tracked features of flights with a change of this signed size; `good`: flights with good tracking."""
+    """Correctly tracked features of flights with a change of one signed size; `good`: flights with good tracking."""
 
     size: float
     tracked: PooledRate
@@ -137,9 +139,9 @@ class SizeResult:
 class TrackingCurve:
     """Tracking against one of the changes of `paper.toml`.
 
-    points: results by size, including zero change
-    knee_up, knee_down: largest change with an interpolated fraction of `GOOD_FRACTION`; infinite if all are larger, NaN
-        if that direction was not flown
+    - points: results by size, including zero change
+    - knee_up, knee_down: largest positive and negative change with an interpolated fraction of `GOOD_FRACTION`;
+      infinite if all fractions are larger, NaN if the campaign contains no change in that direction
     """
 
     change: Mapping[str, Any]
@@ -157,13 +159,13 @@ class TrackingCurve:
 
     @property
     def min_fraction_within_limit(self) -> float:
-        """Minimum fraction of all sizes up to the paper's limit."""
+        """Minimum fraction of tracked features over all sizes up to the paper's limit."""
         fractions = [point.tracked.share for point in self.points if abs(point.size) <= 1.001 * self.change["paper"]]
         return float(np.nanmin(fractions)) if fractions and not np.all(np.isnan(fractions)) else math.nan
 
 
 def limits_section(subject: Subject) -> Section | None:
-    """Features tracked by the change between the pictures; None unless flights change one condition at a time."""
+    """Create the section on tracked features by change; None unless each flight changes at most one condition."""
     frame = landing_rows(subject)
     class_curves = [] if frame is None else tracking_curves(frame)
     if not class_curves:
@@ -188,7 +190,9 @@ def limits_section(subject: Subject) -> Section | None:
             "Flights with 90 %": lambda pair: f"{pair[1].good:,}",
         },
     )
-    caption = "Correctly tracked features, of those in both pictures; red: the paper's limits; grey: 90 %."
+    caption = (
+        "Fraction of the features in both images that are correctly tracked. Red: limits of the paper. Grey: 90 %."
+    )
     figure = section.svg_figure(limits_figure(class_curves), "limits", caption, wide=True)
     blocks = [
         Block(text=note_text("hda.limits_text"), figures=[figure]),
@@ -196,11 +200,11 @@ def limits_section(subject: Subject) -> Section | None:
         Block(heading="By size", grid=size_grid),
     ]
     data = {"curves": [asdict(curve) for curve in class_curves]}
-    return Section("limits", "Limits", "Tracking by change between the pictures", blocks, data)
+    return Section("limits", "Limits", "Tracking by change between the images", blocks, data)
 
 
 def tracking_curves(frame: pd.DataFrame) -> list[TrackingCurve]:
-    """Create a curve for every change that was flown alone in several sizes; empty if changes were combined."""
+    """Create a curve for each change with at least three sizes; empty if flights combine several changes."""
     changes = PAPER["changes"]
     if "tracks_correct" not in frame:
         return []
@@ -221,7 +225,9 @@ def tracking_curves(frame: pd.DataFrame) -> list[TrackingCurve]:
                 flights = frame[selected & (rounded == value)]
                 # a flight without tracks has tracked none of the visible features
                 tracked = pooled_rate(flights, "tracks_correct", "features_in_view")
-                points.append(SizeResult(float(value), tracked, len(flights), int(flag(flights, "tracked_well").sum())))
+                points.append(
+                    SizeResult(float(value), tracked, len(flights), int(flag_mask(flights, "tracked_well").sum()))
+                )
             result.append(TrackingCurve(change, points, find_knee(points, 1.0), find_knee(points, -1.0)))
     return result
 

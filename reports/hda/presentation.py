@@ -14,7 +14,7 @@ from marsyard.reports.hda.case_figures import FIGURES, available_figures, write_
 from marsyard.reports.hda.classes import draw_classes, limits_section
 from marsyard.reports.kinds import CustomBlocks, Distribution, RateTable, SectionDeclaration
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
-from marsyard.reports.section import draw_pictures, svg_figure
+from marsyard.reports.section import draw_images, svg_figure
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {
@@ -24,25 +24,26 @@ _CAPTIONS: Mapping[str, str] = {
     "fig5-maps": "Fig. 5: elevation, roughness, slope and safe landing map. Bottom row: ground truth.",
     "fig7-site": "Fig. 7: first image; safe landing map overlaid on the image and on the terrain.",
 }
-#: Not on the page, since its pictures are those of Fig. 3; only `marsyard replay` draws it.
+#: This figure is not on the page, since its images are those of Fig. 3; only `marsyard replay` draws it.
 _OMITTED_FIGURE = "fig1-tracks"
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """Create the view of a landing case; only its pictures without results of the paper's stages."""
+    """Create the view of a landing case; it contains only the images if no stage of the paper has results."""
     names = [name for name in available_figures(products) if name != _OMITTED_FIGURE]
-    picture_pair = stages.read_images(products)
-    if not names and picture_pair is not None:
-        caption = "The two pictures that the algorithm received."
-        figure = svg_figure(draw_pictures(picture_pair), f"{key}pictures", caption, wide=True)
+    image_pair = stages.read_images(products)
+    if not names and image_pair is not None:
+        caption = "The two images that the algorithm received."
+        figure = svg_figure(draw_images(image_pair), f"{key}pictures", caption, wide=True)
         return CaseView([], [figure], *_stage_rows(products), note_text("hda.plain_legend"))
-    drawn = [(name, FIGURES[name](products)) for name in names]
-    svg_figures = [svg_figure(figure, f"{key}{name[:4]}", _CAPTIONS[name], wide=True) for name, figure in drawn]
+    named_figures = [(name, FIGURES[name](products)) for name in names]
+    svg_figures = [svg_figure(figure, f"{key}{name[:4]}", _CAPTIONS[name], wide=True) for name, figure in named_figures]
     facts = [("Figures", ", ".join(name.split("-")[0] for name in names) or "none")]
     return CaseView(facts, svg_figures, *_stage_rows(products))
 
 
 def _stage_rows(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]:
+    """Create head and rows of the table of results by stage."""
     tracks, motion = stages.read_tracked_features(products), stages.read_motion(products)
     matches, maps = stages.read_matches(products), stages.read_landing_maps(products)
     results = dict.fromkeys(("Features and tracks", "Motion", "Structure", "Map", "Site"), "")
@@ -74,7 +75,7 @@ SITES = SectionDeclaration(
         Distribution(
             sections.hazard_distances,
             ("distance to the nearest unsafe position (m)", "fraction above this distance"),
-            "Fraction of sites and touchdowns farther than this from the nearest unsafe position.",
+            "Fraction of sites and of touchdowns with a larger distance to the nearest unsafe position.",
             heading="Distance to true hazards",
             complementary=True,
             table=sections.distance_grid,

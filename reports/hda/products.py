@@ -29,7 +29,7 @@ class EstimatedMotion:
     """Pose of the second camera relative to the first, and structure in the first camera's frame, metres.
 
     points: positions of the accepted tracks
-    corner_rays: rays of each picture's corners in its camera's frame, with depth 1
+    corner_rays: rays of each image's corners in its camera's frame, with depth 1
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -42,7 +42,7 @@ class EstimatedMotion:
 
 @dataclass(frozen=True)
 class EpipolarMatches:
-    """Structure pixels of the first picture, their epipolar segments and matches in the second, pixels (u, v)."""
+    """Structure pixels of the first image, their epipolar segments and matches in the second, pixels (u, v)."""
 
     grid: Pixels
     starts: Pixels
@@ -55,10 +55,12 @@ class EpipolarMatches:
 class LandingMaps:
     """The maps of a case on the cells of the elevation map; row 0 has the largest y.
 
-    elevation_m: height relative to the first camera safety: 0 safe, 1 unknown, 2 hazard pixels: pixel in the first
-    picture of the centre of every cell; extrapolated if the elevation is unknown corner_m: centre of the first cell (x,
-    y) in the surface frame site, apriori: row and column; NaN for no site limits: limits of slope (radians) and
-    roughness (metres), and the lander's diameter (metres)
+    - elevation_m: height relative to the first camera
+    - safety: 0 safe, 1 unknown, 2 hazard
+    - pixels: pixel (u, v) of each cell's centre in the first image; extrapolated if the elevation is unknown
+    - corner_m: centre of the first cell (x, y) in the surface frame
+    - site, apriori: row and column of the safe and of the a-priori site; NaN for no site
+    - limits: limits of slope (radians) and roughness (metres), and the lander's diameter (metres)
     """
 
     elevation_m: MapArray
@@ -75,7 +77,7 @@ class LandingMaps:
     site: Float[np.ndarray, "2"]
 
     def world_to_cell(self, offset_from_nadir_m: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Fractional (row, column) of offsets (x, y) along the world's axes from the camera's nadir point."""
+        """Convert offsets (x, y) from the camera's nadir point along the world's axes to fractional (row, column)."""
         offset_m = offset_from_nadir_m @ self.world_from_surface[:2, :2]
         return np.asarray(((offset_m - self.corner_m) / self.cell_m * np.array([1.0, -1.0]))[..., ::-1])
 
@@ -84,9 +86,10 @@ class LandingMaps:
 class GroundTruth:
     """Ground truth on its sampling grid.
 
-    offset_from_nadir_m: world (x, y) relative to the camera's true nadir point elevation_m: exact height relative to
-    the camera slope_rad, roughness_m, safe: values of a lander's footprint centred at the position covered: whether
-    both pictures contain the complete footprint
+    - offset_from_nadir_m: world (x, y) relative to the camera's true nadir point
+    - elevation_m: exact height relative to the camera
+    - slope_rad, roughness_m, safe: values of a lander's footprint centred at the position
+    - covered: whether both images contain the complete footprint
     """
 
     offset_from_nadir_m: Float[np.ndarray, "rows columns 2"]
@@ -98,12 +101,12 @@ class GroundTruth:
 
 
 def is_hda_case(products: Mapping[str, Any]) -> bool:
-    """Whether products contain two pictures and the ground truth of a landing."""
+    """Whether products contain two images and the ground truth of a landing."""
     return read_images(products) is not None and read_ground_truth(products) is not None
 
 
 def read_images(products: Mapping[str, Any]) -> tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]] | None:
-    """Read the two pictures; None if one is missing."""
+    """Read the two images; None if one is missing."""
     first, second = (to_matrix(products.get(f"image_{number}")) for number in (1, 2))
     return None if first is None or second is None else (first, second)
 
@@ -137,7 +140,7 @@ def read_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
 
 
 def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
-    """Read the maps; None if the ground was not mapped."""
+    """Read the maps; None if the case has no elevation map."""
     maps = read_arrays(products, dict.fromkeys(("elevation", "roughness", "slope", "safety"), (None, None)))
     if maps is None or len({values.shape for values in maps}) > 1 or min(maps[0].shape) < 2:
         return None
@@ -148,7 +151,7 @@ def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
         return None
     observed = np.isfinite(pixels).all(axis=-1)
     if not observed.all() and observed.sum() >= 3:
-        # unknown pixels: affine map of the known ones, exact for level ground
+        # extrapolate unknown pixels by an affine map fitted to the known pixels; exact for level ground
         cells = np.concatenate([np.moveaxis(np.indices(observed.shape), 0, -1), np.ones((*observed.shape, 1))], axis=-1)
         affine = np.linalg.lstsq(cells[observed], pixels[observed], rcond=None)[0]
         pixels = np.where(observed[..., None], pixels, cells @ affine)

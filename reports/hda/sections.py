@@ -26,12 +26,13 @@ MIN_MAPS = 8
 
 
 def landing_rows(subject: Subject) -> pd.DataFrame | None:
-    """Return the rows of landing cases; None for other rows."""
+    """Return the rows if they are those of landing cases; None for other rows."""
     frame = subject.frame
     return frame if all(name in frame for name in _REQUIRED_COLUMNS) and len(frame) > 0 else None
 
 
 def _threshold_rows(subject: Subject) -> pd.DataFrame | None:
+    """Add the number of footprints that are not truly safe to the rows."""
     frame = landing_rows(subject)
     if frame is None:
         return None
@@ -44,16 +45,16 @@ def _lander_limit_m(subject: Subject) -> float:
     return float(limit) if isinstance(limit, int | float) else LanderParameters().max_roughness_m
 
 
-#: False alarms and misses against the roughness threshold, for the paper's remark on false positives.
+#: False alarms and misses against the roughness threshold, to check the paper's remark on false positives.
 THRESHOLD = kinds.SectionDeclaration(
     "threshold",
     "Threshold",
-    "False alarms and misses by threshold of roughness",
+    "False alarms and misses by roughness threshold",
     rows=_threshold_rows,
     requires=("false_alarms",),
     parts=(
         kinds.RateByCondition(
-            by=kinds.Quantity("max_roughness_m", "Threshold of roughness (m)"),
+            by=kinds.Quantity("max_roughness_m", "Roughness threshold (m)"),
             rates=(
                 kinds.Rate(
                     "false_alarms", "False alarms", kinds.pooled_fraction("false_alarms", "footprints_truly_safe")
@@ -61,21 +62,25 @@ THRESHOLD = kinds.SectionDeclaration(
                 kinds.Rate("missed", "Missed", kinds.pooled_fraction("missed", "footprints_not_safe")),
                 kinds.Rate(
                     "called_safe_unsafe",
-                    "Called safe, not safe",
+                    "Classified as safe, not truly safe",
                     kinds.pooled_fraction("footprints_called_safe_unsafe", "footprints_called_safe"),
                 ),
                 kinds.Rate(
-                    "found", "Site found, if one exists", kinds.flag_rate("site_reported", "wide_site_exists"), False
+                    "found",
+                    "Site reported, if a wide safe site exists",
+                    kinds.flag_rate("site_reported", "wide_site_exists"),
+                    False,
                 ),
                 kinds.Rate("safe", "Sites truly safe", kinds.flag_rate("site_safe", "site_reported"), False),
             ),
             cases="Flights",
             ylabel="fraction of footprints",
-            text="The paper: both results of its Fig. 7 have false positive hazards, caused by a low threshold of "
-            "roughness and by noise of the map; a higher threshold would remove them. It gives no numbers.",
-            note="False alarms: of truly safe footprints. Missed: of footprints that are not truly safe, for slope or "
-            "roughness.",
-            caption="Fractions of footprints against the threshold; dashed: roughness limit of the lander.",
+            text="According to the paper, both results of its Fig. 7 contain false positive hazards. The causes are a "
+            "low roughness threshold and noise of the map. A higher threshold would remove them. The paper gives no "
+            "numbers.",
+            note="False alarms are a fraction of the truly safe footprints. Missed hazards are a fraction of the "
+            "footprints that are not truly safe, because of slope or roughness.",
+            caption="Fractions of footprints against the threshold. Dashed line: roughness limit of the lander.",
             limit=("the lander's limit", _lander_limit_m),
             data="thresholds",
         ),
@@ -94,8 +99,10 @@ def _describe_fault(fault: str, size: float) -> tuple[str, str]:
 
 
 def classify_answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
-    """Masks of the outcomes of the search; each row has exactly one outcome."""
-    reported, safe, refused = (rates.flag(frame, name) for name in ("site_reported", "site_safe", "no_site_reported"))
+    """Create a mask for each outcome of the search; each row has exactly one outcome."""
+    reported, safe, refused = (
+        rates.flag_mask(frame, name) for name in ("site_reported", "site_safe", "no_site_reported")
+    )
     finished = frame["site_reported"].notna().to_numpy(dtype=np.bool_)
     return {
         "safe": reported & safe,
@@ -125,17 +132,17 @@ FAULT_OUTCOMES = kinds.OutcomesBySize(
     cases="Flights",
     wording=_describe_fault,
     extra_columns=(
-        ("Touchdown off (m)", "off_m", lambda rows: _median(rows, "touchdown_error_m"), _two_digits),
-        ("Sinking (m/s)", "sink_m_s", lambda rows: _median(rows, "touchdown_sink_m_s"), _two_digits),
+        ("Touchdown error (m)", "off_m", lambda rows: _median(rows, "touchdown_error_m"), _two_digits),
+        ("Sink rate (m/s)", "sink_m_s", lambda rows: _median(rows, "touchdown_sink_m_s"), _two_digits),
     ),
-    caption="Full: a truly safe site. Hatched: no safe site. Dotted: not converged. Crossed: a site that is not safe.",
+    caption="Solid bars: truly safe site. Hatched: 'no safe site'. Dotted: not converged. Cross-hatched: unsafe site.",
     note=note_text("hda.faults", confidence=format_fraction(CONFIDENCE)),
 )
 FAULTS = kinds.SectionDeclaration("landing-faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), rows=landing_rows)
 
 
 def map_rows(subject: Subject) -> pd.DataFrame | None:
-    """Select cases with a map, with errors relative to height and range; None for few cases or constant conditions."""
+    """Select cases with a map and add errors relative to height and range; None for too few or equal conditions."""
     frame = landing_rows(subject)
     if frame is None or not (rates.varies(frame, "texture") and rates.varies(frame, "baseline_fraction")):
         return None
@@ -154,18 +161,18 @@ _MAP_ERRORS = (
     kinds.Quantity("noise_share", "elevation error rms without its plane (% of height)", 100.0),
     kinds.Quantity("slope_error_rms_deg", "slope error rms (deg)"),
 )
-#: Effects of the applied conditions on the map errors.
+#: Dependence of the map errors on conditions.
 MAP_EFFECTS = kinds.Scatter(
     x=(
         kinds.Quantity("baseline_fraction", "baseline / height"),
         kinds.Quantity("texture", "texture relative to the site"),
         kinds.Quantity("grid_px", "grid spacing (px)"),
         kinds.Quantity("level_error_deg", "error of the vertical (deg)"),
-        kinds.Quantity("altimeter_share", "altimeter's error (% of the range)", 100.0),
+        kinds.Quantity("altimeter_share", "altimeter error (% of range)", 100.0),
     ),
     y=_MAP_ERRORS,
     heading="Dependence on conditions",
-    caption="Every case, and medians of bins with equally many cases; scales of the errors are logarithmic.",
+    caption="Points are cases, lines are medians of bins with equally many cases. The error axes are logarithmic.",
     logarithmic=True,
 )
 MAP_ERRORS = kinds.SectionDeclaration(
@@ -196,11 +203,11 @@ _DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
 
 def _landed_rows(subject: Subject) -> pd.DataFrame | None:
     frame = landing_rows(subject)
-    return None if frame is None else frame[rates.flag(frame, "landed")]
+    return None if frame is None else frame[rates.flag_mask(frame, "landed")]
 
 
 def _draw_table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
-    """Draw Table II: the paper's runs, their mean, and Marsyard's landings by each measure."""
+    """Create Table II: the paper's runs and their mean, and the campaign's landings by each measure."""
     runs: Sequence[Mapping[str, float]] = PAPER["landings"]
     columns = ("error_m", "north_m", "east_m", "run_time_s")
     paper = {f"run {run['run']}": (1, [run[name] for name in columns]) for run in runs}
@@ -266,19 +273,19 @@ TOUCHDOWN = kinds.SectionDeclaration(
     ),
 )
 
-#: Classes of the true ground in both pictures, best first, and outcomes of the search. The surroundings of a wide safe
-#: site are safe up to a lander's radius.
+#: Classes of the true ground in both images, best first, and outcomes of the search. All positions within one lander
+#: radius of a wide safe site are also safe.
 GROUNDS = ("wide safe site", "narrow safe site", "no safe site")
 ANSWERS = ("truly safe site", "unsafe site", "'no safe site'", "not converged", "not finished")
 
 
 def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
-    """Fractions of correct answers by class of the true ground; classes without cases are omitted."""
+    """Compute fractions of correct answers by class of the true ground; classes without cases are omitted."""
     reported, no_site, wide_site, landed = (
-        rates.flag(frame, name) for name in ("site_reported", "no_safe_site_exists", "wide_site_exists", "landed")
+        rates.flag_mask(frame, name) for name in ("site_reported", "no_safe_site_exists", "wide_site_exists", "landed")
     )
-    refused, safe = rates.flag(frame, "no_site_reported"), rates.flag(frame, "site_safe")
-    narrow, correct = rates.flag(frame, "safe_site_exists") & ~wide_site, refused | (reported & safe)
+    refused, safe = rates.flag_mask(frame, "no_site_reported"), rates.flag_mask(frame, "site_safe")
+    narrow, correct = rates.flag_mask(frame, "safe_site_exists") & ~wide_site, refused | (reported & safe)
     fractions = {
         "chosen sites that are truly safe": rates.fraction_of(safe[reported], frame[reported]),
         "answer 'no safe site' if none exists": rates.fraction_of(refused[no_site], frame[no_site]),
@@ -287,8 +294,8 @@ def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
         "truly safe site or 'no safe site' if all safe sites are narrow": rates.fraction_of(
             correct[narrow], frame[narrow]
         ),
-        "converged (of all flights)": rates.fraction_of(rates.flag(frame, "converged"), frame),
-        "landings on safe ground": rates.fraction_of(rates.flag(frame, "touchdown_safe")[landed], frame[landed]),
+        "converged (of all flights)": rates.fraction_of(rates.flag_mask(frame, "converged"), frame),
+        "landings on safe ground": rates.fraction_of(rates.flag_mask(frame, "touchdown_safe")[landed], frame[landed]),
     }
     return {name: fraction for name, fraction in fractions.items() if fraction.n}
 
@@ -296,7 +303,7 @@ def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
 def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
     """Count flights by true ground (`GROUNDS`) and outcome (`ANSWERS`)."""
     wide_site, safe_site, no_site = (
-        rates.flag(frame, name) for name in ("wide_site_exists", "safe_site_exists", "no_safe_site_exists")
+        rates.flag_mask(frame, name) for name in ("wide_site_exists", "safe_site_exists", "no_safe_site_exists")
     )
     answer_masks = dict(zip(ANSWERS, classify_answers(frame).values(), strict=True))
     ground_masks = dict(zip(GROUNDS, (wide_site, safe_site & ~wide_site, no_site), strict=True))
@@ -307,7 +314,7 @@ def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
 
 
 def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
-    """Draw the outcomes of the search by class of the true ground."""
+    """Create the table of the outcomes of the search by class of the true ground."""
     counts = outcome_counts(frame)
     rows = [[ground, *(f"{answer_counts[name]:,}" for name in ANSWERS)] for ground, answer_counts in counts.items()]
     note = note_text("hda.outcomes")
@@ -317,15 +324,15 @@ def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.Bloc
 
 def hazard_distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
     """Distances of reported sites and of touchdowns to the nearest true hazard, metres."""
-    reported = frame[rates.flag(frame, "site_reported")]
+    reported = frame[rates.flag_mask(frame, "site_reported")]
     return {
-        "site, where one was reported": rates.finite_values(reported, "site_hazard_distance_m"),
+        "reported site": rates.finite_values(reported, "site_hazard_distance_m"),
         "touchdown": rates.finite_values(frame, "touchdown_hazard_distance_m"),
     }
 
 
 def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
-    """Table of minimum distance, low quantiles, and the bound of the 5 % quantile."""
+    """Create a table of minimum distance, 5 % quantile, median, and lower bound of the 5 % quantile."""
     rows = []
     for name, values in curves.items():
         if values.size:
@@ -336,7 +343,7 @@ def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
 
 
 def run_times_section(subject: Subject) -> Section | None:
-    """Processor time of the four stages next to Table I; None if no case reached all of them."""
+    """Compare the CPU time of the four stages with Table I; None if no case completed all stages."""
     frame, stages = landing_rows(subject), PAPER["stages"]
     if frame is None:
         return None

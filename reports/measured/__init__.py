@@ -1,1 +1,1 @@
-"""Real cases: how their pictures and measured poses agree."""
+"""Real cases: how their images and measured poses agree."""

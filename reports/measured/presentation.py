@@ -1,4 +1,4 @@
-"""Presentation of measured cases: agreement with measured poses, matches, and the figures of their system."""
+"""Presentation of measured cases: agreement of images and measured poses, matches, and figures of the task."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from marsyard.reports.section import (
     Subject,
     in_page_style,
     new_axes,
-    show_picture,
+    show_image,
     svg_figure,
 )
 from marsyard.reports.wording import NOTHING, label, number, numbers
@@ -46,25 +46,25 @@ _COLUMNS = (
     "baseline_pose_difference_fraction",
 )  # fmt: skip
 _TEXT = (
-    "Pictures and poses must agree, even if the true velocity is unknown. Features are matched between consecutive "
-    "pictures. According to the poses, a match lies on a curve of the later picture (at a point, if the camera only "
+    "Images and poses must agree, even if the true velocity is unknown. Features are matched between consecutive "
+    "images. According to the poses, a match lies on a curve of the later image (at a point, if the camera only "
     "rotated); the residual is its distance from this curve. It contains the errors of poses, lens and matching. "
     "Matching alone causes a few tenths of a pixel; larger residuals are caused by the poses or the camera."
 )
 _INERTIAL = (
     "Differences from the inertial velocity contain its constant error. The discrepancy of pairs does not: it compares "
-    "the change of velocity from the first pair of pictures to the second with the inertial change. Without measured "
+    "the change of velocity from the first pair of images to the second with the inertial change. Without measured "
     "positions, the residual uses the answer's velocity instead of the constant part of the inertial velocity. "
 )
-_NOT_RANDOM = "Measured cases are not random samples: these numbers are not probabilities."
+_NOT_RANDOM = "Measured cases are not random samples, so these numbers are not probabilities."
 
 
 def agreement_section(subject: Subject) -> Section | None:
-    """Section on the agreement; None if the cases are not measured cases."""
+    """Create the section on the agreement of images and poses; None if the cases are not measured cases."""
     frame = subject.frame
     if "measured_case" not in frame or MEDIAN not in frame:
         return None
-    # differences of other algorithms from the first one come last
+    # differences of compared algorithms come last
     differences = [str(name) for name in frame if str(name).endswith((".difference_m_s", ".difference_m"))]
     names = [name for name in (*_COLUMNS, *differences) if name in frame and np.isfinite(numbers(frame, name)).any()]
     medians = numbers(frame, MEDIAN)
@@ -76,7 +76,9 @@ def agreement_section(subject: Subject) -> Section | None:
         rows.append([str(row.get("case", index)), str(row["measured_case"]), str(row["outcome"]), *texts])
     svg_figures = []
     if np.count_nonzero(np.isfinite(medians)) >= _MIN_CASES:
-        svg_figures.append(svg_figure(residual_figure(frame), "agreement", "Residuals of the cases by median."))
+        svg_figures.append(
+            svg_figure(residual_figure(frame), "agreement", "Residuals of each case, in the order of their median.")
+        )
     note = (_INERTIAL if "inertial_difference_m_s" in names else "") + _NOT_RANDOM
     grid = Grid(head, rows, max(0, len(frame) - _MAX_ROWS))
     data = {
@@ -86,12 +88,12 @@ def agreement_section(subject: Subject) -> Section | None:
         "apart": {name: float(np.nanmedian(numbers(frame, name))) for name in names if name in differences},
     }
     blocks = [Block(text=_TEXT, figures=svg_figures, grid=grid, note=note)]
-    return Section("agreement", "Agreement", "Pictures compared with measured poses", blocks, data)
+    return Section("agreement", "Agreement", "Images compared with measured poses", blocks, data)
 
 
 @in_page_style
 def residual_figure(frame: pd.DataFrame) -> Figure:
-    """Median and 90 % residual of each case, ordered by the median."""
+    """Draw the median and the 90 % quantile of the residuals of each case, ordered by the median."""
     medians, percentile_90 = numbers(frame, MEDIAN), numbers(frame, PERCENTILE_90)
     finite = np.flatnonzero(np.isfinite(medians))
     order = finite[np.argsort(medians[finite], kind="stable")]
@@ -108,12 +110,16 @@ def residual_figure(frame: pd.DataFrame) -> Figure:
 
 #: Maximum number of pairs on the page.
 _MAX_PAIRS = 4
-#: Figures of a landing that need no truth.
-_WITHOUT_TRUTH = ("fig1-tracks", "fig3-epipolar", "fig4-elevation")
+#: Figures of a landing that need no ground truth, and their captions.
+_FIGURES_WITHOUT_TRUTH = {
+    "fig1-tracks": "Features of the first image and their tracks in the second image.",
+    "fig3-epipolar": "Structure pixels (red), epipolar segments (green) and matches (blue).",
+    "fig4-elevation": "Two views of the elevation map.",
+}
 _LEGEND = (
-    "Features matched between consecutive pictures, coloured by their residual relative to the measured poses; grey "
-    "crosses: outliers, which no rigid motion explains. Offsets are measured in the later picture: their scatter shows "
-    "errors of matching and lens, a common offset shows an attitude error. "
+    "The points are features matched between consecutive images, coloured by their residual relative to the measured "
+    "poses. Grey crosses are outliers, which no rigid motion explains. Offsets are measured in the later image. Their "
+    "scatter shows errors of matching and lens; a common offset shows an attitude error."
 )
 
 
@@ -129,9 +135,10 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     if DIMES_CASE.is_case(products) and "tracks" in products:
         dimes = DIMES_CASE.view(products, key)
         return CaseView([*facts, *dimes.facts], [*svg_figures, *dimes.figures], dimes.head, dimes.rows)
-    drawn = [(name, FIGURES[name](products)) for name in _landing_figures(products)]
-    svg_figures += [svg_figure(figure, f"{key}{name[:4]}", f"{name}.", wide=True) for name, figure in drawn]
-    head = ["Pictures", "Matches", "Wrong", "Median residual (px)", "90 % (px)"]
+    named_figures = [(name, FIGURES[name](products)) for name in _landing_figures(products)]
+    captions = _FIGURES_WITHOUT_TRUTH
+    svg_figures += [svg_figure(figure, f"{key}{name[:4]}", captions[name], wide=True) for name, figure in named_figures]
+    head = ["Images", "Inliers", "Outliers", "Median residual (px)", "90 % quantile (px)"]
     head += ["Offset right (px)", "Offset down (px)"]
     rows = []
     for pair in pairs:
@@ -147,7 +154,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 
 def _landing_figures(products: Mapping[str, Any]) -> list[str]:
-    return [name for name in available_figures(products) if name in _WITHOUT_TRUTH]
+    return [name for name in available_figures(products) if name in _FIGURES_WITHOUT_TRUTH]
 
 
 def _write_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
@@ -169,21 +176,22 @@ MEASURED = Presentation(
 _MAX_COLOUR_PX = 3.0
 _COLOURS = "plasma"
 _OUTLIER_COLOUR = "#c9d1d9"
-#: Numbers of a case's pictures.
-_PICTURE_NUMBERS = range(1, 100)
+#: Numbers of a case's images.
+_IMAGE_NUMBERS = range(1, 100)
 
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """Two pictures and the features matched between them.
+    """Two images and the features matched between them.
 
-    number: number of the earlier picture, from 1. pictures: both pictures, counts. pixels: (u, v) of each match in both
-    pictures. offsets: position in the later picture minus the position predicted by the poses, pixels. inlier: whether
-    a rigid motion explains the match.
+    - number: number of the earlier image, from 1; images: counts of both images
+    - pixels: (u, v) of each match in both images
+    - offsets: position in the later image minus the position predicted by the poses, pixels
+    - inlier: whether a rigid motion explains the match
     """
 
     number: int
-    pictures: tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]]
+    images: tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]]
     pixels: Float[np.ndarray, "n 2 2"]
     offsets: Float[np.ndarray, "n 2"]
     inlier: Bool[np.ndarray, " n"]
@@ -199,13 +207,13 @@ class MatchedPair:
         """Caption of the pair."""
         residuals = self.residuals_px
         median = f", median residual {number(float(np.median(residuals)))} px" if residuals.size else ""
-        return f"Pictures {self.number} and {self.number + 1}: {residuals.size:,} matches{median}"
+        return f"Images {self.number} and {self.number + 1}: {residuals.size:,} matches{median}"
 
 
 def read_matched_pairs(products: Mapping[str, Any]) -> list[MatchedPair]:
     """Read the valid pairs of a case's products."""
     pairs = []
-    for k in _PICTURE_NUMBERS:
+    for k in _IMAGE_NUMBERS:
         table = numeric_product(products.get(f"matches_{k}"))
         first, second = (to_matrix(products.get(f"image_{number}")) for number in (k, k + 1))
         if table is not None and table.ndim == 2 and table.shape[1] == 7 and first is not None and second is not None:
@@ -216,17 +224,17 @@ def read_matched_pairs(products: Mapping[str, Any]) -> list[MatchedPair]:
 
 @in_page_style
 def draw_pair(pair: MatchedPair) -> Figure:
-    """Draw both pictures with the matches, coloured by their residuals, and the offsets."""
+    """Draw both images with the matches, coloured by their residuals, and the offsets."""
     figure = Figure(figsize=(12.0, 5.2), layout="constrained")
     left, right, scatter = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 0.8))
     offsets = pair.offsets[pair.inlier]
     lengths = np.hypot(*offsets.T)
     style: dict[str, Any] = {"c": lengths, "s": 12.0, "cmap": _COLOURS, "vmin": 0.0, "vmax": _MAX_COLOUR_PX}
     for side, axes in enumerate((left, right)):
-        show_picture(axes, pair.pictures[side])
+        show_image(axes, pair.images[side])
         axes.plot(*pair.pixels[~pair.inlier, side].T, "x", markersize=4.0, color=_OUTLIER_COLOUR, markeredgewidth=0.8)
         points = axes.scatter(*pair.pixels[pair.inlier, side].T, linewidths=0.0, **style)
-        axes.set_title(f"Picture {pair.number + side}", fontsize=9)
+        axes.set_title(f"Image {pair.number + side}", fontsize=9)
     bar: dict[str, Any] = {"location": "bottom", "shrink": 0.5, "aspect": 40, "extend": "max"}
     figure.colorbar(points, ax=[left, right], label="residual (px)", **bar)
     finite = lengths[np.isfinite(lengths)]

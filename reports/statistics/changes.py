@@ -1,16 +1,16 @@
 """Comparison of two sets of cases that share terrains: rates by an exact test, errors by rank tests.
 
-Cases on one terrain are correlated. Where both sets have cases on the same terrains, they are compared within each
-terrain, where cases are independent: failures by the exact distribution of Mantel and Haenszel's sum of hypergeometrics
-(J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int. Statist. 37, 1960). Where
-they have few terrains in common, terrains are compared as units, each by the mean of equally many cases.
+Unpaired cases: cases on one terrain are correlated. If both sets have cases on the same terrains, they are compared
+within each terrain, where cases are independent. Rates are compared by the exact distribution of Mantel and Haenszel's
+sum of hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int.
+Statist. 37, 1960). If they have few terrains in common, each terrain is one unit with the mean of equally many cases.
 
-Small p-values of ranks are computed by permutation. With many ties, for example rates of a few cases per terrain, the
-rank sum is skewed, and its normal approximation is too small by a factor of two to three at 0.001.
+Small p-values of ranks are computed by permutation: with many ties (rates of a few cases per terrain, for example), the
+rank sum is skewed, and the p-value of its normal approximation is too small by a factor of two to three at 0.001.
 
-Pairs of cases (two algorithms, or two campaigns of the same draws): McNemar's test with the exact binomial distribution
-(Psychometrika 12, 1947) on the cases in which exactly one succeeds; Wilcoxon's signed ranks on differences of errors.
-Where cases share terrains, the sums of the differences on each terrain are ranked: under the null hypothesis they are
+Paired cases (two algorithms, or two campaigns with the same draws): successes are compared by McNemar's test with the
+exact binomial distribution (Psychometrika 12, 1947), errors by Wilcoxon's signed-rank test of their differences. If
+cases share terrains, the sums of the differences on each terrain are ranked: under the null hypothesis these sums are
 symmetric about zero for any correlation within terrains.
 """
 
@@ -31,13 +31,13 @@ from marsyard.reports.statistics.samples import Groups, is_shared, mean_interval
 _MIN_COMMON_FRACTION = 0.5
 #: Minimum number of values of each set for a rank test; below it the normal approximation is poor.
 _MIN_RANKED = 8
-#: Maximum number of entries of an exact distribution; above it the normal approximation is as accurate.
+#: Maximum size of an exact distribution; for larger ones the normal approximation is sufficiently accurate.
 _MAX_EXACT = 20_000
-#: Fraction of the terrains of each set that must have the number of cases used in a comparison of terrains.
+#: Minimum fraction of the terrains of each set with at least as many cases as a comparison of terrains uses.
 _FULL_FRACTION = 0.8
 #: p-value of the normal approximation below which permutations are used.
 _PERMUTATION_LIMIT = 0.05
-#: Permutations per batch; sufficient number of exceedances; maximum number of permuted values.
+#: Permutations per batch; number of exceedances at which sampling stops; maximum number of permuted values.
 _BATCH, _MAX_EXCEEDANCES, _MAX_PERMUTED = 500, 50, 2_000_000_000
 #: Fixed seed of the permutations, for reproducible reports.
 _SEED = 19370101
@@ -60,7 +60,7 @@ class Sample:
         return np.asarray(np.unique(self.terrains, return_counts=True)[1])
 
     def terrain_means(self, cases: int) -> Float[np.ndarray, " full"]:
-        """Mean of the first `cases` cases on each terrain that has at least as many."""
+        """Compute the mean of the first `cases` cases on each terrain with at least as many cases."""
         order = np.argsort(self.terrains, kind="stable")
         counts = self.cases_on_terrains()
         first = np.cumsum(counts) - counts
@@ -68,8 +68,8 @@ class Sample:
         return np.asarray(self.values[order][indices].mean(axis=1))
 
 
-def difference_p(now: Sample, before: Sample, permutations: int = 10_000) -> float:
-    """Two-sided p-value of the difference of two sets; NaN for too few cases.
+def difference_p_value(now: Sample, before: Sample, permutations: int = 10_000) -> float:
+    """Compute the two-sided p-value of the difference of two sets; NaN for too few cases.
 
     Values of only 0 and 1 are compared as rates. The minimum p-value of ranks is 1 divided by the permutations.
     """
@@ -93,7 +93,7 @@ Pairs = Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]
 
 
 def _test_rates(pairs: Pairs) -> float:
-    """Exact two-sided p-value of the ones in the first sets, given the ones in each pair: twice the smaller tail."""
+    """Compute the exact two-sided p-value for values of 0 and 1, given the sum of each pair: twice the smaller tail."""
     tables = [(int(a.sum()), a.size, int(a.sum() + b.sum()), a.size + b.size) for a, b in pairs]
     tables = [table for table in tables if 0 < table[2] < table[3]]
     if not tables:
@@ -146,8 +146,8 @@ def _test_ranks(pairs: Pairs, permutations: int) -> float:
     return (exceedances + 1.0) / (n_permutations + 1.0)
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Correct p-values for multiple tests (Holm 1979), except NaN: controls the family-wise error rate."""
+def correct_holm(p_values: Sequence[float]) -> list[float]:
+    """Correct p-values for multiple tests (Holm 1979), which limits the family-wise error rate; NaN remains NaN."""
     sorted_p = sorted((p, index) for index, p in enumerate(p_values) if not math.isnan(p))
     corrected, largest = [math.nan] * len(p_values), 0.0
     for rank, (p, index) in enumerate(sorted_p):
@@ -171,7 +171,7 @@ def compare_successes(
 def compare_errors(
     differences: Float[np.ndarray, " n"], groups: Groups, confidence: float
 ) -> tuple[float, float, float, float]:
-    """Mean of paired differences, its interval, and the two-sided p-value of symmetry about zero.
+    """Compute the mean of paired differences, its interval, and the two-sided p-value of symmetry about zero.
 
     NaN for no pairs; the interval is NaN for one pair.
     """

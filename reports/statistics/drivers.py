@@ -1,8 +1,8 @@
 """Dependence of a response on a condition: rank correlation and fraction of variance, each with an interval.
 
-Where cases share terrains and both condition and response depend on the terrain, the number of cases is divided by
-1 + (m - 1) r_x r_y, with m cases a terrain and the intraclass correlations of both (Scott & Holt, "The effect of
-two-stage sampling on ordinary least squares methods", J. Amer. Statist. Assoc. 77, 1982).
+If cases share terrains and both condition and response depend on the terrain, the number of cases is divided by
+1 + (m - 1) r_x r_y, with m cases per terrain and the intraclass correlations r_x and r_y of condition and response
+(Scott & Holt, "The effect of two-stage sampling on ordinary least squares methods", J. Amer. Statist. Assoc. 77, 1982).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _CASES_PER_BIN, _MAX_BINS = 15, 20
 class Driver:
     """Effect of a condition on a response.
 
-    n, effective_n: number of cases with both, and the equivalent number of independent cases. correlation, lower,
-    upper: Spearman's rank correlation and its interval. share, share_lower, share_upper: fraction of the variance of
-    the response's ranks that the condition alone explains, for any form of the curve, and its interval: the first-order
-    index of a variance-based analysis, estimated from the given cases; 0 to 1. p_value: p-value of the null hypothesis
-    that the condition has no effect.
+    - n, effective_n: number of cases with condition and response, and the equivalent number of independent cases
+    - correlation, lower, upper: Spearman's rank correlation and its interval
+    - share, share_lower, share_upper: fraction (0 to 1) of the variance of the response's ranks that the condition
+      alone explains, for any form of the curve, and its interval (first-order index of a variance-based analysis)
+    - p_value: p-value of the null hypothesis that the condition has no effect
     """
 
     n: int
@@ -48,10 +48,11 @@ def estimate_driver(
     groups: Int[np.ndarray, " n"] | None,
     confidence: float,
 ) -> Driver | None:
-    """Estimate the effect of a condition on a response from cases with both; None for fewer than twenty or a constant.
+    """Estimate the effect of a condition on a response; None for fewer than 20 cases with both, or for constant values.
 
-    condition, response: NaN where missing. groups: terrain of each case; None if no terrain is shared. confidence:
-    confidence of the two-sided intervals.
+    - condition, response: NaN where missing
+    - groups: terrain of each case; None if no terrain is shared
+    - confidence: confidence of the two-sided intervals
 
     Correlation: Fisher's z with Bonett & Wright's variance (Psychometrika 65, 2000). Fraction of variance: ranks of the
     response in bins of equally many cases (the "given data" estimate of the first-order index: Plischke, Borgonovo &
@@ -81,7 +82,7 @@ def estimate_driver(
 def _estimate_explained_fraction(
     x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], effective: float, confidence: float
 ) -> tuple[float, float, float, float]:
-    """Fraction of variance between bins, its interval, and the p-value of the F-test."""
+    """Estimate the fraction of variance between bins, its interval, and the p-value of the F-test."""
     n = x.size
     max_bins = int(np.clip(n // _CASES_PER_BIN, 2, _MAX_BINS))
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, max_bins + 1)))[1:-1]
@@ -100,8 +101,8 @@ def _estimate_explained_fraction(
     ratio = between / (bins - 1.0) / (within / degrees)
     fraction = max(0.0, (between - (bins - 1.0) * within / degrees) / total)
 
-    def excess(value: float, level: float) -> float:
-        """Distribution function of the F ratio at a noncentrality, minus a level."""
+    def cdf_minus_level(value: float, level: float) -> float:
+        """Return the distribution function of the F ratio at a noncentrality `value`, minus a level."""
         cdf = stats.ncf.cdf(ratio, bins - 1.0, degrees, value) if value else stats.f.cdf(ratio, bins - 1.0, degrees)
         return float(cdf) - level
 
@@ -109,11 +110,11 @@ def _estimate_explained_fraction(
     tail = 0.5 * (1.0 - confidence)
     for level in (1.0 - tail, tail):
         high = max(1.0, ratio * (bins - 1.0))
-        while excess(high, level) > 0.0:
+        while cdf_minus_level(high, level) > 0.0:
             high *= 2.0
         noncentrality = 0.0
-        if excess(0.0, level) > 0.0:
-            root = float(optimize.brentq(excess, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4))
+        if cdf_minus_level(0.0, level) > 0.0:
+            root = float(optimize.brentq(cdf_minus_level, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4))
             noncentrality = root / effective
         bounds.append(noncentrality / (1.0 + noncentrality))
     return fraction, bounds[0], bounds[1], float(stats.f.sf(ratio, bins - 1.0, degrees))
@@ -122,7 +123,7 @@ def _estimate_explained_fraction(
 def _estimate_intraclass_correlation(
     values: Float[np.ndarray, " n"], index: Int[np.ndarray, " n"], sizes: Float[np.ndarray, " groups"]
 ) -> float:
-    """Intraclass correlation by analysis of variance, 0 to 1; 0 if no group has two values."""
+    """Estimate the intraclass correlation (0 to 1) by analysis of variance; 0 if no group has two values."""
     n, groups = values.size, sizes.size
     if groups < 2 or groups == n:
         return 0.0

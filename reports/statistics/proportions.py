@@ -1,7 +1,7 @@
-"""Success rates: exact binomial bounds, also for cases that share terrains, and the number of cases required.
+"""Success rates: exact binomial bounds, bounds for cases that share terrains, required cases, and sequential tests.
 
-Bounds: Clopper & Pearson, "The use of confidence or fiducial limits illustrated in the case of the binomial",
-Biometrika 26, 1934.
+The bounds are those of Clopper & Pearson, "The use of confidence or fiducial limits illustrated in the case of the
+binomial", Biometrika 26, 1934.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 from scipy import special, stats
 
+#: Maximum number of cases of `minimum_sample_size`.
 _MAX_SAMPLE_SIZE = 2**40
 #: A lower and an upper bound.
 Interval = tuple[float, float]
@@ -84,15 +85,15 @@ def minimum_sample_size(reliability: float, confidence: float, failures: int = 0
 
 
 def further_cases_needed(n: int, failures: int, reliability: float, confidence: float) -> int:
-    """Number of additional cases without failure that demonstrate the reliability at the confidence; 0 if none."""
+    """Return the number of additional cases without failure that demonstrate the reliability; 0 if already shown."""
     return max(0, minimum_sample_size(reliability, confidence, failures) - n)
 
 
 def consumer_risk(successes: float | int, n: float | int, rate: float) -> float:
-    """Probability of evidence at least as good if the true rate equals `rate`; 1 for no successes.
+    """Compute the probability of as many successes or more if the true rate equals `rate`; 1 for no successes.
 
-    It is at most 1 - confidence exactly if the one-sided lower Clopper-Pearson bound at that confidence reaches the
-    rate (Hanson & Beard, NASA/TP-2010-216447).
+    The risk is at most 1 - confidence if and only if the one-sided lower Clopper-Pearson bound at that confidence is at
+    least `rate` (Hanson & Beard, NASA/TP-2010-216447).
     """
     _check_counts(successes, n)
     return 1.0 if successes <= 0 else float(stats.beta.cdf(rate, successes, n - successes + 1.0))
@@ -115,10 +116,11 @@ class ClusterMethod(StrEnum):
 class ClusteredEvidence:
     """Evidence for a success rate from cases that share terrains.
 
-    terrains, failed_terrains: number of distinct terrains, and of terrains with at least one failed case. method:
-    method of the bounds. design_effect: variance of the success rate divided by that of as many independent cases; NaN
-    if it cannot be estimated. effective_n, effective_successes: equivalent independent cases, and successes for the
-    lower bound. lower, upper: one-sided bounds of the success rate of a case, each at the requirement's confidence.
+    - terrains, failed_terrains: number of distinct terrains, and of terrains with at least one failed case
+    - method: method of the bounds
+    - design_effect: variance of the success rate divided by that of as many independent cases; NaN if unknown
+    - effective_n, effective_successes: equivalent independent cases, and their successes for the lower bound
+    - lower, upper: one-sided bounds of the success rate of a case, each at the requirement's confidence
     """
 
     terrains: int
@@ -134,10 +136,10 @@ class ClusteredEvidence:
 def clustered_evidence(
     success: Bool[np.ndarray, " n"], terrain: Int[np.ndarray, " n"], confidence: float
 ) -> ClusteredEvidence:
-    """Bounds of a success rate, each at `confidence`, for at least one case; `terrain`: terrain number of each.
+    """Compute bounds of a success rate, each at `confidence`, for at least one case; `terrain`: number of its terrain.
 
-    For few terrains with failures or successes, terrains are counted. Otherwise: bounds of Clopper and Pearson
-    with the effective sample size of Korn & Graubard 1998, never larger than n.
+    For few terrains with failures or with successes, terrains are counted instead of cases. Otherwise the bounds are
+    those of Clopper and Pearson with the effective sample size of Korn & Graubard 1998, limited to n.
     """
     index = number_terrains(terrain)
     sizes = np.bincount(index).astype(np.float64)
@@ -151,9 +153,9 @@ def clustered_evidence(
         effective_n = min(n, n / max(design_effect, 1e-9) * float(correction))
         min_successes = max_successes = float(successes.sum() / n * effective_n)
     else:
-        # With equally many cases on each, a terrain has a failure at least as often as a case fails, and a success at
-        # least as often as a case succeeds: both bounds are safe. If bad terrains have fewer cases (they answer less
-        # often) or more, the rate of the cases is on the safe side of the terrains' rate for one of the two bounds.
+        # A terrain counts as failed if any of its cases failed (lower bound), and as successful if any of its cases
+        # succeeded (upper bound). With equally many cases on each terrain, both bounds are therefore conservative. With
+        # unequal numbers (fewer answers on difficult terrains), the rate of the cases can be the more conservative one.
         method, design_effect, effective_n = ClusterMethod.TERRAIN_COUNT, float("nan"), float(terrains)
         scaled_successes = terrains * float(successes.sum() / n)
         min_successes = min(float(terrains - failed), scaled_successes)
@@ -164,7 +166,7 @@ def clustered_evidence(
 
 
 def _estimate_design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
-    """Variance of the rate over terrains (Taylor linearisation), divided by the binomial variance."""
+    """Estimate the variance of the rate over terrains (Taylor linearisation), divided by the binomial variance."""
     terrains, n = sizes.size, sizes.sum()
     rate = successes.sum() / n
     residuals = successes - rate * sizes
@@ -182,7 +184,7 @@ def number_terrains(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     return np.asarray((np.cumsum(np.bincount(shifted) > 0) - 1)[shifted])
 
 
-#: Minimum risk: a confidence closer to 1 would round to 1.
+#: Minimum risk, since a confidence closer to 1 would be rounded to 1.
 _MIN_RISK = 1e-12
 #: Minimum number of cases of the first look, and maximum number of looks.
 _MIN_FIRST_CASES, _MAX_LOOKS = 16, 6
@@ -190,7 +192,7 @@ _MIN_FIRST_CASES, _MAX_LOOKS = 16, 6
 
 @dataclass(frozen=True)
 class Look:
-    """A planned evaluation of the verdicts: number of cases, and fraction of the risk that it may spend."""
+    """A planned evaluation of the verdicts: number of cases, and fraction of the risk of a wrong verdict it may use."""
 
     cases: int
     risk_fraction: float
@@ -207,31 +209,31 @@ def planned_looks(cases: int) -> tuple[Look, ...]:
 
 
 def spent_fraction(looks: tuple[Look, ...], cases: int) -> float:
-    """Fraction of the risk for a verdict from a number of cases: that of the first look with at least as many.
+    """Return the fraction of the risk for a number of cases: that of the first look with at least as many cases.
 
-    For more cases than at the last look it is that of the last look.
+    For more cases than at the last look, return the fraction of the last look.
     """
     return next((look.risk_fraction for look in looks if cases <= look.cases), looks[-1].risk_fraction)
 
 
 def confidence_at(confidence: float, risk_fraction: float) -> float:
-    """Confidence of the bounds at one look."""
+    """Return the confidence of the bounds at a look that may use a fraction of the risk."""
     return 1.0 - (1.0 - confidence) * risk_fraction
 
 
 @dataclass(frozen=True)
 class LaterLook:
-    """Test at a look at a campaign that was evaluated earlier: one verdict, PASS or FAIL, of a requirement.
+    """Test for one verdict (PASS or FAIL) on a requirement of a campaign that was evaluated with fewer cases before.
 
-    Events are failures for PASS, successes for FAIL: few events support the verdict. Under `rate`, the rate at the
-    limit, the likelihood ratio (`_log_likelihood_ratio`) is a martingale, and under any higher rate a supermartingale.
-    By Ville's inequality it ever reaches c with probability at most its value at the first look divided by c, for any
-    stopping rule. The threshold c is chosen so that the probabilities of a verdict at the first look, by the ordinary
-    bound, and at any later look add up to `risk`.
+    Events are failures for PASS, successes for FAIL: few events support the verdict. If the probability of an event is
+    `rate`, the likelihood ratio (`_log_likelihood_ratio`) is a martingale; if it is higher, a supermartingale. By
+    Ville's inequality, the probability that the ratio ever reaches a threshold c is at most its value at the first look
+    divided by c, for any stopping rule. The threshold c is chosen so that the probabilities of a false verdict at the
+    first look (by the Clopper-Pearson bound) and at all later looks add up to `risk`.
 
-    rate: probability of an event in a case at the limit: 1 - probability for PASS, probability for FAIL.
-    risk: probability of a false verdict of all looks together: 1 - confidence.
-    first: number of cases of the first look, or of terrains if these are counted.
+    - rate: probability of an event at the limit of the requirement: 1 - probability for PASS, probability for FAIL
+    - risk: probability of a false verdict at all looks together: 1 - confidence
+    - first: number of cases at the first look, or of terrains if terrains are counted
     """
 
     rate: float
@@ -245,13 +247,13 @@ class LaterLook:
         decided_events = events[stats.binom.cdf(events, self.first, self.rate) <= self.risk]
         log_probability = stats.binom.logpmf(decided_events, self.first, self.rate)
         spent_risk = float(np.exp(log_probability).sum())
-        # remainder of the martingale's mean of 1, if the first look does not decide
+        # part of the martingale's mean of 1 that remains if the first look does not decide
         log_ratio = _log_likelihood_ratio(decided_events, self.first, self.rate)
         remaining = 1.0 - float(np.exp(log_probability + log_ratio).sum())
         return math.log(max(_MIN_RISK, remaining) / max(_MIN_RISK, self.risk - spent_risk))
 
     def risk_of_bound(self, n: float | int) -> float:
-        """Risk at which the one-sided Clopper-Pearson bound of n cases supports the verdict at this look."""
+        """Compute the risk at which the one-sided Clopper-Pearson bound of n cases supports the verdict."""
         log_ratio = float(_log_likelihood_ratio(0.0, n, self.rate))
         if log_ratio < self.log_threshold:
             level = n * math.log1p(-self.rate) + log_ratio - self.log_threshold
@@ -264,7 +266,7 @@ class LaterLook:
         return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - few, few + 1.0))))
 
     def cases_needed(self, n: int, events: int) -> int:
-        """Total number of cases, at least n, that supports the verdict if no more events occur."""
+        """Return the total number of cases, at least n, that supports the verdict if no more events occur."""
 
         def is_sufficient(cases: int) -> bool:
             return bool(_log_likelihood_ratio(events, cases, self.rate) >= self.log_threshold)
@@ -278,10 +280,10 @@ class LaterLook:
 def _log_likelihood_ratio(
     events: Float64[np.ndarray, "*n"] | float | int, n: float | int, rate: float
 ) -> Float64[np.ndarray, "*n"]:
-    """Logarithm of the likelihood ratio of a lower rate to `rate`, for a number of events in n cases.
+    """Compute the logarithm of the likelihood ratio of a lower rate to `rate`, for a number of events in n cases.
 
-    The lower rate has Jeffreys' prior, Beta(1/2, 1/2), truncated at `rate`. The ratio decreases with the events, and
-    increases with every case without one.
+    The lower rate has Jeffreys' prior, Beta(1/2, 1/2), truncated at `rate`. The ratio decreases with every event and
+    increases with every case without an event.
     """
     events = np.asarray(events, dtype=np.float64)
     likelihood = special.betaln(events + 0.5, n - events + 0.5) - special.betaln(0.5, 0.5)

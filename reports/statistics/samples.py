@@ -1,16 +1,16 @@
 """Statistics of samples: quantiles, mean, standard deviation, each with bounds; prediction ellipses of errors in 2-D.
 
-Quantiles are bounded by order statistics, for any distribution (Wilks, "Determination of sample sizes for setting
+The bounds of quantiles are order statistics, for any distribution (Wilks, "Determination of sample sizes for setting
 tolerance limits", Ann. Math. Statist. 12, 1941; used by Hanson & Beard for a specified consumer risk,
-NASA/TP-2010-216447). Means and standard deviations are bounded by SciPy's BCa bootstrap (Efron, "Better bootstrap
-confidence intervals", J. Amer. Statist. Assoc. 82, 1987), at the level of Student's t instead of the normal
+NASA/TP-2010-216447). The intervals of means and standard deviations are those of SciPy's BCa bootstrap (Efron, "Better
+bootstrap confidence intervals", J. Amer. Statist. Assoc. 82, 1987), at the level of Student's t instead of the normal
 distribution (Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69, 2015), since the coverage
-of BCa is too low in small samples. The interval of a standard deviation contains Bonett's ("Approximate confidence
-interval for standard deviation of nonnormal distributions", Comput. Statist. Data Anal. 50, 2006).
+of BCa is too low in small samples. The interval of a standard deviation also includes Bonett's interval ("Approximate
+confidence interval for standard deviation of nonnormal distributions", Comput. Statist. Data Anal. 50, 2006).
 
 Values that share terrains (`groups`) are correlated; the terrain is the sampling unit. Mean and standard deviation: BCa
 bootstrap of entire terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section 3.8), widened
-for few terrains as for few values; it contains Student's interval with the variance over terrains (Taylor
+for few terrains as for few values; it also includes Student's interval with the variance over terrains (Taylor
 linearisation; Cochran, "Sampling techniques", 1977, section 6). Quantiles: order statistics, with the counts of
 `marsyard.reports.statistics.proportions`: the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952,
 with Korn & Graubard's number), or the number of terrains if too few of them lie on one side.
@@ -41,13 +41,13 @@ from marsyard.reports.statistics.proportions import (
     proportion_lower,
 )
 
-#: Maximum number of values (or terrains) of a bootstrap; above it, the printed large-sample interval is equal.
+#: Maximum number of values (or terrains) of a bootstrap; above it, the large-sample interval is equal as printed.
 _MAX_BOOTSTRAP = 2000
 _N_RESAMPLES = 2000
 #: Fixed seed of the bootstrap, for reproducible reports.
 _SEED = 19340401
 #: Minimum number of terrains, and of independent values, to estimate a standard deviation.
-MIN_TERRAINS, _MIN_FOR_SPREAD = 5, 8
+MIN_TERRAINS, _MIN_FOR_DEVIATION = 5, 8
 #: Minimum number of points of an ellipse.
 _MIN_FOR_ELLIPSE = 5
 #: Terrain number of each value; None if all are independent.
@@ -128,26 +128,28 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Gr
     return _union((mean - half_width, mean + half_width), _bootstrap((sums, sizes), ratio, confidence))
 
 
-def spread_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
+def standard_deviation_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
     """Two-sided interval of the standard deviation: union of BCa bootstrap and Bonett's; in large samples Bonett's.
 
     NaN for fewer than eight values, or five terrains; 0 if all are equal.
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
-    if values.size < _MIN_FOR_SPREAD:
+    if values.size < _MIN_FOR_DEVIATION:
         return math.nan, math.nan
     if np.ptp(values) == 0.0:
         return 0.0, 0.0
     if groups is not None and is_shared(groups):
-        return _clustered_spread(values, groups, confidence)
+        return _clustered_deviation_interval(values, groups, confidence)
     interval = _bonett_interval(values, confidence)
     if values.size > _MAX_BOOTSTRAP:
         return interval
     return _union(interval, _bootstrap((values,), partial(np.std, ddof=1), confidence))
 
 
-def _clustered_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
+def _clustered_deviation_interval(
+    values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float
+) -> Interval:
     """Two-sided interval of the standard deviation of values on shared terrains; NaN for fewer than five terrains."""
     index = number_terrains(groups)
     sizes = np.bincount(index).astype(np.float64)
@@ -202,10 +204,10 @@ def quantile_bounds(
 
 
 def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: float, confidence: float) -> float:
-    """Find the smallest sample value with at least a fraction `quantile` of the population below it, at the confidence.
+    """Find the smallest sample value that is an upper bound of the quantile at the confidence; infinite if none is.
 
     Wilks 1941: the r-th smallest of n values lies at or above the quantile q with probability P(Bin(n, q) <= r - 1);
-    the bound is the smallest such value with that probability at the confidence.
+    the bound is the smallest value for which this probability is at least the confidence.
     """
     ordered = np.sort(values)
     n = ordered.size
@@ -217,7 +219,7 @@ def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: f
     evidence = clustered_evidence(below, groups, confidence)
     weight = evidence.effective_n / n
     if evidence.method is ClusterMethod.TERRAIN_COUNT:
-        # a bound for the maximum of a terrain also holds for its values
+        # an upper bound of the terrains' maxima is also an upper bound of the values, so each terrain counts once
         index = number_terrains(groups)
         ordered = np.full(int(index.max()) + 1, -math.inf)
         np.maximum.at(ordered, index, values)
@@ -243,11 +245,12 @@ class Quantile:
 class ErrorSummary:
     """Summary of a sample of errors; NaN for too few values.
 
-    n, missing: number of finite values, and of missing values (no answer was reported). mean, mean_lower, mean_upper:
-    mean and its two-sided interval at `confidence`. sd, sd_lower, sd_upper: standard deviation (n - 1) and its
-    two-sided interval at `confidence`. rms, median: root mean square about zero, median. robust_sd: median absolute
-    deviation about the median times 1.4826, the standard deviation of a normal core. largest: largest magnitude.
-    quantiles: quantiles with order-statistic bounds at `confidence`.
+    - n, missing: number of finite values, and of missing values (no answer was reported)
+    - mean, mean_lower, mean_upper: mean and its two-sided interval at `confidence`
+    - sd, sd_lower, sd_upper: standard deviation (n - 1) and its two-sided interval at `confidence`
+    - rms, median: root mean square about zero, median
+    - robust_sd: median absolute deviation about the median times 1.4826 (standard deviation for normal values)
+    - largest: largest magnitude; quantiles: quantiles with order-statistic bounds at `confidence`
     """
 
     n: int
@@ -281,10 +284,10 @@ def summarize(
     n, missing = finite.size, values.size - finite.size
     median = float(np.median(finite)) if n else math.nan
     mean_lower, mean_upper = mean_interval(finite, confidence, finite_groups)
-    sd_lower, sd_upper = spread_interval(finite, confidence, finite_groups)
+    sd_lower, sd_upper = standard_deviation_interval(finite, confidence, finite_groups)
     quantile_results = []
     for probability in quantiles:
-        # a quantile beyond the last but one value is an extrapolation, not an estimate
+        # a quantile needs at least one value beyond it; otherwise it would be an extrapolation
         is_estimate = n * min(probability, 1.0 - probability) >= 1.0 - 1e-9
         estimate = float(np.quantile(finite, probability)) if is_estimate else math.nan
         bounds = quantile_bounds(finite, probability, confidence, finite_groups)
@@ -309,11 +312,12 @@ def summarize(
 
 @dataclass(frozen=True)
 class ErrorEllipse:
-    """Ellipse that contains the next error with a given probability, for normal errors.
+    """Ellipse that contains the next error with a specified probability, for normally distributed errors.
 
-    centre: mean error. semi_major, semi_minor: semi-axes, in the errors' unit. angle_deg: angle of the major axis from
-    the first component towards the second, from -90 (excluded) to 90 degrees. probability: probability that the next
-    error lies inside. inside: fraction of the sample inside; differs from the probability if the errors are not normal.
+    - centre: mean error; semi_major, semi_minor: semi-axes, in the errors' unit
+    - angle_deg: angle of the major axis from the first component towards the second, -90 (excluded) to 90 degrees
+    - probability: probability that the next error lies inside
+    - inside: fraction of the sample inside; it differs from the probability if the errors are not normal
     """
 
     centre: tuple[float, float]
@@ -333,7 +337,7 @@ class ErrorEllipse:
 
 
 def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> ErrorEllipse | None:
-    """Prediction ellipse of two-dimensional errors; None for fewer than five errors or if all are equal.
+    """Compute the prediction ellipse of two-dimensional errors; None for fewer than five errors or if all are equal.
 
     For a new error e of the same normal distribution, (e - m)' S^-1 (e - m) with the sample's mean and covariance is
     distributed as 2 (n - 1) (n + 1) / (n (n - 2)) times F with 2 and n - 2 degrees of freedom (Hotelling; Chew,
@@ -367,7 +371,7 @@ def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> Error
 def circular_error(
     errors: Float[np.ndarray, "n 2"], probability: float, confidence: float, groups: Groups = None
 ) -> Quantile:
-    """Radius about the truth that contains a fraction of the errors (0.5: circular error probable), with bounds.
+    """Compute the radius about zero error that contains a fraction of the errors (0.5: circular error probable).
 
     The bounds are one-sided order statistics, each at the confidence, for any distribution.
     """

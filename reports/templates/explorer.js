@@ -119,7 +119,7 @@
     const command = line(detail, "p", "Run it again: ");
     line(command, "code", data.replay.replace(/CASE$/, data.cases[k]));
     if (pictured.has(data.cases[k])) {
-      const link = line(line(detail, "p", ""), "a", "Its pictures");
+      const link = line(line(detail, "p", ""), "a", "Images of the case");
       link.href = `#case-${data.cases[k]}`;
     }
   };

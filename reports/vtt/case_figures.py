@@ -1,8 +1,8 @@
 """Figures of one tracking case as Figs. 15, 17 and 16b of `papers/visual-target-tracking.txt`.
 
-First figure: for every stop the left subframe with search window and match, the match enlarged (the next template), and
-the right subframe with the stereo match; above them the numbers of the update. Second figure: the path from above, and
-the target's estimated positions, enlarged.
+The first figure contains for every stop: the left subframe with search window and match, the enlarged match (the next
+template), the right subframe with the stereo match, and above them the quantities of the update. The second figure
+contains a top view of the path, and an enlarged view of the target's estimated positions.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from scipy import ndimage
 from marsyard.reports.presentation import check_shape, numeric_product, save_figures, to_matrix
 from marsyard.reports.section import GRID, INK, MUTED, SERIES, in_page_style, show_subframe
 
-Picture = Float[np.ndarray, "_ _"]
+Image = Float[np.ndarray, "_ _"]
 Point = Float[np.ndarray, "2"]
-#: Orange and blue of Okabe and Ito; the true position is a white cross with a dark rim. The target's square is solid,
-#: the window is dashed: colour is never the only distinction.
+#: Orange and blue of Okabe and Ito; the true position is a white cross with a dark outline. The target's square is
+#: solid and the window is dashed, since colour must not be the only distinction.
 TARGET, WINDOW, TRUTH = "#f0a202", "#56b4e9", "#ffffff"
 _OUTLINE = [patheffects.Stroke(linewidth=2.0, foreground="#000000"), patheffects.Normal()]
 #: Side of the enlarged template as drawn, pixels.
 _ENLARGED_PX = 126
 #: Maximum number of stops in a row, and the size of a stop, inches.
 _MAX_COLUMNS, _CELL_SIZE_IN = 4, (3.0, 2.35)
-#: Minimum distance between numbered stops as a fraction of the axes' width.
+#: Minimum distance between stops with a number, as a fraction of the width of the axes.
 _MIN_SPACING = 0.07
-#: Quantiles of a subframe that are drawn as black and white.
-_CONTRAST = (0.005, 0.998)
+#: Quantiles of a subframe's values that are drawn as black and as white.
+_CONTRAST_QUANTILES = (0.005, 0.998)
 #: Minimum ratio of height to width of the path's axes, since paths are mostly straight.
 _MIN_ASPECT = 0.5
 #: Valid numbers of stops.
@@ -46,18 +46,21 @@ _STOP_NUMBERS = range(1, 1000)
 
 
 @dataclass(frozen=True)
-class StopPictures:
+class StopImages:
     """Subframes of a stop with search window and matches, full-frame (u, v) pixels; NaN where missing.
 
-    number: number of the stop, from 1 state: state of the tracker corners: upper left pixels of the subframes window:
-    upper left pixel, columns and rows of the search window in the left frame matches: matches in the left and the right
-    frame point: true projection of the designated point in the left frame quantities: quantities of the update by name
+    - number: number of the stop, from 1; state: state of the tracker
+    - corners: upper left pixels of the left and the right subframe
+    - window: upper left pixel, columns and rows of the search window in the left frame
+    - matches: positions of the match in the left and the right frame
+    - point: true projection of the designated point in the left frame
+    - quantities: quantities of the update by name
     """
 
     number: int
     state: str
-    left: Picture
-    right: Picture | None
+    left: Image
+    right: Image | None
     corners: Float[np.ndarray, "2 2"]
     window: Float[np.ndarray, "4"]
     matches: Float[np.ndarray, "2 2"]
@@ -66,22 +69,24 @@ class StopPictures:
 
     @property
     def is_matched(self) -> bool:
-        """Whether the target was reported."""
+        """Whether the tracker reported the target."""
         return bool(np.isfinite(self.matches[0]).all())
 
     def quantity(self, name: str) -> float:
-        """A quantity of the update; NaN if missing."""
+        """Return a quantity of the update; NaN if missing."""
         return self.quantities.get(name, float("nan"))
 
 
 @dataclass(frozen=True)
 class RoverPath:
-    """A run seen from above, world metres (east, north).
+    """Top view of a run, world metres (east, north).
 
-    path: positions of the rover's origin stops, estimated: true position at each stop, and the rover's estimate
-    heading: heading at each stop, radians clockwise from north; NaN if unknown target: the designated point estimates:
-    the target's estimate at each stop in the rover's estimated world frame; NaN if not matched rocks: east, north and
-    diameter, the target's first
+    - path: positions of the rover's origin
+    - stops, estimated: true and estimated position of the rover at each stop
+    - heading: heading at each stop, radians clockwise from north; NaN if unknown
+    - target: the designated point
+    - estimates: estimated target at each stop in the rover's estimated world frame; NaN without a match
+    - rocks: east, north and diameter; the first rock is that of the target
     """
 
     path: Float[np.ndarray, "points 2"]
@@ -94,7 +99,7 @@ class RoverPath:
 
 
 def is_vtt_case(products: Mapping[str, Any]) -> bool:
-    """Whether products contain the picture of a stop and a template's size."""
+    """Whether products contain the image of a stop and a template's size."""
     return to_matrix(products.get("stop_1_left")) is not None and read_template_px(products) is not None
 
 
@@ -104,9 +109,9 @@ def read_template_px(products: Mapping[str, Any]) -> float | None:
     return float(side) if side is not None and side.ndim == 0 and np.isfinite(side) else None
 
 
-def read_stops(products: Mapping[str, Any]) -> list[StopPictures]:
+def read_stops(products: Mapping[str, Any]) -> list[StopImages]:
     """Read the stops in order, up to the first stop without a left subframe."""
-    stops: list[StopPictures] = []
+    stops: list[StopImages] = []
     states, table = products.get("states"), products.get("figures")
     items = table.items() if isinstance(table, Mapping) else ()
     columns = {str(name): numeric_product(values) for name, values in items}
@@ -119,7 +124,7 @@ def read_stops(products: Mapping[str, Any]) -> list[StopPictures]:
         shapes = {"corners": (2, 2), "window": (4,), "found": (2, 2), "point": (2,)}
         pixels = [_read_or_nan(products.get(f"stop_{number}_{name}"), *shape) for name, shape in shapes.items()]
         stops.append(
-            StopPictures(
+            StopImages(
                 number=number,
                 state=str(state).replace("_", " ").lower(),
                 left=left,
@@ -132,7 +137,7 @@ def read_stops(products: Mapping[str, Any]) -> list[StopPictures]:
 
 
 def read_rover_path(products: Mapping[str, Any]) -> RoverPath | None:
-    """Read the run as seen from above; None if missing."""
+    """Read the top view of the run; None if missing."""
     target = numeric_product(products.get("target_m"))
     stops, estimated = _read_positions(products.get("rover_true_m")), _read_positions(products.get("rover_believed_m"))
     estimates = _read_positions(products.get("target_believed_m"))
@@ -163,7 +168,7 @@ def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Fig
         stops = [stops[k] for k in np.unique(np.rint(np.linspace(0, len(stops) - 1, max_stops)).astype(np.int64))]
     side = read_template_px(products)
     if not stops or side is None:
-        raise ValueError("the products contain no picture of a stop")
+        raise ValueError("the products contain no image of a stop")
     columns = min(_MAX_COLUMNS, len(stops))
     rows = -(-len(stops) // columns)
     layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.06, wspace=0.02, hspace=0.02)
@@ -176,7 +181,7 @@ def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Fig
 
 @in_page_style
 def draw_path(products: Mapping[str, Any]) -> Figure:
-    """Draw the path from above, and the target's estimates around the designated point; ValueError if missing."""
+    """Draw the top view of the path, and the target's estimates; raises ValueError if the path is missing."""
     run = read_rover_path(products)
     if run is None:
         raise ValueError("the products contain no path of a rover")
@@ -196,10 +201,10 @@ def write_vtt_figures(directory: Path, products: Mapping[str, Any]) -> list[Path
     return save_figures(directory, figures)
 
 
-def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopPictures, side: float) -> None:
+def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side: float) -> None:
     cells = cell.subgridspec(2, 2, width_ratios=(2.0, 1.0))
     left = figure.add_subplot(cells[:, 0])
-    show_subframe(left, stop.left, _CONTRAST)
+    show_subframe(left, stop.left, _CONTRAST_QUANTILES)
     corner = stop.corners[0]
     if np.isfinite([*stop.window, *corner]).all():
         _draw_rectangle(left, stop.window[:2] - corner - 0.5, stop.window[2:], WINDOW, (0, (4, 2)))
@@ -215,7 +220,9 @@ def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopPictures, side: floa
         steps = (np.arange(_ENLARGED_PX) + 0.5) / _ENLARGED_PX * side - 0.5 * side
         u, v = (stop.matches[0] - corner)[:, None] + steps
         pixels = np.meshgrid(v, u, indexing="ij")
-        show_subframe(enlarged, ndimage.map_coordinates(stop.left, pixels, order=0, mode="nearest"), _CONTRAST)
+        show_subframe(
+            enlarged, ndimage.map_coordinates(stop.left, pixels, order=0, mode="nearest"), _CONTRAST_QUANTILES
+        )
         enlarged.spines[:].set(visible=True, edgecolor=TARGET, linewidth=1.6)
     else:
         enlarged.set_axis_off()
@@ -224,17 +231,17 @@ def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopPictures, side: floa
     if stop.right is None:
         right.set_axis_off()
         return
-    show_subframe(right, stop.right, _CONTRAST)
+    show_subframe(right, stop.right, _CONTRAST_QUANTILES)
     if np.isfinite(stop.matches[1]).all():
         _draw_target(right, stop.matches[1] - stop.corners[1], side)
 
 
-def _title_lines(stop: StopPictures) -> list[str]:
-    """Format the three lines above a stop's pictures; unknown quantities are omitted."""
+def _title_lines(stop: StopImages) -> list[str]:
+    """Format the three lines above a stop's images; unknown quantities are omitted."""
     formats = {
         "range_m": "{:.2f} m", "azimuth_deg": "azimuth {:+.1f}°", "elevation_deg": "elevation {:+.1f}°",
         "magnification": "× {:.3f}", "roll_change_deg": "roll {:+.1f}°", "match_score": "NCC {:.2f}",
-        "stereo_score": "stereo {:.2f}", "error_px": "off by {:.1f} px",
+        "stereo_score": "stereo {:.2f}", "error_px": "error {:.1f} px",
     }  # fmt: skip
     values = {name: 0.0 if abs(stop.quantity(name)) < 0.05 else stop.quantity(name) for name in formats}  # no -0.0
     texts = {name: formats[name].format(x).replace("-", "−") for name, x in values.items() if np.isfinite(x)}
@@ -258,16 +265,16 @@ def _draw_rectangle(axes: Axes, corner: Point, size: Point, colour: str, line: A
 
 
 def _draw_path_axes(axes: Axes, run: RoverPath) -> None:
-    """Draw the path, north up."""
+    """Draw the top view of the path; north is up."""
     for number, (east, north, diameter) in enumerate(run.rocks):
         rock = Circle((east, north), 0.5 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8)
         rock.set_hatch("" if number == 0 else "////")
         axes.add_patch(rock)
     axes.plot(*run.path.T, "-", color=SERIES[0], linewidth=1.6, label="path driven")
     axes.plot(*run.stops.T, "o", color=SERIES[0], markersize=5, label="stops")
-    axes.plot(*run.estimated.T, "x", color=SERIES[1], markersize=5.5, markeredgewidth=1.3, label="stops as estimated")
+    axes.plot(*run.estimated.T, "x", color=SERIES[1], markersize=5.5, markeredgewidth=1.3, label="estimated stops")
     axes.plot(*run.target, "*", color=INK, markersize=12, label="designated target")
-    axes.set(xlabel="east (m)", ylabel="north (m)", title="The path from above")
+    axes.set(xlabel="east (m)", ylabel="north (m)", title="Top view of the path")
     width = _set_limits(axes, np.vstack([run.path, run.stops, run.estimated, run.target[None]]), 0.5, _MIN_ASPECT)
     directions = np.column_stack([np.sin(run.heading), np.cos(run.heading)])
     for position, direction in zip(run.stops, 0.045 * width * directions, strict=True):
@@ -285,18 +292,18 @@ def _draw_estimates(axes: Axes, run: RoverPath) -> None:
         axes.add_patch(Circle((centre[0], centre[1]), 50.0 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8))
     change_cm = float(np.linalg.norm(offsets[finite[-1]] - offsets[finite[0]])) if finite.size else 0.0
     axes.plot(*offsets[finite].T, "-", color=SERIES[1], linewidth=1.0)
-    text = f"target as estimated ({change_cm:.0f} cm from first to last)"
+    text = f"estimated target ({change_cm:.0f} cm from first to last estimate)"
     axes.plot(*offsets[finite].T, "o", color=SERIES[1], markersize=5, label=text)
     axes.plot(0.0, 0.0, "*", color=INK, markersize=12)
     axes.set(xlabel="east of the target (cm)", ylabel="north of the target (cm)")
-    axes.set_title("The target as estimated")
+    axes.set_title("Estimated target positions")
     width = _set_limits(axes, np.vstack([offsets[finite], np.zeros((1, 2))]), 2.0)
     for index in _choose_labelled(offsets[finite], width):
         _write_number(axes, offsets[finite[index]], int(finite[index]) + 1)
 
 
 def _choose_labelled(points: Float[np.ndarray, "n 2"], width: float) -> list[int]:
-    """Choose points with a number: the first, the last, and points far enough from all others with a number."""
+    """Choose the points that get a number: the first, the last, and points far enough from other numbered points."""
     indices = [0, len(points) - 1] if len(points) > 1 else list(range(len(points)))
     for index in range(1, len(points) - 1):
         if np.linalg.norm(points[indices] - points[index], axis=1).min() > _MIN_SPACING * width:

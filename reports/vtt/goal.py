@@ -1,4 +1,4 @@
-"""Rows of tracking campaigns, and the section on the target's position at the goal by camera."""
+"""Selection of rows of tracking campaigns, and the section on the target's position error at the goal by camera."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from marsyard.reports.wording import NOTHING, format_fraction, note_text, number
 
 #: Columns of all rows of tracking cases.
 _TRACKING_COLUMNS = ("tracked", "drift_px", "position_error_m", "losses")
-#: Requirement of the instrument placement (section 4.2), metres, and the quantile of runs that must meet it.
+#: Maximum position error for the instrument placement (section 4.2), metres, and required quantile of the runs.
 MAX_ERROR_M, QUANTILE = 0.03, 0.99
-#: Rates of a camera's runs at selectable targets, by key. Tracked: the drift at the goal is below the limit.
+#: Names of the rates of a camera's runs at selectable targets, and their keys in `summarize_cameras`.
 _RATES: Mapping[str, str] = {
     "Completed": "completed",
     "Tracked at the goal": "tracked",
@@ -35,17 +35,17 @@ def is_tracking(frame: pd.DataFrame) -> bool:
 
 
 def is_closed_loop(frame: pd.DataFrame) -> bool:
-    """Whether the tracker steers the runs; otherwise many targets share the pictures."""
+    """Whether the tracker guides the rover; in other campaigns, many targets are tracked in the same images."""
     return is_tracking(frame) and "skip" not in frame
 
 
 def selectable_targets(frame: pd.DataFrame) -> pd.DataFrame:
-    """Select rows with selectable targets: lit, off the rock's edge, in both pictures to the end, on the given face."""
+    """Select rows with selectable targets: sunlit, not on the rock's edge, in both images to the end, on the face."""
     return frame[rates.all_flags(frame, "selectable", "in_view", "on_face")]
 
 
 def goal_rows(subject: Subject) -> Rows | None:
-    """Select rows with selectable targets; None unless the tracker steers the runs to a goal."""
+    """Select rows with selectable targets; None unless the tracker guides the rover to a goal."""
     frame = subject.frame
     return selectable_targets(frame) if is_closed_loop(frame) and "camera" in frame else None
 
@@ -82,6 +82,7 @@ def summarize_cameras(runs: Rows) -> list[dict[str, Any]]:
 
 
 def _format_mm(name: str) -> Any:
+    """Create a function that formats a length of a row in millimetres."""
     return lambda row: number(1000.0 * row[name]) if np.isfinite(row[name]) else "too few cases"
 
 
@@ -127,15 +128,15 @@ def _expected_errors() -> str:
         drift = drift_error_m(GOAL_M, design.focal_px, 1.0)
         errors.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
     return (
-        f"By Eqs. 1 and 4 a pixel of disparity and a pixel of drift at {GOAL_M:g} m are, for the paper's cameras: "
-        f"{'; '.join(errors)}. Along and across: relative to the line of sight. Bound: of the "
-        f"{format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence (at least 230 runs)."
+        f"By Eqs. 1 and 4, one pixel of disparity error and one pixel of drift correspond to these errors along and "
+        f"across the line of sight at {GOAL_M:g} m for the paper's cameras: {'; '.join(errors)}. The bound of the "
+        f"{format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence needs at least 230 runs."
     )
 
 
 def losses_grid(frame: Rows) -> Grid:
     """Count runs that ended without a tracked target, by outcome and loss criteria."""
-    failed = frame[~rates.flag(frame, "tracked")]
+    failed = frame[~rates.flag_mask(frame, "tracked")]
     rows = []
     for (outcome, losses), runs in failed.groupby([failed["outcome"], failed["losses"].fillna(NOTHING)]):
         azimuth = rates.finite_values(runs, "azimuth_change_max_deg")

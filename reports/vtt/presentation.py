@@ -21,7 +21,7 @@ from marsyard.reports.vtt.goal import GOAL
 from marsyard.reports.wording import NOTHING, label, note_text, number
 from marsyard.scenarios.rover.stops import RunOutcome
 
-#: Maximum number of stops with pictures on the page.
+#: Maximum number of stops with images on the page.
 _MAX_STOPS = 8
 #: Quantities of an update in the order of the table.
 _QUANTITIES = (
@@ -33,10 +33,11 @@ _QUANTITIES = (
 def view(products: Mapping[str, Any], key: str) -> CaseView:
     """Create the view of a tracking case."""
     stops = read_stops(products)
-    caption = f"{_MAX_STOPS} stops of {len(stops)}." if len(stops) > _MAX_STOPS else "All stops."
+    is_selection = len(stops) > _MAX_STOPS
+    caption = f"{_MAX_STOPS} of the {len(stops)} stops." if is_selection else "All stops."
     svg_figures = [svg_figure(draw_stops(products, _MAX_STOPS), f"{key}stops", caption, wide=True)]
     if read_rover_path(products) is not None:
-        text = "Top view of the rover path, and estimated target positions."
+        text = "Left: top view of the rover's path. Right: estimated target positions."
         svg_figures.append(svg_figure(draw_path(products), f"{key}way", text, wide=True))
     names = [name for name in _QUANTITIES if any(name in stop.quantities for stop in stops)]
     rows = []

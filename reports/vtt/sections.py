@@ -1,4 +1,4 @@
-"""Sections about visual target tracking: comparison with the paper's tables and runs, and tracking by step size."""
+"""Sections about visual target tracking: comparisons with the paper's tables and runs, and tracking by step size."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ PAPER = read_paper(_PAPER_FILE)
 PRINTED = {name: AccuracyRow(name, **row) for name, row in PAPER["table_1"].items()}
 #: Campaigns of Tables II and III, and of the regression runs.
 TERRAINS, CHECKOUT_1, CHECKOUT_3, REGRESSION = "vtt-terrains", "vtt-checkout-1", "vtt-checkout-3", "vtt-regression"
-#: Maximum relative deviation of a run's distances from those of Table I.
+#: Maximum relative deviation of the start and goal distances of a run from those of Table I.
 _MAX_DEVIATION = 0.1
 
 
 def table_1_section(subject: Subject) -> Section | None:
-    """Table I: computed, printed and measured; None without completed runs from 10 m to 2 m, as in the paper."""
+    """Create the section on Table I: computed, printed and measured; None without completed runs from 10 m to 2 m."""
     accuracy = measured_accuracy(subject.frame)
     if not accuracy:
         return None
@@ -65,10 +65,10 @@ def table_1_section(subject: Subject) -> Section | None:
 
 
 def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
-    """Compute the errors of each camera's completed runs, 3 sigma (three times the root mean square).
+    """Compute the 3-sigma errors (three times the root mean square) of the completed runs of each camera.
 
-    disparity_px: 1 sigma, from the designation error by Eq. 1
-    untracked_cm: by Eq. 3 from the errors of designation and pose
+    - disparity_px: 1-sigma disparity error, computed from the designation error by Eq. 1
+    - untracked_cm: error without tracking, computed by Eq. 3 from the errors of designation and pose
     """
     if not is_closed_loop(frame) or "designation_error_m" not in frame or "camera" not in frame:
         return []
@@ -110,7 +110,7 @@ def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
 
 
 def read_legs(subject: Subject) -> list[Mapping[str, Any]]:
-    """Read the legs of the campaign's drive or runs."""
+    """Read the legs of the drive from the campaign's parameters."""
     drive = subject.run.parameter("drive")
     leg_table = table(drive).get("legs") if drive is not None else subject.run.parameter("legs")
     return [table(leg) for leg in leg_table] if isinstance(leg_table, list | tuple) else []
@@ -131,7 +131,7 @@ def table_4_grid(frame: Rows, legs: Sequence[Mapping[str, Any]]) -> Grid:
         is_reached = is_in_mode.any(axis=1)
         end = np.where(is_in_mode, update_minutes, -np.inf).max(axis=1)
         counts, minutes = is_in_mode.sum(axis=1).astype(np.float64), (end - previous_end)[is_reached]
-        simulated = (rates.spread_text(counts[is_reached], 0), rates.spread_text(minutes, 1))
+        simulated = (rates.median_text(counts[is_reached], 0), rates.median_text(minutes, 1))
         rows.append([mode["name"], f"{mode['updates']}", simulated[0], f"{mode['minutes']:g}", simulated[1]])
         previous_end = np.where(is_reached, end, previous_end)
     return Grid(["Mode", "Updates, paper", "Updates, ours", "Minutes, paper", "Minutes, ours"], rows)
@@ -156,7 +156,7 @@ QUANTITIES: tuple[tuple[str, str, int], ...] = (
 
 
 def updates_section(subject: Subject) -> Section | None:
-    """Quantities of every stored update, with Table III for the first checkout; None if rows contain no updates."""
+    """Create the section on the updates, with Table III for the first checkout; None if rows contain no updates."""
     frame = subject.frame
     matched = (re.match(r"^update_(\d+)_range_m$", str(name)) for name in frame.columns)
     updates = sorted(int(match[1]) for match in matched if match)
@@ -165,7 +165,7 @@ def updates_section(subject: Subject) -> Section | None:
     endings = [suffix for _, suffix, _ in QUANTITIES]
     values = {n: {name: rates.finite_values(frame, f"update_{n}_{name}") for name in endings} for n in updates}
     rows = [
-        [str(n), f"{update['range_m'].size:,}", *(rates.spread_text(update[name], d) for _, name, d in QUANTITIES)]
+        [str(n), f"{update['range_m'].size:,}", *(rates.median_text(update[name], d) for _, name, d in QUANTITIES)]
         for n, update in values.items()
         if update["range_m"].size
     ]
@@ -179,7 +179,7 @@ def updates_section(subject: Subject) -> Section | None:
             printed = PAPER["table_3"].get(suffix)
             if printed is not None:
                 paper = [f"{printed[str(n)]:.{digits}f}" if str(n) in printed else NOTHING for n in values]
-                simulated = [rates.spread_text(np.abs(update[suffix]), digits) for update in values.values()]
+                simulated = [rates.median_text(np.abs(update[suffix]), digits) for update in values.values()]
                 comparison_rows += [[heading, "paper", *paper], ["", "ours", *simulated]]
         table_3 = Grid(["Parameter", "Rover position", *(str(n) for n in values)], comparison_rows)
         blocks = [
@@ -190,7 +190,7 @@ def updates_section(subject: Subject) -> Section | None:
     return Section("updates", "Updates", title, blocks, {"updates": data})
 
 
-#: Columns whose values are separate lines in a figure of steps, if they vary.
+#: Columns by which the figure of steps is divided into lines; the first of them that varies is used.
 _LINE_COLUMNS = ("algorithm", "search_px")
 _STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
 #: Edges of the classes of maximum obliquity, deg.
@@ -198,7 +198,7 @@ _OBLIQUITY_EDGES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
 
 def steps_section(subject: Subject) -> Section | None:
-    """Targets tracked by step size: Fig. 8, sideways motion (5.2), turns (5.3); None unless targets share pictures."""
+    """Create the section on step sizes (Fig. 8, sections 5.2 and 5.3); None unless targets share the images."""
     motion, steps = _read_motion(subject), step_rates(subject)
     if motion is None or not steps:
         return None
@@ -214,7 +214,7 @@ def steps_section(subject: Subject) -> Section | None:
     ]
     unit = "% of the distance" if motion["per_cent"] else "deg"
     xlabel = "step (% of the target's distance)" if motion["per_cent"] else "step (deg)"
-    caption = "Selectable targets tracked to the end, with intervals; open: the paper's text."
+    caption = "Fraction of selectable targets tracked to the end, with intervals. Open marks: text of the paper."
     grid = build_grid(
         steps,
         {
@@ -281,7 +281,7 @@ def _group_by_line(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def _obliquity_grid(frame: Rows) -> Grid | None:
-    """Table of targets tracked by maximum obliquity and step size; None if rows contain no obliquities."""
+    """Create a table of tracked targets by maximum obliquity and step size; None if rows contain no obliquities."""
     if "obliquity_max_deg" not in frame:
         return None
     visible = frame[rates.all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
@@ -302,7 +302,7 @@ MAX_SMALL_ROCK_M = 0.1
 
 
 def terrains_section(subject: Subject) -> Section | None:
-    """Table II; None unless the campaign is that of the paper's terrains."""
+    """Create the section on Table II; None unless the campaign is that of the paper's terrains."""
     frame, printed = subject.frame, PAPER["table_2"]
     if subject.run.name != TERRAINS or not is_closed_loop(frame) or "incline" not in frame:
         return None
@@ -312,7 +312,7 @@ def terrains_section(subject: Subject) -> Section | None:
     for name in ordered_names:
         runs = frame[frame["incline"].eq(name)]
         good_runs, slips = selectable_targets(runs), rates.finite_values(runs, "slip_max")
-        lost_runs = good_runs[~rates.flag(good_runs, "tracked")]
+        lost_runs = good_runs[~rates.flag_mask(good_runs, "tracked")]
         cause_counts = dict(Counter(failure_cause(row) for _, row in lost_runs.iterrows()).most_common())
         failed, failed_all = (rates.flag_fraction(group, "tracked", wanted=False) for group in (good_runs, runs))
         slip = float(slips.max()) if slips.size else float("nan")
@@ -343,7 +343,7 @@ def failure_cause(row: pd.Series) -> str:
 
 
 def regression_section(subject: Subject) -> Section | None:
-    """Regression runs (section 6); None for other campaigns."""
+    """Create the section on the regression runs (section 6); None for other campaigns."""
     frame = subject.frame
     if subject.run.name != REGRESSION or not is_closed_loop(frame) or "visual_odometry" not in frame:
         return None
@@ -363,12 +363,12 @@ def regression_section(subject: Subject) -> Section | None:
             "Runs": lambda group: f"{len(group[1]):,}",
             "Tracked to the goal": lambda group: rates.fraction_text(rates.flag_fraction(group[1], "tracked")),
             "Outcomes": lambda group: ", ".join(sorted(str(outcome) for outcome in group[1]["outcome"].unique())),
-            "Position error (cm)": lambda g: rates.spread_text(rates.finite_values(g[1], "position_error_m", 100.0), 2),
-            "Drift (px)": lambda g: rates.spread_text(rates.finite_values(g[1], "drift_px"), 1),
-            "Navigation updates": lambda g: rates.spread_text(rates.finite_values(g[1], "autonav_updates"), 0),
+            "Position error (cm)": lambda g: rates.median_text(rates.finite_values(g[1], "position_error_m", 100.0), 2),
+            "Drift (px)": lambda g: rates.median_text(rates.finite_values(g[1], "drift_px"), 1),
+            "Navigation updates": lambda g: rates.median_text(rates.finite_values(g[1], "autonav_updates"), 0),
         },
     )
-    note = "The paper: 14 runs, all successful, not listed. Small rocks: at most 10 cm high."
+    note = "According to the paper, all 14 runs were successful. Small rocks are at most 10 cm high."
     blocks, loss_grid = [Block(grid=grid, note=note)], losses_grid(frame)
     if loss_grid.rows:
         blocks.append(Block(heading="Runs that lost the target", grid=loss_grid))

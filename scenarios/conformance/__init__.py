@@ -20,7 +20,7 @@ from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Ta
 from marsyard.scenarios.parts.named import KINDS
 from marsyard.scenarios.user_files import import_object
 
-#: Tasks and kinds of parts with a suite; names on the command line.
+#: Names, on the command line, of the tasks and kinds of parts that have a suite.
 SUBJECT_KINDS = (*TASKS, *KINDS)
 
 
@@ -28,9 +28,9 @@ SUBJECT_KINDS = (*TASKS, *KINDS)
 class Subject:
     """An algorithm or a user-defined part under test.
 
-    - spec: its name; see `marsyard.scenarios.estimators`, `marsyard.scenarios.parts`
-    - task: name of its task or kind
-    - limit_s: maximum time of an answer
+    - spec: name of the algorithm (`marsyard.scenarios.estimators`) or part (`marsyard.scenarios.parts`)
+    - task: name of the algorithm's task, or of the kind of part
+    - limit_s: maximum computation time of an answer
     """
 
     spec: str
@@ -38,7 +38,7 @@ class Subject:
     limit_s: float
 
     def suite(self) -> Suite:
-        """Return its conformance suite."""
+        """Return the conformance suite of the algorithm or part."""
         if self.task in KINDS:
             kind = KINDS[self.task]
             return parts.PartSuite(partial(parts.load_part, kind, self.spec), self.spec, False, self.limit_s, kind)
@@ -53,7 +53,7 @@ class Subject:
         return estimators.EstimatorSuite(create, self.spec, is_program, self.limit_s, protocol)
 
     def prepare(self) -> None:
-        """Load and compile the suite and the algorithm."""
+        """Check that the algorithm or part exists, and create the inputs of its suite."""
         check_subject(self.spec, self.task)
         self.suite().cases()
 
@@ -67,17 +67,17 @@ def check_subject(spec: str, task: str) -> None:
 
 
 def check_names(subject: Subject) -> list[tuple[str, str]]:
-    """Names and requirements of a subject's checks."""
+    """Return names and requirements of a subject's checks."""
     return [(check.name, check.requirement) for check in subject.suite().checks()]
 
 
 def run_check(subject: Subject, number: int) -> Finding:
-    """Run one check."""
-    return list(subject.suite().checks())[number].finding()
+    """Run the check with this index."""
+    return list(subject.suite().checks())[number].evaluate()
 
 
 def determine_task(spec: str) -> str:
-    """Task or kind of a name by its entry point, methods or annotations; velocity if they do not determine it.
+    """Determine the task or kind of a name from entry point, methods or annotations; velocity if they are ambiguous.
 
     Raises ValueError if the algorithm does not exist.
     """
@@ -86,7 +86,7 @@ def determine_task(spec: str) -> str:
         return shipped
     if spec.startswith(tuple(PREFIXES)):
         return VELOCITY.name
-    kind = None if spec in list_installed() else parts.part_kind(spec)
+    kind = None if spec in list_installed() else parts.determine_kind(spec)
     if kind is not None:
         return kind
     path = list_installed()[spec].value if spec in list_installed() else spec
@@ -99,5 +99,5 @@ def determine_task(spec: str) -> str:
     if hasattr(algorithm, "designate"):
         return TRACKING.name
     annotations = inspect.get_annotations(getattr(algorithm, "estimate", None) or algorithm)
-    landing = any("Landing" in str(item) or "Site" in str(item) for item in annotations.values())
-    return LANDING.name if landing else VELOCITY.name
+    is_landing = any("Landing" in str(item) or "Site" in str(item) for item in annotations.values())
+    return LANDING.name if is_landing else VELOCITY.name

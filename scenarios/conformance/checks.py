@@ -28,8 +28,8 @@ class Finding:
     """Result of one check.
 
     - requirement: text of the protocol's requirement
-    - problem, next_step: the violation and its remedy; empty if passed
-    - note: the answer, or its computation time
+    - problem, next_step: the violation and its remedy; empty if the check passed
+    - note: description of the answer, or its computation time
     """
 
     check: str
@@ -57,7 +57,7 @@ class Check:
     advice: str
     run: Callable[[], str]
 
-    def finding(self) -> Finding:
+    def evaluate(self) -> Finding:
         """Run the check; an exception is a problem."""
         try:
             return Finding(self.name, self.requirement, note=self.run())
@@ -80,9 +80,11 @@ class Check:
 class Suite(ABC):
     """Conformance suite of one algorithm or part; a new object is constructed for each check.
 
-    `marsyard.campaigns.running.replay` detects state that a check leaves in its process.
+    `marsyard.campaigns.running.replay` detects global state that a check changes in its process.
 
     - make: constructs the algorithm or part
+    - spec: name of the algorithm or part
+    - limit_s: maximum computation time of an answer
     - is_program: whether it is an external program, which reads files and cannot change the suite's objects
     """
 
@@ -95,7 +97,7 @@ class Suite(ABC):
     deterministic_advice = (
         "use numpy.random.default_rng(a fixed seed), created in estimate; keep no state between cases"
     )
-    answers = "answers"
+    time_verb = "answers"
     #: Problem of an answer that differs after other cases.
     dependence = "its answer depends on earlier cases"
     #: Whether imports of modules with ground truth are forbidden.
@@ -105,14 +107,14 @@ class Suite(ABC):
 
     @abstractmethod
     def checks(self) -> Iterator[Check]:
-        """All checks, the ordinary case first."""
+        """Yield all checks, that of the ordinary case first."""
 
     @abstractmethod
     def cases(self) -> Sequence[Any]:
-        """Inputs of ordinary cases."""
+        """Return the inputs of ordinary cases."""
 
     def _other_cases(self) -> Sequence[Any]:
-        """Inputs of other cases, on which the answers of `cases` must not depend."""
+        """Return the inputs of other cases, which must not affect the answers to `cases`."""
         return self.cases()
 
     @abstractmethod
@@ -121,26 +123,26 @@ class Suite(ABC):
 
     @abstractmethod
     def _check_answer(self, answer: Any, case: Any) -> Any:
-        """The answer, valid by the protocol; raises BreachError or AlgorithmError otherwise."""
+        """Return the answer if it is valid. Raises BreachError or AlgorithmError if it violates the protocol."""
 
     def _answer(self, case: Any, seed: int = 1) -> Any:
-        """Checked answer of a new algorithm or part to a copy of a case's input."""
+        """Return the checked answer of a new algorithm or part to a copy of a case's input."""
         return self._check_answer(self._call(self.make(), copy_inputs(case, writable=self.writable_inputs), seed), case)
 
     def common_checks(self) -> Iterator[Check]:
-        """Checks of unchanged inputs, repeatability, time, and imports."""
+        """Yield the checks of unchanged inputs, repeatability, time, and imports."""
         if not self.is_program:
             copies = "work on copies: counts.astype(...), array.copy()"
-            yield Check("inputs", "does not change its inputs", copies, self._leaves_inputs)
+            yield Check("inputs", "does not change its inputs", copies, self._check_inputs)
         rule = "returns the same answers to the same case, after any other cases"
-        yield Check("deterministic", rule, self.deterministic_advice, self._repeats_answers)
+        yield Check("deterministic", rule, self.deterministic_advice, self._check_repeatability)
         advice = "reduce the computation time, or raise the limit with --time-limit"
-        yield Check("time", f"{self.answers} within {self.limit_s:g} s", advice, self._answers_in_time)
+        yield Check("time", f"{self.time_verb} within {self.limit_s:g} s", advice, self._check_time)
         if self.forbids_truth and not self.is_program:
             advice = f"use only the inputs; from marsyard import only {', '.join(OPEN_MODULES)}"
-            yield Check("truth", "imports no module with access to the truth", advice, self._imports_no_truth)
+            yield Check("truth", "imports no module with access to the truth", advice, self._check_imports)
 
-    def _leaves_inputs(self) -> str:
+    def _check_inputs(self) -> str:
         for case in self.cases():
             copy = copy_inputs(case, writable=True)
             original_hash = hash_inputs(copy)
@@ -149,7 +151,7 @@ class Suite(ABC):
                 raise BreachError(f"it changed its input, a {type(case).__name__}")
         return ""
 
-    def _repeats_answers(self) -> str:
+    def _check_repeatability(self) -> str:
         reused = self.make()
         for case in self.cases():
             fingerprints = []
@@ -166,19 +168,19 @@ class Suite(ABC):
                 raise BreachError(self.dependence)
         return ""
 
-    def _answers_in_time(self) -> str:
+    def _check_time(self) -> str:
         elapsed_s = self._answer_time_s()
         if elapsed_s > self.limit_s:
             raise BreachError(f"it took {elapsed_s:.3g} s")
         return f"{elapsed_s:.3g} s"
 
     def _answer_time_s(self) -> float:
-        """Time of an answer after a first answer, which compiles kernels."""
+        """Measure the time of a second answer; the first answer compiles kernels."""
         case = self.cases()[0]
         self._answer(case)
         return measure_time_s(lambda: self._answer(case))
 
-    def _imports_no_truth(self) -> str:
+    def _check_imports(self) -> str:
         forbidden, allowed = [], tuple(f"{module}." for module in OPEN_MODULES)
         for name, path in algorithm_sources(self.spec):
             try:
@@ -199,12 +201,12 @@ class Suite(ABC):
 
 
 def measure_time_s(call: Callable[[], object]) -> float:
-    """Wall-clock time of a call."""
+    """Measure the wall-clock time of a call."""
     start_s = time.perf_counter()
     call()
     return time.perf_counter() - start_s
 
 
 def fingerprint(answer: Any) -> str:
-    """Fingerprint of an answer without its details, which may contain times."""
+    """Compute the hash of an answer without its details, which may contain times."""
     return hash_inputs(answer, ("details",))

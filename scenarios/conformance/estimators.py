@@ -16,15 +16,16 @@ from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
 from marsyard.sim.measurements import DescentMeasurements
 
-#: Images of an ordinary stream; of streams too short and long enough for an answer; of a long stream.
-_PICTURES, _TOO_FEW, _ENOUGH, _MANY = 5, (0, 1), (2, 3), 10
+#: Numbers of images: of an ordinary stream, of streams too short for an answer, of short streams, of a long stream.
+_IMAGES, _TOO_SHORT, _SHORT, _LONG = 5, (0, 1), (2, 3), 10
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Measurements of a task, and the check, validity and description of its answers.
+    """Measurements of a task, and the rules for its answers.
 
-    `check` checks an answer against the interface (AlgorithmError); `failures` lists the outcomes without a result.
+    `measurements` creates the input of an ordinary case; `check` checks an answer against the interface
+    (AlgorithmError); `failures` lists the outcomes without a result.
     """
 
     measurements: Callable[[], Any]
@@ -35,7 +36,7 @@ class Protocol:
 
 
 def describe_velocity(estimate: VelocityEstimate) -> str:
-    """Outcome of an estimate, and its error relative to the truth of the suite's descents."""
+    """Return the outcome of an estimate, and its error relative to the truth of the suite's descents."""
     if estimate.velocity_m_s is None:
         return estimate.outcome.name
     error = float(np.hypot(*(estimate.velocity_m_s - inputs.DESCENT_VELOCITY_M_S[:2])))
@@ -49,7 +50,7 @@ VELOCITY = Protocol(
     describe=describe_velocity,
     failures=", ".join(outcome.name for outcome in VelocityOutcome if outcome is not VelocityOutcome.VALID),
 )
-STREAM = replace(VELOCITY, measurements=partial(inputs.descent, _PICTURES))
+STREAM = replace(VELOCITY, measurements=partial(inputs.descent, _IMAGES))
 LANDING = Protocol(
     measurements=inputs.landing,
     check=check_site,
@@ -74,9 +75,9 @@ class EstimatorSuite(Suite):
         advice = f"return one of the failures: {protocol.failures}"
         for name, blank in inputs.BLANKS.items():
             rule = f"returns a failure if images are {name}"
-            yield Check(name, rule, advice, partial(self._fails_on, name, blank))
+            yield Check(name, rule, advice, partial(self._check_blank_images, name, blank))
         rule = "returns a well-formed answer to images of noise"
-        yield Check("noise", rule, advice, lambda: self._outcome(inputs.noisy(protocol.measurements())))
+        yield Check("noise", rule, advice, lambda: self._outcome(inputs.make_noisy(protocol.measurements())))
         if protocol is LANDING:
             rule = "returns a well-formed answer without a range"
             no_range = replace(inputs.landing(), slant_range_m=float("nan"))
@@ -84,20 +85,20 @@ class EstimatorSuite(Suite):
         yield from self.common_checks()
         if protocol is STREAM:
             advice = f"return one of the failures from finish: {VELOCITY.failures}"
-            yield Check("few", "returns a failure for zero images and for one image", advice, self._fails_on_few)
-            rule = f"returns a well-formed answer to {', '.join(map(str, _ENOUGH))} and {_MANY} images"
+            yield Check("few", "returns a failure for zero images and for one image", advice, self._check_short_streams)
+            rule = f"returns a well-formed answer to {', '.join(map(str, _SHORT))} and {_LONG} images"
             advice = "accept any number: see VelocityStream in algorithms/interface.py"
-            streams = (*map(_first_pictures, _ENOUGH), inputs.descent(_MANY))
-            yield Check("number", rule, advice, lambda: "; ".join(describe_velocity(self._answer(x)) for x in streams))
+            streams = (*map(_select_first_images, _SHORT), inputs.descent(_LONG))
+            yield Check("number", rule, advice, lambda: "; ".join(describe_velocity(self._answer(s)) for s in streams))
             rule, advice = "resets its state after an interrupted descent", "reset the whole state in start"
-            yield Check("start", rule, advice, self._starts_again)
+            yield Check("start", rule, advice, self._check_restart)
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""
         return [self.protocol.measurements()]
 
     def _other_cases(self) -> Sequence[Any]:
-        return [inputs.noisy(self.protocol.measurements())]
+        return [inputs.make_noisy(self.protocol.measurements())]
 
     def _call(self, algorithm: Any, case: Any, seed: int) -> Any:
         return algorithm.estimate(case)
@@ -108,32 +109,32 @@ class EstimatorSuite(Suite):
     def _outcome(self, measurements: Any) -> str:
         return str(self._answer(measurements).outcome.name)
 
-    def _fails_on(self, name: str, blank: inputs.Blank) -> str:
-        answer = self._answer(inputs.blank_pictures(self.protocol.measurements(), blank))
+    def _check_blank_images(self, name: str, blank: inputs.Blank) -> str:
+        answer = self._answer(inputs.make_blank(self.protocol.measurements(), blank))
         if self.protocol.is_valid(answer):
             raise BreachError(f"it answers {answer.outcome.name} to images that are {name}: they contain no texture")
         return str(answer.outcome.name)
 
-    def _fails_on_few(self) -> str:
+    def _check_short_streams(self) -> str:
         outcomes = []
-        for number in _TOO_FEW:
-            answer = self._answer(_first_pictures(number))
+        for number in _TOO_SHORT:
+            answer = self._answer(_select_first_images(number))
             if VELOCITY.is_valid(answer):
                 raise BreachError(f"it answers {answer.outcome.name} to {number or 'no'} image: no motion is visible")
             outcomes.append(answer.outcome.name)
         return ", ".join(outcomes)
 
-    def _starts_again(self) -> str:
+    def _check_restart(self) -> str:
         measurements = self.protocol.measurements()
         expected = fingerprint(self._answer(measurements))
         reused = self.make()
         reused.stream.start()
-        for frame in copy_inputs(inputs.noisy(measurements)).frames()[:2]:
+        for frame in copy_inputs(inputs.make_noisy(measurements)).frames()[:2]:
             reused.stream.picture(frame)
         if fingerprint(reused.estimate(copy_inputs(measurements))) != expected:
             raise BreachError("after a restart in the middle of a descent, its answer differs")
         return ""
 
 
-def _first_pictures(number: int) -> DescentMeasurements:
-    return inputs.descent(_PICTURES).select(tuple(range(number)))
+def _select_first_images(number: int) -> DescentMeasurements:
+    return inputs.descent(_IMAGES).select(tuple(range(number)))

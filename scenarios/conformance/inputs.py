@@ -34,6 +34,7 @@ Measurements = TypeVar("Measurements", DescentMeasurements, LandingMeasurements)
 
 #: Mean radiance factor of the plane, and radiance factor outside the plane.
 MEAN, BACKGROUND = 0.2, 0.1
+#: Side of the periodic texture, samples, and its standard deviation relative to the mean.
 _SIZE, _CONTRAST = 1024, 0.2
 #: Mean velocity of the descent, east, north, up, m/s.
 DESCENT_VELOCITY_M_S = np.array([12.0, -7.0, -75.0])
@@ -45,7 +46,7 @@ _START_POSITION_M = np.array([0.0, 0.0, 1900.0])
 #: Positions of the two landing images, metres.
 _HOVER_M = np.array([[0.0, 0.0, 30.0], [1.2, 0.2, 29.8]])
 
-#: Counts of a blank image as a function of the detector's calibration.
+#: Function of the detector's calibration that returns the count of all pixels of a blank image.
 Blank = Callable[[DetectorCalibration], int]
 BLANKS: dict[str, Blank] = {
     "featureless": lambda calibration: round(0.4 * calibration.full_scale_dn),
@@ -66,7 +67,7 @@ class TexturedPlane:
     step_m: float
 
     def radiance(self, camera: CameraModel) -> Float32[np.ndarray, "rows columns"]:
-        """Radiance factor in each pixel of a camera in the world."""
+        """Compute the radiance factor in each pixel of a camera in the world."""
         origins, directions = camera.rays(camera.pixel_grid())
         normal = np.cross(*self.axes)
         offset = (self.origin - origins) @ normal
@@ -82,7 +83,7 @@ class TexturedPlane:
 
 @cache
 def texture() -> Float32[np.ndarray, "rows columns"]:
-    """Periodic noise of mean 1; its amplitudes decrease with frequency, as on natural surfaces."""
+    """Create periodic noise of mean 1; its amplitudes decrease with frequency, as on natural surfaces."""
     rng = np.random.default_rng(20040103)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(_SIZE), fft.rfftfreq(_SIZE), indexing="ij"))
     frequency[0, 0] = np.inf
@@ -92,27 +93,28 @@ def texture() -> Float32[np.ndarray, "rows columns"]:
 
 
 @cache
-def descent(pictures: int = 3) -> DescentMeasurements:
-    """Descent images of level, textured ground; all instruments except the inertial velocity are exact."""
-    interval_s = min(_INTERVAL_S, _DURATION_S / (pictures - 1))
-    positions = _START_POSITION_M + interval_s * np.arange(pictures)[:, None] * DESCENT_VELOCITY_M_S
-    angles = [_ATTITUDES_DEG[number % len(_ATTITUDES_DEG)] for number in range(pictures)]
+def descent(image_count: int = 3) -> DescentMeasurements:
+    """Create the measurements of a descent over level, textured ground; only the inertial velocity has an error."""
+    interval_s = min(_INTERVAL_S, _DURATION_S / (image_count - 1))
+    positions = _START_POSITION_M + interval_s * np.arange(image_count)[:, None] * DESCENT_VELOCITY_M_S
+    angles = [_ATTITUDES_DEG[number % len(_ATTITUDES_DEG)] for number in range(image_count)]
     attitudes = [Rotation.from_euler("ZYX", values, degrees=True) for values in angles]
-    times = [100.0 + interval_s * number for number in range(pictures)]
+    times = [100.0 + interval_s * number for number in range(image_count)]
+    # constant horizontal error of the inertial velocity, m/s
     inertial = DESCENT_VELOCITY_M_S + np.array([9.0, -4.0, 0.0])
     return DescentMeasurements(
         images=tuple(_take_images(preset("mer-descent-flown"), positions, attitudes, times, 2.0)),
         attitudes=tuple(AttitudeMeasurement(attitude, time) for attitude, time in zip(attitudes, times, strict=True)),
         altitudes=tuple(AltitudeMeasurement(float(z), time) for z, time in zip(positions[:, 2], times, strict=True)),
-        interval_velocities_m_s=np.tile(inertial, (pictures - 1, 1)),
+        interval_velocities_m_s=np.tile(inertial, (image_count - 1, 1)),
         sun_direction=direction(np.radians(250.0), np.radians(35.0)),
-        inertial_velocities_m_s=np.tile(inertial, (pictures, 1)),
+        inertial_velocities_m_s=np.tile(inertial, (image_count, 1)),
     )
 
 
 @cache
 def landing() -> LandingMeasurements:
-    """Two images of level, textured ground from a helicopter; all instruments are exact."""
+    """Create the measurements of two helicopter images of level, textured ground; all instruments are exact."""
     attitudes = [Rotation.from_euler("ZYX", angles, degrees=True) for angles in ((10, 3, -2), (10.2, 2.8, -1.9))]
     times = [0.0, 2.0]
     first, second = _take_images(preset("xc-55"), _HOVER_M, attitudes, times, 0.03)
@@ -143,12 +145,12 @@ def _take_images(
     return images
 
 
-def blank_pictures(measurements: Measurements, blank: Blank) -> Measurements:
+def make_blank(measurements: Measurements, blank: Blank) -> Measurements:
     """Return the measurements with blank images."""
     return _replace_counts(measurements, lambda item: np.full(item.counts.shape, blank(item.calibration), np.uint16))
 
 
-def noisy(measurements: Measurements) -> Measurements:
+def make_noisy(measurements: Measurements) -> Measurements:
     """Return the measurements with images of pure noise."""
     rng = np.random.default_rng(2)
 

@@ -36,8 +36,8 @@ _SLOPE = 0.05
 _NORMAL = np.array([-_SLOPE, 0.0, 1.0]) / np.hypot(_SLOPE, 1.0)
 
 
-def part_kind(spec: str) -> str | None:
-    """Kind of a part by its entry point, members or annotations; None if they do not determine it."""
+def determine_kind(spec: str) -> str | None:
+    """Determine the kind of a part from entry point, members or annotations; None if they are ambiguous."""
     name = next((kind.name for kind in KINDS.values() if spec in list_installed(kind.group)), None)
     if name is not None or ":" not in spec:
         return name
@@ -58,7 +58,7 @@ class PartSuite(Suite):
     kind: PartKind
 
     deterministic_advice = "use only the generator in the arguments; keep no state between cases"
-    answers = "answers a case"
+    time_verb = "answers a case"
     forbids_truth = False
     writable_inputs = True
 
@@ -68,12 +68,12 @@ class PartSuite(Suite):
         rule = "returns the output of its kind: right shapes, finite and in order"
         yield Check("answer", rule, advice, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
         rule = "reports the same columns in every case: identifiers, with numbers or booleans"
-        yield Check("columns", rule, "report every column in every case; NaN for a missing number", self._columns)
+        yield Check("columns", rule, "report every column in every case; NaN for a missing number", self._check_columns)
         yield from self.common_checks()
         if self.kind is not SCORE:
             rule = "depends on its random stream only if its attribute random is true"
             advice = "set random to true if it uses random numbers, and use only the generator in the arguments"
-            yield Check("random", rule, advice, self._depends_on_stream)
+            yield Check("random", rule, advice, self._check_random_attribute)
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""
@@ -103,7 +103,7 @@ class PartSuite(Suite):
             raise BreachError(str(error)) from error
         return answer
 
-    def _columns(self) -> str:
+    def _check_columns(self) -> str:
         answers = [self._answer(case, seed) for case in self.cases() for seed in (1, 2)]
         columns = [tuple(answer if isinstance(answer, dict) else answer.columns) for answer in answers]
         if len(set(columns)) > 1:
@@ -111,7 +111,7 @@ class PartSuite(Suite):
             raise BreachError(f"its columns change: {variants}")
         return ", ".join(columns[0]) or "none"
 
-    def _depends_on_stream(self) -> str:
+    def _check_random_attribute(self) -> str:
         is_random = bool(self.make().random)
         case = self.cases()[0]
         is_different = fingerprint(self._answer(case, 1)) != fingerprint(self._answer(case, 2))
@@ -123,7 +123,7 @@ class PartSuite(Suite):
 
 
 def load_part(kind: PartKind, spec: str) -> Any:
-    """A part with default options. Raises ValueError with the allowed names if there is no such part."""
+    """Load a part with default options. Raises ValueError with the allowed names if there is no such part."""
     return scores.load_score(spec) if kind is SCORE else kind.create(spec, {})
 
 
@@ -142,7 +142,7 @@ def _ground_height(x: float, y: float) -> float:
 def _nearest_ground(
     apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_width_rad: float, max_range_m: float
 ) -> float:
-    """Distance to the suite's plane within a cone."""
+    """Compute the distance from the apex of a cone to the suite's plane within the cone; infinite beyond the range."""
     angle = max(float(np.arccos(np.clip(-axis @ _NORMAL, -1.0, 1.0))) - half_width_rad, 0.0)
     distance = float(apex @ _NORMAL) / np.cos(angle) if angle < 0.5 * np.pi else np.inf
     return float(distance) if distance <= max_range_m else np.inf
@@ -150,7 +150,7 @@ def _nearest_ground(
 
 @cache
 def motion_cases() -> tuple[DescentPlace, ...]:
-    """Inputs of motions: three images over Mars, and five at shorter intervals over a smaller planet."""
+    """Create the inputs of motions: three images on Mars, and five images at shorter intervals on the Moon."""
     return (
         DescentPlace(_ground_height, _GRAVITY_M_S2, (0.0, 3.75, 7.5), -5.0, 8.0, 100.0),
         DescentPlace(_ground_height, 1.62, (0.0, 2.0, 4.0, 6.0, 8.0), -2.0, 8.5, 50.0),
@@ -159,7 +159,7 @@ def motion_cases() -> tuple[DescentPlace, ...]:
 
 @cache
 def swinging_fall() -> RecordedMotion:
-    """A swinging fall from 1900 m."""
+    """Create the motion of a swinging fall: 1900 m high at time 0, 75 m/s down, tilts up to 10 deg."""
     times = np.arange(-6.0, 22.0, 0.05)
     positions = np.column_stack([12.0 * times, -7.0 * times, 1900.0 - 75.0 * times])
     tilts = np.radians(10.0) * np.column_stack([np.sin(times), np.cos(times), 0.1 * times])
@@ -168,7 +168,7 @@ def swinging_fall() -> RecordedMotion:
 
 @cache
 def instrument_cases() -> tuple[InstrumentTruth, ...]:
-    """Inputs of instruments: two descents."""
+    """Create the inputs of instruments: two descents."""
     return tuple(
         InstrumentTruth(np.array(times), swinging_fall(), _ground_height, _nearest_ground)
         for times in ((0.0, 3.75, 7.5), (1.0, 2.0, 3.0, 4.0))
@@ -177,7 +177,7 @@ def instrument_cases() -> tuple[InstrumentTruth, ...]:
 
 @cache
 def scored_cases() -> tuple[scores.ScoredCase, ...]:
-    """Inputs of scores: all kinds of cases with an answer and with a failure; recorded cases also without truth."""
+    """Create the inputs of scores: all kinds of cases, each with an answer and with a failure, partly without truth."""
     velocities = (
         VelocityEstimate(VelocityOutcome.VALID, np.array([11.0, -7.5])),
         VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None),
@@ -199,13 +199,13 @@ def scored_cases() -> tuple[scores.ScoredCase, ...]:
     for site in sites:
         answered = {"measurements": inputs.landing(), "answer": site}
         with_truth = answered | {"true_poses": poses}
-        landing = scores.ScoredLanding(**with_truth, states=states[:2], ground=_ground_truth())
+        landing = scores.ScoredLanding(**with_truth, states=states[:2], ground=_make_ground_truth())
         cases += [landing, scores.ScoredSite(**with_truth), scores.ScoredSite(**answered, true_poses=None)]
-    return (*cases, _scored_run(TrackingState.NORMAL), _scored_run(TrackingState.FAILURE))
+    return (*cases, _make_scored_run(TrackingState.NORMAL), _make_scored_run(TrackingState.FAILURE))
 
 
-def _ground_truth() -> GroundTruth:
-    """Level ground of 20 m with one unsafe position."""
+def _make_ground_truth() -> GroundTruth:
+    """Create level ground of 20 m x 20 m with one unsafe position."""
     line = np.linspace(-4.0, 4.0, 9)
     positions_m = np.stack(np.meshgrid(line, line), axis=-1)
     zeros = np.zeros(positions_m.shape[:2])
@@ -216,8 +216,8 @@ def _ground_truth() -> GroundTruth:
     return GroundTruth(relief, Limits(2.0, 0.26, 0.2), positions_m, footprints, np.ones(zeros.shape, dtype=bool), 1.0)
 
 
-def _scored_run(state: TrackingState) -> scores.ScoredRun:
-    """A rover's run with two stops, the second with an answer of this state."""
+def _make_scored_run(state: TrackingState) -> scores.ScoredRun:
+    """Create a rover's run with two stops; the answer at the second stop has this state."""
     poses = (trackers.pose(0.0), trackers.pose(0.4))
     first = TargetUpdate(TrackingState.NORMAL, (), trackers.TARGET_M.copy())
     last = TargetUpdate(state, (), trackers.TARGET_M - 0.4 if state is TrackingState.NORMAL else None)

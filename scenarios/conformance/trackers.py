@@ -21,29 +21,29 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements
 from marsyard.sim.sensor import stereo_mast
 
-FULL_SCALE_DN = 4095
-_LEVEL_DN = 1500.0
-_WALL_M, _STEP_M = 8.0, 0.4
-#: The designated point in the world; number of stops of the drive.
+#: Largest count of the 12-bit cameras, and mean count of the wall.
+FULL_SCALE_DN, _MEAN_DN = 4095, 1500.0
+#: Distance of the wall from the start, length of a step, number of stops of the drive.
+_WALL_M, _STEP_M, _STOPS = 8.0, 0.4, 4
+#: The designated point on the wall, world axes.
 TARGET_M = np.array([_WALL_M, 0.3, 1.2])
-_STOPS = 4
-#: Counts of blank images.
+#: Count of all pixels of the blank images.
 BLANKS = {"featureless": 1500, "dark": 0, "saturated": FULL_SCALE_DN}
 
 
 @cache
 def mast() -> MastCalibration:
-    """Mast of the suite's rover."""
+    """Return the mast of the suite's rover."""
     return stereo_mast("research-navcam")
 
 
 def pose(distance_m: float) -> RigidTransform:
-    """Pose of the rover at a distance along its path."""
+    """Return the pose of the rover at a distance along its path."""
     return rigid(Rotation.identity(), np.array([distance_m, 0.0, 0.0]))
 
 
 def designation() -> PixelTarget:
-    """The target, designated in an image at the start."""
+    """Return the target, designated by its pixel in the left image at the start."""
     angles = mast_angles(TARGET_M, mast())
     if angles is None:
         raise ValueError("the mast cannot point at the suite's target")
@@ -52,7 +52,7 @@ def designation() -> PixelTarget:
 
 
 def take_images(aim: MastAim, world_from_rover: RigidTransform, blank: int | None = None) -> RoverMeasurements:
-    """Measurements of a stop at the aim: images of the wall, or blank images of one count."""
+    """Create the measurements of a stop: images of the wall with this aim, or blank images of one count."""
     angles = aim.azimuth_rad, aim.elevation_rad
     head = world_from_rover * mast().geometry.rover_from_head(*angles)
     left = _take_image(mast().left.transform(head), aim.left, blank)
@@ -65,15 +65,15 @@ def _take_image(camera: CameraModel, box: PixelBox, blank: int | None) -> MastIm
         return MastImage(np.full(box.size[::-1], blank, np.uint16), box.corner)
     wall = TexturedPlane(np.array([_WALL_M, 0.0, 0.0]), np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]), 0.006)
     radiance = wall.radiance(camera.crop(*box.corner, box.size))
-    return MastImage(np.clip(np.rint(_LEVEL_DN / MEAN * radiance), 0, FULL_SCALE_DN).astype(np.uint16), box.corner)
+    return MastImage(np.clip(np.rint(_MEAN_DN / MEAN * radiance), 0, FULL_SCALE_DN).astype(np.uint16), box.corner)
 
 
 @dataclass(frozen=True)
 class TrackerSuite(Suite):
-    """Suite of one tracker; its case is a drive to the designated target."""
+    """Suite of one tracker; its only case is a drive to the designated target."""
 
     deterministic_advice = "use numpy.random.default_rng(a fixed seed); reset the whole state in clear and designate"
-    answers = "updates"
+    time_verb = "updates"
     dependence = "after clear and a second designation of the target, its answer differs"
 
     def checks(self) -> Iterator[Check]:
@@ -81,12 +81,12 @@ class TrackerSuite(Suite):
         advice = "see algorithms/interface.py for aim, update and state"
         rule = "returns a well-formed aim and answer at every stop of a drive"
         yield Check("answer", rule, advice, lambda: ", ".join(update.state.name for update in drive(self.make())))
-        yield Check("states", "has no target before the designation and after clear", advice, self._has_states)
+        yield Check("states", "has no target before the designation and after clear", advice, self._check_states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
-            yield Check(name, f"loses its target if images are {name}", advice, partial(self._loses, name, blank))
+            yield Check(name, f"loses its target if images are {name}", advice, partial(self._check_loss, name, blank))
         rule = "answers if the pose jumps and the images show a different scene"
-        yield Check("pose", rule, advice, self._answers_after_jump)
+        yield Check("pose", rule, advice, self._check_pose_jump)
         yield from self.common_checks()
 
     def cases(self) -> Sequence[PixelTarget]:
@@ -102,7 +102,7 @@ class TrackerSuite(Suite):
     def _check_answer(self, answer: Any, case: PixelTarget) -> Any:
         return answer  # checked by `drive`
 
-    def _has_states(self) -> str:
+    def _check_states(self) -> str:
         tracker = self.make()
         _expect_state(tracker, "before the designation", TrackingState.NO_TARGET)
         tracker.designate(copy_inputs(designation()), pose(0.0))
@@ -114,7 +114,7 @@ class TrackerSuite(Suite):
             raise BreachError(f"without a target, it answers {update.state.name}; allowed: NO_TARGET")
         return ""
 
-    def _loses(self, name: str, blank: int) -> str:
+    def _check_loss(self, name: str, blank: int) -> str:
         tracker = self.make()
         drive(tracker)
         update = stop(tracker, pose(_STOPS * _STEP_M), blank)
@@ -126,13 +126,13 @@ class TrackerSuite(Suite):
             raise BreachError("it reports no reason for the lost target: losses is empty")
         return ", ".join([update.state.name, *(loss.name for loss in update.losses)])
 
-    def _answers_after_jump(self) -> str:
+    def _check_pose_jump(self) -> str:
         tracker = self.make()
         drive(tracker)
         measurements = replace(take_images(aim_ahead(), pose(0.0)), world_from_rover=pose(3.0))
         return check_update(tracker.update(copy_inputs(measurements))).state.name
 
-    def _leaves_inputs(self) -> str:
+    def _check_inputs(self) -> str:
         tracker, target = self.make(), copy_inputs(designation(), writable=True)
         target_hash = hash_inputs(target)
         tracker.designate(target, pose(0.0))
@@ -144,7 +144,7 @@ class TrackerSuite(Suite):
         return ""
 
     def _answer_time_s(self) -> float:
-        """Maximum time of an update in a drive after a first drive, which compiles kernels."""
+        """Measure the maximum time of an update in a second drive; the first drive compiles kernels."""
         drive(self.make())
         tracker = self.make()
         tracker.designate(copy_inputs(designation()), pose(0.0))
@@ -171,7 +171,7 @@ def drive(tracker: Any) -> Sequence[TargetUpdate]:
 
 
 def stop(tracker: Any, rover_pose: RigidTransform, blank: int | None = None) -> TargetUpdate | None:
-    """Aim, take images and update, checked against the interface; None without an aim."""
+    """Aim, take images and update the tracker; check its answers against the interface. None without an aim."""
     aim = check_aim(tracker.aim(rover_pose, copy_inputs(mast())), mast())
     if aim is None:
         return None
@@ -189,7 +189,7 @@ def _aim_at_target(tracker: Any, rover_pose: RigidTransform) -> MastAim:
 
 
 def aim_ahead() -> MastAim:
-    """Aim straight ahead with the centres of both images."""
+    """Return an aim straight ahead with subframes at the centres of both images."""
     columns, rows = mast().left.size
     box = PixelBox((columns // 4, rows // 4), (columns // 2, rows // 2))
     return MastAim(0.0, -0.2, box, box)

@@ -1,4 +1,4 @@
-"""Pictures of a descent: terrain and light, the camera, and dust haze and the falling heat shield in the view."""
+"""Rendered images of a descent: terrain and light, camera, dust haze, and the falling heat shield in the view."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment, Surface, TerrainBank
 
-#: Finest mesh spacing of a generic terrain: upper limit, and fraction of the last picture's height above ground.
-MESH_FINEST_M, MESH_FINEST_HEIGHTS = 12.0, 0.01
+#: Finest mesh spacing of a generic terrain: upper limit, and ratio to the height of the last image above ground.
+MESH_FINEST_M, MESH_FINEST_FRACTION = 12.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -68,26 +68,27 @@ class World:
         return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
     def scene(self, east_m: float, north_m: float, lowest_m: float, pixel_rad: float) -> Scene:
-        """Create the scene of all pictures of a descent, without the lander's shadow and clouds.
+        """Create the scene of all images of a descent, without the lander's shadow and clouds.
 
-        - east_m, north_m: position below the first picture
-        - lowest_m: height above ground of the last picture, which determines the smallest rocks
+        - east_m, north_m: position below the first image
+        - lowest_m: height above ground of the last image; determines the smallest rocks of the scene
+        - pixel_rad: angle of a pixel
         """
         if self.ground is None:
-            finest = min(MESH_FINEST_M, MESH_FINEST_HEIGHTS * lowest_m)
+            finest = min(MESH_FINEST_M, MESH_FINEST_FRACTION * lowest_m)
             scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry(), mesh_finest_m=finest)
         else:
             scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
         return add_meshes(scene, self.meshes, (east_m, north_m))
 
 
-#: Path length to which the optical depth of the haze fault refers, m: about the height of the first picture.
+#: Path length to which the optical depth of the haze fault refers, m: about the height of the first image.
 HAZE_HEIGHT_M = 2000.0
 #: Diameter of MER's aeroshell (Desai & Knocke 2004), m.
 SHIELD_DIAMETER_M = 2.65
-#: Heat shield relative to the lander: horizontal speed and tumble rate; assumed.
+#: Heat shield relative to the lander: horizontal speed, m/s, and tumble rate, rad/s (assumed).
 DRIFT_M_S, TUMBLE_RAD_S = 2.0, 1.0
-#: Largest angle of the heat shield from nadir in the first picture, radians (assumed).
+#: Largest angle of the heat shield from nadir in the first image, radians (assumed).
 MAX_OFF_NADIR_RAD = 0.2
 #: Assumed albedos of the shield: charred outside, insulated inside.
 OUTSIDE_ALBEDO, INSIDE_ALBEDO = 0.1, 0.5
@@ -101,7 +102,7 @@ def take_exposures(
     detector: Detector,
     streams: Streams,
 ) -> Iterator[tuple[UInt16[np.ndarray, "rows columns"], Frame]]:
-    """Yield detector counts and rendered frame of each picture, without delivery faults."""
+    """Render and expose the images; yield detector counts and rendered frame of each, without delivery faults."""
     first, last = states[0].position_m, states[-1].position_m
     first_ground_m, last_ground_m = (float(world.surface.height(east, north)) for east, north, _ in (first, last))
     scene = world.scene(float(first[0]), float(first[1]), float(last[2]) - last_ground_m, optics.rays.pixel_rad)
@@ -122,7 +123,7 @@ def take_exposures(
         extinction = world.air.mean_extinction_m(height) if world.ground else 0.0
         radiance = add_haze(frame, world.air, world.sun, extinction + p.faults.haze / HAZE_HEIGHT_M)
         if shield is not None:
-            radiance = shield.draw_over(radiance, frame, world.sun, state.time_s)
+            radiance = shield.paint_over(radiance, frame, world.sun, state.time_s)
         yield detector.expose(radiance * np.float32(world.brightness), noise, motion), frame
 
 
@@ -130,7 +131,7 @@ def take_exposures(
 class HeatShield:
     """Freely falling, tumbling disc that approximates the shield's cone of 70 deg half angle.
 
-    Centre, velocity, outward normal and angular velocity are those at the first picture, in world axes.
+    Centre, velocity, outward normal and angular velocity are those at the first image, in world axes.
     """
 
     centre_m: Float64[np.ndarray, "3"]
@@ -141,7 +142,7 @@ class HeatShield:
 
     @classmethod
     def draw(cls, first: State, angle_rad: float, rng: np.random.Generator) -> HeatShield:
-        """Draw a shield below the lander at its first picture; `angle_rad` is its angular diameter seen face on."""
+        """Draw a shield below the lander at its first image; `angle_rad` is its angular diameter seen face on."""
         limits = [2 * np.pi, MAX_OFF_NADIR_RAD, 2 * np.pi, 2 * np.pi]
         azimuth, off_nadir, drift_azimuth, axis_azimuth = rng.uniform(size=4) * limits
         ray = np.array([np.sin(azimuth) * np.sin(off_nadir), np.cos(azimuth) * np.sin(off_nadir), -np.cos(off_nadir)])
@@ -155,19 +156,19 @@ class HeatShield:
             start_s=first.time_s,
         )
 
-    def draw_over(
+    def paint_over(
         self, radiance: Float32[np.ndarray, "rows columns"], frame: Frame, sun: Sun, time_s: float
     ) -> Float32[np.ndarray, "rows columns"]:
-        """Draw the shield into a picture's radiance factor: a Lambert surface, lit by the sun only."""
-        elapsed = time_s - self.start_s
-        centre = self.centre_m + elapsed * self.velocity_m_s
-        normal = Rotation.from_rotvec(elapsed * self.spin_rad_s).apply(self.normal)
+        """Paint the shield over an image's radiance factor: a Lambert surface, lit by the sun only."""
+        elapsed_s = time_s - self.start_s
+        centre = self.centre_m + elapsed_s * self.velocity_m_s
+        normal = Rotation.from_rotvec(elapsed_s * self.spin_rad_s).apply(self.normal)
         origin = frame.world_from_body.apply(frame.rays.centre)
         directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
         cosines = directions @ normal
         distance = ((centre - origin) @ normal) / np.where(np.abs(cosines) > 1e-9, cosines, 1e-9)
-        from_centre = np.linalg.norm(origin + distance[:, None] * directions - centre, axis=1)
-        is_hit = (distance > 0.0) & (from_centre < 0.5 * SHIELD_DIAMETER_M)
+        centre_distance = np.linalg.norm(origin + distance[:, None] * directions - centre, axis=1)
+        is_hit = (distance > 0.0) & (centre_distance < 0.5 * SHIELD_DIAMETER_M)
         # the visible side faces the camera
         sun_cosine = np.maximum(-np.sign(cosines) * float(normal @ sun.direction), 0.0)
         reflected = np.where(cosines < 0.0, OUTSIDE_ALBEDO, INSIDE_ALBEDO) * sun_cosine
@@ -182,7 +183,7 @@ def camera_optics(parameters: CameraParameters) -> Optics:
 
 
 def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) -> CameraModel:
-    """Draw calibration errors and add them to the true camera of `camera_optics`."""
+    """Return the calibrated camera: the true camera of `camera_optics` with drawn calibration errors."""
     p = parameters
     focal, column, row, distortion = rng.standard_normal(4)
     centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))

@@ -17,13 +17,13 @@ from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
-#: Gravity on Mars, used for a generic terrain.
+#: Gravity on Mars, m/s^2, used for a generic terrain.
 MARS_GRAVITY_M_S2 = 3.72
-#: Duration of a simulated descent before the first picture, s.
+#: Duration of a simulated descent before the first image, s.
 LEAD_S = 5.0
-#: Margin of the inertial unit's data before the first picture and after the last instant of interest, s.
+#: Margin of the inertial unit's data: after the start of the motion and after the thrusters' firing, s.
 MARGIN_S = 0.1
-#: Number of times at which a recorded or custom flight is searched for the thrusters' firing height.
+#: Number of times at which the height of a recorded or custom flight is compared with the firing height.
 _SEARCH_TIMES = 2000
 
 
@@ -31,10 +31,11 @@ _SEARCH_TIMES = 2000
 class DescentFlight:
     """Motion of a descent.
 
-    - motion: true motion over time; time 0 is that of the first picture
-    - lead_s: duration of the motion before the first picture
-    - firing_s: time of the thrusters' firing, at `thruster_firing_m` above the ground, or the end of a pose file
-    - row: columns of the results
+    - motion: true motion over time; time 0 is that of the first image
+    - lead_s: duration of the motion before the first image
+    - firing_s: time of the thrusters' firing: at the height `thruster_firing_m` above the ground, or at the end of a
+      motion that ends above this height
+    - row: result columns that describe the motion
     """
 
     motion: Trajectory
@@ -49,13 +50,13 @@ def gravity_m_s2(p: DescentScenarioParameters) -> float:
 
 
 def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> DescentFlight:
-    """Create the motion of a case: its first picture is at the specified height, or at the recorded position.
+    """Create the motion of a case: its first image is at the specified height, or at the recorded position.
 
-    Raises ValueError if a recorded or custom motion is below the ground at a picture, or a custom motion is invalid.
+    Raises ValueError if a recorded or custom motion is below the ground at an image, or a custom motion is invalid.
     """
     ground = float(surface.height(p.location.east_m, p.location.north_m))
     site_m = np.array([p.location.east_m, p.location.north_m, ground])
-    times = add_time_fault(p.faults, p.picture_times_s)
+    times = add_time_fault(p.faults, p.image_times_s)
     if p.flight is None:
         descent = SwingDescent.simulate(
             p.descent,
@@ -88,15 +89,15 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
     invalid = np.flatnonzero(heights <= 0.0)
     if invalid.size:
         raise TrajectoryFileError(
-            f"{p.flight.motion if isinstance(p.flight, CustomMotion) else p.flight.file}: at picture {invalid[0] + 1} "
+            f"{p.flight.motion if isinstance(p.flight, CustomMotion) else p.flight.file}: at image {invalid[0] + 1} "
             f"the camera is {-heights[invalid[0]]:.1f} m below the ground; allowed: above it"
         )
     return DescentFlight(motion, p.flight.lead_s, _find_firing_time(p, motion, surface), row)
 
 
 def _find_firing_time(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
-    """Return the first time at the firing height above the ground below the first picture, else the last time."""
-    times = np.linspace(max(p.picture_times_s), motion.span_s[1] - MARGIN_S, _SEARCH_TIMES)
+    """Return the first time at the firing height, relative to the ground below the first image, or the last time."""
+    times = np.linspace(max(p.image_times_s), motion.span_s[1] - MARGIN_S, _SEARCH_TIMES)
     first = motion.state(0.0).position_m
     heights = motion.motion(times).positions_m[:, 2] - float(surface.height(first[0], first[1]))
     indices = np.flatnonzero(heights <= p.descent.thruster_firing_m)
@@ -106,20 +107,20 @@ def _find_firing_time(p: DescentScenarioParameters, motion: Trajectory, surface:
     return float(np.interp(-p.descent.thruster_firing_m, -heights[crossing], times[crossing]))
 
 
-def picture_states(p: DescentScenarioParameters, flight: DescentFlight) -> list[State]:
-    """Return the true states at the exposures. Raises ValueError for a picture after the thrusters' firing."""
-    times = add_time_fault(p.faults, p.picture_times_s)
-    late = [number for number, time in enumerate(times, start=1) if time > flight.firing_s]
-    if late:
+def states_at_images(p: DescentScenarioParameters, flight: DescentFlight) -> list[State]:
+    """Return the true states at the exposures. Raises ValueError for an image after the thrusters' firing."""
+    times = add_time_fault(p.faults, p.image_times_s)
+    late_numbers = [number for number, time in enumerate(times, start=1) if time > flight.firing_s]
+    if late_numbers:
         raise ValueError(
-            f"picture {late[0]} of {p.pictures} would be taken at {times[late[0] - 1]:.2f} s, after the "
-            f"thrusters' firing at {flight.firing_s:.2f} s; allowed: fewer pictures, or a smaller descent.interval_s"
+            f"image {late_numbers[0]} of {p.pictures} would be taken at {times[late_numbers[0] - 1]:.2f} s, after the "
+            f"thrusters' firing at {flight.firing_s:.2f} s; allowed: fewer images, or a smaller descent.interval_s"
         )
     return [flight.motion.state(time) for time in times]
 
 
 def mean_velocities(states: Sequence[State]) -> Float64[np.ndarray, "intervals 3"]:
-    """Compute the true mean velocities of the camera between the pictures, world axes, m/s."""
+    """Compute the true mean velocities of the camera between the images, world axes, m/s."""
     times = np.array([state.time_s for state in states])
     positions = np.stack([state.position_m for state in states])
     return np.asarray(np.diff(positions, axis=0) / np.diff(times)[:, None])
@@ -130,8 +131,8 @@ def true_velocity(
 ) -> Float64[np.ndarray, "2"]:
     """Compute the camera's true mean horizontal velocity over a span of time tags, or its velocity at one tag, m/s.
 
-    A picture's tag is mapped to its true exposure time; other tags are mapped by interpolation. A span from picture to
-    picture is therefore a span from exposure to exposure, independent of tag errors.
+    The time tag of an image is mapped to its true exposure time; tags between images are interpolated. Tag errors
+    therefore do not change the true velocity between two images.
     """
 
     def state_at(tag_s: float) -> State:

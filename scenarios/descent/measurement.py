@@ -1,4 +1,4 @@
-"""Measurements of a descent: pictures, attitudes propagated from a star reference, altitudes, velocity changes."""
+"""Create an estimator's measurements of a descent: images, attitudes, altitudes and inertial velocities."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from marsyard.sim.streams import Streams
 
 @dataclass(frozen=True)
 class Instruments:
-    """Instruments of one descent with drawn constant errors.
+    """Instruments of one descent with their constant errors, and readings of custom instruments.
 
     - approach: flight before the descent, during which navigation errors grow
-    - navigation: propagated attitude and velocity, from shortly before the first picture to the thrusters' firing
+    - navigation: propagated attitude and velocity, from shortly before the first image to the thrusters' firing
     - altimeter: the radar, or the readings of a custom altimeter
-    - tags_s: time tags of the pictures
+    - tags_s: time tags of the images
     - attitude_source: readings of a custom attitude source at the time tags; None: attitudes of the navigation are used
     - row: columns of the custom instruments
     """
@@ -52,7 +52,7 @@ class Instruments:
     imu: Imu
     navigation: InertialSolution
     altimeter: RadarAltimeter | InstrumentReadings
-    tags_s: Float64[np.ndarray, "pictures"]
+    tags_s: Float64[np.ndarray, "images"]
     attitude_source: InstrumentReadings | None
     row: Mapping[str, Scalar]
 
@@ -61,14 +61,14 @@ class Instruments:
         """Draw the instruments of a case, propagate the navigation, and read the custom instruments."""
         start, end = -flight.lead_s + MARGIN_S, flight.firing_s + MARGIN_S
         approach = Approach(p.approach, start)
-        unit = Imu.draw(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
-        imu = approach.calibrate(unit, streams.generator("inertial unit's calibration"))
+        uncalibrated_imu = Imu.draw(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
+        imu = approach.calibrate(uncalibrated_imu, streams.generator("inertial unit's calibration"))
         clock = Clock.draw(p.clock, streams.generator("image clock"))
         surface, motion = world.surface, flight.motion
         # readings and columns of the custom instruments, by parameter table
         custom: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
-        tags = clock.tags(np.array(p.picture_times_s), streams.generator("image time tags"))
-        for table, times in (("altimeter", np.array(p.picture_times_s)), ("attitude_source", tags)):
+        tags = clock.tags(np.array(p.image_times_s), streams.generator("image time tags"))
+        for table, times in (("altimeter", np.array(p.image_times_s)), ("attitude_source", tags)):
             instrument = getattr(p, table)
             if isinstance(instrument, CustomAltimeter | CustomAttitudeSource):
                 truth = InstrumentTruth(
@@ -101,7 +101,7 @@ Counts = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
 def measure_exactly(
-    p: DescentScenarioParameters, world: World, states: Sequence[State], pictures: Counts, detector: Detector
+    p: DescentScenarioParameters, world: World, states: Sequence[State], images: Counts, detector: Detector
 ) -> DescentMeasurements:
     """Create measurements without errors: true attitudes, altitudes, times and velocities, and the true camera."""
     camera = camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed)
@@ -109,7 +109,7 @@ def measure_exactly(
     return DescentMeasurements(
         images=tuple(
             DetectorImage(counts, state.time_s, camera, detector.calibration)
-            for counts, state in zip(pictures, states, strict=True)
+            for counts, state in zip(images, states, strict=True)
         ),
         attitudes=tuple(AttitudeMeasurement(state.attitude, state.time_s) for state in states),
         altitudes=tuple(
@@ -125,18 +125,18 @@ def measure(
     p: DescentScenarioParameters,
     world: World,
     motion: Trajectory,
-    pictures: Counts,
+    images: Counts,
     detector: Detector,
     instruments: Instruments,
     streams: Streams,
 ) -> DescentMeasurements:
-    """Create an estimator's measurements: attitudes at the image tags, and the last altitude before each picture."""
+    """Create measurements with errors: attitudes at the images' time tags, and the last altitude before each image."""
     tags = instruments.tags_s
     model = calibrated_camera(p.camera, streams.generator("camera calibration"))
     camera = model.bin(columns=1, rows=p.detector.rows_summed)
-    images = [
+    detector_images = [
         DetectorImage(counts, float(tag), camera, detector.calibration)
-        for counts, tag in zip(pictures, tags, strict=True)
+        for counts, tag in zip(images, tags, strict=True)
     ]
     source = instruments.attitude_source
     rotations = instruments.navigation.attitude(tags) if source is None else Rotation.from_quat(source.values)
@@ -144,7 +144,7 @@ def measure(
     attitudes = add_attitude_faults(p.faults, attitudes, streams.generator("attitude fault"))
     readings: Readings | InstrumentReadings
     if isinstance(instruments.altimeter, RadarAltimeter):
-        times = instruments.altimeter.sampling.latest(np.array(p.picture_times_s))
+        times = instruments.altimeter.sampling.latest(np.array(p.image_times_s))
         readings = instruments.altimeter.measure(motion, times, streams.generator("altimeter noise"))
     else:
         readings = instruments.altimeter
@@ -153,7 +153,7 @@ def measure(
         for value, tag in zip(readings.values, readings.times_s, strict=True)
     ]
     return DescentMeasurements(
-        images=tuple(images),
+        images=tuple(detector_images),
         attitudes=tuple(attitudes),
         altitudes=tuple(add_altitude_faults(p.faults, altitudes)),
         interval_velocities_m_s=instruments.navigation.mean_velocities(tags),

@@ -1,4 +1,4 @@
-"""Parameters of a descent campaign, and the faults that a case may have."""
+"""Parameters of descent campaigns, and functions that inject a case's faults."""
 
 from __future__ import annotations
 
@@ -38,31 +38,31 @@ from marsyard.sim.sensor import (
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.landforms import Dunes
 
-#: Amplitude and length of an interference burst: a third of the picture's signal, over two delivered rows.
+#: Amplitude of an interference burst, a third of the image's signal, and its length, two delivered rows.
 BURST_DN, BURST_PX = 300.0, 2048.0
 #: Regular dunes of the dune fault.
 REGULAR_DUNES = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regularity=12.0)
-#: Assumed: downward speed of the released heat shield relative to the lander.
+#: Downward speed of the released heat shield relative to the lander, m/s (assumed).
 SHIELD_FALL_M_S = 20.0
-#: Index of the picture that single-picture faults affect; it belongs to both pairs.
-FAULTY_PICTURE = 1
+#: Index of the image that single-image faults affect; it belongs to both pairs.
+FAULTY_IMAGE = 1
 
 
 class Faults(SizedFaults):
     """Faults of a descent."""
 
     heat_shield_deg: Annotated[
-        NonNegative, Field(le=90.0, description="angular diameter of the falling heat shield in the first picture")
+        NonNegative, Field(le=90.0, description="angular diameter of the falling heat shield in the first image")
     ] = 0.0
     cloud_cover: Annotated[NonNegative, Field(le=0.9, description="fraction of the ground in cloud shadows")] = 0.0
     haze: Annotated[NonNegative, Field(le=10.0, description="optical depth of dusty air over 2000 m")] = 0.0
     dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes on the whole terrain")] = 0.0
-    cable_bursts: Annotated[NonNegative, Field(le=1e4, description="mean interference bursts per picture")] = 0.0
+    cable_bursts: Annotated[NonNegative, Field(le=1e4, description="mean interference bursts per image")] = 0.0
     late_s: Annotated[NonNegative, Field(le=3.0, description="delay of the second exposure after its time tag")] = 0.0
-    repeated_picture: Annotated[int, bounded_field(0, 3, "picture replaced by the previous one, 2 or 3; 0: none")] = 0
-    black_picture: Annotated[int, bounded_field(0, 3, "picture that is delivered black, 1 to 3; 0: none")] = 0
+    repeated_picture: Annotated[int, bounded_field(0, 3, "image replaced by the previous one, 2 or 3; 0: none")] = 0
+    black_picture: Annotated[int, bounded_field(0, 3, "image that is delivered black, 1 to 3; 0: none")] = 0
     shield_range_m: Annotated[
-        NonNegative, Field(le=2000.0, description="radar locked on the heat shield at this range in picture 1; 0: none")
+        NonNegative, Field(le=2000.0, description="radar locked on the heat shield at this range in image 1; 0: none")
     ] = 0.0
     altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0
     altitude_error_once: Annotated[NonNegative, Field(le=0.9, description="added, second altitude only")] = 0.0
@@ -76,7 +76,7 @@ class Faults(SizedFaults):
 
 
 def add_terrain_fault(faults: Faults, terrain: TerrainParameters) -> TerrainParameters:
-    """Return the terrain; with the dune fault, add regular dunes and remove rocks and craters."""
+    """Return the terrain; the dune fault adds regular dunes and removes rocks and craters."""
     if faults.dunes_m == 0.0:
         return terrain
     dunes = REGULAR_DUNES.model_copy(update={"height_m": faults.dunes_m})
@@ -84,26 +84,26 @@ def add_terrain_fault(faults: Faults, terrain: TerrainParameters) -> TerrainPara
 
 
 def draw_clouds(faults: Faults, ground_m: float, rng: np.random.Generator) -> CloudLayer | None:
-    """Draw clouds whose shadows move over ground at this height; None without the cloud fault."""
+    """Draw the clouds of the cloud fault over ground at this height; None without the fault."""
     if faults.cloud_cover == 0.0:
         return None
     return CloudLayer.draw(CloudParameters(cover=faults.cloud_cover), rng, ground_m=ground_m)
 
 
 def add_time_fault(faults: Faults, times_s: Sequence[float]) -> list[float]:
-    """Return the true exposure times of pictures commanded at these times."""
-    return [time + faults.late_s * (index == FAULTY_PICTURE) for index, time in enumerate(times_s)]
+    """Return the true exposure times of images commanded at these times."""
+    return [time + faults.late_s * (index == FAULTY_IMAGE) for index, time in enumerate(times_s)]
 
 
 def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]) -> list[AltitudeMeasurement]:
-    """Add the faults' relative errors to measured altitudes; a locked radar measures the falling heat shield."""
+    """Add the faults' relative errors to measured altitudes, or replace the altitudes by ranges to the heat shield."""
     if faults.shield_range_m:
         first_s = altitudes[0].time_s
         return [
             AltitudeMeasurement(faults.shield_range_m + SHIELD_FALL_M_S * (altitude.time_s - first_s), altitude.time_s)
             for altitude in altitudes
         ]
-    errors = [faults.altitude_error + faults.altitude_error_once * (n == FAULTY_PICTURE) for n in range(len(altitudes))]
+    errors = [faults.altitude_error + faults.altitude_error_once * (n == FAULTY_IMAGE) for n in range(len(altitudes))]
     return [
         AltitudeMeasurement(altitude.altitude_m * (1.0 + error), altitude.time_s)
         for altitude, error in zip(altitudes, errors, strict=True)
@@ -113,20 +113,19 @@ def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]
 def add_attitude_faults(
     faults: Faults, attitudes: Sequence[AttitudeMeasurement], rng: np.random.Generator
 ) -> list[AttitudeMeasurement]:
-    """Tilt attitudes about two drawn horizontal axes: one for the common error, one for the single picture's error."""
+    """Tilt attitudes about two drawn horizontal axes: the first for all attitudes, the second for `FAULTY_IMAGE`."""
     axes = [np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) for azimuth in rng.uniform(-np.pi, np.pi, 2)]
     common = Rotation.from_rotvec(np.radians(faults.attitude_error_deg) * axes[0])
     single = Rotation.from_rotvec(np.radians(faults.attitude_error_once_deg) * axes[1])
     return [
         AttitudeMeasurement(
-            (single if n == FAULTY_PICTURE else Rotation.identity()) * common * attitude.world_from_body,
-            attitude.time_s,
+            (single if n == FAULTY_IMAGE else Rotation.identity()) * common * attitude.world_from_body, attitude.time_s
         )
         for n, attitude in enumerate(attitudes)
     ]
 
 
-#: Number of pictures of an MER descent, and of the input of estimators that do not process a stream.
+#: Number of images of an MER descent, and of the input of estimators that do not process a stream.
 TRIPLE_SIZE = 3
 
 
@@ -136,8 +135,8 @@ class Location(Parameters):
     bank: Annotated[int, bounded_field(1, 100000, "number of terrains in the terrain bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="index of the terrain in the bank")] = 0
-    east_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
-    north_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
+    east_m: Annotated[float, Field(description="position of the first image on the periodic terrain")] = 0.0
+    north_m: Annotated[float, Field(description="position of the first image on the periodic terrain")] = 0.0
 
     @model_validator(mode="after")
     def _check_terrain(self) -> Location:
@@ -158,21 +157,21 @@ DustOpacity = Annotated[float | None, bounded_field(0.0, 10.0, "optical depth of
 
 
 class LanderParameters(Parameters):
-    """The lander's shadow in its own pictures: a disc at the camera's position.
+    """The lander's shadow in its own images: a disc at the camera's position.
 
-    The canopy's shadow dominates: 15.09 m nominal, inflated to 0.72 of that (Witkowski & Bruno 2003, MER parachute),
-    it covers the whole sun. Backshell and lander, 2.65 m in diameter, cover 1/20 of the sun from 2 km; their shadow
-    lies inside the canopy's when the sun is high. The canopy is about 40 m above the camera, which moves its shadow by
-    1 deg of the view. This is not modelled: the zero-phase spot that DIMES masks is 4 deg in radius.
+    The parachute's canopy dominates. Its diameter is 15.09 m (nominal) times 0.72 (inflated; Witkowski & Bruno 2003,
+    MER parachute); it covers the whole sun. Backshell and lander, 2.65 m in diameter, cover 1/20 of the sun from 2 km;
+    for a high sun their shadow is inside the shadow of the canopy. The canopy is about 40 m above the camera, which
+    moves its shadow by 1 deg in the view. This is not modelled: DIMES masks a zero-phase spot of 4 deg.
     """
 
     caster_diameter_m: Annotated[float, bounded_field(0.0, 100.0, "diameter of the shadow disc")] = 10.9
 
 
 class LandingParameters(Parameters):
-    """Landing with the estimate (`descent.score.compute_touchdown`); all values except the burn's are assumed."""
+    """Parameters of the landing (`descent.score.compute_touchdown`); values other than the burn's are assumed."""
 
-    computation_s: Annotated[float, bounded_field(0.0, 1000.0, "time to the answer on the flight computer")] = 14.0
+    computation_s: Annotated[float, bounded_field(0.0, 1000.0, "computation time on the flight computer")] = 14.0
     processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="run time, flight / host (assumed)")] = 600.0
     steering_deadband_m_s: Annotated[float, bounded_field(0.0, 100.0, "no steering up to this horizontal speed")] = 5.0
     max_steering_m_s: Annotated[float, bounded_field(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
@@ -181,7 +180,9 @@ class LandingParameters(Parameters):
 
 
 class CameraParameters(Parameters):
-    """The descent camera: 14.67 mm, 12 um pixels, 45 deg; distortion of an Opportunity navcam (its PDS label).
+    """The descent camera: focal length 14.67 mm, pixels 12 um, field of view 45 deg.
+
+    The distortion is that of an Opportunity navcam (its PDS label).
 
     A custom camera `model` replaces focal length, pixels and distortion.
     """
@@ -201,7 +202,7 @@ class CameraParameters(Parameters):
 
 
 class RenderParameters(Parameters):
-    """Rendering of the pictures."""
+    """Rendering of the images."""
 
     backend: Backend = Field(default_factory=default_backend, description="OpenGL context provider")
 
@@ -219,8 +220,8 @@ Altimeter = Annotated[
 class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     """Parameters of a descent campaign.
 
-    A `site` sets light, gravity, texture and rocks; keys of the table `terrain` override the site's terrain. The
-    site is the same in all cases: it is merged into `terrain` when the campaign is read, and cannot be dispersed.
+    `site` defines light, gravity, texture and rocks; keys of the table `terrain` override the site's terrain. All cases
+    have the same site: it is merged into `terrain` when the campaign is read, and cannot be dispersed.
     """
 
     task = VELOCITY
@@ -231,16 +232,16 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         site_validator("a descent", "descent"),
         Field(description="preset of terrain, light and gravity; none: generic terrain"),
     ] = None
-    terrain_site: Annotated[str | None, Field(description="site of the terrain; filled in with `site`, not set")] = None
+    terrain_site: Annotated[str | None, Field(description="site of the terrain; set automatically from `site`")] = None
     location: Location = Location()
     terrain: CheckedTerrain = TerrainParameters()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom objects on the ground")] = ()
     sun: SunParameters = SunParameters()
     dust_opacity: DustOpacity = None
     descent: SwingParameters = SwingParameters()
-    pictures: Annotated[int, bounded_field(2, 100, "number, every descent.interval_s; a stream gets all")] = TRIPLE_SIZE
-    #: Default: the last picture and two earlier ones, at the longest possible equal intervals.
-    triple: Annotated[tuple[int, int, int] | None, Field(description="picture numbers of the triple, from 1")] = None
+    pictures: Annotated[int, bounded_field(2, 100, "number, every descent.interval_s; streams use all")] = TRIPLE_SIZE
+    #: Default: the last image and two earlier ones, at the longest possible equal intervals.
+    triple: Annotated[tuple[int, int, int] | None, Field(description="image numbers of the triple, from 1")] = None
     flight: Annotated[Flight | None, Field(description="recorded flight or custom motion")] = None
     lander: LanderParameters = LanderParameters()
     camera: CameraParameters = CameraParameters()
@@ -252,11 +253,14 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     approach: ApproachParameters = ApproachParameters()
     altimeter: Altimeter = RadarParameters()
     attitude_source: Annotated[CustomAttitudeSource | None, Field(description="custom source of attitudes")] = None
-    clock: Annotated[ClockParameters, Field(description="clock of the pictures' time tags")] = ClockParameters(
+    clock: Annotated[ClockParameters, Field(description="clock of the images' time tags")] = ClockParameters(
         offset_sd_s=0.001, jitter_sd_s=0.0005
     )
     exact_instruments: Annotated[
-        bool, Field(description="estimators get true attitudes, altitudes, times and camera, to see the images' error")
+        bool,
+        Field(
+            description="true attitudes, altitudes, times and camera for estimators; shows the error from the images"
+        ),
     ] = False
     landing: LandingParameters = LandingParameters()
     render: RenderParameters = Field(default_factory=RenderParameters)
@@ -275,9 +279,9 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> DescentScenarioParameters:
-        """Check terrain, binning, selected pictures and flight.
+        """Check terrain, binning, selected images and flight.
 
-        Terrain and light must come from the same site. Pictures must be divisible into DIMES' bins because each case
+        Terrain and light must come from the same site. Images must be divisible into DIMES' bins because each case
         reports DIMES' feasible overlap.
         """
         if self.dust_opacity is not None and self.site is None:
@@ -297,21 +301,21 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
                 raise ValueError(
                     f"pictures is {self.pictures}, but '{specs[0]}' needs {TRIPLE_SIZE}; allowed: {TRIPLE_SIZE} to 100"
                 )
-        affected = max(self.faults.repeated_picture, self.faults.black_picture)
-        if affected > self.pictures:
-            raise ValueError(f"a fault affects picture {affected}, but the descent has only {self.pictures} pictures")
+        faulty_image = max(self.faults.repeated_picture, self.faults.black_picture)
+        if faulty_image > self.pictures:
+            raise ValueError(f"a fault affects image {faulty_image}, but the descent has only {self.pictures} images")
         if isinstance(self.flight, FlightFile):
-            self.flight.check(add_time_fault(self.faults, self.picture_times_s))
+            self.flight.check(add_time_fault(self.faults, self.image_times_s))
         return self
 
     @property
-    def picture_times_s(self) -> list[float]:
-        """Nominal picture times relative to the first picture."""
+    def image_times_s(self) -> list[float]:
+        """Nominal image times relative to the first image."""
         return [number * self.descent.interval_s for number in range(self.pictures)]
 
     @property
     def triple_indices(self) -> tuple[int, int, int] | None:
-        """Indices of the pictures for estimators that process a triple; None if there are fewer than three pictures."""
+        """Indices of the images for estimators that process a triple; None if there are fewer than three images."""
         if self.triple is not None:
             return self.triple[0] - 1, self.triple[1] - 1, self.triple[2] - 1
         if self.pictures < TRIPLE_SIZE:
@@ -326,10 +330,10 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
 
 def check_binning(binned: tuple[int, int], delivered: tuple[int, int]) -> None:
-    """Raise ValueError if DIMES cannot bin a delivered picture to this size; both are (columns, rows)."""
+    """Raise ValueError if DIMES cannot bin a delivered image to this size; both are (columns, rows)."""
     if delivered[0] % binned[0] or delivered[1] % binned[1]:
         raise ValueError(
-            f"dimes.binned_size {list(binned)} does not divide the delivered picture of {delivered[0]} x "
+            f"dimes.binned_size {list(binned)} does not divide the delivered image of {delivered[0]} x "
             f"{delivered[1]} pixels; allowed: sizes that do, such as {list(binned_size_for(*delivered))}"
         )
 

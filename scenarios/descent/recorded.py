@@ -14,25 +14,26 @@ from marsyard.scenarios.user_files import RecordedAxes, UserFile
 from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, read_poses
 from marsyard.sim.parameters import bounded_field
 
-#: Required duration of the flight after the last picture, s.
+#: Required duration of the flight after the last image, s.
 AFTER_S = 0.5
 
 
 class FlightFile(UserFile, RecordedAxes):
     """A recorded flight: a CSV, Parquet, TUM or EuRoC file of poses, or SPICE kernels.
 
-    Positions are the camera's, or with `lever_m` the vehicle's. The first picture is at the file's time
-    `first_picture_s`; others follow every `descent.interval_s`. Instruments measure it like a simulated flight.
+    Positions are those of the camera or, with `lever_m`, of the vehicle. The first image is taken at the file's time
+    `first_picture_s`, the next images at intervals of `descent.interval_s`. Instruments measure this motion like a
+    simulated flight.
     """
 
     origin: Annotated[
         Literal["place", "terrain"],
-        Field(description="origin of positions: ground at `place`, or the terrain's origin"),
+        Field(description="origin of positions: ground below the first image, or the terrain's origin"),
     ] = "place"
     first_picture_s: Annotated[
-        float | None, Field(description="file's time of the first picture; default: file's start + `lead_s`")
+        float | None, Field(description="file's time of the first image; default: file's start + `lead_s`")
     ] = None
-    lead_s: Annotated[float, bounded_field(0.2, 30.0, "navigation time before the first picture")] = 5.0
+    lead_s: Annotated[float, bounded_field(0.2, 30.0, "navigation time before the first image")] = 5.0
     turn_deg: Annotated[float, bounded_field(-720.0, 720.0, "rotation about the vertical, clockwise from above")] = 0.0
 
     @classmethod
@@ -42,19 +43,19 @@ class FlightFile(UserFile, RecordedAxes):
 
     @property
     def start_s(self) -> float:
-        """File's time of the first picture."""
+        """File's time of the first image."""
         if self.first_picture_s is not None:
             return self.first_picture_s
         return float(read_poses(self.file).times_s[0]) + self.lead_s
 
     def check(self, pictures_s: Sequence[float]) -> None:
-        """Raise ValueError if the flight does not cover the pictures, or its camera looks up or is below the ground."""
+        """Raise ValueError if the flight does not cover the images, or its camera looks up or is below the ground."""
         motion = self.motion(np.zeros(3), 0.0)
         first, last = motion.span_s
         if first > -self.lead_s + 1e-9 or last < max(pictures_s) + AFTER_S:
             begin, end = read_poses(self.file).times_s[[0, -1]]
             raise TrajectoryFileError(
-                f"{self.file}: covers {begin:.3f} to {end:.3f} s; pictures from {self.start_s:.3f} to "
+                f"{self.file}: covers {begin:.3f} to {end:.3f} s; images from {self.start_s:.3f} to "
                 f"{self.start_s + max(pictures_s):.3f} s, lead_s {self.lead_s:g} s before and {AFTER_S:g} s after them "
                 "are needed"
             )
@@ -62,12 +63,12 @@ class FlightFile(UserFile, RecordedAxes):
         for number, position in enumerate(motion.motion(np.array(pictures_s)).positions_m, start=1):
             if self.origin == "place" and position[2] <= 0.0:
                 raise TrajectoryFileError(
-                    f"{self.file}: at picture {number} the camera is {-position[2]:.1f} m below the ground at the "
+                    f"{self.file}: at image {number} the camera is {-position[2]:.1f} m below the ground at the "
                     'place; allowed: above it (with origin = "terrain", heights refer to the terrain\'s origin)'
                 )
 
     def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
-        """Transform the flight to world axes, time 0 at the first picture; `ground_m` is the ground below it."""
+        """Transform the flight to world axes with time 0 at the first image; `ground_m` is the ground below it."""
         poses = read_poses(self.file)
         world = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.world
         recorded = world * Rotation.from_quat(poses.quaternions)
@@ -78,12 +79,12 @@ class FlightFile(UserFile, RecordedAxes):
 
 
 def check_looks_down(name: str, motion: RecordedMotion, pictures_s: Sequence[float]) -> None:
-    """Raise TrajectoryFileError if the camera of the flight looks up at a picture; `name` is used in the message."""
+    """Raise TrajectoryFileError if the camera of the flight looks up at an image; `name` is used in the message."""
     for number, attitude in enumerate(motion.motion(np.array(pictures_s)).attitudes, start=1):
         axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
         if axis[2] >= 0.0:
             elevation = np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0)))
             raise TrajectoryFileError(
-                f"{name}: at picture {number} the camera looks up, {elevation:.1f} deg above the horizon; "
+                f"{name}: at image {number} the camera looks up, {elevation:.1f} deg above the horizon; "
                 "allowed: down (flight.axes, attitude_of and mounting define the axes)"
             )

@@ -1,4 +1,4 @@
-"""Scenario of a parachute descent: world, motion, pictures, measurements, estimate, landing, score."""
+"""Descent scenario: simulate a parachute descent and its measurements, run the algorithms, and score them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from marsyard.scenarios.conditions import (
     optics_columns,
 )
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
-from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
+from marsyard.scenarios.descent.flight import DescentFlight, create_flight, states_at_images, true_velocity
 from marsyard.scenarios.descent.measurement import Instruments, measure, measure_exactly
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
 from marsyard.scenarios.descent.score import (
-    Pictures,
+    Images,
     compute_touchdown,
     conditions,
     feasible_overlap_row,
@@ -57,7 +57,7 @@ from marsyard.sim.terrain import TerrainBank
 
 
 class DescentScenario(TerrainScenario[DescentScenarioParameters]):
-    """Parachute descent with pictures and measurements for a velocity estimator."""
+    """Parachute descent with images and measurements for a velocity estimator."""
 
     name = "descent"
     parameters_type = DescentScenarioParameters
@@ -74,7 +74,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         return tuple(range(self.check_parameters(parameters).location.bank))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """Return the terrain below the descent; empty with the dune fault, because that terrain is not in the bank."""
+        """Return the index of the terrain below the descent; empty with the dune fault, whose terrain is in no bank."""
         p = self.check_parameters(parameters)
         return (p.location.terrain,) if add_terrain_fault(p.faults, p.terrain) == p.terrain else ()
 
@@ -83,10 +83,10 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         return TerrainBank(p.terrain, p.location.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """Yield the pictures of a case without delivery faults, with the ground truth of their pixels."""
+        """Yield the images of a case without delivery faults, with the ground truth of their pixels."""
         p = self.check_parameters(parameters)
         world = World.from_parameters(p)
-        states = picture_states(p, create_flight(p, world.surface, streams))
+        states = states_at_images(p, create_flight(p, world.surface, streams))
         optics = camera_optics(p.camera)
         camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
         exposures = take_exposures(p, world, states, optics, draw_detector(p, optics, streams), streams)
@@ -95,7 +95,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
             metadata: dict[str, Any] = {
                 "site": p.site or "plain",
                 "time_s": state.time_s,
-                # the camera's axes are the body's, rotated by the alignment error
+                # pose of the camera: body pose, rotated by the alignment error
                 "position_m": np.asarray(pose.translation).tolist(),
                 "world_from_body_xyzw": pose.rotation.as_quat().tolist(),
                 "velocity_m_s": state.velocity_m_s.tolist(),
@@ -111,12 +111,12 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
             **descent.overlap,
             **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
             **ground_columns(descent.world.ground),
-            **contrast_columns(descent.pictures[0], p.detector),
+            **contrast_columns(descent.images[0], p.detector),
             **optics_columns(p.detector.optics),
             "altimeter_sidelobe_fraction": getattr(p.altimeter, "sidelobe_fraction", np.nan),
             **instrument_errors(descent.world, descent.states, descent.measurements),
             **descent.flight.row,
-            **image_columns(p.render.backend, hash_images(descent.pictures)),
+            **image_columns(p.render.backend, hash_images(descent.images)),
         }
         return case_result(p.algorithms, lambda algorithm: _score_algorithm(descent, algorithm, shared), shared)
 
@@ -129,10 +129,10 @@ def draw_detector(p: DescentScenarioParameters, optics: Optics, streams: Streams
 
 @dataclass(frozen=True)
 class Descent:
-    """A simulated descent and its measurements.
+    """A simulated descent and its measurements, which all algorithms of a case use.
 
-    - states, pictures: true states at the pictures, and the delivered pictures
-    - overlap: columns of `feasible_overlap_row`, empty if there are fewer than three pictures
+    - states, images: true states at the images, and the delivered images
+    - overlap: columns of `feasible_overlap_row`, empty if there are fewer than three images
     """
 
     p: DescentScenarioParameters
@@ -141,7 +141,7 @@ class Descent:
     flight: DescentFlight
     instruments: Instruments
     states: Sequence[State]
-    pictures: Pictures
+    images: Images
     measurements: DescentMeasurements
     overlap: Mapping[str, Scalar]
 
@@ -150,22 +150,22 @@ class Descent:
         """Simulate the descent of a case and its measurements."""
         world = World.from_parameters(p)
         flight = create_flight(p, world.surface, streams)
-        states = picture_states(p, flight)
+        states = states_at_images(p, flight)
         optics = camera_optics(p.camera)
         detector = draw_detector(p, optics, streams)
-        images = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
-        pictures = corrupt_images(images, p.faults.repeated_picture, p.faults.black_picture)
+        exposures = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
+        images = corrupt_images(exposures, p.faults.repeated_picture, p.faults.black_picture)
         instruments = Instruments.draw(p, world, flight, streams)
         if p.exact_instruments:
-            measurements = measure_exactly(p, world, states, pictures, detector)
+            measurements = measure_exactly(p, world, states, images, detector)
         else:
-            measurements = measure(p, world, flight.motion, pictures, detector, instruments, streams)
+            measurements = measure(p, world, flight.motion, images, detector, instruments, streams)
         overlap: Mapping[str, Scalar] = {}
         if p.triple_indices is not None:
             triple = [states[index] for index in p.triple_indices]
             camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
             overlap = feasible_overlap_row(triple, world, camera, detector.calibration, p.dimes)
-        return cls(p, streams, world, flight, instruments, states, pictures, measurements, overlap)
+        return cls(p, streams, world, flight, instruments, states, images, measurements, overlap)
 
     @cached_property
     def at_firing(self) -> State:
@@ -210,9 +210,9 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
             touchdown_m_s=landing.with_answer,
         )
         row |= compute_scores(p.scores, case, {*row, *shared})
-    # figures show the three input pictures of DIMES, or all pictures of other algorithms
+    # figures show the three input images of DIMES, or all images of other algorithms
     is_dimes = estimate is not None and isinstance(estimate.details, DimesDetails)
-    indices = p.triple_indices if is_dimes and p.triple_indices is not None else range(len(descent.pictures))
-    pictures = [descent.pictures[index] for index in indices]
-    products = {**velocity_products(pictures, estimate, truth), **stream_products(estimate, descent.truth)}
+    indices = p.triple_indices if is_dimes and p.triple_indices is not None else range(len(descent.images))
+    images = [descent.images[index] for index in indices]
+    products = {**velocity_products(images, estimate, truth), **stream_products(estimate, descent.truth)}
     return algorithm_result(algorithm_run, velocity is not None, row, products)

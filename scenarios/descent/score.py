@@ -25,7 +25,7 @@ from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration
 from marsyard.sim.sensor import height_above_ground
 
-Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
+Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 #: Width of the ground patch whose mean height is the reference of DIMES' altitude, m.
 PATCH_M = 200.0
@@ -33,7 +33,7 @@ PATCH_M = 200.0
 
 @dataclass(frozen=True)
 class Touchdown:
-    """Horizontal touchdown velocities of the same descent with and without the estimate, m/s.
+    """Horizontal touchdown velocities of a descent, steered with the estimate and without it, m/s.
 
     - is_in_time: with the assumed computation time, the estimate is available before the rockets fire
     """
@@ -53,15 +53,15 @@ def compute_touchdown(
     """Compute touchdown velocities with a simple model of MER's last seconds; `rng` draws errors of burn and steering.
 
     Solid rockets in the backshell stop the fall near 100 m; small rockets next to them (TIRS) can tilt the backshell
-    first to give the burn a horizontal component. The lander keeps its horizontal velocity at the rockets' firing,
-    and the burn adds an error. If an estimate is available in time and large enough, the burn is steered against the
-    estimate, which the inertial unit has propagated to the firing, up to the tilt limit. Otherwise the burn is not
-    steered. Swinging and wind during the burn's three seconds are not modelled. The computation time is an assumed
-    constant, so that rows are reproducible bit for bit.
+    first to give the burn a horizontal component. The touchdown velocity is the horizontal velocity at the rockets'
+    firing plus an error of the burn. If an estimate is available in time and exceeds the deadband, the burn is steered
+    against the estimate, up to the tilt limit. Otherwise the burn is not steered. Swinging and wind during the burn of
+    three seconds are not modelled. The computation time is an assumed constant, so that rows are reproducible bit for
+    bit.
 
     - true_m_s: horizontal velocity of the lander at the rockets' firing
     - estimated_m_s: the estimate, propagated to that time by the inertial unit; None without an estimate
-    - available_s: time from the last picture to the firing
+    - available_s: time from the last image to the firing
     """
     burn, steering = p.burn_error_m_s * rng.standard_normal(2), p.steering_error * rng.standard_normal(2)
     unsteered = true_m_s + burn
@@ -91,7 +91,7 @@ def conditions(
 ) -> dict[str, Scalar]:
     """Compute the columns of a case's conditions: true states, flight azimuth before entry, IMU temperature change.
 
-    The columns of custom instruments are included.
+    The row also contains the columns of custom instruments.
     """
     approach = instruments.approach
     entry_direction = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
@@ -120,12 +120,12 @@ def conditions(
 
 
 def instrument_errors(world: World, states: Sequence[State], measurements: DescentMeasurements) -> dict[str, Scalar]:
-    """Compute the columns of measurement errors, split into a part common to all pictures and an independent part.
+    """Compute the columns of measurement errors, split into a part common to all images and an independent part.
 
-    The common attitude error is the mean of the pictures' rotation vectors (world axes); the independent part is the
+    The common attitude error is the mean of the images' rotation vectors (world axes); the independent part is the
     RMS length of the residuals. Relative altitude errors are split likewise. True altitudes are heights above the
-    ground directly below; closer relief in the radar beam is an error. Velocity changes are between the last two
-    intervals.
+    ground directly below; a radar return from nearer relief is therefore an error. The velocity change is that between
+    the last two intervals.
     """
     rotations = np.stack(
         [
@@ -134,8 +134,10 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
         ]
     )
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
-    relative = altitudes_at_images(measurements) / heights - 1.0
-    tags = np.array([image.time_s for image in measurements.images]) - np.array([state.time_s for state in states])
+    relative_errors = altitudes_at_images(measurements) / heights - 1.0
+    tag_errors = np.array([image.time_s for image in measurements.images]) - np.array(
+        [state.time_s for state in states]
+    )
     true_changes, changes = (
         np.diff(velocities[:, :2], axis=0)
         for velocities in (mean_velocities(states), measurements.interval_velocities_m_s)
@@ -144,29 +146,31 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
     row: dict[str, Scalar] = {
         "attitude_error_common_deg": float(np.degrees(np.linalg.norm(rotations.mean(axis=0)))),
         "attitude_error_independent_deg": float(np.degrees(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))),
-        "altitude_error_common": float(relative.mean()),
-        "altitude_error_independent": float(np.sqrt(np.mean((relative - relative.mean()) ** 2))),
+        "altitude_error_common": float(relative_errors.mean()),
+        "altitude_error_independent": float(np.sqrt(np.mean((relative_errors - relative_errors.mean()) ** 2))),
     }
     if len(changes):
         row["velocity_change_error_m_s"] = float(np.hypot(*(changes[-1] - true_changes[-1])))
-    for number, (rotation, error, tag) in enumerate(zip(rotations, relative, tags, strict=True), start=1):
+    for number, (rotation, error, tag_error) in enumerate(
+        zip(rotations, relative_errors, tag_errors, strict=True), start=1
+    ):
         row[f"attitude_error_{number}_deg"] = float(np.degrees(np.linalg.norm(rotation)))
         row[f"altitude_error_{number}_m"] = float(error * heights[number - 1])
-        row[f"tag_error_{number}_s"] = float(tag)
+        row[f"tag_error_{number}_s"] = float(tag_error)
     return row
 
 
 def feasible_overlap_row(
     states: Sequence[State], world: World, camera: CameraModel, calibration: DetectorCalibration, options: DimesOptions
 ) -> dict[str, Scalar]:
-    """Count the grid points of the feasible overlap of three pictures: template and search window of DIMES fit there.
+    """Count the grid points of the feasible overlap of three images: template and search window of DIMES fit there.
 
     Attitudes, times, altitudes and camera are the true ones. As in DIMES, the zero-phase spot is excluded. If a pair
-    of pictures has no such point, the geometry makes DIMES fail.
+    of images has no such point, the geometry makes DIMES fail.
     """
     columns, rows = bin_factors(camera.size[::-1], options.binned_size)
-    samples = PATCH_M / world.surface.spacing_m
-    level = int(np.clip(np.rint(np.log2(max(samples, 1.0))), 0, len(world.surface.levels) - 1))
+    patch_samples = PATCH_M / world.surface.spacing_m
+    level = int(np.clip(np.rint(np.log2(max(patch_samples, 1.0))), 0, len(world.surface.levels) - 1))
     blank = np.zeros(options.binned_size[::-1], dtype=np.float32)
     views = []
     for state in states:

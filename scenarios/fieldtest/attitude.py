@@ -1,12 +1,14 @@
-"""Attitude of the pictures from surveyed targets at both ends of a flight and gyros in between (paper, III.D.2).
+"""Estimate the attitude at the images of a flight from surveyed targets and gyros (paper, III.D.2).
 
-The gyros map the target directions of all pictures of a pass over the targets to one instant. These directions and
-those from GPS determine the attitude at that instant. This is Wahba's problem. The paper solves it by QUEST, SciPy's
-`align_vectors` by singular value decomposition, with the same result. A constant gyro bias is fitted so that both
-passes agree; the gyros, corrected for that bias, propagate the attitude to the pictures in between.
+The helicopter passes over the targets at the start and at the end of the flight. The gyros map the target directions of
+all images of a pass to one instant. The directions in the images, and those from survey and GPS, determine the attitude
+at this instant: Wahba's problem. The paper solves it by QUEST. Here SciPy's `align_vectors` (singular value
+decomposition) has the same result. A constant gyro bias is fitted so that both passes agree. The gyros, corrected for
+this bias, propagate the attitude to the images between the passes.
 
-If the camera turns with the flight, the passes hardly observe the horizontal bias: its effects on the outbound and
-return legs cancel. A prior with the standard deviation of the IMU's class therefore bounds the fitted bias.
+The effects of a horizontal gyro bias on the outbound and the return legs cancel if the camera turns with the flight
+direction: the passes hardly observe this bias. A prior with the standard deviation of the IMU's class therefore limits
+the fitted bias.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from marsyard.sim.terrain import Surface
 
 #: Gauss-Newton iterations of attitude and bias.
 _ITERATIONS = 3
-#: Minimum distance of a measured target from the edge of the picture, pixels.
+#: Minimum distance of a measured target from the edge of the image, pixels.
 _BORDER_PX = 4.0
 
 
@@ -50,10 +52,10 @@ class Targets:
 
 @dataclass(frozen=True)
 class Sightings:
-    """Target directions measured in the pictures of a pass: one row per target and picture.
+    """Target directions measured in the images of a pass: one row per target and image.
 
-    - times_s: time tag of the picture
-    - camera: unit vector to the target in body axes, from its centroid in the picture
+    - times_s: time tag of the image
+    - camera: unit vector to the target in body axes, from its centroid in the image
     - world: unit vector to the target in world axes, from the survey and the helicopter's GPS position
     """
 
@@ -66,16 +68,16 @@ def sight_targets(
     targets: Targets,
     camera: CameraModel,
     motion: Motion,
-    tags_s: Float64[np.ndarray, "pictures"],
-    gps_m: Float64[np.ndarray, "pictures 3"],
+    tags_s: Float64[np.ndarray, "images"],
+    gps_m: Float64[np.ndarray, "images 3"],
     centroid_px: float,
     rng: np.random.Generator,
 ) -> Sightings:
-    """Project the targets into the pictures of a pass and add centroid errors; these pictures are not rendered.
+    """Project the targets into the images of a pass and add centroid errors; these images are not rendered.
 
     - camera: the camera in the body frame, at its origin
     - motion: true motion at the exposures
-    - tags_s, gps_m: time tags of the pictures and measured positions of the camera
+    - tags_s, gps_m: time tags of the images and measured positions of the camera
     - centroid_px: standard deviation of a centroid per axis
     """
     columns, rows = camera.size
@@ -99,10 +101,10 @@ def _normalize(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"
 def add_thermal_drift(
     increments: ImuIncrements, p: DriftParameters, flight: HelicopterFlight, start_s: float
 ) -> ImuIncrements:
-    """Add the gyro bias that follows the unit's temperature; `start_s` is the true time of the first boundary.
+    """Add the temperature-dependent gyro bias; `start_s` is the true time at which the increments start.
 
-    The temperature follows the air temperature with a first-order lag. The air is cooler from the end of the first pass
-    over the targets to the end of the last pass along the line.
+    The temperature of the unit follows the air temperature with a first-order lag. The air is cooler from the end of
+    the first pass over the targets to the end of the last pass along the line.
     """
     times = start_s + increments.period_s * (np.arange(len(increments.delta_angles_rad)) + 0.5)
     cooling, warming = (
@@ -134,7 +136,7 @@ def solve_attitude(
     for _ in range(_ITERATIONS):
         propagated = _propagate(increments, bias)
         predicted = (start * propagated.attitude(times)).apply(camera)
-        # matrices M with M w = v x w
+        # cross-product matrices of the predicted directions v: M w = v x w
         (x, y, z), zero = predicted.T, np.zeros(len(predicted))
         cross = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), 2, 0)
         # integral of the attitude matrix up to each time: rotation in the starting axes per unit of bias in body axes
@@ -152,6 +154,6 @@ def solve_attitude(
 
 
 def _propagate(increments: ImuIncrements, bias_rad_s: Float64[np.ndarray, "3"]) -> InertialSolution:
-    """Propagate the attitude relative to its initial value with the gyros corrected for a bias."""
+    """Propagate the attitude, relative to its initial value, with the gyro increments corrected for a bias."""
     corrected = replace(increments, delta_angles_rad=increments.delta_angles_rad - bias_rad_s * increments.period_s)
     return InertialSolution.propagate(corrected, Rotation.identity(), np.zeros(3), 0.0)

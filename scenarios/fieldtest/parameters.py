@@ -1,4 +1,4 @@
-"""Parameters of field test campaigns."""
+"""Parameters of field test campaigns: runs, helicopter, instruments, targets, and selection of triples."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ CAMERA = "mer-descent-field"
 
 
 class RunParameters(Parameters):
-    """A run: site, time, and number of picture triples of each category."""
+    """A run: site, time, and number of image triples of each category."""
 
     name: Annotated[str, Field(min_length=1, description="name of the run in the report")]
     site: Annotated[str, site_validator("a flight", "descent"), Field(description="preset of terrain and light")]
     begins: Annotated[AwareDatetime, Field(description="start of the first pass, with time zone")]
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0, description="east positive")]
-    short_time: Annotated[Count, Field(description="triples of pictures close in time")] = 0
+    short_time: Annotated[Count, Field(description="triples of images close in time")] = 0
     same_direction: Annotated[Count, Field(description="triples at three altitudes, one flight direction")] = 0
     opposite_direction: Annotated[Count, Field(description="triples at three altitudes, both directions")] = 0
     clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the site")] = None
@@ -47,17 +47,18 @@ class RunParameters(Parameters):
 
 
 class DriftParameters(Parameters):
-    """Drift of the gyro bias with the temperature of the inertial unit, which cools in the air during the passes.
+    """Drift of the gyro bias with the temperature of the inertial unit, which cools during the passes.
 
     The paper explains the scatter of the opposite-direction triples by "temperature variations in the IMU which negated
-    the constant bias assumption", without a value. The drift is chosen so that some of them exceed 5 m/s of error.
+    the constant bias assumption", without a value. The drift is chosen so that some of these triples have errors above
+    5 m/s.
     """
 
     across_deg_h_k: Annotated[
         float, Field(description="bias per temperature change of the gyro along the flight line, deg/h/K")
     ] = 1.0
     change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="final temperature change, K; 0: none")] = -22.0
-    time_constant_s: Annotated[Positive, Field(description="time constant of that change, s (assumed)")] = 300.0
+    time_constant_s: Annotated[Positive, Field(description="time constant of the cooling, s (assumed)")] = 300.0
 
 
 class TargetParameters(Parameters):
@@ -66,7 +67,7 @@ class TargetParameters(Parameters):
     placed: Annotated[int, Field(ge=3, le=1000, description="targets on the ground")] = 11
     used: Annotated[int, Field(ge=3, le=1000, description="targets used for attitude")] = 9
     within_m: Annotated[Positive, Field(description="half the side length of the targets' square, m (assumed)")] = 90.0
-    pictures: Annotated[int, Field(ge=1, le=1000, description="pictures of a pass over the targets")] = 20
+    pictures: Annotated[int, Field(ge=1, le=1000, description="images of a pass over the targets")] = 20
     centroid_px: Annotated[NonNegative, Field(description="error of a centroid per axis, px (assumed)")] = 0.15
     survey_m: Annotated[NonNegative, Field(description="error of the survey per axis, m (assumed)")] = 0.02
 
@@ -87,26 +88,26 @@ class ElevationParameters(Parameters):
 
 
 class PictureParameters(Parameters):
-    """Times of the pictures: the paper takes 20 pictures in less than 2 min (III.D.2)."""
+    """Times of the images: the paper takes 20 images in less than 2 min (III.D.2)."""
 
-    interval_s: Annotated[Positive, Field(le=60.0, description="time between pictures, s (assumed)")] = 3.0
+    interval_s: Annotated[Positive, Field(le=60.0, description="time between images, s (assumed)")] = 3.0
     clock: Annotated[ClockParameters, Field(description="time tag errors (assumed)")] = ClockParameters(
         offset_sd_s=0.0005, jitter_sd_s=0.0005
     )
 
 
 class TripleParameters(Parameters):
-    """Selection of triples from a run's pictures (paper, III.D and IV)."""
+    """Selection of triples from a run's images (paper, III.D and IV)."""
 
     virtual_interval_s: Annotated[
-        Positive, Field(le=60.0, description="time assigned to the interval of two pictures, s, as in the landings")
+        Positive, Field(le=60.0, description="time assigned to the interval of two images, s, as in the landings")
     ] = 3.75
-    max_speed_m_s: Annotated[Positive, Field(description="maximum speed over that interval, m/s, as in DIMES")] = 30.0
+    max_speed_m_s: Annotated[Positive, Field(description="maximum speed over a virtual interval, as in DIMES")] = 30.0
     overlap_fraction: Annotated[
-        Positive, Field(description="maximum distance between two picture centres divided by the altitude (assumed)")
+        Positive, Field(description="maximum distance between two image centres divided by the altitude (assumed)")
     ] = 0.3
-    min_step_m: Annotated[Positive, Field(description="minimum height step between pictures, m (assumed)")] = 150.0
-    max_step_m: Annotated[Positive, Field(description="maximum height step between pictures, m (assumed)")] = 390.0
+    min_step_m: Annotated[Positive, Field(description="minimum height step between images, m (assumed)")] = 150.0
+    max_step_m: Annotated[Positive, Field(description="maximum height step between images, m (assumed)")] = 390.0
 
 
 class FieldTestParameters(AlgorithmSelection, CustomScores):
@@ -143,7 +144,7 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
 
     @property
     def site_names(self) -> tuple[str, ...]:
-        """Sites of the runs without duplicates; the index of a site is that of its terrain."""
+        """Names of the runs' sites without duplicates; their indices are those of the shared terrains."""
         return tuple(dict.fromkeys(run.site for run in self.runs))
 
     def terrain(self, site_name: str) -> TerrainParameters:

@@ -1,7 +1,8 @@
 """Simulate and process a run of the field test: flight, sun, attitudes, altitudes and triples (paper, III.D and IV).
 
-The sun is that of Meeus, "Astronomical Algorithms" (1998), chapter 25, low accuracy: accurate to 0.01 deg in this
-century, without refraction (0.02 deg at 45 deg of elevation) and parallax (0.002 deg).
+The sun's direction is computed by the method of low accuracy in Meeus, "Astronomical Algorithms" (1998), chapter 25.
+The error is 0.01 deg in this century. Refraction (0.02 deg at 45 deg of elevation) and parallax (0.002 deg) are
+neglected.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from marsyard.scenarios.fieldtest.parameters import (
 )
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import Motion
-from marsyard.sim.dynamics.helicopter import HelicopterFlight, helicopter_flight
+from marsyard.sim.dynamics.helicopter import HelicopterFlight, draw_helicopter_flight
 from marsyard.sim.frames import direction
 from marsyard.sim.render import CloudLayer
 from marsyard.sim.sensor import preset
@@ -40,9 +41,9 @@ from marsyard.sim.terrain import Surface, TerrainBank, site
 
 _Generators = Callable[[str], np.random.Generator]
 
-#: Number of points on the flight line; their mean ground height is the reference of the flight's heights.
+#: Number of points on the flight line whose mean ground height is the reference of the flight's heights.
 _GROUND_POINTS = 256
-#: Number of posts of the elevation model beyond the requested points on each side.
+#: Margin of the elevation model around the requested points, posts.
 _MARGIN = 2
 #: Noon of 1 January 2000, and terrestrial time minus universal time in 2002, s.
 _J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
@@ -58,8 +59,8 @@ class Category(StrEnum):
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """Measurements at a run's pictures, one row per picture in the order taken.
+class ImageMeasurements:
+    """Measurements at a run's images, one row per image in the order taken.
 
     - pass_number: number of the pass
     - direction: direction of flight along the line, +1 or -1
@@ -77,29 +78,29 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Triple:
-    """Three pictures in the input order of DIMES, as indices of the run's pictures."""
+    """Category of three images, and their indices among the run's images in the input order of DIMES."""
 
     category: Category
-    pictures: tuple[int, int, int]
+    image_indices: tuple[int, int, int]
 
 
 def draw_triples(
-    run: RunParameters, pictures: Pictures, parameters: TripleParameters, rng: np.random.Generator
+    run: RunParameters, images: ImageMeasurements, parameters: TripleParameters, rng: np.random.Generator
 ) -> tuple[Triple, ...]:
     """Draw the triples of a run: for each category the specified number out of all candidates.
 
-    A short-time triple consists of consecutive pictures of one pass. Triples of the other categories have decreasing
+    A short-time triple consists of consecutive images of one pass. Triples of the other categories have decreasing
     altitudes, as in a landing. Raises ValueError if there are too few candidates.
     """
     # pairs that overlap and whose distance DIMES can measure over the virtual interval
-    min_altitude = np.minimum(pictures.altitude_m[:, None], pictures.altitude_m)
-    is_pair = _distances(pictures.centre_m) <= parameters.overlap_fraction * min_altitude
-    is_pair &= _distances(pictures.position_m[:, :2]) <= parameters.max_speed_m_s * parameters.virtual_interval_s
-    first = np.arange(len(pictures.pass_number) - 2)
-    in_one_pass = pictures.pass_number[first] == pictures.pass_number[first + 2]
+    min_altitude = np.minimum(images.altitude_m[:, None], images.altitude_m)
+    is_pair = _pairwise_distances(images.centre_m) <= parameters.overlap_fraction * min_altitude
+    is_pair &= _pairwise_distances(images.position_m[:, :2]) <= parameters.max_speed_m_s * parameters.virtual_interval_s
+    first = np.arange(len(images.pass_number) - 2)
+    in_one_pass = images.pass_number[first] == images.pass_number[first + 2]
     consecutive = first[in_one_pass & is_pair[first, first + 1] & is_pair[first + 1, first + 2]]
-    # all triples whose GPS height decreases by a permitted step from picture to picture
-    step = pictures.position_m[:, 2][:, None] - pictures.position_m[:, 2]
+    # all triples whose GPS height decreases by a permitted step from image to image
+    step = images.position_m[:, 2][:, None] - images.position_m[:, 2]
     is_step = is_pair & (step >= parameters.min_step_m) & (step <= parameters.max_step_m)
     descending = np.array(
         [
@@ -110,7 +111,7 @@ def draw_triples(
         ],
         dtype=np.int64,
     ).reshape(-1, 3)
-    same_direction = (np.diff(pictures.direction[descending], axis=1) == 0).all(axis=1)
+    same_direction = (np.diff(images.direction[descending], axis=1) == 0).all(axis=1)
     candidates = {
         Category.SHORT_TIME: (consecutive[:, None] + np.arange(3), run.short_time),
         Category.SAME_DIRECTION: (descending[same_direction], run.same_direction),
@@ -125,7 +126,7 @@ def draw_triples(
     return tuple(triples)
 
 
-def _distances(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n n"]:
+def _pairwise_distances(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n n"]:
     return np.asarray(np.linalg.norm(points[:, None] - points, axis=-1))
 
 
@@ -138,15 +139,16 @@ def sun_direction(time: datetime, latitude_deg: float, longitude_deg: float) -> 
         raise ValueError(f"the time {time} has no time zone; it needs one, as in 2002-10-15T12:00-07:00")
     days = (time - _J2000).total_seconds() / 86400.0
     t = (days + _TT_MINUS_UT_S / 86400.0) / 36525.0  # Julian centuries since J2000
+    # Meeus 25.2 to 25.8: mean longitude and anomaly, equation of centre, apparent longitude (nutation, aberration)
     mean_longitude = 280.46646 + 36000.76983 * t + 0.0003032 * t**2
     anomaly = np.radians(357.52911 + 35999.05029 * t - 0.0001537 * t**2)
-    centre = (
+    equation_of_centre = (
         (1.914602 - 0.004817 * t) * np.sin(anomaly)
         + (0.019993 - 0.000101 * t) * np.sin(2.0 * anomaly)
         + 0.000289 * np.sin(3.0 * anomaly)
     )
     node = np.radians(125.04 - 1934.136 * t)
-    longitude = np.radians(mean_longitude + centre - 0.00569 - 0.00478 * np.sin(node))
+    longitude = np.radians(mean_longitude + equation_of_centre - 0.00569 - 0.00478 * np.sin(node))
     obliquity = np.radians(23.4392911 - 0.0130042 * t + 0.00256 * np.cos(node))
     right_ascension = np.arctan2(np.cos(obliquity) * np.sin(longitude), np.cos(longitude))
     declination = np.arcsin(np.sin(obliquity) * np.sin(longitude))
@@ -164,7 +166,7 @@ def sun_direction(time: datetime, latitude_deg: float, longitude_deg: float) -> 
 
 @dataclass(frozen=True)
 class RunKey:
-    """Inputs of a run: the field test, the run's index in it, the campaign's seed and name."""
+    """Inputs that determine a run: the field test, the run's index in it, the campaign's seed and name."""
 
     field_test: FieldTestParameters
     number: int
@@ -178,9 +180,9 @@ class Run:
 
     - clouds: clouds that drift with the flight's time; None for a clear sky
     - flight: the true motion
-    - truth: true motion at the pictures of the passes
-    - pictures: measurements at the pictures
-    - attitudes: estimated attitudes at the pictures' time tags
+    - truth: true motion at the images of the passes
+    - images: measurements at the images
+    - attitudes: estimated attitudes at the images' time tags
     - triples: triples of the run, one per case
     """
 
@@ -189,7 +191,7 @@ class Run:
     clouds: CloudLayer | None
     flight: HelicopterFlight
     truth: Motion
-    pictures: Pictures
+    images: ImageMeasurements
     attitudes: Rotation
     triples: tuple[Triple, ...]
 
@@ -235,11 +237,11 @@ def simulate_run(key: RunKey) -> Run:
     offsets = np.linspace(-0.5, 0.5, _GROUND_POINTS) * p.helicopter.length_m
     line_heights = surface.height(centre[0] + offsets * np.sin(azimuth), centre[1] + offsets * np.cos(azimuth))
     origin = np.array([*centre, float(line_heights.mean())])
-    flight = helicopter_flight(p.helicopter, origin, azimuth, site(run.site).environment.gravity_m_s2, rng)
+    flight = draw_helicopter_flight(p.helicopter, origin, azimuth, site(run.site).environment.gravity_m_s2, rng)
     interval = p.pictures.interval_s
     pass_times = [np.arange(leg.start_s + 0.5 * interval, leg.end_s, interval) for leg in flight.passes]
     times = np.concatenate(pass_times)
-    passes = np.repeat(np.arange(len(pass_times)), [times.size for times in pass_times])
+    pass_indices = np.repeat(np.arange(len(pass_times)), [times.size for times in pass_times])
     clock = Clock.draw(p.pictures.clock, generator("camera clock"))
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
     position = gps.measure(flight, times, generator("gps noise")).values
@@ -250,9 +252,9 @@ def simulate_run(key: RunKey) -> Run:
     interpolation = generator("elevation interpolation").standard_normal(len(horizontal))
     altitude = position[:, 2] - (elevation_model(horizontal) + p.elevation.interpolation_m * interpolation)
     down = attitudes.apply(np.array([0.0, 0.0, -1.0]))
-    pictures = Pictures(
-        pass_number=np.array([leg.number for leg in flight.passes], dtype=np.int64)[passes],
-        direction=np.array([leg.direction for leg in flight.passes], dtype=np.int64)[passes],
+    images = ImageMeasurements(
+        pass_number=np.array([leg.number for leg in flight.passes], dtype=np.int64)[pass_indices],
+        direction=np.array([leg.direction for leg in flight.passes], dtype=np.int64)[pass_indices],
         position_m=position,
         altitude_m=altitude,
         centre_m=horizontal + (altitude / -down[:, 2])[:, None] * down[:, :2],
@@ -266,9 +268,9 @@ def simulate_run(key: RunKey) -> Run:
         clouds=clouds,
         flight=flight,
         truth=flight.motion(times),
-        pictures=pictures,
+        images=images,
         attitudes=attitudes,
-        triples=draw_triples(run, pictures, p.triples, generator("triples")),
+        triples=draw_triples(run, images, p.triples, generator("triples")),
     )
 
 

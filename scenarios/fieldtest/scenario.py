@@ -1,4 +1,4 @@
-"""Field test scenario: simulate, measure, estimate and score one picture triple of one run."""
+"""Field test scenario: simulate, measure, estimate and score one triple of images of a run."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from marsyard.sim.sensor.ranging import height_above_ground
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface, TerrainBank, site
 
-#: Pixel spacing of the grid on which cloud transmittance is evaluated.
+#: Spacing of the grid on which cloud transmittance is evaluated, pixels.
 CLOUD_GRID_PX = 32
-#: Cache sizes of grounds, runs and scenes: large enough for the paper's runs, because cases use them in turn.
+#: Cache sizes of grounds, runs and scenes: large enough for all runs of the paper, because the cases alternate runs.
 _CACHED_GROUNDS, _CACHED_RUNS, _CACHED_SCENES = 3, 16, 5
 
 
 @dataclass(frozen=True)
 class Case:
-    """A triple of a run, and the true states at its pictures."""
+    """A triple of a run, and the true states at its images."""
 
     run: Run
     triple: Triple
@@ -48,7 +48,7 @@ class Case:
 
 
 class FieldTestScenario(TerrainScenario[FieldTestParameters]):
-    """Picture triples of a helicopter flight, measured as in the paper, as input of a velocity estimator."""
+    """Triples of images from a helicopter flight, measured as in the paper, for a velocity estimator."""
 
     name = "fieldtest"
     parameters_type = FieldTestParameters
@@ -82,24 +82,24 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         key = RunKey(p, number, streams.seed, streams.campaign)
         run, ground = self._simulate_run(key), run_ground(key, self.load_ground)
         triple = run.triples[index]
-        first, second, third = (run.flight.state(float(time)) for time in run.truth.times_s[list(triple.pictures)])
+        first, second, third = (run.flight.state(float(time)) for time in run.truth.times_s[list(triple.image_indices)])
         case = Case(run, triple, (first, second, third))
-        # the same detector takes the pictures of all cases
+        # the same detector takes the images of all cases
         response = Streams(streams.seed, streams.campaign, 0).generator("detector response")
         detector = Detector.draw(camera_optics(field_camera()).fall_off, p.detector, response)
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
-        exposures = [take_picture(run, scene, ground, state, detector, noise) for state in case.states]
-        pictures = [counts for counts, _ in exposures]
+        exposures = [take_image(run, scene, ground, state, detector, noise) for state in case.states]
+        images = [counts for counts, _ in exposures]
         truth = truth_velocities(p, case)[1, :2]
-        measurements = measure(p, case, pictures, detector, calibrated_camera(p, streams))
-        # cloud transmittance on the ground of the second picture, at the time of each picture, and its changes
+        measurements = measure(p, case, images, detector, calibrated_camera(p, streams))
+        # cloud transmittance on the ground of the second image, at the time of each image, and its changes
         transmittances = cloud_transmittances(run, exposures[1][1], [state.time_s for state in case.states])
         changes = np.abs(np.diff(transmittances, axis=0))
         conditions = {
             **_conditions(p, case, measurements, ground.surface),
             **{f"cloud_transmittance_{n}": float(np.nanmean(field)) for n, field in enumerate(transmittances, start=1)},
             **{f"cloud_change_{pair}": float(np.nanmean(change)) for pair, change in enumerate(changes, start=1)},
-            **image_columns(p.backend, hash_images(pictures)),
+            **image_columns(p.backend, hash_images(images)),
         }
 
         def evaluate(algorithm: str) -> CaseResult:
@@ -115,14 +115,14 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
                 truths: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flight}
                 flight = ScoredFlight(measurements=measurements, answer=estimate, **truths)
                 row |= compute_scores(p.scores, flight, {*row, *conditions})
-            products = velocity_products(pictures, estimate, truth)
+            products = velocity_products(images, estimate, truth)
             return algorithm_result(algorithm_run, velocity is not None, row, products)
 
         return case_result(p.algorithms, evaluate, conditions)
 
 
 def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:
-    """Return the calibrated camera of the delivered pictures, the same in all cases."""
+    """Return the calibrated camera of the delivered images, the same in all cases."""
     rng = Streams(streams.seed, streams.campaign, 0).generator("camera calibration")
     return draw_calibrated(field_camera(), p.calibration, rng).bin(columns=1, rows=p.detector.rows_summed)
 
@@ -151,24 +151,24 @@ def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, 
 
     The paper's "biased IMU velocities" are the same differences (III.D.5).
     """
-    fixes = case.run.pictures.position_m[list(case.triple.pictures)]
+    fixes = case.run.images.position_m[list(case.triple.image_indices)]
     return np.asarray(np.diff(fixes, axis=0) / p.triples.virtual_interval_s)
 
 
 def measure(
     p: FieldTestParameters,
     case: Case,
-    pictures: Sequence[UInt16[np.ndarray, "rows columns"]],
+    images: Sequence[UInt16[np.ndarray, "rows columns"]],
     detector: Detector,
     camera: CameraModel,
 ) -> DescentMeasurements:
     """Create the inputs of an estimator: time tags at virtual intervals, and the calibrated camera (paper, III.D)."""
-    tags = [number * p.triples.virtual_interval_s for number in range(len(pictures))]
-    tagged_indices = list(zip(case.triple.pictures, tags, strict=True))
-    altitudes = case.run.pictures.altitude_m
+    tags = [number * p.triples.virtual_interval_s for number in range(len(images))]
+    tagged_indices = list(zip(case.triple.image_indices, tags, strict=True))
+    altitudes = case.run.images.altitude_m
     return DescentMeasurements(
         images=tuple(
-            DetectorImage(counts, tag, camera, detector.calibration) for counts, tag in zip(pictures, tags, strict=True)
+            DetectorImage(counts, tag, camera, detector.calibration) for counts, tag in zip(images, tags, strict=True)
         ),
         attitudes=tuple(AttitudeMeasurement(case.run.attitudes[k], tag) for k, tag in tagged_indices),
         altitudes=tuple(AltitudeMeasurement(float(altitudes[k]), tag) for k, tag in tagged_indices),
@@ -180,7 +180,7 @@ def measure(
 def _conditions(
     p: FieldTestParameters, case: Case, measurements: DescentMeasurements, surface: Surface
 ) -> dict[str, Scalar]:
-    run, indices = case.run, list(case.triple.pictures)
+    run, indices = case.run, list(case.triple.image_indices)
     true_altitudes = height_above_ground(surface, np.stack([state.position_m for state in case.states]))
     row: dict[str, Scalar] = {
         "run": run.parameters.name,
@@ -199,7 +199,7 @@ def _conditions(
     for number, (state, attitude, altitude, true_altitude) in enumerate(samples, start=1):
         errors.append((attitude.world_from_body * state.attitude.inv()).as_rotvec())
         row[f"picture_time_{number}_s"] = state.time_s
-        row[f"pass_{number}"] = int(run.pictures.pass_number[indices[number - 1]])
+        row[f"pass_{number}"] = int(run.images.pass_number[indices[number - 1]])
         row[f"altitude_{number}_m"] = float(true_altitude)
         row[f"altitude_error_{number}_m"] = altitude.altitude_m - float(true_altitude)
         row[f"off_nadir_{number}_deg"] = off_nadir_deg(state)
@@ -213,10 +213,10 @@ def _conditions(
     return row
 
 
-def take_picture(
+def take_image(
     run: Run, start_scene: Scene, ground: SiteGround, state: State, detector: Detector, rng: np.random.Generator
 ) -> tuple[UInt16[np.ndarray, "rows columns"], Float64[np.ndarray, "m n 3"]]:
-    """Render and expose a picture; return its counts and the ground points of a coarse pixel grid, world axes."""
+    """Render and expose an image; return its counts and the ground points of a coarse pixel grid, world axes."""
     p, scene = run.key.field_test, scene_at(run, start_scene, ground, state.time_s)
     frame, motion = render_state(p.backend, scene, camera_optics(field_camera()), state)
     brightness = sunlight_ratio(ground.site.environment, float(np.arcsin(scene.sun.direction[2])), p.detector)
@@ -236,15 +236,15 @@ def cloud_transmittances(
 
 
 def sun_at(run: Run, time_s: float) -> Sun:
-    """Return the sun over a run's site at a time of the run."""
+    """Return the sun at a run's site at a time of the flight."""
     return Sun(run.sun(time_s), site(run.parameters.site).environment.sun_radius_rad)
 
 
 def scene_at(run: Run, start_scene: Scene, ground: SiteGround, time_s: float) -> Scene:
     """Return the run's scene with the sun at a given time.
 
-    The sun is updated for every picture: it moves the shadows of clouds at 2.5 km by a third of a metre per second, and
-    the shadows would jump if the sun were fixed.
+    The sun is updated for every image, because its motion moves the shadows of clouds at 2.5 km height by a third of a
+    metre per second.
     """
     sun = sun_at(run, time_s)
     return replace(start_scene, sun=sun, photometry=ground.photometry(sun))
@@ -258,7 +258,7 @@ def run_ground(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> S
 
 
 def build_start_scene(run: Run, ground: SiteGround) -> Scene:
-    """Build a run's scene with the sun at its start; later pictures use the same objects with a new sun."""
+    """Build a run's scene with the sun at its start; later images use the same objects with a new sun."""
     east, north, _ = run.flight.origin_m.tolist()
     pixel_rad = camera_optics(field_camera()).rays.pixel_rad
     eye = Eye(east, north, run.key.field_test.helicopter.lowest_m, pixel_rad)

@@ -1,4 +1,4 @@
-"""True states and on-board poses at the two pictures of a case; choice of the pair on a helicopter flight."""
+"""Compute true states and on-board poses at the two images of a case; choose the pair from a helicopter flight."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marsyard.scenarios.landing.parameters import (
     PairParameters,
     add_range_faults,
     add_receiver_outage,
-    draw_received_pictures,
+    draw_received_images,
 )
 from marsyard.scenarios.views import nadir_pose
 from marsyard.sim.camera import CameraModel
@@ -28,22 +28,22 @@ from marsyard.sim.sensor.ranging import RangingUnit, range_along
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
-#: Minimum time between pictures, s; used for a camera at rest.
+#: Minimum time between the two images, s; applies to a camera at rest.
 MIN_INTERVAL_S = 0.1
 
 
 @dataclass(frozen=True)
 class Flight:
-    """True states and estimated poses at the two pictures."""
+    """True states and estimated poses at the two images."""
 
     states: tuple[State, State]  #: true states of the body; the camera is at the body's origin
     poses: tuple[PoseMeasurement, PoseMeasurement]  #: estimates of the on-board filter
-    up_body: Float64[np.ndarray, "3"]  #: up vector of the inclinometers at the first picture, body axes
+    up_body: Float64[np.ndarray, "3"]  #: up vector of the inclinometers at the first image, body axes
     transit: Transit | None = None  #: the helicopter flight; None if the parameters define the poses
 
     @classmethod
     def from_parameters(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> Flight:
-        """Create the flight of a case: a pair chosen from a helicopter flight, or the pair of the parameters."""
+        """Create the flight of a case: choose a pair from a helicopter flight, or use the poses of the parameters."""
         if p.helicopter is None:
             states = true_states(p, surface, streams)
             upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
@@ -58,8 +58,8 @@ class Flight:
         course = np.pi / 2 - np.radians(p.flown.heading_deg + p.flown.course_deg)
         gravity = p.preset.environment.gravity_m_s2
         transit = Transit.fly(helicopter, start_m, float(course), float(heading), gravity, streams)
-        received = draw_received_pictures(p.faults, transit.times_s.size, streams.generator("lost pictures"))
-        # laser ranges to the ground, without rocks, at all pictures
+        received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
+        # laser ranges to the ground, without rocks, at all images
         transit_states = [transit.state(number) for number in range(transit.times_s.size)]
         unit = RangingUnit.draw(p.laser, streams.generator("laser"))
         axes = [np.asarray(state.attitude.apply(unit.axis)) for state in transit_states]
@@ -68,28 +68,28 @@ class Flight:
             for state, axis in zip(transit_states, axes, strict=True)
         ]
         readings = unit.readings(transit.times_s, np.array(true_ranges), streams.generator("laser noise, transit"))
-        ranges = add_range_faults(p.faults, readings.values, height)[received]
+        ranges = add_range_faults(p.faults, readings.values, height)[received_indices]
         calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
-        choice = choose_pair([transit.pose(int(n)) for n in received], ranges, calibrated, p.pair, height)
-        first, second = int(received[choice.first]), int(received[choice.second])
+        choice = choose_pair([transit.pose(int(n)) for n in received_indices], ranges, calibrated, p.pair, height)
+        first, second = int(received_indices[choice.first]), int(received_indices[choice.second])
         poses = (transit.pose(first), transit.pose(second))
         return cls((transit_states[first], transit_states[second]), poses, transit.up_body(first), transit)
 
     @property
     def position_error_m(self) -> Float64[np.ndarray, "3"]:
-        """Estimated minus true position at the first picture."""
+        """Estimated minus true position at the first image."""
         return np.asarray(np.array(self.poses[0].world_from_body.translation) - self.states[0].position_m)
 
 
 def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams) -> tuple[State, State]:
-    """Compute the body's states at the pictures from the pair."""
+    """Compute the body's states at the two images from `PassParameters`."""
     pair = p.flown
     first = nadir_pose(surface, p.location.east_m, p.location.north_m, pair.height_m, pair.heading_deg)
     towards = np.radians(pair.tilt_towards_deg)
     # a rotation about the horizontal axis to the right of the azimuth tilts the optical axis towards the azimuth
     tilt = Rotation.from_rotvec(np.radians(pair.tilt_deg) * np.array([np.cos(towards), -np.sin(towards), 0.0]))
     attitude = tilt * first.rotation
-    # body axes: x towards the picture's right, y towards its upper edge, z opposite to the optical axis
+    # body axes: x towards the image's right, y towards its upper edge, z opposite to the optical axis
     rotation = Rotation.from_rotvec(np.radians([pair.pitch_deg, pair.yaw_deg, pair.roll_deg]))
     course = np.radians(pair.heading_deg + pair.course_deg)
     distance = pair.baseline_fraction * pair.height_m
@@ -107,7 +107,7 @@ def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams
 def measure_poses(
     p: LandingScenarioParameters, states: tuple[State, State], streams: Streams
 ) -> tuple[PoseMeasurement, PoseMeasurement]:
-    """Draw the filter's poses: an error common to both, and an error of the motion between them."""
+    """Draw the filter's poses with an error common to both poses, and an error of the motion between them."""
     n, rng = p.navigation, streams.generator("navigation")
     position = n.position_m * rng.standard_normal(3)
     motion = n.motion_m * rng.standard_normal(3)
@@ -125,7 +125,7 @@ def measure_poses(
 
 @dataclass(frozen=True)
 class PairChoice:
-    """Indices of the chosen pictures, their baseline perpendicular to the first optical axis, and their overlap."""
+    """Indices of the chosen images, their baseline perpendicular to the first optical axis, and their overlap."""
 
     first: int
     second: int
@@ -140,16 +140,17 @@ def choose_pair(
     parameters: PairParameters,
     height_m: float,
 ) -> PairChoice:
-    """Choose the pair with the highest score, the earliest of equal ones (landing paper, section V).
+    """Choose the pair with the highest score; among equal scores, the earliest pair (landing paper, section V).
 
-    Uses on-board data: poses of the filter, ranges of the laser, the calibrated camera; level ground is assumed. The
-    commanded height replaces a missing range. Pairs with too little overlap are used only if there are no others.
+    The choice uses on-board data: poses of the filter, ranges of the laser, and the calibrated camera; level ground is
+    assumed. The commanded height replaces a missing range. Pairs with an overlap below `min_overlap` are used only if
+    there are no other pairs.
 
-    Raises ValueError if there are fewer than two pictures.
+    Raises ValueError if there are fewer than two images.
     """
     if len(poses) < 2:
-        raise ValueError(f"cannot choose a pair from {len(poses)} pictures; at least 2 are needed")
-    views = [_PictureView.from_pose(camera, pose) for pose in poses]
+        raise ValueError(f"cannot choose a pair from {len(poses)} images; at least 2 are needed")
+    views = [_ImageView.from_pose(camera, pose) for pose in poses]
     best, best_score = None, (False, -np.inf)
     for i, first in enumerate(views[:-1]):
         distance = float(ranges_m[i]) if np.isfinite(ranges_m[i]) else height_m
@@ -168,20 +169,20 @@ def choose_pair(
                 best_score = (overlap >= parameters.min_overlap, score)
                 best = PairChoice(i, j, baseline, overlap)
     if best is None:
-        raise ValueError("no pair of pictures has finite poses")
+        raise ValueError("no pair of images has finite poses")
     return best
 
 
 @dataclass(frozen=True)
-class _PictureView:
-    """A picture's projection centre, optical axis, and corner rays, world axes."""
+class _ImageView:
+    """An image's projection centre, optical axis, and corner rays, world axes."""
 
     centre_m: Float64[np.ndarray, "3"]
     axis: Float64[np.ndarray, "3"]
     corners: Float64[np.ndarray, "4 3"]
 
     @classmethod
-    def from_pose(cls, camera: CameraModel, pose: PoseMeasurement) -> _PictureView:
+    def from_pose(cls, camera: CameraModel, pose: PoseMeasurement) -> _ImageView:
         rotation = pose.world_from_body.rotation
         columns, rows = camera.size
         rays = camera.rays(np.array([[0.0, 0.0], [columns, 0.0], [columns, rows], [0.0, rows]]) - 0.5)[1]

@@ -1,9 +1,9 @@
-"""Helicopter flight of a case with on-board navigation: transit for the pictures, and landing at the site.
+"""Simulate a helicopter flight with on-board navigation: a transit with images, then the landing at the site.
 
-The landing is controlled by the filter's estimate, and the filter's errors depend slightly on the flight. Picard
-iteration solves both: fly with the errors of the previous iteration, then simulate instruments and filter on that
-flight with the same random numbers, until the path converges. The fixed point is unique because the filter is causal.
-The change of the path in the last iteration is reported.
+The filter's estimate controls the landing, and the filter's errors depend slightly on the flight. Picard iteration
+solves for both. Each iteration flies with the errors of the previous iteration, then simulates instruments and filter
+on this flight with the same random numbers, until the path converges. The fixed point is unique because the filter is
+causal. The change of the path in the last iteration is reported.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from marsyard.sim.dynamics.rotorcraft import (
     RotorcraftFlight,
     RotorcraftParameters,
     TransitParameters,
-    landing_flight,
-    transit_flight,
+    simulate_landing,
+    simulate_transit,
 )
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.parameters import Parameters
@@ -57,8 +57,12 @@ class HelicopterParameters(Parameters):
     picture_clock: ClockParameters = Field(
         default=ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005), description="errors of the time tags (assumed)"
     )
-    averaging_after_s: float = Field(default=2.0, ge=2.0, le=3600.0, description="delay after touchdown (assumed)")
-    averaging_s: float = Field(default=5.0, gt=0.0, le=600.0, description="gives dozens of solutions, as in the paper")
+    averaging_after_s: float = Field(
+        default=2.0, ge=2.0, le=3600.0, description="start of the average after touchdown (assumed)"
+    )
+    averaging_s: float = Field(
+        default=5.0, gt=0.0, le=600.0, description="duration of the average: dozens of solutions, as in the paper"
+    )
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -95,7 +99,7 @@ class Instruments:
 
 @dataclass(frozen=True)
 class NavigatedLeg:
-    """The filter's solution over a leg of a flight, with the measurements used."""
+    """The filter's solution over a leg of a flight, and the measurements that it processes."""
 
     solution: NavigationSolution
     boundaries_s: Float64[np.ndarray, "m"]  #: true times of the solution's boundaries
@@ -141,15 +145,15 @@ class NavigatedLeg:
 
 @dataclass(frozen=True)
 class Transit:
-    """The flight during which pictures are taken."""
+    """The leg of the flight in which the images are taken."""
 
     parameters: HelicopterParameters
     instruments: Instruments
     air: Air
     flight: RotorcraftFlight  #: true flight
     navigated: NavigatedLeg
-    times_s: Float64[np.ndarray, "pictures"]  #: true mid-exposure times
-    tags_s: Float64[np.ndarray, "pictures"]  #: time tags of the pictures
+    times_s: Float64[np.ndarray, "images"]  #: true mid-exposure times
+    tags_s: Float64[np.ndarray, "images"]  #: time tags of the images
 
     @classmethod
     def fly(
@@ -161,14 +165,14 @@ class Transit:
         gravity_m_s2: float,
         streams: Streams,
     ) -> Transit:
-        """Simulate a flight whose first picture is commanded at `start_m`; angles are counterclockwise from east.
+        """Simulate a transit whose first image is commanded at `start_m`; angles are counterclockwise from east.
 
         The height of `start_m` is that of the ground plus `transit.height_m`.
         """
         p = parameters
         start, end = p.span_s
         air = Air.draw(p.air, p.craft.step_s, end - start, streams.generator("gusts"))
-        flight = transit_flight(
+        flight = simulate_transit(
             p.craft, p.transit, start_m, course_rad, heading_rad, gravity_m_s2, air, streams.generator("vibration")
         )
         instruments = Instruments.draw(p, gravity_m_s2, streams)
@@ -179,16 +183,16 @@ class Transit:
         return cls(p, instruments, air, flight, navigated, times, tags)
 
     def state(self, number: int) -> State:
-        """Return the true state at a picture."""
+        """Return the true state at an image."""
         return self.flight.path.state(float(self.times_s[number]))
 
     def pose(self, number: int) -> PoseMeasurement:
-        """Return the filter's pose at a picture's time tag."""
+        """Return the filter's pose at an image's time tag."""
         tag = float(self.tags_s[number])
         return PoseMeasurement(self.navigated.solution.pose(tag), tag)
 
     def up_body(self, number: int) -> Float64[np.ndarray, "3"]:
-        """Return the up vector in body axes from the inclinometers' last reading before a picture."""
+        """Return the up vector in body axes from the inclinometers' last reading before an image."""
         readings = self.navigated.readings
         last = int(np.searchsorted(readings.times_s, self.tags_s[number], side="right")) - 1
         up: Float64[np.ndarray, "3"] = readings.up_body[max(last, 0)]
@@ -227,7 +231,7 @@ def land(
 ) -> Touchdown | None:
     """Continue a transit to a site in estimated coordinates and land; None without ground contact in time.
 
-    `ground` contains the true heights around the site, including rocks.
+    `ground` contains the true heights around the site, including rocks. `laser_stuck_m` is the altimeter's stuck range.
     """
     p, path = transit.parameters, transit.flight.path
     noise = np.hypot(laser.parameters.noise_m, laser.parameters.noise * p.guidance.flare_range_m)
@@ -238,7 +242,7 @@ def land(
     errors, previous, end = transit_errors, None, None
     iterations, change_m, initial = 0, np.inf, transit.navigated.solution.end
     while iterations < MAX_ITERATIONS and change_m > CONVERGED_M:
-        flight = landing_flight(transit.flight, p.guidance, site_m[:2], errors, transit.air, ground, altimeter, end)
+        flight = simulate_landing(transit.flight, p.guidance, site_m[:2], errors, transit.air, ground, altimeter, end)
         path = flight.path
         end = path.span_s[1] if end is None else end
         navigated = NavigatedLeg.simulate(path, start, end, transit.instruments, streams, "landing", initial)

@@ -1,4 +1,4 @@
-"""Kernels: heights of rocks on a grid, robust planes, and slope and roughness of footprints."""
+"""Compiled kernels of `relief`: heights of rocks on a grid, robust planes, slope and roughness of footprints."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-#: Smaller deviations contribute their square (Huber loss), which makes the cost function differentiable.
+#: Deviations below this limit, m, contribute their square (Huber loss): the cost function is differentiable.
 SQUARED_BELOW_M = 1e-4
-#: Maximum change of the plane at convergence, and maximum number of iterations.
+#: Maximum change of the plane at convergence, m, and maximum number of iterations.
 CONVERGED_M, MAX_ITERATIONS = 1e-5, 60
 
 
@@ -72,7 +72,7 @@ def _fit_weighted_plane(x: Array, y: Array, z: Array, weights: Array, plane: Arr
 
 @njit(cache=True)
 def _fit_least_absolute_plane(x: Array, y: Array, z: Array, weights: Array) -> Array:
-    """Fit a plane of least absolute deviations by reweighted least squares: value at (0, 0) and slopes."""
+    """Fit a plane of least absolute deviations by iteratively reweighted least squares: value at (0, 0) and slopes."""
     plane, previous = np.empty(3), np.empty(3)
     weights[:] = 1.0
     _fit_weighted_plane(x, y, z, weights, plane)
@@ -99,9 +99,10 @@ class Disc(NamedTuple):
 def measure_footprints(
     heights: Array, spacing: float, centres: NDArray[np.int64], disc: Disc, limit: float
 ) -> tuple[Array, Array, Array]:
-    """Compute slope (rad), maximum distance from the plane (m), and area farther than `limit` (m2) of footprints.
+    """Compute slope (rad), maximum distance from the plane (m), and area beyond the limit (m2) of footprints.
 
-    `centres` are grid points (row, column); footprints must lie within the grid.
+    The area contains the points farther than `limit` (m) from the plane. `centres` are grid points (row, column);
+    footprints must lie within the grid.
     """
     offsets, fitted = disc.offsets, disc.fitted
     slopes, roughness, areas = np.empty(len(centres)), np.empty(len(centres)), np.empty(len(centres))

@@ -36,16 +36,20 @@ from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 
 
 class Faults(SizedFaults):
-    """Faults of a flight; lost pictures and receiver outages need a helicopter flight."""
+    """Faults of a landing case; lost images and receiver outages need a helicopter flight."""
 
-    black_picture: Annotated[int, bounded_field(0, 2, "number of the black picture, 1 or 2; 0: none")] = 0
-    repeated_picture: Annotated[int, bounded_field(0, 1, "1: the second picture is a copy of the first")] = 0
-    lost_rows: Annotated[float, bounded_field(0.0, 1.0, "fraction of lowest rows lost in picture 2")] = 0.0
-    lost_pictures: Annotated[float, bounded_field(0.0, 1.0, "fraction of pictures lost; two always arrive")] = 0.0
-    laser_silent: Annotated[int, bounded_field(0, 1, "1: the altimeter gives no range down to the ground")] = 0
+    black_picture: Annotated[int, bounded_field(0, 2, "number of the black image, 1 or 2; 0: none")] = 0
+    repeated_picture: Annotated[int, bounded_field(0, 1, "1: the second image is a copy of the first")] = 0
+    lost_rows: Annotated[float, bounded_field(0.0, 1.0, "fraction of lowest rows lost in image 2")] = 0.0
+    lost_pictures: Annotated[float, bounded_field(0.0, 1.0, "fraction of images lost; two always arrive")] = 0.0
+    laser_silent: Annotated[int, bounded_field(0, 1, "1: the altimeter returns no range, also in the landing")] = 0
     laser_stuck: Annotated[float, bounded_field(0.0, 5.0, "relative excess of the stuck range; 0: no fault")] = 0.0
-    gps_outage_s: Annotated[float, bounded_field(0.0, 300.0, "starts before picture 1, lasts to the end")] = 0.0
-    listed_bad_pixels: Annotated[float, bounded_field(0.0, 0.5, "`bad_pixels` that the camera lists and fills")] = 0.0
+    gps_outage_s: Annotated[
+        float, bounded_field(0.0, 300.0, "duration of the GPS outage before image 1; it lasts to the end")
+    ] = 0.0
+    listed_bad_pixels: Annotated[
+        float, bounded_field(0.0, 0.5, "fraction of bad pixels that the camera interpolates")
+    ] = 0.0
     vehicle_shadow_m: Annotated[float, bounded_field(0.0, 100.0, "diameter of the shadow disc; raises the sun")] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
@@ -65,9 +69,9 @@ def raise_sun_deg(faults: Faults, elevation_deg: float) -> float:
 
 
 def add_receiver_outage(faults: Faults, helicopter: HelicopterParameters) -> HelicopterParameters:
-    """Add the outage of the GPS receiver, from before the first picture until after the landing.
+    """Add the outage of the GPS receiver, from before the first image until after the landing.
 
-    The initial hover is longer by the outage, so that the filter is initialized with the receiver as in other flights.
+    The outage extends the initial hover, so that the filter is initialized with the receiver as in other flights.
     """
     if not faults.gps_outage_s:
         return helicopter
@@ -81,8 +85,8 @@ def add_receiver_outage(faults: Faults, helicopter: HelicopterParameters) -> Hel
     )
 
 
-def draw_received_pictures(faults: Faults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
-    """Draw the pictures of a flight that arrive, at least two; return their sorted indices."""
+def draw_received_images(faults: Faults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
+    """Draw the images of a flight that arrive, at least two; return their sorted indices."""
     received = max(2, count - round(faults.lost_pictures * count))
     return np.sort(rng.permutation(count)[:received]).astype(np.int64)
 
@@ -106,45 +110,45 @@ Angle = Annotated[float, Field(ge=-720.0, le=720.0)]
 
 
 class PassParameters(Parameters):
-    """Camera poses at the two pictures; by default level flight on a straight line.
+    """Camera poses at the two images; by default level flight on a straight line.
 
-    The motion between the pictures has components along the course, upwards, and rotations about the first picture's
+    The motion between the images has components along the course, upwards, and rotations about the first image's
     optical axis, right direction and up direction.
     """
 
-    height_m: float = Field(default=15.0, gt=0.0, le=2000.0, description="above the ground below the first picture, m")
+    height_m: float = Field(default=15.0, gt=0.0, le=2000.0, description="above the ground below the first image, m")
     baseline_fraction: float = Field(default=0.2, ge=0.0, le=2.0, description="horizontal distance divided by height")
     speed_m_s: Annotated[float, Field(ge=0.0, le=200.0, description="along the course, m/s")] = 3.0
-    heading_deg: Annotated[Angle, Field(description="azimuth of the picture's upper edge")] = 0.0
+    heading_deg: Annotated[Angle, Field(description="azimuth of the image's upper edge")] = 0.0
     course_deg: Annotated[Angle, Field(description="clockwise from the upper edge; 90: along the rows")] = 90.0
     tilt_deg: Annotated[float, Field(ge=0.0, le=60.0, description="angle of the first optical axis from nadir")] = 0.0
     tilt_towards_deg: Annotated[Angle, Field(description="azimuth of that tilt")] = 0.0
     climb_fraction: float = Field(default=0.0, gt=-0.9, le=5.0, description="change of height divided by height")
-    roll_deg: Annotated[Angle, Field(description="rotation about the optical axis between the pictures")] = 0.0
-    pitch_deg: Annotated[Angle, Field(description="rotation about the picture's right direction")] = 0.0
-    yaw_deg: Annotated[Angle, Field(description="rotation about the picture's up direction")] = 0.0
-    rate_deg_s: Annotated[NonNegative, Field(le=100.0, description="RMS attitude rate per axis at a picture")] = 0.0
+    roll_deg: Annotated[Angle, Field(description="rotation about the optical axis between the images")] = 0.0
+    pitch_deg: Annotated[Angle, Field(description="rotation about the image's right direction")] = 0.0
+    yaw_deg: Annotated[Angle, Field(description="rotation about the image's up direction")] = 0.0
+    rate_deg_s: Annotated[NonNegative, Field(le=100.0, description="RMS attitude rate per axis at an image")] = 0.0
 
 
 class NavigationParameters(Parameters):
     """Standard deviations per axis of the on-board poses and of the inclinometers, drawn for a case."""
 
-    position_m: NonNegative = Field(default=0.02, le=100.0, description="SD of the position, common to both pictures")
-    motion_m: Annotated[NonNegative, Field(le=10.0, description="SD of the motion between pictures, m")] = 0.01
-    tilt_deg: NonNegative = Field(default=0.3, le=30.0, description="SD of roll and pitch, common to both pictures")
-    azimuth_deg: NonNegative = Field(default=1.0, le=30.0, description="SD of the azimuth, common to both pictures")
-    turn_deg: Annotated[NonNegative, Field(le=10.0, description="SD of the rotation between pictures")] = 0.1
+    position_m: NonNegative = Field(default=0.02, le=100.0, description="SD of the position, common to both images")
+    motion_m: Annotated[NonNegative, Field(le=10.0, description="SD of the motion between images, m")] = 0.01
+    tilt_deg: NonNegative = Field(default=0.3, le=30.0, description="SD of roll and pitch, common to both images")
+    azimuth_deg: NonNegative = Field(default=1.0, le=30.0, description="SD of the azimuth, common to both images")
+    turn_deg: Annotated[NonNegative, Field(le=10.0, description="SD of the rotation between images")] = 0.1
     inclinometer_deg: NonNegative = Field(default=0.2, le=30.0, description="SD of the inclinometers' roll and pitch")
 
 
 class PairParameters(Parameters):
-    """Criterion of the pair choice: overlap times baseline; the baseline is limited to a fraction of the range.
+    """Score of a pair of images: overlap times baseline, with the baseline limited to a fraction of the range.
 
-    The paper mentions baseline and overlap; their weighting is assumed.
+    The paper mentions baseline and overlap; the weighting is assumed.
     """
 
     max_baseline_fraction: float = Field(default=0.2, gt=0.0, le=2.0, description="limit of baseline divided by range")
-    min_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="fraction of the first picture's ground")
+    min_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="fraction of the first image's ground")
 
 
 class LanderParameters(Parameters):
@@ -169,11 +173,11 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
 
     site: Annotated[str, Field(description="preset of terrain, light, texture and rocks")] = "heli-hazardous"
     scale: Annotated[Literal["ground", "descent"], Field(description="terrain of the site")] = "ground"
-    terrain_of: str | None = Field(default=None, description="site of the terrain; filled in, not to be set")
+    terrain_of: str | None = Field(default=None, description="site of the terrain; set automatically from `site`")
     terrain: CheckedTerrain = TerrainParameters()
     location: Location = Location()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom meshes on the ground")] = ()
-    texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture / the site's contrast")
+    texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture divided by the site's")
     sun: SunParameters = SunParameters()
     dust_opacity: DustOpacity = None
     camera: NamedOrCustomCamera = Field(default="xc-55", description="nadir camera preset, or a table with file")
@@ -183,7 +187,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     flown: PassParameters = Field(default=PassParameters(), description="poses; only azimuths for a helicopter")
     navigation: NavigationParameters = Field(default=NavigationParameters(), description="errors without helicopter")
     helicopter: HelicopterParameters | None = Field(default=None, description="helicopter flight and landing")
-    pair: PairParameters = Field(default=PairParameters(), description="choice of two pictures of a helicopter flight")
+    pair: PairParameters = Field(default=PairParameters(), description="choice of two images of a helicopter flight")
     laser: LaserParameters = LaserParameters()
     lander: LanderParameters = LanderParameters()
     faults: Faults = Faults()
@@ -242,7 +246,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
 
     @property
     def height_m(self) -> float:
-        """Commanded height of the pictures above the ground."""
+        """Commanded height of the images above the ground."""
         return self.flown.height_m if self.helicopter is None else self.helicopter.transit.height_m
 
     @property

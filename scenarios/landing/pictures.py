@@ -1,4 +1,4 @@
-"""World, pictures and measurements of a landing case; landing site truth and errors of the hazard map."""
+"""Simulate images and measurements of a landing case; compute landing site truth and errors of the hazard map."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import site
 from marsyard.sim.terrain.sites import SiteTexture
 
-#: Maximum number of grounds in a worker's cache; placing the rocks of a ground takes one or two seconds.
+#: Maximum number of grounds in a worker's cache; loading a ground with its rocks takes one or two seconds.
 MAX_GROUNDS = 64
 
 
 @dataclass(frozen=True)
 class World:
-    """Terrain with rocks, custom meshes and sun of a landing."""
+    """Terrain with rocks, custom meshes, and sun of a landing case."""
 
     ground: SiteGround
     sun: Sun
@@ -57,14 +57,14 @@ class World:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two pictures of a flight."""
+    """Two images of a flight."""
 
     images: tuple[DetectorImage, DetectorImage]  #: delivered images with the true camera
     frames: tuple[Frame, Frame]  #: rendered radiance and ground truth
 
     @property
     def counts(self) -> tuple[UInt16[np.ndarray, "rows columns"], UInt16[np.ndarray, "rows columns"]]:
-        """Detector counts of both pictures."""
+        """Detector counts of both images."""
         return self.images[0].counts, self.images[1].counts
 
     @property
@@ -73,9 +73,9 @@ class Pair:
         return self.range_along_m(self.images[0].camera.a)
 
     def range_along_m(self, axis: Float64[np.ndarray, "3"]) -> float:
-        """Compute the true range of the first picture along a direction (body axes): median of the four nearest pixels.
+        """Compute the true range of the first image along a direction (body axes): median of the four nearest pixels.
 
-        They are at most 0.7 px from the direction.
+        The centres of these pixels are at most 0.7 px from the direction.
         """
         ranges, image = self.frames[0].range_m, self.images[0]
         column, row = image.camera.project(np.array([axis]))[0][0]
@@ -84,13 +84,13 @@ class Pair:
         return float(np.median(ranges[first_row : first_row + 2, first_column : first_column + 2]))
 
 
-def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, optics: Optics, streams: Streams) -> Pair:
-    """Take both pictures of a flight; the first picture determines the exposure of both."""
+def take_images(p: LandingScenarioParameters, world: World, flight: Flight, optics: Optics, streams: Streams) -> Pair:
+    """Take both images of a flight; the first image determines the exposure of both."""
     settings = add_detector_faults(p.faults, p.detector)
     detector = Detector.draw(optics.fall_off, settings, streams.generator("detector response"))
     shadow_disc_m = max(p.lander.caster_diameter_m, p.faults.vehicle_shadow_m)
     lowest = min(flight.states, key=lambda state: float(state.position_m[2]))
-    # one scene for both pictures, with the detail that the lower picture needs
+    # one scene for both images, with the level of detail for the lower image
     eye = Eye.of(optics.rays, lowest.world_from_body, world.ground.surface)
     scene = add_meshes(site_scene(world.ground, eye, world.sun), world.meshes, (eye.east_m, eye.north_m))
     scene = replace(scene, caster_diameter_m=shadow_disc_m)
@@ -141,20 +141,20 @@ SAFE, UNSAFE, UNKNOWN = 0, 1, 255
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Ground truth of a flight on a sampling grid aligned with the first picture's horizontal axes."""
+    """Ground truth of a flight on a sampling grid aligned with the first image's horizontal axes."""
 
     relief: Relief
     limits: Limits
     positions: Float[np.ndarray, "rows columns 2"]  #: world x, y of the grid points
     footprints: Footprints  #: slope and roughness under a lander at each position
-    covered: Bool[np.ndarray, "rows columns"]  #: whether both pictures show the whole footprint
+    covered: Bool[np.ndarray, "rows columns"]  #: whether both images show the whole footprint
     step_m: float
 
     @classmethod
-    def from_pictures(cls, world: World, flight: Flight, pair: Pair, limits: Limits) -> GroundTruth:
-        """Compute the ground truth of the area in the first picture."""
+    def from_images(cls, world: World, flight: Flight, pair: Pair, limits: Limits) -> GroundTruth:
+        """Compute the ground truth of the area in the first image."""
         centre = flight.states[0].position_m
-        # rows: unit vectors of the picture's right and up directions on the ground
+        # rows: unit vectors of the image's right and up directions on the ground
         right = flight.states[0].attitude.apply(np.array([1.0, 0.0, 0.0]))[:2]
         right = right / np.hypot(*right)
         axes = np.array([right, [-right[1], right[0]]])
@@ -172,7 +172,7 @@ class GroundTruth:
         spacing = SPACING_DIAMETERS * limits.diameter_m
         relief = Relief.from_ground(world.ground, west_south, east_north, spacing, world.meshes)
         heights = relief.average(positions, relief.spacing_m)
-        # ground points that both pictures show
+        # ground points that both images show
         points = np.concatenate([flat_positions, heights.reshape(-1, 1)], axis=1)
         visible = np.ones(len(points), dtype=bool)
         for image, state in zip(pair.images, flight.states, strict=True):
@@ -185,7 +185,7 @@ class GroundTruth:
 
     @property
     def safe(self) -> Bool[np.ndarray, "rows columns"]:
-        """Safe positions whose whole footprint is in both pictures."""
+        """Safe positions whose whole footprint is in both images."""
         return np.asarray(self.covered & self.footprints.safe)
 
     @property
@@ -224,7 +224,7 @@ class GroundTruth:
 
 @dataclass(frozen=True)
 class RenderedFlight:
-    """A flight with its world, pictures and ground truth."""
+    """A flight with its world, images and ground truth."""
 
     p: LandingScenarioParameters
     world: World
@@ -236,17 +236,17 @@ class RenderedFlight:
     def simulate(
         cls, p: LandingScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank
     ) -> RenderedFlight:
-        """Simulate the flight of a case and take its pictures."""
+        """Simulate the flight of a case and take its images."""
         world = World.from_parameters(p, load_ground)
         flight = Flight.from_parameters(p, world.ground.surface, streams)
-        pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
-        return cls(p, world, flight, pair, GroundTruth.from_pictures(world, flight, pair, p.lander.limits))
+        pair = take_images(p, world, flight, camera_optics(p.optics), streams)
+        return cls(p, world, flight, pair, GroundTruth.from_images(world, flight, pair, p.lander.limits))
 
 
 #: Bounds of the hazard classes (slope or roughness divided by its limit), and names of the classes between them.
 CLASS_BOUNDS = (1.0, 1.5, 2.0, 3.0)
 CLASS_NAMES = ("below_1", "1_to_1.5", "1.5_to_2", "2_to_3", "above_3")
-#: Gross hazards (criterion 2 of the validation): minimum diameter in cells, and minimum roughness / limit.
+#: Gross hazards (criterion 2 of the validation): minimum diameter in map cells, and minimum roughness / limit.
 MIN_GROSS_CELLS, MIN_GROSS_ROUGHNESS = 3.0, 2.0
 
 
@@ -254,7 +254,7 @@ MIN_GROSS_CELLS, MIN_GROSS_ROUGHNESS = 3.0, 2.0
 class SampledMap:
     """The algorithm's hazard map, sampled at the truth's grid positions."""
 
-    #: whether the map has slope and roughness at the position, and both pictures show the whole footprint
+    #: whether the map has slope and roughness at the position, and both images show the whole footprint
     valid: Bool[np.ndarray, "rows columns"]
     safe: Bool[np.ndarray, "rows columns"]  #: whether the map classifies the position as safe
     flagged: Bool[np.ndarray, "rows columns"]  #: whether a hazard cell, before growth, is under the lander
@@ -283,9 +283,10 @@ class SampledMap:
 def count_hazards(ground: Ground, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
     """Count footprints by truth and map; sums over cases give rates.
 
-    For each class of roughness / limit and slope / limit: `footprints_*` counts all, `footprints_*_safe` those that the
-    map classifies as safe, `footprints_*_unflagged` those without a map hazard before growth. `gross_*` hazards have
-    twice the roughness limit and a diameter of at least three cells; `false_alarms` are flagged safe footprints.
+    Footprints are classified by roughness / limit and slope / limit. For each class, `footprints_*` is the number of
+    footprints, `footprints_*_safe` the number that the map classifies as safe, `footprints_*_unflagged` the number
+    without a hazard cell before growth. `gross_*` hazards have at least twice the roughness limit and a diameter of at
+    least three cells; `false_alarms` are safe footprints with a hazard cell.
     """
     footprints, valid, safe = truth.footprints, sampled.valid, sampled.safe
     ratios = {
@@ -319,9 +320,9 @@ def count_hazards(ground: Ground, sampled: SampledMap, truth: GroundTruth) -> di
 def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
     """Compute the errors of the map's elevation and slope.
 
-    The reference elevation is the mean of the exact heights in each cell, relative to the camera. `bias` is the mean
-    error, `rms` its RMS about zero, `noise` the robust standard deviation about the plane fitted to the errors, which
-    affects roughness. `outliers` is the fraction of errors beyond five standard deviations.
+    The reference elevation is the mean of the exact heights in a cell, relative to the camera. `bias` is the mean
+    error, `rms` the RMS error. `noise` is the robust standard deviation of the errors about a fitted plane; it affects
+    roughness. `outliers` is the fraction of errors beyond five times `noise`.
     """
     rows, columns = np.indices(ground.elevation.elevation_m.shape)
     local = ground.elevation.positions(np.stack([rows, columns], axis=-1).astype(np.float64))
@@ -351,5 +352,5 @@ def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: Groun
 
 
 def _robust_deviation(values: Float[np.ndarray, "n"]) -> float:
-    """Compute a robust standard deviation, at least 1e-12 in case more than half of the values are equal."""
+    """Compute a robust standard deviation (1.4826 times the median absolute deviation), at least 1e-12."""
     return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-12)

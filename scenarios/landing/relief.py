@@ -63,7 +63,7 @@ class Relief:
         spacing_m: float,
         meshes: Sequence[MeshParameters] = (),
     ) -> Relief:
-        """Compute heights between two corners (x, y) with custom meshes; rocks are finer than the grid resolves."""
+        """Compute heights of ground, rocks and custom meshes on a grid between two corners (x, y)."""
         columns, rows = (int(n) for n in np.ceil((high_m - low_m) / spacing_m) + 1)
         west, south = float(low_m[0]), float(low_m[1])
         x, y = np.meshgrid(west + spacing_m * np.arange(columns), south + spacing_m * np.arange(rows))
@@ -71,7 +71,7 @@ class Relief:
         centre = 0.5 * (low_m + high_m)
         if ground.rocks is not None:
             radius = 0.5 * float(np.hypot(*(high_m - low_m))) + float(ground.rocks.diameter_m.max(initial=0.0))
-            # rocks as detailed as in a view from far above with pixels of the grid's spacing
+            # rocks with the level of detail of a distant view from above, with pixels of the grid's spacing
             mesh = ground.rocks.near(
                 float(centre[0]), float(centre[1]), radius, above_m=1e3 * radius, pixel_rad=spacing_m / (1e3 * radius)
             )
@@ -88,7 +88,7 @@ class Relief:
         return np.asarray((positions_m - np.array([self.west_m, self.south_m]))[..., ::-1] / self.spacing_m)
 
     def average(self, points: Float[np.ndarray, "rows columns 2"], side_m: float) -> Float[np.ndarray, "rows columns"]:
-        """Compute mean heights of squares with this side around positions (x, y); NaN outside the grid."""
+        """Compute mean heights of squares of side `side_m` around positions (x, y); NaN outside the grid."""
         width = max(round(side_m / self.spacing_m), 1)
         means = cv2.blur(self.heights_m, (width, width)) if width > 1 else self.heights_m
         rows, columns = np.moveaxis(self.cells(points).astype(np.float32), -1, 0)

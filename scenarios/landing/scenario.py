@@ -1,4 +1,4 @@
-"""Landing scenario: world, flight, pictures, estimate, landing and score of a case."""
+"""Landing scenario: simulate images and measurements, run the algorithms, simulate the landings, and score them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from marsyard.sim.terrain import TerrainBank
 
 
 class LandingScenario(TerrainScenario[LandingScenarioParameters]):
-    """Two pictures of the ground from a moving camera as input of a landing site estimator."""
+    """Estimation of a landing site from two images of a moving camera, and the landing at this site."""
 
     name = "landing"
     parameters_type = LandingScenarioParameters
@@ -43,7 +43,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         super().__init__(MAX_GROUNDS)
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return the indices of the bank's terrains; empty for a large bank, whose terrains each flight builds."""
+        """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""
         bank = self.check_parameters(parameters).location.bank
         return tuple(range(bank)) if bank <= MAX_GROUNDS else ()
 
@@ -56,7 +56,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         return TerrainBank(p.terrain, p.location.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """Yield the two delivered pictures of a case with the ground truth of their pixels."""
+        """Yield the two delivered images of a case with the ground truth of their pixels."""
         case = RenderedFlight.simulate(self.check_parameters(parameters), streams, self.load_ground)
         p, pair = case.p, case.pair
         for frame, image, state in zip(pair.frames, pair.images, case.flight.states, strict=True):

@@ -27,9 +27,9 @@ NAN = float("nan")
 MAX_TRACK_ERROR_PX = 1.0
 #: Width of the border in which features need not be tracked, px.
 BORDER_PX = 12.0
-#: Minimum fraction of correct tracks, among the features in both pictures, of a well-tracked pair.
+#: Minimum fraction of correct tracks, among the features in both images, of a well-tracked pair.
 MIN_TRACKED_FRACTION = 0.9
-#: Match statuses that are counted: reasons for dropped matches.
+#: Match statuses whose matches are dropped and counted.
 DROP_STATUSES = (MatchStatus.DISSIMILAR, MatchStatus.OUT_OF_BOUNDS, MatchStatus.NOT_RETURNED)
 #: Maximum changes for tracking (section II.A): rotation about the optical axis, about other axes, relative height.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_CLIMB = 10.0, 20.0, 0.2
@@ -41,7 +41,7 @@ MOTION_COLUMNS = (
     "motion_residual_px", "points", "matched_fraction", "map_rows", "map_columns", "cell_m",
     "matches_dissimilar", "matches_out_of_bounds", "matches_not_returned",
 )  # fmt: skip
-#: Columns of the true ground under a lander; the name of the position is their prefix.
+#: Columns of the true ground under a lander; their prefix is the name of the position (`site`, `touchdown`).
 GROUND_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m")
 TOUCHDOWN_COLUMNS = (
     "touchdown_error_gps_m", "touchdown_error_estimated_m", "touchdown_error_m", "gps_deviation_north_m",
@@ -51,7 +51,7 @@ TOUCHDOWN_COLUMNS = (
 
 
 def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
-    """Compute the outcome columns of requirement populations; a crashed algorithm has none and fails in all."""
+    """Compute the outcome columns that select requirement populations; a crashed algorithm has no such columns."""
     return {
         "converged": estimate.outcome.converged,
         "site_reported": estimate.outcome is SiteOutcome.SAFE_SITE,
@@ -60,10 +60,10 @@ def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
 
 
 def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
-    """Classify the flight by the true ground: no safe site, only safe sites without margin, or sites with a margin.
+    """Classify the flight by its true ground: no safe site, only safe sites without margin, or safe sites with margin.
 
-    The surroundings of a site with margin (`wide_site_exists`) are safe up to a lander's radius. Every flight is in one
-    of `no_safe_site_exists`, `narrow_site_exists` and `wide_site_exists`.
+    The ground around a site with margin is safe up to a lander's radius. Exactly one of `no_safe_site_exists`,
+    `narrow_site_exists` and `wide_site_exists` is true.
     """
     has_safe_site, has_margin = bool(np.any(truth.safe)), bool(np.any(truth.safe_with_margin))
     return {
@@ -77,7 +77,7 @@ def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
 def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
     """Compare the reported site with the ground truth.
 
-    The true site is the reported site minus the navigation error at the first picture. Only the outcome SAFE_SITE
+    The true site is the reported site minus the navigation error at the first image. Only the outcome SAFE_SITE
     reports a safe site. If the algorithm did not converge, the a-priori site is scored.
     """
     row = _ground_row("site", _true_site(estimate, flight), truth)
@@ -108,9 +108,9 @@ def landing_row(
 
     `touchdown_error_gps_m` is the distance from the receiver's averaged solutions to the site's coordinates, as
     measured in the paper. `touchdown_error_m` is the distance from the true touchdown to the true site, which excludes
-    the navigation error at the first picture. `touchdown_safe` is true if the ground under the helicopter is safe.
-    `touchdown_sink_m_s` and `touchdown_drift_m_s` are its vertical and horizontal speed. Without a site or a helicopter
-    there is no landing: numbers are NaN, and `touchdown_safe` is missing.
+    the navigation error at the first image. `touchdown_safe` is true if the ground under the helicopter is safe.
+    `touchdown_sink_m_s` and `touchdown_drift_m_s` are the vertical and horizontal speeds at touchdown. Without a site
+    or a helicopter there is no landing: numbers are NaN, and `touchdown_safe` is missing.
     """
     site, relief, touchdown = estimate.site_world, truth.relief, None
     if flight.transit is not None and site is not None:
@@ -239,7 +239,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     slopes = truth.footprints.slope_rad[covered]
     # the paper's limits of tracking (section II.A)
     pitch, yaw, roll = np.degrees(np.abs(true_motion(case.flight, pair).rotation.as_rotvec()))
-    # height and attitude at the first picture, motion and rotation to the second
+    # height and attitude at the first image, motion and rotation to the second
     first, second = case.flight.states
     motion = second.position_m - first.position_m
     positions = np.stack([first.position_m, second.position_m])
@@ -307,13 +307,13 @@ def _navigation_errors(flight: Flight, measurements: LandingMeasurements) -> dic
 def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
     """Return the arrays for the case's figures.
 
-    They are those of `marsyard.algorithms.hda.hda_products` (Figs. 1-5 and 7), and
+    The arrays are those of `marsyard.algorithms.hda.hda_products` (Figs. 1-5 and 7), and:
 
-    - `image_1`, `image_2`: the pictures;
+    - `image_1`, `image_2`: the images;
     - `true_rotation`, `true_translation`: true motion from the first to the second camera's frame;
     - `true_places`, `true_slope`, `true_roughness`, `true_safe`, `true_covered`: the truth's sampling grid, world axes;
     - `true_heights`, `true_corner`, `true_spacing`: exact heights, world axes (row i at y = corner[1] + i spacing);
-    - `camera_true`, `camera_believed`: body poses at the first picture (4 x 4), true and estimated on board;
+    - `camera_true`, `camera_believed`: body poses at the first image (4 x 4), true and estimated on board;
     - `limits`: the algorithm's limits of slope (radians) and roughness (metres), and the lander's diameter;
     - `site_true`: true x, y of the reported site (see `site_row`).
     """

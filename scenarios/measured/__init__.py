@@ -1,5 +1,5 @@
-"""Real pictures with measured attitudes and altitudes, ingested from a user's folder (docs/real-pictures.md).
+"""Real images with measured attitudes and altitudes, ingested from a user's folder (docs/real-pictures.md).
 
 `layout` reads the folder, `ingest` converts it to cases, `store` reads and writes cases, and `scenarios` compares
-algorithms and pictures with the measured poses.
+algorithms and images with the measured poses.
 """

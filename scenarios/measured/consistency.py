@@ -1,10 +1,10 @@
-"""Compare pictures with measured poses: match features, and measure their distance from the epipolar lines.
+"""Compare images with measured poses: match features, and compute their distances from the epipolar curves.
 
 SIFT features (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 60, 2004) are matched with the
-ratio test and a cross check. Matches that no rigid motion explains (essential matrix with RANSAC, independent of the
-poses) are outliers and ignored. According to the poses, a feature of the earlier picture is on an epipolar curve of the
-later picture: from the direction of the earlier camera to the feature's direction at infinity. The offset is the
-distance of the match from the nearest point of that curve, which is a single point for pictures from one position.
+ratio test and a cross check. An essential matrix, fitted by RANSAC without the poses, separates inliers from outliers.
+Outliers are ignored. The poses define the epipolar curve of a feature of the earlier image: the projection of its ray
+into the later image, from the position of the earlier camera to infinity. The residual is the distance of the match
+from the nearest point of this curve. For two images from one position, the curve is a single point.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import DetectorImage
 
-#: Maximum number of features of a picture; maximum distance ratio (Lowe, Fig. 11).
+#: Maximum number of features of an image; maximum distance of the best match / second-best match (Lowe, Fig. 11).
 _MAX_FEATURES, _RATIO = 4000, 0.8
-#: RANSAC: maximum distance of an inlier from its epipolar line, pixels, and probability of a clean sample.
+#: RANSAC: maximum distance of an inlier from its epipolar line, pixels, and probability of a sample without outlier.
 _MAX_DISTANCE_PX, _CONFIDENCE = 2.0, 0.9999
-#: Minimum number of matches: an essential matrix passes through any five.
+#: Minimum number of matches; five matches always have an essential matrix without residuals.
 MIN_MATCHES = 15
 #: Distance that represents infinity, m.
 _INFINITY_M = 1e7
-#: Quantiles of the counts that become black and white.
+#: Quantiles of the counts that are mapped to black and white before feature detection.
 _STRETCH = (0.005, 0.995)
 
 _Features: TypeAlias = tuple[Float64[np.ndarray, "n 2"], np.ndarray]
@@ -40,7 +40,7 @@ _Features: TypeAlias = tuple[Float64[np.ndarray, "n 2"], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """Pixels (u, v) of features matched between an earlier and a later picture; a rigid motion explains the inliers."""
+    """Pixels (u, v) of features matched between an earlier and a later image; inliers fit one rigid motion."""
 
     pixels: Float64[np.ndarray, "2 n 2"]
     inliers: Bool[np.ndarray, "n"]
@@ -48,9 +48,9 @@ class PairMatches:
 
 @dataclass(frozen=True, eq=False)
 class PairAgreement:
-    """Matches of two pictures, and their offsets from the positions that the poses predict.
+    """Matches of two images, and their offsets (u, v) from the epipolar curves that the poses define.
 
-    The offsets are in pixels of the later picture; NaN if its camera cannot see the predicted point.
+    The offsets are in pixels of the later image; NaN if its camera cannot see the predicted point.
     """
 
     matches: PairMatches
@@ -66,7 +66,7 @@ class PairAgreement:
 
 
 def match_images(images: Sequence[DetectorImage]) -> list[PairMatches]:
-    """Match the features of each picture with those of the next picture."""
+    """Match the features of each image with the features of the next image."""
     features = [_detect_features(image) for image in images]
     return list(map(_match_pair, itertools.pairwise(images), itertools.pairwise(features)))
 
@@ -74,7 +74,7 @@ def match_images(images: Sequence[DetectorImage]) -> list[PairMatches]:
 def compare_with_poses(
     images: Sequence[DetectorImage], pairs: Sequence[PairMatches], poses: Sequence[RigidTransform]
 ) -> list[PairAgreement]:
-    """Compare the matches of a case's pictures with the body's pose at each picture."""
+    """Compare the matches of a case's images with the body's pose at each image."""
     cameras = [image.camera.transform(pose) for image, pose in zip(images, poses, strict=True)]
     return [
         PairAgreement(pair, epipolar_offsets_px(earlier, later, pair.pixels[0], pair.pixels[1]))
@@ -99,9 +99,9 @@ def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
 
 
 def agreement_products(images: Sequence[DetectorImage], pairs: Sequence[PairAgreement]) -> dict[str, object]:
-    """Return arrays for figures: `image_<k>`, and `matches_<k>` of each pair of pictures k and k + 1.
+    """Return arrays for figures: `image_<k>`, and `matches_<k>` of each pair of images k and k + 1.
 
-    The columns of `matches_<k>` are u and v in the earlier and in the later picture, the offset in u and v, and 1 for
+    The columns of `matches_<k>` are u and v in the earlier and in the later image, the offset in u and v, and 1 for
     inliers.
     """
     products: dict[str, object] = {f"image_{number}": image.counts for number, image in enumerate(images, start=1)}
@@ -115,7 +115,7 @@ def _detect_features(image: DetectorImage) -> _Features:
     """Detect SIFT features on nearly square pixels, without the flat field; return delivered pixels and descriptors."""
     fu, fv = image.camera.focal_lengths
     rows, columns = image.counts.shape
-    column_bin, row_bin = _binning(fu / fv, columns), _binning(fv / fu, rows)
+    column_bin, row_bin = _square_pixel_factor(fu / fv, columns), _square_pixel_factor(fv / fu, rows)
     signal = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
     binned = signal.reshape(rows // row_bin, row_bin, columns // column_bin, column_bin).mean(axis=(1, 3))
     black, white = np.quantile(binned, _STRETCH)
@@ -127,16 +127,16 @@ def _detect_features(image: DetectorImage) -> _Features:
     return (binned_points + 0.5) * np.array([column_bin, row_bin]) - 0.5, descriptors
 
 
-def _binning(ratio: float, extent: int) -> int:
-    """Return the number of pixels to average along a side that is sampled more finely than the other by `ratio`."""
+def _square_pixel_factor(ratio: float, extent: int) -> int:
+    """Return the number of pixels to average along a side whose focal length, in pixels, is larger by `ratio`."""
     factor = max(round(ratio), 1)
     return factor if extent % factor == 0 else 1
 
 
 def _match_pair(images: tuple[DetectorImage, DetectorImage], features: tuple[_Features, _Features]) -> PairMatches:
-    """Match features that are mutual nearest neighbours and pass the ratio test.
+    """Match features that are mutual nearest neighbours and pass the ratio test; find the inliers by RANSAC.
 
-    Inliers are the matches that one rigid motion between the cameras explains, independent of the poses.
+    Inliers are consistent with one rigid motion between the cameras. The measured poses are not used.
     """
     (earlier, descriptors), (later, later_descriptors) = features
     matches: dict[tuple[float, ...], tuple[int, int]] = {}
@@ -174,7 +174,7 @@ def epipolar_offsets_px(
     pixels: Float64[np.ndarray, "n 2"],
     later_pixels: Float64[np.ndarray, "n 2"],
 ) -> Float64[np.ndarray, "n 2"]:
-    """Return the offsets of matches from the nearest points of their epipolar curves in the second picture, pixels.
+    """Return the offsets of matches from the nearest points of their epipolar curves in the second image, pixels.
 
     The cameras are in one frame. NaN if the second camera cannot see the point. From the second camera, a ray of the
     first camera spans the arc from the direction of the first camera, `baseline`, to the direction of the ray. The

@@ -1,4 +1,4 @@
-"""Convert a folder of recorded pictures into stored cases and their campaign: `marsyard ingest`."""
+"""Convert a folder of recorded images into stored cases and their campaign: `marsyard ingest`."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from marsyard.scenarios.measured.layout import (
     LANDING,
     TABLE_FILE,
     VELOCITY,
+    ImageRow,
     IngestError,
     IngestFile,
-    PictureRow,
     SunTable,
-    file_head,
     read_counts,
     read_flat_field,
+    read_header,
     read_ingest_file,
     read_table,
 )
@@ -38,21 +38,22 @@ from marsyard.sim.camera.pds import is_pds3
 from marsyard.sim.frames import SITE_FROM_WORLD
 
 _POSITION = ("x_m", "y_m", "z_m")
-#: Maximum number of rows that a detector sums, and the tolerance of the ratio of a camera's scales relative to a whole
+#: Maximum number of rows that a detector sums, and maximum relative deviation of a ratio of focal lengths from a whole
 #: number. Calibrated focal lengths are accurate to 1 %; the next whole number after 8 differs by 12 %.
 _MAX_SUMMED_ROWS, _RATIO_TOLERANCE = 64, 0.05
 _DESCRIPTIONS = {
-    "velocity": "Real descents: horizontal velocity from three pictures.",
-    "landing": "Real flights: landing sites from two pictures.",
-    "matching": "Real pictures against their measured poses.",
+    "velocity": "Real descents: horizontal velocity from three images.",
+    "landing": "Real flights: landing sites from two images.",
+    "matching": "Real images against their measured poses.",
 }
 
 
 def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
     """Write the cases of a folder, and return their campaign.
 
-    - source: folder with `ingest.toml`, `pictures.csv` and pictures (docs/real-pictures.md)
-    - target, final: folder that the cases are written to, and folder that they are moved to afterwards
+    - source: folder with `ingest.toml`, `pictures.csv` and images (docs/real-pictures.md)
+    - target: folder for the new cases
+    - final: folder to which `target` is moved afterwards
 
     Raises ValueError if the folder is invalid: the message contains the file, and the line or key. Raises OSError if
     the cases cannot be written.
@@ -64,7 +65,7 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
             f"rows_summed = {rows_summed}: computed from the camera, whose pixels are longer than wide by "
             f"that factor; rows_summed under [detector] of {INGEST_FILE} overrides it"
         )
-    if stored.task == VELOCITY:  # DIMES bins the delivered pictures, whose rows are already summed
+    if stored.task == VELOCITY:  # DIMES bins the delivered images, whose rows are already summed
         columns, rows = stored.cases[0].pictures[0].size
         binned_size = binned_size_for(columns, rows * rows_summed)
         binned_size = binned_size if rows % binned_size[1] == 0 else (columns, rows)
@@ -127,10 +128,10 @@ def infer_summed_rows(camera: CameraModel) -> int:
 
 
 @dataclass(frozen=True)
-class _Picture:
-    """A picture as read, with its pose in the world axes of Marsyard."""
+class _RecordedImage:
+    """An image as read, with its pose in the world axes of Marsyard."""
 
-    row: PictureRow
+    row: ImageRow
     counts: UInt16[np.ndarray, "rows columns"]
     camera: CameraModel
     time_s: float
@@ -140,7 +141,7 @@ class _Picture:
 
 @dataclass
 class _FolderReader:
-    """Reads the cases of `source` and writes them to `target`; each camera and flat field is written once."""
+    """Reads the cases of a folder `source` and writes them to `target`; each camera and flat field is written once."""
 
     source: Path
     file: IngestFile
@@ -148,17 +149,17 @@ class _FolderReader:
     cameras: dict[CameraModel, store.StoredFile] = field(default_factory=dict)
     flat_fields: dict[Path, tuple[store.StoredFile, tuple[int, ...]]] = field(default_factory=dict)
 
-    def store_case(self, number: int, name: str, rows: Sequence[PictureRow]) -> store.StoredCase:
-        """Read and check one case, and write its pictures."""
-        pictures = [self._read_picture(row) for row in rows]
-        for earlier, later in itertools.pairwise(pictures):
+    def store_case(self, number: int, name: str, rows: Sequence[ImageRow]) -> store.StoredCase:
+        """Read and check the rows of a case, and write its images."""
+        images = [self._read_image(row) for row in rows]
+        for earlier, later in itertools.pairwise(images):
             if later.time_s <= earlier.time_s:
                 raise later.row.error(f"time goes from {earlier.time_s:g} to {later.time_s:g} s; it must increase")
-        stored = [self._store_picture(f"{number:06d}-{index}", item) for index, item in enumerate(pictures, start=1)]
+        stored = [self._store_image(f"{number:06d}-{index}", item) for index, item in enumerate(images, start=1)]
         measurements: dict[str, Any] = {}
-        truth = self._read_truth(pictures)
+        truth = self._read_truth(images)
         if self.file.task == VELOCITY:
-            measurements["interval_velocities_m_s"] = tuple(map(self._mean_velocity, pictures, pictures[1:]))
+            measurements["interval_velocities_m_s"] = tuple(map(self._mean_velocity, images, images[1:]))
             angles, sun = rows[0].vector("sun_azimuth_deg", "sun_elevation_deg"), self.file.sun
             if angles is not None:
                 azimuth, elevation = angles.tolist()
@@ -167,18 +168,18 @@ class _FolderReader:
                 sun = SunTable.model_construct(azimuth_deg=azimuth, elevation_deg=elevation)
             if sun is None:
                 raise rows[0].error(f"no sun: neither sun_azimuth_deg and sun_elevation_deg nor {INGEST_FILE}'s [sun]")
-            measurements["sun_direction"] = _vector(sun.direction)
+            measurements["sun_direction"] = _to_vector(sun.direction)
         elif self.file.task == LANDING:
             measurements["slant_range_m"] = rows[0].numbers.get("slant_range_m")
-            measurements["site_m"] = self._apriori_site(pictures[0], measurements["slant_range_m"])
-        elif len({picture.position_m is None for picture in pictures}) > 1:
-            raise rows[0].error(f"case '{name}': some pictures have a position and some have none")
+            measurements["site_m"] = self._apriori_site(images[0], measurements["slant_range_m"])
+        elif len({image.position_m is None for image in images}) > 1:
+            raise rows[0].error(f"case '{name}': some images have a position and some have none")
         return store.StoredCase(name=name, pictures=tuple(stored), truth=truth, **measurements)
 
-    def _read_picture(self, row: PictureRow) -> _Picture:
-        """Read a row's picture and its camera in the body frame; a PDS3 label supplies missing values of the row."""
+    def _read_image(self, row: ImageRow) -> _RecordedImage:
+        """Read a row's image and its camera in the body frame; a PDS3 label supplies missing values of the row."""
         path, table = self.source / row.texts["file"], self.file.camera
-        is_product = is_pds3(file_head(path))
+        is_product = is_pds3(read_header(path))
         camera_name = row.texts.get("camera", table.file)
         if camera_name is None and not is_product:
             raise row.error(f"no camera: the column camera and camera.file of {INGEST_FILE} are both empty")
@@ -213,10 +214,10 @@ class _FolderReader:
         time_s = row.numbers.get("time_s", None if product is None else product.time_s)
         if time_s is None:
             raise row.error("time_s is empty, and no label contains it")
-        return _Picture(row, counts, camera, time_s, attitude, position)
+        return _RecordedImage(row, counts, camera, time_s, attitude, position)
 
     def _body_pose(
-        self, row: PictureRow, rotation: Rotation, position: Float64[np.ndarray, "n"] | None
+        self, row: ImageRow, rotation: Rotation, position: Float64[np.ndarray, "n"] | None
     ) -> tuple[Rotation, Float64[np.ndarray, "3"] | None]:
         poses = self.file.poses
         if poses is None:
@@ -226,16 +227,16 @@ class _FolderReader:
             return poses.body_attitudes(vehicle), None
         return poses.body_attitudes(vehicle), np.asarray(poses.world.apply(position) + poses.lever_arms(vehicle))
 
-    def _to_world(self, row: PictureRow, vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+    def _to_world(self, row: ImageRow, vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
         if self.file.poses is None:
             raise row.error(f"vectors need [poses] in {INGEST_FILE}, which defines their axes")
         return np.asarray(self.file.poses.world.apply(vector))
 
-    def _store_picture(self, name: str, picture: _Picture) -> store.StoredPicture:
-        row, camera, counts = picture.row, picture.camera, picture.counts
+    def _store_image(self, name: str, image: _RecordedImage) -> store.StoredImage:
+        row, camera, counts = image.row, image.camera, image.counts
         if camera not in self.cameras:
             self.cameras[camera] = store.write_camera(self.target, len(self.cameras), camera)
-        if self.file.task == LANDING and picture.position_m is None:
+        if self.file.task == LANDING and image.position_m is None:
             raise row.error("x_m, y_m, z_m are empty; landing needs them")
         flat_field, flat_field_name = None, row.texts.get("flat_field", self.file.detector.flat_field)
         if flat_field_name is not None:
@@ -249,44 +250,44 @@ class _FolderReader:
             flat_field, shape = self.flat_fields[path]
             if shape != counts.shape:
                 raise row.error(f"{path}: has {shape[1]} x {shape[0]} pixels, unlike {row.texts['file']}")
-        return store.StoredPicture(
+        return store.StoredImage(
             source=row.texts["file"],
             size=camera.size,
             counts=store.write_file(self.target, "pictures", f"{name}.png", lambda path: write_picture(path, counts)),
             camera=self.cameras[camera],
             flat_field=flat_field,
-            time_s=picture.time_s,
+            time_s=image.time_s,
             exposure_s=row.numbers.get("exposure_s", self.file.detector.exposure_s),
-            world_from_body_xyzw=_quaternion(picture.attitude),
-            position_m=None if picture.position_m is None else _vector(picture.position_m),
+            world_from_body_xyzw=_to_quaternion(image.attitude),
+            position_m=None if image.position_m is None else _to_vector(image.position_m),
             altitude_m=row.numbers.get("altitude_m"),
             altitude_time_s=row.numbers.get("altitude_time_s"),
         )
 
-    def _mean_velocity(self, earlier: _Picture, later: _Picture) -> store.Vector:
-        """Return the mean velocity between two pictures: the inertial velocity, or computed from measured positions."""
+    def _mean_velocity(self, earlier: _RecordedImage, later: _RecordedImage) -> store.Vector:
+        """Return the mean velocity between two images: the inertial velocity, or computed from measured positions."""
         inertial = later.row.vector("vx_m_s", "vy_m_s", "vz_m_s")
         if inertial is not None:
-            return _vector(self._to_world(later.row, inertial))
+            return _to_vector(self._to_world(later.row, inertial))
         if earlier.position_m is None or later.position_m is None:
             raise later.row.error("vx_m_s to vz_m_s and the positions are empty; velocity needs one of them")
-        return _vector((later.position_m - earlier.position_m) / (later.time_s - earlier.time_s))
+        return _to_vector((later.position_m - earlier.position_m) / (later.time_s - earlier.time_s))
 
-    def _apriori_site(self, picture: _Picture, slant_range_m: float | None) -> store.Vector:
-        """Return the a-priori site: as recorded, or the ground on the first picture's optical axis."""
-        site = picture.row.vector("site_x_m", "site_y_m", "site_z_m")
+    def _apriori_site(self, image: _RecordedImage, slant_range_m: float | None) -> store.Vector:
+        """Return the a-priori site: as recorded, or the ground on the first image's optical axis."""
+        site = image.row.vector("site_x_m", "site_y_m", "site_z_m")
         if site is not None:
-            return _vector(self._to_world(picture.row, site))
-        if slant_range_m is None or picture.position_m is None:
-            raise picture.row.error("slant_range_m and site_x_m to site_z_m are empty; landing needs one of them")
-        ground = picture.camera.c + slant_range_m * picture.camera.a
-        return _vector(picture.position_m + picture.attitude.apply(ground))
+            return _to_vector(self._to_world(image.row, site))
+        if slant_range_m is None or image.position_m is None:
+            raise image.row.error("slant_range_m and site_x_m to site_z_m are empty; landing needs one of them")
+        ground = image.camera.c + slant_range_m * image.camera.a
+        return _to_vector(image.position_m + image.attitude.apply(ground))
 
-    def _read_truth(self, pictures: Sequence[_Picture]) -> store.StoredTruth:
-        """Read true poses and, for a descent, the true mean velocity from the second to the third picture."""
-        rows = [picture.row for picture in pictures]
+    def _read_truth(self, images: Sequence[_RecordedImage]) -> store.StoredTruth:
+        """Read true poses and, for a descent, the true mean velocity from the second to the third image."""
+        rows = [image.row for image in images]
         poses = [self._true_pose(row) for row in rows]
-        last, velocity = pictures[-1], None
+        last, velocity = images[-1], None
         if self.file.task == VELOCITY:
             components = last.row.vector("true_vx_m_s", "true_vy_m_s")
             earlier, later = poses[-2:]
@@ -294,7 +295,7 @@ class _FolderReader:
             if components is not None:
                 mean = self._to_world(last.row, np.array([*components, 0.0]))
             elif earlier is not None and later is not None:
-                mean = (later[1] - earlier[1]) / (last.time_s - pictures[-2].time_s)
+                mean = (later[1] - earlier[1]) / (last.time_s - images[-2].time_s)
             velocity = None if mean is None else (float(mean[0]), float(mean[1]))
         has_pose = [
             row.rotation("true_") is not None and pose is not None for row, pose in zip(rows, poses, strict=True)
@@ -302,11 +303,13 @@ class _FolderReader:
         if not any(has_pose):
             return store.StoredTruth(velocity_m_s=velocity)
         if not all(has_pose):
-            raise rows[0].error("some pictures have a true pose and some have none")
-        true_poses = tuple((_vector(position), _quaternion(attitude)) for attitude, position in filter(None, poses))
+            raise rows[0].error("some images have a true pose and some have none")
+        true_poses = tuple(
+            (_to_vector(position), _to_quaternion(attitude)) for attitude, position in filter(None, poses)
+        )
         return store.StoredTruth(velocity_m_s=velocity, poses=true_poses)
 
-    def _true_pose(self, row: PictureRow) -> tuple[Rotation, Float64[np.ndarray, "3"]] | None:
+    def _true_pose(self, row: ImageRow) -> tuple[Rotation, Float64[np.ndarray, "3"]] | None:
         """Return the body's true attitude (by default the measured attitude) and position; None without a position."""
         true_position = row.vector(*(f"true_{name}" for name in _POSITION))
         if true_position is None:
@@ -318,11 +321,11 @@ class _FolderReader:
         return None if position is None else (attitude, position)
 
 
-def _vector(values: Float64[np.ndarray, "3"]) -> store.Vector:
+def _to_vector(values: Float64[np.ndarray, "3"]) -> store.Vector:
     x, y, z = values.tolist()
     return x, y, z
 
 
-def _quaternion(rotation: Rotation) -> store.Quaternion:
+def _to_quaternion(rotation: Rotation) -> store.Quaternion:
     x, y, z, w = rotation.as_quat().tolist()
     return x, y, z, w

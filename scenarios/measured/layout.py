@@ -1,6 +1,6 @@
-"""Read the inputs of `marsyard ingest` (docs/real-pictures.md): `ingest.toml`, `pictures.csv`, pictures, flat fields.
+"""Read the inputs of `marsyard ingest` (docs/real-pictures.md): `ingest.toml`, `pictures.csv`, images, flat fields.
 
-Pictures are PNG, PGM and TIFF of one band with 8 or 16 bits.
+Images are PNG, PGM and TIFF of one band with 8 or 16 bits.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.user_files import RecordedAxes, check_column_groups, finite_number, format_problems, parse_table
-from marsyard.sim.files import check_regular, npy_header, open_regular
+from marsyard.sim.files import check_regular, open_regular, read_npy_header
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters, bounded_field
 
-#: The two files of every folder.
+#: Names of the settings file and of the table of images in every folder.
 INGEST_FILE, TABLE_FILE = "ingest.toml", "pictures.csv"
 
 VELOCITY, LANDING, MATCHING = "velocity", "landing", "matching"
 TaskName = Literal["velocity", "landing", "matching"]
 
-#: Minimum and maximum number of pictures of a case.
-PICTURES = {VELOCITY: (3, 3), LANDING: (2, 2), MATCHING: (2, 50)}
+#: Minimum and maximum number of images of a case.
+IMAGE_COUNTS = {VELOCITY: (3, 3), LANDING: (2, 2), MATCHING: (2, 50)}
 
 
 class IngestError(ValueError):
@@ -40,7 +40,7 @@ class IngestError(ValueError):
 
 
 class CameraTable(Parameters):
-    """Default camera of the pictures."""
+    """Default camera of the images."""
 
     file: Annotated[
         str | None, Field(description="camera file; not needed for PDS3 products, whose labels contain the camera")
@@ -54,15 +54,15 @@ class CameraTable(Parameters):
         ),
     ] = False
     subframe_folded_in: Annotated[
-        bool, Field(description="PDS labels: a subframe's model describes the stored picture")
+        bool, Field(description="PDS labels: a subframe's model describes the stored image")
     ] = False
 
 
 class DetectorTable(Parameters):
     """Settings of the detector."""
 
-    bits: Annotated[int, Field(ge=1, le=16, description="of a count; the largest count is 2^bits - 1")]
-    offset_dn: Annotated[float, Field(ge=0.0, le=65535.0, description="counts without light")] = 0.0
+    bits: Annotated[int, Field(ge=1, le=16, description="bits of a count; the largest count is 2^bits - 1")]
+    offset_dn: Annotated[float, Field(ge=0.0, le=65535.0, description="count of a dark pixel")] = 0.0
     exposure_s: Annotated[float, Field(ge=0.0, le=100.0, description="exposure time; 0: unknown")] = 0.0
     transfer_row_s: Annotated[
         float, Field(ge=0.0, le=1.0, description="frame transfer: time under each row while shifted out; 0: none")
@@ -72,12 +72,12 @@ class DetectorTable(Parameters):
     ] = 0.0
     rows_summed: Annotated[
         int | None,
-        Field(ge=1, le=64, description="detector rows in a delivered row; by default the camera's ratio of scales"),
+        Field(ge=1, le=64, description="detector rows in an image row; default: ratio of the camera's focal lengths"),
     ] = None
     flat_field: Annotated[
         str | None,
         Field(
-            description="relative response of each pixel: `.npy` of numbers, about 1 at the maximum, or a picture, "
+            description="relative response of each pixel: `.npy` of numbers, about 1 at the maximum, or an image, "
             "divided by its largest count"
         ),
     ] = None
@@ -98,11 +98,13 @@ class SunTable(Parameters):
 class IngestFile(Parameters):
     """`ingest.toml`: settings of the whole folder."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100, description="of the campaign")]
-    task: Annotated[
-        TaskName, Field(description="velocity: three pictures of a descent; landing: two; matching: two or more")
+    name: Annotated[
+        str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100, description="name of the campaign")
     ]
-    description: Annotated[str, Field(description="in the report")] = ""
+    task: Annotated[
+        TaskName, Field(description="velocity: three images of a descent; landing: two; matching: two or more")
+    ]
+    description: Annotated[str, Field(description="description in the report")] = ""
     poses: Annotated[RecordedAxes | None, Field(description="not needed if PDS3 labels contain all poses")] = None
     camera: CameraTable = CameraTable()
     detector: DetectorTable
@@ -122,11 +124,11 @@ def read_ingest_file(folder: Path) -> IngestFile:
     try:
         file = IngestFile.model_validate(values)
     except ValidationError as error:
-        kinds = {"missing": "required, but missing", "extra_forbidden": "unknown key; see docs/real-pictures.md"}
+        messages = {"missing": "required, but missing", "extra_forbidden": "unknown key; see docs/real-pictures.md"}
         problems = []
         for detail in error.errors(include_url=False):
             message = f"{detail['msg'].removeprefix('Value error, ')}, got {detail['input']!r}"
-            problems.append(f"{path}: {'.'.join(map(str, detail['loc']))}: {kinds.get(detail['type'], message)}")
+            problems.append(f"{path}: {'.'.join(map(str, detail['loc']))}: {messages.get(detail['type'], message)}")
         raise IngestError("\n".join(problems)) from error
     if file.camera.placed and file.poses is not None and file.poses.attitude_of != "body":
         raise IngestError(
@@ -136,7 +138,7 @@ def read_ingest_file(folder: Path) -> IngestFile:
 
 
 class Column(NamedTuple):
-    """A column of `pictures.csv` as described in `pictures.toml`."""
+    """A column of `pictures.csv`; `pictures.toml` describes all columns."""
 
     name: str
     tasks: tuple[str, ...]
@@ -152,7 +154,7 @@ COLUMNS = tuple(
 )
 _TEXT_COLUMNS = ("case", "file", "camera", "flat_field")
 _POSITIVE_COLUMNS = ("altitude_m", "slant_range_m")
-#: Groups of columns: in a row, all of a group are filled, or none.
+#: Groups of columns: a row must contain all values of a group, or none.
 _COLUMN_GROUPS = (
     ("qx", "qy", "qz", "qw"),
     ("x_m", "y_m", "z_m"),
@@ -163,11 +165,11 @@ _COLUMN_GROUPS = (
     ("true_x_m", "true_y_m", "true_z_m"),
     ("true_qx", "true_qy", "true_qz", "true_qw"),
 )
-#: Maximum deviation of a quaternion's length from 1: quaternions may be written with three digits.
+#: Maximum deviation of a quaternion's length from 1; large enough for quaternions with three digits.
 _QUATERNION_TOLERANCE = 5e-3
-#: Maximum number of rows; more would take days to match.
+#: Maximum number of rows; matching more images would take days.
 _MAX_ROWS = 200_000
-#: Bytes that contain the header of a PGM file with comments.
+#: Number of first bytes that are read as header: enough for a PGM file with comments.
 _HEADER_BYTES = 4096
 #: Maximum number of pixels along a side of a flat field.
 _MAX_SIDE = 16384
@@ -178,7 +180,7 @@ _ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 p
 
 
 @dataclass(frozen=True)
-class PictureRow:
+class ImageRow:
     """One row of `pictures.csv`: its line, and its filled cells by column."""
 
     line: int
@@ -199,7 +201,7 @@ class PictureRow:
         return None if quaternion is None else Rotation.from_quat(quaternion)
 
 
-def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
+def read_table(path: Path, task: str) -> dict[str, list[ImageRow]]:
     """Read the rows of `pictures.csv` by case, in the order of the cases' first rows.
 
     Raises IngestError with all problems by line.
@@ -211,16 +213,16 @@ def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
         parsed, problems = parse_table(path, _MAX_ROWS, required, allowed, hint, _parse_row)
     except ValueError as error:
         raise IngestError(str(error)) from error
-    cases: dict[str, list[PictureRow]] = {}
+    cases: dict[str, list[ImageRow]] = {}
     for row in parsed:
         cases.setdefault(row.texts["case"], []).append(row)
     if not problems:
-        low, high = PICTURES[task]
+        low, high = IMAGE_COUNTS[task]
         number = str(low) if low == high else f"{low} to {high}"
         for name, rows in cases.items():
             if not low <= len(rows) <= high:
                 problems.append(
-                    f"line {rows[0].line}: case '{name}' has {len(rows)} pictures; allowed for {task}: {number}"
+                    f"line {rows[0].line}: case '{name}' has {len(rows)} images; allowed for {task}: {number}"
                 )
             for previous, row in itertools.pairwise(rows):
                 first, second = previous.numbers.get("time_s"), row.numbers.get("time_s")
@@ -241,10 +243,10 @@ def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
     return cases
 
 
-def _parse_row(line: int, cells: Mapping[str, str]) -> PictureRow:
+def _parse_row(line: int, cells: Mapping[str, str]) -> ImageRow:
     filled = {name: cell for name, cell in cells.items() if cell}
     numbers = {name: finite_number(name, cell) for name, cell in filled.items() if name not in _TEXT_COLUMNS}
-    row = PictureRow(line, {name: filled[name] for name in _TEXT_COLUMNS if name in filled}, numbers)
+    row = ImageRow(line, {name: filled[name] for name in _TEXT_COLUMNS if name in filled}, numbers)
     for name in _POSITIVE_COLUMNS:
         if numbers.get(name, 1.0) <= 0.0:
             raise ValueError(f"{name} is {filled[name]}; allowed: above 0")
@@ -263,7 +265,7 @@ def _parse_row(line: int, cells: Mapping[str, str]) -> PictureRow:
     return row
 
 
-def file_head(path: Path) -> bytes:
+def read_header(path: Path) -> bytes:
     """Read the file's first bytes. Raises IngestError if the file is missing, empty or unreadable."""
     try:
         with open_regular(path) as file:
@@ -276,11 +278,11 @@ def file_head(path: Path) -> bytes:
 
 
 def read_counts(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "rows columns"]:
-    """Decode a picture after its header has confirmed the size (columns, rows).
+    """Decode an image after its header has confirmed the size (columns, rows).
 
     Raises IngestError if the file is unreadable, or of another format or size.
     """
-    columns, rows = picture_size(path)
+    columns, rows = read_image_size(path)
     if (columns, rows) != size:
         raise IngestError(
             f"{path}: has {columns} x {rows} pixels; its camera has {size[0]} x {size[1]} (columns x rows)"
@@ -295,9 +297,9 @@ def read_counts(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "rows c
     return np.asarray(counts, dtype=np.uint16)
 
 
-def picture_size(path: Path) -> tuple[int, int]:
+def read_image_size(path: Path) -> tuple[int, int]:
     """Read (columns, rows) from the header. Raises IngestError for other formats."""
-    head = file_head(path)
+    head = read_header(path)
     if head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) >= 24:
         return struct.unpack(">II", head[16:24])
     pgm = _PGM.match(head)
@@ -319,21 +321,21 @@ def picture_size(path: Path) -> tuple[int, int]:
         if len(extents) != 2:
             raise IngestError(f"{path}: is a damaged TIFF: its first directory contains no size")
         return extents[256], extents[257]
-    raise IngestError(f"{path}: is not a supported picture; {_ALLOWED}")
+    raise IngestError(f"{path}: is not a supported image; {_ALLOWED}")
 
 
 def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
-    """Read a relative response: an array unchanged, a picture divided by its largest count. Raises IngestError."""
-    head = file_head(path)
+    """Read a flat field: an array unchanged, or an image divided by its largest count. Raises IngestError."""
+    head = read_header(path)
     try:
         if head.startswith(b"\x93NUMPY"):
             with path.open("rb") as file:
-                shape, kind = npy_header(file)
+                shape, kind = read_npy_header(file)
             if len(shape) != 2 or max(shape) > _MAX_SIDE or kind.kind not in "iuf":
                 raise ValueError(f"contains an array of shape {shape} and type {kind}")
             response = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
         else:
-            counts = read_counts(path, picture_size(path))
+            counts = read_counts(path, read_image_size(path))
             response = counts / max(int(counts.max()), 1)
     except (ValueError, EOFError) as error:
         raise IngestError(f"{path}: is not a valid flat field: {error}") from error

@@ -1,4 +1,4 @@
-"""Scenarios of recorded pictures: velocity estimators, estimators of landing sites, and measured poses alone."""
+"""Scenarios of recorded images: run velocity or landing site estimators, or compare the images with measured poses."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ Answer = TypeVar("Answer")
 ParametersType = TypeVar("ParametersType", bound=BaseModel)
 
 NAN = float("nan")
-#: Outcomes of the scenario without an algorithm.
+#: Outcomes of `MatchingScenario`, which runs no algorithm.
 MATCHED, TOO_FEW = "MATCHED", "TOO_FEW_MATCHES"
 
 
 class MeasuredParameters(Parameters):
-    """Parameters of all tasks; subclasses define the task that `cases.json` must have."""
+    """Parameters of all tasks; subclasses define `task_name`, the required task of `cases.json`."""
 
     task_name: ClassVar[TaskName]
 
     cases: Annotated[store.CasesFile, Field(description="`cases.json` of `marsyard ingest`")]
-    number: Annotated[int, Field(ge=0, description="number of the case in the file; usually a grid over all cases")] = 0
+    number: Annotated[int, Field(ge=0, description="index of the case in the file; usually a grid over all cases")] = 0
 
     @model_validator(mode="after")
     def _check_case_and_task(self) -> MeasuredParameters:
@@ -69,13 +69,13 @@ class MeasuredParameters(Parameters):
 
 
 class MatchingParameters(MeasuredParameters):
-    """Pictures compared with their poses alone."""
+    """Parameters of the comparison of images with their poses."""
 
     task_name = "matching"
 
 
 class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParameters):
-    """Three pictures of a descent."""
+    """Parameters of velocity estimation from three images of a descent."""
 
     task_name = "velocity"
     task = VELOCITY
@@ -87,13 +87,13 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
     @model_validator(mode="after")
     def _check_binning(self) -> MeasuredVelocityParameters:
         if "dimes" in self.algorithms:
-            for picture in self.case.pictures:
-                check_binning(self.dimes.binned_size, picture.size)
+            for image in self.case.pictures:
+                check_binning(self.dimes.binned_size, image.size)
         return self
 
 
 class MeasuredLandingParameters(AlgorithmSelection, CustomScores, MeasuredParameters):
-    """Two pictures of the ground."""
+    """Parameters of landing site estimation from two images of the ground."""
 
     task_name = "landing"
     task = LANDING
@@ -104,10 +104,10 @@ class MeasuredLandingParameters(AlgorithmSelection, CustomScores, MeasuredParame
 
 
 class MeasuredScenario(BaseScenario[ParametersType]):
-    """A scenario whose cases are stored files: it has no shared inputs."""
+    """A scenario whose cases are stored files; it has no shared inputs."""
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return no inputs."""
+        """Return an empty tuple: there are no shared inputs."""
         return ()
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
@@ -115,7 +115,7 @@ class MeasuredScenario(BaseScenario[ParametersType]):
 
 
 class MatchingScenario(MeasuredScenario[MatchingParameters]):
-    """Two or more pictures compared with their measured poses, without an algorithm."""
+    """Comparison of two or more images with their measured poses, without an algorithm."""
 
     name = "measured-matching"
     parameters_type = MatchingParameters
@@ -124,7 +124,7 @@ class MatchingScenario(MeasuredScenario[MatchingParameters]):
         """Run one case."""
         p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
-        pairs = compare_with_poses(images, match_images(images), [picture.pose for picture in p.case.pictures])
+        pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.pictures])
         has_matches = all(pair.residuals_px.size for pair in pairs)
         return CaseResult(
             outcome=MATCHED if has_matches else TOO_FEW,
@@ -135,7 +135,7 @@ class MatchingScenario(MeasuredScenario[MatchingParameters]):
 
 
 class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
-    """Three pictures of a descent with measurements, given to velocity estimators."""
+    """Velocity estimation from three recorded images of a descent and their measurements."""
 
     name = "measured-velocity"
     parameters_type = MeasuredVelocityParameters
@@ -169,7 +169,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
 
         def evaluate(algorithm: str) -> CaseResult:
             run = runs[algorithm]
-            velocity = _velocity(run.answer)
+            velocity = _get_velocity(run.answer)
             pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
             details = None if run.answer is None else run.answer.details
             velocity_pair = details.chosen if isinstance(details, DimesDetails) else None
@@ -177,15 +177,15 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
             row: dict[str, Scalar] = {
                 "velocity_estimated_x_m_s": float(reported[0]),
                 "velocity_estimated_y_m_s": float(reported[1]),
-                # contains the unknown error of the inertial velocity
+                # includes the unknown error of the inertial velocity
                 "inertial_difference_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
-                # without that error: change of velocity between the two pairs, compared with the inertial unit's change
+                # without that error: velocity change between the intervals, compared with the inertial unit's change
                 "pair_discrepancy_m_s": NAN if velocity_pair is None else velocity_pair.discrepancy_m_s,
             }
             if true_velocity is not None:
                 row |= {**velocity_row("velocity", velocity, truth), **consistency_row(run.answer, truth)}
             if algorithm != p.algorithm:
-                row["difference_m_s"] = _distance(velocity, _velocity(runs[p.algorithm].answer))
+                row["difference_m_s"] = _distance(velocity, _get_velocity(runs[p.algorithm].answer))
             row |= {**agreement_row(pairs), **run.row}
             if run.answer is not None:
                 case = ScoredVelocity(
@@ -201,7 +201,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
 
 
 class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
-    """Two pictures of the ground with measured poses, given to estimators of landing sites."""
+    """Estimation of a landing site from two recorded images of the ground and their measured poses."""
 
     name = "measured-landing"
     parameters_type = MeasuredLandingParameters
@@ -214,7 +214,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
         p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
         measurements = store.landing_measurements(p.case, images)
-        pairs = compare_with_poses(images, match_images(images), [picture.pose for picture in p.case.pictures])
+        pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.pictures])
         true_poses = None
         if p.case.truth.poses is not None:
             first, second = (store.body_pose(*pose) for pose in p.case.truth.poses)
@@ -233,7 +233,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             details = None if run.answer is None else run.answer.details
             row = _site_answer_row(run.answer, measurements, true_poses)
             if algorithm != p.algorithm:
-                row["difference_m"] = _distance(_site(run.answer), _site(runs[p.algorithm].answer))
+                row["difference_m"] = _distance(_get_site(run.answer), _get_site(runs[p.algorithm].answer))
             row |= run.row
             if run.answer is not None:
                 case = ScoredSite(measurements=measurements, answer=run.answer, true_poses=true_poses)
@@ -255,10 +255,10 @@ def _run_algorithms(
 
 
 def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:
-    """Return the columns of the case: name, pictures, and the maximum motion of the camera between two pictures."""
-    poses = [picture.pose * camera_pose(image.camera) for picture, image in zip(p.case.pictures, images, strict=True)]
+    """Return the columns of the case: name, images, and the maximum motion of the camera between two images."""
+    poses = [item.pose * camera_pose(image.camera) for item, image in zip(p.case.pictures, images, strict=True)]
     steps = [earlier.inv() * later for earlier, later in itertools.pairwise(poses)]
-    has_positions = all(picture.position_m is not None for picture in p.case.pictures)
+    has_positions = all(image.position_m is not None for image in p.case.pictures)
     return {
         "measured_case": p.case.name,
         "pictures": len(images),
@@ -274,11 +274,11 @@ def _distance(first: Float[np.ndarray, "n"] | None, second: Float[np.ndarray, "n
     return NAN if first is None or second is None else float(np.linalg.norm(first - second))
 
 
-def _velocity(estimate: VelocityEstimate | None) -> Float64[np.ndarray, "2"] | None:
+def _get_velocity(estimate: VelocityEstimate | None) -> Float64[np.ndarray, "2"] | None:
     return None if estimate is None else estimate.velocity_m_s
 
 
-def _site(estimate: SiteEstimate | None) -> Float[np.ndarray, "3"] | None:
+def _get_site(estimate: SiteEstimate | None) -> Float[np.ndarray, "3"] | None:
     """Return the site; None if the algorithm reports no safe site."""
     return None if estimate is None or estimate.outcome is not SiteOutcome.SAFE_SITE else estimate.site_world
 
@@ -288,16 +288,16 @@ def _descent_poses(
 ) -> list[RigidTransform]:
     """Return the body's poses from measured positions or, without these, from the inertial unit's velocities.
 
-    The inertial velocities have an unknown constant error. The estimate removes it: the horizontal velocity of the
-    second interval is the estimate, and that of the first interval follows from the inertial change. The agreement of
-    pictures and poses then depends on the estimate as well.
+    The inertial velocities have an unknown constant error, which the estimate removes. The horizontal velocity of the
+    second interval is the estimate; the velocity of the first interval is the estimate minus the inertial velocity
+    change. The agreement of images and poses then depends on the estimate as well.
     """
     velocities = measurements.interval_velocities_m_s.copy()
     if estimated is not None:
         velocities[:, :2] += estimated - velocities[1, :2]
     times = np.array([image.time_s for image in measurements.images])
     positions = np.concatenate([np.zeros((1, 3)), np.cumsum(velocities * np.diff(times)[:, None], axis=0)])
-    positions_m = [picture.position_m for picture in case.pictures]
+    positions_m = [image.position_m for image in case.pictures]
     if None not in positions_m:
         positions = np.array(positions_m, dtype=np.float64)
     rotations = [attitude.world_from_body for attitude in measurements.attitudes]
@@ -311,9 +311,9 @@ def _site_answer_row(
 ) -> dict[str, Scalar]:
     """Return the columns of an answer: site, and motion compared with the measured and the true poses.
 
-    The safety of the site is not scored: it needs the true ground, which a folder of pictures does not contain.
+    The safety of the site is not scored: it needs the true ground, which a folder of images does not contain.
     """
-    site = _site(estimate)
+    site = _get_site(estimate)
     position = np.full(3, np.nan) if site is None else site
     outcome = SiteOutcome.NO_STRUCTURE if estimate is None else estimate.outcome
     row: dict[str, Scalar] = {

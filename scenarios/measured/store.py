@@ -1,4 +1,4 @@
-"""Store ingested cases: `cases.json`, and its pictures, cameras and flat fields with their hashes.
+"""Write and read ingested cases: `cases.json`, and its images, cameras and flat fields with their hashes.
 
 World axes are east, north, up; attitudes are those of the body.
 """
@@ -48,8 +48,8 @@ class StoredFile(Parameters):
     sha256: str
 
 
-class StoredPicture(Parameters):
-    """A picture, its size (columns, rows), and the measurements taken with it."""
+class StoredImage(Parameters):
+    """An image, its size (columns, rows), and the measurements taken with it."""
 
     source: str
     size: tuple[int, int]
@@ -65,22 +65,22 @@ class StoredPicture(Parameters):
 
     @property
     def pose(self) -> RigidTransform:
-        """The body's measured pose; at the origin if no position was measured."""
+        """The body's measured pose; its position is the origin if no position was measured."""
         return body_pose(self.position_m or (0.0, 0.0, 0.0), self.world_from_body_xyzw)
 
 
 class StoredTruth(Parameters):
-    """Truth: the camera's mean velocity from the second to the third picture (east, north), and the body's poses."""
+    """True mean velocity of the camera from the second to the third image (east, north), and true poses of the body."""
 
     velocity_m_s: tuple[float, float] | None = None
     poses: tuple[tuple[Vector, Quaternion], ...] | None = None
 
 
 class StoredCase(Parameters):
-    """One case."""
+    """A case: its images and their measurements, and its truth."""
 
     name: str
-    pictures: tuple[StoredPicture, ...]
+    pictures: tuple[StoredImage, ...]
     interval_velocities_m_s: tuple[Vector, ...] | None = None
     sun_direction: Vector | None = None
     slant_range_m: float | None = None
@@ -89,7 +89,7 @@ class StoredCase(Parameters):
 
 
 class StoredDetector(Parameters):
-    """Settings of the detector of all pictures."""
+    """Settings of the detector of all images."""
 
     offset_dn: float
     full_scale_dn: int
@@ -99,7 +99,7 @@ class StoredDetector(Parameters):
 
 
 class StoredCases(Parameters):
-    """`cases.json`."""
+    """Contents of `cases.json`."""
 
     schema_version: int
     name: str
@@ -111,11 +111,11 @@ class StoredCases(Parameters):
 
 
 class CasesFile(UserFile):
-    """The `cases.json` of `marsyard ingest`: all measurements, and the hash of every picture."""
+    """The `cases.json` of `marsyard ingest`: all measurements, and the hash of every image."""
 
     @classmethod
     def file_hash(cls, file: str) -> str:
-        """SHA-256 of `cases.json`, which is checked."""
+        """Check `cases.json` and return its SHA-256."""
         return _load(file)[1]
 
     @property
@@ -184,20 +184,20 @@ def _check_unchanged(folder: Path, stored: StoredFile) -> Path:
 
 
 def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]:
-    """Load the pictures of a case with their cameras in the body frame. Raises ValueError if a file has changed."""
+    """Load the images of a case with their cameras in the body frame. Raises ValueError if a file has changed."""
     folder, images = Path(cases.file).parent, []
-    for picture in case.pictures:
-        counts = read_picture(_check_unchanged(folder, picture.counts))
-        flat = picture.flat_field
+    for image in case.pictures:
+        counts = read_picture(_check_unchanged(folder, image.counts))
+        flat = image.flat_field
         calibration = DetectorCalibration(
             flat_field=np.ones(counts.shape)
             if flat is None
             else np.load(_check_unchanged(folder, flat), allow_pickle=False),
-            exposure_s=picture.exposure_s,
+            exposure_s=image.exposure_s,
             **cases.stored.detector.model_dump(),
         )
-        camera = read_cahvor(_check_unchanged(folder, picture.camera))
-        images.append(DetectorImage(counts, picture.time_s, camera, calibration))
+        camera = read_cahvor(_check_unchanged(folder, image.camera))
+        images.append(DetectorImage(counts, image.time_s, camera, calibration))
     return tuple(images)
 
 
@@ -224,7 +224,7 @@ def body_pose(position_m: Vector, xyzw: Quaternion) -> RigidTransform:
 
 def landing_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> LandingMeasurements:
     """Return the inputs of an estimator of landing sites."""
-    first, second = (PoseMeasurement(picture.pose, picture.time_s) for picture in case.pictures)
+    first, second = (PoseMeasurement(image.pose, image.time_s) for image in case.pictures)
     attitude = Rotation.from_quat(np.array(case.pictures[0].world_from_body_xyzw))
     return LandingMeasurements(
         images=(images[0], images[1]),

@@ -1,6 +1,6 @@
-"""User-defined parts of a case: the motion of a descent, an instrument, a score.
+"""User-defined parts of a case: motions of a descent, instruments, and scores.
 
-`named` imports and constructs a part by its name; `motions`, `instruments` and `scores` define inputs and outputs.
+`motions`, `instruments` and `scores` define the inputs and outputs of parts. `named` imports and constructs parts.
 """
 
 from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentTruth

@@ -2,11 +2,11 @@
 
 An instrument is a class with
 
-- options, the arguments of its constructor, each with a default;
-- ``quantity``, the measured quantity: ``"altitude"`` or ``"attitude"``;
-- ``random``, whether its readings depend on the random stream;
-- ``read(truth: InstrumentTruth, rng: numpy.random.Generator) -> InstrumentReadings``, all readings of one case, so that
-  errors common to all readings are drawn once.
+- options: arguments of the constructor, each with a default value;
+- ``quantity``: the measured quantity, ``"altitude"`` or ``"attitude"``;
+- ``random``: whether the readings depend on the random stream;
+- ``read(truth: InstrumentTruth, rng: numpy.random.Generator) -> InstrumentReadings``: returns all readings of one case.
+  Errors common to all readings are therefore drawn once.
 """
 
 from __future__ import annotations
@@ -25,20 +25,23 @@ from marsyard.scenarios.parts.named import INSTRUMENT, CustomPart
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.sensor.ranging import DOWN
 
-#: Quantities of instruments, and the shape of one reading.
+#: Shape of one reading by measured quantity.
 QUANTITIES: Mapping[str, tuple[int, ...]] = {"altitude": (), "attitude": (4,)}
 
 
 @dataclass(frozen=True)
 class InstrumentTruth:
-    """Truth for an instrument. World axes are east, north, up; the optical axis is the body's -z, columns along x.
+    """True motion and ground as input of an instrument.
 
-    - times_s: requested times: true picture times for altitudes, time tags of the pictures for attitudes; an instrument
-      that measures at other times returns the tags of those times
-    - motion: true motion; `motion.state(time_s)` has pose, velocity, body rate, specific force within `motion.span_s`
-    - ground_height: height of the ground at world x and y, metres
-    - nearest_ground: distance to the nearest ground in a cone, infinite without ground, metres. Arguments: apex and
-      axis of the cone (world), half-width (radians), and maximum range (metres)
+    World axes are east, north, up. In body axes the camera looks along -z, and its image columns increase along x.
+
+    - times_s: requested times: true exposure times for an altimeter, time tags of the images for an attitude source.
+      An instrument may measure at other times; its readings contain the time tags.
+    - motion: true motion; `motion.state(time_s)` returns pose, velocity, body rate and specific force at a time within
+      `motion.span_s`
+    - ground_height: function that returns the height of the ground (m) at world x and y (m)
+    - nearest_ground: function that returns the distance (m) to the nearest ground in a cone, infinite without ground.
+      Arguments: apex of the cone (m, world), axis (unit vector, world), half angle (rad), maximum range (m)
     """
 
     times_s: Float64[np.ndarray, "n"]
@@ -47,12 +50,12 @@ class InstrumentTruth:
     nearest_ground: Callable[[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float, float], float]
 
     def altitude_m(self, time_s: float) -> float:
-        """True height above the ground directly below."""
+        """Return the true height above the ground directly below, metres."""
         position = self.motion.state(time_s).position_m
         return float(position[2]) - self.ground_height(float(position[0]), float(position[1]))
 
     def first_return_m(self, time_s: float, half_width_deg: float, max_range_m: float) -> float:
-        """True distance to the nearest ground in a beam along the body's -z; infinite without ground."""
+        """Return the true distance (m) to the nearest ground in a beam along the body's -z; infinite without ground."""
         state = self.motion.state(time_s)
         axis = np.asarray(state.attitude.apply(DOWN.copy()))
         return self.nearest_ground(state.position_m, axis, float(np.radians(half_width_deg)), max_range_m)
@@ -60,11 +63,12 @@ class InstrumentTruth:
 
 @dataclass(frozen=True)
 class InstrumentReadings:
-    """Readings of an instrument, one for each requested time.
+    """Readings of an instrument: one reading for each requested time.
 
-    - times_s: the instrument's time tags
-    - values: altitudes, metres, NaN without a reading; or quaternions x, y, z, w from body to world axes
-    - columns: further columns of the row, as `altimeter_NAME` or `attitude_source_NAME`, such as sampled errors
+    - times_s: time tags of the readings
+    - values: altitudes (m; NaN without a reading), or quaternions (x, y, z, w) of rotations from body to world axes
+    - columns: further result columns, such as sampled errors; the prefix `altimeter_` or `attitude_source_` is added to
+      their names
     """
 
     times_s: Float[np.ndarray, "n"]
@@ -87,7 +91,7 @@ class _CustomInstrument(CustomPart):
         return self
 
     def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
-        """Read and check one case. Raises ValueError for invalid readings."""
+        """Return the checked readings of one case. Raises ValueError for invalid readings."""
         return check_readings(self.spec, self.create().read(truth, rng), self.quantity, truth.times_s.size)
 
 
@@ -98,13 +102,13 @@ class CustomAltimeter(_CustomInstrument):
 
 
 class CustomAttitudeSource(_CustomInstrument):
-    """A user-defined instrument of attitudes at the pictures, instead of the inertial navigation."""
+    """A user-defined attitude source that replaces the attitudes of the inertial navigation."""
 
     quantity = "attitude"
 
 
 def check_readings(spec: str, readings: object, quantity: str, count: int) -> InstrumentReadings:
-    """Return an instrument's readings as 64-bit arrays. Raises ValueError for invalid readings."""
+    """Check an instrument's readings and return them as 64-bit arrays. Raises ValueError for invalid readings."""
     if not isinstance(readings, InstrumentReadings):
         raise ValueError(
             f"'{spec}' returns a {type(readings).__name__}; allowed: marsyard.scenarios.parts.InstrumentReadings"

@@ -2,12 +2,12 @@
 
 A motion is a class with
 
-- options, the arguments of its constructor, each with a default;
-- ``random``, whether its poses depend on the random stream;
-- ``fly(place: DescentPlace, rng: numpy.random.Generator) -> Poses``, the poses of one case.
+- options: arguments of the constructor, each with a default value;
+- ``random``: whether the poses depend on the random stream;
+- ``fly(place: DescentPlace, rng: numpy.random.Generator) -> Poses``: returns the poses of one case.
 
-Poses are interpolated like those of a recorded flight (`marsyard.sim.dynamics.recorded`); every instrument measures the
-motion like a simulated one.
+Poses are interpolated as in a recorded flight (`marsyard.sim.dynamics.recorded`). Instruments measure the interpolated
+motion as they measure a simulated motion.
 """
 
 from __future__ import annotations
@@ -27,18 +27,23 @@ from marsyard.scenarios.user_files import RecordedAxes
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.parameters import bounded_field
 
-#: Tolerance of a quaternion's length.
+#: Maximum deviation of a quaternion's length from 1.
 UNIT_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
 class DescentPlace:
-    """A case as the input of a motion.
+    """Place and times of a descent, as input of a motion.
 
-    - ground_height: height of the ground relative to the origin of the place, by metres east and north of it
-    - pictures_s: times of the pictures, the first at 0
-    - from_s, until_s: interval that the poses must cover; a motion that ends above the firing height fires at its end
-    - firing_height_m: height above the ground at which the thrusters fire
+    The place is the ground point of the case's location; positions are relative to it.
+
+    - ground_height: function that returns the height of the ground (m, relative to the place) at x metres east and y
+      metres north of the place
+    - gravity_m_s2: gravity at the place
+    - pictures_s: nominal times of the images; the first image is at 0
+    - from_s, until_s: interval that the poses must cover
+    - firing_height_m: height above the ground at which the thrusters fire; they fire at the end of a motion that ends
+      above this height
     """
 
     ground_height: Callable[[float, float], float]
@@ -53,10 +58,12 @@ class DescentPlace:
 class Poses:
     """A motion as a sequence of poses, sampled densely enough for a cubic spline.
 
-    - times_s: increasing times, at least four; the first picture is at 0
-    - positions_m: relative to the ground at the place, in the world axes of the campaign, by default east, north, up
-    - quaternions_xyzw: rotations to those axes from the campaign's camera or body axes; of length 1, scalar last
-    - columns: further columns of the row, as `flight_NAME`, such as sampled values
+    - times_s: increasing times, at least four; the first image is at time 0
+    - positions_m: positions relative to the place (`DescentPlace`), in the world axes of the key `axes` (default: east,
+      north, up)
+    - quaternions_xyzw: unit quaternions (x, y, z, w) of rotations to these world axes from the frame of the key
+      `attitude_of` (default: OpenCV camera frame)
+    - columns: further result columns, such as sampled values; the prefix `flight_` is added to their names
     """
 
     times_s: Float[np.ndarray, "n"]
@@ -68,7 +75,7 @@ class Poses:
 class CustomMotion(CustomPart, RecordedAxes):
     """A user-defined motion (see `marsyard.scenarios.parts.motions`).
 
-    Positions are relative to the ground at `place`; they are those of the camera or, with `lever_m`, of the vehicle.
+    Positions are those of the camera or, with `lever_m`, of the vehicle.
     """
 
     kind = DYNAMICS
@@ -76,12 +83,12 @@ class CustomMotion(CustomPart, RecordedAxes):
 
     motion: Annotated[str, Field(description="custom motion's class: module:Class, or an entry point's name")]
     axes: Annotated[Literal["enu", "ned"], Field(description="east, north, up; or north, east, down")] = "enu"
-    lead_s: Annotated[float, bounded_field(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
+    lead_s: Annotated[float, bounded_field(0.2, 30.0, "start of the navigation before the first image")] = 5.0
 
     def compute(
         self, place: DescentPlace, ground_m: Float[np.ndarray, "3"], rng: np.random.Generator
     ) -> tuple[RecordedMotion, dict[str, Scalar]]:
-        """Return the motion of a case in the terrain's world, and its columns. Raises ValueError for invalid poses."""
+        """Compute the motion of a case in world axes, and its columns. Raises ValueError for invalid poses."""
         poses = check_poses(self.spec, self.create().fly(place, rng), place)
         recorded = self.world * Rotation.from_quat(poses.quaternions_xyzw)
         positions = self.world.apply(poses.positions_m) + self.lever_arms(recorded) + ground_m
@@ -93,7 +100,7 @@ class CustomMotion(CustomPart, RecordedAxes):
 
 
 def check_poses(spec: str, poses: object, place: DescentPlace) -> Poses:
-    """Return a motion's poses as 64-bit arrays. Raises ValueError for invalid poses."""
+    """Check a motion's poses and return them as 64-bit arrays. Raises ValueError for invalid poses."""
     if not isinstance(poses, Poses):
         raise ValueError(f"'{spec}' returns a {type(poses).__name__}; allowed: marsyard.scenarios.parts.Poses")
     names = ("times_s", "positions_m", "quaternions_xyzw")

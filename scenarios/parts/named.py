@@ -1,7 +1,7 @@
-"""Import and construction of user-defined parts by name.
+"""Import and construct user-defined parts by name.
 
-The name of a part is ``module:name``, also for a module in the current folder, or an entry point of an installed
-package in the group of the part's kind.
+The name of a part is ``module:name`` (the module may be in the current folder), or the name of an entry point of an
+installed package in the group of the part's kind.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from marsyard.sim.parameters import Parameters
 
 @dataclass(frozen=True)
 class PartKind:
-    """A kind of part.
+    """A kind of user-defined parts: motions, instruments or scores.
 
-    - name: name on the command line
-    - group: entry point group of installed packages
-    - noun: noun in messages
-    - members: required members of a class; empty for functions
+    - name: name of the kind on the command line
+    - group: entry point group for installed packages
+    - noun: noun for a part of this kind in messages
+    - members: required members of a part's class; empty if parts are functions
     """
 
     name: str
@@ -59,7 +59,7 @@ class PartKind:
             raise ValueError(f"cannot import {self.noun} '{spec}': {error}") from error
 
     def create(self, spec: str, options: Mapping[str, Any]) -> Any:
-        """Construct a part's class. Raises ValueError for a missing class, another kind, or invalid options."""
+        """Construct a part from its class. Raises ValueError for a missing or unsuitable class, or invalid options."""
         part = self.load(spec)
         if not isinstance(part, type):
             raise ValueError(f"'{spec}' is not a valid {self.noun}: it is a {type(part).__name__}, not a class")
@@ -91,7 +91,7 @@ def list_installed(group: str) -> Mapping[str, str]:
 
 
 def default_options(part: Any) -> dict[str, JsonValue]:
-    """Return the options of a class with their default values, except defaults that TOML cannot represent."""
+    """Return the options of a class that have a default value which TOML can represent, with this value."""
     options: dict[str, JsonValue] = {}
     with suppress(TypeError, ValueError):  # a class without a signature
         for name, argument in inspect.signature(part).parameters.items():
@@ -101,10 +101,10 @@ def default_options(part: Any) -> dict[str, JsonValue]:
 
 
 class CustomPart(Parameters):
-    """A parameter table with a user-defined class, whose name is in the key `name_key`, and its options.
+    """A parameter table with the name of a user-defined class, in the key `name_key`, and the options of the class.
 
-    The class's defaults complete the options when the campaign is read: the campaign's record contains all options, and
-    each can be dispersed.
+    When the campaign is read, missing options are set to the defaults of the class. The campaign's record therefore
+    contains all options, and each option can be dispersed.
     """
 
     kind: ClassVar[PartKind]
@@ -138,7 +138,7 @@ class CustomPart(Parameters):
         return self
 
     def columns(self, prefix: str, reported: Mapping[str, Scalar]) -> dict[str, Scalar]:
-        """Return the columns of the row: name of the part, its scalar options, and the columns that it reports.
+        """Return the result columns of a part: its name, its scalar options, and the columns that it reports.
 
         Raises ValueError for a reported column with an invalid name or value, or with the name of an option.
         """
@@ -152,20 +152,23 @@ class CustomPart(Parameters):
 
 
 def default_or_custom(default: type[BaseModel], custom: type[CustomPart]) -> Discriminator:
-    """Discriminator between a table with a user-defined part and the default table; tags are the models' names."""
+    """Create the discriminator between a table with a user-defined part and the default table.
 
-    def model(table: Any) -> str:
+    The tags are the names of the models.
+    """
+
+    def select_tag(table: Any) -> str:
         is_custom = custom.name_key in table if isinstance(table, Mapping) else isinstance(table, custom)
         return custom.__name__ if is_custom else default.__name__
 
-    return Discriminator(model)
+    return Discriminator(select_tag)
 
 
 def check_columns(spec: str, reported: object, *, texts: bool = True) -> dict[str, Scalar]:
-    """Return the columns reported by a part: numbers as floats, booleans and texts unchanged.
+    """Check and return the columns reported by a part: numbers as floats, booleans and texts unchanged.
 
-    Raises ValueError for anything except a mapping, names that are not ASCII identifiers, or values of another type
-    (with `texts` false also for texts).
+    Raises ValueError if `reported` is not a mapping, a name is not an ASCII identifier, or a value is not a number, a
+    boolean or a text; texts are allowed only if `texts` is true.
     """
     if not isinstance(reported, Mapping):
         raise ValueError(f"'{spec}' returns columns of type {type(reported).__name__}; allowed: a mapping")

@@ -1,12 +1,12 @@
 """User-defined scores: `scores` of a campaign.
 
-A score is a function ``score(case) -> Mapping[str, float | bool]``, with the same names in every case; NaN means no
-number. Its values become columns prefixed with the function's name: `lateral_j` of `energy` becomes `energy_lateral_j`.
-Requirements use them as metrics, or booleans as populations. The answer of each algorithm is scored, except after a
-crash of the algorithm.
+A score is a function ``score(case) -> Mapping[str, float | bool]``. It returns the same names in every case; NaN is a
+missing number. Its values become result columns with the name of the function as prefix: `lateral_j` of the function
+`energy` becomes `energy_lateral_j`. Requirements use numeric columns as metrics and boolean columns as populations. The
+answer of each algorithm is scored, except after a crash of the algorithm.
 
-The annotation of the argument defines the accepted kinds of cases, one or a union of several; without annotation, the
-score must accept all kinds. A kind includes its subclasses: `ScoredVelocity` includes `ScoredFlight`.
+The annotation of the argument defines the accepted kinds of cases: one class or a union of classes, with their
+subclasses (`ScoredVelocity` includes `ScoredFlight`). A score without annotation must accept all kinds.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredVelocity:
-    """An estimator's answer to pictures of a descent, simulated or real.
+    """A velocity estimator's answer to images of a descent, simulated or real.
 
-    - measurements: the estimator's input
-    - answer: its output; `answer.velocity_m_s` is None after a failure
-    - true_velocity_m_s: true mean horizontal velocity (east, north) over the answer's span, by default the last
-      interval; None if unknown
+    - measurements: input of the estimator
+    - answer: output of the estimator; `answer.velocity_m_s` is None after a failure
+    - true_velocity_m_s: true mean horizontal velocity (east, north) over the answer's span, by default the interval of
+      the last two images; None if unknown
     """
 
     measurements: DescentMeasurements
@@ -50,7 +50,11 @@ class ScoredVelocity:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredFlight(ScoredVelocity):
-    """`ScoredVelocity` with known true motion and states at the pictures: simulated descent, or field test flight."""
+    """A velocity estimator's answer in a simulated descent, or in a flight of the field test.
+
+    - states: true states at the images
+    - motion: true motion; `motion.state(time_s)` returns the state at a time within `motion.span_s`
+    """
 
     states: tuple[State, ...]
     motion: Trajectory
@@ -58,10 +62,10 @@ class ScoredFlight(ScoredVelocity):
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredDescent(ScoredFlight):
-    """A simulated descent down to the ground.
+    """A velocity estimator's answer in a simulated descent, with the touchdown.
 
     - at_firing: true state at the firing of the thrusters
-    - touchdown_m_s: true horizontal touchdown velocity, east and north, if the answer is used
+    - touchdown_m_s: true horizontal touchdown velocity (east, north) of a landing steered with the answer
     """
 
     at_firing: State
@@ -70,11 +74,11 @@ class ScoredDescent(ScoredFlight):
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredSite:
-    """An estimator's answer to two pictures of the ground, simulated or real.
+    """A landing site estimator's answer to two images of the ground, simulated or real.
 
-    - measurements: the estimator's input
-    - answer: its output; `answer.site_world` is None without a site
-    - true_poses: true poses of the body at the two pictures, in the world; None if unknown
+    - measurements: input of the estimator
+    - answer: output of the estimator; `answer.site_world` is None without a site
+    - true_poses: true poses of the body, in world axes, at the two images; None if unknown
     """
 
     measurements: LandingMeasurements
@@ -84,7 +88,11 @@ class ScoredSite:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredLanding(ScoredSite):
-    """A simulated flight for a landing site: true states at the two pictures, and the true safety of the ground."""
+    """A landing site estimator's answer in a simulated flight.
+
+    - states: true states at the two images
+    - ground: true slope, roughness and safety of the ground
+    """
 
     states: tuple[State, State]
     ground: GroundTruth
@@ -92,13 +100,14 @@ class ScoredLanding(ScoredSite):
 
 @dataclass(frozen=True)
 class ScoredRun:
-    """A rover's run with a tracker's answers, stop by stop.
+    """A tracker's answers at the stops of a rover's run.
 
-    - outcome: end of the run, a name of `marsyard.scenarios.rover.stops.RunOutcome`
-    - target_world: the designated point, metres
+    - outcome: outcome of the run, a name of `marsyard.scenarios.rover.stops.RunOutcome`
+    - target_world: the designated point, world axes, metres
     - world_from_rover: true pose of the rover at each stop
-    - point_px: true image of the designated point in the left camera at each stop, full-frame (u, v); NaN if hidden
-    - measurements, answers: the tracker's input and output at each stop
+    - point_px: true full-frame pixel (u, v) of the designated point in the left camera at each stop; NaN if the camera
+      cannot see the point
+    - measurements, answers: input and output of the tracker at each stop
     """
 
     outcome: str
@@ -139,7 +148,7 @@ def load_score(spec: str, kind: type[Any] | None = None) -> Any:
 
 
 class CustomScores(Parameters):
-    """Parameters of a scenario with user-defined scores; `scored` is its kind of case."""
+    """Parameters of a scenario with user-defined scores; `scored` is the class of its cases as input of scores."""
 
     scored: ClassVar[type[Any]]
 

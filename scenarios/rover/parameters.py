@@ -1,4 +1,4 @@
-"""Parameters of the rover scenario."""
+"""Parameters of the rover scenario: world, target, route, cameras, timing, and tracker."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Azimuth = Annotated[float, Field(ge=-360.0, le=720.0)]
 
 
 class InclineParameters(Parameters):
-    """An even slope around the target that rises to the east, and the direction of the route on it."""
+    """A plane slope around the target that rises to the east, and the direction of the route on it."""
 
     name: Annotated[str, Field(min_length=1, description="name in the report")] = "flat ground"
     slope_deg: Annotated[float, Field(ge=0.0, le=40.0, description="0: no slope")] = 0.0
@@ -60,14 +60,14 @@ class WorldParameters(Parameters):
     terrain: Annotated[int, Field(ge=0, description="index of the terrain in the bank")] = 0
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, every 2.5 cm")] = 2048
     incline: InclineParameters = InclineParameters()
-    rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "of the ground; default: the site's")] = None
-    dust_opacity: Annotated[float | None, bounded_field(0.0, 10.0, "of the air; default: the site's")] = None
+    rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "ground's RMS slope; default: the site's")] = None
+    dust_opacity: Annotated[float | None, bounded_field(0.0, 10.0, "air's optical depth; default: the site's")] = None
     rock_abundance: Annotated[float | None, bounded_field(0.0, 0.4, "area fraction; default: the site's")] = None
     largest_near_m: Annotated[NonNegative, Field(description="maximum diameter of rocks on the route")] = 0.08
     east_m: float = Field(default=8.0, description="position of the target's rock, periodic terrain")
     north_m: float = Field(default=8.0, description="position of the target's rock, periodic terrain")
-    rocks_underfoot: bool = Field(default=False, description="whether wheels roll over rocks, or only the ground")
-    background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle of rocks behind target")] = 50.0
+    rocks_underfoot: bool = Field(default=False, description="whether wheels roll over rocks; else only over ground")
+    background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle of rendered rocks' sector")] = 50.0
 
     @model_validator(mode="after")
     def _check_terrain(self) -> WorldParameters:
@@ -92,8 +92,8 @@ class ObstacleParameters(Parameters):
 class TargetParameters(Parameters):
     """The target's rock, the designated point on it, and the kind of designation (section 3).
 
-    The point is picked in the view from the start: `across` is its horizontal position from the left (-1) to the right
-    (1) outline of the rock, `up` its vertical position from the foot (0) to the top (1).
+    The point is selected in the view from the start: `across` is its horizontal position from the left (-1) to the
+    right (1) outline of the rock, `up` its vertical position from the foot (0) to the top (1).
     """
 
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 0.8
@@ -106,7 +106,7 @@ class TargetParameters(Parameters):
 
 
 class StartParameters(Parameters):
-    """The rover's start, relative to the target."""
+    """The rover's position and heading at the start, relative to the target."""
 
     distance_m: float = Field(default=10.0, gt=1.0, le=40.0, description="horizontal, from mast to designated point")
     bearing_deg: Azimuth = Field(default=270.0, description="from the target to the rover, clockwise from north")
@@ -129,18 +129,20 @@ class LegParameters(Parameters):
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
     steps: Annotated[int, bounded_field(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
     step_fraction: float = Field(default=0.1, gt=0.0, le=0.9, description="step length / the camera's distance")
-    step_m: Annotated[float | None, Field(description="fixed step length instead; needed for straight")] = None
+    step_m: Annotated[float | None, Field(description="fixed step length; required for straight")] = None
     step_deg: Annotated[RelativeAngle, Field(description="step of a turn or circle")] = 5.0
     goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
-    ends_with_steps: bool = Field(default=False, description="whether it may end before goal_m after all steps")
+    ends_with_steps: bool = Field(default=False, description="whether the leg may end after all steps before goal_m")
     offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
-    shuffle_m: NonNegative = Field(default=0.0, description="drive of a step with a stuck motor, reversed in the next")
+    shuffle_m: NonNegative = Field(
+        default=0.0, description="drive after each step of a turn, alternately forward, back"
+    )
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
-    visual_odometry_step_m: Positive = Field(default=0.75, description="maximum drive between pictures (60 % overlap)")
-    autonav: bool = Field(default=False, description="whether the navigator avoids rocks in its map")
+    visual_odometry_step_m: Positive = Field(default=0.75, description="maximum drive between images (60 % overlap)")
+    autonav: bool = Field(default=False, description="whether a navigator avoids the rocks in its map")
     maps_first: Annotated[bool, Field(description="whether the navigator maps before the first step")] = False
-    map_by: Annotated[Literal["body", "mast"], Field(description="cameras that map for the navigator")] = "mast"
-    wedges: Annotated[int, Field(ge=1, le=4, description="wedges of the mast's pictures at each step")] = 2
+    map_by: Annotated[Literal["body", "mast"], Field(description="cameras of the navigator's map")] = "mast"
+    wedges: Annotated[int, Field(ge=1, le=4, description="number of mapped wedges at each step, for the mast")] = 2
     target_is_no_obstacle: bool = Field(default=True, description="whether the navigator ignores the target's rock")
 
     @model_validator(mode="after")
@@ -153,7 +155,7 @@ class LegParameters(Parameters):
 
 
 class SunParameters(Parameters):
-    """Position of the sun at the start, and its motion."""
+    """Position of the sun at the start, and motion of the sun."""
 
     azimuth_deg: Annotated[Azimuth, Field(description="clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
@@ -161,7 +163,7 @@ class SunParameters(Parameters):
         16.0 / 66.0
     )
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
-    held_s: Annotated[Positive, Field(description="interval in which all pictures have the same sun")] = 120.0
+    held_s: Annotated[Positive, Field(description="interval in which the sun is constant in images")] = 120.0
 
     def direction(self, time_s: float) -> Float64[np.ndarray, "3"]:
         """Compute the unit vector to the sun, world axes; the sun rotates westwards about the pole."""
@@ -173,12 +175,12 @@ class SunParameters(Parameters):
         return np.asarray(rotated / np.linalg.norm(rotated))
 
     def sun_in_interval(self, index: int, angular_radius_rad: float) -> Sun:
-        """Return the sun at the centre of an interval of `held_s`; all pictures of the interval use it."""
+        """Return the sun of all images in an interval of `held_s`: the sun at the centre of the interval."""
         return Sun(self.direction((index + 0.5) * self.held_s), angular_radius_rad)
 
 
 class TimingParameters(Parameters):
-    """Durations of a run's activities (Table IV, means)."""
+    """Durations of a run's activities (means of Table IV)."""
 
     track_s: Annotated[NonNegative, Field(description="a tracking update, s")] = 45.0
     visual_odometry_s: Annotated[NonNegative, Field(description="a visual odometry update, s")] = 105.0
@@ -187,7 +189,7 @@ class TimingParameters(Parameters):
 
 
 class ExposureParameters(Parameters):
-    """Exposure of the pictures (section 4.5)."""
+    """Exposure of the images (section 4.5)."""
 
     of: Literal["subframe", "full-frame", "fixed"] = Field(default="subframe", description="region of auto-exposure")
     auto: AutoExposureParameters = AutoExposureParameters()
@@ -197,7 +199,7 @@ class CustomPair(Parameters):
     """A custom stereo pair on the mast's head; the positions in the camera files are ignored."""
 
     left: Annotated[CustomCameraChoice, Field(description="camera file: a path, or a table with file")]
-    right: Annotated[CustomCameraChoice | None, Field(description="right camera file; default: as left")] = None
+    right: Annotated[CustomCameraChoice | None, Field(description="right camera file; default: same as left")] = None
     baseline_m: Annotated[float, Field(gt=0.0, le=5.0, description="distance between the cameras, m")]
     toe_in_deg: Annotated[float, Field(ge=-30.0, le=30.0, description="inward rotation of each camera")] = 0.0
 
@@ -219,10 +221,10 @@ class CameraParameters(Parameters):
 
     preset: str = Field(default="mer-navcam", description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
-    detector: DetectorChoice | None = Field(default=None, description="both detectors; default: preset")
-    detector_noise: Annotated[bool, Field(description="whether pictures have detector noise and response")] = True
+    detector: DetectorChoice | None = Field(default=None, description="both detectors; default: the preset's")
+    detector_noise: Annotated[bool, Field(description="whether images have detector noise and response")] = True
     defocus_px: Annotated[NonNegative, Field(le=10.0, description="diameter of a point's defocused image, px")] = 0.0
-    stray_light: Annotated[float, bounded_field(0.0, 0.5, "fraction of the light spread evenly")] = 0.0
+    stray_light: Annotated[float, bounded_field(0.0, 0.5, "fraction of the light spread over the image")] = 0.0
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on each lens")] = 0
 
     @field_validator("preset")
@@ -245,7 +247,7 @@ class CameraParameters(Parameters):
         return self.preset if self.custom is None else self.custom.left.file or "custom"
 
     def mast(self) -> MastCalibration:
-        """Return the design of the mast and its stereo pair."""
+        """Return the mast and its stereo pair as designed, without errors."""
         design = stereo_mast(self.preset)
         if self.custom is None:
             return design
@@ -261,10 +263,10 @@ class CameraParameters(Parameters):
 
 
 class ScoreParameters(Parameters):
-    """Criterion for a tracked target, and number of updates with columns."""
+    """Criterion for a tracked target, and number of updates that are stored in columns."""
 
     tracked_px: Positive = Field(default=10.0, description="maximum distance of a tracked target from the true pixel")
-    stored_updates: int = Field(default=0, ge=0, le=100, description="number of first updates with columns")
+    stored_updates: int = Field(default=0, ge=0, le=100, description="number of first updates stored in columns")
 
 
 class RoverScenarioParameters(AlgorithmSelection, CustomScores):

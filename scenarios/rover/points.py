@@ -1,4 +1,4 @@
-"""Ray casting on the target's rock: points on its visible face, occlusion, its shadow and the rover's shadow."""
+"""Ray casting on the target's rock: points on the visible face, occlusion, shadows of the rock and of the rover."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ Points = Float64[np.ndarray, "points 3"]
 
 #: Number of rows that sample a rock's outline.
 _OUTLINE_ROWS = 96
-#: A point is occluded if a surface is at least this far in front of it, metres: more than rounding, less than relief.
+#: A point is occluded if a surface is at least this far in front of it, m: more than rounding errors, less than relief.
 _MIN_GAP_M = 1e-3
 #: Number of rays along a side of the patch whose normals are averaged.
 _PATCH_RAYS = 5
-#: Directions around a point in which its template is sampled for shadow, and radii as fractions of its half side.
+#: Sample points of a template: number of directions around its centre, and radii as fractions of its half side.
 _RING_POINTS, _RING_RADII = 8, (0.5, 1.0)
 
 
@@ -40,7 +40,7 @@ def intersect_rays(
 ) -> tuple[Float64[np.ndarray, "rays"], Int64[np.ndarray, "rays"]]:
     """Compute the distance to the first triangle on each ray and its index; infinite and -1 without an intersection.
 
-    Method: Moeller & Trumbore.
+    Method: Moeller & Trumbore, "Fast, Minimum Storage Ray/Triangle Intersection", J. Graphics Tools 2(1), 1997.
     """
     corner = triangles[:, 0]
     edge_1, edge_2 = triangles[:, 1] - corner, triangles[:, 2] - corner
@@ -69,7 +69,7 @@ def ray_distances(triangles: Triangles, origin: Vector, directions: Rays) -> Flo
 
 
 def triangles_near_line(triangles: Triangles, eye: Vector, point: Vector, half_angle_rad: float) -> Triangles:
-    """Select all triangles that rays within an angle of the line of sight can hit; the selection is conservative."""
+    """Select all triangles that rays within an angle of the line of sight can hit, and possibly some more."""
     axis = (point - eye) / np.linalg.norm(point - eye)
     centres = triangles.mean(axis=1) - eye
     depths = centres @ axis
@@ -100,7 +100,7 @@ def patch_normal(triangles: Triangles, eye: Vector, point: Vector, half_angle_ra
 
 @dataclass(frozen=True)
 class RockOutline:
-    """Outline of a rock from one eye, in tangents of angles to the right of and above the line to its centre."""
+    """Outline of a rock seen from an eye, in tangents of angles to the right of and above the line to its centre."""
 
     triangles: Triangles
     eye: Vector
@@ -109,7 +109,7 @@ class RockOutline:
 
     @classmethod
     def from_triangles(cls, triangles: Triangles, eye: Vector, ground_m: float) -> RockOutline:
-        """Compute the outline of the part above a height."""
+        """Compute the outline of the part of the rock above the height `ground_m`."""
         corners = triangles.reshape(-1, 3)
         corners = corners[corners[:, 2] > ground_m]
         axes = sight_axes(0.5 * (corners.min(axis=0) + corners.max(axis=0)) - eye)
@@ -125,7 +125,7 @@ class RockOutline:
     def point(self, across: float, up: float) -> Vector:
         """Compute the surface point at `across` from left (-1) to right (1), and at `up` from foot (0) to top (1).
 
-        Raises ValueError if the line of sight hits no triangle, as at the outline itself.
+        Raises ValueError if the line of sight hits no triangle, for example exactly on the outline.
         """
         heights, left, right = self.rows.T
         tangent_up = heights[0] + up * (heights[-1] - heights[0])
@@ -140,21 +140,24 @@ class RockOutline:
 
 
 def find_self_occlusion(triangles: Triangles, points: Points, eye: Vector) -> Bool[np.ndarray, "points"]:
-    """Find the points of a rock that the rock itself hides from an eye."""
+    """Return for each point of a rock whether the rock occludes it, seen from an eye."""
     offsets = points - eye
     distance = np.linalg.norm(offsets, axis=1)
     return np.asarray(ray_distances(triangles, eye, offsets / distance[:, None]) < distance - _MIN_GAP_M)
 
 
 def find_self_shadow(triangles: Triangles, points: Points, sun_direction: Vector) -> Bool[np.ndarray, "points"]:
-    """Find the points of a rock that are in the rock's own shadow."""
+    """Return for each point of a rock whether the rock shadows it."""
     origins = points + 2.0 * _MIN_GAP_M * sun_direction
     distances = [ray_distances(triangles, origin, sun_direction[None])[0] for origin in origins]
     return np.array([np.isfinite(distance) for distance in distances], dtype=bool)
 
 
-def template_patch(eye: Vector, point: Vector, half_angle_rad: float) -> Points:
-    """Create points on rings around a point, perpendicular to the line of sight, up to an angle seen from the eye."""
+def sample_template(eye: Vector, point: Vector, half_angle_rad: float) -> Points:
+    """Create sample points of a template: a point, and rings around it perpendicular to the line of sight.
+
+    `half_angle_rad` is half the template's angular size, seen from the eye.
+    """
     _, right, up = sight_axes(point - eye)
     angles = np.linspace(0.0, 2.0 * np.pi, _RING_POINTS, endpoint=False)
     radius_m = float(np.tan(half_angle_rad) * np.linalg.norm(point - eye))
@@ -171,8 +174,8 @@ def cast_rover_shadow(
     radius_m: float,
     sun_direction: Vector,
 ) -> Objects | None:
-    """Return the rover's mesh with its mast at these angles if its shadow may fall into a sphere, else None."""
-    # the mesh is built only if its bounding sphere may cast a shadow into the sphere
+    """Return the rover's mesh, with its mast at these angles, if its shadow may fall on the given sphere, else None."""
+    # the mesh is built only if the rover's bounding sphere may cast a shadow on the sphere
     if not may_cast_shadow(rover_sphere(rover, stance, mast), sun_direction, centre_m, radius_m):
         return None
     body = rover_objects(rover, stance, mast, *angles_rad)

@@ -1,7 +1,7 @@
-"""The closed loop of a run: at each stop visual odometry, tracking, navigation, drive, in the order of Fig. 12.
+"""Simulate the closed loop of a run: at each stop visual odometry, tracking, navigation and drive, as in Fig. 12.
 
-A guide points the mast at a stop and estimates the target's position. It is a tracker (`TrackerGuide`), or the true
-position (`TruthGuide`) for drives whose pictures are used by many trackers.
+A guide points the mast at each stop and estimates the target's position. `TrackerGuide` uses a tracker; `TruthGuide`
+uses the true position, for drives whose images are used by many trackers.
 """
 
 from __future__ import annotations
@@ -32,22 +32,23 @@ from marsyard.sim.frames import compose
 from marsyard.sim.measurements import DriveCommand, MastCalibration, RoverMeasurements
 from marsyard.sim.streams import Streams
 
-#: Radius around the target in a subframe, divided by the target's distance: 8 deg, more than half the diagonal of the
-#: subframe of a navcam's right camera.
+#: Radius of the ground in a subframe around the target, divided by the target's distance: 8 deg, more than half the
+#: diagonal of the subframe of a navcam's right camera.
 SUBFRAME_RADIUS_FRACTION = 0.14
 #: Maximum distance from the goal at the end of an approach or back-off, metres.
 GOAL_TOLERANCE_M = 0.03
-#: Maximum goal direction from straight ahead for an arc; beyond it the rover first turns in place.
+#: Maximum angle of the goal from straight ahead for an arc; for a larger angle the rover first turns in place.
 MAX_ARC_RAD = np.radians(15.0)
-#: Wedges of the mast's cameras: half of a navcam's 45 deg, from the end of the rover's deck to the maximum stereo range
-#: of rocks; neighbours overlap by 5 deg. Body cameras (hazcams): half of 120 deg, from the front wheels.
+#: Mapped wedges of the mast's cameras: half a navcam's field of view of 45 deg, from the end of the rover's deck to the
+#: maximum stereo range of rocks; neighbours overlap by 5 deg.
 MAST_HALF_RAD, MAST_MIN_M, MAST_MAX_M, MAST_SPACING_RAD = float(np.radians(22.5)), 1.4, 12.0, np.radians(40.0)
+#: Mapped wedge of the body cameras (hazcams): half the field of view of 120 deg, from the front wheels.
 BODY_HALF_RAD, BODY_MIN_M, BODY_MAX_M = float(np.radians(60.0)), 0.3, 4.0
 
 
 @dataclass(frozen=True)
 class TargetEstimate:
-    """Target position that the on-board computer uses to plan a step."""
+    """On-board estimate of the target's position, used to plan a step."""
 
     position_rover: Float64[np.ndarray, "3"]  #: latest estimate in the rover frame, metres
     range_m: float  #: distance from the camera
@@ -59,9 +60,9 @@ class TargetEstimate:
 
 
 def goal_position(leg: LegParameters, target: TargetEstimate) -> Float64[np.ndarray, "2"]:
-    """Compute the final position of the rover's origin, forward and left of the current one, metres.
+    """Compute the goal of the rover's origin, forward and left of its current position, metres.
 
-    It is on the line to the target, `goal_m` in front of the target, shifted to the right by the offset.
+    The goal is on the line to the target, `goal_m` in front of the target, shifted to the right by `offset_right_m`.
     """
     ahead = target.position_rover[:2] / target.distance_m
     right = np.array([ahead[1], -ahead[0]])
@@ -82,8 +83,8 @@ def is_finished(leg: LegParameters, step_count: int, target: TargetEstimate) -> 
     return leg.motion == "back-off" and target.distance_m >= leg.goal_m - GOAL_TOLERANCE_M
 
 
-def step_commands(leg: LegParameters, step_count: int, target: TargetEstimate) -> Iterator[DriveCommand]:
-    """Plan the commands of the next step; there are two if the rover turns in place before it drives."""
+def plan_step(leg: LegParameters, step_count: int, target: TargetEstimate) -> Iterator[DriveCommand]:
+    """Plan the commands of the next step; two commands if the rover turns in place before it drives."""
     if leg.motion == "turn":
         yield DriveCommand(turn_left_rad=-float(np.radians(leg.step_deg)))
         if leg.shuffle_m:
@@ -98,10 +99,10 @@ def step_commands(leg: LegParameters, step_count: int, target: TargetEstimate) -
     elif leg.motion == "back-off":
         yield DriveCommand(forward_m=-min(step_length_m(leg, target), leg.goal_m - target.distance_m))
     elif leg.motion == "approach":
-        yield from drive_towards(goal_position(leg, target), step_length_m(leg, target))
+        yield from plan_drive(goal_position(leg, target), step_length_m(leg, target))
 
 
-def drive_towards(position: Float64[np.ndarray, "2"], max_length_m: float) -> Iterator[DriveCommand]:
+def plan_drive(position: Float64[np.ndarray, "2"], max_length_m: float) -> Iterator[DriveCommand]:
     """Plan a step to a position (forward, left): an arc, or a turn in place and a straight drive."""
     angle = float(np.arctan2(position[1], position[0]))
     chord = float(np.hypot(*position))
@@ -162,7 +163,7 @@ class TrackerGuide:
     """The tracker under test as guide: it receives copies of its inputs, and its answers are checked."""
 
     def __init__(self, p: RoverScenarioParameters, run: Run, estimated: RigidTransform) -> None:
-        """Create the tracker and designate the run's target at the rover's estimated pose."""
+        """Create the tracker and designate the run's target; `estimated` is the rover's estimated world pose."""
         self._tracker: TargetTracker = TRACKING.make(p.algorithm, p.vtt, p.executable)
         self._mast = InputCopy[MastCalibration](run.rig.calibrated)
         self._tracker.designate(InputCopy(run.target.designation).inputs, estimated)
@@ -177,8 +178,11 @@ class TrackerGuide:
         return check_aim(answer, run.rig.calibrated)
 
     def observe(self, run: Run, view: View) -> RunOutcome | None:
-        """Update the tracker and append the stop to the run; return why the run ended, or None. Raises as `aim`."""
-        input_copy = InputCopy((view.pictures.left, view.pictures.right))
+        """Update the tracker and append the stop to the run; return the outcome if the run ends, else None.
+
+        Raises the same exceptions as `aim`.
+        """
+        input_copy = InputCopy((view.images.left, view.images.right))
         measurements = RoverMeasurements(*input_copy.inputs, self._mast.inputs, *view.angles_rad, view.estimated)
         start_s = time.process_time()
         answer = self._tracker.update(measurements)
@@ -203,13 +207,13 @@ class TrackerGuide:
 
 @dataclass(frozen=True)
 class TruthGuide:
-    """The true target position as guide; it stores the views."""
+    """The true target position as guide; stores the views of all stops."""
 
     margin_px: float
     views: list[View] = field(default_factory=list)
 
     def aim(self, run: Run) -> MastAim | None:
-        """Point at the target; the boxes contain the visible rock above its foot, and a margin."""
+        """Return an aim at the target; its boxes contain the visible rock above its foot, and a margin."""
         stance, rig = run.vehicle.stance, run.rig
         angles = mast_angles(self.target(run).position_rover, rig.calibrated, use_both=False)
         if angles is None:
@@ -248,7 +252,7 @@ def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
 
 
 def prepare_run(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Run:
-    """Create a run at its start: choose the target; do not call the tracker."""
+    """Create a run at its start and choose its target; the tracker is not called."""
     setup = Setup.draw(p, streams, load_ground)
     return Run.from_setup(setup, choose_target(p, setup.world, setup.rig, setup.vehicle.stance))
 
@@ -273,7 +277,7 @@ def track_target(p: RoverScenarioParameters, run: Run) -> Run:
 
 
 def drive_legs(p: RoverScenarioParameters, run: Run, guide: Guide) -> RunOutcome | None:
-    """Drive all legs; return why the run ended early, or None."""
+    """Drive all legs; return the outcome if the run ends early, else None."""
     failure = visit_stop(p, run, guide, -1)
     for number, leg in enumerate(p.legs):
         count = 0
@@ -286,7 +290,7 @@ def drive_legs(p: RoverScenarioParameters, run: Run, guide: Guide) -> RunOutcome
 
 
 def visit_stop(p: RoverScenarioParameters, run: Run, guide: Guide, leg: int) -> RunOutcome | None:
-    """Point the mast, take pictures, and pass them to the guide; return why the run ended, or None."""
+    """Point the mast, take images, and pass them to the guide; return the outcome if the run ends, else None."""
     run.time_s += p.timing.track_s
     aim = guide.aim(run)
     if aim is None:
@@ -301,18 +305,18 @@ def visit_stop(p: RoverScenarioParameters, run: Run, guide: Guide, leg: int) -> 
         geometry, sun = rig.calibrated.geometry, world.scene(time_s).sun.direction
         shadow = cast_rover_shadow(vehicle.rover, stance, geometry, rig.state.true_rad, target, radius_m, sun)
     cameras, boxes, brightness = (rig.left, rig.right), (aim.left, aim.right), world.brightness(time_s)
-    pictures = run.camera.take(world.scene(time_s), shadow, world_from_head, cameras, boxes, brightness, time_s)
+    images = run.camera.take(world.scene(time_s), shadow, world_from_head, cameras, boxes, brightness, time_s)
     angles, drives = rig.state.readings_rad, tuple(run.pending)
     run.pending = []
-    view = View(leg, time_s, vehicle.stance, vehicle.estimated, angles, world_from_head, pictures, drives)
+    view = View(leg, time_s, vehicle.stance, vehicle.estimated, angles, world_from_head, images, drives)
     return guide.observe(run, view)
 
 
 def drive_step(
     p: RoverScenarioParameters, run: Run, leg: LegParameters, step_count: int, target: TargetEstimate
 ) -> RunOutcome | None:
-    """Drive one step of a leg, divided for visual odometry if needed; return why the run ended, or None."""
-    commands: Iterable[DriveCommand] = step_commands(leg, step_count, target)
+    """Drive one step of a leg, in parts for visual odometry; return the outcome if the run ends, else None."""
+    commands: Iterable[DriveCommand] = plan_step(leg, step_count, target)
     if leg.autonav:
         map_terrain(p, run, leg, target)
         estimated, step_m = run.vehicle.estimated, step_length_m(leg, target)
@@ -335,9 +339,9 @@ def drive_step(
 
 
 def map_terrain(p: RoverScenarioParameters, run: Run, leg: LegParameters, target: TargetEstimate) -> None:
-    """Add the wedges of a navigation update to the map, with their rocks at estimated positions.
+    """Add the wedges of a navigation update, and the rocks at their estimated positions, to the navigator's map.
 
-    The first update also adds the ground under the rover.
+    The first update also adds a disc around the rover.
     """
     run.autonav_updates += 1
     run.time_s += p.timing.autonav_s
@@ -349,7 +353,8 @@ def map_terrain(p: RoverScenarioParameters, run: Run, leg: LegParameters, target
         obstacles.append(Obstacle(name, centre, 0.5 * float(rocks.diameter_m[number]), float(rocks.height_m[number])))
     position, forward = estimated.translation[:2], estimated.rotation.as_matrix()[:2, 0]
     heading = float(np.arctan2(forward[0], forward[1]))
-    wedges = [] if run.terrain.wedges else [Wedge(position.copy(), 0.0, float(np.pi), 0.0, rover.reach_m + 0.3)]
+    radius_m = rover.enclosing_radius_m + 0.3
+    wedges = [] if run.terrain.wedges else [Wedge(position.copy(), 0.0, float(np.pi), 0.0, radius_m)]
     if leg.map_by == "body":
         apex = np.asarray(position + rover.front_m * forward)
         wedges.append(Wedge(apex, heading, BODY_HALF_RAD, BODY_MIN_M, BODY_MAX_M))

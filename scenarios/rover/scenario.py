@@ -1,10 +1,9 @@
-"""Rover scenarios: one run of the closed loop, or one target tracked over the pictures of a shared drive.
+"""Rover scenarios: one run of the closed loop, or one target tracked over the images of a shared drive.
 
-A shared drive is open-loop tracking (paper, 5.1 to 5.3). The true position of the point at the centre of all targets
-guides the rover and its mast. At every stop, subframes of both cameras are taken that contain the rock and the search
-windows around it. A case then tracks one of the targets over every (skip + 1)-th stop: skipped pictures make larger
-steps. The tracker's answers do not move the rover. A drive depends only on the parameters, the campaign's seed and the
-run's index.
+A shared drive is open-loop tracking (paper, 5.1 to 5.3): the tracker's answers do not move the rover. The true position
+of the point at the centre of all targets guides the rover and its mast. At every stop, both cameras take subframes that
+contain the rock and the search windows around it. A case tracks one target over the images of every (skip + 1)-th stop;
+skipping stops makes the steps larger. A drive depends only on the parameters, the campaign's seed and the run's index.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ from marsyard.sim.terrain import TerrainBank
 
 #: Maximum bank size whose terrains are built before the runs; terrains of larger banks are built by the runs.
 MAX_PREPARED_TERRAINS = 64
-#: Cache sizes of a process: grounds, shared drives with their pictures, and visibilities along drives.
+#: Cache sizes of a process: grounds, shared drives with their images, visibilities of targets along drives.
 MAX_GROUNDS, MAX_DRIVES, MAX_VISIBILITIES = 4, 1, 128
 
 
@@ -59,7 +58,7 @@ class VariantParameters(Parameters):
 
 
 class PointParameters(Parameters):
-    """A target on the rock's face, as in `TargetParameters`; on a circle, as seen from the middle of the circle."""
+    """A target on the rock's face, as in `TargetParameters`; for a circle leg, seen from the middle of the circle."""
 
     across: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
     up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
@@ -74,7 +73,7 @@ class BandParameters(Parameters):
 
 
 class SharedDriveParameters(Parameters):
-    """Drives whose pictures many cases use; `run`, `target`, `skip`, `drive.algorithm`, `drive.vtt` define a case."""
+    """Drives whose images many cases use; `run`, `target`, `skip`, `drive.algorithm`, `drive.vtt` define a case."""
 
     drive: Annotated[RoverScenarioParameters, Field(description="drive with its smallest steps, and the tracker")]
     variants: Annotated[tuple[VariantParameters, ...], Field(min_length=1, description="the runs")]
@@ -82,7 +81,7 @@ class SharedDriveParameters(Parameters):
     run: Annotated[int, Field(ge=0, description="index of the run")] = 0
     target: Annotated[int, Field(ge=0, description="index of the target")] = 0
     skip: Annotated[int, Field(ge=0, le=100, description="stops skipped between two updates")] = 0
-    margin_px: Annotated[float, Field(gt=0.0, description="margin around the rock in the pictures")] = 110.0
+    margin_px: Annotated[float, Field(gt=0.0, description="margin around the rock in the images")] = 110.0
     bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps")] = ()
     face_deg: float | None = Field(default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`")
 
@@ -106,7 +105,7 @@ class SharedDriveParameters(Parameters):
 
 @dataclass(frozen=True)
 class DriveKey:
-    """All inputs of a drive's pictures: the drive of a run without its tracker, and its seed."""
+    """All inputs of a drive's images: the drive of a run without its tracker, and its seed."""
 
     drive: RoverScenarioParameters
     margin_px: float
@@ -118,7 +117,7 @@ class DriveKey:
     def from_parameters(cls, p: SharedDriveParameters, streams: Streams) -> DriveKey:
         """Create the key of a case's drive."""
         variant, drive = p.variants[p.run], p.drive
-        # the drive is guided by the centre of its targets
+        # the centre of all targets guides the drive
         centre = {name: float(np.mean([getattr(point, name) for point in p.targets])) for name in ("across", "up")}
         rock = variant.model_dump(include={"diameter_m", "height_m", "shape", "yaw_deg"})
         sun = {"azimuth_deg": variant.sun_azimuth_deg, "elevation_deg": variant.sun_elevation_deg}
@@ -135,10 +134,10 @@ class DriveKey:
 
 @dataclass(frozen=True)
 class SharedDrive:
-    """A drive and its pictures; targets on its rock are picked from `eye`.
+    """A drive and its images; `eye` is the position from which targets on the rock are selected.
 
-    The paper selected the targets of its circle on the face that is visible from both ends of the circle. `eye` is
-    the left camera at the start, or in the middle of a circle.
+    `eye` is the left camera at the start, or in the middle of a circle: the paper selected the targets of its circle on
+    the face that is visible from both ends of the circle.
     """
 
     run: Run
@@ -147,7 +146,7 @@ class SharedDrive:
 
 
 def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) -> SharedDrive:
-    """Drive a run and take its pictures; its random streams depend on the run, not on a case."""
+    """Drive a run and take its images; its random streams depend on the run, not on a case."""
     p, streams = key.drive, Streams(key.seed, f"{key.campaign}: run {key.run}", 0)
     setup = Setup.draw(p, streams, load_ground)
     world, rig, leg = setup.world, setup.rig, p.legs[0]
@@ -168,7 +167,7 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
 
 
 def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
-    """Create a run over the drive's pictures: choose the target; do not call the tracker."""
+    """Create a run over the drive's images and choose its target; the tracker is not called."""
     first, run, point = drive.views[0], drive.run, p.targets[p.target]
     position, head = (point.across, point.up), first.world_from_head
     target = pick_target(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.eye)
@@ -176,7 +175,7 @@ def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
 
 
 def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> Run:
-    """Run a tracker over the drive's pictures for one of the targets; default: the tracker under test."""
+    """Run a tracker over the drive's images for one of the targets; default: the tracker under test."""
     run = prepare_shared_run(p, drive)
     parameters = p.drive.model_copy(update={"algorithm": algorithm or p.drive.algorithm})
     guide = TrackerGuide(parameters, run, drive.views[0].estimated)
@@ -201,7 +200,7 @@ def evaluate_drive_visibility(drive: SharedDrive, point: PointParameters, option
 
 
 class RoverScenario(TerrainScenario[RoverScenarioParameters]):
-    """A rover drives to, around or away from a target, and tracks it at every stop."""
+    """Tracking of a target at every stop of a rover that drives to, around or away from the target."""
 
     name = "rover"
     parameters_type = RoverScenarioParameters
@@ -211,7 +210,7 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
         super().__init__(MAX_GROUNDS)
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return the indices of the bank's terrains; empty for a large bank, whose terrains few runs use."""
+        """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the runs."""
         bank = self.check_parameters(parameters).world.bank
         return tuple(range(bank)) if bank <= MAX_PREPARED_TERRAINS else ()
 
@@ -241,7 +240,7 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
 
 
 class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
-    """Many targets are tracked over the pictures of one drive."""
+    """Tracking of many targets over the images of one drive."""
 
     name = "rover-drive"
     parameters_type = SharedDriveParameters
@@ -271,7 +270,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
         return TerrainBank(terrain_parameters(w), w.bank_seed), shared_input
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """Track one target of one run with one step size; all algorithms use the same pictures."""
+        """Track one target of one run with one step size; all algorithms use the same images."""
         p = self.check_parameters(parameters)
         key, point, algorithm = DriveKey.from_parameters(p, streams), p.targets[p.target], p.drive.algorithm
         drive = self._drive(key)
@@ -307,7 +306,7 @@ def _evaluate(
 ) -> CaseResult:
     """Score a run; conditions and products are stored only for the algorithm under test (`is_tested`).
 
-    `start_s` is the processor time at the start of a run that takes its own pictures.
+    `start_s` is the processor time at the start of a run that takes its own images.
     """
 
     def track_and_score() -> tuple[Run, dict[str, Scalar]]:
@@ -322,7 +321,7 @@ def _evaluate(
         row["run_time_s"] = time.process_time() - start_s
         row |= score.visibility_columns(p, run) if is_tested else {}
     if is_tested:
-        digest = hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest()
+        digest = hashlib.sha256(b"".join(stop.images.digest for stop in run.stops)).hexdigest()
         row |= {**score.update_columns(run, p.score.stored_updates), **score.run_conditions(p, run)}
         row |= image_columns(p.backend, digest)
     row |= compute_scores(p.scores, score.create_scored_run(run), {*row, *shared})

@@ -1,4 +1,4 @@
-"""Columns and products of a run: tracking errors, conditions of the simulated objects, arrays for figures."""
+"""Compute columns and products of a run: tracking errors, conditions of the simulated objects, arrays for figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marsyard.scenarios.conditions import ground_columns, optics_columns, sun_co
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.points import rover_shades_patch, template_patch
+from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
 from marsyard.scenarios.rover.run import Run
 from marsyard.scenarios.rover.stops import RunOutcome, evaluate_visibility
 from marsyard.sim.measurements import RoverMeasurements
@@ -46,10 +46,11 @@ def errors_px(run: Run) -> Float64[np.ndarray, "stops 2"]:
 def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     """Compute the columns of tracking success and errors at the goal.
 
-    `tracked`: the run is completed and the last tracked pixel is within `tracked_px` of the true projection of the
-    designated point. `position_error_m`: length of the last reported position minus the designated point, in the rover
-    frame; NaN if the run was not completed. `false_updates`: number of updates that report the target farther than
-    `tracked_px` from the true projection.
+    - `tracked`: whether the run is completed and the last tracked pixel is within `tracked_px` of the true
+      projection of the designated point
+    - `position_error_m`: distance of the last reported position from the designated point; NaN if the run was not
+      completed
+    - `false_updates`: number of updates that report the target farther than `tracked_px` from the true projection
     """
     errors = errors_px(run)
     sizes = np.hypot(*errors.T)
@@ -206,13 +207,14 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     is_moving = lengths > 0.0
     slips = np.array([drive.slip for drive in drives])[is_moving]
     distance = float(lengths.sum())
+    # range and time at the first and last stop, pose error at the last stop
     ranges, times, pose_error = (NAN, NAN), (0.0, 0.0), NAN
     if stops:
         ranges, times = (stops[0].range_m, stops[-1].range_m), (stops[0].time_s, stops[-1].time_s)
         position_error = stops[-1].estimated.translation - stops[-1].stance.world_from_rover.translation
         pose_error = float(np.linalg.norm(position_error))
     sun = [world.sun.direction(time_s) for time_s in times]
-    exposures = np.array([stop.pictures.exposure_s for stop in stops], dtype=np.float64)
+    exposures = np.array([stop.images.exposure_s for stop in stops], dtype=np.float64)
     is_shadowed = _is_rover_shadow_on_target(p, run)
     return {
         "rover_shadow_on_target": is_shadowed,
@@ -245,12 +247,12 @@ def visibility_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar
 def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
     """Return whether the rover's shadow was on the template up to the first stop with a lost or falsely tracked point.
 
-    Later stops are a consequence of the tracker's error.
+    The poses at later stops are a consequence of the tracker's error.
     """
     half_angle, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
     for stop, error in zip(run.stops, np.hypot(*errors_px(run).T), strict=True):
         eye = run.rig.eyes(stop.world_from_head)[0]
-        patch = template_patch(eye, run.target.point_world, half_angle)
+        patch = sample_template(eye, run.target.point_world, half_angle)
         sun = run.world.sun.direction(stop.time_s)
         if p.rover_shadow and rover_shades_patch(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
             return True
@@ -282,7 +284,7 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     stops, rocks, rock_indices = run.stops, run.world.rocks, list(run.world.rocks.names.values())
     arrays: dict[str, object] = {}
     for number, stop in enumerate(stops, start=1):
-        left, right, details = stop.pictures.left, stop.pictures.right, stop.details
+        left, right, details = stop.images.left, stop.images.right, stop.details
         window, matched_px = np.full(4, np.nan), np.full((2, 2), np.nan)
         if details is not None and details.window is not None and details.window_corner is not None:
             window = np.array([*details.window_corner, *details.window.shape[::-1]], dtype=np.float64)
@@ -328,7 +330,7 @@ def create_scored_run(run: Run) -> ScoredRun:
         world_from_rover=tuple(stop.stance.world_from_rover for stop in run.stops),
         point_px=np.array([stop.point_px for stop in run.stops]).reshape(-1, 2),
         measurements=tuple(
-            RoverMeasurements(stop.pictures.left, stop.pictures.right, mast, *stop.angles_rad, stop.estimated)
+            RoverMeasurements(stop.images.left, stop.images.right, mast, *stop.angles_rad, stop.estimated)
             for stop in run.stops
         ),
         answers=tuple(stop.update for stop in run.stops),

@@ -1,4 +1,4 @@
-"""Stops of a run: stereo subframes of the true cameras, poses, and the tracker's answer; choice of the target."""
+"""Stops of a run: take stereo images, store poses and the tracker's answer; choose the target and its visibility."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from marsyard.sim.render import Objects, PixelRays, Scene, process_renderer
 from marsyard.sim.sensor import Detector, auto_expose, natural_fall_off
 from marsyard.sim.streams import Streams
 
-#: Factor by which full-frame auto-exposure reduces the picture size.
+#: Factor by which full-frame auto-exposure reduces the image size.
 _BINNING = 16
 #: Fall-off of a lens; cached because all runs of a process use the same camera designs.
 _cached_fall_off = lru_cache(maxsize=8)(natural_fall_off)
 
 
 @dataclass(frozen=True)
-class StereoPictures:
+class StereoImages:
     """A stereo pair of delivered subframes."""
 
     left: MastImage
@@ -51,7 +51,7 @@ class StereoPictures:
 
     @cached_property
     def digest(self) -> bytes:
-        """Hash of both pictures' counts."""
+        """Hash of both images' counts."""
         return hashlib.sha256(self.left.counts.tobytes() + self.right.counts.tobytes()).digest()
 
 
@@ -59,7 +59,7 @@ class StereoPictures:
 class StereoCamera:
     """The detectors of a stereo pair with drawn pixel responses.
 
-    Without detector noise, counts are rounded values in proportion to light; the left subframe determines the exposure.
+    Without detector noise, counts are proportional to the light and rounded. The left subframe determines the exposure.
     """
 
     parameters: RoverScenarioParameters
@@ -82,11 +82,14 @@ class StereoCamera:
         boxes: tuple[PixelBox, PixelBox],
         brightness: float,
         time_s: float,
-    ) -> StereoPictures:
+    ) -> StereoImages:
         """Take subframes with the true cameras on the mast's head.
 
-        `scene` does not contain the rover; `rover` is its mesh if its shadow may fall into a picture, else None.
-        `world_from_head` and `cameras` are true; `boxes` are the subframes; `brightness` is sunlight relative to 1 AU.
+        - scene: the scene without the rover
+        - rover: mesh of the rover if its shadow may fall into an image, else None
+        - world_from_head, cameras: true pose of the head, and true cameras in the head's frame
+        - boxes: subframes of the cameras
+        - brightness: direct sunlight on the ground relative to 1 AU
         """
         p, scale = self.parameters, np.float32(brightness / self.detectors[0].parameters.sunlight)
 
@@ -117,11 +120,11 @@ class StereoCamera:
                 for window, radiance in zip(windows, radiances, strict=True)
             ]
         else:
-            # 12-bit counts in proportion to light; the left subframe's brightest are at three quarters of full scale
+            # 12-bit counts; the 98 % percentile of the left subframe is at three quarters of full scale
             gain = 3071.0 / max(float(np.percentile(radiances[0], 98.0)), 1e-9)
             counts = [np.clip(np.rint(gain * radiance), 0, 4095).astype(np.uint16) for radiance in radiances]
         left, right = (MastImage(values, box.corner) for values, box in zip(counts, boxes, strict=True))
-        return StereoPictures(left, right, exposure_s)
+        return StereoImages(left, right, exposure_s)
 
 
 class RunOutcome(Enum):
@@ -137,7 +140,7 @@ class RunOutcome(Enum):
 
 @dataclass(frozen=True)
 class View:
-    """The pictures of a stop, with the poses at which they were taken."""
+    """The images of a stop, with the poses at which they were taken."""
 
     leg: int  #: index of the leg that ended at this stop; -1 for the start
     time_s: float  #: time since the start of the run
@@ -145,7 +148,7 @@ class View:
     estimated: RigidTransform  #: estimated world pose of the rover
     angles_rad: tuple[float, float]  #: azimuth and elevation read by the mast's encoders
     world_from_head: RigidTransform  #: true pose of the mast's head
-    pictures: StereoPictures
+    images: StereoImages
     drives: tuple[Drive, ...]  #: drives since the previous stop
 
 
@@ -157,7 +160,7 @@ class Stop(View):
     details: VttDetails | None  #: details of the answer; None for a custom tracker
     reported_rover: Float64[np.ndarray, "3"] | None  #: reported position, rover frame; None if not found
     track_time_s: float  #: processor time of the update
-    point_px: Float64[np.ndarray, "2"]  #: true full-frame (u, v) of the target in the left picture; NaN outside
+    point_px: Float64[np.ndarray, "2"]  #: true full-frame (u, v) of the target in the left image; NaN outside
     point_rover: Float64[np.ndarray, "3"]  #: the designated point in the rover's true frame, metres
     range_m: float  #: true distance from the left camera to the point
 
@@ -179,7 +182,7 @@ class Stop(View):
         )
 
     def reported_px(self, mast: MastCalibration) -> Float64[np.ndarray, "2"]:
-        """Compute the reported pixel of the target in the left picture; NaN if it was not found.
+        """Compute the reported pixel of the target in the left image; NaN if it was not found.
 
         Without details of the match the reported position is projected through the calibrated camera.
         """
@@ -195,11 +198,11 @@ class Stop(View):
         return np.full(3, np.nan) if self.reported_rover is None else np.asarray(self.reported_rover - self.point_rover)
 
 
-#: Number of directions around a point. If one of them shows ground far behind the rock, the point is on an edge.
+#: Number of directions around a point. The point is on an edge if one direction shows ground far behind the rock.
 _RING_DIRECTIONS = 12
-#: Background farther behind the point than this fraction of its distance moves relative to the rock between steps:
-#: the paper's "large discontinuities at occluding boundaries" (5.2). The ground around a small rock, which its template
-#: includes, is nearer: 3 % behind a 7 cm rock at 4 m, 8 % behind a 12 cm rock at 10 m.
+#: Minimum distance of background behind the point, divided by the point's distance, at which the background moves
+#: visibly relative to the rock between steps: "large discontinuities at occluding boundaries" (paper, 5.2). The ground
+#: in the template of a small rock is nearer: 3 % behind a 7 cm rock at 4 m, 8 % behind a 12 cm rock at 10 m.
 BEHIND_FRACTION = 0.1
 
 
@@ -209,7 +212,7 @@ class DesignatedTarget:
 
     point_world: Vector
     designation: TargetDesignation
-    on_edge: bool  #: whether the template in a first picture shows background far behind the rock
+    on_edge: bool  #: whether the template in a first image shows background far behind the rock
     lit: bool  #: whether the point is in direct sunlight at the start
 
 
@@ -217,9 +220,9 @@ class DesignatedTarget:
 class Visibility:
     """Visibility of a point of the rock along a run.
 
-    The width of a patch is proportional to the cosine of its obliquity. A change of 10 deg reduces it by a sixth near
-    45 deg and by a third near 65 deg; scaling and rolling a template do not compensate this. Obliquity is the angle
-    between the left camera's line of sight and the surface normal in the first template; 0 is face-on.
+    Obliquity is the angle between the left camera's line of sight and the surface normal in the first template; it is 0
+    face-on. The apparent width of a patch is proportional to the cosine of its obliquity: an increase by 10 deg reduces
+    the width by a sixth near 45 deg and by a third near 65 deg. Scale and roll of a template do not compensate this.
     """
 
     in_view: bool  #: whether both cameras see the point at every stop, never on an occluding edge
@@ -228,10 +231,10 @@ class Visibility:
 
 
 def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance: Stance) -> DesignatedTarget:
-    """Choose the point at the parameters' position on the rock's face, as operators pick it from the start.
+    """Select the designated point on the rock's face, as operators do from the start.
 
-    The point is designated by its true pixel, or by the position that operators triangulate from both pixels. The mast
-    does not move until the rover's first pictures.
+    The point is designated by its true pixel, or by the position triangulated from its true pixels in both images. The
+    mast does not move between this designation and the rover's first images.
     """
     number = world.target_number
     centre = world.rocks.position_m[number] + np.array([0.0, 0.0, 0.5 * world.rocks.height_m[number]])
@@ -264,10 +267,10 @@ def pick_target(
     options: VttOptions,
     picking_eye: Vector | None = None,
 ) -> DesignatedTarget:
-    """Pick a point on the rock's face; designate it by its true pixel in the left picture.
+    """Select a point on the rock's face; designate it by its true pixel in the left image.
 
-    `position` is (across, up) as seen from `picking_eye`, by default the left camera. The point is on an edge if it is
-    on an edge for either camera, because stereo matching also needs it in the right picture.
+    `position` is (across, up) seen from `picking_eye`, by default the left camera. The point is on an edge if it is on
+    an edge for either camera, because stereo matching needs it in both images.
     """
     eyes, triangles = rig.eyes(world_from_head), world.target_triangles
     foot = float(world.rocks.position_m[world.target_number, 2])
@@ -302,7 +305,7 @@ def evaluate_visibility(
 
 
 def _is_on_edge(triangles: Triangles, foot_m: float, eye: Vector, point: Vector, half_rad: float) -> bool:
-    """Return whether a line of sight at an angle around the point misses the rock and hits ground far behind it."""
+    """Return whether a line of sight, `half_rad` from the point, passes the rock and hits ground far behind."""
     distance = float(np.linalg.norm(point - eye))
     axis, right, up = points.sight_axes(point - eye)
     angles = np.linspace(0.0, 2.0 * np.pi, _RING_DIRECTIONS, endpoint=False)

@@ -1,4 +1,4 @@
-"""World of a rover run: terrain of a site with the target's rock and obstacles, sun, rover and mast."""
+"""Create the world of a rover run: terrain with the target's rock and obstacles, sun, mast with cameras, and rover."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS
 
 #: Name of the target's rock.
 TARGET = "target"
-#: Viewing height above the target's foot that determines the scene's detail: the mast head's height at the goal.
+#: Viewing height above the target's foot, m, which determines the scene's level of detail: height of the mast's head.
 EYE_HEIGHT_M = 1.2
-#: Distance behind the target up to which ground and rocks are rendered.
+#: Maximum distance of rendered ground and rocks behind the target, m.
 BACKGROUND_M = 25.0
-#: Mesh spacing of the ground around the target, and its growth from line to line. With half the spacing, 38 of 1.4
-#: million pixels change by a thousandth of their brightness (ADR 34).
+#: Mesh spacing of the ground around the target, m, and its relative growth from line to line. With half the spacing, 38
+#: of 1.4 million pixels change by a thousandth of their brightness (ADR 34).
 MESH_FINEST_M, MESH_GROWTH = 0.04, 0.012
-#: Length of an even slope divided by the terrain's period; its centre is at a quarter of the period.
+#: Length of a plane slope divided by the terrain's period; its centre is at a quarter of the period.
 RAMP_FRACTION = 0.4
-#: Margin beyond start and target in which large rocks are removed.
+#: Margin beyond start and target in which large rocks are removed, m.
 CLEARANCE_M = 2.0
 #: Minimum gap between the terrain's rocks and a placed rock, m.
 MIN_GAP_M = 0.05
@@ -44,7 +44,7 @@ ROUTE_MARGIN_M = 1.5
 
 
 def terrain_parameters(w: WorldParameters) -> TerrainParameters:
-    """Return the site's terrain parameters with the campaign's changes."""
+    """Return the site's terrain parameters with the changes of the campaign."""
     changes: dict[str, object] = {"samples": w.samples}
     if w.rms_slope_deg is not None:
         changes["rms_slope_deg"] = w.rms_slope_deg
@@ -92,7 +92,7 @@ class RunWorld:
             mesh_lines=2 * int(np.ceil(np.arcsinh(radius / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1,
             clouds=clouds,
         )
-        # a periodic scene may contain copies of the target's rock: use the copy nearest to its position
+        # a periodic scene may contain copies of the target's rock: use the copy nearest to the rock's position
         number, objects = rocks.by_name(TARGET), scene.objects
         bodies = np.flatnonzero(objects.names == number)
         offsets = objects.spheres[bodies, :2] - rocks.position_m[number][:2]
@@ -100,10 +100,10 @@ class RunWorld:
         first, end = objects.first_triangle[nearest : nearest + 2]
         return cls(ground, rocks, scene, p.sun, number, objects.triangles[first:end])
 
-    def face_m(self, p: RoverScenarioParameters) -> float:
+    def face_distance_m(self, p: RoverScenarioParameters) -> float:
         """Compute the horizontal distance of the designated point from the rock's centre towards the start, metres.
 
-        The point is picked from near the rover's start: at the start's distance, EYE_HEIGHT_M above the rock's foot.
+        The point is selected from near the rover's start: at the start's distance, EYE_HEIGHT_M above the rock's foot.
         """
         bearing, foot = p.bearing_rad, self.rocks.position_m[self.target_number]
         to_start = np.array([np.sin(bearing), np.cos(bearing), 0.0])
@@ -158,14 +158,14 @@ def _distances(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[
 
 @dataclass
 class Rig:
-    """A mast and its stereo pair with drawn errors."""
+    """The mast and its stereo pair with drawn errors: truth, calibration, and current angles."""
 
     head: StereoHead  #: true and calibrated stereo pair
     calibrated: MastCalibration  #: calibration known to the flight software
     left: CameraModel  #: true left camera in the head's frame
     right: CameraModel  #: true right camera in the head's frame
     mast: Mast
-    state: MastState  #: current angles
+    state: MastState  #: current angles: true, and read by the encoders
     motors: np.random.Generator  #: stream of the motors' stopping errors
 
     @classmethod
@@ -218,7 +218,7 @@ class Vehicle:
 
     @classmethod
     def at_start(cls, p: RoverScenarioParameters, world: RunWorld, rig: Rig, streams: Streams) -> Vehicle:
-        """Place the rover on the ground at its start; its pose is known at the start."""
+        """Place the rover on the ground at its start; its estimated pose is exact there."""
         rover = MER if p.camera.preset.startswith("mer") else ROCKY_8
         bearing = p.bearing_rad
         to_start = np.array([np.sin(bearing), np.cos(bearing)])
@@ -227,7 +227,9 @@ class Vehicle:
         left = np.array([-ahead[1], ahead[0]])
         base = rig.calibrated.geometry.base_m
         target = np.array([p.world.east_m, p.world.north_m])
-        position = target + (world.face_m(p) + p.start.distance_m) * to_start - base[0] * ahead - base[1] * left
+        position = (
+            target + (world.face_distance_m(p) + p.start.distance_m) * to_start - base[0] * ahead - base[1] * left
+        )
         ground: Ground = world.ground.surface
         if p.world.rocks_underfoot:
             half_side = p.start.distance_m + ROUTE_MARGIN_M
@@ -244,7 +246,7 @@ class Vehicle:
         return self.estimate.world_from_rover
 
     def drive(self, command: DriveCommand, visual: bool) -> Drive:
-        """Drive a command and update the estimate."""
+        """Execute a drive command and update the estimated pose; `visual`: with visual odometry."""
         result = drive(self.rover, self.ground, self.soil, self.stance, command, self.slip_stream)
         self.estimate = self.odometer.step(self.estimate, result, self.odometry_stream, visual)
         self.stance = result.end

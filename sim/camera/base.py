@@ -1,15 +1,16 @@
 """Base class of the CAHV camera models: image plane, rigid motion, binning, scaling and cropping.
 
-The vectors of a camera, points to project and rays are in one frame of reference (the world's, a body's, a label's
-rover frame), metres. Pixels are (u, v): column to the right, row down, the centre of the upper left pixel at (0, 0).
+The vectors of a camera, the points to project and the rays are in one frame of reference (world frame, body frame or
+the rover frame of a label), metres. Pixels are (u, v): u is the column, to the right, and v the row, down. The centre
+of the upper left pixel is (0, 0).
 
-The image plane is that of Yakimovsky & Cunningham 1978: a point P' (after distortion, if any) falls on
+A point P' (after distortion, if any) is projected to the pixel (Yakimovsky & Cunningham 1978)
 
     u = (P' - C).H / (P' - C).A        v = (P' - C).V / (P' - C).A
 
-so that H = hs H' + hc A and V = vs V' + vc A, with H' and V' the unit vectors of the image's columns and rows, hs and
-vs the focal lengths in pixels and (hc, vc) the image centre. H' and V' need not be perpendicular, and H', V', A
-need not form a right-handed frame.
+where H = hs H' + hc A and V = vs V' + vc A. H' and V' are unit vectors in the directions of growing u and growing v,
+hs and vs are the focal lengths in pixels, and (hc, vc) is the image centre. H' and V' need not be perpendicular, and
+H', V', A need not form a right-handed frame.
 """
 
 from __future__ import annotations
@@ -27,16 +28,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 Vector = NDArray[np.float64]
-#: A number that may be written as an integer (the run-time checks do not accept an integer for a float).
+#: Type of a number that may be an integer (the run-time type checks do not accept an integer for a float).
 Real = float | int
-#: Three components, as an array or written out.
+#: Three components, as an array or a tuple.
 Triple = Num[np.ndarray, "3"] | tuple[Real, Real, Real]
+#: Components x, y and z of n vectors, shape (n,) each.
 Gradient = tuple[Vector, Vector, Vector]
 
 #: Tolerance on the length of A and O: labels round them to six digits or fewer.
 UNIT_TOLERANCE = 1e-4
-#: Points per block: few enough for the processor's cache, enough to hide NumPy's cost per call.
-_BLOCK = 16384
+#: Points per block: a block fits into the processor's cache, and NumPy's overhead per call is small against its work.
+_BLOCK_POINTS = 16384
 
 M = TypeVar("M", bound="CameraModel")  # beartype does not support typing.Self
 
@@ -56,49 +58,49 @@ class CameraModel(ABC):
     v: Float[np.ndarray, "3"]
     size: tuple[int, int]
 
-    # ----- defined by each model: x, y, z are the coordinates of P - C; all arrays have the shape (n,) -----
+    # ----- implemented by each model: x, y, z are the coordinates of P - C; all arrays have the shape (n,) -----
 
     @abstractmethod
-    def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
-        """Columns, rows and whether the optics can image the point."""
+    def _compute_pixels(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
+        """Compute columns and rows, and whether each point lies in the valid range of the lens."""
 
     @abstractmethod
-    def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
-        """Derivatives of column and row with respect to x, y and z."""
+    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+        """Compute the derivatives of column and row with respect to x, y and z."""
 
     @abstractmethod
-    def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
-        """Direction (of any length) of a pixel, and the offset of its ray's origin from C, (n, 3) (None: no offset)."""
+    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+        """Compute directions (of any length) of pixels, and the rays' origins minus C, (n, 3); None if they are C."""
 
     def project(
         self, points: Float[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
         """Project points (metres) to pixels (u, v) and report whether they are visible.
 
-        Pixels are NaN where not visible. A point is visible if it lies before the image plane, the distortion is
-        one-to-one there, and its coordinates are finite. The frame's border is not tested:
-        ``visible & camera.in_frame(pixels)`` does that.
+        A point is visible if it lies in front of the camera, the distortion is one-to-one there, and its coordinates
+        are finite. The pixels of the other points are NaN. Points outside the frame can be visible in this sense; use
+        ``visible & camera.in_frame(pixels)`` to exclude them.
         """
         flat = points.reshape(-1, 3)
         pixels = np.empty((len(flat), 2))
         visible = np.empty(len(flat), dtype=np.bool_)
         with np.errstate(all="ignore"):
-            for block in _blocks(len(flat)):
-                u, v, imaged = self._image(*self._from_centre(flat[block]))
+            for block in _split_into_blocks(len(flat)):
+                u, v, is_valid = self._compute_pixels(*self._subtract_centre(flat[block]))
                 pixels[block, 0], pixels[block, 1] = u, v
-                visible[block] = imaged & np.isfinite(u) & np.isfinite(v)
+                visible[block] = is_valid & np.isfinite(u) & np.isfinite(v)
         pixels[~visible] = np.nan
         return pixels.reshape(*points.shape[:-1], 2), visible.reshape(points.shape[:-1])
 
     def projection_jacobian(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
-        """Derivative of the pixels of `project` with respect to the points, pixels per metre; NaN where not visible."""
+        """Return the derivative of `project`'s pixels by the points, pixels per metre; NaN where not visible."""
         flat = points.reshape(-1, 3)
         jacobian = np.empty((len(flat), 2, 3))
         with np.errstate(all="ignore"):
-            for block in _blocks(len(flat)):
-                coordinates = self._from_centre(flat[block])
-                jacobian[block] = np.moveaxis(np.array(self._image_gradient(*coordinates)), -1, 0)
-                jacobian[block][~self._image(*coordinates)[2]] = np.nan
+            for block in _split_into_blocks(len(flat)):
+                coordinates = self._subtract_centre(flat[block])
+                jacobian[block] = np.moveaxis(np.array(self._compute_gradients(*coordinates)), -1, 0)
+                jacobian[block][~self._compute_pixels(*coordinates)[2]] = np.nan
         return jacobian.reshape(*points.shape[:-1], 2, 3)
 
     def rays(
@@ -106,15 +108,16 @@ class CameraModel(ABC):
     ) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch 3"]]:
         """Return the origins (metres) and unit directions of the rays of pixels.
 
-        Pixels may be fractional or outside the frame. Origins are C, which `Cahvore` moves along the optical axis; they
-        may be read-only. Directions are NaN for pixels beyond the valid range of the distortion.
+        Pixels may be fractional or outside the frame. The origin is C; for `Cahvore` it lies on the optical axis
+        through C and depends on the pixel. The array of origins may be read-only. Directions are NaN for pixels beyond
+        the valid range of the distortion.
         """
         flat = pixels.reshape(-1, 2)
         directions = np.empty((len(flat), 3))
         origins = np.broadcast_to(self.c, (len(flat), 3))
         with np.errstate(all="ignore"):
-            for block in _blocks(len(flat)):
-                (x, y, z), offset = self._sight(*np.array(flat[block].T, dtype=np.float64, order="C"))
+            for block in _split_into_blocks(len(flat)):
+                (x, y, z), offset = self._compute_rays(*np.array(flat[block].T, dtype=np.float64, order="C"))
                 length = np.sqrt(x * x + y * y + z * z)
                 directions[block, 0], directions[block, 1], directions[block, 2] = x / length, y / length, z / length
                 if offset is not None:
@@ -124,31 +127,31 @@ class CameraModel(ABC):
         return origins.reshape(shape), directions.reshape(shape)
 
     def in_frame(self, pixels: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether pixels lie in the frame, -0.5 <= u < columns - 0.5 and the same for rows; false for NaN."""
+        """Return whether -0.5 <= u < columns - 0.5 and -0.5 <= v < rows - 0.5; False for NaN."""
         return np.asarray(np.all((pixels >= -0.5) & (pixels < np.array(self.size) - 0.5), axis=-1))
 
     def pixel_grid(self) -> Float[np.ndarray, "rows columns 2"]:
-        """(u, v) of every pixel's centre."""
+        """Return (u, v) of every pixel's centre."""
         columns, rows = self.size
         return np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)), axis=-1)
 
     def transform(self: M, new_from_old: RigidTransform) -> M:
         """Return the camera after a rigid motion: ``transform(T).project(T.apply(points))`` equals ``project(points)``.
 
-        With the camera in the body frame, ``transform(world_from_body)`` is the camera in the world frame. Raises
-        ValueError if `new_from_old` holds more than one transform.
+        If the camera is in the body frame, ``transform(world_from_body)`` is the camera in the world frame. Raises
+        ValueError if `new_from_old` contains more than one transform.
         """
         if not new_from_old.single:
-            raise ValueError("a camera moves by a single transform, not by an array of transforms")
+            raise ValueError("a camera is transformed by a single transform, not by an array of transforms")
         matrix = new_from_old.as_matrix()
         rotated = {name: matrix[:3, :3] @ getattr(self, name) for name in ("a", "h", "v", "o") if hasattr(self, name)}
         return self._with(c=matrix[:3, :3] @ self.c + matrix[:3, 3], **rotated)
 
     def bin(self: M, columns: int, rows: int) -> M:
-        """The camera of an image in which blocks of `columns` x `rows` pixels are summed or averaged into one.
+        """Return the camera of the binned image: each block of `columns` x `rows` pixels becomes one pixel.
 
-        Column u becomes (u - (columns - 1) / 2) / columns, and rows likewise. Raises ValueError if a factor is not
-        positive or does not divide the image's size (crop first).
+        Column u becomes (u - (columns - 1) / 2) / columns, row v becomes (v - (rows - 1) / 2) / rows. Raises ValueError
+        if a factor is not positive or does not divide the image's size (crop first).
         """
         for factor, extent, name in ((columns, self.size[0], "columns"), (rows, self.size[1], "rows")):
             if factor < 1 or extent % factor:
@@ -160,32 +163,32 @@ class CameraModel(ABC):
         )
 
     def scale(self: M, factor: Real) -> M:
-        """The camera of the resized image: u becomes (u + 0.5) * factor - 0.5. ValueError unless factor is positive."""
+        """Return the camera of the resized image: u becomes (u + 0.5) * factor - 0.5; ValueError if factor <= 0."""
         if not (np.isfinite(factor) and factor > 0):
-            raise ValueError(f"an image is scaled by a positive, finite factor, not {factor}")
+            raise ValueError(f"the factor of an image's scale must be positive and finite, not {factor}")
         scale, (columns, rows) = float(factor), self.size
         shift = 0.5 * scale - 0.5
         return self._with_image_map((scale, scale), (shift, shift), (round(columns * factor), round(rows * factor)))
 
     def crop(self: M, column: int, row: int, size: tuple[int, int]) -> M:
-        """The camera of a part of the image, by upper left pixel and size. Raises ValueError outside the frame."""
+        """Return the camera of the part of the image with upper left pixel (column, row). Raises ValueError outside."""
         if column < 0 or row < 0 or column + size[0] > self.size[0] or row + size[1] > self.size[1]:
             crop, frame = (f"{columns} x {rows}" for columns, rows in (size, self.size))
-            raise ValueError(f"a crop of {crop} pixels at ({column}, {row}) leaves the frame of {frame}")
+            raise ValueError(f"a crop of {crop} pixels at ({column}, {row}) extends beyond the frame of {frame}")
         return self._with_image_map((1.0, 1.0), (-float(column), -float(row)), size)
 
     def magnify(self: M, factor: Real) -> M:
-        """The camera with its focal lengths scaled about its image centre."""
+        """Return the camera with its focal lengths multiplied by `factor`; its image centre is unchanged."""
         column, row = self.image_centre
         h = self.h + (factor - 1.0) * (self.h - column * self.a)
         return self._with(h=h, v=self.v + (factor - 1.0) * (self.v - row * self.a))
 
     def recentre(self: M, columns: Real, rows: Real) -> M:
-        """The camera whose pictures are shifted to the right and down by a number of pixels."""
+        """Return the camera whose images are shifted by `columns` pixels to the right and `rows` pixels down."""
         return self._with(h=self.h + columns * self.a, v=self.v + rows * self.a)
 
     def _with_image_map(self: M, scale: tuple[float, float], shift: tuple[float, float], size: tuple[int, int]) -> M:
-        """The camera whose pixels are scale * pixel + shift."""
+        """Return the camera whose pixels are scale * pixel + shift, for columns and rows separately."""
         return self._with(h=scale[0] * self.h + shift[0] * self.a, v=scale[1] * self.v + shift[1] * self.a, size=size)
 
     def _with(self: M, **changes: Any) -> M:
@@ -193,52 +196,52 @@ class CameraModel(ABC):
 
     @property
     def image_centre(self) -> tuple[float, float]:
-        """(hc, vc): the pixel of the direction A before distortion."""
+        """Image centre (hc, vc): the pixel of the direction A before distortion."""
         scale = self.a @ self.a
         return float(self.a @ self.h / scale), float(self.a @ self.v / scale)
 
     @property
     def focal_lengths(self) -> tuple[float, float]:
-        """(hs, vs): the focal length in units of a column's width and of a row's height."""
-        hs, vs = (float(np.linalg.norm(np.cross(self.a, one)) / (self.a @ self.a)) for one in (self.h, self.v))
+        """Focal lengths (hs, vs): the focal length divided by the pixel pitch along a row and along a column."""
+        hs, vs = (float(np.linalg.norm(np.cross(self.a, vector)) / (self.a @ self.a)) for vector in (self.h, self.v))
         return hs, vs
 
     @property
     def right(self) -> Float[np.ndarray, "3"]:
         """Unit vector H', perpendicular to A, along which u grows."""
-        return _unit(self.h - self.image_centre[0] * self.a)
+        return _normalise(self.h - self.image_centre[0] * self.a)
 
     @property
     def down(self) -> Float[np.ndarray, "3"]:
         """Unit vector V', perpendicular to A, along which v grows."""
-        return _unit(self.v - self.image_centre[1] * self.a)
+        return _normalise(self.v - self.image_centre[1] * self.a)
 
     @property
     def theta(self) -> float:
-        """Angle from V' to H' about A, radians: -pi/2 for square axes; positive in mirrored pictures."""
+        """Angle from V' to H' about A, radians: -pi/2 if the axes are perpendicular; positive for mirrored images."""
         right, down = self.right, self.down
         return float(np.arctan2(self.a @ np.cross(down, right), down @ right))
 
     def corner_rays(self) -> tuple[Float[np.ndarray, "4 3"], Float[np.ndarray, "4 3"]]:
-        """`rays` of the frame's outer corners (half a pixel beyond the centres), clockwise from the upper left."""
+        """Return the `rays` of the frame's four outer corners, clockwise from the upper left one at (-0.5, -0.5)."""
         return self.rays(self.border(1))
 
     def boresight(self) -> Float[np.ndarray, "3"]:
-        """Unit direction of the middle of the frame."""
+        """Return the unit direction of the ray through the middle of the frame."""
         return self.rays(np.array([(self.size[0] - 1) / 2, (self.size[1] - 1) / 2]))[1]
 
     def border(self, steps: int) -> Float[np.ndarray, "pixels 2"]:
-        """Pixels along the frame's outer edge, clockwise from the upper left, `steps` on each side."""
+        """Return points (u, v) on the frame's outer edge, clockwise from the upper left, `steps` on each side."""
         right, bottom = self.size[0] - 0.5, self.size[1] - 0.5
         corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [-0.5, -0.5]])
-        along = np.arange(steps)[:, np.newaxis] / steps
-        return np.concatenate([start + along * (end - start) for start, end in pairwise(corners)])
+        fractions = np.arange(steps)[:, np.newaxis] / steps
+        return np.concatenate([start + fractions * (end - start) for start, end in pairwise(corners)])
 
     def __post_init__(self) -> None:
         for field in fields(cast(Any, self)):
             if field.name in ("size", "linearity"):
                 continue
-            # a copy; turns -0.0 into 0.0, so that equal cameras have equal hashes
+            # the sum is a copy, and converts -0.0 to 0.0, so that equal cameras have equal hashes
             vector = np.asarray(getattr(self, field.name), dtype=np.float64) + 0.0
             if vector.shape != (3,):
                 raise ValueError(f"{field.name} must have three components, not shape {vector.shape}")
@@ -277,45 +280,46 @@ class CameraModel(ABC):
 
     @cached_property
     def _direction_from_pixel(self) -> NDArray[np.float64]:
-        """Matrix that takes (u, v, 1) to the vector d with d.A = 1, d.H = u, d.V = v."""
+        """Matrix that maps (u, v, 1) to the vector d with d.A = 1, d.H = u, d.V = v."""
         columns = (_cross(self.v, self.a), _cross(self.a, self.h), _cross(self.h, self.v))
         return np.stack(columns, axis=1) / self._determinant
 
-    def _from_centre(self, points: NDArray[Any]) -> Gradient:
+    def _subtract_centre(self, points: NDArray[Any]) -> Gradient:
         x, y, z = points.T
         return x - self.c[0], y - self.c[1], z - self.c[2]
 
-    def _image_plane_direction(self, u: Vector, v: Vector) -> Gradient:
+    def _compute_linear_directions(self, u: Vector, v: Vector) -> Gradient:
+        """Compute the directions of pixels of the camera without distortion."""
         m = self._direction_from_pixel
         x, y, z = (m[i, 0] * u + m[i, 1] * v + m[i, 2] for i in range(3))
         return x, y, z
 
 
 def mount_looking_down(camera: CameraModel) -> CameraModel:
-    """Mount a camera at the origin, A along -z, columns along +x; raises ValueError for mirrored pictures."""
+    """Move a camera to the origin with A along -z, u growing along +x. Raises ValueError if its image is mirrored."""
     if not camera.theta < 0:
-        raise ValueError("the camera's picture is mirrored: u right, v down and A forward must be right-handed")
-    axis = _unit(camera.a)
-    right = _unit(camera.right - (camera.right @ axis) * axis)
+        raise ValueError("the camera's image is mirrored: u right, v down and A forward must be right-handed")
+    axis = _normalise(camera.a)
+    right = _normalise(camera.right - (camera.right @ axis) * axis)
     rotation = Rotation.from_matrix(np.stack([right, np.cross(right, axis), -axis]))
     return camera.transform(RigidTransform.from_components(-rotation.apply(camera.c.copy()), rotation))
 
 
 def dot(vector: Vector, x: Vector, y: Vector, z: Vector) -> Vector:
-    """Scalar products of one vector with n vectors, independent of n (unlike a BLAS product)."""
+    """Compute the scalar products of one vector with n vectors; each is bit-identical for any n (unlike with BLAS)."""
     return np.asarray(vector[0] * x + vector[1] * y + vector[2] * z)
 
 
 def _cross(first: Vector, second: Vector) -> Vector:
-    """Vector product of two vectors, five times faster than NumPy's."""
+    """Compute the vector product of two vectors, five times faster than `numpy.cross`."""
     a, b, c = first.tolist()
     x, y, z = second.tolist()
     return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
-def _unit(vector: Vector) -> Vector:
+def _normalise(vector: Vector) -> Vector:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def _blocks(count: int) -> list[slice]:
-    return [slice(start, min(start + _BLOCK, count)) for start in range(0, count, _BLOCK)]
+def _split_into_blocks(count: int) -> list[slice]:
+    return [slice(start, min(start + _BLOCK_POINTS, count)) for start in range(0, count, _BLOCK_POINTS)]

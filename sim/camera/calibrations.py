@@ -1,21 +1,22 @@
-"""Calibrations of other programs: OpenCV's YAML or JSON, ROS' `camera_info`, Kalibr's camera chain, EuRoC's sensor.
+"""Camera calibrations of other programs: OpenCV (YAML, JSON), ROS `camera_info`, Kalibr camera chains, EuRoC sensors.
 
-All are YAML with a camera matrix and OpenCV's distortion in OpenCV's axes (z forward, x right, y down, pixels counted
-from the centre of the upper left one). They are converted to the nearest camera of the CAHV family (`from_opencv`,
-`from_opencv_fisheye`), which is exact for lenses of k1 and k2 alone. A residual above `MAX_RMS_PX` over the frame or
-`MAX_PX` anywhere in it is an error (docs/adr/0020). Cameras of a chain are given in the axes of its first.
+All files are YAML with a camera matrix and OpenCV's distortion in OpenCV's axes: z forward, x right, y down; the centre
+of the upper left pixel is (0, 0), as in Marsyard. Each is converted to the nearest camera of the CAHV family
+(`from_opencv`, `from_opencv_fisheye`). The conversion is exact if only k1 and k2 are not zero. A residual above
+`MAX_RMS_PX` (RMS over the frame) or `MAX_PX` (at any pixel) is an error (docs/adr/0020). All cameras of a chain are in
+the axes of its first camera.
 
-OpenCV's camera looks along z with x right and y down; its pixels count as ours. Its pinhole model distorts about the
-direction z with k1, k2, k3 (radial) and p1, p2 (tangential):
+OpenCV's pinhole model distorts about the direction z with k1, k2, k3 (radial) and p1, p2 (tangential), for a point
+(x, y) of the plane z = 1:
 
     r^2 = x^2 + y^2        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
                            y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-Its rational model divides the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6. Its fisheye model moves a ray at the angle
-theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala & Brandt 2006).
+Its rational model divides the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6. Its fisheye model projects a ray at the
+angle theta from z to the radius theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala & Brandt 2006).
 
-CAHVOR about O = A equals the pinhole model with k3 = p1 = p2 = 0; others are fitted by tilting O. CAHVORE about O = A
-with linearity 0 and a fixed pupil equals the fisheye model with k3 = k4 = 0.
+CAHVOR with O = A equals the pinhole model with k3 = p1 = p2 = 0; for other coefficients it is fitted, also by tilting
+O. CAHVORE with O = A, linearity 0 and a fixed pupil equals the fisheye model with k3 = k4 = 0.
 """
 
 from __future__ import annotations
@@ -41,34 +42,35 @@ from marsyard.sim.files import open_regular
 Array = NDArray[np.float64]
 C = TypeVar("C", bound=CameraModel)
 
-#: Maximum residual of the fitted camera: RMS over the frame, less than a calibration's own residual (0.1 to 0.5 px);
-#: and anywhere in the frame, which is in a corner.
+#: Maximum residual of the fitted camera: RMS over the frame, similar to the residual of a calibration (0.1 to 0.5 px);
+#: and at any pixel (the maximum is in a corner).
 MAX_RMS_PX, MAX_PX = 0.3, 3.0
-#: Tolerance on the orthonormality of a chain's rotation.
-_ORTHONORMAL = 1e-4
+#: Tolerance on the elements of R R^T - I for a chain's rotation matrix R.
+_ORTHONORMAL_TOLERANCE = 1e-4
 
+#: First bytes of a YAML or JSON file; the YAML version line; names of the cameras in a Kalibr chain.
 _START = re.compile(rb"\A(\xef\xbb\xbf)?\s*(#[^\n]*\n\s*)*(%YAML|---|\{|[A-Za-z_]\w*\s*:)")
 _DIRECTIVE = re.compile(r"^%YAML[^\n]*$", re.MULTILINE)
 _CHAIN = re.compile(r"cam\d+$")
 #: Names of the two lens models in the formats.
 _PINHOLE = frozenset({"plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "none", "pinhole"})
 _FISHEYE = frozenset({"equidistant", "fisheye"})
-_ALLOWED = (
+_ALLOWED_FILES = (
     "a calibration of OpenCV (camera_matrix, distortion_coefficients, image_width, image_height), ROS (the same and "
     "distortion_model), Kalibr (cam0: ...) or EuRoC (intrinsics, resolution, ...)"
 )
 
-#: Samples along each side of the frame, including its outer edge.
-_SAMPLES = 33
-#: A closed form with a smaller residual is exact and is not fitted.
+#: Number of pixels along each side of the frame, from edge to edge, at which cameras are compared.
+_SAMPLES_PER_SIDE = 33
+#: A start camera with a smaller residual is exact and is not fitted.
 _EXACT_PX = 1e-9
-#: Residual of a pixel that is not visible in a camera during the fit.
+#: Residual during the fit of a direction that is not visible in the camera.
 _INVISIBLE_PX = 1e3
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Root mean square and maximum of the distance between two cameras' pixels over the frame."""
+    """Distance in pixels between the images of the same direction in two cameras: RMS and maximum over the frame."""
 
     rms_px: float
     max_px: float
@@ -78,9 +80,9 @@ class Residual:
 class Calibration:
     """A camera read from a calibration file.
 
-    - name: the camera's name in the file; empty if it has none
-    - camera: in OpenCV's axes, those of the first camera of a chain
-    - residual: distance between the camera's pixels and the calibration's, over the frame
+    - name: the camera's name in the file; empty if the file has none
+    - camera: the nearest camera of the CAHV family, in OpenCV's axes; in a chain, in the axes of the first camera
+    - residual: difference between this camera and the calibration in the file
     """
 
     name: str
@@ -89,16 +91,18 @@ class Calibration:
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
-    """Loader of plain data and OpenCV's matrices; aliases are errors, because nested ones can fill the memory."""
+    """YAML loader for plain data and OpenCV's matrices; aliases are errors: nested aliases can fill the memory."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Compose a node of the document. Raises yaml.YAMLError at an alias."""
         if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError(f"line {self.peek_event().start_mark.line + 1} has an alias (*), which is not read")
+            raise yaml.YAMLError(
+                f"line {self.peek_event().start_mark.line + 1} has an alias (*), which is not supported"
+            )
         return super().compose_node(parent, index)
 
 
-# the second is OpenCV 5's tag of one-dimensional matrices
+# YAML tags of OpenCV's matrices; the second is that of one-dimensional matrices in OpenCV 5
 for _kind in ("opencv-matrix", "opencv-nd-matrix"):
     _Loader.add_constructor(
         f"tag:yaml.org,2002:{_kind}",
@@ -107,42 +111,42 @@ for _kind in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def is_calibration(head: bytes) -> bool:
-    """Whether the first bytes of a file may be those of a calibration in YAML or JSON."""
+    """Return whether a file with these first bytes can be a calibration in YAML or JSON."""
     return _START.match(head) is not None
 
 
 def read_calibrations(path: str | Path) -> tuple[Calibration, ...]:
     """Read every camera of a calibration file, in order.
 
-    Raises CameraFileError if the file cannot be read, is no such calibration, has an impossible camera or a lens that
-    the CAHV family cannot represent; it names file, field and allowed values.
+    Raises CameraFileError if the file cannot be read or is not a calibration, or if it contains an impossible camera or
+    a lens that the CAHV family cannot represent. The message contains file, field and allowed values.
     """
     source = Source(str(path))
-    text = source.text().encode("latin-1").decode("utf-8-sig", errors="replace")
+    text = source.read_text().encode("latin-1").decode("utf-8-sig", errors="replace")
     try:
         data = yaml.load(_DIRECTIVE.sub("", text), Loader=_Loader)  # noqa: S506  (a SafeLoader)
     except (yaml.YAMLError, ValueError, RecursionError, TypeError) as fault:
         message = " ".join(str(fault).split())
-        raise source.error("file", f"is not valid YAML ({message[:200]})", _ALLOWED) from fault
+        raise source.error("file", f"is not valid YAML ({message[:200]})", _ALLOWED_FILES) from fault
     if not isinstance(data, Mapping):
-        raise source.error("file", "holds no named values", _ALLOWED)
+        raise source.error("file", "contains no named values", _ALLOWED_FILES)
     names = [name for name in data if isinstance(name, str) and _CHAIN.match(name) and isinstance(data[name], Mapping)]
     if not names:
-        return (_Reader(source, data, "").calibration(str(data.get("camera_name", "")), None),)
+        return (_Reader(source, data, "").read_calibration(str(data.get("camera_name", "")), None),)
     pose: RigidTransform | None = None
     calibrations = []
     for number, name in enumerate(names):
         reader = _Reader(source, data[name], f"{name}.")
         if number:
-            step = reader.transform("T_cn_cnm1")
+            step = reader.read_transform("T_cn_cnm1")
             pose = step if pose is None else step * pose
-        calibrations.append(reader.calibration(name, pose))
+        calibrations.append(reader.read_calibration(name, pose))
     return tuple(calibrations)
 
 
 @dataclass(frozen=True)
 class _Reader:
-    """The values of one camera, and the prefix of its fields in messages."""
+    """Reader of one camera: the values in the file, and the prefix of their names in error messages."""
 
     source: Source
     data: Mapping[str, Any]
@@ -152,13 +156,13 @@ class _Reader:
         """Create the error for a field."""
         return self.source.error(f"{self.prefix}{field}", fault, allowed)
 
-    def calibration(self, name: str, pose: RigidTransform | None) -> Calibration:
-        """Read the camera; lens models are given by name, in OpenCV's files also by the number of coefficients."""
+    def read_calibration(self, name: str, pose: RigidTransform | None) -> Calibration:
+        """Read the camera; its lens model follows from the model's name and, in OpenCV's files, the coefficients."""
         if self.prefix or "intrinsics" in self.data:  # Kalibr, EuRoC
             model = self.data.get("camera_model", "pinhole")
             if model != "pinhole":
                 raise self.error("camera_model", f"{model!r}", "pinhole")
-            intrinsics = self.numbers(("intrinsics",), "fx, fy, cx, cy")
+            intrinsics = self.read_numbers(("intrinsics",), "fx, fy, cx, cy")
             if len(intrinsics) != 4:
                 raise self.error("intrinsics", f"has {len(intrinsics)} numbers", "fx, fy, cx, cy")
             fx, fy, cx, cy = intrinsics
@@ -166,20 +170,20 @@ class _Reader:
             names: tuple[str, ...] = ("distortion_coeffs", "distortion_coefficients")
             is_fisheye = False
         else:
-            flat = self.numbers(("camera_matrix", "cameraMatrix", "K"), "a matrix of 3 x 3 numbers")
+            flat = self.read_numbers(("camera_matrix", "cameraMatrix", "K"), "a matrix of 3 x 3 numbers")
             if len(flat) != 9:
                 raise self.error("camera_matrix", f"has {len(flat)} numbers", "3 x 3")
             matrix = np.array(flat, dtype=np.float64).reshape(3, 3)
             names = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D")
             is_fisheye = bool(self.data.get("fisheye_model", False))
-        coefficients = self.numbers(names, "a list of numbers", missing=[])
+        coefficients = self.read_numbers(names, "a list of numbers", default=[])
         lens = self.data.get("distortion_model")
         if lens is not None and lens not in _PINHOLE | _FISHEYE:
             raise self.error("distortion_model", f"{lens!r}", ", ".join(sorted(_PINHOLE | _FISHEYE)))
         is_fisheye = is_fisheye or lens in _FISHEYE
         while not is_fisheye and len(coefficients) > 8 and coefficients[-1] == 0.0:
-            coefficients = coefficients[:-1]  # thin prism and tilt, unused
-        size = self.size()
+            coefficients = coefficients[:-1]  # coefficients of thin prism and tilt that are zero
+        size = self.read_size()
         try:
             camera: CameraModel
             fit = from_opencv_fisheye if is_fisheye else from_opencv
@@ -189,16 +193,16 @@ class _Reader:
         if not (residual.rms_px <= MAX_RMS_PX and residual.max_px <= MAX_PX):
             raise self.error(
                 "distortion",
-                f"the nearest camera of the CAHV family is {residual.rms_px:.2g} px off over the frame (RMS), "
+                f"the nearest camera of the CAHV family differs by {residual.rms_px:.2g} px over the frame (RMS), "
                 f"{residual.max_px:.2g} px at most",
-                f"{MAX_RMS_PX:g} and {MAX_PX:g} px; crop the picture, or calibrate with fewer coefficients",
+                f"{MAX_RMS_PX:g} and {MAX_PX:g} px; crop the image, or calibrate with fewer coefficients",
             )
         return Calibration(name, camera, residual)
 
-    def size(self) -> tuple[int, int]:
-        """(columns, rows)."""
-        both = next((self.data[name] for name in ("resolution", "image_size", "imageSize") if name in self.data), None)
-        pair = both if both is not None else [self.data.get("image_width"), self.data.get("image_height")]
+    def read_size(self) -> tuple[int, int]:
+        """Read (columns, rows)."""
+        pair = next((self.data[name] for name in ("resolution", "image_size", "imageSize") if name in self.data), None)
+        pair = pair if pair is not None else [self.data.get("image_width"), self.data.get("image_height")]
         if isinstance(pair, Mapping):
             pair = [pair.get("width"), pair.get("height")]
         match pair:
@@ -210,36 +214,36 @@ class _Reader:
             "two positive integers, columns and rows",
         )
 
-    def numbers(self, names: Sequence[str], allowed: str, missing: list[float] | None = None) -> list[float]:
-        """Read finite numbers from a list, nested lists or a matrix with `data`."""
-        name = next((one for one in names if one in self.data), None)
-        if name is None and missing is not None:
-            return missing
+    def read_numbers(self, names: Sequence[str], allowed: str, default: list[float] | None = None) -> list[float]:
+        """Read the finite numbers of the first of `names` in the file: a list, nested lists or a matrix with `data`."""
+        name = next((name for name in names if name in self.data), None)
+        if name is None and default is not None:
+            return default
         if name is None:
             raise self.error(names[0], "missing", allowed)
         value = self.data[name]
         items = value.get("data") if isinstance(value, Mapping) else value
-        flat = _flat(items) if isinstance(items, list) else None
+        flat = _flatten_numbers(items) if isinstance(items, list) else None
         if flat is None:
-            raise self.error(name, f"{str(value)[:80]!r} is no list of finite numbers", allowed)
+            raise self.error(name, f"{str(value)[:80]!r} is not a list of finite numbers", allowed)
         return flat
 
-    def transform(self, name: str) -> RigidTransform:
-        """Read a rigid transform, written as a matrix of 4 x 4."""
-        matrix = np.array(self.numbers((name,), "a rigid transform as a matrix of 4 x 4 numbers"))
+    def read_transform(self, name: str) -> RigidTransform:
+        """Read a rigid transform, stored as a 4 x 4 matrix."""
+        matrix = np.array(self.read_numbers((name,), "a rigid transform as a matrix of 4 x 4 numbers"))
         if matrix.size == 16:
             matrix = matrix.reshape(4, 4)
             rotation = matrix[:3, :3]
-            orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0.0, atol=_ORTHONORMAL)
-            if orthonormal and np.linalg.det(rotation) > 0.0 and np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+            is_orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0.0, atol=_ORTHONORMAL_TOLERANCE)
+            if is_orthonormal and np.linalg.det(rotation) > 0.0 and np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
                 return RigidTransform.from_matrix(matrix)
         raise self.error(name, "is not rigid", "a rotation and a translation as a matrix of 4 x 4 numbers")
 
 
-def _flat(value: Any) -> list[float] | None:
-    """Flatten nested lists of finite numbers; None if they contain anything else. YAML 1.1 reads 1e-3 as text."""
+def _flatten_numbers(value: Any) -> list[float] | None:
+    """Flatten nested lists of finite numbers; None if they contain anything else. YAML 1.1 parses 1e-3 as text."""
     if isinstance(value, list):
-        parts = [_flat(one) for one in value]
+        parts = [_flatten_numbers(item) for item in value]
         return None if None in parts else [number for part in parts for number in part or ()]
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return None
@@ -258,13 +262,13 @@ def from_opencv(
 ) -> tuple[Cahvor, Residual]:
     """Fit the CAHVOR camera nearest to OpenCV's pinhole camera; return it with its residual over the frame.
 
-    Exact if all coefficients but k1 and k2 are zero; otherwise fitted by least squares.
+    Exact if all coefficients except k1 and k2 are zero; otherwise fitted by least squares.
 
-    - matrix: camera matrix, pixels; may have a skew
-    - distortion: none, (k1, k2, p1, p2), (k1, k2, p1, p2, k3) or (k1, k2, p1, p2, k3, k4, k5, k6)
-    - camera_from_world: transform from the new camera's frame of reference to OpenCV's axes; identity by default
+    - matrix: camera matrix ((fx, skew, cx), (0, fy, cy), (0, 0, 1)), pixels
+    - distortion: empty, (k1, k2, p1, p2), (k1, k2, p1, p2, k3) or (k1, k2, p1, p2, k3, k4, k5, k6)
+    - camera_from_world: transform from the frame of the returned camera to OpenCV's axes; identity by default
 
-    Raises ValueError if the matrix is no camera matrix, the number of coefficients differs, or the distortion is not
+    Raises ValueError if the matrix has another form, the number of coefficients is another, or the distortion is not
     one-to-one within the frame.
     """
     if len(distortion) not in (0, 4, 5, 8) or not np.all(np.isfinite(distortion)):
@@ -273,16 +277,16 @@ def from_opencv(
             f"finite, not {distortion}"
         )
     coefficients = np.concatenate([distortion, np.zeros(8 - len(distortion))])
-    linear, pixels, distorted = _undistorted_camera(matrix, size, camera_from_world)
+    linear, pixels, distorted = _create_linear_camera(matrix, size, camera_from_world)
     perpendicular = np.cross(linear.a, np.eye(3)[np.argmin(np.abs(linear.a))])
     perpendicular /= np.linalg.norm(perpendicular)
     tilt_axes = np.stack([perpendicular, np.cross(linear.a, perpendicular)])
-    points = _undistort(distorted, coefficients)
-    directions = _in_world(np.concatenate([points, np.ones((len(points), 1))], axis=1), camera_from_world)
+    points = _invert_pinhole_distortion(distorted, coefficients)
+    directions = _rotate_to_world(np.concatenate([points, np.ones((len(points), 1))], axis=1), camera_from_world)
     start = Cahvor.from_cahv(linear, r=(0.0, coefficients[0], coefficients[1]))
 
-    def vary(change: Array) -> Cahvor:
-        """Tilt O, change rho1 and rho2, rotate the image plane, rescale and shift H and V."""
+    def modify_camera(change: Array) -> Cahvor:
+        """Tilt O, change rho1 and rho2, rotate the image plane, scale and shift H and V."""
         rotation = Rotation.from_rotvec(change[4:7]).as_matrix()
         scale_u, scale_v, shift_u, shift_v = change[7:]
         o = start.o + change[0] * tilt_axes[0] + change[1] * tilt_axes[1]
@@ -296,7 +300,7 @@ def from_opencv(
         )
 
     scales = np.array([1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1.0])
-    return _fit(start, vary, (directions, pixels), scales, method="lm")
+    return _fit_camera(start, modify_camera, (directions, pixels), scales, method="lm")
 
 
 def from_opencv_fisheye(
@@ -307,52 +311,52 @@ def from_opencv_fisheye(
 ) -> tuple[Cahvore, Residual]:
     """Fit the CAHVORE camera nearest to OpenCV's fisheye (Kannala & Brandt); return it with its residual.
 
-    Exact if k3 and k4 are zero; otherwise scale, radial terms and linearity are fitted by least squares. `distortion`
-    is (k1, k2, k3, k4); the other parameters and the errors are those of `from_opencv`.
+    Exact if k3 and k4 are zero; otherwise focal lengths, radial terms and linearity are fitted by least squares.
+    `distortion` is (k1, k2, k3, k4); the other parameters and the errors are those of `from_opencv`.
     """
     if len(distortion) != 4 or not np.all(np.isfinite(distortion)):
         raise ValueError(f"distortion of a fisheye must be (k1, k2, k3, k4), finite, not {distortion}")
-    linear, pixels, distorted = _undistorted_camera(matrix, size, camera_from_world)
-    directions = _in_world(_fisheye_directions(distorted, distortion), camera_from_world)
+    linear, pixels, distorted = _create_linear_camera(matrix, size, camera_from_world)
+    directions = _rotate_to_world(_invert_fisheye(distorted, distortion), camera_from_world)
     start = Cahvore.from_cahv(linear, r=(0.0, distortion[0], distortion[1]), linearity=0.0)
 
-    def vary(change: Array) -> Cahvore:
+    def modify_camera(change: Array) -> Cahvore:
         (hc, vc), a, scale = start.image_centre, start.a, float(change[0])
         h, v = start.h + scale * (start.h - hc * a), start.v + scale * (start.v - vc * a)
         return replace(start, h=h, v=v, r=start.r + np.array([0.0, *change[1:3]]), linearity=float(change[3]))
 
     limits, scales = np.array([0.5, 10.0, 10.0, 1.0]), np.array([1e-3, 1e-3, 1e-3, 1e-1])
-    return _fit(start, vary, (directions, pixels), scales, bounds=(-limits, limits))
+    return _fit_camera(start, modify_camera, (directions, pixels), scales, bounds=(-limits, limits))
 
 
-def _fit(
-    start: C, vary: Callable[[Array], C], samples: tuple[Array, Array], scales: Array, **options: Any
+def _fit_camera(
+    start: C, modify_camera: Callable[[Array], C], samples: tuple[Array, Array], scales: Array, **options: Any
 ) -> tuple[C, Residual]:
-    """Fit a camera to samples (directions, pixels) from `start`; `scales` are typical sizes of the parameters."""
+    """Fit the changes of `modify_camera` to samples (directions, pixels); `scales` are typical sizes of the changes."""
     directions, pixels = samples
-    residual = _residual(_far_pixels(start, directions) - pixels)
+    residual = _compute_residual(_project_directions(start, directions) - pixels)
     if residual.max_px <= _EXACT_PX:
         return start, residual
 
     def differences(change: Array) -> Array:
-        projected = _far_pixels(vary(change), directions)
+        projected = _project_directions(modify_camera(change), directions)
         return np.nan_to_num(projected - pixels, nan=_INVISIBLE_PX).ravel()
 
     fit = least_squares(differences, np.zeros(len(scales)), x_scale=scales, xtol=1e-14, ftol=1e-14, **options)
-    camera = vary(np.asarray(fit.x))
-    return camera, _residual(_far_pixels(camera, directions) - pixels)
+    camera = modify_camera(np.asarray(fit.x))
+    return camera, _compute_residual(_project_directions(camera, directions) - pixels)
 
 
-def _undistorted_camera(
+def _create_linear_camera(
     matrix: Array, size: tuple[int, int], camera_from_world: RigidTransform | None
 ) -> tuple[Cahv, Array, Array]:
-    """The camera without distortion, pixels over its frame, and their points (x, y) in the plane z = 1."""
-    allowed = matrix[1, 0] == 0 and np.array_equal(matrix[2], [0.0, 0.0, 1.0])
-    if not (allowed and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+    """Create the camera without distortion, a grid of pixels, and their points (x, y) in the plane z = 1."""
+    has_allowed_form = matrix[1, 0] == 0 and np.array_equal(matrix[2], [0.0, 0.0, 1.0])
+    if not (has_allowed_form and matrix[0, 0] > 0 and matrix[1, 1] > 0):
         raise ValueError("matrix must be ((fx, skew, cx), (0, fy, cy), (0, 0, 1)) with fx and fy positive")
     world_from_camera = np.eye(4) if camera_from_world is None else camera_from_world.inv().as_matrix()
     rotation = world_from_camera[:3, :3]
-    columns, rows = (np.linspace(-0.5, extent - 0.5, _SAMPLES) for extent in size)
+    columns, rows = (np.linspace(-0.5, extent - 0.5, _SAMPLES_PER_SIDE) for extent in size)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
     points = np.stack([(pixels[:, 0] - matrix[0, 2] - matrix[0, 1] * y) / matrix[0, 0], y], axis=-1)
@@ -360,92 +364,95 @@ def _undistorted_camera(
     return linear, pixels, points
 
 
-def _fisheye_directions(points: Array, coefficients: Array) -> Array:
-    """Invert OpenCV's fisheye: directions (z along the axis) of its points (x, y), shape (n, 2); Newton's method."""
+def _invert_fisheye(points: Array, coefficients: Array) -> Array:
+    """Invert OpenCV's fisheye model by Newton's method: directions (z is the axis) of points (x, y), shape (n, 2)."""
     distance = np.hypot(points[:, 0], points[:, 1])
     theta = np.minimum(distance, np.pi)
     for _ in range(50):
-        gain, slope = _fisheye_gain(theta, coefficients)
+        gain, slope = _compute_fisheye_gain(theta, coefficients)
         step = (theta * gain - distance) / slope
         theta = np.clip(theta - step, 0.0, np.pi)
         if np.max(np.abs(step)) < 1e-14:
             break
     angles = np.linspace(0.0, float(theta.max()), 1000)
-    reached = theta * _fisheye_gain(theta, coefficients)[0]
-    if not (np.max(np.abs(reached - distance)) < 1e-9 and np.all(_fisheye_gain(angles, coefficients)[1] > 0)):
+    recomputed = theta * _compute_fisheye_gain(theta, coefficients)[0]
+    if not (
+        np.max(np.abs(recomputed - distance)) < 1e-9 and np.all(_compute_fisheye_gain(angles, coefficients)[1] > 0)
+    ):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
-    across = np.divide(np.sin(theta), distance, out=np.ones_like(theta), where=distance > 0)
-    return np.stack([points[:, 0] * across, points[:, 1] * across, np.cos(theta)], axis=-1)
+    scale = np.divide(np.sin(theta), distance, out=np.ones_like(theta), where=distance > 0)
+    return np.stack([points[:, 0] * scale, points[:, 1] * scale, np.cos(theta)], axis=-1)
 
 
-def _in_world(directions: Array, camera_from_world: RigidTransform | None) -> Array:
+def _rotate_to_world(directions: Array, camera_from_world: RigidTransform | None) -> Array:
     return directions if camera_from_world is None else directions @ camera_from_world.as_matrix()[:3, :3]
 
 
-def _far_pixels(camera: CameraModel, directions: Array) -> Array:
+def _project_directions(camera: CameraModel, directions: Array) -> Array:
+    """Project the points C + direction; their distance has no effect, because the entrance pupil does not move."""
     return camera.project(camera.c + directions)[0]
 
 
-def _undistort(distorted: Array, coefficients: Array) -> Array:
+def _invert_pinhole_distortion(distorted: Array, coefficients: Array) -> Array:
     """Invert the pinhole distortion by Newton's method in two dimensions."""
     points = distorted.copy()
     for _ in range(50):
-        image, slope = _distort(points, coefficients)
+        image, slope = _apply_pinhole_distortion(points, coefficients)
         step = np.linalg.solve(slope, (image - distorted)[..., np.newaxis])[..., 0]
         points -= step
         if np.max(np.abs(step)) < 1e-14:
             break
-    image, slope = _distort(points, coefficients)
+    image, slope = _apply_pinhole_distortion(points, coefficients)
     if not (np.max(np.abs(image - distorted)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
     return points
 
 
-def _distort(points: Array, coefficients: Array) -> tuple[Array, Array]:
-    """OpenCV's pinhole distortion of (x, y), shape (n, 2), and its derivative, shape (n, 2, 2)."""
+def _apply_pinhole_distortion(points: Array, coefficients: Array) -> tuple[Array, Array]:
+    """Apply OpenCV's pinhole distortion to (x, y), shape (n, 2); return also its derivative, shape (n, 2, 2)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     x, y = points.T
     square = x * x + y * y
-    over = 1 + square * (k1 + square * (k2 + square * k3))
-    under = 1 + square * (k4 + square * (k5 + square * k6))
-    gain = over / under
-    slope = (k1 + square * (2 * k2 + square * 3 * k3) - gain * (k4 + square * (2 * k5 + square * 3 * k6))) / under
-    across = 2 * (x * y * slope + p1 * x + p2 * y)
+    numerator = 1 + square * (k1 + square * (k2 + square * k3))
+    denominator = 1 + square * (k4 + square * (k5 + square * k6))
+    gain = numerator / denominator
+    slope = (k1 + square * (2 * k2 + square * 3 * k3) - gain * (k4 + square * (2 * k5 + square * 3 * k6))) / denominator
+    mixed = 2 * (x * y * slope + p1 * x + p2 * y)
     distorted = np.stack(
         [x * gain + 2 * p1 * x * y + p2 * (square + 2 * x * x), y * gain + p1 * (square + 2 * y * y) + 2 * p2 * x * y],
         axis=-1,
     )
-    by_x = np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, across], axis=-1)
-    by_y = np.stack([across, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1)
+    by_x = np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=-1)
+    by_y = np.stack([mixed, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1)
     return distorted, np.stack([by_x, by_y], axis=-2)
 
 
-def _fisheye_gain(theta: Array, coefficients: Array) -> tuple[Array, Array]:
-    """Distance over angle of OpenCV's fisheye, and the derivative of the distance."""
+def _compute_fisheye_gain(theta: Array, coefficients: Array) -> tuple[Array, Array]:
+    """Compute the distance divided by theta of OpenCV's fisheye model, and the derivative of the distance by theta."""
     k1, k2, k3, k4 = coefficients
     square = theta * theta
     gain = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
     return gain, 1 + square * (3 * k1 + square * (5 * k2 + square * (7 * k3 + square * 9 * k4)))
 
 
-def _residual(differences: Array) -> Residual:
+def _compute_residual(differences: Array) -> Residual:
     squares = np.sum(differences * differences, axis=-1)
     return Residual(rms_px=float(np.sqrt(np.mean(squares))), max_px=float(np.sqrt(np.max(squares))))
 
 
 #: Maximum size of a camera file; some labels have several megabytes.
 MAX_BYTES = 1 << 23
-#: Names of the models; their letters are the names of their vectors.
+#: Names of the models; each letter of a name is the name of one of the model's vectors.
 MODELS = ("CAHV", "CAHVOR", "CAHVORE")
 
 
 class CameraFileError(ValueError):
-    """A camera file that cannot be used. The message names the file, the field and the allowed values."""
+    """A camera file that cannot be used. The message contains the file, the field and the allowed values."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Path of the file that is read, for its content and for error messages."""
+    """Path of a camera file: reads its content and creates error messages."""
 
     path: str
 
@@ -453,27 +460,27 @@ class Source:
         """Create the error for a field."""
         return CameraFileError(f"{self.path}: {field}: {fault}; allowed: {allowed}")
 
-    def text(self) -> str:
+    def read_text(self) -> str:
         """Read the whole file. Raises CameraFileError if it is unreadable, empty or larger than `MAX_BYTES`."""
-        contents = self.head(MAX_BYTES + 1)
+        contents = self.read_head(MAX_BYTES + 1)
         if len(contents) > MAX_BYTES:
-            raise self.error("file", f"is larger than {MAX_BYTES >> 20} MiB", "a camera file or label, not a picture")
+            raise self.error("file", f"is larger than {MAX_BYTES >> 20} MiB", "a camera file or label, not an image")
         return contents.decode("latin-1")
 
-    def head(self, count: int) -> bytes:
-        """Read at most `count` bytes. Raises CameraFileError if the file is unreadable or empty."""
+    def read_head(self, count: int) -> bytes:
+        """Read at most the first `count` bytes. Raises CameraFileError if the file is unreadable or empty."""
         try:
             with open_regular(self.path) as file:
-                read = file.read(count)
+                first_bytes = file.read(count)
         except OSError as fault:
             raise self.error("file", f"cannot be read ({fault.strerror})", "a readable camera file") from fault
-        if not read:
+        if not first_bytes:
             raise self.error("file", "is empty (0 bytes)", "a camera file")
-        return read
+        return first_bytes
 
 
 def linearity_of_type(kind: Real | None, parameter: float | None, field: str, source: Source) -> float:
-    """Return CAHVORE's linearity for its type (1 perspective, 2 fish-eye, 3 general) and the parameter of type 3."""
+    """Return CAHVORE's linearity: 1 for type 1 (perspective), 0 for type 2 (fish-eye), `parameter` for type 3."""
     if kind in (1, 2):
         return 1.0 if kind == 1 else 0.0
     if kind != 3:
@@ -486,7 +493,7 @@ def linearity_of_type(kind: Real | None, parameter: float | None, field: str, so
 def create_camera(
     name: str, vectors: Mapping[str, Sequence[float]], size: tuple[int, int], linearity: float | None, source: Source
 ) -> CameraModel:
-    """Create the camera of a model name and its vectors by letter. Raises CameraFileError for impossible values."""
+    """Create the camera of a model's name and its vectors by letter. Raises CameraFileError for impossible values."""
     c, a, h, v, *lens = (np.array(vectors[letter], dtype=np.float64) for letter in name)
     try:
         if linearity is not None:

@@ -1,4 +1,4 @@
-"""Compiled projection through a lens with radial distortion, and its inverse."""
+"""Compiled projection through a lens with radial distortion, and its inverse; used by `marsyard.sim.camera.models`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
-#: Maximum number of Newton steps, and the relative size of the last step: the error is of its square.
+#: Maximum number of Newton steps, and the relative step at which they end; the remaining error is of its square.
 NEWTON_STEPS, TOLERANCE = 12, 1e-9
-#: Steps of the bisection if Newton's method fails: more than a float has bits.
-BISECTIONS = 70
+#: Steps of the bisection if Newton's method fails: more than the 53 bits of a float's mantissa.
+BISECTION_STEPS = 70
 
 
 @njit(cache=True, inline="always")
@@ -24,7 +24,7 @@ def _dot(vector: Array, x: float, y: float, z: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def radial_image(
+def project_radial(
     points: tuple[Array, Array, Array],
     axis: Array,
     image_plane: tuple[Array, Array, Array],
@@ -32,12 +32,12 @@ def radial_image(
     r: Array,
     tau_limit: float,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Project points to columns and rows, and test whether the optics image them; model: `Cahvor`.
+    """Project points to columns and rows, and test whether they are visible; equations and symbols of `Cahvor`.
 
     - points: x, y and z of P - C, shape (n,) each
     - axis: O, normalised
     - image_plane, axis_image: H, V and A, and their scalar products with O
-    - r, tau_limit: (rho0, rho1, rho2), and the tau at which the distance from the axis stops growing
+    - r, tau_limit: (rho0, rho1, rho2), and the tau at which the distance (1 + mu) sqrt(tau) from the axis stops growing
     """
     point_x, point_y, point_z = points
     h, v, a = image_plane
@@ -59,23 +59,23 @@ def radial_image(
 
 
 @njit(cache=True, inline="always")
-def _excess(polynomial: Triple, tau: float, ratio: float) -> float:
-    """Residual of the ratio chi / f(chi); it grows with the ratio as far as f grows."""
+def _compute_residual(polynomial: Triple, tau: float, ratio: float) -> float:
+    """Compute the residual of the equation of `_invert_distortion`; it grows with the ratio while f grows."""
     s = tau * ratio * ratio
     return ratio * (polynomial[0] + s * (polynomial[1] + s * polynomial[2])) - 1.0
 
 
 @njit(cache=True, error_model="numpy")
 def _bisect(polynomial: Triple, tau: float, upper: float) -> float:
-    """Solve `_undistortion` by bisection below a bound, which may be infinite."""
+    """Solve the equation of `_invert_distortion` by bisection between 0 and `upper`, which may be infinite."""
     low, high = 0.0, upper
     if upper == math.inf:
         high = 1.0
-        while _excess(polynomial, tau, high) < 0.0:
+        while _compute_residual(polynomial, tau, high) < 0.0:
             high *= 2.0
-    for _ in range(BISECTIONS):
+    for _ in range(BISECTION_STEPS):
         midpoint = 0.5 * (low + high)
-        if _excess(polynomial, tau, midpoint) > 0.0:
+        if _compute_residual(polynomial, tau, midpoint) > 0.0:
             high = midpoint
         else:
             low = midpoint
@@ -83,10 +83,10 @@ def _bisect(polynomial: Triple, tau: float, upper: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _undistortion(polynomial: Triple, limits: tuple[float, float], tau: float) -> float:
-    """Solve g (k1 + s (k3 + s k5)) = 1 with s = tau g^2 for the ratio g = chi / f(chi), which is finite on the axis.
+def _invert_distortion(polynomial: Triple, limits: tuple[float, float], tau: float) -> float:
+    """Solve g (k1 + s (k3 + s k5)) = 1 with s = tau g^2 for the ratio g = chi / f(chi); tau is f(chi)^2.
 
-    Newton's method from g = 1 / k1, then bisection if it fails.
+    The ratio is finite on the axis. Newton's method starts at g = 1 / k1; bisection follows if it fails.
     """
     if not tau < limits[1]:
         return math.nan
@@ -106,20 +106,20 @@ def _undistortion(polynomial: Triple, limits: tuple[float, float], tau: float) -
 
 
 @njit(cache=True, error_model="numpy")
-def undistortion(polynomial: Triple, limits: tuple[float, float], distorted_tau: Array) -> Array:
+def compute_undistortion_ratios(polynomial: Triple, limits: tuple[float, float], distorted_tau: Array) -> Array:
     """Compute the ratio chi / f(chi) for each f(chi)^2; NaN beyond the range of f.
 
-    - polynomial: k1, k3 and k5 of f
-    - limits: chi^2 and f(chi)^2 where f stops growing
+    - polynomial: k1, k3 and k5 of f(chi) = k1 chi + k3 chi^3 + k5 chi^5
+    - limits: chi^2 and f(chi)^2 at the first maximum of f
     """
     ratio = np.empty(distorted_tau.size)
     for n in range(distorted_tau.size):
-        ratio[n] = _undistortion(polynomial, limits, distorted_tau[n])
+        ratio[n] = _invert_distortion(polynomial, limits, distorted_tau[n])
     return ratio
 
 
 @njit(cache=True, error_model="numpy")
-def radial_sight(
+def compute_ray_directions(
     u: Array,
     v: Array,
     direction_from_pixel: NDArray[np.float64],
@@ -127,11 +127,11 @@ def radial_sight(
     polynomial: Triple,
     limits: tuple[float, float],
 ) -> tuple[Array, Array, Array]:
-    """Compute directions of pixels, of any length; NaN without a ray; model: `Cahvor`.
+    """Compute ray directions of pixels for `Cahvor`: of any length, NaN beyond the range of the distortion.
 
     - direction_from_pixel: matrix that maps (u, v, 1) to a direction before distortion
     - axis: O, normalised
-    - polynomial, limits: as in `undistortion`
+    - polynomial, limits: as in `compute_undistortion_ratios`
     """
     m = direction_from_pixel
     direction_x, direction_y, direction_z = np.empty(u.size), np.empty(u.size), np.empty(u.size)
@@ -142,7 +142,7 @@ def radial_sight(
         axial = _dot(axis, x, y, z)
         x, y, z = x - axial * axis[0], y - axial * axis[1], z - axial * axis[2]
         tau = (x * x + y * y + z * z) / (axial * axial) if axial > 0.0 else math.nan
-        ratio = _undistortion(polynomial, limits, tau)
+        ratio = _invert_distortion(polynomial, limits, tau)
         direction_x[n] = axial * axis[0] + ratio * x
         direction_y[n] = axial * axis[1] + ratio * y
         direction_z[n] = axial * axis[2] + ratio * z

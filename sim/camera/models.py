@@ -18,20 +18,20 @@ from marsyard.sim.camera import kernels
 from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel, Gradient, Real, Triple, Vector, dot
 
 _ORIGIN = (0.0, 0.0, 0.0)
-#: A chi^2 beyond this is infinite.
-_UNLIMITED_TAU = 1e30
+#: A chi^2 above this is treated as infinite.
+_INFINITE_TAU = 1e30
 _NEWTON_STEPS = 30
-#: A linearity nearer to 0 than this is 0, as in JPL's cmod.
+#: A linearity of at most this magnitude is treated as 0, as in JPL's cmod.
 _ZERO_LINEARITY = 1e-15
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Cahv(CameraModel):
-    """A pinhole camera; attributes as in `CameraModel`.
+    """A pinhole camera: u = (P - C).H / (P - C).A and v = (P - C).V / (P - C).A for a point P.
 
-    Raises ValueError if a vector is not finite, A is not a unit vector, A, H and V are linearly dependent or the size
-    is not positive.
+    Attributes as in `CameraModel`. Raises ValueError if a vector is not finite, A is not a unit vector, A, H and V are
+    linearly dependent or the size is not positive.
     """
 
     c: Float[np.ndarray, "3"]
@@ -40,17 +40,17 @@ class Cahv(CameraModel):
     v: Float[np.ndarray, "3"]
     size: tuple[int, int]
 
-    def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
+    def _compute_pixels(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
         depth = dot(self.a, x, y, z)
         return dot(self.h, x, y, z) / depth, dot(self.v, x, y, z) / depth, depth > 0
 
-    def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
         depth = dot(self.a, x, y, z)
         u, v = dot(self.h, x, y, z) / depth, dot(self.v, x, y, z) / depth
         return _gradient(self.h, self.a, u, depth), _gradient(self.v, self.a, v, depth)
 
-    def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
-        return self._image_plane_direction(u, v), None
+    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+        return self._compute_linear_directions(u, v), None
 
     @classmethod
     def from_axes(
@@ -63,14 +63,14 @@ class Cahv(CameraModel):
         centre: Triple = _ORIGIN,
         image_centre: tuple[Real, Real] | None = None,
     ) -> Cahv:
-        """Create a camera with square axes from its focal lengths (hs, vs) in pixels.
+        """Create a camera whose H' and V' are perpendicular from its focal lengths (hs, vs) in pixels.
 
-        - axis: viewing direction, of any length
-        - right: direction in which columns grow; its component along `axis` is dropped. Rows grow along axis x right
+        - axis: viewing direction A, of any length
+        - right: direction in which u grows; its component along `axis` is removed. v grows along axis x right
         - centre: C, metres
         - image_centre: (hc, vc), pixels; the middle of the frame by default
 
-        Raises ValueError if a focal length is not positive, or `axis` and `right` are null or parallel.
+        Raises ValueError if a focal length is not positive, or if `axis` and `right` are zero or parallel.
         """
         if not (np.all(np.isfinite(focal_lengths)) and min(focal_lengths) > 0):
             raise ValueError(f"focal lengths must be positive and finite, not {focal_lengths}")
@@ -81,8 +81,8 @@ class Cahv(CameraModel):
             if vector.shape != (3,) or not (np.isfinite(length) and length > 0):
                 raise ValueError(f"{name} must be a finite vector of three components that are not all zero")
             units.append(vector / length)
-        forward, across = units
-        perpendicular = across - (across @ forward) * forward
+        forward, sideways = units
+        perpendicular = sideways - (sideways @ forward) * forward
         if np.linalg.norm(perpendicular) < 1e-6:
             raise ValueError("axis and right must not be parallel")
         perpendicular /= np.linalg.norm(perpendicular)
@@ -107,7 +107,7 @@ class Cahv(CameraModel):
         centre: Triple = _ORIGIN,
         image_centre: tuple[Real, Real] | None = None,
     ) -> Cahv:
-        """Create a camera from its focal length and pixel pitch (one, or along columns and rows); see `from_axes`."""
+        """Create a camera from its focal length and pixel pitch (one number, or width and height); see `from_axes`."""
         column_m, row_m = pixel_pitch_m if isinstance(pixel_pitch_m, tuple) else (pixel_pitch_m, pixel_pitch_m)
         if not (column_m > 0 and row_m > 0):
             raise ValueError(f"the pixel pitch must be positive, not {pixel_pitch_m} m")
@@ -125,7 +125,7 @@ class Cahv(CameraModel):
         vertical_rad: Real | None = None,
         centre: Triple = _ORIGIN,
     ) -> Cahv:
-        """Create a camera from its full field of view (outer edges); square pixels by default; see `from_axes`."""
+        """Create a camera from its full field of view; pixels are square if `vertical_rad` is None; see `from_axes`."""
         for angle in (horizontal_rad, vertical_rad):
             if angle is not None and not 0 < angle < np.pi:
                 raise ValueError(f"a field of view must lie between 0 and pi radians, not {angle}")
@@ -135,6 +135,7 @@ class Cahv(CameraModel):
 
 
 def _gradient(image_vector: NDArray[np.float64], axis: NDArray[np.float64], pixel: Vector, depth: Vector) -> Gradient:
+    """Compute the derivative of a column or row with respect to x, y and z, without distortion."""
     x, y, z = ((image_vector[i] - pixel * axis[i]) / depth for i in range(3))
     return x, y, z
 
@@ -142,14 +143,14 @@ def _gradient(image_vector: NDArray[np.float64], axis: NDArray[np.float64], pixe
 class RadialModel(CameraModel):
     """A camera with radial distortion about an optical axis O: base class of CAHVOR and CAHVORE.
 
-    The image of P is that of the direction O + kappa lambda, where lambda is the component of P - C perpendicular to O.
-    The models differ in kappa. Both move a ray from its "distance" chi from the axis (for a perspective lens the
-    tangent of its angle) to
+    Let lambda be the component of P - C perpendicular to O. A point P is projected to the pixel of the direction
+    O + kappa lambda; the two models differ in kappa. Let chi be the radial coordinate of a ray: a function of its angle
+    from O, for a perspective lens the tangent. The distortion moves the ray from chi to
 
         f(chi) = (1 + rho0) chi + rho1 chi^3 + rho2 chi^5
 
-    (Gennery 2006: mu = rho0 + rho1 tau + rho2 tau^2 with tau = chi^2). The range of f ends at its first maximum: beyond
-    it the picture would fold back.
+    (Gennery 2006: mu = rho0 + rho1 tau + rho2 tau^2 with tau = chi^2). The valid range of chi ends at the first maximum
+    of f, because beyond it two directions would be projected to one pixel.
     """
 
     o: Float[np.ndarray, "3"]
@@ -168,11 +169,12 @@ class RadialModel(CameraModel):
 
     @cached_property
     def _axis(self) -> NDArray[np.float64]:
-        """O normalised: labels round it to six digits."""
+        """O normalised, because labels contain it rounded to six digits."""
         return np.asarray(self.o / np.linalg.norm(self.o))
 
     @cached_property
     def _axis_image(self) -> tuple[float, float, float]:
+        """Scalar products of the normalised O with H, V and A."""
         return float(self._axis @ self.h), float(self._axis @ self.v), float(self._axis @ self.a)
 
     @cached_property
@@ -182,7 +184,7 @@ class RadialModel(CameraModel):
 
     @cached_property
     def _limits(self) -> tuple[float, float]:
-        """chi^2 and f(chi)^2 at the first maximum of f; infinite if it has none, or only at 90 deg to rounding."""
+        """chi^2 and f(chi)^2 at the first maximum of f; infinite if f has none below `_INFINITE_TAU`."""
         k1, k3, k5 = self._polynomial
         tau, discriminant = np.inf, 9 * k3**2 - 20 * k5 * k1
         if k5 == 0:
@@ -192,28 +194,30 @@ class RadialModel(CameraModel):
             half = -0.5 * (3 * k3 + np.copysign(np.sqrt(discriminant), k3))
             roots = [half / (5 * k5), k1 / half if half else -np.inf]
             tau = min((float(root) for root in roots if root > 0), default=np.inf)
-        if not tau < _UNLIMITED_TAU:
+        if not tau < _INFINITE_TAU:
             return np.inf, np.inf
         return float(tau), float(tau * (k1 + tau * (k3 + tau * k5)) ** 2)
 
-    def _off_axis(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Gradient, Vector]:
-        """Component of P - C along O, the vector lambda perpendicular to O, and its length."""
-        along = dot(self._axis, x, y, z)
-        x, y, z = x - along * self._axis[0], y - along * self._axis[1], z - along * self._axis[2]
-        return along, (x, y, z), np.sqrt(x * x + y * y + z * z)
+    def _split_at_axis(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Gradient, Vector]:
+        """Split P - C into its component along O and the vector lambda perpendicular to O; third value: its length."""
+        axial = dot(self._axis, x, y, z)
+        x, y, z = x - axial * self._axis[0], y - axial * self._axis[1], z - axial * self._axis[2]
+        return axial, (x, y, z), np.sqrt(x * x + y * y + z * z)
 
-    def _radial_gradient(self, off: Gradient, kappa: Vector, kappa_gradient: Gradient) -> tuple[Gradient, Gradient]:
-        """Gradients of the pixel of O + kappa lambda, from kappa's."""
-        across = [dot(vector, *off) for vector in (self.h, self.v, self.a)]
-        onto = self._axis_image
-        depth = onto[2] + kappa * across[2]
+    def _radial_gradient(self, lateral: Gradient, kappa: Vector, kappa_gradient: Gradient) -> tuple[Gradient, Gradient]:
+        """Compute the gradients of the pixel of O + kappa lambda; `lateral` is lambda."""
+        lateral_image = [dot(vector, *lateral) for vector in (self.h, self.v, self.a)]
+        axis_image = self._axis_image
+        depth = axis_image[2] + kappa * lateral_image[2]
 
         gradients = []
         for k, vector in enumerate((self.h, self.v)):
-            pixel = (onto[k] + kappa * across[k]) / depth
-            slope = (across[k] - pixel * across[2]) / depth
+            pixel = (axis_image[k] + kappa * lateral_image[k]) / depth
+            slope = (lateral_image[k] - pixel * lateral_image[2]) / depth
             x, y, z = (
-                kappa * ((vector[i] - onto[k] * self._axis[i]) - pixel * (self.a[i] - onto[2] * self._axis[i])) / depth
+                kappa
+                * ((vector[i] - axis_image[k] * self._axis[i]) - pixel * (self.a[i] - axis_image[2] * self._axis[i]))
+                / depth
                 + slope * kappa_gradient[i]
                 for i in range(3)
             )
@@ -224,17 +228,17 @@ class RadialModel(CameraModel):
 @final
 @dataclass(frozen=True, eq=False)
 class Cahvor(RadialModel):
-    """A camera with radial distortion.
+    """A camera with radial distortion about an optical axis O.
 
-    A point P is moved to P' = P + mu lambda before the linear projection, with omega = (P - C).O,
-    lambda = P - C - omega O, tau = lambda.lambda / omega^2 and mu = rho0 + rho1 tau + rho2 tau^2. Points beyond the tau
-    at which the distance (1 + mu) sqrt(tau) from the axis stops growing are not visible.
+    A point P is moved to P' = P + mu lambda before the linear projection of `Cahv`, with omega = (P - C).O,
+    lambda = P - C - omega O, tau = lambda.lambda / omega^2 and mu = rho0 + rho1 tau + rho2 tau^2. The distorted
+    distance (1 + mu) sqrt(tau) from the axis grows with tau up to a maximum; points beyond it are not visible.
 
     - c, a, h, v, size: as in `CameraModel`
     - o: unit vector O of the optical axis; only its direction is used
     - r: (rho0, rho1, rho2)
 
-    Raises ValueError as `Cahv`; or if O is not a unit vector or points away from A, or rho0 <= -1.
+    Raises ValueError as `Cahv` does; also if O is not a unit vector, O.A <= 0, or rho0 <= -1.
     """
 
     c: Float[np.ndarray, "3"]
@@ -251,26 +255,26 @@ class Cahvor(RadialModel):
         axis = cahv.a if o is None else np.asarray(o, dtype=np.float64)
         return cls(cahv.c, cahv.a, cahv.h, cahv.v, axis, np.asarray(r, dtype=np.float64), cahv.size)
 
-    def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
-        image: tuple[Vector, Vector, NDArray[np.bool_]] = kernels.radial_image(
+    def _compute_pixels(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
+        pixels: tuple[Vector, Vector, NDArray[np.bool_]] = kernels.project_radial(
             (x, y, z), self._axis, (self.h, self.v, self.a), self._axis_image, self.r, self._limits[0]
         )
-        return image
+        return pixels
 
-    def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
         omega = dot(self._axis, x, y, z)
         tau = np.maximum((x * x + y * y + z * z) / (omega * omega) - 1, 0)
         kappa = (1 + (self.r[0] + tau * (self.r[1] + tau * self.r[2]))) / omega
         mu_slope = (self.r[1] + 2 * self.r[2] * tau) * 2 / omega**3
-        along, off, _ = self._off_axis(x, y, z)
+        axial, lateral, _ = self._split_at_axis(x, y, z)
         # d tau = 2 (lambda / omega^2 - tau / omega O).dP, because lambda is perpendicular to O
         kappa_x, kappa_y, kappa_z = (
-            mu_slope * (off[i] - tau * omega * self._axis[i]) - kappa / along * self._axis[i] for i in range(3)
+            mu_slope * (lateral[i] - tau * omega * self._axis[i]) - kappa / axial * self._axis[i] for i in range(3)
         )
-        return self._radial_gradient(off, kappa, (kappa_x, kappa_y, kappa_z))
+        return self._radial_gradient(lateral, kappa, (kappa_x, kappa_y, kappa_z))
 
-    def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
-        direction: Gradient = kernels.radial_sight(
+    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+        direction: Gradient = kernels.compute_ray_directions(
             u, v, self._direction_from_pixel, self._axis, self._polynomial, self._limits
         )
         return direction, None
@@ -282,21 +286,21 @@ class Cahvore(RadialModel):
     """A wide-angle camera whose entrance pupil moves along the optical axis.
 
     A ray that makes the angle theta with O starts at C + s O, with
-    s = (theta / sin theta - 1) (e0 + e1 theta^2 + e2 theta^4). Its "distance" from the axis, L being the linearity, is
+    s = (theta / sin theta - 1) (e0 + e1 theta^2 + e2 theta^4). With the linearity L its radial coordinate is
 
         chi = tan(L theta) / L   (L > 0; L = 1 is a perspective lens)
         chi = theta              (L = 0, an equidistant fisheye)
         chi = sin(L theta) / L   (L < 0; L = -1 is orthographic)
 
-    It is moved to (1 + rho0) chi + rho1 chi^3 + rho2 chi^5 and projected linearly. Points outside the range in which
-    this is one-to-one are not visible, nor are points so near that none or several rays pass through them.
+    The distortion changes chi to (1 + rho0) chi + rho1 chi^3 + rho2 chi^5, followed by the linear projection of `Cahv`.
+    A point is not visible if the distortion is not one-to-one at its chi, or if not exactly one ray passes through it.
 
     - c, a, h, v, size: as in `CameraModel`; C is the entrance pupil for rays along the axis
     - o, r: as in `Cahvor`
-    - e: (e0, e1, e2) of the pupil's motion, metres
+    - e: coefficients (e0, e1, e2) of the pupil's motion, metres
     - linearity: L, from -1 to 1
 
-    Raises ValueError as `Cahvor`; or if the linearity is not from -1 to 1.
+    Raises ValueError as `Cahvor` does; also if the linearity is not from -1 to 1.
     """
 
     c: Float[np.ndarray, "3"]
@@ -319,7 +323,7 @@ class Cahvore(RadialModel):
     def from_cahv(
         cls, cahv: Cahv, r: Triple, e: Triple = (0.0, 0.0, 0.0), *, linearity: Real, o: Triple | None = None
     ) -> Cahvore:
-        """Put a wide-angle lens about the unit vector `o` (A by default) before a pinhole camera's image plane."""
+        """Add a wide-angle lens about the unit vector `o` (A by default) to a pinhole camera."""
         axis = cahv.a if o is None else np.asarray(o, dtype=np.float64)
         radial, pupil = np.asarray(r, dtype=np.float64), np.asarray(e, dtype=np.float64)
         return cls(cahv.c, cahv.a, cahv.h, cahv.v, axis, radial, pupil, linearity=linearity, size=cahv.size)
@@ -328,83 +332,87 @@ class Cahvore(RadialModel):
     def _theta_limit(self) -> float:
         """Angle from the axis up to which the lens is one-to-one, radians."""
         chi = np.sqrt(self._limits[0])
-        return min(float(self._theta(np.array([chi]))[0]), np.pi)
+        return min(float(self._theta_from_chi(np.array([chi]))[0]), np.pi)
 
-    def _chi(self, theta: Vector) -> Vector:
+    def _chi_from_theta(self, theta: Vector) -> Vector:
         scale = self.linearity
         if scale > _ZERO_LINEARITY:
             return np.tan(scale * theta) / scale
         return np.sin(scale * theta) / scale if scale < -_ZERO_LINEARITY else theta
 
-    def _theta(self, chi: Vector) -> Vector:
+    def _theta_from_chi(self, chi: Vector) -> Vector:
         scale = self.linearity
         if scale > _ZERO_LINEARITY:
             return np.arctan(scale * chi) / scale
         return np.arcsin(np.maximum(scale * chi, -1)) / scale if scale < -_ZERO_LINEARITY else chi
 
-    def _pupil(self, theta: Vector) -> tuple[Vector, Vector]:
+    def _pupil_series(self, theta: Vector) -> tuple[Vector, Vector]:
+        """Compute e0 + e1 theta^2 + e2 theta^4, metres, and its derivative by theta."""
         square = theta * theta
         series = self.e[0] + square * (self.e[1] + square * self.e[2])
         return series, theta * (2 * self.e[1] + 4 * self.e[2] * square)
 
-    def _angle(self, along: Vector, across: Vector) -> tuple[Vector, Vector]:
-        """Angle theta of the ray through a point `along` the axis and `across` from it (NaN if none), and upsilon.
+    def _solve_theta(self, axial: Vector, radius: Vector) -> tuple[Vector, Vector]:
+        """Compute the angle theta of the ray through a point (NaN if there is none), and upsilon.
 
-        Newton's method on along sin theta - across cos theta - (theta - sin theta) (e0 + e1 theta^2 + e2 theta^4) = 0.
+        The point has the coordinate `axial` along the axis and the distance `radius` from it. Newton's method on
+        axial sin theta - radius cos theta - (theta - sin theta) (e0 + e1 theta^2 + e2 theta^4) = 0; upsilon: slope.
         """
-        theta = np.arctan2(across, along)
+        theta = np.arctan2(radius, axial)
         upsilon = step = np.zeros_like(theta)
         for _ in range(_NEWTON_STEPS):
             sine, cosine = np.sin(theta), np.cos(theta)
-            series, slope = self._pupil(theta)
-            lag = theta - sine
-            upsilon = along * cosine + across * sine - (1 - cosine) * series - lag * slope
-            step = (along * sine - across * cosine - lag * series) / upsilon
+            series, slope = self._pupil_series(theta)
+            theta_minus_sine = theta - sine
+            upsilon = axial * cosine + radius * sine - (1 - cosine) * series - theta_minus_sine * slope
+            step = (axial * sine - radius * cosine - theta_minus_sine * series) / upsilon
             theta = theta - step
-            if not np.any(np.abs(step) > 1e-9):  # the error is of the step's square
+            if not np.any(np.abs(step) > 1e-9):  # the remaining error is of the step's square
                 break
-        solved = (np.abs(step) <= 1e-9) & (upsilon > 0) & (theta >= 0) & (theta < self._theta_limit)
-        return np.where(solved, theta, np.nan), upsilon
+        is_solved = (np.abs(step) <= 1e-9) & (upsilon > 0) & (theta >= 0) & (theta < self._theta_limit)
+        return np.where(is_solved, theta, np.nan), upsilon
 
-    def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
-        along, off, across = self._off_axis(x, y, z)
-        theta, _ = self._angle(along, across)
-        kappa = self._kappa(self._chi(theta), along, across)
-        onto = self._axis_image
-        depth = onto[2] + kappa * dot(self.a, *off)
-        u = (onto[0] + kappa * dot(self.h, *off)) / depth
-        v = (onto[1] + kappa * dot(self.v, *off)) / depth
+    def _compute_pixels(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
+        axial, lateral, radius = self._split_at_axis(x, y, z)
+        theta, _ = self._solve_theta(axial, radius)
+        kappa = self._compute_kappa(self._chi_from_theta(theta), axial, radius)
+        axis_image = self._axis_image
+        depth = axis_image[2] + kappa * dot(self.a, *lateral)
+        u = (axis_image[0] + kappa * dot(self.h, *lateral)) / depth
+        v = (axis_image[1] + kappa * dot(self.v, *lateral)) / depth
         return u, v, depth > 0
 
-    def _kappa(self, chi: Vector, along: Vector, across: Vector) -> Vector:
+    def _compute_kappa(self, chi: Vector, axial: Vector, radius: Vector) -> Vector:
         (k1, k3, k5), tau = self._polynomial, chi * chi
         gain = k1 + tau * (k3 + tau * k5)
-        return gain * np.where(across > 0, chi / across, 1 / along)
+        return gain * np.where(radius > 0, chi / radius, 1 / axial)
 
-    def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
-        along, off, across = self._off_axis(x, y, z)
-        theta, upsilon = self._angle(along, across)
-        chi = self._chi(theta)
-        kappa = self._kappa(chi, along, across)
+    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+        axial, lateral, radius = self._split_at_axis(x, y, z)
+        theta, upsilon = self._solve_theta(axial, radius)
+        chi = self._chi_from_theta(theta)
+        kappa = self._compute_kappa(chi, axial, radius)
         (k1, k3, k5), tau = self._polynomial, chi * chi
         cosine = np.cos(self.linearity * theta)
         chi_slope = 1 / (cosine * cosine) if self.linearity > _ZERO_LINEARITY else cosine
         slope = (k1 + tau * (3 * k3 + tau * 5 * k5)) * chi_slope
-        # kappa = f(chi) / across; on the axis lambda vanishes, and with it the effect of kappa's gradient
-        inverse = np.where(across > 0, 1 / across, 0.0)
-        by_across = (slope * np.cos(theta) / upsilon - kappa) * inverse
-        by_along = -slope * np.sin(theta) / upsilon * inverse
-        kappa_x, kappa_y, kappa_z = (by_across * off[i] * inverse + by_along * self._axis[i] for i in range(3))
-        return self._radial_gradient(off, kappa, (kappa_x, kappa_y, kappa_z))
+        # kappa = f(chi) / radius. On the axis lambda is zero, and the gradient of kappa has no effect
+        inverse = np.where(radius > 0, 1 / radius, 0.0)
+        kappa_by_radius = (slope * np.cos(theta) / upsilon - kappa) * inverse
+        kappa_by_axial = -slope * np.sin(theta) / upsilon * inverse
+        kappa_x, kappa_y, kappa_z = (
+            kappa_by_radius * lateral[i] * inverse + kappa_by_axial * self._axis[i] for i in range(3)
+        )
+        return self._radial_gradient(lateral, kappa, (kappa_x, kappa_y, kappa_z))
 
-    def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
-        along, off, across = self._off_axis(*self._image_plane_direction(u, v))
-        distorted = across / np.where(along > 0, along, np.nan)
-        ratio = kernels.undistortion(self._polynomial, self._limits, distorted * distorted)
-        theta = self._theta(distorted * ratio)
+    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+        axial, lateral, radius = self._split_at_axis(*self._compute_linear_directions(u, v))
+        distorted = radius / np.where(axial > 0, axial, np.nan)
+        ratio = kernels.compute_undistortion_ratios(self._polynomial, self._limits, distorted * distorted)
+        theta = self._theta_from_chi(distorted * ratio)
         theta = np.where(theta < self._theta_limit, theta, np.nan)
         sine, cosine = np.sin(theta), np.cos(theta)
-        outward = np.where(across > 0, sine / across, 0.0)
-        x, y, z = (cosine * self._axis[i] + outward * off[i] for i in range(3))
-        shift = np.where(theta > 0, theta / sine - 1, 0.0) * self._pupil(theta)[0]
+        lateral_scale = np.where(radius > 0, sine / radius, 0.0)
+        x, y, z = (cosine * self._axis[i] + lateral_scale * lateral[i] for i in range(3))
+        shift = np.where(theta > 0, theta / sine - 1, 0.0) * self._pupil_series(theta)[0]
         return (x, y, z), shift[:, np.newaxis] * self._axis

@@ -1,13 +1,13 @@
-"""PDS3 and PDS4 labels: camera models; of PDS3 products also the picture and the rover's pose.
+"""Readers of PDS3 and PDS4 labels: camera models; for PDS3 products also the image and the rover's pose.
 
-PDS3: each group GEOMETRIC_CAMERA_MODEL (Curiosity: GEOMETRIC_CAMERA_MODEL_PARMS) gives MODEL_TYPE, the letters of its
-components (MODEL_COMPONENT_ID) and the components, in the frame named by REFERENCE_COORD_SYSTEM_NAME (a rover's frame,
-metres: x forward, y right, z down). The vectors are returned in that frame. The picture's size is that of the label's
-IMAGE object. Labels are attached to the product or detached; Curiosity's begin with ODL_VERSION_ID.
+PDS3: each group GEOMETRIC_CAMERA_MODEL (Curiosity: GEOMETRIC_CAMERA_MODEL_PARMS) contains MODEL_TYPE, the letters of
+the components (MODEL_COMPONENT_ID) and the components, in the frame named by REFERENCE_COORD_SYSTEM_NAME (a rover's
+frame, metres: x forward, y right, z down). The vectors are returned in that frame. The image's size is that of the
+label's IMAGE object. Labels are attached to the product or detached; Curiosity's begin with ODL_VERSION_ID.
 
 PDS4: the class `geom:Camera_Model_Parameters` of the geometry dictionary. Vectors are returned in the frame named by
-the label (`Coordinate_Space_Reference`). The picture's size is that of the label's image array. Prefixes and versions
-of namespaces do not matter.
+the label (`Coordinate_Space_Reference`). The image's size is that of the label's image array. Prefixes and versions
+of namespaces are ignored.
 """
 
 from __future__ import annotations
@@ -29,16 +29,19 @@ from marsyard.sim.camera.calibrations import MAX_BYTES, MODELS, Source, create_c
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import rigid
 
-_GROUP = "GEOMETRIC_CAMERA_MODEL"
-_GROUPS = (_GROUP, f"{_GROUP}_PARMS")
+_CAMERA_GROUP = "GEOMETRIC_CAMERA_MODEL"
+_CAMERA_GROUPS = (_CAMERA_GROUP, f"{_CAMERA_GROUP}_PARMS")
+#: Number of bytes in which the end of a label is searched first; then `MAX_BYTES`.
 _FIRST_BYTES = 1 << 16
 _START = re.compile(rb"^\s*(?:PDS|ODL)_VERSION_ID\s*=", re.MULTILINE)
-_START_WITHIN = 4096
+#: Number of bytes in which the start of a label is searched.
+_START_BYTES = 4096
 _END = re.compile(rb"^END\s*$", re.MULTILINE)
-_METRES = ("METER", "METERS", "METRE", "METRES", "M", "N/A")
+_PDS3_METRES = ("METER", "METERS", "METRE", "METRES", "M", "N/A")
 #: Groups of the rover's pose; the second is Curiosity's.
-_ROVERS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
-#: `9`, `20481 <BYTES>`, `("PICTURE.IMG", 9)`, `("PICTURE.IMG", 20481 <BYTES>)`, `"PICTURE.IMG"`.
+_POSE_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
+#: The ^IMAGE line with one of `9`, `20481 <BYTES>`, `("A.IMG", 9)`, `("A.IMG", 20481 <BYTES>)`, `"A.IMG"`: the image's
+#: first record or byte, counted from 1, and its file.
 _POINTER = re.compile(
     r"^[ \t]*\^IMAGE[ \t]*=[ \t]*"
     r"(?:\([ \t]*\"(?P<detached>[^\"\n]+)\"[ \t]*,[ \t]*(?P<at>\d+)[ \t]*(?P<at_bytes><BYTES>)?[ \t]*\)"
@@ -47,10 +50,10 @@ _POINTER = re.compile(
 )
 _RECORD = re.compile(r"^[ \t]*RECORD_BYTES[ \t]*=[ \t]*(\d+)", re.MULTILINE)
 _CLOCK = re.compile(r"^[ \t]*SPACECRAFT_CLOCK_(START|STOP)_COUNT[ \t]*=[ \t]*\"?(\d+\.?\d*)\"?[ \t]*\r?$", re.MULTILINE)
-#: Byte orders of integer samples by the first word of SAMPLE_TYPE; 8-bit samples have none.
-_ORDERS = {"MSB": ">", "LSB": "<", "PC": "<", "SUN": ">", "UNSIGNED": ">", "INTEGER": ">"}
+#: Byte orders of integer samples by the first word of SAMPLE_TYPE; for 8-bit samples the order has no effect.
+_BYTE_ORDERS = {"MSB": ">", "LSB": "<", "PC": "<", "SUN": ">", "UNSIGNED": ">", "INTEGER": ">"}
 #: Tolerance on the length of a quaternion.
-_UNIT = 1e-3
+_QUATERNION_TOLERANCE = 1e-3
 _SUBFRAME = "of a part of the detector or of averaged pixels"
 
 _XML_START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|[A-Za-z_][\w:.-]*[\s>])")
@@ -72,9 +75,9 @@ _PDS4_METRES = (None, "m", "meter", "metre")
 
 @dataclass(frozen=True)
 class Pds3Product:
-    """A picture with its pose and time by its label.
+    """An image of a rover with the rover's pose and the time from the image's label.
 
-    - counts: as stored
+    - counts: the stored numbers of the pixels, DN
     - site_from_rover: the rover's pose in the site frame (x north, y east, z down), metres; None if not in the label
     - time_s: spacecraft clock at the middle of the exposure; None if not in the label
     """
@@ -87,80 +90,80 @@ class Pds3Product:
 def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
     """Read every camera model of a PDS3 product (.IMG) or detached label (.LBL), in order; the image is not read.
 
-    The standard does not define whether the model of a subframe, or of a picture with averaged pixels, describes the
-    stored picture or the whole detector. Such labels are refused unless `subframe_folded_in` is set: the vectors then
-    describe the stored picture. Raises CameraFileError if the label cannot be read, has no camera model, or one is
-    incomplete or wrong; it names file, field and allowed values.
+    The standard does not define whether the model of a subframe, or of an image with averaged pixels, describes the
+    stored image or the whole detector. Such labels are refused by default. With `subframe_folded_in` they are accepted,
+    and the vectors are assumed to describe the stored image. Raises CameraFileError if the label cannot be read or has
+    no camera model, or if a model is incomplete or wrong. The message contains file, field and allowed values.
     """
     source = Source(str(path))
-    label = _parse_blocks(_label_text(source), (*_GROUPS, "IMAGE", "INSTRUMENT_STATE_PARMS"), source)
-    groups = [group for name, group in label.items() if name in _GROUPS]
+    label = _parse_blocks(_read_label(source), (*_CAMERA_GROUPS, "IMAGE", "INSTRUMENT_STATE_PARMS"), source)
+    groups = [group for name, group in label.items() if name in _CAMERA_GROUPS]
     if not groups:
-        raise source.error(_GROUP, "missing or not closed", "a label with at least one such group")
-    size = _picture_size(label, source)
+        raise source.error(_CAMERA_GROUP, "missing or not closed", "a label with at least one such group")
+    size = _read_size(label, source)
     fields = {f"IMAGE.{field}": label["IMAGE"].get(field) for field in ("FIRST_LINE", "FIRST_LINE_SAMPLE")}
     state = label.get("INSTRUMENT_STATE_PARMS")
     if isinstance(state, Mapping):
         for field in ("PIXEL_AVERAGING_HEIGHT", "PIXEL_AVERAGING_WIDTH"):
             fields[f"INSTRUMENT_STATE_PARMS.{field}"] = state.get(field)
-    for field, stated in fields.items():
-        value = getattr(stated, "value", stated)  # a quantity with its unit, as 2 <pixel>
+    for field, quantity in fields.items():
+        value = getattr(quantity, "value", quantity)  # pvl parses 2 <pixel> to an object with value and unit
         if not subframe_folded_in and isinstance(value, int) and value != 1:
             raise source.error(field, f"{value}: {_SUBFRAME}", "1, or subframe_folded_in=True")
-    return tuple(_pds3_camera(group, size, source) for group in groups)
+    return tuple(_create_pds3_camera(group, size, source) for group in groups)
 
 
 def read_pds3_product(path: str | Path) -> Pds3Product:
-    """Read a picture of 8 or 16-bit integers and its pose; `read_pds3` reads its camera.
+    """Read an image of 8-bit or 16-bit integers, the rover's pose and the time; `read_pds3` reads the camera.
 
-    Raises CameraFileError if the label or the picture's file cannot be read, the picture has another type or is cut
-    short, or the rover's pose is invalid; it names file, field and allowed values.
+    Raises CameraFileError if the label or the image's file cannot be read, the image has another type or is
+    incomplete, or the rover's pose is invalid. The message contains file, field and allowed values.
     """
     source = Source(str(path))
-    text = _label_text(source)
-    label = _parse_blocks(text, ("IMAGE", *_ROVERS), source)
-    size = _picture_size(label, source)
+    text = _read_label(source)
+    label = _parse_blocks(text, ("IMAGE", *_POSE_GROUPS), source)
+    size = _read_size(label, source)
     counts = _read_counts(text, label["IMAGE"], size, source)
     times = [float(match[2]) for match in _CLOCK.finditer(text)]
     time_s = float(np.mean(times)) if times else None
-    name = next((one for one in _ROVERS if one in label), None)
+    name = next((name for name in _POSE_GROUPS if name in label), None)
     if name is None:
         return Pds3Product(counts, None, time_s)
     vectors = []
     for field, length in (("ORIGIN_OFFSET_VECTOR", 3), ("ORIGIN_ROTATION_QUATERNION", 4)):
         value = label[name].get(field) if isinstance(label[name], Mapping) else None
-        numeric = isinstance(value, list) and all(isinstance(one, int | float) for one in value)
-        if not numeric or len(value) != length:  # type: ignore[arg-type]  # a list, as just seen
+        is_numeric = isinstance(value, list) and all(isinstance(number, int | float) for number in value)
+        if not is_numeric or len(value) != length:  # type: ignore[arg-type]  # numeric values are a list
             raise source.error(f"{name}.{field}", f"{value!r}", f"{length} numbers")
         vectors.append(np.array(value, dtype=np.float64))
     offset, quaternion = vectors
-    if abs(float(np.linalg.norm(quaternion)) - 1.0) > _UNIT:
+    if abs(float(np.linalg.norm(quaternion)) - 1.0) > _QUATERNION_TOLERANCE:
         raise source.error(f"{name}.ORIGIN_ROTATION_QUATERNION", "is not of length 1", "a unit quaternion")
-    # the label's quaternion has its scalar first
+    # the label's quaternion is (w, x, y, z), SciPy's is (x, y, z, w)
     return Pds3Product(counts, rigid(Rotation.from_quat(quaternion[[1, 2, 3, 0]]), offset), time_s)
 
 
 def is_pds3(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a PDS3 label or product."""
-    return _START.search(head[:_START_WITHIN]) is not None
+    """Return whether the first bytes of a file are those of a PDS3 label or product."""
+    return _START.search(head[:_START_BYTES]) is not None
 
 
-def _label_text(source: Source) -> str:
+def _read_label(source: Source) -> str:
     for count in (_FIRST_BYTES, MAX_BYTES):
-        head = source.head(count)
+        head = source.read_head(count)
         if not is_pds3(head):
-            raise source.error("PDS_VERSION_ID", "missing at the head of the file", "a PDS3 label or product")
+            raise source.error("PDS_VERSION_ID", "missing at the start of the file", "a PDS3 label or product")
         end = _END.search(head)
         if end is not None:
             return head[: end.end()].decode("latin-1")
-    raise source.error("END", f"missing in the first {MAX_BYTES} bytes", "a label closed by a line END")
+    raise source.error("END", f"missing in the first {MAX_BYTES} bytes", "a label that ends with a line END")
 
 
 def _parse_blocks(text: str, names: Sequence[str], source: Source) -> Any:
     """Parse the groups and objects of these names in a label.
 
-    pvl's strict parser refuses other parts of real labels (unquoted values that begin with a digit), and its lenient
-    parser never returns from some damaged labels; the blocks are regular.
+    Only these blocks are parsed, because pvl's strict parser fails on other parts of real labels (unquoted values that
+    begin with a digit), and its lenient parser never returns for some damaged labels.
     """
     blocks = re.compile(
         rf"^[ \t]*(GROUP|OBJECT)[ \t]*=[ \t]*({'|'.join(names)})[ \t]*\r?$.*?^[ \t]*END_\1\b[^\n]*$",
@@ -168,7 +171,7 @@ def _parse_blocks(text: str, names: Sequence[str], source: Source) -> Any:
     )
     try:
         with warnings.catch_warnings():
-            # pvl warns of a missing optional package and of a deprecated class of its own
+            # pvl warns of a missing optional package and of its use of a deprecated class
             warnings.simplefilter("ignore", ImportWarning)
             warnings.simplefilter("ignore", PendingDeprecationWarning)
             from pvl.decoder import PDSLabelDecoder
@@ -182,7 +185,7 @@ def _parse_blocks(text: str, names: Sequence[str], source: Source) -> Any:
         raise source.error("label", f"cannot be parsed ({fault})", "a PDS3 label") from fault
 
 
-def _picture_size(label: Any, source: Source) -> tuple[int, int]:
+def _read_size(label: Any, source: Source) -> tuple[int, int]:
     if "IMAGE" not in label or not isinstance(label["IMAGE"], Mapping):
         raise source.error("IMAGE", "missing", "an object with LINES and LINE_SAMPLES")
     image = label["IMAGE"]
@@ -190,30 +193,31 @@ def _picture_size(label: Any, source: Source) -> tuple[int, int]:
     for field in ("LINE_SAMPLES", "LINES"):
         value = image.get(field)
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise source.error(f"IMAGE.{field}", _fault(value), "a positive integer")
+            raise source.error(f"IMAGE.{field}", _describe_fault(value), "a positive integer")
         extents.append(value)
     return extents[0], extents[1]
 
 
-def _pds3_camera(group: Any, size: tuple[int, int], source: Source) -> CameraModel:
-    """Create the camera of a group: its components are found by their letters."""
+def _create_pds3_camera(group: Any, size: tuple[int, int], source: Source) -> CameraModel:
+    """Create the camera of a group; the letters in MODEL_COMPONENT_ID assign its components to vectors."""
 
     def is_number(value: Any) -> bool:
         return isinstance(value, int | float) and not isinstance(value, bool)
 
     if not isinstance(group, Mapping):
-        raise source.error(_GROUP, "is not a group", "GROUP = GEOMETRIC_CAMERA_MODEL ... END_GROUP")
-    name, letters, id_field = group.get("MODEL_TYPE"), group.get("MODEL_COMPONENT_ID"), f"{_GROUP}.MODEL_COMPONENT_ID"
+        raise source.error(_CAMERA_GROUP, "is not a group", "GROUP = GEOMETRIC_CAMERA_MODEL ... END_GROUP")
+    name, letters = group.get("MODEL_TYPE"), group.get("MODEL_COMPONENT_ID")
+    id_field = f"{_CAMERA_GROUP}.MODEL_COMPONENT_ID"
     if not isinstance(name, str) or name not in MODELS:
-        raise source.error(f"{_GROUP}.MODEL_TYPE", _fault(name), ", ".join(MODELS))
+        raise source.error(f"{_CAMERA_GROUP}.MODEL_TYPE", _describe_fault(name), ", ".join(MODELS))
     if not isinstance(letters, list) or not all(isinstance(letter, str) for letter in letters):
-        raise source.error(id_field, _fault(letters), "a list of letters such as (C,A,H,V,O,R)")
+        raise source.error(id_field, _describe_fault(letters), "a list of letters such as (C,A,H,V,O,R)")
     if len(set(letters)) != len(letters):
         raise source.error(id_field, f"{letters} repeats a letter", "each letter once")
     units = group.get("MODEL_COMPONENT_UNIT", ["N/A"] * len(letters))
     for letter, unit in zip(letters, units, strict=False):
-        if letter in ("C", "E") and str(unit).upper() not in _METRES:
-            raise source.error(f"{_GROUP}.MODEL_COMPONENT_UNIT", f"{unit!r} for {letter}", "METER")
+        if letter in ("C", "E") and str(unit).upper() not in _PDS3_METRES:
+            raise source.error(f"{_CAMERA_GROUP}.MODEL_COMPONENT_UNIT", f"{unit!r} for {letter}", "METER")
     vectors: dict[str, list[float]] = {}
     lens: dict[str, float] = {}
     for letter in (*name, "T", "P") if name == "CAHVORE" else name:
@@ -223,13 +227,13 @@ def _pds3_camera(group: Any, size: tuple[int, int], source: Source) -> CameraMod
             continue
         keyword = f"MODEL_COMPONENT_{letters.index(letter) + 1}"
         value: Any = group.get(keyword)
-        field = f"{_GROUP}.{keyword} ({letter})"
+        field = f"{_CAMERA_GROUP}.{keyword} ({letter})"
         if letter in name:
             if not isinstance(value, list) or len(value) != 3 or not all(is_number(number) for number in value):
-                raise source.error(field, _fault(value), "three finite numbers")
+                raise source.error(field, _describe_fault(value), "three finite numbers")
             vectors[letter] = [float(number) for number in value]
         elif not is_number(value):
-            raise source.error(field, _fault(value), "a finite number")
+            raise source.error(field, _describe_fault(value), "a finite number")
         else:
             lens[letter] = float(value)
     if name != "CAHVORE":
@@ -238,84 +242,84 @@ def _pds3_camera(group: Any, size: tuple[int, int], source: Source) -> CameraMod
     return create_camera(name, vectors, size, linearity, source)
 
 
-def _fault(value: Any) -> str:
+def _describe_fault(value: Any) -> str:
     return "missing" if value is None else f"{value!r}"
 
 
 def _read_counts(text: str, image: Any, size: tuple[int, int], source: Source) -> UInt16[np.ndarray, "rows columns"]:
     pointer = _POINTER.search(text)
     if pointer is None:
-        raise source.error("^IMAGE", "missing, or of another form", 'a record, bytes, or ("FILE", record)')
+        raise source.error("^IMAGE", "missing or not readable", 'a record, bytes, or ("FILE", record)')
     name = pointer["detached"] or pointer["alone"]
     path = Path(source.path)
     if name is not None:
         if Path(name).name != name:
-            raise source.error("^IMAGE", f"names {name!r}, a file elsewhere", "a file next to the label")
-        # archives differ in the case of names
+            raise source.error("^IMAGE", f"{name!r} is in another folder", "a file next to the label")
+        # some archives write the file's name in the other case
         paths = [path.parent / name, path.parent / name.lower(), path.parent / name.upper()]
-        path = next((one for one in paths if one.exists()), paths[0])
+        path = next((path for path in paths if path.exists()), paths[0])
     offset = int(pointer["at"] or pointer["number"] or 1) - 1
     if offset > 0 and not (pointer["at_bytes"] or pointer["bytes"]):
         record = _RECORD.search(text)
         if record is None:
-            raise source.error("RECORD_BYTES", "missing", "the bytes of a record")
+            raise source.error("RECORD_BYTES", "missing", "the number of bytes of a record")
         offset *= int(record[1])
     bits, kind = image.get("SAMPLE_BITS"), str(image.get("SAMPLE_TYPE", ""))
-    order = _ORDERS.get(kind.split("_")[0])
+    order = _BYTE_ORDERS.get(kind.split("_")[0])
     if bits not in (8, 16) or order is None or not kind.endswith("INTEGER"):
         raise source.error("IMAGE.SAMPLE_TYPE, SAMPLE_BITS", f"{kind}, {bits}", "integers of 8 or 16 bits")
     for field, allowed in (("BANDS", 1), ("LINE_PREFIX_BYTES", 0), ("LINE_SUFFIX_BYTES", 0)):
         if image.get(field, allowed) != allowed:
             raise source.error(f"IMAGE.{field}", f"{image.get(field)}", f"{allowed}")
-    signed = bits == 16 and "UNSIGNED" not in kind
-    sample = np.dtype(f"{order}{'i' if signed else 'u'}{bits // 8}")
+    is_signed = bits == 16 and "UNSIGNED" not in kind
+    sample_type = np.dtype(f"{order}{'i' if is_signed else 'u'}{bits // 8}")
     columns, rows = size
-    wanted = columns * rows * sample.itemsize
+    required_bytes = columns * rows * sample_type.itemsize
     try:
-        # at most the file's size: a label may state any size
-        available = max(min(check_regular(path).st_size - offset, wanted), 0)
+        # limited to the file's size, because a damaged label can contain any size
+        available_bytes = max(min(check_regular(path).st_size - offset, required_bytes), 0)
         with path.open("rb") as file:
             file.seek(offset)
-            data = file.read(available)
+            data = file.read(available_bytes)
     except OSError as fault:
-        raise source.error("^IMAGE", f"{path} cannot be read ({fault.strerror})", "the picture's file") from fault
-    if len(data) < wanted:
+        raise source.error("^IMAGE", f"{path} cannot be read ({fault.strerror})", "the image's file") from fault
+    if len(data) < required_bytes:
         raise source.error("IMAGE", f"ends after {len(data)} bytes", f"{columns} x {rows} samples of {bits} bits")
-    counts = np.frombuffer(data, dtype=sample).reshape(rows, columns)
-    if signed and counts.min() < 0:
-        raise source.error("IMAGE", f"holds counts down to {counts.min()}", "counts from 0")
+    counts = np.frombuffer(data, dtype=sample_type).reshape(rows, columns)
+    if is_signed and counts.min() < 0:
+        raise source.error("IMAGE", f"contains counts down to {counts.min()}", "counts from 0")
     return counts.astype(np.uint16)
 
 
 def is_xml(head: bytes) -> bool:
-    """Whether the first bytes of a file are XML."""
+    """Return whether the first bytes of a file are XML."""
     return _XML_START.match(head) is not None
 
 
 def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
     """Read every camera model of a PDS4 label (.xml or .lblx), in order.
 
-    Raises CameraFileError as `read_pds3` does, also if ground processing cropped or averaged the picture. With
-    `subframe_folded_in` such pictures are accepted: the vectors then describe the stored picture, as those of Mars 2020
-    do. Subframes and averages of the command are accepted.
+    Raises CameraFileError as `read_pds3` does, also if ground processing cropped or averaged the image. With
+    `subframe_folded_in` such images are accepted, and the vectors are assumed to describe the stored image, as in the
+    labels of Mars 2020. Images that the camera itself cropped or averaged on command are always accepted.
     """
     source = Source(str(path))
-    text = source.text()
-    if "<!ENTITY" in text:  # labels need none, and nested entities fill the memory
+    text = source.read_text()
+    if "<!ENTITY" in text:  # labels do not need entities, and nested entities can fill the memory
         raise source.error("label", "declares entities", "a PDS4 label, which has none")
     try:
         root = ElementTree.fromstring(text.encode("latin-1"))  # noqa: S314  (entities are refused above)
     except (ElementTree.ParseError, ValueError, LookupError) as fault:
         raise source.error("label", f"cannot be parsed ({fault})", "a PDS4 label, which is XML") from fault
-    models = [one for one in _named(root, _PARAMETERS) if _child(one, "model_type") is not None]
+    models = [model for model in _find_elements(root, _PARAMETERS) if _find_child(model, "model_type") is not None]
     if not models:
-        raise source.error(_PARAMETERS, "missing", "a PDS4 label with at least one such class that states a model_type")
-    arrays = _named(root, "Array_2D_Image", "Array_3D_Image")
+        raise source.error(_PARAMETERS, "missing", "a PDS4 label with at least one such class with a model_type")
+    arrays = _find_elements(root, "Array_2D_Image", "Array_3D_Image")
     if not arrays:
         raise source.error("Array_2D_Image", "missing", "an image array of lines and samples")
     extents = {}
-    for axis in (one for one in arrays[0] if _local(one) == "Axis_Array"):
-        axis_name, count = _text(_child(axis, "axis_name")), _child(axis, "elements")
+    for axis in (element for element in arrays[0] if _local_name(element) == "Axis_Array"):
+        axis_name, count = _text(_find_child(axis, "axis_name")), _find_child(axis, "elements")
         if axis_name in ("Line", "Sample") and count is not None:
             if not (_text(count).isdecimal() and int(_text(count)) > 0):
                 raise source.error("Axis_Array.elements", f"{_text(count)!r}", "a positive integer")
@@ -323,63 +327,66 @@ def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
     if set(extents) != {"Line", "Sample"}:
         raise source.error("Axis_Array", f"names {sorted(extents)}", "the axes Line and Sample")
     size = extents["Sample"], extents["Line"]
-    parts = [part for imaging in _named(root, "Imaging") for part in imaging]
-    for part in (one for one in parts if _local(one) in ("Subframe", "Downsampling") and not subframe_folded_in):
-        for field in _named(part, "first_line", "first_sample", "height_pixels", "width_pixels"):
+    parts = [part for imaging in _find_elements(root, "Imaging") for part in imaging]
+    for part in (
+        part for part in parts if _local_name(part) in ("Subframe", "Downsampling") and not subframe_folded_in
+    ):
+        for field in _find_elements(part, "first_line", "first_sample", "height_pixels", "width_pixels"):
             if _text(field) not in ("", "1"):
-                name = f"{_local(part)}.{_local(field)}"
+                name = f"{_local_name(part)}.{_local_name(field)}"
                 raise source.error(name, f"{_text(field)}: {_SUBFRAME}", "1, or subframe_folded_in = true")
-    return tuple(_pds4_camera(element, size, source) for element in models)
+    return tuple(_create_pds4_camera(element, size, source) for element in models)
 
 
-def _local(element: ElementTree.Element) -> str:
+def _local_name(element: ElementTree.Element) -> str:
+    """Return an element's name without its namespace."""
     return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
 
 
-def _named(element: ElementTree.Element, *names: str) -> list[ElementTree.Element]:
-    return [one for one in element.iter() if _local(one) in names]
+def _find_elements(element: ElementTree.Element, *names: str) -> list[ElementTree.Element]:
+    return [descendant for descendant in element.iter() if _local_name(descendant) in names]
 
 
-def _child(element: ElementTree.Element, name: str) -> ElementTree.Element | None:
-    return next((one for one in element if _local(one) == name), None)
+def _find_child(element: ElementTree.Element, name: str) -> ElementTree.Element | None:
+    return next((child for child in element if _local_name(child) == name), None)
 
 
 def _text(element: ElementTree.Element | None) -> str:
     return "" if element is None else (element.text or "").strip()
 
 
-def _pds4_camera(element: ElementTree.Element, size: tuple[int, int], source: Source) -> CameraModel:
-    name = _text(_child(element, "model_type"))
+def _create_pds4_camera(element: ElementTree.Element, size: tuple[int, int], source: Source) -> CameraModel:
+    name = _text(_find_child(element, "model_type"))
     if name not in MODELS:
         raise source.error(f"{_PARAMETERS}.model_type", f"{name!r}", ", ".join(MODELS))
     class_name = f"{name}_Model"
-    model = _child(element, class_name)
+    model = _find_child(element, class_name)
     if model is None:
-        raise source.error(f"{_PARAMETERS}.{class_name}", "missing", "the class that the model_type names")
+        raise source.error(f"{_PARAMETERS}.{class_name}", "missing", "the class that belongs to the model_type")
     vectors: dict[str, list[float]] = {}
     for letter in name:
         vector_name, parts = _VECTORS[letter]
-        vector, field = _child(model, vector_name), f"{class_name}.{vector_name} ({letter})"
+        vector, field = _find_child(model, vector_name), f"{class_name}.{vector_name} ({letter})"
         if vector is None:
             raise source.error(field, "missing", "every vector of the model")
         vectors[letter] = []
         for part in parts:
-            number = _number(vector, part, f"{field}.{part}", source)
+            number = _parse_number(vector, part, f"{field}.{part}", source)
             if number is None:
                 raise source.error(f"{field}.{part}", "missing", "a finite number")
-            unit = getattr(_child(vector, part), "attrib", {}).get("unit")
+            unit = getattr(_find_child(vector, part), "attrib", {}).get("unit")
             if parts is _POSITION and unit not in _PDS4_METRES:
                 raise source.error(f"{field}.{part}", f"is in {unit!r}", "metres (unit m)")
             vectors[letter].append(number)
     if name != "CAHVORE":
         return create_camera(name, vectors, size, None, source)
     field = f"{class_name}.cahvore_model_type, cahvore_model_parameter"
-    kind, parameter = (_number(model, f"cahvore_model_{part}", field, source) for part in ("type", "parameter"))
+    kind, parameter = (_parse_number(model, f"cahvore_model_{part}", field, source) for part in ("type", "parameter"))
     return create_camera(name, vectors, size, linearity_of_type(kind, parameter, field, source), source)
 
 
-def _number(element: ElementTree.Element, name: str, field: str, source: Source) -> float | None:
-    child = _child(element, name)
+def _parse_number(element: ElementTree.Element, name: str, field: str, source: Source) -> float | None:
+    child = _find_child(element, name)
     if child is None:
         return None
     try:

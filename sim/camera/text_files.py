@@ -1,15 +1,15 @@
-"""Camera models of files of any format; JPL's text files (.cahv, .cahvor, .cahvore).
+"""Readers of camera files of any format; reader and writer of JPL's text files (.cahv, .cahvor, .cahvore).
 
-The text files are those of the programs CCALADJ and cmod:
+JPL's programs CCALADJ and cmod use these text files:
 
     Model = CAHVOR = perspective, distortion
     Dimensions = 1024 1024
     C =  0.442604 -0.0611635 -1.25106
     A = ...
 
-and the model's other vectors H, V, O, R, E. The line Model of CAHVORE contains its type (1 perspective, 2 fish-eye, 3
-general) and for type 3 the linearity: ``Model = CAHVORE3,0.37 = general``. The derived lines Hs, Hc, Vs, Vc and Theta,
-the covariance matrices ``S`` and ``S internal`` and unknown lines are not read.
+and likewise the model's other vectors H, V, O, R, E. The line Model of CAHVORE contains its type (1 perspective, 2
+fish-eye, 3 general) and for type 3 the linearity: ``Model = CAHVORE3,0.37 = general``. The reader ignores the derived
+values Hs, Hc, Vs, Vc and Theta, the covariance matrices ``S`` and ``S internal``, and unknown lines.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from marsyard.sim.camera.pds import is_pds3, is_xml, read_pds3, read_pds4
 #: Number of bytes that identify a format.
 _FORMAT_BYTES = 4096
 
-#: Texts of the frames in written files.
+#: Descriptions of the frames of reference, written into the files.
 BODY_FRAME = "body (metres); the body's pose in the world, where it is known, is stated next to this file"
 HEAD_FRAME = "head of the mast (metres: x forward, y left, z up at azimuth and elevation zero)"
 
@@ -42,17 +42,17 @@ _MODEL = re.compile(r"(?P<name>CAHV|CAHVOR|CAHVORE(?P<type>\d+)?)(?:\s*,\s*(?P<p
 def read_cameras(
     path: str | Path, *, subframe_folded_in: bool = False, size: tuple[int, int] | None = None
 ) -> tuple[CameraModel, ...]:
-    """Read every camera model of a file, by its format.
+    """Detect the format of a file and read every camera model in it.
 
     Formats: a PDS3 label or product (`read_pds3`), a PDS4 label (`read_pds4`), a JPL text file (`read_cahvor`), a
     calibration of OpenCV, ROS, Kalibr or EuRoC in YAML (`read_calibrations`, which also reports the residuals).
 
-    - subframe_folded_in: PDS labels: the model of a subframe, or of averaged pixels, describes the stored picture
-    - size: (columns, rows) of the pictures, for JPL text files without the line Dimensions
+    - subframe_folded_in: accept PDS labels of subframes and averaged pixels, see `read_pds3`
+    - size: (columns, rows) of the image, required for JPL text files without the line Dimensions
 
-    Raises CameraFileError if the file cannot be read or is wrong; it names file, field and allowed values.
+    Raises CameraFileError if the file cannot be read or is wrong. The message contains file, field and allowed values.
     """
-    leading_bytes = Source(str(path)).head(_FORMAT_BYTES)
+    leading_bytes = Source(str(path)).read_head(_FORMAT_BYTES)
     if is_pds3(leading_bytes):
         return read_pds3(path, subframe_folded_in=subframe_folded_in)
     if is_xml(leading_bytes):
@@ -63,7 +63,7 @@ def read_cameras(
 
 
 def read_camera(path: str | Path, *, subframe_folded_in: bool = False) -> CameraModel:
-    """Read the only camera model of a file, as `read_cameras`. Raises CameraFileError also if it has several."""
+    """Read a file with one camera model, as `read_cameras` does. Raises CameraFileError also if it has several."""
     cameras = read_cameras(path, subframe_folded_in=subframe_folded_in)
     if len(cameras) != 1:
         raise Source(str(path)).error("camera models", f"{len(cameras)} of them", "one, or use read_cameras")
@@ -73,13 +73,13 @@ def read_camera(path: str | Path, *, subframe_folded_in: bool = False) -> Camera
 def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> CameraModel:
     """Read the camera model of a JPL text file.
 
-    `size` is (columns, rows) of the pictures, for files without the line Dimensions; otherwise it must agree. Raises
-    CameraFileError if the file cannot be read, or a line is missing, repeated or wrong; it names file, field and
-    allowed values.
+    `size` is (columns, rows) of the image, required if the file has no line Dimensions; if it has one, both must agree.
+    Raises CameraFileError if the file cannot be read, or if a line is missing, repeated or wrong. The message contains
+    file, field and allowed values.
     """
     source = Source(str(path))
     lines: dict[str, tuple[str, int]] = {}
-    for number, line in enumerate(source.text().splitlines(), start=1):
+    for number, line in enumerate(source.read_text().splitlines(), start=1):
         match = _ASSIGNMENT.match(line.partition("#")[0])
         if match is not None and match["name"] in lines:
             name = match["name"]
@@ -87,12 +87,12 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
         if match is not None:
             lines[match["name"]] = match["value"], number
 
-    def require(name: str) -> tuple[str, int]:
+    def find_line(name: str) -> tuple[str, int]:
         if name not in lines:
             raise source.error(name, "missing", f"a line '{name} = ...'")
         return lines[name]
 
-    value, number = require("Model")
+    value, number = find_line("Model")
     model = _MODEL.match(value)
     if model is None:
         allowed = "CAHV, CAHVOR, CAHVORE1, CAHVORE2 or CAHVORE3,<linearity>"
@@ -107,23 +107,23 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
     size = _read_size(lines.get("Dimensions"), size, source)
     vectors = {}
     for letter in name:
-        value, number = require(letter)
+        value, number = find_line(letter)
         words = value.split()
         if len(words) != 3:
             raise source.error(letter, f"{len(words)} words in line {number}", "three finite numbers")
-        vectors[letter] = [_parse_number(letter, linearity_text, number, source) for linearity_text in words]
+        vectors[letter] = [_parse_number(letter, word, number, source) for word in words]
     return create_camera(name, vectors, size, linearity, source)
 
 
-def _parse_number(name: str, word: str, number: int, source: Source) -> float:
+def _parse_number(name: str, word: str, line_number: int, source: Source) -> float:
     try:
         return float(word)
     except ValueError:
-        raise source.error(name, f"{word!r} in line {number} is not a number", "finite numbers") from None
+        raise source.error(name, f"{word!r} in line {line_number} is not a number", "finite numbers") from None
 
 
 def _read_size(line: tuple[str, int] | None, expected_size: tuple[int, int] | None, source: Source) -> tuple[int, int]:
-    """(columns, rows) by the line Dimensions, or as given if the file has none."""
+    """Read (columns, rows) from the line Dimensions; if there is none, return `expected_size`."""
     if line is None:
         if expected_size is None:
             raise source.error("Dimensions", "missing", "a line 'Dimensions = columns rows', or size = [columns, rows]")
@@ -141,7 +141,10 @@ def _read_size(line: tuple[str, int] | None, expected_size: tuple[int, int] | No
 
 
 def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, frame: str = "") -> None:
-    """Write a JPL text file, equal when read back; `comment` and `frame` become lines with '#' at the start."""
+    """Write a JPL text file, from which `read_cahvor` reads an equal camera.
+
+    `comment` and `frame` (a description of the frame of reference) are written as lines that begin with '#'.
+    """
     if isinstance(camera, Cahvore):
         model = _TYPE_NAMES.get(camera.linearity, f"CAHVORE3,{camera.linearity!r} = general")
     else:

@@ -1,4 +1,4 @@
-"""Dynamics of vehicles: true motion over time of landers, helicopters and rovers."""
+"""Dynamics of landers, helicopters and rovers: their true motion over time, and the wind."""
 
 from marsyard.sim.dynamics.driving import Drive, DriveStep, SlipParameters, Soil, drive
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RockyGround, RoverParameters, Stance, settle

@@ -1,12 +1,12 @@
-"""Helicopter flight back and forth along a line with climb, its camera on a gimbal (field test paper, III.C).
+"""Helicopter flight in climbing passes along a line, with a camera on a gimbal (field test paper, III.C).
 
-The flight begins and ends with a slow pass over surveyed targets. In between the helicopter flies passes along a
-horizontal line in alternating directions; it climbs on the passes and turns at constant height between them. A
-stabilised platform keeps the gimbal's base level and its azimuth constant, or rotates it with the helicopter. The
-gimbal tilts the camera along and across the line, and swings it on some passes.
+The flight begins and ends with a slow pass over surveyed targets. Between these the helicopter flies passes along a
+line in alternating directions; it climbs on the passes and turns at constant height between them. The gimbal is
+mounted on a stabilised platform, which is level and has a constant azimuth or rotates with the helicopter. The gimbal
+tilts the camera along and across the line, and swings it on some passes.
 
-Every coordinate is a piecewise quintic polynomial, or such a polynomial times a sine: twice continuously
-differentiable, so that velocity, rates and specific force are exact derivatives of position and attitude.
+Every coordinate is a piecewise quintic polynomial, or such a polynomial times a sine. It is twice continuously
+differentiable: velocity, rates and specific force are exact derivatives of position and attitude.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded_fiel
 Vector = Float64[np.ndarray, "3"]
 Angle = Annotated[float, Field(ge=0.0, le=45.0)]
 
-#: Breakpoints within a pass, with small changes of the speed.
-_BREAKPOINTS = 4
+#: Number of points within a pass at which the speed is drawn.
+_SPEED_CHANGES = 4
 
 
 class HelicopterParameters(Parameters):
-    """A flight. Values are the field test paper's (III.C, III.D) unless marked as assumed.
+    """Parameters of a flight. Values are from the field test paper (III.C, III.D) unless marked as assumed.
 
-    At 1 m/s on passes of 100 s with turns of 60 s, ten passes climb from 1000 m to 2000 m in 27 min. The paper states
-    1 to 2 m/s, about 30 min of pictures, and about 40 min between the passes over the targets.
+    With a climb of 1 m/s, passes of 100 s and turns of 60 s, ten passes climb from 1000 m to 2000 m in 27 min. The
+    paper: a climb of 1 to 2 m/s, about 30 min of images, and about 40 min between the passes over the targets.
     """
 
     passes: Annotated[int, bounded_field(1, 100, "passes along the line")] = 10
@@ -46,11 +46,13 @@ class HelicopterParameters(Parameters):
     lowest_m: Annotated[Positive, Field(description="initial height of the first pass above the line's ground")] = (
         1000.0
     )
-    climb_m_s: Annotated[float, bounded_field(0.0, 10.0, "climb on a pass")] = 1.0
+    climb_m_s: Annotated[float, bounded_field(0.0, 10.0, "rate of climb on a pass")] = 1.0
     wander_m: Annotated[float, bounded_field(0.0, 200.0, "RMS distance from the line (assumed)")] = 8.0
-    pointing_deg: Annotated[Angle, Field(description="RMS tilt along and across (assumed)")] = 9.0
-    max_tilt_deg: Annotated[Angle, Field(description="maximum tilt of the camera along and across")] = 30.0
-    swinging_fraction: Annotated[Fraction, Field(description="of passes, with a swinging camera (assumed)")] = 0.5
+    pointing_deg: Annotated[Angle, Field(description="RMS tilt along and across the line (assumed)")] = 9.0
+    max_tilt_deg: Annotated[Angle, Field(description="maximum tilt along and across the line")] = 30.0
+    swinging_fraction: Annotated[Fraction, Field(description="fraction of passes with a swinging camera (assumed)")] = (
+        0.5
+    )
     swing_rate_deg_s: Annotated[float, bounded_field(0.0, 120.0, "maximum rate of the swinging")] = 60.0
     swing_hz: Annotated[Positive, Field(le=5.0, description="frequency of the swinging, 1/s (assumed)")] = 0.6
     platform_deg: Annotated[float, bounded_field(0.0, 10.0, "RMS residual motion of the platform (assumed)")] = 0.2
@@ -59,13 +61,13 @@ class HelicopterParameters(Parameters):
     fly_over_m_s: Annotated[Positive, Field(description="speed of the passes over the targets (assumed)")] = 3.0
     fly_over_s: Annotated[Positive, Field(le=120.0, description="duration of a pass over the targets")] = 90.0
     between_s: Annotated[Positive, Field(description="time between the passes over the targets")] = 2400.0
-    approach_s: Annotated[Positive, Field(description="from the first targets to the first pass (assumed)")] = 350.0
+    approach_s: Annotated[Positive, Field(description="time from the targets to the first pass (assumed)")] = 350.0
     vibration: Annotated[VibrationParameters, Field(description="at the blades' rate, on the platform (assumed)")] = (
         VibrationParameters(rate_hz=13.0, acceleration_m_s2=1.0, angle_deg=0.005)
     )
 
     @model_validator(mode="after")
-    def _return_takes_time(self) -> HelicopterParameters:
+    def _check_times(self) -> HelicopterParameters:
         collection_s = self.passes * self.pass_s + (self.passes - 1) * self.turn_s
         if self.between_s - self.fly_over_s - self.approach_s - collection_s <= 0.0:
             raise ValueError(
@@ -82,7 +84,7 @@ class HelicopterParameters(Parameters):
 
 @dataclass(frozen=True)
 class FlownPass:
-    """A pass along the line: its number, its times, and its direction, +1 or -1 along the line."""
+    """A pass along the line: its number, start and end, and its direction, +1 or -1 along the line."""
 
     number: int
     start_s: float
@@ -92,17 +94,17 @@ class FlownPass:
 
 @dataclass(frozen=True)
 class Tilt:
-    """An angle of the gimbal over time: a pointing, and a sine of variable amplitude about it; radians."""
+    """An angle of the gimbal over time, radians: pointing + amplitude sin(swing_rad_s t)."""
 
     pointing: BPoly
     amplitude: BPoly
     swing_rad_s: float
 
     def derivatives(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "2 n"]:
-        """The angle and its rate."""
-        amplitude, growth = self.amplitude(times_s), self.amplitude.derivative()(times_s)
+        """Compute the angle and its rate."""
+        amplitude, amplitude_rate = self.amplitude(times_s), self.amplitude.derivative()(times_s)
         sine, cosine = np.sin(self.swing_rad_s * times_s), np.cos(self.swing_rad_s * times_s)
-        rate = self.pointing.derivative()(times_s) + growth * sine + amplitude * self.swing_rad_s * cosine
+        rate = self.pointing.derivative()(times_s) + amplitude_rate * sine + amplitude * self.swing_rad_s * cosine
         return np.stack([self.pointing(times_s) + amplitude * sine, rate])
 
 
@@ -110,15 +112,16 @@ class Tilt:
 class HelicopterFlight(Trajectory):
     """A flight from the start of the first pass over the targets to the end of the second.
 
-    The body frame is the camera's: x along the line, y to its left, z up for a gimbal at rest and a platform at its
-    initial azimuth; the camera looks along -z. Time 0 is the middle of the first pass over the targets.
+    The body frame is the camera's; the camera looks along -z. If the gimbal's angles are zero and the platform has its
+    initial azimuth, x is along the line, y to its left and z up. Time 0 is the middle of the first pass over the
+    targets.
 
     - origin_m: world point at ground level in the middle of the line, reference of the heights
     - azimuth_rad: direction of the line, clockwise from north
-    - along, across, up: distance along the line from its middle, to its left, and above the origin, metres
+    - along, across, up: coordinates along the line from its middle, to its left, and above the origin, metres
     - platform: angle of the platform from the line, counterclockwise, radians
-    - tilt_along, tilt_across: the gimbal's angles, about the body's y axis (positive: looks back) and then about its x
-      axis (positive: looks to the right)
+    - tilt_along, tilt_across: the gimbal's angles, about the body's y axis (positive: the camera looks backwards) and
+      then about its x axis (positive: it looks to the right)
     - fly_overs_s: start and end of both passes over the targets
     """
 
@@ -141,7 +144,7 @@ class HelicopterFlight(Trajectory):
         return self.fly_overs_s[0][0], self.fly_overs_s[1][1]
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
-        """True states at many times. Raises ValueError outside of the span."""
+        """Compute the true states at many times. Raises ValueError for times outside the span."""
         check_times(times_s, self.span_s)
         yaw = 0.5 * np.pi - self.azimuth_rad + self.platform(times_s)
         pitch, pitch_rate = self.tilt_along.derivatives(times_s)
@@ -161,42 +164,42 @@ class HelicopterFlight(Trajectory):
         return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
 
-def helicopter_flight(
+def draw_helicopter_flight(
     p: HelicopterParameters, origin_m: Vector, azimuth_rad: float, gravity_m_s2: float, rng: np.random.Generator
 ) -> HelicopterFlight:
-    """Draw a flight along a line through a point of the ground."""
-    half = 0.5 * p.fly_over_s
-    first = half + p.approach_s
-    starts = [first + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
+    """Draw a flight along a line whose middle is above `origin_m`, a point of the ground."""
+    half_s = 0.5 * p.fly_over_s
+    first_s = half_s + p.approach_s
+    starts = [first_s + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
     passes = tuple(FlownPass(k, start, start + p.pass_s, 1 - 2 * (k % 2)) for k, start in enumerate(starts))
-    fly_overs = ((-half, half), (p.between_s - half, p.between_s + half))
+    fly_overs = ((-half_s, half_s), (p.between_s - half_s, p.between_s + half_s))
     times = np.arange(fly_overs[0][0], fly_overs[1][1] + 15.0, 15.0)
-    # points of the curves: (time, value, rate) or (time, value); height and platform angle are constant over the
-    # targets, and a platform that rotates with the flight rotates by half a turn after each pass, in alternate senses
-    reach, rate = half * p.fly_over_m_s, p.fly_over_m_s
-    positions = [point for start, end in fly_overs for point in ((start, -reach, rate), (end, reach, rate))]
+    # points of the curves: (time, value, rate) or (time, value). Height and platform angle are constant over the
+    # targets. A platform that rotates with the helicopter rotates by 180 deg after each pass, forward and back
+    half_m, rate = half_s * p.fly_over_m_s, p.fly_over_m_s
+    positions = [point for start, end in fly_overs for point in ((start, -half_m, rate), (end, half_m, rate))]
     heights = [(time, p.fly_over_m, 0.0) for times_s in fly_overs for time in times_s]
     angles = [(time, 0.0) for times_s in fly_overs for time in times_s]
-    gain = p.climb_m_s * p.pass_s
-    fraction = np.linspace(0.0, 1.0, _BREAKPOINTS + 2)
-    for one in passes:
+    climb_m = p.climb_m_s * p.pass_s
+    fraction = np.linspace(0.0, 1.0, _SPEED_CHANGES + 2)
+    for flown in passes:
         changes = p.speed_change_m_s * rng.standard_normal(fraction.size)
         changes[[0, -1]] = 0.0
-        distances = one.direction * p.length_m * (fraction - 0.5)
-        speeds = one.direction * (p.speed_m_s + changes)
-        pass_times = one.start_s + fraction * (one.end_s - one.start_s)
+        distances = flown.direction * p.length_m * (fraction - 0.5)
+        speeds = flown.direction * (p.speed_m_s + changes)
+        pass_times = flown.start_s + fraction * (flown.end_s - flown.start_s)
         positions += list(zip(pass_times.tolist(), distances.tolist(), speeds.tolist(), strict=True))
-        height = p.lowest_m + one.number * gain
-        heights += [(one.start_s, height, p.climb_m_s), (one.end_s, height + gain, p.climb_m_s)]
-        angle = np.pi if one.direction < 0 and p.turns_with_flight else 0.0
-        angles += [(one.start_s, angle), (one.end_s, angle)]
+        height = p.lowest_m + flown.number * climb_m
+        heights += [(flown.start_s, height, p.climb_m_s), (flown.end_s, height + climb_m, p.climb_m_s)]
+        angle = np.pi if flown.direction < 0 and p.turns_with_flight else 0.0
+        angles += [(flown.start_s, angle), (flown.end_s, angle)]
     return HelicopterFlight(
         origin_m=origin_m,
         azimuth_rad=azimuth_rad,
-        along=_moving_curve(sorted(positions)),
-        across=_rest_curve(times, p.wander_m * rng.standard_normal(times.size)),
-        up=_moving_curve(sorted(heights)),
-        platform=_rest_curve(*np.array(sorted(angles)).T),
+        along=_fit_moving(sorted(positions)),
+        across=_fit_stationary(times, p.wander_m * rng.standard_normal(times.size)),
+        up=_fit_moving(sorted(heights)),
+        platform=_fit_stationary(*np.array(sorted(angles)).T),
         tilt_along=_draw_tilt(p, passes, times, rng),
         tilt_across=_draw_tilt(p, passes, times, rng),
         passes=passes,
@@ -209,28 +212,28 @@ def helicopter_flight(
 def _draw_tilt(
     p: HelicopterParameters, passes: Sequence[FlownPass], times: Float64[np.ndarray, "n"], rng: np.random.Generator
 ) -> Tilt:
-    """An angle of the gimbal: a new pointing every few seconds on the passes, none over the targets."""
-    on_pass = np.any([(times > one.start_s) & (times < one.end_s) for one in passes], axis=0)
+    """Draw an angle of the gimbal over time: pointing and swing on the passes; elsewhere only residual motion."""
+    on_pass = np.any([(times > flown.start_s) & (times < flown.end_s) for flown in passes], axis=0)
     limit = p.max_tilt_deg
     pointing = np.clip(p.pointing_deg * rng.standard_normal(times.size), -limit, limit) * on_pass
     pointing = pointing + p.platform_deg * rng.standard_normal(times.size)
     swing_rad_s = 2.0 * np.pi * p.swing_hz
-    # both axes swing: each has the rate over the square root of 2
-    largest = np.radians(p.swing_rate_deg_s) / np.sqrt(2.0) / swing_rad_s
+    # both axes swing: the maximum rate of each is the parameter divided by sqrt(2)
+    max_amplitude = np.radians(p.swing_rate_deg_s) / np.sqrt(2.0) / swing_rad_s
     amplitudes = np.zeros(times.size)
-    for one in passes:
-        swings = rng.uniform() < p.swinging_fraction
-        amplitude = largest * rng.uniform(0.2, 1.0)
-        amplitudes[(times > one.start_s) & (times < one.end_s)] = amplitude if swings else 0.0
-    return Tilt(_rest_curve(times, np.radians(pointing)), _rest_curve(times, amplitudes), swing_rad_s)
+    for flown in passes:
+        has_swing = rng.uniform() < p.swinging_fraction
+        amplitude = max_amplitude * rng.uniform(0.2, 1.0)
+        amplitudes[(times > flown.start_s) & (times < flown.end_s)] = amplitude if has_swing else 0.0
+    return Tilt(_fit_stationary(times, np.radians(pointing)), _fit_stationary(times, amplitudes), swing_rad_s)
 
 
-def _moving_curve(points: Sequence[tuple[float, float, float]]) -> BPoly:
-    """Curve through (time, value, rate) with zero acceleration at these points."""
+def _fit_moving(points: Sequence[tuple[float, float, float]]) -> BPoly:
+    """Fit a curve through points (time, value, rate), with zero acceleration at each point."""
     return BPoly.from_derivatives([time for time, _, _ in points], [[value, rate, 0.0] for _, value, rate in points])
 
 
-def _rest_curve(times_s: Float64[np.ndarray, "n"], values: Float64[np.ndarray, "n"]) -> BPoly:
-    """Curve through values with zero rate and acceleration at each of them."""
+def _fit_stationary(times_s: Float64[np.ndarray, "n"], values: Float64[np.ndarray, "n"]) -> BPoly:
+    """Fit a curve through values, with zero rate and zero acceleration at each of them."""
     zero = np.zeros_like(values)
     return BPoly.from_derivatives(times_s, np.stack([values, zero, zero], axis=-1))

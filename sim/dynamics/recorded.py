@@ -1,12 +1,12 @@
-"""Recorded motion: poses interpolated by splines, and their files.
+"""Recorded motion: reader of pose files, and a trajectory that interpolates the poses by splines.
 
-Formats are CSV and Parquet tables, TUM's text files, EuRoC's ground truth, and SPICE kernels:
+File formats are CSV and Parquet tables, TUM's text files, EuRoC's ground truth, and SPICE kernels:
 
 - CSV and Parquet: columns time_s, x_m, y_m, z_m, qx, qy, qz, qw, in any order; other columns are ignored.
 - TUM: lines ``timestamp tx ty tz qx qy qz qw``, seconds and metres; lines with # are comments.
 - EuRoC: a header that begins with ``#timestamp``; nanoseconds, position, quaternion with the scalar part first.
-- SPICE: a file that ends in ``.spice.toml`` names the kernels, the body, the observer and the frames. Positions are
-  geometric, without light time; times are TDB seconds since `begin`, without leap seconds. ::
+- SPICE: a file ``*.spice.toml`` with the kernels, the body, the observer and the frames. Positions are geometric,
+  without light time; times are TDB seconds since `begin`, without leap seconds. ::
 
     kernels = ["naif0012.tls", "mission.bsp", "mission.bc", "mission.tsc", "site.tf"]   # relative to this file
     target = "-999"            # the body: a name or number in the kernels
@@ -17,7 +17,7 @@ Formats are CSV and Parquet tables, TUM's text files, EuRoC's ground truth, and 
     end = "2030-01-01T00:01:30"
     step_s = 0.1               # time between poses
 
-Quaternions rotate from the recorded body's axes to the world's. No format states which axes these are.
+Quaternions rotate from the body's axes to the world's. Except for SPICE the files do not define these axes.
 """
 
 from __future__ import annotations
@@ -41,25 +41,25 @@ from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters
 
-#: Minimum number of poses that determine an acceleration.
+#: Minimum number of poses of a cubic spline.
 MIN_POSES = 4
-#: Largest rotation from one pose to the next: the interpolation between larger ones is ambiguous.
+#: Maximum rotation from one pose to the next; for larger rotations the interpolation is ambiguous.
 MAX_ROTATION_DEG = 90.0
-#: Tolerated excess over the span: sums of times that end at its limit have rounding errors.
+#: Tolerance on times outside the span, for rounding errors in sums of times.
 ROUNDING_S = 1e-9
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-#: Tolerated deviation of a quaternion's length from 1: that of three written digits.
+#: Tolerance on a quaternion's length: the rounding error of components with three digits.
 UNIT_TOLERANCE = 5e-3
-#: Largest file that is read: ten hours at 100 Hz are 400 MB of text.
+#: Maximum size of a file: ten hours at 100 Hz are 400 MB of text.
 MAX_BYTES = 1 << 29
-#: Longest table that is read, independent of compression.
+#: Maximum number of rows of a Parquet file, whose size depends on the compression.
 MAX_ROWS = 5_000_000
 #: Maximum number of poses sampled from SPICE kernels: five hours at 50 Hz.
 MAX_SPICE_POSES = 1_000_000
-#: End of the name of a file of SPICE kernels.
+#: End of the name of a file that lists SPICE kernels.
 SUFFIX = ".spice.toml"
 _MAX_CACHED_FILES = 4
-#: Cells of a text table without a number.
+#: Texts for a missing number in a text table.
 _MISSING = ("na", "NA", "n/a", "N/A", "null", "NULL", "none", "None")
 _ALLOWED = (
     f"a CSV or Parquet table with the columns {', '.join(COLUMNS)}; TUM's lines of timestamp tx ty tz qx qy qz qw; "
@@ -71,8 +71,11 @@ _ALLOWED = (
 class RecordedMotion(Trajectory):
     """A `Trajectory` through recorded poses of a body, world axes.
 
-    Positions have a cubic spline (not-a-knot), attitudes one of continuous angular acceleration. Velocity, rate and
-    specific force are the splines' derivatives.
+    Positions are interpolated by a cubic spline (not-a-knot), attitudes by a spline of continuous angular acceleration.
+    Velocity, body rate and specific force are derivatives of these splines.
+
+    - times_s, positions_m, attitudes: the recorded poses; attitudes rotate from body to world
+    - gravity_m_s2: gravity, along the world's -z
 
     Raises ValueError for fewer than `MIN_POSES` poses, times that do not increase, a value that is not finite, or a
     rotation of more than `MAX_ROTATION_DEG` from one pose to the next.
@@ -87,24 +90,25 @@ class RecordedMotion(Trajectory):
         if self.times_s.size < MIN_POSES:
             raise ValueError(f"has {self.times_s.size} poses; allowed: at least {MIN_POSES}")
         if not (np.all(np.isfinite(self.times_s)) and np.all(np.isfinite(self.positions_m))):
-            raise ValueError("holds a value that is not finite")
-        late = np.flatnonzero(np.diff(self.times_s) <= 0.0)
-        if late.size:
-            raise ValueError(f"time does not increase after {self.times_s[late[0]]:.6f} s (pose {late[0] + 1})")
+            raise ValueError("contains a value that is not finite")
+        stops = np.flatnonzero(np.diff(self.times_s) <= 0.0)
+        if stops.size:
+            raise ValueError(f"time does not increase after {self.times_s[stops[0]]:.6f} s (pose {stops[0] + 1})")
         angles = np.degrees((self.attitudes[:-1].inv() * self.attitudes[1:]).magnitude())
-        wide = np.flatnonzero(angles > MAX_ROTATION_DEG)
-        if wide.size:
+        too_large = np.flatnonzero(angles > MAX_ROTATION_DEG)
+        if too_large.size:
+            index = too_large[0]
             raise ValueError(
-                f"turns by {angles[wide[0]]:.0f} deg after {self.times_s[wide[0]]:.6f} s (pose {wide[0] + 1}); "
+                f"rotates by {angles[index]:.0f} deg after {self.times_s[index]:.6f} s (pose {index + 1}); "
                 f"allowed: up to {MAX_ROTATION_DEG:g} deg from one pose to the next"
             )
 
     @cached_property
-    def _position(self) -> CubicSpline:
+    def _position_spline(self) -> CubicSpline:
         return CubicSpline(self.times_s, self.positions_m)
 
     @cached_property
-    def _attitude(self) -> RotationSpline:
+    def _attitude_spline(self) -> RotationSpline:
         return RotationSpline(self.times_s, self.attitudes)
 
     @property
@@ -113,21 +117,20 @@ class RecordedMotion(Trajectory):
         return float(self.times_s[0]), float(self.times_s[-1])
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
-        """True states at many times. Raises ValueError outside of the span."""
+        """Compute the true states at many times. Raises ValueError for times outside the span."""
         check_times(times_s, self.span_s, ROUNDING_S)
-        derivatives = [self._position(times_s, order) for order in range(3)]
-        return Motion.from_accelerations(
-            times_s, derivatives, self._attitude(times_s), self._attitude(times_s, 1), self.gravity_m_s2
-        )
+        derivatives = [self._position_spline(times_s, order) for order in range(3)]
+        attitudes, rates = self._attitude_spline(times_s), self._attitude_spline(times_s, 1)
+        return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
 
 class TrajectoryFileError(ValueError):
-    """A file of poses that cannot be used; the message names the file, the fault, and the allowed formats or values."""
+    """A pose file that cannot be used; the message contains the file, the fault, and the allowed formats or values."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedPoses:
-    """Poses of a file, in its own world and body axes; unit quaternions x, y, z, w from body to world."""
+    """Poses of a file in the file's world and body axes; unit quaternions (x, y, z, w) from body to world."""
 
     path: str
     sha256: str
@@ -137,7 +140,7 @@ class RecordedPoses:
 
 
 def read_poses(path: str | Path) -> RecordedPoses:
-    """Read and check a file of poses; cached until the file changes.
+    """Read and check a pose file; the result is cached until the file changes.
 
     Raises TrajectoryFileError for a file that cannot be read, an unknown format, too few poses, a value that is not
     finite, times that do not increase, or a quaternion that is not of length 1.
@@ -167,7 +170,7 @@ def _read_file(path: str, _changed_ns: int, size: int) -> RecordedPoses:
         with Path(path).open("rb") as file:
             head = file.read(4096)
             if not head.startswith(b"PAR1") and b"\0" in head:
-                raise TrajectoryFileError(f"{path}: is no table of poses; allowed: {_ALLOWED}")
+                raise TrajectoryFileError(f"{path}: is not a table of poses; allowed: {_ALLOWED}")
             file.seek(0)
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as fault:
@@ -183,7 +186,7 @@ def _read_file(path: str, _changed_ns: int, size: int) -> RecordedPoses:
 
 
 def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
-    """Time, position and quaternion (x, y, z, w) of each row; the first bytes determine the format."""
+    """Read time, position and quaternion (x, y, z, w) of each row; the first bytes determine the format."""
     first = head.decode("utf-8", errors="replace").lstrip("\ufeff").split("\n", 1)[0].strip()
     if head.startswith(b"PAR1"):
         return _read_parquet(path)
@@ -192,7 +195,7 @@ def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     if first.startswith("#timestamp") and "," in first:
         frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
         values = frame.to_numpy(dtype=np.float64)
-        # nanoseconds since 1970 exceed the precision of a float: differences are taken first
+        # nanoseconds since 1970 exceed the precision of a float, therefore integers are subtracted first
         values[:, 0] = 1e-9 * (frame[0] - int(frame[0].iloc[0])).to_numpy(dtype=np.float64)
         values[:, 0] += 1e-9 * int(frame[0].iloc[0])
         return np.asarray(values[:, [0, 1, 2, 3, 5, 6, 7, 4]])
@@ -217,7 +220,7 @@ def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
 
 
 def _read_parquet(path: str) -> Float64[np.ndarray, "n 8"]:
-    """The pose columns; row count and types are checked in the metadata before any data is decompressed."""
+    """Read the pose columns; row count and types are checked in the metadata before any data is decompressed."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -229,17 +232,17 @@ def _read_parquet(path: str) -> Float64[np.ndarray, "n 8"]:
     fields = [fields[index] for index in _column_indices(path, [field.name.strip() for field in fields])]
     for field in fields:
         if not (pa.types.is_floating(field.type) or pa.types.is_integer(field.type)):
-            raise TrajectoryFileError(f"{path}: the column {field.name} holds {field.type}; allowed: numbers")
+            raise TrajectoryFileError(f"{path}: the column {field.name} contains {field.type}; allowed: numbers")
     values = np.empty((rows, len(COLUMNS)))
-    read = 0
+    start = 0
     for batch in file.iter_batches(columns=[field.name for field in fields]):
-        if read + batch.num_rows > rows:
-            raise TrajectoryFileError(f"{path}: has more rows than the {rows} that it states")
+        if start + batch.num_rows > rows:
+            raise TrajectoryFileError(f"{path}: has more rows than the {rows} of its metadata")
         for column, field in enumerate(fields):
             numbers = batch.column(field.name).cast(pa.float64(), safe=False)
-            values[read : read + batch.num_rows, column] = numbers.to_numpy(zero_copy_only=False)
-        read += batch.num_rows
-    return values[:read]
+            values[start : start + batch.num_rows, column] = numbers.to_numpy(zero_copy_only=False)
+        start += batch.num_rows
+    return values[:start]
 
 
 def _column_indices(path: str, names: Sequence[str]) -> list[int]:
@@ -256,26 +259,26 @@ def _check_poses(path: str, digest: str, values: Float64[np.ndarray, "n 8"]) -> 
     if faulty.size:
         names = [COLUMNS[column] for column in np.flatnonzero(~np.isfinite(values[faulty[0]]))]
         raise TrajectoryFileError(f"{path}: pose {faulty[0] + 1}: {', '.join(names)} is not finite; allowed: numbers")
-    late = np.flatnonzero(np.diff(values[:, 0]) <= 0.0)
-    if late.size:
-        before, after = values[late[0] : late[0] + 2, 0]
+    stops = np.flatnonzero(np.diff(values[:, 0]) <= 0.0)
+    if stops.size:
+        before, after = values[stops[0] : stops[0] + 2, 0]
         raise TrajectoryFileError(
-            f"{path}: pose {late[0] + 2}: time goes from {before:.6f} to {after:.6f} s; allowed: times that increase"
+            f"{path}: pose {stops[0] + 2}: time goes from {before:.6f} to {after:.6f} s; allowed: times that increase"
         )
     lengths = np.linalg.norm(values[:, 4:], axis=1)
     wrong = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE)
     if wrong.size:
         raise TrajectoryFileError(
             f"{path}: pose {wrong[0] + 1}: the quaternion's length is {lengths[wrong[0]]:.4g}; "
-            f"allowed: 1 to {UNIT_TOLERANCE:g}"
+            f"allowed: 1 within {UNIT_TOLERANCE:g}"
         )
-    # copies: a table's columns may be read-only, which rotations refuse
+    # copies, because the table can be read-only, and SciPy's rotations do not accept read-only arrays
     times, positions = np.array(values[:, 0]), np.array(values[:, 1:4])
     return RecordedPoses(path, digest, times, positions, values[:, 4:] / lengths[:, None])
 
 
 class SpiceFlight(Parameters):
-    """Poses to be sampled from SPICE kernels."""
+    """Content of a file ``*.spice.toml``: SPICE kernels, body, frames and times of the poses to be sampled."""
 
     kernels: Annotated[tuple[str, ...], Field(min_length=1, description="paths, relative to the file")]
     target: Annotated[str, Field(description="the body: a name or number in the kernels")]
@@ -288,9 +291,10 @@ class SpiceFlight(Parameters):
 
 
 def _sample_kernels(path: str) -> tuple[str, Float64[np.ndarray, "n 8"]]:
-    """Sample poses: time (s from `begin`), position (m), quaternion (xyzw); SHA-256 of the file with its kernels.
+    """Sample poses from SPICE kernels; return the SHA-256 of the file and its kernels, and the poses.
 
-    Raises ValueError for a fault of the file or of a kernel, ImportError without the package spiceypy.
+    Columns: time (s since `begin`), position (m), quaternion (x, y, z, w). Raises ValueError for an invalid file or
+    kernel, ImportError without the package spiceypy.
     """
     try:
         flight = SpiceFlight.model_validate(tomllib.loads(Path(path).read_text(encoding="utf-8")))
@@ -301,24 +305,26 @@ def _sample_kernels(path: str) -> tuple[str, Float64[np.ndarray, "n 8"]]:
     digest = hashlib.sha256(Path(path).read_bytes())
     for kernel in kernels:
         if not kernel.is_file():
-            raise ValueError(f"the kernel {kernel} is not there")
+            raise ValueError(f"the kernel {kernel} does not exist")
         with kernel.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     import spiceypy
     from spiceypy.utils.exceptions import SpiceyError
 
     try:
-        # the pool belongs to the process: kernels loaded by other code stay in it
+        # SPICE has one kernel pool per process; kernels that other code has loaded remain in it
         with spiceypy.KernelPool([str(kernel) for kernel in kernels]):
             begin, end = (float(spiceypy.str2et(utc)) for utc in (flight.begin, flight.end))
             count = int(np.floor((end - begin) / flight.step_s + 1e-9)) + 1
             if not 1 < count <= MAX_SPICE_POSES:
-                raise ValueError(f"begin, end and step_s make {max(count, 0)} poses; allowed: 2 to {MAX_SPICE_POSES}")
+                raise ValueError(
+                    f"begin, end and step_s result in {max(count, 0)} poses; allowed: 2 to {MAX_SPICE_POSES}"
+                )
             times = flight.step_s * np.arange(count)
             positions = spiceypy.spkpos(flight.target, begin + times, flight.world, "NONE", flight.observer)[0]
             rotations = np.stack([spiceypy.pxform(flight.axes, flight.world, begin + time) for time in times])
     except SpiceyError as error:
-        # the message in one line, without SPICE's banner and traceback
+        # put the message on one line, without SPICE's banner and traceback
         words = [getattr(error, "short", ""), *str(getattr(error, "long", "") or error).split()]
         raise ValueError(f"SPICE: {' '.join(words).strip()[:300]}") from error
     quaternions = Rotation.from_matrix(rotations).as_quat()

@@ -1,15 +1,15 @@
-"""Six-wheeled rover on a rocker-bogie suspension, at rest on ground with rocks.
+"""Static pose of a six-wheeled rover with a rocker-bogie suspension on ground with rocks.
 
-Each side has a rocker, which carries the front wheel and the bogie's pivot, and a bogie, which carries the middle and
-the rear wheel. Rockers and bogies rotate about axes parallel to the body's y axis. A differential rotates the two
-rockers against the body by opposite angles: the body's pitch is the mean of the rockers'. Wheels are unsteered
-cylinders whose axles are parallel to the body's y axis. There are no springs, and the joints have no stops.
+Each side of the rover has a rocker and a bogie. The front wheel and the pivot of the bogie are mounted on the rocker,
+the middle and the rear wheel on the bogie. Rockers and bogies rotate about axes parallel to the body's y axis. A
+differential rotates the two rockers against the body by opposite angles: the body's pitch is the mean of their
+pitches. Wheels are unsteered cylinders with axles parallel to the y axis. There are no springs or joint limits.
 
-At a position (east, north) and an azimuth six unknowns remain: height, pitch and roll of the body, the angles of the
-differential and of both bogies. All six wheels touch the ground and none penetrates it: six equations, solved by
-Newton's method or Levenberg-Marquardt. On a plane the joint angles are zero and the body is parallel to the plane.
+For a position (east, north) and an azimuth there are six unknowns: height, pitch and roll of the body, and the angles
+of the differential and of both bogies. The six equations are that the gap between each wheel and the ground is zero.
+They are solved by Newton's method or Levenberg-Marquardt. On a plane all joint angles are zero.
 
-The rover (body) frame has x forward, y to the left and z up. Its origin is the point of level ground between the two
+The rover (body) frame has x forward, y to the left and z up. Its origin lies on level ground midway between the two
 middle wheels.
 """
 
@@ -34,19 +34,19 @@ Metres = Annotated[float, Field(gt=0.0, le=5.0)]
 Six = Float64[np.ndarray, "6"]
 WheelPoints = Float64[np.ndarray, "6 3"]
 
-#: Names of the wheels in the order of all arrays: two columns, left and right, of three.
+#: Names of the wheels, in the order of all arrays.
 WHEELS = ("left front", "left middle", "left rear", "right front", "right middle", "right rear")
-#: Signs of the sides along y and in the differential.
+#: Signs of the wheels' y coordinates.
 _SIDE = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
-#: Sample points of a tread: angles about the axle from straight below, and lines across the tread.
+#: Sample points of a tread: angles about the axle from straight below, and lateral positions in widths of the tread.
 _TREAD_RAD = np.radians(np.linspace(-72.0, 72.0, 25))
 _TREAD_LINES = np.array([-0.5, 0.0, 0.5])
 #: Steps of finite differences, metres and radians.
 _DIFFERENCE = 1e-6
-#: Iterations of Newton's method, and the gap at which a wheel touches the ground.
-_NEWTON_STEPS, _CLOSED_M = 12, 1e-10
+#: Iterations of Newton's method, and the gap below which a wheel touches the ground.
+_NEWTON_STEPS, _GAP_TOLERANCE_M = 12, 1e-10
 
-#: Side of the grid's cells, metres: a tenth of a wheel's radius.
+#: Cell size of the rocks' height grid: a tenth of a wheel's radius.
 CELL_M = 0.0125
 #: Largest distance between sample points on a triangle, in cells.
 _SAMPLE_SPACING = 0.7
@@ -57,18 +57,18 @@ class Ground(Protocol):
     """Ground under the wheels: `marsyard.sim.terrain.Surface`, or `RockyGround`."""
 
     def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-        """Height of the ground at world positions, metres."""
+        """Compute the height of the ground at world positions, metres."""
 
 
 @dataclass(frozen=True)
 class RockyGround:
-    """Ground with bodies on it within a square; the ground alone outside.
+    """Ground with rocks on it within a square grid; outside the grid the ground without rocks.
 
-    Heights are interpolated bilinearly between cell centres. A cell is as high as the highest body point in it, so
-    that steep sides extend up to one cell outwards. Overhangs are filled.
+    Heights are interpolated bilinearly between cell centres. A cell has the height of the highest rock point in it;
+    steep sides therefore extend up to one cell outwards. Overhangs are filled.
 
     - corner_m: world x, y of the centre of cell (0, 0)
-    - above_m: height of each cell above the ground, 0 without a body; row i lies at y = corner + i cells
+    - above_m: height of each cell above the ground, 0 without a rock; row i is at y = corner + i cells
     """
 
     ground: Ground
@@ -83,9 +83,9 @@ class RockyGround:
         centre_m: tuple[float, float],
         half_m: float,
     ) -> RockyGround:
-        """Rasterize bodies (triangles in world axes, metres) within `half_m` of a centre along x and y.
+        """Rasterize rocks (triangles in world axes, metres) within `half_m` of a centre along x and y.
 
-        A `marsyard.sim.terrain.RockMesh` gives the triangles of a rock field as ``mesh.vertices[mesh.faces]``.
+        For a `marsyard.sim.terrain.RockMesh` the triangles are ``mesh.vertices[mesh.faces]``.
         """
         cells = 2 * int(np.ceil(half_m / CELL_M)) + 1
         corner = np.array(centre_m) - 0.5 * (cells - 1) * CELL_M
@@ -100,30 +100,30 @@ class RockyGround:
             samples.append(np.einsum("pk,tki->tpi", weights, triangles[steps == count]).reshape(-1, 3))
         points = np.concatenate(samples)
         cell = np.rint((points[:, :2] - corner) / CELL_M).astype(np.int64)
-        inside = np.all((cell >= 0) & (cell < cells), axis=1)
-        column, row = cell[inside].T
+        is_inside = np.all((cell >= 0) & (cell < cells), axis=1)
+        column, row = cell[is_inside].T
         top = np.full((cells, cells), -np.inf)
-        np.maximum.at(top, (row, column), points[inside, 2])
+        np.maximum.at(top, (row, column), points[is_inside, 2])
         y, x = np.nonzero(np.isfinite(top))
         above = np.zeros((cells, cells))
-        below = ground.height(corner[0] + CELL_M * x, corner[1] + CELL_M * y)
-        above[y, x] = np.maximum(top[y, x] - below, 0.0)
+        ground_height = ground.height(corner[0] + CELL_M * x, corner[1] + CELL_M * y)
+        above[y, x] = np.maximum(top[y, x] - ground_height, 0.0)
         above.setflags(write=False)
         return cls(ground, (float(corner[0]), float(corner[1])), above)
 
     def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-        """Height of ground or rocks at world positions, metres."""
+        """Compute the height of ground or rocks at world positions, metres."""
         cells = [(y - self.corner_m[1]) / CELL_M, (x - self.corner_m[0]) / CELL_M]
         above = map_coordinates(self.above_m, cells, order=1, mode="constant", prefilter=False)
         return np.asarray(self.ground.height(x, y) + above)
 
 
 class RoverParameters(Parameters):
-    """Dimensions of a rover; the defaults are MER's.
+    """Dimensions of a rover in the rover frame on level ground; the defaults are those of MER.
 
-    Wheels: 0.25 m in diameter (press kit: 26 cm with cleats; Opportunity's odometer counts 0.8 m a turn), 0.16 m wide;
-    wheel base 1.41 m, track 1.06 m, 1.22 m between the middle wheels (Lindemann & Voorhees 2005). Positions of the
-    pivots are assumed. Body: press kit (1.6 m long, 2.3 m wide with solar panels; cameras at 1.54 m, Maki et al. 2003).
+    Wheels: 0.25 m in diameter (press kit: 26 cm with cleats; Opportunity's odometer: 0.8 m per revolution), 0.16 m
+    wide; wheel base 1.41 m, track 1.06 m, 1.22 m between the middle wheels (Lindemann & Voorhees 2005). Positions of
+    the pivots are assumed. Body: 1.6 m long, 2.3 m wide with solar panels (press kit), cameras at 1.54 m (Maki 2003).
     """
 
     wheel_radius_m: Annotated[Metres, Field(description="radius of a wheel")] = 0.125
@@ -132,21 +132,21 @@ class RoverParameters(Parameters):
     rear_m: Annotated[Metres, Field(description="distance of the rear wheels behind the middle wheels")] = 0.705
     half_track_m: Annotated[Metres, Field(description="|y| of the front and rear wheels")] = 0.53
     middle_half_track_m: Annotated[Metres, Field(description="|y| of the middle wheels")] = 0.61
-    rocker_pivot_x_m: Annotated[float, bounded_field(-2.0, 2.0, "x of the axis of rockers against the body")] = 0.08
-    rocker_pivot_z_m: Annotated[Metres, Field(description="its height")] = 0.40
-    bogie_pivot_x_m: Annotated[float, bounded_field(-2.0, 2.0, "x of the axes of bogies against rockers")] = -0.35
-    bogie_pivot_z_m: Annotated[Metres, Field(description="their height")] = 0.28
+    rocker_pivot_x_m: Annotated[float, bounded_field(-2.0, 2.0, "x of the rockers' axis on the body")] = 0.08
+    rocker_pivot_z_m: Annotated[Metres, Field(description="height of the rockers' axis on the body")] = 0.40
+    bogie_pivot_x_m: Annotated[float, bounded_field(-2.0, 2.0, "x of the bogies' axes on the rockers")] = -0.35
+    bogie_pivot_z_m: Annotated[Metres, Field(description="height of the bogies' axes on the rockers")] = 0.28
     body_length_m: Annotated[Metres, Field(description="length of the body's deck")] = 1.6
     body_width_m: Annotated[Metres, Field(description="width of the deck with its panels")] = 2.3
-    clearance_m: Annotated[Metres, Field(description="height of the body's belly")] = 0.29
+    clearance_m: Annotated[Metres, Field(description="height of the body's underside")] = 0.29
     deck_m: Annotated[Metres, Field(description="height of the deck")] = 0.64
 
     @model_validator(mode="after")
-    def _is_a_rover(self) -> RoverParameters:
+    def _check_pivots(self) -> RoverParameters:
         if not -self.rear_m < self.bogie_pivot_x_m < 0.0:
             raise ValueError(
                 f"bogie_pivot_x_m is {self.bogie_pivot_x_m:g}; it must lie between the rear wheels ({-self.rear_m:g}) "
-                "and the middle ones (0)"
+                "and the middle wheels (0)"
             )
         if not self.bogie_pivot_x_m < self.rocker_pivot_x_m < self.front_m:
             raise ValueError(
@@ -158,9 +158,9 @@ class RoverParameters(Parameters):
     @property
     def wheel_centres_m(self) -> WheelPoints:
         """Centres of the wheels on level ground, rover frame, in the order of `WHEELS`."""
-        along = np.tile([self.front_m, 0.0, -self.rear_m], 2)
-        across = _SIDE * np.tile([self.half_track_m, self.middle_half_track_m, self.half_track_m], 2)
-        return np.stack([along, across, np.full(6, self.wheel_radius_m)], axis=1)
+        x = np.tile([self.front_m, 0.0, -self.rear_m], 2)
+        y = _SIDE * np.tile([self.half_track_m, self.middle_half_track_m, self.half_track_m], 2)
+        return np.stack([x, y, np.full(6, self.wheel_radius_m)], axis=1)
 
     @property
     def pivots_m(self) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
@@ -169,15 +169,15 @@ class RoverParameters(Parameters):
         return rocker, np.array([self.bogie_pivot_x_m, self.bogie_pivot_z_m])
 
     @property
-    def reach_m(self) -> float:
-        """Radius of the circle about the origin that encloses wheels and body, seen from above."""
+    def enclosing_radius_m(self) -> float:
+        """Radius of the circle about the origin that encloses wheels and body in the top view."""
         wheel = np.hypot(
             max(self.front_m, self.rear_m) + self.wheel_radius_m, self.half_track_m + 0.5 * self.wheel_width_m
         )
         return float(max(wheel, np.hypot(0.5 * self.body_length_m, 0.5 * self.body_width_m)))
 
 
-#: The Mars Exploration Rover, and its engineering model on Earth.
+#: A Mars Exploration Rover (Spirit, Opportunity), and its engineering model on Earth.
 MER = RoverParameters()
 #: Rocky 8, the research rover of the tracking paper's section 5: six steered and driven wheels, about the size of a MER
 #: without panels. Its exact dimensions are assumed.
@@ -203,10 +203,12 @@ ROCKY_8 = RoverParameters(
 class Stance:
     """True pose and joint angles of a rover at rest on the ground.
 
-    - differential_rad: angle of the left rocker against the body, the negative of the right one's; positive: its front
-      wheel is lowered
+    - world_from_rover: pose of the rover frame in the world
+    - differential_rad: angle of the left rocker against the body; positive: the left front wheel is lowered. The right
+      rocker has the opposite angle
     - bogies_rad: angles of the left and the right bogie against their rockers; positive: the middle wheel is lowered
-    - gaps_m: height of each wheel above the ground in the order of `WHEELS`; not zero where no pose has all six on it
+    - gaps_m: height of each wheel's lowest point above the ground, in the order of `WHEELS`; zero (to rounding) if a
+      pose with all six wheels on the ground was found, otherwise with minimal sum of squares
     """
 
     world_from_rover: RigidTransform
@@ -248,36 +250,40 @@ def settle(
     east_m: float,
     north_m: float,
     azimuth_rad: float,
-    near: Stance | None = None,
+    initial: Stance | None = None,
 ) -> Stance:
-    """Solve for the rover's pose and joint angles at rest at a position.
+    """Compute the rover's pose and joint angles at rest at a position (east, north).
 
-    The azimuth is clockwise from north. The solution starts from the stance `near`, or from level on the ground.
+    The azimuth is clockwise from north. The iteration starts at the stance `initial`, or at a level pose without it.
     """
     equations = _StanceEquations(rover, ground, np.array([east_m, north_m]), 0.5 * np.pi - azimuth_rad)
-    if near is None:
+    if initial is None:
         start = np.array([float(ground.height(*equations.position_m[:, None])[0]), 0.0, 0.0, 0.0, 0.0, 0.0])
     else:
-        height = float(near.world_from_rover.translation[2])
-        start = np.array([height, near.pitch_rad, near.roll_rad, near.differential_rad, *near.bogies_rad])
+        height = float(initial.world_from_rover.translation[2])
+        start = np.array([height, initial.pitch_rad, initial.roll_rad, initial.differential_rad, *initial.bogies_rad])
     unknowns, gaps = equations.solve(start)
     differential, left, right = (float(angle) for angle in unknowns[3:])
     rotation = Rotation.from_euler("ZYX", [equations.yaw_rad, -unknowns[1], unknowns[2]])
     return Stance(rigid(rotation, np.array([east_m, north_m, unknowns[0]])), differential, (left, right), gaps)
 
 
-def wheel_centres(rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]) -> WheelPoints:
-    """Centres of the wheels in the rover frame at the given joint angles, metres."""
+def compute_wheel_centres(
+    rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]
+) -> WheelPoints:
+    """Compute the centres of the wheels in the rover frame from the joint angles, metres."""
     joints = np.array([differential_rad, *bogies_rad])
-    return np.asarray(suspension.wheel_centres(rover.wheel_centres_m, *rover.pivots_m, joints))
+    return np.asarray(suspension.compute_wheel_centres(rover.wheel_centres_m, *rover.pivots_m, joints))
 
 
-def bogie_pivots(rover: RoverParameters, differential_rad: float) -> Float64[np.ndarray, "2 3"]:
-    """Positions of the left and the right bogie's pivot, rover frame, metres."""
-    (x, z), about = rover.pivots_m[1], rover.pivots_m[0]
-    half = rover.half_track_m
-    left, right = (suspension.rotate(x, z, angle, about) for angle in (differential_rad, -differential_rad))
-    return np.array([[left[0], half, left[1]], [right[0], -half, right[1]]])
+def compute_bogie_pivots(rover: RoverParameters, differential_rad: float) -> Float64[np.ndarray, "2 3"]:
+    """Compute the positions of the left and the right bogie's pivot, rover frame, metres."""
+    rocker_pivot, (x, z) = rover.pivots_m
+    y = rover.half_track_m
+    left, right = (
+        suspension.rotate_about_pivot(x, z, angle, rocker_pivot) for angle in (differential_rad, -differential_rad)
+    )
+    return np.array([[left[0], y, left[1]], [right[0], -y, right[1]]])
 
 
 @dataclass(frozen=True)
@@ -290,44 +296,44 @@ class _StanceEquations:
     yaw_rad: float
 
     def solve(self, start: Six) -> tuple[Six, Six]:
-        """Unknowns that close the gaps, and the remaining gaps, by Newton's method: few iterations on most ground.
+        """Solve for the unknowns with gaps of zero; return the unknowns and the remaining gaps.
 
-        A wheel's lowest point jumps along its tread. If Newton's method then diverges, or no stance has all wheels on
-        the ground, Levenberg-Marquardt minimizes the gaps.
+        Newton's method needs few iterations on most ground. It can diverge where a wheel's lowest point jumps along the
+        tread, or where no stance has all wheels on the ground. Then Levenberg-Marquardt minimizes the squared gaps.
         """
         unknowns = start
         for _ in range(_NEWTON_STEPS):
-            gaps, points = self._lowest_points(unknowns)
-            if float(np.abs(gaps).max()) < _CLOSED_M:
+            gaps, points = self._find_lowest_points(unknowns)
+            if float(np.abs(gaps).max()) < _GAP_TOLERANCE_M:
                 return unknowns, gaps
             try:
-                unknowns = unknowns - np.linalg.solve(self._jacobian(unknowns, points), gaps)
+                unknowns = unknowns - np.linalg.solve(self._compute_jacobian(unknowns, points), gaps)
             except np.linalg.LinAlgError:
                 break
 
-        def gaps_of(x: Six) -> Six:
-            return self._lowest_points(x)[0]
+        def compute_gaps(x: Six) -> Six:
+            return self._find_lowest_points(x)[0]
 
-        def jacobian(x: Six) -> Float64[np.ndarray, "6 6"]:
-            return self._jacobian(x, self._lowest_points(x)[1])
+        def compute_jacobian(x: Six) -> Float64[np.ndarray, "6 6"]:
+            return self._compute_jacobian(x, self._find_lowest_points(x)[1])
 
-        solution = least_squares(gaps_of, start, jac=jacobian, method="lm", xtol=1e-8, ftol=1e-12)
+        solution = least_squares(compute_gaps, start, jac=compute_jacobian, method="lm", xtol=1e-8, ftol=1e-12)
         return solution.x, solution.fun
 
-    def _jacobian(self, unknowns: Six, points: WheelPoints) -> Float64[np.ndarray, "6 6"]:
-        """Derivatives of the gaps by finite differences, at the lowest point of each tread alone."""
+    def _compute_jacobian(self, unknowns: Six, points: WheelPoints) -> Float64[np.ndarray, "6 6"]:
+        """Compute the derivatives of the gaps by finite differences, at the lowest point of each tread only."""
         step = _DIFFERENCE * np.eye(6)
-        heights = self._heights(np.concatenate([unknowns - step, unknowns + step]), points[:, None])[..., 0]
+        heights = self._compute_heights(np.concatenate([unknowns - step, unknowns + step]), points[:, None])[..., 0]
         return np.asarray(((heights[6:] - heights[:6]) / (2.0 * _DIFFERENCE)).T)
 
-    def _lowest_points(self, unknowns: Six) -> tuple[Six, WheelPoints]:
-        """Smallest height of each tread above the ground, and its point on the tread, from the wheel's centre."""
-        heights = self._heights(unknowns[None], self._tread[None])[0]
+    def _find_lowest_points(self, unknowns: Six) -> tuple[Six, WheelPoints]:
+        """Find each tread's smallest height above the ground, and the point there, relative to the wheel's centre."""
+        heights = self._compute_heights(unknowns[None], self._tread[None])[0]
         lowest = heights.argmin(axis=1)
         return heights[np.arange(6), lowest], self._tread[lowest]
 
     @cached_property
-    def _shape(self) -> tuple[WheelPoints, Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+    def _geometry(self) -> tuple[WheelPoints, Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
         return (self.rover.wheel_centres_m, *self.rover.pivots_m)
 
     @cached_property
@@ -336,9 +342,9 @@ class _StanceEquations:
         radius, width = self.rover.wheel_radius_m, self.rover.wheel_width_m
         return np.stack([radius * np.sin(angle), width * line, -radius * np.cos(angle)], axis=-1).reshape(-1, 3)
 
-    def _heights(
+    def _compute_heights(
         self, unknowns: Float64[np.ndarray, "n 6"], treads: Float64[np.ndarray, "wheels points 3"]
     ) -> Float64[np.ndarray, "n 6 points"]:
-        """Heights of tread points above the ground; the points are common to all wheels, or each wheel's own."""
-        x, y, z = suspension.tread_points(unknowns, self.yaw_rad, self.position_m, *self._shape, treads)
+        """Compute the heights of tread points above the ground; `treads` as in `suspension.compute_tread_points`."""
+        x, y, z = suspension.compute_tread_points(unknowns, self.yaw_rad, self.position_m, *self._geometry, treads)
         return np.asarray(z - self.ground.height(x, y))

@@ -1,11 +1,11 @@
-"""Parachute descent as a two-stage pendulum: the line cones below the parachute, the lander nods on its bridle.
+"""Parachute descent as a two-stage pendulum: the line cones below the canopy, and the lander nods on its bridle.
 
-The canopy, a mass m_c at r, carries a massless straight line with direction n (unit vector, downwards). The backshell
-is a point mass m_b on it at L_b; the lander, three quarters of the mass, hangs at its end, at L, and keeps it taut. The
-lander is a rigid body, hinged at the end of its bridle. Its axis e (unit vector) runs from the hinge through its centre
-of mass, at d, to the camera, at `arm_length_m`. It is axially symmetric: I_t across and I_a along its axis. Swings of
-the backshell within the line are not modelled. Unit vectors are coordinates without singularity. With the total mass M,
-S = m_b L_b + m_l L, J = m_b L_b^2 + m_l L^2 and the projection P_x perpendicular to x, Lagrange's equations are
+The canopy is a point mass m_c at r. Below it is a massless straight line with direction n (unit vector, downwards). The
+backshell is a point mass m_b on the line at the distance L_b from the canopy. The lander is a rigid body of mass m_l,
+hinged at the end of the line, at L. The line between backshell and lander is the bridle. The lander's axis e (unit
+vector) points from the hinge through its centre of mass, at d, to the camera, at `arm_length_m`. The lander is axially
+symmetric, with the moments of inertia I_t across and I_a along the axis. The line is always straight. With the total
+mass M, S = m_b L_b + m_l L, J = m_b L_b^2 + m_l L^2 and the projection P_x perpendicular to x, Lagrange's equations are
 
     M r'' + S n'' + m_l d e'' = M g + F                                                                        (1)
     P_n (S (r'' - g) + J n'' + m_l d L e'') = c s x n                                                          (2)
@@ -13,27 +13,27 @@ S = m_b L_b + m_l L, J = m_b L_b^2 + m_l L^2 and the projection P_x perpendicula
 
     I_a w' = -c s e                                                                                            (4)
 
-with g downwards, the lander's spin w about its axis, and its rate against the line s = P_n (e x e' + w e) - n x n',
-damped by c in the bridle; the line rolls with the lander. (1) gives r''; (2) and (3) are then two equations for n'' and
-e'', solved in closed form (`marsyard.sim.dynamics.kernels.swing`). The air's force on the canopy, at velocity v
-relative to the air, is
+where g is the gravity vector, w the lander's spin about its axis, s = P_n (e x e' + w e) - n x n' the lander's angular
+rate relative to the line, and c the damping in the bridle; the line has the lander's roll rate. With r'' from (1), (2)
+and (3) are two equations for n'' and e'', solved in closed form (`marsyard.sim.dynamics.kernels.swing`). The force of
+the air on the canopy, at the velocity v relative to the air, is
 
-    F = -rho/2 A |v| (C_T |v| n + C_N P_n v),      rho decreasing exponentially with height:
+    F = -rho/2 A |v| (C_T |v| n + C_N P_n v),      rho decreasing exponentially with height.
 
-a tangential coefficient independent of the angle of attack, and a small restoring normal force, typical of
-disk-gap-band parachutes near their trim angle (wind-tunnel tests: Cruz et al., AIAA 2003-2129). The damping below
-determines the normal force, which is therefore assumed. The canopy's force includes the force on backshell and lander,
-a few per cent. rho A C_T makes the canopy fall at the stated rate in equilibrium with density and swing: this rate
-alone disperses density, area and coefficient.
+C_T is independent of the angle of attack, and C_N is a small restoring normal force, as for disk-gap-band parachutes
+near their trim angle (wind-tunnel tests: Cruz et al., AIAA 2003-2129). C_N follows from the assumed damping of the
+coning. F includes the force on backshell and lander, a few per cent. rho A C_T is chosen such that the canopy falls at
+`descent_rate_m_s` in equilibrium; the dispersion of this rate stands for those of density, area and coefficient.
 
-C_N causes the coning. With the normal force per angle of attack k, mu = M - S^2 / J (lander fixed to the line, and thus
-in S and J), kappa = k / mu, l = J / S, a = |F| / M and the descent rate V, small swings of the tilt obey
+C_N causes the coning. Let the lander be fixed to the line, and included in S and J. With the normal force per angle of
+attack k, mu = M - S^2 / J, kappa = k / mu, l = J / S, a = |F| / M and the descent rate V, the characteristic equation
+(p: eigenvalue) of small swings is
 
     (p + kappa / V) (p^2 + kappa / l) = kappa (kappa - a) / (V l).
 
-At kappa = a the canopy falls straight and the line swings below it as an undamped pendulum of length l. A larger kappa
-damps, with the ratio (kappa - a) / (2 V omega), omega^2 = kappa / l; a smaller kappa makes the coning grow.
-`cone_damping_ratio` sets kappa.
+At kappa = a the canopy falls straight and the line swings below it as an undamped pendulum of length l. For a larger
+kappa the coning is damped, with the ratio (kappa - a) / (2 V omega), omega^2 = kappa / l; for a smaller kappa it grows.
+kappa is computed from `cone_damping_ratio`.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ Constants = tuple[kernels.Array, kernels.Array]
 Phase = Annotated[float, Field(ge=-360.0, le=720.0)]
 Gyration = Annotated[float, Field(ge=0.05, le=5.0)]
 
-#: The integration ends with the camera this far below the height of the thrusters' firing, m: more than a second later.
-BEYOND_FIRING_M = 90.0
-#: Integrated backwards, damped swings grow: a nod of 60 deg/s to twice that in half a minute.
+#: The integration ends with the camera this far below the height of the thrusters' firing: more than a second later.
+BELOW_FIRING_M = 90.0
+#: Maximum time of backward integration, in which damped swings grow: in 30 s a nod of 60 deg/s doubles its rate.
 MAX_LEAD_S = 30.0
 #: With these relative and absolute tolerances finite differences of the flight reproduce its derivatives to 1e-6.
 TOLERANCE = 1e-9
@@ -73,50 +73,50 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 class SwingParameters(WindParameters):
-    """A descent. Angles in degrees, as in campaign files; altitudes above the ground below the first picture.
+    """Parameters of a parachute descent. Altitudes are above the ground below the position of the first image.
 
-    Masses are those of the Mars Exploration Rovers (NASA press kit, January 2004: lander with rover 533 kg, backshell
-    with parachute 209 kg), as is the bridle of 20 m. Values marked "assumed" are not published.
+    Masses and bridle length are those of the Mars Exploration Rovers (NASA press kit, January 2004: lander with rover
+    533 kg, backshell with parachute 209 kg, bridle 20 m). Values marked "assumed" are not published.
     """
 
-    altitude_first_m: Annotated[float, Field(gt=100.0, le=10000.0, description="of the first picture")] = 2000.0
-    interval_s: Annotated[float, Field(gt=0.1, le=60.0, description="time between pictures")] = 3.75
-    descent_rate_m_s: Annotated[
-        float, bounded_field(20.0, 200.0, "descent rate of the canopy at the first picture")
-    ] = 75.0
-    density_scale_height_m: Annotated[float, bounded_field(5000.0, 20000.0, "of the atmosphere; CO2 at 220 K")] = (
+    altitude_first_m: Annotated[float, Field(gt=100.0, le=10000.0, description="altitude of the first image")] = 2000.0
+    interval_s: Annotated[float, Field(gt=0.1, le=60.0, description="time between images")] = 3.75
+    descent_rate_m_s: Annotated[float, bounded_field(20.0, 200.0, "descent rate of the canopy at the first image")] = (
+        75.0
+    )
+    density_scale_height_m: Annotated[float, bounded_field(5000.0, 20000.0, "of the atmosphere: CO2 at 220 K")] = (
         11200.0
     )
     cone_angle_deg: Annotated[float, bounded_field(0.0, 45.0, "largest angle of the coning lander from nadir")] = 15.0
-    cone_minor_fraction: Annotated[float, bounded_field(-1.0, 1.0, "minor over major half-axis; sign: sense")] = 0.5
+    cone_minor_fraction: Annotated[float, bounded_field(-1.0, 1.0, "minor / major half-axis; sign: sense")] = 0.5
     cone_direction_deg: Annotated[Phase, Field(description="azimuth of the cone's major axis")] = 0.0
-    cone_phase_deg: Annotated[Phase, Field(description="phase of the coning at the first picture")] = 0.0
-    cone_damping_ratio: Annotated[
-        float, bounded_field(-0.05, 0.2, "damping of small coning over critical (assumed)")
-    ] = 0.01
+    cone_phase_deg: Annotated[Phase, Field(description="phase of the coning at the first image")] = 0.0
+    cone_damping_ratio: Annotated[float, bounded_field(-0.05, 0.2, "damping of small coning / critical (assumed)")] = (
+        0.01
+    )
     nod_rate_deg_s: Annotated[float, bounded_field(0.0, 120.0, "largest rate of the nodding")] = 20.0
     nod_direction_deg: Annotated[Phase, Field(description="azimuth of the nodding, relative to the cone's axis")] = 0.0
-    nod_phase_deg: Annotated[Phase, Field(description="phase of the nodding at the first picture")] = 0.0
+    nod_phase_deg: Annotated[Phase, Field(description="phase of the nodding at the first image")] = 0.0
     nod_damping_ratio: Annotated[float, bounded_field(0.0, 0.5, "damping of small nodding by the bridle (assumed)")] = (
         0.002
     )
-    heading_deg: Annotated[Phase, Field(description="rotation about the lander's axis at the first picture")] = 0.0
-    spin_rate_deg_s: Annotated[float, bounded_field(-30.0, 30.0, "rate of this rotation at that time")] = 0.0
+    heading_deg: Annotated[Phase, Field(description="rotation about the lander's axis at the first image")] = 0.0
+    spin_rate_deg_s: Annotated[float, bounded_field(-30.0, 30.0, "spin about the lander's axis at that time")] = 0.0
     line_length_m: Annotated[float, bounded_field(10.0, 200.0, "canopy to hinge; bridle 20 m, rest assumed")] = 47.0
     bridle_length_m: Annotated[float, bounded_field(1.0, 100.0, "from the backshell to the hinge")] = 20.0
     canopy_mass_kg: Annotated[float, bounded_field(1.0, 1000.0, "with lines and entrained air (assumed)")] = 30.0
     backshell_mass_kg: Annotated[float, bounded_field(0.0, 5000.0, "backshell without canopy")] = 179.0
     lander_mass_kg: Annotated[float, bounded_field(1.0, 5000.0, "lander with rover")] = 533.0
     mass_centre_m: Annotated[float, bounded_field(0.1, 10.0, "hinge to the lander's centre of mass (assumed)")] = 1.5
-    gyration_transverse_m: Annotated[Gyration, Field(description="radius across the lander's axis (assumed)")] = 0.5
-    gyration_axial_m: Annotated[Gyration, Field(description="radius about the lander's axis (assumed)")] = 0.5
+    gyration_transverse_m: Annotated[Gyration, Field(description="gyration radius across its axis (assumed)")] = 0.5
+    gyration_axial_m: Annotated[Gyration, Field(description="gyration radius about its axis (assumed)")] = 0.5
     arm_length_m: Annotated[float, bounded_field(0.0, 10.0, "from the hinge to the camera (assumed)")] = 1.5
     thruster_firing_m: Annotated[float, bounded_field(0.0, 1000.0, "height above ground of the thrusters' firing")] = (
         100.0
     )
 
     @model_validator(mode="after")
-    def _bridle_is_part_of_line(self) -> SwingParameters:
+    def _check_bridle(self) -> SwingParameters:
         if self.bridle_length_m > self.line_length_m:
             raise ValueError(
                 f"bridle_length_m is {self.bridle_length_m:.6g}; allowed: up to line_length_m, {self.line_length_m:.6g}"
@@ -127,23 +127,23 @@ class SwingParameters(WindParameters):
     def _mass_kg(self) -> float:
         return self.canopy_mass_kg + self.backshell_mass_kg + self.lander_mass_kg
 
-    def _moments(self, lander_at_m: float) -> tuple[float, float]:
-        """First and second moment of mass about the canopy, with the lander's mass at a distance."""
-        backshell_at = self.line_length_m - self.bridle_length_m
-        first = self.backshell_mass_kg * backshell_at + self.lander_mass_kg * lander_at_m
-        return first, self.backshell_mass_kg * backshell_at**2 + self.lander_mass_kg * lander_at_m**2
+    def _moments(self, lander_m: float) -> tuple[float, float]:
+        """Compute the first and second moment of mass about the canopy for the lander's distance from the canopy."""
+        backshell_m = self.line_length_m - self.bridle_length_m
+        first = self.backshell_mass_kg * backshell_m + self.lander_mass_kg * lander_m
+        return first, self.backshell_mass_kg * backshell_m**2 + self.lander_mass_kg * lander_m**2
 
 
 @dataclass(frozen=True)
 class Modes:
     """Linear coning and nodding modes of the hanging chain, from which a descent's initial state is computed.
 
-    - support_m_s2: mean force of the air over mass: gravity, and braking in air of increasing density
-    - cone_rad_s, nod_rad_s: undamped angular frequencies
-    - lander_tilt_ratio: the lander's tilt over the line's while coning
-    - line_recoil, canopy_recoil_m: the line's tilt and the canopy's displacement per tilt of the nodding lander
+    - support_m_s2: mean force of the air / mass: gravity plus the deceleration in air of increasing density
+    - cone_rad_s, nod_rad_s: undamped angular frequencies of coning and nodding
+    - lander_tilt_ratio: tilt of the lander / tilt of the line during coning
+    - line_recoil, canopy_recoil_m: tilt of the line and displacement of the canopy / tilt of the nodding lander
     - normal_force_n: normal force on the canopy per radian of angle of attack
-    - hinge_damping: torque per rate in the bridle, N m s; the canopy's drag adds about 0.003 of critical damping
+    - hinge_damping: damping c in the bridle, N m s; the canopy's drag adds about 0.003 of critical damping
     """
 
     support_m_s2: float
@@ -157,8 +157,8 @@ class Modes:
 
     @classmethod
     def of(cls, p: SwingParameters, gravity_m_s2: float) -> Modes:
-        """Compute the modes. Raises ValueError unless the lander nods far faster than it cones."""
-        mass, lander = p._mass_kg, p.lander_mass_kg * p.mass_centre_m
+        """Compute the modes. Raises ValueError unless the nodding is much faster than the coning."""
+        mass, lander_moment = p._mass_kg, p.lander_mass_kg * p.mass_centre_m
         inertia = p.lander_mass_kg * p.gyration_transverse_m**2
         first, second = p._moments(p.line_length_m)
         support = gravity_m_s2 + p.descent_rate_m_s**2 / (2.0 * p.density_scale_height_m)
@@ -169,18 +169,18 @@ class Modes:
         damping = p.cone_damping_ratio * p.descent_rate_m_s
         cone = (damping + np.sqrt(damping**2 + support * length)) / length
         normal = (mass - rigid_first**2 / rigid_second) * length * cone**2
-        # moments with the canopy's position eliminated: A of the line, B of the lander, C of both
+        # coefficients of n'' and e'' in (2) and (3) after r'' is eliminated: A n'' + C e'', C n'' + B e''
         a = second - first**2 / mass
-        c = lander * (p.line_length_m - first / mass)
-        b = inertia + lander * (p.mass_centre_m - lander / mass)
-        nod = np.sqrt(lander * support * (1.0 + c / a) / (b - c**2 / a))
+        c = lander_moment * (p.line_length_m - first / mass)
+        b = inertia + lander_moment * (p.mass_centre_m - lander_moment / mass)
+        nod = np.sqrt(lander_moment * support * (1.0 + c / a) / (b - c**2 / a))
         # forced response of the lander's pendulum to the line's coning
-        tilt_ratio = (lander * (support - normal / mass) + c * cone**2) / (lander * support - b * cone**2)
+        tilt_ratio = (lander_moment * (support - normal / mass) + c * cone**2) / (lander_moment * support - b * cone**2)
         if not 0.0 < tilt_ratio <= MAX_LANDER_TILT_RATIO:
             raise ValueError(
                 f"gyration_transverse_m of {p.gyration_transverse_m:.6g} with mass_centre_m of {p.mass_centre_m:.6g} "
-                f"makes the lander nod in {2.0 * np.pi / nod:.3g} s, and it cones in {2.0 * np.pi / cone:.3g} s; "
-                "allowed: nods far faster than cones"
+                f"leads to nodding with a period of {2.0 * np.pi / nod:.3g} s and coning with one of "
+                f"{2.0 * np.pi / cone:.3g} s; allowed: nodding much faster than coning"
             )
         return cls(
             support_m_s2=float(support),
@@ -188,26 +188,26 @@ class Modes:
             nod_rad_s=float(nod),
             lander_tilt_ratio=float(tilt_ratio),
             line_recoil=float(-c / a),
-            canopy_recoil_m=float((first * c / a - lander) / mass),
+            canopy_recoil_m=float((first * c / a - lander_moment) / mass),
             normal_force_n=float(normal),
             hinge_damping=float(2.0 * p.nod_damping_ratio * nod * (b - c**2 / a) / (1.0 + c / a) ** 2),
         )
 
 
 def build_chain(p: SwingParameters, modes: Modes, gravity_m_s2: float, canopy_height_m: float) -> Chain:
-    """Constants of the equations of motion; `canopy_height_m` is the canopy's world z at the first picture."""
+    """Compute the constants of the equations of motion; `canopy_height_m`: the canopy's world z at the first image."""
     first, second = p._moments(p.line_length_m)
     largest_rad = np.radians(p.cone_angle_deg) / modes.lander_tilt_ratio
-    # the vertical component of the air's mean force over the cone balances the weight
-    upright = np.cos(largest_rad * np.sqrt(0.5 * (1.0 + p.cone_minor_fraction**2)))
-    tangential = p._mass_kg * modes.support_m_s2 / (upright * p.descent_rate_m_s**2)
+    # the vertical component of the air's force, averaged over a turn of the cone, balances the weight
+    vertical_fraction = np.cos(largest_rad * np.sqrt(0.5 * (1.0 + p.cone_minor_fraction**2)))
+    tangential = p._mass_kg * modes.support_m_s2 / (vertical_fraction * p.descent_rate_m_s**2)
     return Chain(
         **p.model_dump(include=set(Chain._fields)),
         mass_kg=p._mass_kg,
         first_moment=first,
         second_moment=second,
         line_m=p.line_length_m,
-        reach_m=p.arm_length_m,
+        camera_m=p.arm_length_m,
         transverse_inertia=p.lander_mass_kg * p.gyration_transverse_m**2,
         axial_inertia=p.lander_mass_kg * p.gyration_axial_m**2,
         hinge_damping=modes.hinge_damping,
@@ -224,8 +224,8 @@ class Path:
     """Solution of the equations of motion as polynomials, one for each integration step of SciPy's DOP853.
 
     - knots_s: earliest time of each step, increasing
-    - starts_s, states, lengths_s: time and state at the step's start, and its length, negative backwards
-    - polynomials: coefficients of SciPy's Horner scheme, which multiplies by the elapsed fraction x and 1 - x in turn
+    - starts_s, states, lengths_s: time and state at the step's start, and its length; backward steps have negative ones
+    - polynomials: coefficients of SciPy's Horner scheme, whose factors alternate: elapsed fraction x, and 1 - x
     """
 
     span_s: tuple[float, float]
@@ -239,9 +239,9 @@ class Path:
     def integrate(
         cls, state: StateVector, lead_s: float, max_s: float, event: Callable[..., float], constants: Constants
     ) -> Path:
-        """Integrate from a state at time 0: back by `lead_s`, and forward until `event` passes zero or `max_s`.
+        """Integrate from a state at time 0: back by `lead_s`, and forward until `event` is zero or for `max_s`.
 
-        `constants` are those of `kernels.pack_constants`. Raises ValueError where the integration fails.
+        `constants` are from `kernels.pack_constants`. Raises ValueError if the integration fails.
         """
         event.terminal = True  # type: ignore[attr-defined]
         parts: list[OdeSolution] = []
@@ -258,13 +258,13 @@ class Path:
                 args=constants,
             )
             if solution.sol is None or not solution.success:
-                raise ValueError(f"the descent cannot be followed beyond {solution.t[-1]:.6g} s: {solution.message}")
+                raise ValueError(f"the integration of the descent fails at {solution.t[-1]:.6g} s: {solution.message}")
             parts.append(solution.sol)
-        before, after = parts
-        steps = [*reversed(before.interpolants), *after.interpolants]
+        backward, forward = parts
+        steps = [*reversed(backward.interpolants), *forward.interpolants]
         starts, lengths = np.array([[step.t_old, step.h] for step in steps]).T.copy()
         return cls(
-            span_s=(float(before.t_min), float(after.t_max)),
+            span_s=(float(backward.t_min), float(forward.t_max)),
             knots_s=np.minimum(starts, starts + lengths),
             starts_s=starts,
             lengths_s=lengths,
@@ -273,7 +273,7 @@ class Path:
         )
 
     def at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 22"]:
-        """State vectors (`marsyard.sim.dynamics.kernels.swing`). Raises ValueError outside of the span."""
+        """Return the state vectors at many times (`kernels.swing`). Raises ValueError for times outside the span."""
         check_times(times_s, self.span_s)
         return np.asarray(
             kernels.interpolate_states(
@@ -284,14 +284,17 @@ class Path:
 
 @dataclass(frozen=True)
 class SwingDescent(Trajectory):
-    """A descent on the parachute through a given position; a `Trajectory`.
+    """Simulated parachute descent of a lander below a swinging line: a `Trajectory` of the camera.
 
-    The body's origin is the camera; the IMU is next to it. At time 0, the nominal time of the first picture, the camera
-    is at `start_m`, the cone and the nod have the stated phases, and the canopy drifts with the mean wind. Before and
-    after, the equations of motion apply with gusts. Phases, amplitudes and rates are exact where the line or the lander
-    swings alone in still air; large cones and nods together disturb each other slightly.
+    The origin of the body frame is the camera, and the IMU is at the same point. At time 0, the time of the first
+    image, the camera is at `start_m`, coning and nodding have the phases of the parameters, and the canopy drifts with
+    the mean wind. The equations of motion with gusts are integrated from this state backward and forward. Amplitudes
+    and rates match the parameters for coning alone or nodding alone in still air; large ones together interact.
 
-    - ground_height_m: the world's z of the ground, reference of the altitudes
+    - parameters, start_m: parameters of the descent, and the camera's position at time 0, world axes, metres
+    - wind: mean wind and gusts as functions of height
+    - ground_height_m: world z of the ground, the reference of altitudes
+    - chain, path: constants and solution of the equations of motion
     """
 
     parameters: SwingParameters
@@ -312,33 +315,33 @@ class SwingDescent(Trajectory):
         gravity_m_s2: float = 3.72,
         lead_s: float = 10.0,
     ) -> SwingDescent:
-        """Simulate from `lead_s` before the first picture until more than a second after the thrusters' firing.
+        """Simulate from `lead_s` before the first image until more than a second after the thrusters' firing.
 
-        The camera is at `start_m` (world) at time 0: `altitude_first_m` of the parameters is not used here. `rng` draws
-        the gusts. Raises ValueError for a start below the height of the thrusters' firing, a nod rate that would turn
-        the lander over, or a lead outside of 0 to `MAX_LEAD_S`.
+        `start_m` is the camera's position at time 0, world axes; `altitude_first_m` of the parameters is not used.
+        `rng` draws the gusts. Raises ValueError if the start is below the height of the thrusters' firing, the nod rate
+        would rotate the lander by a full turn, or `lead_s` is not above 0 and at most `MAX_LEAD_S`.
         """
         p = parameters
         if not 0.0 < lead_s <= MAX_LEAD_S:
             raise ValueError(f"lead_s is {lead_s:.6g}; allowed: above 0, up to {MAX_LEAD_S:.6g} s")
-        lowest = ground_height_m + p.thruster_firing_m
-        if start_m[2] <= lowest:
+        firing_m = ground_height_m + p.thruster_firing_m
+        if start_m[2] <= firing_m:
             raise ValueError(
-                f"start_m is at z = {start_m[2]:.1f} m; allowed: above the thrusters' firing, {lowest:.1f} m"
+                f"start_m is at z = {start_m[2]:.1f} m; allowed: above the thrusters' firing, {firing_m:.1f} m"
             )
         wind = Wind.draw(p, ground_height_m, rng)
         modes = Modes.of(p, gravity_m_s2)
         loop_deg_s = float(np.degrees(2.0 * modes.nod_rad_s))
         if p.nod_rate_deg_s >= loop_deg_s:
             raise ValueError(f"nod_rate_deg_s is {p.nod_rate_deg_s:.6g}; allowed: below {loop_deg_s:.6g}, a full loop")
-        state = _initial_state(p, modes, wind, start_m)
+        state = _compute_initial_state(p, modes, wind, start_m)
         chain = build_chain(p, modes, gravity_m_s2, float(state[CANOPY + 2]))
 
-        def height_left(_t: float, y: StateVector, *_constants: Float64[np.ndarray, "..."]) -> float:
-            return _camera_height(y, chain) - lowest + BEYOND_FIRING_M
+        def remaining_height(_t: float, y: StateVector, *_constants: Float64[np.ndarray, "..."]) -> float:
+            return _compute_camera_height(y, chain) - firing_m + BELOW_FIRING_M
 
         max_s = 3.0 * (start_m[2] - ground_height_m) / p.descent_rate_m_s
-        path = Path.integrate(state, lead_s, max_s, height_left, kernels.pack_constants(chain, wind.field))
+        path = Path.integrate(state, lead_s, max_s, remaining_height, kernels.pack_constants(chain, wind.field))
         return cls(p, start_m, wind, ground_height_m, chain, path)
 
     @property
@@ -347,24 +350,26 @@ class SwingDescent(Trajectory):
         return self.path.span_s
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
-        """True states at many times. Raises ValueError outside of the span."""
+        """Compute the true states at many times. Raises ValueError for times outside the span."""
         positions, velocities, matrices, rates, forces = kernels.compute_truth(
             self.path.at(times_s), self.chain, self.wind.field
         )
         return Motion(times_s, positions, velocities, Rotation.from_matrix(matrices, assume_valid=True), rates, forces)
 
     def time_of_altitude(self, altitude_m: float) -> float:
-        """Time at which the camera passes an altitude above the ground. Raises ValueError outside of the span."""
+        """Return the time at which the camera passes an altitude above the ground; ValueError if it does not."""
         first, last = self.span_s
 
         def excess(time_s: float) -> float:
-            return _camera_height(self.path.at(np.array([time_s]))[0], self.chain) - self.ground_height_m - altitude_m
+            return (
+                _compute_camera_height(self.path.at(np.array([time_s]))[0], self.chain)
+                - self.ground_height_m
+                - altitude_m
+            )
 
         if not excess(last) <= 0.0 <= excess(first):
             highest, lowest = altitude_m + excess(first), altitude_m + excess(last)
-            raise ValueError(
-                f"altitude {altitude_m:.6g} m is not flown through; allowed: {lowest:.6g} to {highest:.6g} m"
-            )
+            raise ValueError(f"altitude {altitude_m:.6g} m is not passed; allowed: {lowest:.6g} to {highest:.6g} m")
         return float(brentq(excess, first, last, xtol=1e-9))
 
     @cached_property
@@ -373,39 +378,41 @@ class SwingDescent(Trajectory):
         return self.time_of_altitude(self.parameters.thruster_firing_m)
 
 
-def _camera_height(y: StateVector, chain: Chain) -> float:
-    return float(y[CANOPY + 2] + chain.line_m * y[kernels.LINE + 2] + chain.reach_m * y[kernels.AXIS + 2])
+def _compute_camera_height(y: StateVector, chain: Chain) -> float:
+    return float(y[CANOPY + 2] + chain.line_m * y[kernels.LINE + 2] + chain.camera_m * y[kernels.AXIS + 2])
 
 
-def _initial_state(p: SwingParameters, modes: Modes, wind: Wind, start_m: Vector) -> StateVector:
-    """State at the first picture: cone and nod, superposed on a canopy that drifts with the mean wind."""
-    line, line_rate = _cone_direction(p, modes, 1.0)
-    axis, axis_rate = _cone_direction(p, modes, modes.lander_tilt_ratio)
-    # a pendulum of any amplitude, its axis fixed to the cone: sin(angle / 2) and rate are in quadrature
+def _compute_initial_state(p: SwingParameters, modes: Modes, wind: Wind, start_m: Vector) -> StateVector:
+    """Compute the state at the first image: coning and nodding of a canopy that drifts with the mean wind."""
+    line, line_rate = _compute_cone_direction(p, modes, 1.0)
+    axis, axis_rate = _compute_cone_direction(p, modes, modes.lander_tilt_ratio)
+    # pendulum of any amplitude about an axis that moves with the cone: sin(angle / 2) and the rate are in quadrature
     phase, largest_rate = np.radians(p.nod_phase_deg), np.radians(p.nod_rate_deg_s)
     nod = 2.0 * np.arcsin(largest_rate / (2.0 * modes.nod_rad_s) * np.sin(phase))
     nod_rate = largest_rate * np.cos(phase)
     # axis of a tilt from nadir towards an azimuth: (0, 0, -1) x (sin a, cos a, 0)
     azimuth = np.radians(p.cone_direction_deg + p.nod_direction_deg)
     tilt_axis = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])
-    about = _perpendicular(tilt_axis, axis)
-    about_line = _perpendicular(about, line)
-    recoil = modes.canopy_recoil_m * nod_rate * np.cross(about, axis)
-    # with damped coning the canopy's fall is not exactly straight: r'' = (kappa - a) tilt, harmonic
-    lag = -2.0 * p.cone_damping_ratio * p.descent_rate_m_s / modes.cone_rad_s * line_rate * np.array([1.0, 1.0, 0.0])
-    axis_rotation = np.cross(axis, axis_rate) + nod_rate * about
-    line_rotation = np.cross(line, line_rate) + modes.line_recoil * nod_rate * about_line
-    axis = Rotation.from_rotvec(nod * about).apply(axis)
-    line = Rotation.from_rotvec(modes.line_recoil * nod * about_line).apply(line)
+    nod_axis = _perpendicular(tilt_axis, axis)
+    line_axis = _perpendicular(nod_axis, line)
+    recoil_velocity = modes.canopy_recoil_m * nod_rate * np.cross(nod_axis, axis)
+    # with damped coning the canopy oscillates: r'' = (kappa - a) tilt
+    coning_velocity = (
+        -2.0 * p.cone_damping_ratio * p.descent_rate_m_s / modes.cone_rad_s * line_rate * np.array([1.0, 1.0, 0.0])
+    )
+    axis_rotation = np.cross(axis, axis_rate) + nod_rate * nod_axis
+    line_rotation = np.cross(line, line_rate) + modes.line_recoil * nod_rate * line_axis
+    axis = Rotation.from_rotvec(nod * nod_axis).apply(axis)
+    line = Rotation.from_rotvec(modes.line_recoil * nod * line_axis).apply(line)
     canopy = start_m - p.line_length_m * line - p.arm_length_m * axis
     drift = wind.without_gusts.velocities(canopy[2:])[0]
-    # the smallest rotation from the body's downward axis to the lander's, after one about it by the heading
-    upright = Rotation.from_quat(np.append(np.cross(DOWN, axis), 1.0 + DOWN @ axis))
-    side = (upright * Rotation.from_rotvec(np.radians(p.heading_deg) * DOWN)).apply(np.array([1.0, 0.0, 0.0]))
+    # attitude: rotation by the heading about the downward axis, then the smallest rotation from there to the axis
+    tilt = Rotation.from_quat(np.append(np.cross(DOWN, axis), 1.0 + DOWN @ axis))
+    side = (tilt * Rotation.from_rotvec(np.radians(p.heading_deg) * DOWN)).apply(np.array([1.0, 0.0, 0.0]))
     return np.concatenate(
         [
             canopy,
-            drift + p.descent_rate_m_s * DOWN + recoil + lag,
+            drift + p.descent_rate_m_s * DOWN + recoil_velocity + coning_velocity,
             line,
             np.cross(line_rotation, line),
             axis,
@@ -416,16 +423,17 @@ def _initial_state(p: SwingParameters, modes: Modes, wind: Wind, start_m: Vector
     )
 
 
-def _cone_direction(p: SwingParameters, modes: Modes, tilt_ratio: float) -> tuple[Vector, Vector]:
-    """Direction, and its rate of change, of the line at the first picture; its tilt is scaled by a ratio.
+def _compute_cone_direction(p: SwingParameters, modes: Modes, tilt_ratio: float) -> tuple[Vector, Vector]:
+    """Compute the line's direction at the first image and its rate of change; the tilt is multiplied by a ratio.
 
-    The line is a spherical pendulum between its largest and smallest tilt, of cosines z_0 and z_1. With angular
-    frequency w_0 of small swings, angular momentum Lz about the vertical per moment of inertia, and z = cos(tilt),
+    The line is a spherical pendulum between its largest and smallest tilt, tilt_0 and tilt_1, with the cosines z_0 and
+    z_1. With the angular frequency w_0 of small swings, the angular momentum Lz about the vertical divided by the
+    moment of inertia, and z = cos(tilt),
 
         z'^2 = 2 w_0^2 (z - z_0) (z_1 - z) (z - z_2),   z_2 = -(1 + z_0 z_1) / (z_0 + z_1),
         Lz^2 = 2 w_0^2 sin^2(tilt_0) sin^2(tilt_1) / (z_0 + z_1)
 
-    (Landau & Lifshitz, Mechanics, 14). The phase is that of the ellipse of small swings.
+    (Landau & Lifshitz, Mechanics, 14). The phase is the parameter of the ellipse of small swings.
     """
     if p.cone_angle_deg == 0.0:
         return DOWN, np.zeros(3)
@@ -435,23 +443,23 @@ def _cone_direction(p: SwingParameters, modes: Modes, tilt_ratio: float) -> tupl
     major = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
     minor = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])
     offset = largest * np.cos(phase) * major + smallest * np.sin(phase) * minor
-    # not zero: no floating-point phase has a cosine of zero
+    # the tilt is never zero, because no floating-point phase has a cosine of exactly zero
     tilt = float(np.linalg.norm(offset))
-    outwards = offset / tilt
-    azimuthal = np.cross(DOWN, outwards)
+    outward = offset / tilt
+    tangent = np.cross(DOWN, outward)
     z0, z1, z = np.cos(largest), np.cos(smallest), np.cos(tilt)
     above_z0 = 2.0 * (np.sin(0.5 * largest) ** 2 - np.sin(0.5 * tilt) ** 2)
     below_z1 = 2.0 * (np.sin(0.5 * tilt) ** 2 - np.sin(0.5 * smallest) ** 2)
-    level = (above_z0 * below_z1) * (z + (1.0 + z0 * z1) / (z0 + z1))
-    tilt_rate = -np.sign(np.sin(2.0 * phase)) * modes.cone_rad_s * np.sqrt(2.0 * max(level, 0.0)) / np.sin(tilt)
+    product = (above_z0 * below_z1) * (z + (1.0 + z0 * z1) / (z0 + z1))
+    tilt_rate = -np.sign(np.sin(2.0 * phase)) * modes.cone_rad_s * np.sqrt(2.0 * max(product, 0.0)) / np.sin(tilt)
     azimuthal_speed = modes.cone_rad_s * np.sqrt(2.0 / (z0 + z1)) * np.sin(largest) * np.sin(smallest) / np.sin(tilt)
-    inclined = tilt_ratio * tilt
-    direction = np.sin(inclined) * outwards + np.cos(inclined) * DOWN
-    rate = tilt_ratio * tilt_rate * (np.cos(inclined) * outwards - np.sin(inclined) * DOWN)
-    return direction, rate + np.sin(inclined) / np.sin(tilt) * azimuthal_speed * azimuthal
+    scaled_tilt = tilt_ratio * tilt
+    direction = np.sin(scaled_tilt) * outward + np.cos(scaled_tilt) * DOWN
+    rate = tilt_ratio * tilt_rate * (np.cos(scaled_tilt) * outward - np.sin(scaled_tilt) * DOWN)
+    return direction, rate + np.sin(scaled_tilt) / np.sin(tilt) * azimuthal_speed * tangent
 
 
 def _perpendicular(vector: Vector, direction: Vector) -> Vector:
-    """Unit vector along the component of a vector perpendicular to a direction."""
+    """Return the unit vector along the component of a vector perpendicular to a direction."""
     component = vector - (vector @ direction) * direction
     return np.asarray(component / np.linalg.norm(component))

@@ -1,4 +1,4 @@
-"""True motion of a body: its state at an instant, at many instants, and over a span of time; wind."""
+"""True motion of a body: states at one or many instants, the interface `Trajectory`, a body at rest; and the wind."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.dynamics.kernels.swing import WindField, wind_profile
+from marsyard.sim.dynamics.kernels.swing import WindField, compute_wind_profile
 from marsyard.sim.frames import rigid
 from marsyard.sim.parameters import Parameters, Positive, bounded_field
 
@@ -26,7 +26,7 @@ class State:
     - position_m, velocity_m_s: of the body frame's origin, world axes
     - attitude: rotation from body to world axes
     - body_rate_rad_s: angular velocity relative to the world, body axes
-    - specific_force_m_s2: acceleration less gravity at the body's origin, body axes; an ideal accelerometer's reading
+    - specific_force_m_s2: acceleration minus gravity at the body's origin, body axes: an ideal accelerometer's output
     """
 
     time_s: float
@@ -38,7 +38,7 @@ class State:
 
     @property
     def world_from_body(self) -> RigidTransform:
-        """Pose of the body."""
+        """Pose of the body in the world."""
         return rigid(self.attitude, self.position_m)
 
 
@@ -62,13 +62,13 @@ class Motion:
         body_rates_rad_s: Vectors,
         gravity_m_s2: float,
     ) -> Motion:
-        """Motion from position, velocity and acceleration in world axes."""
+        """Create the motion from `derivatives`: position, velocity and acceleration in world axes."""
         positions, velocities, accelerations = derivatives
         forces = attitudes.inv().apply(accelerations + np.array([0.0, 0.0, gravity_m_s2]))
         return cls(times_s, positions, velocities, attitudes, body_rates_rad_s, forces)
 
     def state(self, row: int) -> State:
-        """True state at one of the instants."""
+        """Return the true state of one row."""
         position, velocity, attitude = self.positions_m[row], self.velocities_m_s[row], self.attitudes[row]
         rate, force = self.body_rates_rad_s[row], self.specific_forces_m_s2[row]
         return State(float(self.times_s[row]), position, velocity, attitude, rate, force)
@@ -76,18 +76,18 @@ class Motion:
 
 @runtime_checkable
 class Trajectory(Protocol):
-    """A consistent motion: velocity, body rate and specific force are derivatives of position and attitude."""
+    """Interface of a true motion, whose velocity, rate and specific force are derivatives of position and attitude."""
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """First and last time at which the motion is defined; infinite for a motion given by a formula."""
+        """First and last time at which the motion is defined; can be infinite."""
 
     def state(self, time_s: float) -> State:
-        """True state at a time. Raises ValueError outside of the span."""
+        """Compute the true state at a time. Raises ValueError for a time outside the span."""
         return self.motion(np.array([time_s])).state(0)
 
     def motion(self, times_s: Times) -> Motion:
-        """True states at many times. Raises ValueError outside of the span."""
+        """Compute the true states at many times. Raises ValueError for times outside the span."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,11 @@ class Resting(Trajectory):
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """All times."""
+        """First and last time: the motion is defined at all times."""
         return -np.inf, np.inf
 
     def motion(self, times_s: Times) -> Motion:
-        """True states at many times."""
+        """Return the state at rest for each time."""
         count = times_s.size
         zeros = np.zeros((count, 3))
         forces = np.tile(self.attitude.inv().apply(np.array([0.0, 0.0, self.gravity_m_s2])), (count, 1))
@@ -113,7 +113,7 @@ class Resting(Trajectory):
 
 
 def check_times(times_s: Times, span_s: tuple[float, float], tolerance_s: float = 0.0) -> None:
-    """Raises ValueError for a time outside of a span."""
+    """Raise ValueError for a time outside a span."""
     first, last = span_s
     outside = times_s[(times_s < first - tolerance_s) | (times_s > last + tolerance_s)]
     if outside.size:
@@ -121,7 +121,7 @@ def check_times(times_s: Times, span_s: tuple[float, float], tolerance_s: float 
 
 
 def attitudes_and_body_rates(angles_rad: Vectors, rates_rad_s: Vectors) -> tuple[Rotation, Vectors]:
-    """Attitudes, and angular velocities in body axes, from Euler angles (yaw, pitch, roll) and their rates.
+    """Convert Euler angles (yaw, pitch, roll) and their rates to attitudes and angular velocities in body axes.
 
     The rotation sequence is yaw about z, pitch about the new y axis, roll about the new x axis.
     """
@@ -135,15 +135,16 @@ def attitudes_and_body_rates(angles_rad: Vectors, rates_rad_s: Vectors) -> tuple
     return Rotation.from_euler("ZYX", angles_rad), np.stack(rates, axis=-1)
 
 
-#: Shortest gusts, m: two diameters of the canopy, which responds to the mean over its own width.
+#: Shortest wavelength of the gusts: two diameters of the canopy, over which shorter gusts average out.
 SHORTEST_WAVE_M = 30.0
-#: Longest gusts over the gusts' length scale: longer ones belong to the mean wind, which has its own parameters.
+#: Longest wavelength of the gusts in units of their length scale; longer waves are part of the mean wind.
 LONGEST_WAVE_SCALES = 20.0
+#: Number of waves of the gusts.
 WAVES = 24
 
 
 class WindParameters(Parameters):
-    """Mean wind above the boundary layer, profile of the layer, and gusts."""
+    """Parameters of the wind: mean wind above the boundary layer, profile within the layer, and gusts."""
 
     wind_east_m_s: Annotated[float, bounded_field(-60.0, 60.0, "mean wind to the east")] = 0.0
     wind_north_m_s: Annotated[float, bounded_field(-60.0, 60.0, "mean wind to the north")] = 0.0
@@ -157,25 +158,28 @@ class WindParameters(Parameters):
 
 @dataclass(frozen=True)
 class Wind:
-    """Wind as a smooth function of height alone: frozen turbulence, the same at all times and horizontal positions.
+    """Mean wind and gusts as a function of height only: the same at all times and horizontal positions.
 
-    The mean wind is constant above the boundary layer and logarithmic in it, ``ln(1 + h / roughness)``, zero on the
-    ground. Gusts have Dryden's spectra (MIL-F-8785C, 3.7.2) along a vertical path: upward gusts the longitudinal one,
-    ``2 sigma^2 L / pi / (1 + (L k)^2)``, the others the transverse one, ``sigma^2 L / pi (1 + 3 (L k)^2) / (1 + (L
-    k)^2)^2``, k in rad/m, between the longest and the shortest wave; sigma^2 is the variance in that band. They are
-    sums of waves with normal amplitudes (Rice 1944), evenly spaced in log k, each k drawn within its interval.
+    Mean wind at the height h above ground: the wind of `WindParameters` times ``ln(1 + h / z0) / ln(1 + H / z0)``, with
+    the roughness z0 and the depth H of the boundary layer; constant above H.
+
+    Gusts: Dryden's spectra (MIL-F-8785C, 3.7.2) for the wavenumber k in rad/m along a vertical path, with the length
+    scale L. Vertical gusts have the longitudinal spectrum ``2 sigma^2 L / pi / (1 + (L k)^2)``, horizontal gusts the
+    transverse one ``sigma^2 L / pi (1 + 3 (L k)^2) / (1 + (L k)^2)^2``. k is limited to wavelengths from
+    `SHORTEST_WAVE_M` to `LONGEST_WAVE_SCALES` L; sigma^2 is the variance in this band. The gusts are sums of `WAVES`
+    waves with normal amplitudes (Rice 1944); each k is drawn within one of `WAVES` equal intervals of log k.
     """
 
     field: WindField
 
     @classmethod
     def draw(cls, parameters: WindParameters, ground_height_m: float, rng: np.random.Generator) -> Wind:
-        """Draw the gusts over ground at a height of the world's z."""
+        """Draw the gusts; `ground_height_m` is the world z of the ground."""
         p = parameters
         longest_m = LONGEST_WAVE_SCALES * p.gust_length_m
         edges = np.geomspace(2.0 * np.pi / longest_m, 2.0 * np.pi / SHORTEST_WAVE_M, WAVES + 1)
         wavenumbers = edges[:-1] * (edges[1:] / edges[:-1]) ** rng.random(WAVES)
-        # integrals of the transverse and the longitudinal spectrum between wavenumbers, x = L k
+        # integrals of the transverse and the longitudinal spectrum over each interval, with x = L k
         x = p.gust_length_m * edges
         transverse = np.diff(2.0 * np.arctan(x) - x / (1.0 + x**2)) / np.pi
         longitudinal = np.diff(2.0 * np.arctan(x)) / np.pi
@@ -195,9 +199,9 @@ class Wind:
 
     @property
     def without_gusts(self) -> Wind:
-        """The mean wind alone."""
+        """The same mean wind without gusts."""
         return Wind(self.field._replace(waves=np.zeros((0, 7))))
 
     def velocities(self, heights_m: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
-        """Wind towards east, north and up, m/s, at heights of the world's z, metres."""
-        return np.asarray(wind_profile(heights_m, self.field))
+        """Compute the wind towards east, north and up, m/s, at heights (world z, metres)."""
+        return np.asarray(compute_wind_profile(heights_m, self.field))

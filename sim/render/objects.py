@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.sim.dynamics.rover import RoverParameters, Stance, bogie_pivots, wheel_centres
+from marsyard.sim.dynamics.rover import RoverParameters, Stance, compute_bogie_pivots, compute_wheel_centres
 from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render.kernels.hierarchy import Hierarchy, body_spheres, morton_codes, node_boxes, select_facing
 
@@ -182,8 +182,8 @@ def rover_objects(
         _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m)),
         _rod((x, y, rover.deck_m), (x, y, z + mast.elbow_m[2]), _MAST_RADIUS_M),
     ]
-    centres = wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
-    for side, bogie in enumerate(bogie_pivots(rover, stance.differential_rad)):
+    centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
+    for side, bogie in enumerate(compute_bogie_pivots(rover, stance.differential_rad)):
         front, middle, rear = centres[3 * side : 3 * side + 3]
         rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
         legs = ((rocker, front), (rocker, bogie), (bogie, middle), (bogie, rear))
@@ -213,8 +213,8 @@ def rover_sphere(
 
     Joints rotate about axes, so no part is farther away than the sum of the links that carry it.
     """
-    front, middle, rear = wheel_centres(rover, 0.0, (0.0, 0.0))[:3]
-    bogie = bogie_pivots(rover, 0.0)[0]
+    front, middle, rear = compute_wheel_centres(rover, 0.0, (0.0, 0.0))[:3]
+    bogie = compute_bogie_pivots(rover, 0.0)[0]
     rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
     wheel = rover.wheel_radius_m + 0.5 * rover.wheel_width_m + _LEG_M
     behind = _length(bogie - rocker) + max(_length(middle - bogie), _length(rear - bogie))

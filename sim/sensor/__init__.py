@@ -1,4 +1,4 @@
-"""Instrument models: measurements of the true state with errors."""
+"""Instrument models: cameras, inertial and navigation sensors that measure the true state with errors."""
 
 from marsyard.sim.sensor.detector import AutoExposure, AutoExposureParameters, Detector, DetectorParameters, auto_expose
 from marsyard.sim.sensor.imu import Imu, ImuIncrements, ImuParameters, WarmUp

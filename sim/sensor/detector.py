@@ -1,8 +1,8 @@
 """Frame-transfer CCD: radiance to counts, with noise, smear, defects, bursts and 8-bit companding; auto-exposure.
 
-Companding: the step size of the table grows with the square root of the count, as shot noise does. The table is
-``code = round(a (sqrt(count + b) - sqrt(b)))`` with ``a = 2 sqrt(b)``: the smallest step is one count. b follows from
-code 255 at full scale. Every code is used. A code is expanded to the centre of its range of counts.
+Companding compresses counts to 8-bit codes with steps that grow with the square root of the count, as shot noise does:
+``code = round(a (sqrt(count + b) - sqrt(b)))`` with ``a = 2 sqrt(b)``, so that the smallest step is one count. b is
+chosen such that full scale has code 255. A code is expanded to the centre of its range of counts.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ class DefectParameters(Parameters):
     hot_fraction: Annotated[Fraction, Field(description="fraction of hot pixels")] = 0.0
     hot_e_s: Annotated[NonNegative, Field(description="mean dark current of a hot pixel at 0 deg C, e/s")] = 20000.0
     dead_fraction: Annotated[Fraction, Field(description="fraction of pixels without response")] = 0.0
-    listed: Annotated[bool, Field(description="whether the camera interpolates them by a list")] = False
+    listed: Annotated[bool, Field(description="whether the camera has a list of them and interpolates them")] = False
 
 
 class BurstParameters(Parameters):
     """Bursts of noise on the cable during the readout; none by default."""
 
-    bursts: Annotated[NonNegative, Field(le=1e4, description="mean number of bursts in a picture")] = 0.0
+    bursts: Annotated[NonNegative, Field(le=1e4, description="mean number of bursts in an image")] = 0.0
     length_px: Annotated[float, Field(gt=0.0, le=1e7, description="mean length of a burst, delivered pixels")] = 2000.0
     amplitude_dn: Annotated[NonNegative, Field(description="RMS of the noise in a burst, counts")] = 300.0
 
@@ -62,8 +62,8 @@ class DetectorParameters(Parameters):
     responsivity_e_s: Annotated[Positive, Field(description="electrons/s on axis at radiance factor 1")] = 1.019e7
     sun_au: Annotated[float, Field(gt=0.1, le=100.0, description="distance of the sun for this responsivity, AU")] = 1.5
     rows_summed: Annotated[int, Field(ge=1, le=16, description="rows summed on the chip")] = 4
-    transfer_row_s: Annotated[NonNegative, Field(description="time under each row during the transfer, s")] = 5.0e-6
-    clear_row_s: Annotated[NonNegative, Field(description="time under each row during the clearing, s")] = 1.0e-6
+    transfer_row_s: Annotated[NonNegative, Field(description="time per row during the transfer, s")] = 5.0e-6
+    clear_row_s: Annotated[NonNegative, Field(description="time per row during the clearing, s")] = 1.0e-6
     readout_row_s: Annotated[NonNegative, Field(description="time to read out a delivered row, s")] = 5.3e-3
     full_well_e: Annotated[Positive, Field(description="full well, electrons")] = 170000.0
     gain_e_dn: Annotated[Positive, Field(description="electrons per count")] = 41.5
@@ -75,14 +75,14 @@ class DetectorParameters(Parameters):
     dark_doubling_c: Annotated[float, Field(gt=0.0, le=50.0, description="temperature rise for doubling, deg C")] = 6.0
     response_spread: Annotated[_RelativeError, Field(description="RMS of the pixels' relative response")] = 0.01
     calibration_error: Annotated[_RelativeError, Field(description="RMS error of the calibrated response")] = 0.002
-    companded: Annotated[bool, Field(description="send counts as 8-bit square roots and expand them again")] = False
+    companded: Annotated[bool, Field(description="compress counts to 8 bits and expand them again")] = False
     optics: OpticsParameters = OpticsParameters()
     defects: DefectParameters = DefectParameters()
     bursts: BurstParameters = BurstParameters()
     file: Annotated[str | None, Field(description="datasheet that the values were read from")] = None
 
     def input_files(self) -> tuple[str, ...]:
-        """The datasheet that the values were read from."""
+        """Return the datasheet that the values were read from, if any."""
         return () if self.file is None else (self.file,)
 
     @property
@@ -97,7 +97,7 @@ class DetectorParameters(Parameters):
 
     @property
     def dark_growth(self) -> float:
-        """Dark current relative to 0 deg C."""
+        """Dark current at the detector's temperature / dark current at 0 deg C."""
         return float(2.0 ** (self.temperature_c / self.dark_doubling_c))
 
 
@@ -122,10 +122,10 @@ class AutoExposureParameters(Parameters):
 
 @dataclass(frozen=True)
 class Detector:
-    """A detector behind a lens with a fixed response; noise is drawn for each image.
+    """A detector with its lens: the response of the pixels is drawn once, the noise for each image.
 
     - response: relative response of each physical pixel, including natural fall-off, dust and dead pixels
-    - calibration: ground calibration, without dust, dead pixels and dark current
+    - calibration: calibration before flight, without dust, dead pixels and dark current
     - hot_e_s: excess dark current of each physical pixel at 0 deg C, electrons per second; None without hot pixels
     - listed: delivered pixels that are interpolated from neighbours; None without a list of bad pixels
     """
@@ -144,10 +144,10 @@ class Detector:
             raise ValueError(f"{rows} rows cannot be summed by {p.rows_summed}")
         response = fall_off * (1.0 + p.response_spread * rng.standard_normal(fall_off.shape, dtype=np.float32))
         delivered = _sum_rows(response, p.rows_summed) / p.rows_summed
-        measured = delivered * (1.0 + p.calibration_error * rng.standard_normal(delivered.shape))
+        measured_response = delivered * (1.0 + p.calibration_error * rng.standard_normal(delivered.shape))
         names = ("exposure_s", "transfer_row_s", "clear_row_s", "rows_summed", "offset_dn", "full_scale_dn")
         settings = {name: getattr(p, name) for name in names}
-        calibration = DetectorCalibration(flat_field=measured.astype(np.float64), **settings)
+        calibration = DetectorCalibration(flat_field=measured_response.astype(np.float64), **settings)
         bad, hot = np.zeros(fall_off.shape, dtype=np.bool_), None
         if p.defects.hot_fraction > 0.0:
             # the dark current of hot pixels is exponentially distributed
@@ -173,11 +173,11 @@ class Detector:
     def window(self, column: int, row: int, size: tuple[int, int]) -> Detector:
         """Return the part of the detector that a subframe reads: upper left pixel and size (columns, rows).
 
-        The pixel responses are those of the full detector. Smear comes from the rows of the subframe only: for each
-        column, about ``row * transfer_row_s / exposure_s`` of the mean radiance of the rows above the subframe is
-        missing, and the same of the rows below with `clear_row_s`. The result is exact for a detector without smear,
-        such as the XC-55. If smear is relevant, expose the full image and crop it. Raises ValueError if the subframe is
-        empty, extends beyond the detector or splits summed rows.
+        The pixel responses are those of the full detector. The smear includes only the rows of the subframe: the
+        smear of the rows above, about ``row * transfer_row_s / exposure_s`` of their mean radiance, is missing, and
+        likewise that of the rows below with `clear_row_s`. The result is exact for a detector without smear, such as
+        the XC-55. If smear is relevant, expose the full image and crop it. Raises ValueError if the subframe is empty,
+        extends beyond the detector or splits summed rows.
         """
         rows, columns = self.response.shape
         count = self.parameters.rows_summed
@@ -199,7 +199,7 @@ class Detector:
         """Simulate the counts of one exposure; `radiance` is the radiance factor of the scene at mid exposure."""
         p = self.parameters
         mean = _sum_rows(self.charge(radiance, motion), p.rows_summed) + self.dark_charge()
-        # the point spread kernel has negative weights: the mean may be negative next to a bright edge
+        # the point spread kernel has negative weights, so that the mean can be negative next to a bright edge
         electrons = rng.poisson(np.maximum(mean, 0.0)).astype(np.float32)
         electrons += np.float32(p.read_noise_e) * rng.standard_normal(electrons.shape, dtype=np.float32)
         np.minimum(electrons, np.float32(p.full_well_e), out=electrons)
@@ -219,9 +219,9 @@ class Detector:
     def charge(self, radiance: Image, motion: ImageMotion | None = None) -> Image:
         """Compute the mean photo charge in electrons of each physical pixel at the end of the transfer.
 
-        In addition to the exposure, a charge packet collects light from the rows that it passes: the rows after its
-        start row during the clearing before the exposure, and the rows before its start row on the way to the storage
-        area. Each row has the radiance at the time when the packet passes it.
+        In addition to the exposure, a charge packet collects light in the rows that it passes: in the rows after its
+        own row during the clearing before the exposure, and in the rows before its own row during the transfer to the
+        storage area. The radiance of each row is that at the time when the packet passes it.
         """
         p = self.parameters
         scene = apply_point_spread(radiance, p.optics)
@@ -250,7 +250,7 @@ class Detector:
 
 
 def dark_seconds(parameters: DetectorParameters, rows: int) -> Float64[np.ndarray, "delivered_rows"]:
-    """Compute the integration time of dark current for each delivered row: exposure, transfer, and wait for readout."""
+    """Compute the integration time of the dark current of each delivered row: exposure, transfer, wait for readout."""
     waits = parameters.readout_row_s * np.arange(rows // parameters.rows_summed, dtype=np.float64)
     return np.asarray(waits + parameters.exposure_s + rows * parameters.transfer_row_s)
 
@@ -261,21 +261,21 @@ def _sum_rows(image: Float[np.ndarray, "rows columns"], count: int) -> Float[np.
 
 
 def fill_bad_pixels(counts: Counts, bad: Bool[np.ndarray, "rows columns"]) -> Counts:
-    """Replace bad pixels by the mean of the good pixels among the eight neighbours; keep them if there are none."""
-    good = np.where(bad, 0.0, 1.0)
-    total, fraction = (uniform_filter(values, 3, mode="constant") for values in (good * counts, good))
-    # both are means over nine pixels: with one good neighbour the fraction is 1/9
-    fillable = bad & (fraction > 0.5 / 9.0)
-    repaired = counts.copy()
-    repaired[fillable] = np.rint(total[fillable] / fraction[fillable]).astype(np.uint16)
-    return repaired
+    """Replace bad pixels by the mean of the good pixels among the eight neighbours; no change if there are none."""
+    weights = np.where(bad, 0.0, 1.0)
+    mean_counts, mean_weights = (uniform_filter(values, 3, mode="constant") for values in (weights * counts, weights))
+    # means over nine pixels: with one good neighbour the mean weight is 1/9
+    is_fillable = bad & (mean_weights > 0.5 / 9.0)
+    filled = counts.copy()
+    filled[is_fillable] = np.rint(mean_counts[is_fillable] / mean_weights[is_fillable]).astype(np.uint16)
+    return filled
 
 
 @cache
 def compression_table(full_scale_dn: int) -> UInt8[np.ndarray, "counts"]:
-    """Return the code of every count. Raises ValueError if the full scale is below 255."""
+    """Compute the companding code of every count. Raises ValueError if the full scale is below 255."""
     if full_scale_dn < CODES - 1:
-        raise ValueError(f"counts up to {full_scale_dn} need no companding; allowed: {CODES - 1} or more")
+        raise ValueError(f"the full scale of companded counts is {full_scale_dn}; allowed: {CODES - 1} or more")
     if full_scale_dn == CODES - 1:
         return np.arange(CODES, dtype=np.uint8)
     b = brentq(lambda x: 2.0 * (np.sqrt(x * (full_scale_dn + x)) - x) - (CODES - 1), 1e-3, 1e12)
@@ -287,7 +287,7 @@ def compression_table(full_scale_dn: int) -> UInt8[np.ndarray, "counts"]:
 
 @cache
 def expansion_table(full_scale_dn: int) -> UInt16[np.ndarray, "codes"]:
-    """Return the count of every code."""
+    """Compute the expanded count of every code."""
     table = compression_table(full_scale_dn)
     first = np.searchsorted(table, np.arange(CODES), side="left")
     last = np.searchsorted(table, np.arange(CODES), side="right") - 1
@@ -297,12 +297,12 @@ def expansion_table(full_scale_dn: int) -> UInt16[np.ndarray, "codes"]:
 
 
 def compand(counts: Counts, full_scale_dn: int) -> UInt8[np.ndarray, "rows columns"]:
-    """Compress counts to 8-bit codes."""
+    """Compress counts to 8-bit codes (`compression_table`)."""
     return np.asarray(compression_table(full_scale_dn)[counts])
 
 
 def expand(codes: UInt8[np.ndarray, "rows columns"], full_scale_dn: int) -> Counts:
-    """Expand 8-bit codes to counts."""
+    """Expand 8-bit codes to counts (`expansion_table`)."""
     return np.asarray(expansion_table(full_scale_dn)[codes])
 
 
@@ -330,12 +330,12 @@ def auto_expose(
 ) -> AutoExposure:
     """Expose test images and scale the exposure time until the image has the target brightness.
 
-    - detector: the first test image has its exposure time
+    - detector: its exposure time is that of the first test image
     - rng: random generator for the noise of the test images
     - region: rows and columns of the delivered image in which the percentile is computed; all by default
 
-    The factor on the exposure time is 1/8 to 8, and a quarter if the counts saturate. Raises ValueError if the region
-    is empty.
+    Each test image changes the exposure time by a factor from 1/8 to 8, or by 1/4 if the counts saturate. Raises
+    ValueError if the region is empty.
     """
     exposures: list[float] = []
     p = detector.parameters

@@ -3,9 +3,9 @@
 The world frame is treated as inertial: the rotation of the planet, which flight software compensates, is neglected in
 motion and measurement. The unit is at the origin of the body frame, with parallel axes.
 
-The sensors are sampled much faster than the increments are delivered: an angle increment is the exact rotation vector
-between two sample boundaries (coning included). A velocity increment is the integral of specific force in the body axes
-at the start of the interval (sculling included).
+The increments are ideal integrals, as if the sensors were sampled much faster than the increments are delivered. An
+angle increment is the exact rotation vector between two sample boundaries (coning included). A velocity increment is
+the integral of specific force in the body axes at the start of the interval (sculling included).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Times
 
 STANDARD_GRAVITY_M_S2 = 9.80665  #: Standard gravity, the unit of accelerometer specifications.
-MILLI_G = 1e-3 * STANDARD_GRAVITY_M_S2
-DEG_H = np.radians(1.0) / 3600.0
-DEG_SQRT_H = np.radians(1.0) / 60.0
+MILLI_G = 1e-3 * STANDARD_GRAVITY_M_S2  #: 1 mg in m/s2.
+DEG_H = np.radians(1.0) / 3600.0  #: 1 deg/h in rad/s.
+DEG_SQRT_H = np.radians(1.0) / 60.0  #: 1 deg/sqrt(h) in rad/sqrt(s).
 Vector = Float64[np.ndarray, "3"]
 Vectors = Float64[np.ndarray, "n 3"]
 Boundaries = Float64[np.ndarray, "m"]
@@ -34,7 +34,7 @@ Quaternions = Float64[np.ndarray, "n 4"]  #: In the order x, y, z, w.
 
 
 class WarmUp(Parameters):
-    """Temperature of the unit minus the calibration temperature: zero, then an exponential approach to `change_k`."""
+    """Temperature of the unit minus that of its calibration: zero until `start_s`, then exponentially to `change_k`."""
 
     start_s: Annotated[float, Field(description="time at which the change begins, s")] = 0.0
     change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="final change, K")] = 0.0
@@ -46,7 +46,7 @@ class WarmUp(Parameters):
 
 
 class ImuParameters(Parameters):
-    """An inertial measurement unit of the class of Litton's LN-200; spreads are one standard deviation per axis.
+    """Parameters of an inertial measurement unit like Litton's LN-200; errors are standard deviations per axis.
 
     Bias repeatability (1 deg/h to 3 deg/h, 0.2 mg to 1 mg), bias instability in operation (0.35 deg/h over 100 s,
     0.05 mg over 60 s), random walk, scale factors (100 ppm, 300 ppm) and misalignment: LN-200 data sheet, Northrop
@@ -74,8 +74,8 @@ class ImuParameters(Parameters):
     clock: ClockParameters = ClockParameters(offset_sd_s=0.0002, jitter_sd_s=0.00002)
 
 
-#: A small quartz or silicon unit of a 2 m helicopter; assumed (the landing paper uses Inertial Science's ISIS, without
-#: error values). The gyro bias is the residual after zeroing on the ground.
+#: A small quartz or silicon unit for a 2 m helicopter. All values are assumed: the landing paper uses Inertial
+#: Science's ISIS and contains no error values. The gyro bias is the residual after zeroing on the ground.
 SMALL_UNIT = ImuParameters(
     rate_hz=100.0, gyro_bias_deg_h=60.0, gyro_wander_deg_h=20.0, gyro_bias_deg_h_k=0.0,
     angular_random_walk_deg_sqrt_h=2.0, gyro_scale_ppm=1000.0, gyro_misalignment_mrad=1.0, gyro_count_rad=2.0**-19,
@@ -95,7 +95,7 @@ class Triad:
     - scale: relative errors of the scale factors
     - misalignment: cross-axis sensitivity of each sensor (row) to the axes (columns), radians; zero diagonal
     - random_walk: random walk coefficient, unit/sqrt(s)
-    - count: resolution, unit; 0 for no rounding
+    - count: resolution, unit; 0: no rounding
     """
 
     bias: Vector
@@ -117,12 +117,12 @@ class Triad:
         thermal = self.warm_up.temperature_k(times_s)[:, None] * self.bias_per_k
         return np.asarray(self.bias + thermal + self.wander.at(times_s))
 
-    def measure(self, true: Vectors, boundaries_s: Boundaries, rng: np.random.Generator) -> Vectors:
-        """Measure true increments between m = n + 1 boundaries; rounding residuals are added to the next increment."""
+    def measure(self, increments: Vectors, boundaries_s: Boundaries, rng: np.random.Generator) -> Vectors:
+        """Measure n true increments between n + 1 boundaries; rounding residuals are added to the next increment."""
         steps = np.diff(boundaries_s)[:, None]
-        noise = self.random_walk * np.sqrt(steps) * rng.standard_normal(true.shape)
+        noise = self.random_walk * np.sqrt(steps) * rng.standard_normal(increments.shape)
         bias = self.bias_at(0.5 * (boundaries_s[1:] + boundaries_s[:-1])) * steps
-        measured: Vectors = true + true @ self.sensitivity_error.T + bias + noise
+        measured: Vectors = increments + increments @ self.sensitivity_error.T + bias + noise
         if self.count == 0.0:
             return measured
         counts = np.rint(np.cumsum(measured, axis=0) / self.count)
@@ -147,7 +147,7 @@ class ImuIncrements:
 
 @dataclass(frozen=True)
 class Imu:
-    """An inertial unit with errors drawn for a time span; noise is drawn with the increments."""
+    """An inertial unit with drawn errors, which are valid in a time span; noise is drawn with the increments."""
 
     parameters: ImuParameters
     gyro: Triad
@@ -159,7 +159,9 @@ class Imu:
         """Draw the errors for use within a time span."""
         p = parameters
 
-        def draw(sensor: str, biases: tuple[float, ...], wander_s: float, random_walk: float, count: float) -> Triad:
+        def draw_triad(
+            sensor: str, biases: tuple[float, ...], wander_s: float, random_walk: float, count: float
+        ) -> Triad:
             """Draw the errors of three sensors; `biases`: constant bias, bias change per K, and wander, SI units."""
             bias, per_k, wander = biases
             return Triad(
@@ -175,12 +177,13 @@ class Imu:
                 count=count,
             )
 
-        rates = (p.gyro_bias_deg_h * DEG_H, p.gyro_bias_deg_h_k * DEG_H, p.gyro_wander_deg_h * DEG_H)
-        gyro = draw("gyro", rates, p.gyro_wander_s, p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H, p.gyro_count_rad)
-        forces = (p.accelerometer_bias_mg, p.accelerometer_bias_mg_k, p.accelerometer_wander_mg)
+        biases = (p.gyro_bias_deg_h * DEG_H, p.gyro_bias_deg_h_k * DEG_H, p.gyro_wander_deg_h * DEG_H)
+        walk = p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H
+        gyro = draw_triad("gyro", biases, p.gyro_wander_s, walk, p.gyro_count_rad)
+        biases_mg = (p.accelerometer_bias_mg, p.accelerometer_bias_mg_k, p.accelerometer_wander_mg)
+        biases = (biases_mg[0] * MILLI_G, biases_mg[1] * MILLI_G, biases_mg[2] * MILLI_G)
         walk = 1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G
-        biases = tuple(force * MILLI_G for force in forces)
-        accelerometer = draw("accelerometer", biases, p.accelerometer_wander_s, walk, p.accelerometer_count_m_s)
+        accelerometer = draw_triad("accelerometer", biases, p.accelerometer_wander_s, walk, p.accelerometer_count_m_s)
         return cls(parameters, gyro, accelerometer, Clock.draw(p.clock, rng))
 
     def boundaries(self, start_s: float, end_s: float) -> Boundaries:
@@ -193,7 +196,7 @@ class Imu:
     def increments(
         self, trajectory: Trajectory, start_s: float, end_s: float, rng: np.random.Generator
     ) -> ImuIncrements:
-        """Measure a trajectory from start to end, both true times within the drawn time span."""
+        """Measure a trajectory from start to end; both are true times within the time span of the drawn errors."""
         boundaries = self.boundaries(start_s, end_s)
         angles, velocities = true_increments(trajectory, boundaries)
         return ImuIncrements(
@@ -205,7 +208,7 @@ class Imu:
 
 
 def true_increments(trajectory: Trajectory, boundaries_s: Boundaries) -> tuple[Vectors, Vectors]:
-    """Compute rotation vectors and velocity increments between boundaries, body axes at the start of each interval.
+    """Compute the true rotation vector and velocity increment of each interval, body axes at the interval's start.
 
     Specific force is integrated in world axes as a cubic spline through the boundaries. For a frequency f the relative
     error is of the order of (2 pi f step)^4 / 720: 1e-9 for a pitch oscillation of 1 Hz at 400 samples per second.
@@ -231,7 +234,7 @@ def multiply_quaternions(left: Quaternions, right: Quaternions) -> Quaternions:
 def accumulate_quaternions(steps: Quaternions) -> Quaternions:
     """Compute the products of the first 1, 2, ... n quaternions; each step multiplies from the right.
 
-    Recursion: products of pairs give every second cumulative product; one more product each gives the others.
+    Recursion: the cumulative products of pairs are every second result; the others require one more product each.
     """
     count = len(steps)
     if count == 1:

@@ -1,15 +1,15 @@
 """On-board inertial navigation: strapdown propagation, and navigation errors at the start of the descent.
 
 `InertialSolution` propagates attitude and velocity from the increments of an inertial unit. `Approach` propagates only
-the errors, along a nominal profile, from the last star reference through spinning cruise, entry and parachute phase to
-the descent, in steps that resolve the spin:
+the errors of a nominal flight: from the last attitude measurement by stars (the star reference) through spinning
+cruise, entry and parachute phase to the start of the descent. The steps resolve the spin:
 
     d(attitude)/dt = R (bias + sensitivity error x body rate) + noise
     d(velocity)/dt = attitude x (R f) + R (bias + sensitivity error x f) + noise
 
-R is the nominal attitude and f the nominal specific force; both errors are in world axes, to first order (Titterton and
-Weston, Strapdown Inertial Navigation Technology, ch. 12). The effect of the errors on gravity is neglected. The unit
-has the same sensor errors as in the descent.
+R is the nominal attitude and f the nominal specific force. Both errors are in world axes, to first order (Titterton and
+Weston, Strapdown Inertial Navigation Technology, ch. 12). The effect of the errors on gravity is neglected. The sensor
+errors are the same as in the descent.
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ class InertialSolution:
         attitudes = Rotation.from_quat(accumulate_quaternions(np.concatenate([attitude.as_quat()[None], steps])))
         gravity = np.array([0.0, 0.0, -gravity_m_s2])
         delta_velocities = attitudes[:-1].apply(increments.delta_velocities_m_s) + gravity * increments.period_s
-        velocities = velocity_m_s + _running_sums(delta_velocities)
+        velocities = velocity_m_s + _cumulative_sums(delta_velocities)
         delta_positions = 0.5 * (velocities[1:] + velocities[:-1]) * increments.period_s
-        return cls(increments, attitudes, velocities, _running_sums(delta_positions))
+        return cls(increments, attitudes, velocities, _cumulative_sums(delta_positions))
 
     def attitude(self, times_s: Times) -> Rotation:
         """Interpolate attitudes at time tags with a constant rate between samples."""
@@ -101,37 +101,37 @@ class InertialSolution:
                 f"requested times {times_s.min():.4f} s to {times_s.max():.4f} s are outside the navigation solution, "
                 f"{tags[0]:.4f} s to {tags[-1]:.4f} s"
             )
-        # of equal tags, use the last, so that no interval has zero length
+        # if several tags are equal, the last one is used, so that no interval has zero length
         interval = np.minimum(np.searchsorted(tags, times_s, side="right"), tags.size - 1) - 1
         length = np.maximum(tags[interval + 1] - tags[interval], np.finfo(float).tiny)
         return interval, np.minimum((times_s - tags[interval]) / length, 1.0)
 
 
-def _running_sums(steps: Vectors) -> Float64[np.ndarray, "m 3"]:
+def _cumulative_sums(steps: Vectors) -> Float64[np.ndarray, "m 3"]:
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 class ApproachParameters(Parameters):
-    """Approach from the last star reference to the descent. Defaults: nominal times and speeds of the MER landings.
+    """Parameters of the flight from the last star reference to the descent, by default of the MER landings.
 
-    Times and speeds: Desai and Knocke (2007), rounded. Assumed: the errors of the star reference, and the
-    scale factor error of the spin-axis gyro after calibration against the stars in cruise.
+    Nominal times and speeds: Desai and Knocke (2007), rounded. Assumed: the errors of the star reference, and the
+    scale factor error of the spin-axis gyro after its calibration against the stars during cruise.
     """
 
     attitude_sd_deg: Annotated[NonNegative, Field(description="attitude error at the reference per axis, deg")] = 0.05
     velocity_sd_m_s: Annotated[NonNegative, Field(description="velocity error at the reference per axis, m/s")] = 1.0
     spin_scale_ppm: Annotated[NonNegative, Field(description="scale factor error of the spin gyro, ppm")] = 100.0
-    cruise_s: Annotated[NonNegative, Field(le=20000.0, description="from the star reference to entry, s")] = 900.0
-    entry_s: Annotated[Positive, Field(le=2000.0, description="from entry to parachute deployment, s")] = 240.0
-    parachute_s: Annotated[Positive, Field(le=2000.0, description="from deployment to the descent's start, s")] = 80.0
+    cruise_s: Annotated[NonNegative, Field(le=20000.0, description="time from star reference to entry, s")] = 900.0
+    entry_s: Annotated[Positive, Field(le=2000.0, description="time from entry to parachute deployment, s")] = 240.0
+    parachute_s: Annotated[Positive, Field(le=2000.0, description="time from deployment to the descent, s")] = 80.0
     spin_rpm: Annotated[float, Field(ge=-10.0, le=10.0, description="spin until deployment, rpm")] = 2.0
     heading_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="azimuth of the velocity at entry")] = 80.0
     entry_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="nadir angle at entry, deg")] = 78.0
     deploy_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="nadir angle at deployment, deg")] = 62.0
-    upright_s: Annotated[Positive, Field(description="from deployment until the body is upright, s")] = 30.0
+    upright_s: Annotated[Positive, Field(description="time from deployment until the body is upright, s")] = 30.0
     entry_delta_v_m_s: Annotated[Positive, Field(description="velocity change from entry to deployment, m/s")] = 5000.0
     parachute_delta_v_m_s: Annotated[NonNegative, Field(description="velocity change under the parachute, m/s")] = 340.0
-    inflation_s: Annotated[Positive, Field(description="time constant of this change, s")] = 8.0
+    inflation_s: Annotated[Positive, Field(description="time constant of this velocity change, s")] = 8.0
     gravity_m_s2: Annotated[NonNegative, Field(description="local gravity, m/s2")] = 3.71
 
     @property
@@ -159,7 +159,7 @@ class Approach:
         return replace(imu, gyro=replace(imu.gyro, scale=scale))
 
     def errors(self, imu: Imu, rng: np.random.Generator) -> NavigationErrors:
-        """Propagate the navigation errors to the descent's start; the unit's time span must include the approach."""
+        """Propagate the navigation errors to the start of the descent; the unit's time span must include the flight."""
         p = self.parameters
         count = int(np.ceil(p.duration_s * STEPS_PER_S))
         step = p.duration_s / count
@@ -177,14 +177,14 @@ class Approach:
         return NavigationErrors(attitude_rad=attitude[-1], velocity_m_s=velocity)
 
     def attitudes(self, times_s: Times) -> Rotation:
-        """Compute nominal rotations from body to world axes: body -z along the velocity, spinning about it."""
+        """Compute nominal rotations from body to world axes: body -z along the velocity, with spin about this axis."""
         pitch = Rotation.from_rotvec(np.interp(times_s, *self._pitch_profile())[:, None] * self._pitch_axis())
         spin = Rotation.from_rotvec(self._spin_angle(times_s)[:, None] * np.array([0.0, 0.0, 1.0]))
         return Rotation.from_quat(multiply_quaternions(pitch.as_quat(), spin.as_quat()))
 
     def body_rates(self, times_s: Times) -> Vectors:
         """Compute nominal angular velocities, body axes, rad/s."""
-        # the pitch axis is fixed in the world and rotates in the body with the spin
+        # the pitch axis is fixed in world axes and rotates with the spin in body axes
         times, angles = self._pitch_profile()
         knot_rates = np.concatenate([[0.0], np.diff(angles) / np.diff(times), [0.0]])
         pitch_rates = knot_rates[np.searchsorted(times, times_s, side="right")]
@@ -213,7 +213,7 @@ class Approach:
         return np.asarray(self._spin_rate() * (np.minimum(times_s, self._deploy_s()) - self.start_s))
 
     def _pitch_axis(self) -> Vector:
-        # a rotation about this axis tilts nadir towards the heading a: (0, 0, -1) x (sin a, cos a, 0)
+        # a rotation about this axis tilts nadir towards the heading a; axis = (0, 0, -1) x (sin a, cos a, 0)
         heading = np.radians(self.parameters.heading_deg)
         return np.array([np.cos(heading), -np.sin(heading), 0.0])
 

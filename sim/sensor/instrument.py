@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline
 
 from marsyard.sim.parameters import Parameters
 
-#: Knots per correlation time. Linear interpolation between them loses at most 1 % of the variance.
+#: Knots per correlation time. Linear interpolation between knots reduces the variance by at most 1 %.
 KNOTS_PER_CORRELATION = 50
 _Deviation = Annotated[float, Field(ge=0.0, le=10.0)]
 Times = Float64[np.ndarray, "n"]  #: One time per row, seconds.

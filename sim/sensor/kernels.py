@@ -1,8 +1,8 @@
 """Compiled kernels for the exposure of a moving scene: motion blur, and smear during the charge transfer.
 
 The scene is the radiance at mid exposure, extended by `pad` rows and columns beyond each border. The image velocity
-(rows and columns per second) is defined on a coarse grid. A point at x at time t was at x - velocity * t at mid
-exposure. Velocity is constant within tiles of `TILE` x `TILE` pixels.
+(rows and columns per second) is defined on a coarse grid. A point that is at pixel x at time t after mid exposure was
+at x - velocity * t at mid exposure. The velocity is constant within tiles of `TILE` x `TILE` pixels.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def interpolate_velocity(field: Array, step: float, row: float, column: float) -
 
 
 @njit(cache=True)
-def _cubic_weights(f: float, weights: Array) -> None:
+def _write_cubic_weights(f: float, weights: Array) -> None:
     """Write the weights of samples -1, 0, 1, 2 for 0 <= f < 1: cubic convolution (Keys 1981, a = -1/2)."""
     weights[0] = ((-0.5 * f + 1.0) * f - 0.5) * f
     weights[1] = (1.5 * f - 2.5) * f * f + 1.0
@@ -68,7 +68,7 @@ def _cubic_weights(f: float, weights: Array) -> None:
 
 
 @njit(cache=True)
-def path_kernel(row_path: float, column_path: float, half_size: int, kernel: Array) -> None:
+def write_path_kernel(row_path: float, column_path: float, half_size: int, kernel: Array) -> None:
     """Write the convolution kernel that averages over a straight path centred on the pixel.
 
     - row_path, column_path: length of the path in rows and columns
@@ -82,8 +82,8 @@ def path_kernel(row_path: float, column_path: float, half_size: int, kernel: Arr
         fraction = (n + 0.5) / count - 0.5
         y, x = fraction * row_path, fraction * column_path
         i, j = math.floor(y), math.floor(x)
-        _cubic_weights(y - i, row_weights)
-        _cubic_weights(x - j, column_weights)
+        _write_cubic_weights(y - i, row_weights)
+        _write_cubic_weights(x - j, column_weights)
         for p in range(4):
             for q in range(4):
                 kernel[half_size + i + p - 1, half_size + j + q - 1] += row_weights[p] * column_weights[q] / count
@@ -107,9 +107,9 @@ def _find_tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
 
 @njit(cache=True)
 def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float, out: Array32) -> None:
-    """Average the moving scene over the exposure; `padded` is the scene at mid exposure.
+    """Average the moving scene over the exposure.
 
-    - padded, pad: scene with border, and width of the border; three more columns on the right
+    - padded, pad: scene at mid exposure with border, and width of the border; three more columns on the right
     - field, step: image velocity at grid nodes (rows and columns per second), and the grid spacing in pixels
     - out: output, shape of the scene without its border
     """
@@ -123,7 +123,7 @@ def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float
         for left in range(0, columns, TILE):
             width = min(TILE, columns - left)
             v_row, v_column = interpolate_velocity(field, step, 0.5 * (top + bottom - 1), left + 0.5 * (width - 1))
-            path_kernel(v_row * exposure_s, v_column * exposure_s, pad, kernel)
+            write_path_kernel(v_row * exposure_s, v_column * exposure_s, pad, kernel)
             count = _find_tap_groups(kernel, groups)
             for r in range(top, bottom):
                 line[:] = 0.0
@@ -194,7 +194,7 @@ def average_blocks(image: Array32, edges: NDArray[np.int64]) -> Array32:
 
 @njit(cache=True)
 def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Array32:
-    """Compute the charge that a packet collects during the transfer from each block edge, radiance x rows.
+    """Compute the charge of packets that start at the edges of blocks and pass all rows above, radiance x rows.
 
     A packet that starts at the upper edge of block R passes the centre of block K < R after the transfer time of
     (R - K - 1/2) blocks. Each block of the scene is sampled at that time.
@@ -229,8 +229,8 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
 def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
     """Add the charge that each packet collects during the transfer to `charge` (radiance x seconds, in place).
 
-    Within a block, the sums over previous blocks (`gather_blocks`) are interpolated linearly. The rows of the same
-    block are added one by one; they are sampled when half of the block has been transferred.
+    The charge from previous blocks (`gather_blocks`) is interpolated linearly between the edges of a block. The rows of
+    the same block are added one by one; they are sampled when half of the block has been transferred.
     """
     padded, pad, response, edges = transfer.padded, transfer.pad, transfer.response, transfer.edges
     columns = response.shape[1]

@@ -2,13 +2,13 @@
 
 Pointing. Each axis has a motor with an encoder, and gears with backlash b. The motor stops near the command; the
 encoder measures its angle in whole counts. The axis follows the motor within half the backlash (play operator:
-``axis = clip(axis, motor - b/2, motor + b/2)``): it lags by half the backlash after a long move, and does not move in a
-reversal shorter than the backlash. The true angle is the axis angle minus a zero error of the encoder that is constant
-in a run. Flight software receives the readings of the encoders.
+``axis = clip(axis, motor - b/2, motor + b/2)``): after a long move it lags by half the backlash, and in a reversal
+shorter than the backlash it does not move. The true angle is the axis angle minus a zero error of the encoder, which is
+constant in a run. Flight software receives the readings of the encoders.
 
-Calibration. The true cameras equal the design. The calibrated cameras differ by a common rotation of the pair on the
-head. In addition, each has half of a relative rotation (an error in disparity or perpendicular to the epipolar lines),
-a roll error and a focal length error.
+Calibration. The true cameras are those of the design. The calibrated cameras differ by a common rotation of the pair on
+the head. In addition, half of a relative rotation is applied to each camera (an error in disparity and perpendicular to
+the epipolar lines), and each camera has a roll error and a focal length error.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ MASTS = {"mer-navcam": MER_MAST, "research-navcam": RESEARCH_MAST, "research-pan
 
 
 class PointingParameters(Parameters):
-    """Pointing errors of a mast, the same for both axes; spreads are one standard deviation.
+    """Pointing errors of a mast, the same for both axes; zero error and settling error are standard deviations.
 
     Requested and measured angles differ by 0.0004 to 0.015 deg in the labels of two Opportunity navcam images;
     the other values are assumed.
@@ -65,7 +65,7 @@ class PointingParameters(Parameters):
 
 
 class StereoCalibrationParameters(Parameters):
-    """Calibration errors of a stereo pair; spreads are one standard deviation."""
+    """Calibration errors of a stereo pair; all except the disparity error are standard deviations."""
 
     disparity_error_px: Annotated[Pixels, Field(description="limit of the uniform disparity error, px")] = 0.5
     epipolar_error_px: Annotated[Pixels, Field(description="perpendicular to the epipolar lines, px")] = 0.2
@@ -76,7 +76,7 @@ class StereoCalibrationParameters(Parameters):
 
 @dataclass(frozen=True)
 class MastState:
-    """Pointing of a mast.
+    """Pointing of a mast at one time.
 
     - readings_rad, true_rad: encoder readings and true angles; azimuth and elevation
     - axes_rad, motors_rad: angles of both axes and both motors, without the zero errors of the encoders
@@ -107,7 +107,7 @@ class Mast:
 
     @property
     def rest(self) -> MastState:
-        """State that points straight ahead, with the gears centred in the backlash."""
+        """State at azimuth and elevation zero, with the axes in the middle of the backlash."""
         return self._state(np.zeros(2), np.zeros(2))
 
     def point(self, state: MastState, azimuth_rad: float, elevation_rad: float, rng: np.random.Generator) -> MastState:
@@ -126,8 +126,8 @@ class Mast:
     def _state(self, motors_rad: Angles, axes_rad: Angles) -> MastState:
         count = np.radians(self.parameters.count_deg)
         readings = count * np.rint(motors_rad / count) if count > 0.0 else motors_rad
-        true = axes_rad - self.zeros_rad
-        measured_pair, true_pair = ((float(angles[0]), float(angles[1])) for angles in (readings, true))
+        true_angles = axes_rad - self.zeros_rad
+        measured_pair, true_pair = ((float(angles[0]), float(angles[1])) for angles in (readings, true_angles))
         return MastState(measured_pair, true_pair, axes_rad, motors_rad)
 
 
@@ -143,22 +143,22 @@ class StereoHead:
         """Draw the calibration errors of a pair."""
         disparity = p.disparity_error_px * rng.uniform(-1.0, 1.0)
         epipolar = p.epipolar_error_px * rng.standard_normal()
-        common = Rotation.from_rotvec(np.radians(p.alignment_deg) * rng.standard_normal(3))
+        alignment = Rotation.from_rotvec(np.radians(p.alignment_deg) * rng.standard_normal(3))
         rolls = np.radians(p.roll_deg) * rng.standard_normal(2)
         focal = 1.0 + p.focal_error * rng.standard_normal(2)
         cameras = []
         for camera, side, roll, scale in zip((design.left, design.right), (0.5, -0.5), rolls, focal, strict=True):
             # a rotation of the camera to the right moves the image to the left
             fx, fy = camera.focal_lengths
-            turn = camera.down * (-side * disparity / fx) + camera.right * (side * epipolar / fy) + camera.a * roll
-            rotation = Rotation.from_rotvec(turn)
-            # rotate about the centre of the camera
+            yaw, pitch = camera.down * (-side * disparity / fx), camera.right * (side * epipolar / fy)
+            rotation = Rotation.from_rotvec(yaw + pitch + camera.a * roll)
+            # rotate about the camera's centre of projection
             pose = rigid(rotation, camera.c - rotation.apply(camera.c.copy()))
-            cameras.append(camera.magnify(float(scale)).transform(pose).transform(rigid(common, np.zeros(3))))
+            cameras.append(camera.magnify(float(scale)).transform(pose).transform(rigid(alignment, np.zeros(3))))
         return cls(design, replace(design, left=cameras[0], right=cameras[1]))
 
     def disparity_error_px(self, range_m: float) -> float:
-        """Compute calibrated minus true disparity of a point at this range straight ahead of each pair."""
+        """Compute calibrated minus true disparity of a point at this range on the mean boresight of the pair."""
         disparities_px = []
         for mast in (self.calibrated, self.true):
             forward = mast.left.boresight() + mast.right.boresight()
@@ -174,7 +174,7 @@ _HEAD_FROM_DOWN = Rotation.from_matrix(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0
 def mount_on_head(
     left: CameraModel, right: CameraModel, baseline_m: float, toe_in_deg: float
 ) -> tuple[CameraModel, CameraModel]:
-    """Mount two cameras that look along -z on a head, as a stereo pair that looks forward with toe-in."""
+    """Mount two cameras that look along -z on a head, as a forward-looking stereo pair with toe-in."""
 
     def mount(camera: CameraModel, side: float) -> CameraModel:
         toe_in = Rotation.from_rotvec([0.0, 0.0, -side * np.radians(toe_in_deg)])

@@ -5,15 +5,15 @@ Attitude (Ali et al. 2005, as on MER). Accelerometers measure the tilt at each s
 rotation A makes the estimate exact at the start, so that B has an effect only when the rover turns or tilts. N is the
 noise of a stop. The heading error is the sum of a fraction of the turns, a drift along the path and a random walk.
 
-Position from wheel odometry. Each part of a drive adds the commanded path in estimated axes; slip is not observed:
+Position from wheel odometry. Each part of a drive adds the commanded path in estimated axes. Slip is not measured:
 ``dp = R_estimated ((1 + scale) path_commanded + noise)``.
 
 Position from visual odometry (paper, section 4.2: "roughly 2% of the rover travel distance"). Each drive adds the true
 motion with a separate scale error, a random walk and a constant noise; attitude comes from the inertial unit. If visual
 odometry does not converge, wheel odometry is used for that drive.
 
-Constant errors of a run are drawn once (`Odometer.draw`), the others with each drive. The estimate is exact at the
-start by definition. It assumes flat ground between stops: climbing over rocks is part of the slip.
+Constant errors of a run are drawn once (`Odometer.draw`), the other errors with each drive. The estimate is exact at
+the start by definition. It assumes flat ground between stops: climbing over rocks has the effect of slip.
 """
 
 from __future__ import annotations
@@ -36,36 +36,36 @@ Degrees = Annotated[float, Field(ge=0.0, le=30.0)]
 
 
 class VisualOdometryParameters(Parameters):
-    """Visual odometry; spreads are one standard deviation.
+    """Errors of visual odometry, standard deviations.
 
-    With the defaults the RMS position error is 2 % of the distance on 8 m (value of the paper; the split into constant
-    and random errors is assumed), and 3 % on 2 m.
+    With the defaults the RMS position error is 2 % of a distance of 8 m, as in the paper, and 3 % of 2 m. The split
+    into constant and random errors is assumed.
     """
 
     scale_error: Annotated[Fraction, Field(description="fraction of the distance, constant in a run")] = 0.015
-    walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis per root metre, m")] = 0.02
+    walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="random walk per axis, m/sqrt(m)")] = 0.02
     floor_m: Annotated[float, Field(ge=0.0, le=1.0, description="additional error per axis and drive, m")] = 0.002
     failure_fraction: Annotated[Fraction, Field(description="fraction of drives without convergence")] = 0.0
 
 
 class OdometryParameters(Parameters):
-    """Wheel odometry with an inertial unit, and optionally visual odometry; spreads are one standard deviation.
+    """Errors of wheel odometry with an inertial unit, and of visual odometry; standard deviations.
 
-    The unit is of the class of MER's LN-200; all values are assumed. On flat, hard ground the error is 1.1 % of 8 m.
-    Slip is not included: it is part of the motion (`marsyard.sim.dynamics.driving`).
+    The unit is similar to MER's LN-200; all values are assumed. On flat, hard ground the error is 1.1 % of 8 m.
+    Slip is not included: it is part of the true motion (`marsyard.sim.dynamics.driving`).
     """
 
     scale_error: Annotated[Fraction, Field(description="fraction of the path, constant (wheel radius)")] = 0.01
-    walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis per root metre, m")] = 0.01
+    walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="random walk per axis, m/sqrt(m)")] = 0.01
     heading_scale_error: Annotated[Fraction, Field(description="fraction of the turn, constant in a run")] = 0.002
     heading_drift_deg_m: Annotated[Degrees, Field(description="drift along the path, constant in a run, deg/m")] = 0.03
-    heading_walk_deg: Annotated[Degrees, Field(description="heading error per root metre of path, deg")] = 0.05
+    heading_walk_deg: Annotated[Degrees, Field(description="random walk of the heading, deg/sqrt(m)")] = 0.05
     misalignment_deg: Annotated[Degrees, Field(description="accelerometer misalignment per axis, constant")] = 0.1
     tilt_noise_deg: Annotated[Degrees, Field(description="pitch and roll noise at each stop")] = 0.03
     visual: VisualOdometryParameters = VisualOdometryParameters()
 
 
-#: Odometry without sensor errors: the only error is slip, which visual odometry measures.
+#: Odometry without sensor errors: the only error of wheel odometry is slip, and visual odometry has no error.
 EXACT = OdometryParameters(
     scale_error=0.0, walk_m=0.0, heading_scale_error=0.0, heading_drift_deg_m=0.0, heading_walk_deg=0.0,
     misalignment_deg=0.0, tilt_noise_deg=0.0,
@@ -77,7 +77,7 @@ EXACT = OdometryParameters(
 class PoseEstimate:
     """The rover's estimate of its pose at a stop.
 
-    - heading_error_rad: true error of the estimated heading, positive to the left; not known to flight software
+    - heading_error_rad: estimated minus true heading, positive to the left; not available to flight software
     - visual_failed: whether visual odometry was used in the last drive and did not converge
     """
 
@@ -97,7 +97,7 @@ class Odometer:
     - start: the initial pose, known exactly
     - wheel_scale, visual_scale, heading_scale: relative errors of wheel path, visual odometry path and turns
     - heading_drift_rad_m: heading drift along the path, positive to the left
-    - misalignment: B in the equation of the module
+    - misalignment: rotation B of the module's equation
     """
 
     parameters: OdometryParameters
@@ -134,34 +134,35 @@ class Odometer:
         """Update the estimate after a drive, with or without visual odometry, with the same number of draws."""
         p = self.parameters
         wheels, walk, *tilt = np.split(rng.standard_normal(8), [2, 3, 5])
-        fails = bool(rng.random() < p.visual.failure_fraction)
-        if visual and not fails:
+        has_failed = bool(rng.random() < p.visual.failure_fraction)
+        if visual and not has_failed:
             start, end = drive.start.world_from_rover, drive.end.world_from_rover
             error = np.hypot(p.visual.walk_m * np.sqrt(drive.length_m), p.visual.floor_m) * tilt[1]
             path = (1.0 + self.visual_scale) * (start.inv() * end).translation + error
-            displacement = self._attitude(start, estimate.heading_error_rad).apply(path)
+            displacement = self._estimate_attitude(start, estimate.heading_error_rad).apply(path)
         else:
             noise_m = p.walk_m * np.sqrt(drive.command.length_m) * wheels
-            displacement = self._wheel_displacement(estimate, drive, noise_m)
+            displacement = self._compute_wheel_displacement(estimate, drive, noise_m)
         heading = estimate.heading_error_rad + self.heading_scale * drive.turn_left_rad
         heading += self.heading_drift_rad_m * drive.length_m
         heading += float(np.radians(p.heading_walk_deg) * np.sqrt(drive.length_m) * walk[0])
         noise = Rotation.from_rotvec(np.radians(p.tilt_noise_deg) * np.array([*tilt[0], 0.0]))
-        attitude = self._attitude(drive.end.world_from_rover, heading) * noise
+        attitude = self._estimate_attitude(drive.end.world_from_rover, heading) * noise
         return PoseEstimate(
-            rigid(attitude, estimate.world_from_rover.translation + displacement), heading, visual and fails
+            rigid(attitude, estimate.world_from_rover.translation + displacement), heading, visual and has_failed
         )
 
     @cached_property
-    def _anchor(self) -> Rotation:
-        """A in the equation of the module."""
+    def _start_correction(self) -> Rotation:
+        """Rotation A of the module's equation, which makes the estimate exact at the start."""
         return self.start.rotation * (self.start.rotation * self.misalignment).inv()
 
-    def _attitude(self, true: RigidTransform, heading_error_rad: float) -> Rotation:
+    def _estimate_attitude(self, true: RigidTransform, heading_error_rad: float) -> Rotation:
         """Compute the estimated attitude without the noise of a stop."""
-        return Rotation.from_rotvec([0.0, 0.0, heading_error_rad]) * self._anchor * true.rotation * self.misalignment
+        heading_error = Rotation.from_rotvec([0.0, 0.0, heading_error_rad]) * self._start_correction
+        return heading_error * true.rotation * self.misalignment
 
-    def _wheel_displacement(
+    def _compute_wheel_displacement(
         self, estimate: PoseEstimate, drive: Drive, noise_m: Float64[np.ndarray, "2"]
     ) -> Float64[np.ndarray, "3"]:
         """Compute the displacement from the wheel path and the turns of the gyros, world axes."""
@@ -171,6 +172,6 @@ class Odometer:
             forward_m, left_m = scale * part.command.forward_m, scale * part.command.left_m
             path[:2] = DriveCommand(forward_m, left_m, part.turn_left_rad).displacement_m
         paths[:, :2] += noise_m / len(paths)
-        true = Rotation.concatenate([part.before.world_from_rover.rotation for part in drive.parts])
-        heading_error = Rotation.from_rotvec([0.0, 0.0, estimate.heading_error_rad]) * self._anchor
-        return np.asarray((heading_error * true * self.misalignment).apply(paths).sum(axis=0))
+        true_attitudes = Rotation.concatenate([part.before.world_from_rover.rotation for part in drive.parts])
+        heading_error = Rotation.from_rotvec([0.0, 0.0, estimate.heading_error_rad]) * self._start_correction
+        return np.asarray((heading_error * true_attitudes * self.misalignment).apply(paths).sum(axis=0))

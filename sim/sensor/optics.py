@@ -8,11 +8,11 @@ The sun is a black body of 5772 K with its nominal radius (IAU 2015 Resolution B
 1100 nm the difference from the measured spectrum is a few per cent, less than the uncertainty of quantum efficiency and
 lens transmission. The calibrated transmission of the lens absorbs the difference.
 
-Calibration: the field-test paper (section III.B) gives the signal-to-noise ratio (SNR) on the darkest terrain, and the
-fraction of the noise due to dark current, at -34, 0 and +23 deg C. Two constants are fitted: `LENS_TRANSMISSION`
+Calibration: the field-test paper (section III.B) reports the signal-to-noise ratio (SNR) on the darkest terrain, and
+the fraction of the noise due to dark current, at -34, 0 and +23 deg C. Two constants are fitted: `LENS_TRANSMISSION`
 (signal) and `DARK_E_S` (dark current). The fraction is 1 - SNR / (SNR without dark current), averaged over the image
 rows, which have different readout delays. From 0 to 23 deg C a dark current that doubles every 6 deg C grows by a
-factor of 14.3, the fraction in the paper by 9.1. `DARK_E_S` is a compromise: both fractions have the same error.
+factor of 14.3, but the fraction in the paper by 9.1. `DARK_E_S` is chosen such that both fractions have equal errors.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor.imu import Vector
 from marsyard.sim.sensor.kernels import Transfer, add_smear, average_blocks, blur, cumulative_row_sums, gather_blocks
 
-_PLANCK, _LIGHT, _BOLTZMANN = 6.62607015e-34, 2.99792458e8, 1.380649e-23
+#: Planck constant, speed of light and Boltzmann constant, SI units.
+_PLANCK, _SPEED_OF_LIGHT, _BOLTZMANN = 6.62607015e-34, 2.99792458e8, 1.380649e-23
 _SUN_K, _SUN_RADIUS_M, _AU_M = 5772.0, 6.957e8, 1.495978707e11
 
-#: Calibrated: signal for an SNR of 103 without dark current at `DARKEST_RADIANCE_FACTOR`; window and losses included.
+#: Calibrated for an SNR of 103 without dark current at `DARKEST_RADIANCE_FACTOR`; includes window and other losses.
 LENS_TRANSMISSION = 0.519
 DARK_E_S = 159.0  #: Calibrated: dark current of a 12 um pixel at 0 deg C, electrons per second (0.018 nA/cm2).
 DARKEST_RADIANCE_FACTOR = 0.07  #: Radiance factor of the darkest terrain: albedo 0.1 under an afternoon sun.
@@ -44,13 +45,13 @@ DARKEST_RADIANCE_FACTOR = 0.07  #: Radiance factor of the darkest terrain: albed
 #: both surfaces: 1.44 mm of NG4 in flight, 1.35 mm of NG3 in the field test.
 NG4_FLIGHT, NG3_FIELD = 0.67, 0.97
 #: Assumed: relative change of a neutral glass' density per 100 nm. The filters then have the
-#: transmissions in the paper, 22 % and 11 % (a flat density would give 21.4 % and 10.7 %).
+#: transmissions in the paper, 22 % and 11 % (21.4 % and 10.7 % with a constant density).
 DENSITY_SLOPE_PER_100_NM = -0.085
 
 #: Assumed: quantum efficiency of a front-illuminated silicon CCD.
 _QE_NM = np.arange(400.0, 1101.0, 50.0)
 _QE = np.array([15.0, 22.0, 28.0, 33.0, 38.0, 42.0, 43.0, 40.0, 34.0, 27.0, 19.0, 11.0, 5.0, 2.0, 0.0]) / 100.0
-#: Default exposure: radiance factor 0.3 gives 60 % of the full well.
+#: Default exposure: at the radiance factor 0.3 a pixel collects 60 % of the full well.
 BRIGHT_RADIANCE_FACTOR, BRIGHT_FILL = 0.3, 0.6
 KERNEL_HALF_SIZE_PX = 6  #: Half size of the point spread kernel, pixels.
 Image = Float32[np.ndarray, "rows columns"]
@@ -61,13 +62,13 @@ Spectrum = Float64[np.ndarray, "n"]  #: One value per wavelength.
 
 
 def bright_exposure_s(full_well_e: float, responsivity_e_s: float) -> float:
-    """Compute the default exposure time, s."""
+    """Compute the default exposure time from `BRIGHT_FILL` and `BRIGHT_RADIANCE_FACTOR`, s."""
     return BRIGHT_FILL * full_well_e / (BRIGHT_RADIANCE_FACTOR * responsivity_e_s)
 
 
 @dataclass(frozen=True)
 class LightPath:
-    """The light path from the sun to a pixel's electrons.
+    """Parameters of the light path from the sun to the electrons of a pixel.
 
     - band_nm: first and last wavelength of the passband
     - neutral_density: optical density of the filter in front of the lens, or None
@@ -96,7 +97,7 @@ class LightPath:
         return 1e-3 * float(np.average(wavelength_nm, weights=electrons)) * self.f_number / self.pixel_pitch_um
 
     def _filtered_electrons(self) -> tuple[Spectrum, Spectrum]:
-        """Return wavelengths and electrons per second, m2 and nm at 1 AU behind the filter, without the lens."""
+        """Return wavelengths, and electrons per second, m2 and nm behind the filter without the lens at 1 AU."""
         wavelength_nm = np.linspace(*self.band_nm, 281)
         if self.quantum_efficiency is None:
             efficiency = np.interp(wavelength_nm, _QE_NM, _QE)
@@ -113,8 +114,8 @@ class LightPath:
 def solar_photons(wavelength_nm: Spectrum) -> Spectrum:
     """Compute the photons of sunlight per second, m2 and nm at 1 AU."""
     wavelength = wavelength_nm * 1e-9
-    occupation = 1.0 / np.expm1(_PLANCK * _LIGHT / (wavelength * _BOLTZMANN * _SUN_K))
-    photons: Spectrum = 2.0 * np.pi * _LIGHT / wavelength**4 * occupation
+    occupation = 1.0 / np.expm1(_PLANCK * _SPEED_OF_LIGHT / (wavelength * _BOLTZMANN * _SUN_K))
+    photons: Spectrum = 2.0 * np.pi * _SPEED_OF_LIGHT / wavelength**4 * occupation
     return photons * (_SUN_RADIUS_M / _AU_M) ** 2 * 1e-9
 
 
@@ -122,11 +123,11 @@ class OpticsParameters(Parameters):
     """Point spread and dust. Defaults: an f/12 lens at 700 nm on 12 um pixels, without dust."""
 
     diffraction_px: Annotated[NonNegative, Field(le=5.0, description="wavelength x f-number / pitch; 0: none")] = 0.70
-    diffusion_px: Annotated[NonNegative, Field(le=5.0, description="RMS charge diffusion, pixels (assumed)")] = 0.25
-    pixel_aperture: Annotated[bool, Field(description="average over pixels; not for area-sampled renderings")] = False
-    defocus_px: Annotated[NonNegative, Field(le=10.0, description="diameter of the defocused image of a point")] = 0.0
+    diffusion_px: Annotated[NonNegative, Field(le=5.0, description="RMS charge diffusion, px (assumed)")] = 0.25
+    pixel_aperture: Annotated[bool, Field(description="average over pixels; only for point-sampled scenes")] = False
+    defocus_px: Annotated[NonNegative, Field(le=10.0, description="diameter of a defocused point, px")] = 0.0
     stray_light: Annotated[float, Field(ge=0.0, le=0.5, description="fraction of the light spread evenly")] = 0.0
-    dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
+    dust_discs: Annotated[int, Field(ge=0, le=1000, description="number of specks of dust on the lens")] = 0
     dust_depth: Annotated[float, Field(ge=0.0, le=1.0, description="fraction of the light absorbed by a speck")] = 0.3
     dust_radius_px: Annotated[float, Field(gt=0.0, le=1000.0, description="mean shadow radius, px; +- 1/3")] = 25.0
     dust_softness: Annotated[float, Field(gt=0.0, le=1.0, description="half width of the edge / radius")] = 0.5
@@ -136,11 +137,11 @@ class OpticsParameters(Parameters):
 def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
     """Compute the line spread function: weights of the neighbouring pixels along a row or column, with sum 1.
 
-    The Fourier series of the weights is the modulation transfer function up to the Nyquist frequency: the product of a
-    diffraction-limited circular pupil, 2/pi (acos s - s sqrt(1 - s^2)) with s = frequency x wavelength x f-number
-    (Goodman, Introduction to Fourier Optics, 6.4), of diffusion, exp(-2 (pi sigma f)^2), of defocus, 2 J1(x) / x with
-    x = pi d f for a uniform disc of diameter d, and optionally of the pixel aperture, sinc(f). Rows and columns are
-    treated as separable, which is an approximation for a round pupil.
+    The Fourier series of the weights is the modulation transfer function up to the Nyquist frequency. It is the product
+    of the functions of a diffraction-limited circular pupil, 2/pi (acos s - s sqrt(1 - s^2)) with s = frequency x
+    wavelength x f-number (Goodman, Introduction to Fourier Optics, 6.4), of diffusion, exp(-2 (pi sigma f)^2), of
+    defocus, 2 J1(x) / x with x = pi d f for a uniform disc of diameter d, and optionally of the pixel aperture,
+    sinc(f). Rows and columns are treated as separable, which is an approximation for a round pupil.
     """
     frequency = np.linspace(0.0, 0.5, 513)
     transfer = np.exp(-2.0 * (np.pi * parameters.diffusion_px * frequency) ** 2)
@@ -176,10 +177,10 @@ def apply_point_spread(radiance: Image, parameters: OpticsParameters) -> Image:
 def natural_fall_off(camera: CameraModel) -> Image:
     """Compute the relative brightness of each pixel behind an unvignetted lens, 1 at the brightest.
 
-    It is proportional to the pixel's solid angle and to the projected area of the entrance pupil: ``dOmega cos(q
-    theta)``, theta being the angle from the optical axis. For a fixed pupil q is 1: for a perspective lens the product
-    is the fourth power of the cosine. The pupil of a fisheye (CAHVORE) tilts towards the ray (Kumler & Bauer 2000,
-    Proc. SPIE 4093), so that the image is not dark at 90 deg: q is `PUPIL_FRACTION`.
+    The brightness is proportional to the pixel's solid angle dOmega and to the projected area of the entrance pupil:
+    ``dOmega cos(q theta)`` with the angle theta from the optical axis. For a fixed pupil q is 1; for a perspective lens
+    the product is then the fourth power of the cosine. The pupil of a fisheye (CAHVORE) tilts towards the ray (Kumler &
+    Bauer 2000, Proc. SPIE 4093), so that the image is not dark at 90 deg; q is `PUPIL_FRACTION`.
     """
     _origins, directions = camera.rays(camera.pixel_grid())
     down, right = np.gradient(directions, axis=(0, 1), edge_order=2)
@@ -210,7 +211,7 @@ def dust_transmission(shape: tuple[int, int], parameters: OpticsParameters, rng:
 GRID_STEP_PX = 32.0  #: Spacing of the velocity grid's nodes, pixels.
 SKY_DISTANCE_M = 1e9  #: Distance assumed for pixels without range (the sky), metres.
 STILL_PX = 0.01  #: Maximum motion of an image that is treated as still, pixels.
-#: Motion within a block of rows of the transfer, pixels, and minimum and maximum number of rows in a block.
+#: Maximum motion during the transfer of a block of rows, pixels, and minimum and maximum number of rows in a block.
 BLOCK_PX, BLOCK_ROWS = 0.25, (4, 32)
 #: Padded scene, response, and charge (changed in place).
 _ExposureArrays = tuple[Float32[np.ndarray, "padded_rows padded_columns"], Image, Image]
@@ -218,7 +219,7 @@ _ExposureArrays = tuple[Float32[np.ndarray, "padded_rows padded_columns"], Image
 
 @dataclass(frozen=True)
 class ImageMotion:
-    """Image velocity over an image.
+    """Image velocity on a grid of pixels.
 
     `velocity_px_s` contains rows and columns per second at the nodes of a grid of at least 2 x 2. The first node is
     pixel (0, 0), the spacing is `GRID_STEP_PX`; the velocity is constant beyond the last node.
@@ -242,7 +243,7 @@ class ImageMotion:
         - velocity_m_s, rate_rad_s: velocity of the body's origin and its angular rate, world axes
         """
         rows, columns = range_m.shape
-        v, u = np.meshgrid(_nodes(rows), _nodes(columns), indexing="ij")
+        v, u = np.meshgrid(_grid_nodes(rows), _grid_nodes(columns), indexing="ij")
         origins, directions = camera.rays(np.stack([u, v], axis=-1))
         pixel = (np.minimum(v.astype(np.int64), rows - 1), np.minimum(u.astype(np.int64), columns - 1))
         distance = np.minimum(range_m[pixel].astype(np.float64), SKY_DISTANCE_M)
@@ -259,11 +260,11 @@ class ImageMotion:
         return float(np.hypot(*np.moveaxis(self.velocity_px_s, -1, 0)).max())
 
     def is_still(self, duration_s: float) -> bool:
-        """Whether all motion within `duration_s` is below `STILL_PX`."""
+        """Return whether all motion within `duration_s` is below `STILL_PX`."""
         return self.max_px_s * duration_s < STILL_PX
 
 
-def _nodes(extent: int) -> Float64[np.ndarray, "nodes"]:
+def _grid_nodes(extent: int) -> Float64[np.ndarray, "nodes"]:
     count = max(2, int(np.ceil((extent - 1) / GRID_STEP_PX)) + 1)
     return GRID_STEP_PX * np.arange(count, dtype=np.float64)
 
@@ -273,13 +274,13 @@ def moving_exposure(
 ) -> Image:
     """Compute the exposure of every pixel to a moving scene, including clearing and transfer, radiance x seconds.
 
-    The scene is constant beyond the image border. At 60 deg/s (4.9 pixels per exposure of the descent camera) the RMS
-    error is 1.2 % of the mean in the outermost pixels (Gusev from 2 km), 0.5 % in the next, and below 0.15 % from
-    the third pixel on, which is a seventh of the noise at SNR 100:1.
+    The scene is assumed constant beyond the image border. At 60 deg/s (4.9 pixels per exposure of the descent camera)
+    this causes an RMS error of 1.2 % of the mean in the outermost pixels (Gusev from 2 km), 0.5 % in the next pixels,
+    and less than 0.15 % from the third pixel on, which is a seventh of the noise at SNR 100:1.
 
     - scene: radiance at mid exposure
     - response: relative response of every pixel
-    - transfer_row_s, clear_row_s: time under each row during the transfer and the clearing
+    - transfer_row_s, clear_row_s: time per row during the transfer and the clearing
     """
     max_time_s = 0.5 * exposure_s + len(scene) * max(transfer_row_s, clear_row_s)
     pad = int(np.ceil(motion.max_px_s * max_time_s)) + 3
@@ -299,23 +300,23 @@ def moving_exposure(
 
 
 def _add_clearing(arrays: _ExposureArrays, motion: ImageMotion, start_s: float, row_s: float) -> None:
-    """Add the clearing: the transfer of the vertically flipped image with time running backwards."""
+    """Add the smear of the clearing, which equals the transfer of the vertically flipped image with reversed time."""
     padded, response, charge = arrays
     rows = len(response)
     # velocities at the nodes of the flipped image: flip and time reversal cancel for rows; columns change sign
-    positions = np.clip((rows - 1 - _nodes(rows)) / GRID_STEP_PX, 0.0, len(motion.velocity_px_s) - 1.0)
-    below = np.minimum(positions.astype(np.int64), len(motion.velocity_px_s) - 2)
-    fraction = (positions - below)[:, None, None]
-    flipped = (1.0 - fraction) * motion.velocity_px_s[below] + fraction * motion.velocity_px_s[below + 1]
-    backwards = ImageMotion(np.ascontiguousarray(flipped * np.array([1.0, -1.0])))
+    positions = np.clip((rows - 1 - _grid_nodes(rows)) / GRID_STEP_PX, 0.0, len(motion.velocity_px_s) - 1.0)
+    node = np.minimum(positions.astype(np.int64), len(motion.velocity_px_s) - 2)
+    fraction = (positions - node)[:, None, None]
+    flipped = (1.0 - fraction) * motion.velocity_px_s[node] + fraction * motion.velocity_px_s[node + 1]
+    reversed_motion = ImageMotion(np.ascontiguousarray(flipped * np.array([1.0, -1.0])))
     clearing_charge = np.zeros_like(charge)
     flipped_arrays = (np.ascontiguousarray(padded[::-1]), np.ascontiguousarray(response[::-1]), clearing_charge)
-    _add_smear(flipped_arrays, backwards, start_s, row_s)
+    _add_smear(flipped_arrays, reversed_motion, start_s, row_s)
     charge += clearing_charge[::-1]
 
 
 def _add_smear(arrays: _ExposureArrays, motion: ImageMotion, start_s: float, row_s: float) -> None:
-    """Add the charge that packets collect from the rows above; the transfer starts `start_s` after mid exposure."""
+    """Add the smear of the transfer, which starts `start_s` after mid exposure, to the charge."""
     padded, response, charge = arrays
     rows = len(response)
     block_rows = int(np.clip(BLOCK_PX / max(motion.max_px_s * row_s, 1e-12), *BLOCK_ROWS))

@@ -1,4 +1,4 @@
-"""Camera presets and datasheets: geometry and detector of the cameras in the papers, and custom cameras.
+"""Camera presets (geometry and detector of the cameras in the papers), detector datasheets, and custom cameras.
 
 A descent camera is defined in the body frame: at its origin, looking along -z, columns along +x. All other cameras are
 defined in the frame of the mast or rover: x forward, y left, z up, with its origin between the two cameras of a pair.
@@ -41,7 +41,7 @@ _MAX_BYTES = 1 << 20  #: Maximum size of a datasheet.
 
 @dataclass(frozen=True)
 class CameraDesign:
-    """Geometry of a camera or of a stereo pair.
+    """Design geometry of a camera or of a stereo pair, from which camera models are created.
 
     - size: (columns, rows)
     - radial: R of CAHVOR or CAHVORE
@@ -84,7 +84,7 @@ class CameraDesign:
 
 @dataclass(frozen=True)
 class Preset:
-    """A camera from the papers: geometry, light path and detector."""
+    """A camera or stereo pair of the papers: geometry, light path and detector."""
 
     design: CameraDesign
     light: LightPath
@@ -95,8 +95,8 @@ class Preset:
         return self.design.cameras()
 
 
-def _mer_preset(design: CameraDesign, light: LightPath, sun_au: float, **changes: float | int) -> Preset:
-    """Create a camera with the MER detector; the defaults of `DetectorParameters` are those of the descent camera."""
+def _create_mer_preset(design: CameraDesign, light: LightPath, sun_au: float, **changes: float | int) -> Preset:
+    """Create a camera with the MER detector: the defaults of `DetectorParameters` with these changes."""
     settings = {
         "responsivity_e_s": light.responsivity_e_s(sun_au),
         "sun_au": sun_au,
@@ -111,28 +111,28 @@ _FLIGHT_EXPOSURE_S = 0.004
 _DESCENT_BAND, _ROVER_BAND = (400.0, 1100.0), (600.0, 800.0)  #: Passbands (Maki et al. 2003), nm.
 
 
-def _mer_descent_flown() -> Preset:
+def _create_mer_descent_flown() -> Preset:
     light = LightPath(12.0, 12.0, _DESCENT_BAND, optics.NG4_FLIGHT)
-    return _mer_preset(_DESCENT, light, MARS_AU, exposure_s=_FLIGHT_EXPOSURE_S, temperature_c=-34.0)
+    return _create_mer_preset(_DESCENT, light, MARS_AU, exposure_s=_FLIGHT_EXPOSURE_S, temperature_c=-34.0)
 
 
-def _mer_descent_field() -> Preset:
-    """Create the camera on Earth, with the exposure time scaled to the same signal electrons as in flight."""
+def _create_mer_descent_field() -> Preset:
+    """Create the camera of the field test, with the exposure time scaled to the same signal electrons as in flight."""
     light = LightPath(12.0, 12.0, _DESCENT_BAND, optics.NG3_FIELD)
-    flight_responsivity = _mer_descent_flown().detector.responsivity_e_s
+    flight_responsivity = _create_mer_descent_flown().detector.responsivity_e_s
     exposure = _FLIGHT_EXPOSURE_S * flight_responsivity / light.responsivity_e_s(1.0)
-    return _mer_preset(_DESCENT, light, 1.0, exposure_s=exposure, temperature_c=0.0)
+    return _create_mer_preset(_DESCENT, light, 1.0, exposure_s=exposure, temperature_c=0.0)
 
 
-def _mer_rover(design: CameraDesign, f_number: float) -> Preset:
+def _create_mer_rover(design: CameraDesign, f_number: float) -> Preset:
     """Create a rover camera; rows are not summed, the temperature is assumed."""
     light = LightPath(f_number, design.pixel_pitch_um, _ROVER_BAND)
     exposure = bright_exposure_s(170000.0, light.responsivity_e_s(MARS_AU))
-    return _mer_preset(design, light, MARS_AU, exposure_s=exposure, temperature_c=-40.0, rows_summed=1)
+    return _create_mer_preset(design, light, MARS_AU, exposure_s=exposure, temperature_c=-40.0, rows_summed=1)
 
 
-def _interline_preset(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
-    """Create an interline CCD on Earth at +20 deg C, no smear; f/4, 700 nm, full well, noise, dark current: assumed."""
+def _create_interline_preset(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
+    """Create an interline CCD without smear, on Earth at +20 deg C. Assumed: f/4, passband, full well, noise, dark."""
     light = LightPath(4.0, design.pixel_pitch_um, (400.0, 700.0))
     responsivity = light.responsivity_e_s(1.0)
     detector = DetectorParameters(
@@ -156,18 +156,26 @@ def _interline_preset(design: CameraDesign, full_well_e: float, bits: int) -> Pr
 
 
 PRESETS: Mapping[str, Callable[[], Preset]] = {
-    "mer-descent-flown": _mer_descent_flown,
-    "mer-descent-field": _mer_descent_field,
-    "mer-navcam": partial(_mer_rover, CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0),
+    "mer-descent-flown": _create_mer_descent_flown,
+    "mer-descent-field": _create_mer_descent_field,
+    "mer-navcam": partial(
+        _create_mer_rover, CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0
+    ),
     # assumed: equidistant fisheye without distortion, with a fixed pupil
-    "mer-hazcam": partial(_mer_rover, CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0),
-    "research-navcam": partial(_interline_preset, CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10),
+    "mer-hazcam": partial(
+        _create_mer_rover, CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0
+    ),
+    "research-navcam": partial(
+        _create_interline_preset, CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10
+    ),
     # assumed: toe-in of the MER pancams; parallel cameras have a disparity of 516 px at 2 m
     "research-pancam": partial(
-        _interline_preset, CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10
+        _create_interline_preset, CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10
     ),
     # assumed: 6 mm lens, 43 deg, with some distortion
-    "xc-55": partial(_interline_preset, CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8),
+    "xc-55": partial(
+        _create_interline_preset, CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8
+    ),
 }
 
 
@@ -209,7 +217,7 @@ class Lens(Parameters):
 
 
 class Datasheet(Parameters):
-    """Values of a detector datasheet."""
+    """Values of a detector's datasheet and of its lens; they define `DetectorParameters`."""
 
     name: str = ""
     pixel_pitch_um: Annotated[float, Field(gt=0.1, le=100.0)]
@@ -247,12 +255,12 @@ class Datasheet(Parameters):
         return LightPath(lens.f_number, self.pixel_pitch_um, lens.band_nm, None, lens.transmission, curve)
 
     def parameters(self) -> DetectorParameters:
-        """Create the parameters of the simulated detector, which reads all pixels."""
+        """Create the parameters of the simulated detector, which reads out all pixels."""
         light = self.light()
         responsivity = light.responsivity_e_s(self.sun_au)
-        same_fields = {"sun_au", "transfer_row_s", "full_well_e", "read_noise_e", "bits", "dark_doubling_c"}
+        common_fields = {"sun_au", "transfer_row_s", "full_well_e", "read_noise_e", "bits", "dark_doubling_c"}
         return DetectorParameters(
-            **self.model_dump(include=same_fields),
+            **self.model_dump(include=common_fields),
             exposure_s=self.exposure_s or bright_exposure_s(self.full_well_e, responsivity),
             responsivity_e_s=responsivity,
             rows_summed=1,
@@ -324,7 +332,7 @@ class CustomCamera(Parameters):
 
     file: Annotated[str | None, Field(description="camera file that the model was read from")] = None
     number: Annotated[int, Field(ge=0, description="index of the camera in the file, from 0")] = 0
-    subframe_folded_in: Annotated[bool, Field(description="PDS: the model includes the subframe offset")] = False
+    subframe_folded_in: Annotated[bool, Field(description="accept PDS labels of subframes")] = False
     model: Annotated[Literal["CAHV", "CAHVOR", "CAHVORE"], Field(description="type of the model, read from the file")]
     columns: Annotated[int, Field(ge=16, le=16384)]
     rows: Annotated[int, Field(ge=16, le=16384)]
@@ -400,7 +408,7 @@ def _resolve_camera(settings: object) -> object:
 
 
 def _resolve_camera_or_preset(value: object) -> object:
-    """Return the name of a preset unchanged; read a camera file, whose path has a suffix or a folder."""
+    """Return the name of a preset unchanged; read the camera file if the text has a suffix or a folder."""
     return value if isinstance(value, str) and not Path(value).suffix and "/" not in value else _resolve_camera(value)
 
 

@@ -1,8 +1,8 @@
 """Ranging instruments: common errors, laser ranges along a ray, radar altimeter, and true height above ground.
 
-The radar measures the range to the nearest ground within a cone fixed to the body. The nearest point is the foot of the
-perpendicular over a slope, the nearest crest over relief, and at the edge of the beam if the tilt exceeds half the beam
-width. A fraction of the readings may come from the wider cone of the side lobes. Ground reflectivity is not modelled.
+The radar measures the range to the nearest ground point within a cone fixed to the body. On a slope this is the foot of
+the perpendicular, over relief a crest, and with a tilt of more than half the beam width a point at the beam's edge. A
+fraction of the readings can be from the wider cone of the side lobes. Ground reflectivity is not modelled.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from marsyard.sim.sensor.imu import Vector
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling, Times
 from marsyard.sim.terrain import Surface
 
-#: Pointing of an altimeter in body axes: down at the identity attitude, like the descent camera.
+#: Nominal direction of an altimeter in body axes: the optical axis of the descent camera.
 DOWN = np.array([0.0, 0.0, -1.0])
 MIN_POINTS = 64  #: Minimum number of points along a laser ray that are compared with the ground.
-#: Radar: step of the coarsest grid / height, refinement factor of each next grid, and number of grids.
-COARSEST_STEP, REFINEMENT, PASSES = 1.0 / 64.0, 5, 3
-#: Bound on nearer ground around a node: this value plus the slope at the node, times the step.
+#: Radar: step of the coarsest grid / height, ratio of successive steps, and number of grids.
+COARSEST_STEP, REFINEMENT, GRIDS = 1.0 / 64.0, 5, 3
+#: Ground around a node is nearer than the node by at most (this value + slope at the node) x step.
 RELIEF_PER_STEP = 0.2
 MAX_SLOPE = 3.0  #: Maximum slope of the ground in the radar's search.
 
@@ -38,12 +38,12 @@ _Degrees = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
 class RangingParameters(Parameters):
-    """Errors of a ranging instrument; fractions of the range are one standard deviation."""
+    """Parameters of a ranging instrument; errors are standard deviations."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 10.0
-    scale_error: Annotated[_Fraction, Field(description="fraction of the range, constant")] = 0.0
-    noise: Annotated[_Fraction, Field(description="fraction of the range, per reading")] = 0.0
-    noise_m: Annotated[_Metres, Field(description="independent of range, per reading, m")] = 0.0
+    scale_error: Annotated[_Fraction, Field(description="constant scale error, fraction of the range")] = 0.0
+    noise: Annotated[_Fraction, Field(description="noise per reading, fraction of the range")] = 0.0
+    noise_m: Annotated[_Metres, Field(description="noise per reading, independent of range, m")] = 0.0
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.0
     min_range_m: Annotated[float, Field(ge=0.0, description="minimum range, m")] = 0.0
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 5000.0
@@ -59,10 +59,10 @@ class RangingParameters(Parameters):
 
 
 class LaserParameters(RangingParameters):
-    """A laser altimeter. Defaults: a surveying laser on a small helicopter, assumed."""
+    """Parameters of a laser altimeter. Defaults: a surveying laser on a small helicopter, assumed."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 50.0
-    noise_m: Annotated[_Metres, Field(description="independent of range, per reading, m")] = 0.05
+    noise_m: Annotated[_Metres, Field(description="noise per reading, independent of range, m")] = 0.05
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.01
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 300.0
     beam_mrad: Annotated[float, Field(ge=0.0, le=50.0, description="full width of the beam, mrad")] = 0.0
@@ -71,16 +71,16 @@ class LaserParameters(RangingParameters):
 
 
 class RadarParameters(RangingParameters):
-    """A radar altimeter. Defaults: the MER descent, where 1 % of altitude is three standard deviations.
+    """Parameters of a radar altimeter. Defaults: the MER descent, with an error of 1 % of altitude (three sigma).
 
     Assumed: the split of the 1 % into a constant error and noise, beam, rate, rounding and time tags.
     """
 
     beam_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width of the beam, deg")] = 60.0
     sidelobe_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width with the side lobes, deg")] = 120.0
-    sidelobe_fraction: Annotated[Fraction, Field(description="readings of the side lobes instead of the beam")] = 0.0
-    scale_error: Annotated[_Fraction, Field(description="fraction of the range, constant")] = 0.003
-    noise: Annotated[_Fraction, Field(description="fraction of the range, per reading")] = 0.0015
+    sidelobe_fraction: Annotated[Fraction, Field(description="fraction of readings from the side lobes")] = 0.0
+    scale_error: Annotated[_Fraction, Field(description="constant scale error, fraction of the range")] = 0.003
+    noise: Annotated[_Fraction, Field(description="noise per reading, fraction of the range")] = 0.0015
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.3
     min_range_m: Annotated[float, Field(ge=0.0, description="minimum range, m")] = 5.0
     clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.001)
@@ -90,8 +90,8 @@ class RadarParameters(RangingParameters):
 class RangingUnit:
     """A ranging instrument with its constant errors.
 
-    - scale: noise-free ratio of measured to true range
-    - axis: direction in which it measures, body axes
+    - scale: ratio of measured to true range without noise
+    - axis: direction of measurement, body axes
     """
 
     parameters: RangingParameters
@@ -131,12 +131,12 @@ def range_along(surface: Surface, position_m: Vector, axis: Vector, max_range_m:
         return np.asarray(points[:, 2] - surface.height(points[:, 0], points[:, 1]))
 
     distances = np.linspace(0.0, max_range_m, count)
-    below = np.flatnonzero(clearance(distances) <= 0.0)
-    if below.size == 0:
+    hits = np.flatnonzero(clearance(distances) <= 0.0)
+    if hits.size == 0:
         return np.inf
-    if below[0] == 0:
+    if hits[0] == 0:
         return 0.0
-    return float(brentq(lambda d: float(clearance(np.array([d]))[0]), distances[below[0] - 1], distances[below[0]]))
+    return float(brentq(lambda d: float(clearance(np.array([d]))[0]), distances[hits[0] - 1], distances[hits[0]]))
 
 
 @dataclass(frozen=True)
@@ -178,9 +178,9 @@ def first_return(
     - position_m, axis: apex of the cone and unit vector along it, world axes
     - half_angle_rad: angle between the cone's axis and its edge
 
-    In plan view, ground within a distance r is within r sin(a) of the apex; a is the maximum angle of the cone from
-    nadir. A grid over this square gives the range with an error of a few metres. Finer grids around candidate nodes
-    reduce the error to 0.05 % of the height. The square is enlarged until it contains all ground nearer than the range.
+    Let a be the maximum angle of the cone from nadir. In plan view, ground of the cone within a distance r is in the
+    square of half side r sin(a) around the apex. A grid over this square determines the range to a few metres. Finer
+    grids around candidate nodes reduce the error to 0.05 % of the height. The square is enlarged until r is the range.
     """
     clearance = position_m[2] - float(surface.height(float(position_m[0]), float(position_m[1])))
     if clearance <= 0.0:
@@ -202,23 +202,23 @@ def _search_nearest_ground(
     surface: Surface, position_m: Vector, axis: Vector, half_angle_rad: float, step_m: float, half_side_m: float
 ) -> float:
     """Compute the range to the nearest ground within a cone and, in plan view, a square; infinite if there is none."""
-    line = np.arange(-np.ceil(half_side_m / step_m), np.ceil(half_side_m / step_m) + 1.0) * step_m
-    offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    coordinates = np.arange(-np.ceil(half_side_m / step_m), np.ceil(half_side_m / step_m) + 1.0) * step_m
+    offsets = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
     nearest = np.inf
-    for number in range(PASSES):
+    for grid in range(GRIDS):
         # range to the ground (smoothed to the step) at the offsets, and angle from the axis
         level = int(min(np.floor(np.log2(max(step_m / surface.spacing_m, 1.0))), len(surface.levels) - 1))
         x, y = position_m[0] + offsets[:, 0], position_m[1] + offsets[:, 1]
-        down = position_m[2] - surface.height(x, y, level)
-        ranges = np.sqrt(offsets[:, 0] ** 2 + offsets[:, 1] ** 2 + down**2)
-        axial = offsets[:, 0] * axis[0] + offsets[:, 1] * axis[1] - down * axis[2]
+        depths = position_m[2] - surface.height(x, y, level)
+        ranges = np.sqrt(offsets[:, 0] ** 2 + offsets[:, 1] ** 2 + depths**2)
+        axial = offsets[:, 0] * axis[0] + offsets[:, 1] * axis[1] - depths * axis[2]
         angles = np.arccos(np.clip(axial / ranges, -1.0, 1.0))
-        in_cone = angles <= half_angle_rad
-        if in_cone.any():
-            nearest = float(ranges[in_cone].min())
-        if number == PASSES - 1:
+        is_in_cone = angles <= half_angle_rad
+        if is_in_cone.any():
+            nearest = float(ranges[is_in_cone].min())
+        if grid == GRIDS - 1:
             return nearest
-        # candidates: nodes within a step of the cone, with possibly nearer ground around them
+        # candidates: nodes within a step of the cone whose surroundings can contain nearer ground
         candidates = (angles <= half_angle_rad + step_m / ranges) & (
             ranges <= nearest + (RELIEF_PER_STEP + MAX_SLOPE) * step_m
         )
@@ -227,8 +227,8 @@ def _search_nearest_ground(
         offsets = offsets[candidates][may_be_nearest]
         # replace each node by the nodes of a finer grid around it
         step_m /= REFINEMENT
-        fine_line = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
-        neighbours = np.stack(np.meshgrid(fine_line, fine_line), axis=-1).reshape(-1, 2)
+        fine_coordinates = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
+        neighbours = np.stack(np.meshgrid(fine_coordinates, fine_coordinates), axis=-1).reshape(-1, 2)
         offsets = np.asarray((offsets[:, None, :] + neighbours).reshape(-1, 2))
         if not offsets.size:
             return nearest
@@ -236,5 +236,5 @@ def _search_nearest_ground(
 
 
 def height_above_ground(surface: Surface, positions_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-    """Compute the true altitude: height above the ground vertically below."""
+    """Compute the true altitude: the height above the ground vertically below each position."""
     return np.asarray(positions_m[:, 2] - surface.height(positions_m[:, 0], positions_m[:, 1]))

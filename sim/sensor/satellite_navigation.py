@@ -1,8 +1,8 @@
-"""Satellite navigation receivers: GPS (positions), and RTK (positions, velocities and reported deviations).
+"""Satellite navigation receivers: GPS (positions), and RTK (positions, velocities, reported standard deviations).
 
-An RTK receiver compares carrier phases with a base station. Its solution is *fixed* while the integer phase
-ambiguities are resolved, and *floating* otherwise; each type has separate time-correlated and white errors. The type
-changes at random times. There are no solutions during an outage. Antennas are at the origin of the body frame.
+An RTK (real-time kinematic) receiver compares carrier phases with a base station. Its solution is *fixed* while the
+integer phase ambiguities are resolved, and *floating* otherwise; each type has its own time-correlated and white
+errors. The type changes at random times. There are no solutions during an outage. Antennas are at the body's origin.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PerAxis = tuple[NonNegative, NonNegative, NonNegative]  #: East, north, up.
 
 
 class GpsParameters(Parameters):
-    """A GPS receiver. Spreads are one standard deviation per axis."""
+    """Parameters of a GPS receiver; errors are standard deviations per axis."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=1000.0, description="fixes per second")] = 10.0
     horizontal_noise_m: Annotated[NonNegative, Field(description="white noise per fix, m")] = 0.3
@@ -37,7 +37,7 @@ class GpsParameters(Parameters):
     clock: ClockParameters = ClockParameters()
 
 
-#: Carrier-phase positions, post-processed with precise orbits (class of GIPSY-OASIS II).
+#: Carrier-phase positions, post-processed with precise orbits (as by GIPSY-OASIS II).
 POST_PROCESSED = GpsParameters(
     rate_hz=1.0, horizontal_noise_m=0.02, vertical_noise_m=0.03, horizontal_wander_m=0.05, vertical_wander_m=0.1,
     correlation_s=600.0, latency_s=0.0,
@@ -46,7 +46,7 @@ POST_PROCESSED = GpsParameters(
 
 @dataclass(frozen=True)
 class Gps:
-    """A GPS receiver with time-correlated errors drawn for a time span."""
+    """A GPS receiver with drawn time-correlated errors, which are valid in a time span."""
 
     parameters: GpsParameters
     sampling: Sampling
@@ -71,7 +71,7 @@ class Gps:
 
 
 class SolutionErrors(Parameters):
-    """Errors of one type of solution, one standard deviation along east, north and up."""
+    """Errors of one type of solution: standard deviations along east, north and up."""
 
     wander_m: Annotated[PerAxis, Field(description="time-correlated error, m")]
     noise_m: Annotated[PerAxis, Field(description="white noise per solution, m")]
@@ -95,10 +95,10 @@ class Outage(Parameters):
 
 
 class RtkParameters(Parameters):
-    """An RTK receiver of the class of NovAtel's RT2.
+    """Parameters of an RTK receiver like NovAtel's RT2.
 
-    Fixed: 2 cm, the specification of this class. Floating: within the deviations in Table II of the landing paper, 0.35
-    to 0.7 m. All other values are assumed.
+    Fixed solutions: 2 cm, the specification of such receivers. Floating solutions: within the deviations in Table II of
+    the landing paper, 0.35 to 0.7 m. All other values are assumed.
     """
 
     rate_hz: Annotated[Positive, Field(le=100.0, description="solutions per second")] = 10.0
@@ -139,7 +139,7 @@ class RtkSolutions:
 
 @dataclass(frozen=True)
 class RtkReceiver:
-    """An RTK receiver with time-correlated errors drawn for a time span.
+    """An RTK receiver with drawn time-correlated errors, which are valid in a time span.
 
     - starts_floating, changes_s: whether the first solution is floating, and true times of the type changes
     - reported_factor: ratio of the reported to the true standard deviation
@@ -179,15 +179,16 @@ class RtkReceiver:
         return np.asarray(is_odd_change != self.starts_floating)
 
     def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> RtkSolutions:
-        """Compute one solution per true time."""
+        """Simulate one solution per true time."""
         p = self.parameters
         motion, floating = trajectory.motion(times_s), self.is_floating(times_s)[:, None]
         tags = self.clock.tags(times_s, rng)
-        shocks = rng.standard_normal((times_s.size, 6))
+        white_noise = rng.standard_normal((times_s.size, 6))
         wander = np.where(floating, self.floating_wander.at(times_s), self.fixed_wander.at(times_s))
         noise = np.where(floating, p.floating.noise_m, p.fixed.noise_m)
-        positions = motion.positions_m + wander + noise * shocks[:, :3]
-        velocities = motion.velocities_m_s + self.velocity_wander.at(times_s) + p.velocity_noise_m_s * shocks[:, 3:]
+        positions = motion.positions_m + wander + noise * white_noise[:, :3]
+        velocities = motion.velocities_m_s + self.velocity_wander.at(times_s)
+        velocities = velocities + p.velocity_noise_m_s * white_noise[:, 3:]
         for outage in p.outages:
             missing = (times_s >= outage.start_s) & (times_s < outage.start_s + outage.duration_s)
             positions[missing], velocities[missing] = np.nan, np.nan

@@ -1,9 +1,9 @@
 """Magnetic compass with inclinometers: heading and up direction.
 
 The inclinometers are damped pendulums that follow the specific force with a lag: they measure the direction of gravity
-only if the vehicle does not accelerate. The compass levels the magnetic field with the inclinometers: in an inclined
-field each tilt error causes a heading error. Iron in the vehicle adds errors that vary with the heading: with its sine
-for magnetised (hard) iron, and with the sine of twice the heading for magnetisable (soft) iron.
+only if the vehicle does not accelerate. The compass projects the magnetic field on the horizontal plane measured by the
+inclinometers. Because the field is inclined, each tilt error causes a heading error. Iron in the vehicle causes errors
+that vary with the heading: as its sine for magnetised (hard) iron, as the sine of twice the heading for soft iron.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from marsyard.sim.sensor.instrument import Clock, ClockParameters, Sampling, Tim
 
 Degrees = Annotated[NonNegative, Field(le=90.0)]
 LAG_STEPS_PER_S = 100.0  #: Steps of the lag filter per second: twenty per default time constant.
-SETTLED = 12.0  #: Settling time in time constants: a residual of 6e-6.
-Readings = Float64[np.ndarray, "n *one"]
+SETTLING_TIME_CONSTANTS = 12.0  #: Duration of the initial settling in time constants: the residual is 6e-6.
+ReadingArray = Float64[np.ndarray, "n *components"]
 
 
 class TiltCompassParameters(Parameters):
-    """A unit of the class of Precision Navigation's TCM2; spreads are one standard deviation.
+    """Parameters of a unit like Precision Navigation's TCM2; errors are standard deviations.
 
-    Specification of the class: 0.2 deg in tilt, 1 deg in heading, 16 readings per second, counts of 0.1 deg. Assumed:
+    Specification of such units: 0.2 deg in tilt, 1 deg in heading, 16 readings per second, resolution 0.1 deg. Assumed:
     the split into error terms, the lag and the effects of the vehicle.
     """
 
@@ -39,8 +39,8 @@ class TiltCompassParameters(Parameters):
     tilt_noise_deg: Annotated[Degrees, Field(description="inclinometer noise per reading")] = 0.15
     lag_s: Annotated[float, Field(gt=0.0, le=5.0, description="time constant of the inclinometers, s")] = 0.2
     heading_bias_deg: Annotated[Degrees, Field(description="heading bias, mounting and declination included")] = 0.8
-    hard_iron_deg: Annotated[Degrees, Field(description="amplitude per sine and cosine of heading")] = 0.5
-    soft_iron_deg: Annotated[Degrees, Field(description="same for twice the heading")] = 0.25
+    hard_iron_deg: Annotated[Degrees, Field(description="amplitudes of sine and cosine of the heading")] = 0.5
+    soft_iron_deg: Annotated[Degrees, Field(description="amplitudes for twice the heading")] = 0.25
     heading_noise_deg: Annotated[Degrees, Field(description="heading noise per reading")] = 0.3
     dip_deg: Annotated[float, Field(ge=-85.0, le=85.0, description="magnetic field below the horizon, deg")] = 59.0
     count_deg: Annotated[Degrees, Field(description="heading resolution, deg; 0: no rounding")] = 0.1
@@ -94,39 +94,40 @@ class TiltCompass:
     def measure(self, trajectory: Trajectory, times_s: Times, rng: np.random.Generator) -> TiltCompassReadings:
         """Measure one reading per true time (non-decreasing); pendulums are settled at the start of the trajectory."""
         p = self.parameters
-        lagged = self._lagged_up(trajectory, times_s)
+        lagged_up = self._compute_lagged_up(trajectory, times_s)
         tags = self.clock.tags(times_s, rng)
         noise = rng.standard_normal((times_s.size, 3))
-        levelled = _add_offset(lagged, self.tilt_bias_rad)
-        # azimuths from the magnetic field, levelled with the measured up directions
+        biased_up = _add_offset(lagged_up, self.tilt_bias_rad)
+        # azimuths from the magnetic field, projected on the plane perpendicular to the measured up directions
         dip = np.radians(p.dip_deg)
         attitudes = trajectory.motion(times_s).attitudes
         magnetic = attitudes.inv().apply(np.array([0.0, np.cos(dip), -np.sin(dip)]))
-        north = _normalize(magnetic - np.sum(magnetic * levelled, axis=1)[:, None] * levelled)
-        azimuths = np.arctan2(np.cross(north, levelled)[:, 0], north[:, 0])
+        north = _normalize(magnetic - np.sum(magnetic * biased_up, axis=1)[:, None] * biased_up)
+        azimuths = np.arctan2(np.cross(north, biased_up)[:, 0], north[:, 0])
         headings = azimuths + self.deviation_rad(azimuths) + np.radians(p.heading_noise_deg) * noise[:, 2]
         if p.count_deg > 0.0:
             headings = np.radians(p.count_deg) * np.rint(headings / np.radians(p.count_deg))
-        up = _hold(_add_offset(levelled, np.radians(p.tilt_noise_deg) * noise[:, :2]), times_s, p.tilt_stuck_s)
-        return TiltCompassReadings(tags, up, _hold(np.mod(headings, 2.0 * np.pi), times_s, p.heading_stuck_s))
+        up = _add_offset(biased_up, np.radians(p.tilt_noise_deg) * noise[:, :2])
+        headings = _apply_stuck(np.mod(headings, 2.0 * np.pi), times_s, p.heading_stuck_s)
+        return TiltCompassReadings(tags, _apply_stuck(up, times_s, p.tilt_stuck_s), headings)
 
     def deviation_rad(self, azimuths_rad: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         """Compute the noise-free heading error of a level unit at rest, at true azimuths."""
         harmonics = np.stack([f(k * azimuths_rad) for k in (1.0, 2.0) for f in (np.sin, np.cos)])
         return np.asarray(self.heading_bias_rad + self.iron_rad @ harmonics)
 
-    def _lagged_up(self, trajectory: Trajectory, times_s: Times) -> Vectors:
+    def _compute_lagged_up(self, trajectory: Trajectory, times_s: Times) -> Vectors:
         """Compute the directions of the pendulums: specific force with a lag."""
         if times_s.size == 0:
             return np.zeros((0, 3))
         lag = self.parameters.lag_s
-        start = max(trajectory.span_s[0], float(times_s[0]) - SETTLED * lag)
+        start = max(trajectory.span_s[0], float(times_s[0]) - SETTLING_TIME_CONSTANTS * lag)
         steps = max(int(np.ceil((times_s[-1] - start) * LAG_STEPS_PER_S)), 1)
         grid = np.linspace(start, float(times_s[-1]), steps + 1) if times_s[-1] > start else np.array([start])
         force = _normalize(trajectory.motion(grid).specific_forces_m_s2)
         if grid.size == 1:
             return np.repeat(force, times_s.size, axis=0)
-        # exact for a specific force that is constant in each step
+        # the filter is exact for a specific force that is constant in each step
         decay = np.exp(-(grid[1] - grid[0]) / lag)
         mean_force = 0.5 * (force[1:] + force[:-1])
         filtered, _ = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], mean_force, axis=0, zi=decay * force[:1])
@@ -144,7 +145,7 @@ def _add_offset(up: Vectors, offset: Float64[np.ndarray, "*any 2"]) -> Vectors:
     return _normalize(tilted)
 
 
-def _hold(values: Readings, times_s: Times, stuck_s: float | None) -> Readings:
+def _apply_stuck(values: ReadingArray, times_s: Times, stuck_s: float | None) -> ReadingArray:
     """Repeat the last value before `stuck_s` (or the first value) at all later times."""
     if stuck_s is None or values.size == 0:
         return values

@@ -1,5 +1,6 @@
-"""A descent over a flat textured plane: the ray of each physical pixel is intersected with the ground. DIMES projects
-in the opposite direction. Each physical row is followed through clearing, exposure and transfer.
+"""Synthetic MER descent images for the tests of DIMES: a flat textured plane, and the smear of a frame-transfer CCD.
+
+The ray of each physical pixel is intersected with the ground; DIMES projects from the ground into the image.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Texture:
     step_m: float
 
     def __call__(self, east: np.ndarray, north: np.ndarray, origin: np.ndarray) -> np.ndarray:
-        """Brightness `east` and `north` of `origin`; float32 offsets keep 1e-4 of a texel, remap itself 1/32."""
+        """Brightness at `origin` plus (east, north), metres. Accuracy: 1e-4 texel in float32, 1/32 texel in remap."""
         size = np.array(self.values.shape, dtype=np.float64)
         row, column = np.mod(np.array([-origin[1], origin[0]]) / self.step_m, size)
         rows = np.float32(row) - east.dtype.type(1.0 / self.step_m) * north
@@ -66,32 +67,33 @@ def draw_terrain(
 
 
 def make_waves(wavelength_m: float, contrast: float = 0.2, size: int = 2048, step_m: float = 1.5) -> Texture:
-    """Repetitive terrain: two crossed waves near this length (a whole number of waves per period)."""
-    turns = 2.0 * np.pi * np.round(size * step_m / wavelength_m) * np.arange(size) / size
-    values = 1.0 + contrast * (np.sin(turns)[:, None] + np.sin(turns)[None, :]) / 2.0
+    """Repetitive terrain: two crossed waves; the wavelength is rounded to a whole number of waves per period."""
+    phase = 2.0 * np.pi * np.round(size * step_m / wavelength_m) * np.arange(size) / size
+    values = 1.0 + contrast * (np.sin(phase)[:, None] + np.sin(phase)[None, :]) / 2.0
     return Texture(values.astype(np.float32), step_m)
 
 
 @cache
-def body_rays() -> np.ndarray:
+def compute_body_rays() -> np.ndarray:
     """Directions of all physical pixels' rays in the body frame, shape (3, 1024, 1024)."""
     return np.ascontiguousarray(np.moveaxis(CAMERA.rays(CAMERA.pixel_grid())[1], -1, 0), dtype=np.float32)
 
 
 @cache
-def fall_off() -> np.ndarray:
+def compute_fall_off() -> np.ndarray:
     """Relative response of the physical pixels: cosine to the fourth, shape (1024, 1024)."""
-    return np.clip(np.tensordot(CAMERA.a, body_rays(), 1), 0.0, 1.0) ** 4
+    return np.clip(np.tensordot(CAMERA.a, compute_body_rays(), 1), 0.0, 1.0) ** 4
 
 
 @cache
-def delivered_fall_off() -> np.ndarray:
-    return np.asarray(fall_off().reshape(-1, ROWS_SUMMED, 1024).mean(axis=1))
+def compute_binned_fall_off() -> np.ndarray:
+    """Relative response of the delivered rows, shape (256, 1024)."""
+    return np.asarray(compute_fall_off().reshape(-1, ROWS_SUMMED, 1024).mean(axis=1))
 
 
-def calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) -> DetectorCalibration:
+def make_calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) -> DetectorCalibration:
     return DetectorCalibration(
-        flat_field=delivered_fall_off(),
+        flat_field=compute_binned_fall_off(),
         exposure_s=0.004,
         transfer_row_s=transfer_row_s,
         clear_row_s=clear_row_s,
@@ -103,20 +105,20 @@ def calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) -> Dete
 
 def trace_scene(texture: Texture, world_from_body: Rotation, position: np.ndarray) -> np.ndarray:
     """Radiance of each physical pixel, shape (1024, 1024); the sky is black."""
-    rays = np.tensordot(world_from_body.as_matrix().astype(np.float32), body_rays(), 1)
-    down = rays[2] < -0.05
-    slant = np.where(down, np.float32(-position[2]) / np.where(down, rays[2], np.float32(-1.0)), np.float32(0.0))
-    return np.where(down, texture(slant * rays[0], slant * rays[1], position), np.float32(0.0))
+    rays = np.tensordot(world_from_body.as_matrix().astype(np.float32), compute_body_rays(), 1)
+    is_down = rays[2] < -0.05
+    slant = np.where(is_down, np.float32(-position[2]) / np.where(is_down, rays[2], np.float32(-1.0)), np.float32(0.0))
+    return np.where(is_down, texture(slant * rays[0], slant * rays[1], position), np.float32(0.0))
 
 
 def expose_scene(
     radiance: np.ndarray, detector: DetectorCalibration, noise: np.random.Generator | None = None, level: float = 1600.0
 ) -> np.ndarray:
-    """Counts of a static scene; radiance 1 on the axis gives `level` counts. Noise: 11,000 electrons at 1600 counts."""
-    rate = radiance * fall_off()
-    before = np.cumsum(rate, axis=0) - rate  # float64, as the fall-off
-    after = rate.sum(axis=0) - before - rate
-    charge = rate + (detector.transfer_row_s * before + detector.clear_row_s * after) / detector.exposure_s
+    """Counts of a static scene; `level`: counts of radiance 1 on the axis. Noise: 50 e, and shot noise at 6.9 e/DN."""
+    rate = radiance * compute_fall_off()
+    rate_above = np.cumsum(rate, axis=0) - rate  # float64, as the fall-off
+    rate_below = rate.sum(axis=0) - rate_above - rate
+    charge = rate + (detector.transfer_row_s * rate_above + detector.clear_row_s * rate_below) / detector.exposure_s
     counts = level * charge.reshape(-1, detector.rows_summed, charge.shape[1]).mean(axis=1)
     if noise is not None:
         electrons = noise.poisson(counts * 11000.0 / 1600.0) + 50.0 * noise.standard_normal(counts.shape)
@@ -126,7 +128,7 @@ def expose_scene(
 
 @dataclass(frozen=True)
 class Flight:
-    """Three images: true positions (3, 3), attitudes and the sun."""
+    """True positions (3, 3) and attitudes at three images, and the direction to the sun."""
 
     positions: np.ndarray
     attitudes: tuple[Rotation, Rotation, Rotation]
@@ -139,18 +141,18 @@ class Flight:
 
 
 def tilt_body(tilt_deg: float, azimuth_deg: float, roll_deg: float) -> Rotation:
-    """Attitude of a body tilted by `tilt_deg` after a roll about its own vertical."""
-    lean = Rotation.from_euler("ZYZ", [azimuth_deg, tilt_deg, -azimuth_deg], degrees=True)
-    return lean * Rotation.from_euler("z", roll_deg, degrees=True)
+    """Attitude of a body that rolls about its vertical and is then tilted towards `azimuth_deg`."""
+    tilt = Rotation.from_euler("ZYZ", [azimuth_deg, tilt_deg, -azimuth_deg], degrees=True)
+    return tilt * Rotation.from_euler("z", roll_deg, degrees=True)
 
 
 def draw_flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float = 30.0) -> Flight:
-    """Random rolls, tilts within a few degrees of a random tilt, and a random wind that changes."""
+    """Random rolls, tilts within 5 deg of a random mean tilt, and a random wind that changes between the intervals."""
     wind = max_wind * np.sqrt(rng.uniform()) * np.array([*_unit(rng), 0.0])
     change = np.array([*rng.normal(0.0, 1.0, 2), 0.0])
     first = np.array([*rng.uniform(0.0, 3000.0, 2), rng.uniform(1900.0, 2100.0)])
-    fall = np.array([0.0, 0.0, -75.0])
-    steps = np.stack([np.zeros(3), wind + fall, 2.0 * (wind + fall) + change])
+    descent = np.array([0.0, 0.0, -75.0])
+    steps = np.stack([np.zeros(3), wind + descent, 2.0 * (wind + descent) + change])
     base = max_tilt_deg * np.sqrt(rng.uniform()) * _unit(rng)
     attitudes = []
     for _ in range(3):
@@ -162,7 +164,7 @@ def draw_flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: 
 LEVEL_FLIGHT = (Rotation.identity(), Rotation.identity(), Rotation.identity())
 
 
-def fly_steadily(
+def steady_flight(
     velocity: tuple[float, float], attitudes: tuple[Rotation, Rotation, Rotation] = LEVEL_FLIGHT
 ) -> Flight:
     """A descent at 75 m/s with a steady horizontal velocity (east, north)."""
@@ -175,7 +177,7 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
     return np.array([np.cos(angle), np.sin(angle)])
 
 
-def measurements_of(path: Flight, counts: list[np.ndarray], detector: DetectorCalibration) -> DescentMeasurements:
+def make_measurements(path: Flight, counts: list[np.ndarray], detector: DetectorCalibration) -> DescentMeasurements:
     """Exact measurements of a flight with these images; the inertial velocities have a common error of (40, -25)."""
     camera = CAMERA.bin(1, detector.rows_summed)
     times = [100.0 + INTERVAL_S * i for i in range(3)]
@@ -192,16 +194,16 @@ def render(
     path: Flight, texture: Texture | None = None, noise: np.random.Generator | None = None, level: float = 1600.0
 ) -> DescentMeasurements:
     """Images and exact measurements of a flight."""
-    detector = calibration()
+    detector = make_calibration()
     ground = draw_terrain() if texture is None else texture
     counts = [
         expose_scene(trace_scene(ground, attitude, position), detector, noise, level)
         for attitude, position in zip(path.attitudes, path.positions, strict=True)
     ]
-    return measurements_of(path, counts, detector)
+    return make_measurements(path, counts, detector)
 
 
-def velocity_of(answer: VelocityEstimate) -> np.ndarray:
-    """The velocity of a valid answer."""
-    assert answer.velocity_m_s is not None
-    return answer.velocity_m_s
+def valid_velocity(estimate: VelocityEstimate) -> np.ndarray:
+    """The velocity of an estimate that has one."""
+    assert estimate.velocity_m_s is not None
+    return estimate.velocity_m_s

@@ -18,16 +18,16 @@ from marsyard.sim.measurements import DescentMeasurements
 from tests.algorithms.synthetic_descent import (
     draw_flight,
     draw_terrain,
-    fly_steadily,
     make_waves,
     render,
+    steady_flight,
     tilt_body,
-    velocity_of,
+    valid_velocity,
 )
 
 ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
-both = pytest.mark.parametrize("name", ESTIMATORS)
-and_dimes = pytest.mark.parametrize("estimator", [*ESTIMATORS.values(), DimesEstimator()], ids=[*ESTIMATORS, "dimes"])
+with_baselines = pytest.mark.parametrize("name", ESTIMATORS)
+with_dimes = pytest.mark.parametrize("estimator", [*ESTIMATORS.values(), DimesEstimator()], ids=[*ESTIMATORS, "dimes"])
 
 
 ATTITUDES = (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
@@ -35,44 +35,44 @@ ATTITUDES = (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 120.0), tilt_body(4.
 
 @pytest.fixture(scope="module")
 def measurements() -> DescentMeasurements:
-    return render(fly_steadily((10.0, 5.0), ATTITUDES), noise=np.random.default_rng(1))
+    return render(steady_flight((10.0, 5.0), ATTITUDES), noise=np.random.default_rng(1))
 
 
-@both
+@with_baselines
 @pytest.mark.parametrize("velocity", [(12.0, 0.0), (0.0, 12.0), (-8.0, 9.0)])
-def test_east_is_east_and_north_is_north(name: str, velocity: tuple[float, float]) -> None:
-    answer = ESTIMATORS[name].estimate(render(fly_steadily(velocity, ATTITUDES)))
+def test_east_and_north_velocities_are_not_swapped(name: str, velocity: tuple[float, float]) -> None:
+    answer = ESTIMATORS[name].estimate(render(steady_flight(velocity, ATTITUDES)))
     assert answer.outcome is VelocityOutcome.VALID
     # Half a rectified pixel is 0.6 m/s.
-    np.testing.assert_allclose(velocity_of(answer), velocity, atol=0.3)
+    np.testing.assert_allclose(valid_velocity(answer), velocity, atol=0.3)
 
 
-@both
-def test_exact_measurements_give_accurate_velocity(name: str) -> None:
+@with_baselines
+def test_velocity_of_exact_measurements_is_accurate(name: str) -> None:
     rng = np.random.default_rng(5)
     flights = [draw_flight(rng, max_tilt_deg=10.0, max_wind=15.0) for _ in range(5)]
-    answers = [ESTIMATORS[name].estimate(render(truth, noise=rng)) for truth in flights]
+    estimates = [ESTIMATORS[name].estimate(render(truth, noise=rng)) for truth in flights]
     errors = [
-        np.hypot(*(answer.velocity_m_s - truth.velocities[1, :2]))
-        for answer, truth in zip(answers, flights, strict=True)
-        if answer.velocity_m_s is not None
+        np.hypot(*(estimate.velocity_m_s - truth.velocities[1, :2]))
+        for estimate, truth in zip(estimates, flights, strict=True)
+        if estimate.velocity_m_s is not None
     ]
     assert len(errors) >= 4
     assert max(errors) < 0.5
 
 
-@and_dimes
-def test_images_of_different_ground_give_no_velocity(estimator: VelocityEstimator) -> None:
+@with_dimes
+def test_images_of_different_ground_have_no_velocity(estimator: VelocityEstimator) -> None:
     rng = np.random.default_rng(10)
     for _ in range(3):
         truth = draw_flight(rng, max_tilt_deg=10.0)
-        first, other = render(truth, draw_terrain(1), rng), render(truth, draw_terrain(2), rng)
-        mixed = replace(first, images=(first.images[0], other.images[1], first.images[2]))
+        first, second = (render(truth, draw_terrain(1), rng), render(truth, draw_terrain(2), rng))
+        mixed = replace(first, images=(first.images[0], second.images[1], first.images[2]))
         answer = estimator.estimate(mixed)
         assert answer.outcome in (VelocityOutcome.NO_VALID_TRACK, VelocityOutcome.IMU_MISMATCH)
 
 
-@both
+@with_baselines
 def test_disagreement_with_imu_rejects_the_velocity(name: str, measurements: DescentMeasurements) -> None:
     velocities = measurements.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
     answer = ESTIMATORS[name].estimate(replace(measurements, interval_velocities_m_s=velocities))
@@ -80,14 +80,14 @@ def test_disagreement_with_imu_rejects_the_velocity(name: str, measurements: Des
     assert answer.velocity_m_s is None
 
 
-@and_dimes
+@with_dimes
 def test_motion_above_max_speed_is_not_reported(estimator: VelocityEstimator) -> None:
-    assert estimator.estimate(render(fly_steadily((45.0, 0.0), ATTITUDES))).outcome is not VelocityOutcome.VALID
+    assert estimator.estimate(render(steady_flight((45.0, 0.0), ATTITUDES))).outcome is not VelocityOutcome.VALID
 
 
-@both
+@with_baselines
 @pytest.mark.parametrize(
-    "paint",
+    "change_counts",
     [
         np.zeros_like,
         lambda c: np.full_like(c, 4095),
@@ -95,19 +95,19 @@ def test_motion_above_max_speed_is_not_reported(estimator: VelocityEstimator) ->
         lambda c: np.where(np.arange(c.shape[1]) % 2 == 0, 0, 4095).astype(np.uint16) + np.zeros_like(c),
     ],
 )
-def test_any_image_gives_an_estimate(
-    name: str, paint: Callable[[np.ndarray], np.ndarray], measurements: DescentMeasurements
+def test_any_image_returns_an_estimate(
+    name: str, change_counts: Callable[[np.ndarray], np.ndarray], measurements: DescentMeasurements
 ) -> None:
-    images = tuple(replace(image, counts=paint(image.counts)) for image in measurements.images)
+    images = tuple(replace(image, counts=change_counts(image.counts)) for image in measurements.images)
     answer = ESTIMATORS[name].estimate(replace(measurements, images=images))
     # Identical images with pixel-scale texture match at zero motion.
     assert answer.outcome in (VelocityOutcome.NO_VALID_TRACK, VelocityOutcome.IMU_MISMATCH)
 
 
-@both
+@with_baselines
 @pytest.mark.parametrize("altitude_m", [-10.0, 1e-3, 3.0, 2e4, np.nan, np.inf])
-def test_any_altitude_gives_an_estimate(name: str, altitude_m: float, measurements: DescentMeasurements) -> None:
-    altitudes = tuple(replace(one, altitude_m=altitude_m) for one in measurements.altitudes)
+def test_any_altitude_returns_an_estimate(name: str, altitude_m: float, measurements: DescentMeasurements) -> None:
+    altitudes = tuple(replace(altitude, altitude_m=altitude_m) for altitude in measurements.altitudes)
     assert ESTIMATORS[name].estimate(replace(measurements, altitudes=altitudes)).outcome is not VelocityOutcome.VALID
 
 
@@ -131,25 +131,25 @@ def test_distortion_is_the_largest_relative_length_change() -> None:
     assert result == pytest.approx(np.abs(changes).max(), abs=1e-4)
 
 
-@both
+@with_baselines
 def test_featureless_and_sky_images_are_rejected(name: str, measurements: DescentMeasurements) -> None:
-    flat = render(fly_steadily((10.0, 0.0), ATTITUDES), draw_terrain(3, 0.0), np.random.default_rng(4))
+    flat = render(steady_flight((10.0, 0.0), ATTITUDES), draw_terrain(3, 0.0), np.random.default_rng(4))
     assert ESTIMATORS[name].estimate(flat).outcome is not VelocityOutcome.VALID
-    up = tuple(replace(one, world_from_body=tilt_body(180.0, 0.0, 0.0)) for one in measurements.attitudes)
+    up = tuple(replace(attitude, world_from_body=tilt_body(180.0, 0.0, 0.0)) for attitude in measurements.attitudes)
     assert ESTIMATORS[name].estimate(replace(measurements, attitudes=up)).outcome is VelocityOutcome.NO_TEMPLATE_AREA
 
 
-@both
-def test_estimates_repeat_and_report_matches(name: str, measurements: DescentMeasurements) -> None:
-    one, other = (ESTIMATORS[name].estimate(measurements) for _ in range(2))
-    np.testing.assert_array_equal(one.velocity_m_s, other.velocity_m_s)
-    assert isinstance(one.details, BaselineDetails)
-    assert all(match is not None and match.valid for match in one.details.matches)
-    assert all(isinstance(patches, PairPatches) for patches in one.details.patches)
+@with_baselines
+def test_estimates_are_deterministic_and_contain_matches(name: str, measurements: DescentMeasurements) -> None:
+    first, second = (ESTIMATORS[name].estimate(measurements) for _ in range(2))
+    np.testing.assert_array_equal(first.velocity_m_s, second.velocity_m_s)
+    assert isinstance(first.details, BaselineDetails)
+    assert all(match is not None and match.valid for match in first.details.matches)
+    assert all(isinstance(patches, PairPatches) for patches in first.details.patches)
 
 
-def test_common_square_is_the_largest_visible_in_both() -> None:
-    triple = usable_views(render(fly_steadily((0.0, 0.0), ATTITUDES)), DimesOptions().binned_size)
+def test_common_square_is_the_largest_visible_in_both_images() -> None:
+    triple = usable_views(render(steady_flight((0.0, 0.0), ATTITUDES)), DimesOptions().binned_size)
     assert triple is not None
     result = find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, max_side_px=1000))
     assert result is not None
@@ -157,8 +157,7 @@ def test_common_square_is_the_largest_visible_in_both() -> None:
     ground = middle + square(0.5 * side * gsd, 9)
     for view in triple[:2]:
         assert inside_frame(view, ground, 0.0, DEFAULT_COMMON_OPTIONS.max_off_nadir_rad).all()
-    # At nadir the second image has 256 pixels per side. After 120 deg of rotation and a tilt, the inner square is
-    # smaller.
+    # The second image has 256 pixels per side, rotated by 120 deg and tilted: a north-up square in it is smaller.
     assert 140 <= side <= 230
     assert find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, min_side_px=side + 16)) is None
     patches = rectify_pair(triple[0], triple[1], DEFAULT_COMMON_OPTIONS)
@@ -170,6 +169,6 @@ def test_common_square_is_the_largest_visible_in_both() -> None:
 @pytest.mark.parametrize("velocity", [(10.0, 5.0), (0.0, 0.0), (-20.0, 12.0)])
 def test_repetitive_terrain_is_rejected(velocity: tuple[float, float]) -> None:
     """Waves of 80 m repeat within the search range: a shift by one wavelength cannot be distinguished from zero."""
-    measured = render(fly_steadily(velocity, ATTITUDES), make_waves(80.0), np.random.default_rng(4))
+    measured = render(steady_flight(velocity, ATTITUDES), make_waves(80.0), np.random.default_rng(4))
     for estimator in ESTIMATORS.values():
         assert estimator.estimate(measured).outcome is VelocityOutcome.NO_VALID_TRACK

@@ -25,26 +25,26 @@ from marsyard.algorithms.dimes.validity import (
 from marsyard.algorithms.image.correlation import Peak
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DetectorImage
-from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, calibration, velocity_of
+from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, make_calibration, valid_velocity
 
 THRESHOLD = DimesOptions().imu_threshold_m_s
 METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_ratio=0.3, on_border=False)
 
 
-def track(pair: int, index: int, velocity: np.ndarray, failed: tuple[ValidityCheck, ...] = ()) -> Track:
+def make_track(pair: int, index: int, velocity: np.ndarray, failed: tuple[ValidityCheck, ...] = ()) -> Track:
     none = np.zeros((3, 3))
     return Track(pair, index, *(np.zeros(2),) * 3, none, none, np.ones(2), none, METRICS, failed, np.asarray(velocity))
 
 
 @cache
-def nadir_view() -> View:
-    picture = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.bin(1, ROWS_SUMMED), calibration())
-    return build_view(picture, Rotation.identity(), 2000.0, (256, 256))
+def make_nadir_view() -> View:
+    image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.bin(1, ROWS_SUMMED), make_calibration())
+    return build_view(image, Rotation.identity(), 2000.0, (256, 256))
 
 
-def pair_of(*tracks: Track) -> PairDetails:
+def make_pair(*tracks: Track) -> PairDetails:
     """Tracks of a pair; the images are not used."""
-    nadir = nadir_view()
+    nadir = make_nadir_view()
     return PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, 1, tracks, (nadir, nadir))
 
 
@@ -52,7 +52,8 @@ def combine_tracks(
     first: list[np.ndarray], second: list[np.ndarray], interval_velocities: np.ndarray
 ) -> VelocityEstimate:
     pairs = [
-        pair_of(*(track(p, k, v) for k, v in enumerate(velocities))) for p, velocities in enumerate((first, second))
+        make_pair(*(make_track(p, k, v) for k, v in enumerate(velocities)))
+        for p, velocities in enumerate((first, second))
     ]
     return combine_pairs((pairs[0], pairs[1]), interval_velocities, THRESHOLD)
 
@@ -71,15 +72,15 @@ def test_best_combination_reports_second_pair_velocity() -> None:
         [np.array([5.0, 5.0]), np.array([30.0, 5.0])], [np.array([6.5, 7.0]), np.array([6.1, 7.0])], velocities
     )
     assert answer.outcome is VelocityOutcome.VALID
-    np.testing.assert_allclose(velocity_of(answer), [6.1, 7.0])
+    np.testing.assert_allclose(valid_velocity(answer), [6.1, 7.0])
 
 
 def test_each_pair_needs_one_track() -> None:
     velocities = np.zeros((2, 3))
-    one = [np.array([5.0, 5.0])]
-    assert combine_tracks(one, one, velocities).outcome is VelocityOutcome.VALID
-    assert combine_tracks(one, [], velocities).outcome is VelocityOutcome.NO_TEMPLATE_AREA
-    assert combine_tracks(one, [np.array([15.0, 5.0])], velocities).outcome is VelocityOutcome.IMU_MISMATCH
+    tracks = [np.array([5.0, 5.0])]
+    assert combine_tracks(tracks, tracks, velocities).outcome is VelocityOutcome.VALID
+    assert combine_tracks(tracks, [], velocities).outcome is VelocityOutcome.NO_TEMPLATE_AREA
+    assert combine_tracks(tracks, [np.array([15.0, 5.0])], velocities).outcome is VelocityOutcome.IMU_MISMATCH
 
 
 def test_discrepancy_at_the_threshold_is_a_mismatch() -> None:
@@ -89,25 +90,25 @@ def test_discrepancy_at_the_threshold_is_a_mismatch() -> None:
     assert combine_tracks(still, [0.999 * moving[0]], velocities).outcome is VelocityOutcome.VALID
 
 
-@pytest.mark.parametrize("broken", [0, 1])
-def test_invalid_tracks_are_ignored(broken: int) -> None:
-    good, bad = np.array([5.0, 5.0]), np.array([25.0, 5.0])
+@pytest.mark.parametrize("invalid_pair", [0, 1])
+def test_invalid_tracks_are_ignored(invalid_pair: int) -> None:
+    correct, wrong, failed = np.array([5.0, 5.0]), np.array([25.0, 5.0]), (ValidityCheck.PEAK_HEIGHT,)
     pairs = [
-        pair_of(track(p, 0, bad, (ValidityCheck.PEAK_HEIGHT,)), track(p, 1, good if p != broken else bad))
+        make_pair(make_track(p, 0, wrong, failed), make_track(p, 1, correct if p != invalid_pair else wrong))
         for p in range(2)
     ]
     answer = combine_pairs((pairs[0], pairs[1]), np.zeros((2, 3)), THRESHOLD)
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
-    invalid = pair_of(track(0, 0, good, (ValidityCheck.CONTRAST,)))
+    invalid = make_pair(make_track(0, 0, correct, (ValidityCheck.CONTRAST,)))
     answer = combine_pairs((invalid, pairs[1]), np.zeros((2, 3)), THRESHOLD)
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK
 
 
 def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
     """Analytic velocity errors of four tracks per case, m/s, shape (cases, pair, template, 2). Errors per image,
-    common to its tracks: altitude 1 % (3 sigma), attitude 0.03 deg (0.5 ms at 60 deg/s), match 0.1 m/s. Features
-    lie within 39 deg of the nadir. A feature at distance r with relative altitude error e and tilt error (a, b) is
-    displaced by at most e r + H (1 + r^2 / H^2) (a, b).
+    common to its tracks: altitude 1 % (3 sigma), attitude 0.03 deg (0.5 ms at 60 deg/s); match error 0.1 m/s per
+    track. Features are within 39 deg of the nadir. A feature at distance r from the nadir of a camera at height H,
+    with relative altitude error e and tilt error (a, b), is displaced by at most e r + H (1 + r^2 / H^2) (a, b).
     """
     heights = np.array([2000.0, 1719.0, 1438.0])
     scale = rng.normal(0.0, 0.01 / 3.0, (cases, 3))
@@ -117,22 +118,22 @@ def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
         radius = 0.8 * heights[pair + 1] * np.sqrt(rng.uniform(0.0, 1.0, (cases, 2, 1)))
         angle = rng.uniform(0.0, 2.0 * np.pi, (cases, 2, 1))
         position = radius * np.concatenate([np.cos(angle), np.sin(angle)], axis=2)
-        misplaced = []
+        displacements = []
         for k in (pair, pair + 1):
             stretch = heights[k] * (1.0 + (radius / heights[k]) ** 2)
-            misplaced.append(scale[:, k, None, None] * position + stretch * tilt[:, k, None, :])
-        errors[:, pair] = (misplaced[0] - misplaced[1]) / 3.75 + rng.normal(0.0, 0.1, (cases, 2, 2))
+            displacements.append(scale[:, k, None, None] * position + stretch * tilt[:, k, None, :])
+        errors[:, pair] = (displacements[0] - displacements[1]) / 3.75 + rng.normal(0.0, 0.1, (cases, 2, 2))
     return errors
 
 
 @pytest.mark.parametrize("tracks_per_pair", [1, 2])
 @pytest.mark.parametrize("wrong_by", [10.0, 20.0, 55.0])
-def test_one_wrong_track_rarely_gives_wrong_velocity(tracks_per_pair: int, wrong_by: float) -> None:
+def test_one_wrong_track_rarely_causes_a_wrong_velocity(tracks_per_pair: int, wrong_by: float) -> None:
     # With one of four tracks wrong by at least 10 m/s, 99.5 % of cases are correct or unsuccessful.
     rng = np.random.default_rng(12)
     cases = 1000
     errors = track_errors(rng, cases)[:, :, :tracks_per_pair]
-    harmless = 0
+    not_wrong = 0
     for case in range(cases):
         angle = rng.uniform(0.0, 2.0 * np.pi)
         tracks = errors[case].copy()
@@ -142,8 +143,8 @@ def test_one_wrong_track_rarely_gives_wrong_velocity(tracks_per_pair: int, wrong
         inertial[:, :2] = truth + np.array([[7.0, -4.0]]) + np.array([[0.0, 0.0], change])
         answer = combine_tracks(list(truth + tracks[0]), list(truth + change + tracks[1]), inertial)
         error = 0.0 if answer.velocity_m_s is None else np.hypot(*(answer.velocity_m_s - truth - change))
-        harmless += bool(error <= 5.0)
-    assert harmless >= 0.995 * cases
+        not_wrong += bool(error <= 5.0)
+    assert not_wrong >= 0.995 * cases
 
 
 def test_propagation_removes_the_inertial_bias() -> None:
@@ -163,7 +164,7 @@ def test_propagation_removes_the_inertial_bias() -> None:
         ({"contrast": float("nan")}, ValidityCheck.CONTRAST),
     ],
 )
-def test_each_metric_has_a_check(change: dict[str, Any], check: ValidityCheck) -> None:
+def test_each_metric_beyond_its_limit_fails_its_check(change: dict[str, Any], check: ValidityCheck) -> None:
     assert failed_checks(METRICS, DimesOptions()) == ()
     assert failed_checks(replace(METRICS, **change), DimesOptions()) == (check,)
 
@@ -183,7 +184,7 @@ def test_invalid_options_are_reported(invalid: dict[str, Any]) -> None:
         DimesOptions(**invalid)
 
 
-def test_surface_without_positive_peak_has_no_distinct_peak() -> None:
+def test_surface_without_positive_peak_fails_the_second_peak_check() -> None:
     metrics = track_metrics(0.02, np.zeros((9, 9)), Peak(4, 4, 0.0, on_border=False), DimesOptions())
     assert metrics.second_peak_ratio == 1.0
     assert ValidityCheck.SECOND_PEAK in failed_checks(metrics, DimesOptions())

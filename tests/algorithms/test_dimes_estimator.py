@@ -17,18 +17,18 @@ from marsyard.sim.measurements import DescentMeasurements
 from tests.algorithms.synthetic_descent import (
     INTERVAL_S,
     Flight,
-    body_rays,
-    calibration,
+    compute_body_rays,
     draw_flight,
     draw_terrain,
     expose_scene,
-    fly_steadily,
+    make_calibration,
+    make_measurements,
     make_waves,
-    measurements_of,
     render,
+    steady_flight,
     tilt_body,
     trace_scene,
-    velocity_of,
+    valid_velocity,
 )
 
 ESTIMATOR: VelocityEstimator = DimesEstimator()
@@ -69,7 +69,7 @@ def test_noise_free_velocity_error_is_within_requirement() -> None:
     assert np.linalg.norm(of_tracks, axis=1).max() < 0.15
 
 
-def test_flight_camera_noise_keeps_velocity_accurate() -> None:
+def test_velocity_is_accurate_with_flight_camera_noise() -> None:
     rng = np.random.default_rng(2025)
     flights = [draw_flight(rng) for _ in range(6)]
     estimates = [ESTIMATOR.estimate(render(truth, noise=rng)) for truth in flights]
@@ -78,14 +78,14 @@ def test_flight_camera_noise_keeps_velocity_accurate() -> None:
 
 
 @pytest.mark.parametrize("velocity", [(20.0, 0.0), (0.0, 20.0), (-15.0, 25.0)])
-def test_east_is_east_and_north_is_north(velocity: tuple[float, float]) -> None:
+def test_east_and_north_velocities_are_not_swapped(velocity: tuple[float, float]) -> None:
     attitudes = (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
-    answer = ESTIMATOR.estimate(render(fly_steadily(velocity, attitudes)))
-    np.testing.assert_allclose(velocity_of(answer), velocity, atol=0.1)
+    answer = ESTIMATOR.estimate(render(steady_flight(velocity, attitudes)))
+    np.testing.assert_allclose(valid_velocity(answer), velocity, atol=0.1)
 
 
 def test_template_and_match_show_the_same_ground() -> None:
-    truth = fly_steadily(
+    truth = steady_flight(
         (12.0, -7.0), (tilt_body(3.0, 0.0, 40.0), tilt_body(8.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
     )
     measured = render(truth)
@@ -105,50 +105,52 @@ def test_subpixel_refinement_reduces_velocity_error() -> None:
     flights = [draw_flight(rng) for _ in range(4)]
     measured = [render(truth) for truth in flights]
 
-    def error(options: DimesOptions) -> float:
+    def rms_error(options: DimesOptions) -> float:
         estimates = [DimesEstimator(options).estimate(m) for m in measured]
         return rms(track_errors(flights, estimates, valid_only=False))
 
-    full, fitted, aligned = (
-        error(DimesOptions(subpixel=subpixel, align=align))
+    whole_pixel, fitted, aligned = (
+        rms_error(DimesOptions(subpixel=subpixel, align=align))
         for subpixel, align in ((False, True), (True, False), (True, True))
     )
-    # Whole pixels: uniform errors of +-0.5 px of 5.6 m and 4.7 m on both axes over 3.75 s give 0.57 m/s rms.
-    assert full == pytest.approx(0.57, rel=0.4)
+    # Whole pixels: uniform errors of +-0.5 px of 5.6 m and 4.7 m on both axes in 3.75 s are 0.57 m/s rms.
+    assert whole_pixel == pytest.approx(0.57, rel=0.4)
     assert fitted < 0.15
     assert aligned < 0.04
-    assert aligned < fitted < full
+    assert aligned < fitted < whole_pixel
 
 
 def test_altitude_is_propagated_to_image_time() -> None:
-    truth = fly_steadily((15.0, 5.0))
+    truth = steady_flight((15.0, 5.0))
     measured = render(truth)
-    late = tuple(replace(a, altitude_m=a.altitude_m - 75.0 * 0.5, time_s=a.time_s + 0.5) for a in measured.altitudes)
-    answer = ESTIMATOR.estimate(replace(measured, altitudes=late))
-    np.testing.assert_allclose(velocity_of(answer), [15.0, 5.0], atol=0.1)
+    later = tuple(replace(m, altitude_m=m.altitude_m - 75.0 * 0.5, time_s=m.time_s + 0.5) for m in measured.altitudes)
+    answer = ESTIMATOR.estimate(replace(measured, altitudes=later))
+    np.testing.assert_allclose(valid_velocity(answer), [15.0, 5.0], atol=0.1)
 
 
 def test_velocity_uses_image_time_tags() -> None:
-    measured = render(fly_steadily((12.0, 0.0)))
+    measured = render(steady_flight((12.0, 0.0)))
     images = tuple(replace(i, time_s=100.0 + 1.25 * (i.time_s - 100.0)) for i in measured.images)
     altitudes = tuple(replace(a, time_s=i.time_s) for a, i in zip(measured.altitudes, images, strict=True))
     answer = ESTIMATOR.estimate(replace(measured, images=images, altitudes=altitudes))
-    np.testing.assert_allclose(velocity_of(answer), [12.0 / 1.25, 0.0], atol=0.1)
+    np.testing.assert_allclose(valid_velocity(answer), [12.0 / 1.25, 0.0], atol=0.1)
 
 
 def test_different_image_sizes_are_binned_equally() -> None:
-    truth = fly_steadily((12.0, -7.0))
-    known = replace(calibration(), rows_summed=1, flat_field=np.repeat(calibration().flat_field, 4, axis=0))
+    truth = steady_flight((12.0, -7.0))
+    detector = replace(
+        make_calibration(), rows_summed=1, flat_field=np.repeat(make_calibration().flat_field, 4, axis=0)
+    )
     counts = [
-        expose_scene(trace_scene(draw_terrain(), a, p), known)
+        expose_scene(trace_scene(draw_terrain(), a, p), detector)
         for a, p in zip(truth.attitudes, truth.positions, strict=True)
     ]
-    answer = ESTIMATOR.estimate(measurements_of(truth, counts, known))
-    np.testing.assert_allclose(velocity_of(answer), [12.0, -7.0], atol=0.1)
+    answer = ESTIMATOR.estimate(make_measurements(truth, counts, detector))
+    np.testing.assert_allclose(valid_velocity(answer), [12.0, -7.0], atol=0.1)
 
 
 def test_featureless_terrain_has_no_contrast() -> None:
-    answer = ESTIMATOR.estimate(render(fly_steadily((10.0, 0.0)), draw_terrain(3, 0.0), np.random.default_rng(4)))
+    answer = ESTIMATOR.estimate(render(steady_flight((10.0, 0.0)), draw_terrain(3, 0.0), np.random.default_rng(4)))
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK
     assert answer.velocity_m_s is None
     tracks = details_of(answer).tracks
@@ -158,13 +160,13 @@ def test_featureless_terrain_has_no_contrast() -> None:
 
 @pytest.mark.parametrize("wavelength_m", [45.0, 80.0])
 def test_repetitive_terrain_is_rejected_by_second_peak(wavelength_m: float) -> None:
-    answer = ESTIMATOR.estimate(render(fly_steadily((10.0, 5.0)), make_waves(wavelength_m), np.random.default_rng(4)))
+    answer = ESTIMATOR.estimate(render(steady_flight((10.0, 5.0)), make_waves(wavelength_m), np.random.default_rng(4)))
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK
     assert all(ValidityCheck.SECOND_PEAK in track.failed for track in details_of(answer).tracks)
 
 
 def test_disagreement_with_imu_rejects_the_velocity() -> None:
-    measured = render(fly_steadily((10.0, 5.0)))
+    measured = render(steady_flight((10.0, 5.0)))
     velocities = measured.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
     answer = ESTIMATOR.estimate(replace(measured, interval_velocities_m_s=velocities))
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
@@ -172,49 +174,49 @@ def test_disagreement_with_imu_rejects_the_velocity() -> None:
     assert details_of(answer).combinations[0].discrepancy_m_s == pytest.approx(10.0, abs=0.2)
 
 
-def _painted(measured: DescentMeasurements, paint: Callable[[int, np.ndarray], np.ndarray]) -> DescentMeasurements:
-    images = tuple(replace(i, counts=paint(k, i.counts.copy())) for k, i in enumerate(measured.images))
+def _set_counts(measured: DescentMeasurements, change: Callable[[int, np.ndarray], np.ndarray]) -> DescentMeasurements:
+    images = tuple(replace(i, counts=change(k, i.counts.copy())) for k, i in enumerate(measured.images))
     return replace(measured, images=images)
 
 
-def _random(k: int, counts: np.ndarray) -> np.ndarray:
+def _draw_random_counts(k: int, counts: np.ndarray) -> np.ndarray:
     return np.random.default_rng(k).integers(0, 4096, counts.shape, dtype=np.uint16)
 
 
 @pytest.fixture(scope="module")
 def measurements() -> DescentMeasurements:
-    return render(fly_steadily((10.0, 5.0)))
+    return render(steady_flight((10.0, 5.0)))
 
 
 @pytest.mark.parametrize(
-    "paint",
+    "change",
     [
         lambda k, c: np.zeros_like(c),
         lambda k, c: np.full_like(c, 4095),
         lambda k, c: np.full_like(c, 65535),
-        _random,
+        _draw_random_counts,
         lambda k, c: c if k else np.zeros_like(c),
         lambda k, c: np.where(np.arange(c.shape[1]) % 2 == 0, 0, 4095).astype(np.uint16) + np.zeros_like(c),
         lambda k, c: np.full_like(c, k),
     ],
 )
-def test_any_image_gives_an_estimate(
-    measurements: DescentMeasurements, paint: Callable[[int, np.ndarray], np.ndarray]
+def test_any_image_returns_an_estimate(
+    measurements: DescentMeasurements, change: Callable[[int, np.ndarray], np.ndarray]
 ) -> None:
-    answer = ESTIMATOR.estimate(_painted(measurements, paint))
+    answer = ESTIMATOR.estimate(_set_counts(measurements, change))
     assert answer.outcome is not VelocityOutcome.VALID
     assert answer.velocity_m_s is None
     dimes_products(details_of(answer))
 
 
 @pytest.mark.parametrize("altitude_m", [1e-300, 1e-3, 3.0, 120.0, 2e4, 9e5, 1e300, -10.0, np.nan, np.inf])
-def test_any_altitude_gives_an_estimate(measurements: DescentMeasurements, altitude_m: float) -> None:
+def test_any_altitude_returns_an_estimate(measurements: DescentMeasurements, altitude_m: float) -> None:
     altitudes = tuple(replace(a, altitude_m=altitude_m) for a in measurements.altitudes)
     answer = ESTIMATOR.estimate(replace(measurements, altitudes=altitudes))
     assert answer.outcome is not VelocityOutcome.VALID
 
 
-def test_any_attitude_gives_an_estimate(measurements: DescentMeasurements) -> None:
+def test_any_attitude_returns_an_estimate(measurements: DescentMeasurements) -> None:
     random = Rotation.random(3 * 15, rng=np.random.default_rng(5))
     for k in range(15):
         attitudes = tuple(replace(a, world_from_body=random[3 * k + i]) for i, a in enumerate(measurements.attitudes))
@@ -226,7 +228,7 @@ def test_any_attitude_gives_an_estimate(measurements: DescentMeasurements) -> No
 @pytest.mark.parametrize(
     "times", [(0.0, 0.0, 0.0), (2.0, 1.0, 0.0), (0.0, 1e9, 2e9), (0.0, np.nan, 1.0), (0.0, 60.0, 120.0)]
 )
-def test_any_time_gives_an_estimate(measurements: DescentMeasurements, times: tuple[float, float, float]) -> None:
+def test_any_time_returns_an_estimate(measurements: DescentMeasurements, times: tuple[float, float, float]) -> None:
     images = tuple(replace(i, time_s=t) for i, t in zip(measurements.images, times, strict=True))
     altitudes = tuple(replace(a, time_s=t) for a, t in zip(measurements.altitudes, times, strict=True))
     answer = ESTIMATOR.estimate(replace(measurements, images=images, altitudes=altitudes))
@@ -236,55 +238,55 @@ def test_any_time_gives_an_estimate(measurements: DescentMeasurements, times: tu
 @pytest.mark.parametrize(
     "sun", [np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]), np.full(3, np.nan)]
 )
-def test_any_sun_direction_gives_an_estimate(measurements: DescentMeasurements, sun: np.ndarray) -> None:
+def test_any_sun_direction_returns_an_estimate(measurements: DescentMeasurements, sun: np.ndarray) -> None:
     answer = ESTIMATOR.estimate(replace(measurements, sun_direction=sun))
     assert answer.outcome in (VelocityOutcome.VALID, VelocityOutcome.NO_TEMPLATE_AREA)
 
 
-def test_one_corrupted_template_per_pair_keeps_velocity() -> None:
+def test_velocity_is_correct_with_one_corrupted_template_per_pair() -> None:
     rng = np.random.default_rng(12)
     truth = draw_flight(rng, max_tilt_deg=10.0)
     measured = render(truth)
-    before = details_of(ESTIMATOR.estimate(measured))
-    corrupted = {t.pair: t.template_pixel for t in before.tracks if t.index == 0}
+    reference = details_of(ESTIMATOR.estimate(measured))
+    corrupted = {t.pair: t.template_pixel for t in reference.tracks if t.index == 0}
 
-    def paint(k: int, counts: np.ndarray) -> np.ndarray:
+    def add_dust(k: int, counts: np.ndarray) -> np.ndarray:
         # Uncalibrated dust on the best template of the earlier image of each pair.
         if k in corrupted:
             u, v = (round(float(x)) for x in corrupted[k])
             counts[max(v - 9, 0) : v + 10, max(4 * (u - 9), 0) : 4 * (u + 10)] = 3000 if (u + v) % 2 else 4000
         return counts
 
-    answer = ESTIMATOR.estimate(_painted(measured, paint))
+    answer = ESTIMATOR.estimate(_set_counts(measured, add_dust))
     assert not all(track.valid for track in details_of(answer).tracks)
     assert answer.outcome is VelocityOutcome.VALID
-    np.testing.assert_allclose(velocity_of(answer), truth.velocities[1, :2], atol=0.3)
+    np.testing.assert_allclose(valid_velocity(answer), truth.velocities[1, :2], atol=0.3)
 
 
 def test_opposition_surge_does_not_bias_velocity() -> None:
     """An opposition surge moves with the lander: a Gaussian of 30 % and 3 deg at the anti-solar point."""
     sun = direction(np.radians(250.0), np.radians(75.0))
     attitudes = (tilt_body(5.0, 0.0, 40.0), tilt_body(8.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
-    truth = replace(fly_steadily((25.0, -10.0), attitudes), sun=sun)
-    dull = draw_terrain(7, 0.02)
+    truth = replace(steady_flight((25.0, -10.0), attitudes), sun=sun)
+    low_contrast = draw_terrain(7, 0.02)
     counts = []
     for attitude, position in zip(truth.attitudes, truth.positions, strict=True):
-        phase = np.arccos(np.clip(np.tensordot(attitude.inv().apply(-sun), body_rays(), 1), -1.0, 1.0))
+        phase = np.arccos(np.clip(np.tensordot(attitude.inv().apply(-sun), compute_body_rays(), 1), -1.0, 1.0))
         surge = 1.0 + 0.3 * np.exp(-0.5 * (phase / np.radians(3.0)) ** 2)
-        counts.append(expose_scene(trace_scene(dull, attitude, position) * surge, calibration()))
-    measured = measurements_of(truth, counts, calibration())
+        counts.append(expose_scene(trace_scene(low_contrast, attitude, position) * surge, make_calibration()))
+    measured = make_measurements(truth, counts, make_calibration())
     answer = ESTIMATOR.estimate(measured)
     assert answer.outcome is VelocityOutcome.VALID
-    np.testing.assert_allclose(velocity_of(answer), truth.velocities[1, :2], atol=0.6)
-    # Without a mask the surge has the highest contrast. Its distance from the nadir shrinks with the altitude. The
-    # apparent velocity is away from the sun: descent rate times the cotangent of the sun's elevation.
-    seeming = -75.0 * sun[:2] / sun[2]
-    naive = details_of(DimesEstimator(DimesOptions(zero_phase_radius_rad=0.0)).estimate(measured))
-    assert np.hypot(*(seeming - truth.velocities[1, :2])) > 10.0
-    assert min(np.hypot(*(t.velocity_m_s - seeming)) for t in naive.tracks) < 5.0
+    np.testing.assert_allclose(valid_velocity(answer), truth.velocities[1, :2], atol=0.6)
+    # Without a mask the templates are at the surge, which has the highest contrast. Its distance from the nadir
+    # decreases with altitude. The apparent velocity is the descent rate times the cotangent of the sun's elevation.
+    apparent_velocity = -75.0 * sun[:2] / sun[2]
+    unmasked = details_of(DimesEstimator(DimesOptions(zero_phase_radius_rad=0.0)).estimate(measured))
+    assert np.hypot(*(apparent_velocity - truth.velocities[1, :2])) > 10.0
+    assert min(np.hypot(*(t.velocity_m_s - apparent_velocity)) for t in unmasked.tracks) < 5.0
 
 
-def test_products_have_the_keys_of_reports(measurements: DescentMeasurements) -> None:
+def test_products_contain_the_keys_used_by_reports(measurements: DescentMeasurements) -> None:
     details = details_of(ESTIMATOR.estimate(measurements))
     products = dimes_products(details)
     assert products["tracks_columns"] == [
@@ -311,7 +313,7 @@ def test_products_report_failures_and_selection(measurements: DescentMeasurement
     assert details.chosen is not None
     products = dimes_products(details)
     np.testing.assert_array_equal(products["chosen"], [details.chosen.first, details.chosen.second])
-    flat = details_of(ESTIMATOR.estimate(_painted(measurements, lambda k, c: np.full_like(c, 1000))))
+    flat = details_of(ESTIMATOR.estimate(_set_counts(measurements, lambda k, c: np.full_like(c, 1000))))
     products = dimes_products(flat)
     assert products["chosen"].size == 0
     column = products["tracks_columns"].index("failed_contrast")
@@ -323,10 +325,10 @@ def test_rectified_lattice_matches_track_pixels(measurements: DescentMeasurement
     products = dimes_products(details)
     for track in details.tracks:
         west, north, step = products[f"rectified_frame_{track.pair}"]
-        moved = track.velocity_m_s * INTERVAL_S
+        motion_m = track.velocity_m_s * INTERVAL_S
         for side, ground, pixel in (
             (0, track.ground_m, track.template_pixel),
-            (1, track.ground_m - moved, track.match_pixel),
+            (1, track.ground_m - motion_m, track.match_pixel),
         ):
             column, row = (ground[0] - west) / step, (north - ground[1]) / step
             pixels = products[f"rectified_{track.pair}_{side}"]
@@ -334,7 +336,7 @@ def test_rectified_lattice_matches_track_pixels(measurements: DescentMeasurement
             np.testing.assert_allclose(result, pixel, atol=0.1)
 
 
-def test_inputs_are_unchanged_and_estimates_repeat(measurements: DescentMeasurements) -> None:
+def test_inputs_are_unchanged_and_estimates_are_deterministic(measurements: DescentMeasurements) -> None:
     copies = [image.counts.copy() for image in measurements.images]
     first, second = (dimes_products(details_of(ESTIMATOR.estimate(measurements))) for _ in range(2))
     for image, copy in zip(measurements.images, copies, strict=True):
@@ -346,14 +348,14 @@ def test_inputs_are_unchanged_and_estimates_repeat(measurements: DescentMeasurem
 
 def test_altitude_error_causes_predicted_velocity_error() -> None:
     """An altitude error e of the third image displaces a feature at distance r from its nadir by e r / H."""
-    truth = fly_steadily((8.0, 3.0), (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 0.0), tilt_body(4.0, 200.0, 0.0)))
+    truth = steady_flight((8.0, 3.0), (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 0.0), tilt_body(4.0, 200.0, 0.0)))
     measured = render(truth)
     error = 10.0
-    wrong = (
+    altitudes = (
         *measured.altitudes[:2],
         replace(measured.altitudes[2], altitude_m=measured.altitudes[2].altitude_m + error),
     )
-    tracks = [t for t in details_of(ESTIMATOR.estimate(replace(measured, altitudes=wrong))).tracks if t.pair == 1]
+    tracks = [t for t in details_of(ESTIMATOR.estimate(replace(measured, altitudes=altitudes))).tracks if t.pair == 1]
     assert len(tracks) == 2
     for track in tracks:
         earlier, later = (truth.positions[k, 2] for k in (1, 2))

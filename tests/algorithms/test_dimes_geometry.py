@@ -1,4 +1,4 @@
-"""Tests of the geometry of DIMES: ground projection, image overlap, zero-phase spot and rectification."""
+"""Tests of the geometry of DIMES: projection between pixels and ground, template candidates and rectification."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ from tests.algorithms.synthetic_descent import (
     INTERVAL_S,
     ROWS_SUMMED,
     Texture,
-    calibration,
     expose_scene,
+    make_calibration,
     tilt_body,
     trace_scene,
 )
@@ -53,9 +53,9 @@ NIGHT = direction(0.0, -1.0)  # the sun below the horizon: no zero-phase spot on
 def make_blank_view(
     attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None
 ) -> View:
-    picture = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
+    pixels = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
     return build_view(
-        DetectorImage(picture, time_s, CAMERA.bin(1, ROWS_SUMMED), calibration()), attitude, altitude_m, (256, 256)
+        DetectorImage(pixels, time_s, CAMERA.bin(1, ROWS_SUMMED), make_calibration()), attitude, altitude_m, (256, 256)
     )
 
 
@@ -65,44 +65,44 @@ def make_views(
     return make_blank_view(first, altitudes[0]), make_blank_view(second, altitudes[1], INTERVAL_S)
 
 
-def candidates(first: View, second: View, sun: np.ndarray = NIGHT) -> Candidates:
+def find_candidates(first: View, second: View, sun: np.ndarray = NIGHT) -> Candidates:
     return template_candidates(first, second, search_geometry(first, second, OPTIONS), sun, OPTIONS)
 
 
-def test_ground_and_pixels_invert_each_other() -> None:
+def test_ground_and_pixel_projections_are_inverse() -> None:
     view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     pixels = grid_pixels(view.size, 16)
-    ground, near = ground_from_pixels(view, pixels, LIMIT)
+    ground, is_within_limit = ground_from_pixels(view, pixels, LIMIT)
     back, visible = pixels_from_ground(view, ground)
-    assert near.sum() > 200
-    assert np.all(visible[near])
-    np.testing.assert_allclose(back[near], pixels[near], atol=1e-6)
+    assert is_within_limit.sum() > 200
+    assert np.all(visible[is_within_limit])
+    np.testing.assert_allclose(back[is_within_limit], pixels[is_within_limit], atol=1e-6)
 
 
-def test_distant_rays_end_at_limit_in_same_azimuth() -> None:
+def test_distant_rays_are_clipped_at_the_off_nadir_limit() -> None:
     view = make_blank_view(tilt_body(80.0, 0.0, 0.0), 1500.0)  # tilted: half of the image is sky
     pixels = border_pixels(view.size)
-    ground, near = ground_from_pixels(view, pixels, LIMIT)
+    ground, is_within_limit = ground_from_pixels(view, pixels, LIMIT)
     _, directions = view.camera.rays(pixels)
     assert np.any(directions[:, 2] > 0.0)
-    assert not near.all()
+    assert not is_within_limit.all()
     off_nadir = np.hypot(*ground.T) / view.centre[2]
-    np.testing.assert_allclose(off_nadir[~near], np.tan(LIMIT))
-    along = np.sum(ground * directions[:, :2], axis=1)
-    np.testing.assert_allclose(along, np.hypot(*ground.T) * np.hypot(*directions[:, :2].T))
+    np.testing.assert_allclose(off_nadir[~is_within_limit], np.tan(LIMIT))
+    dot_products = np.sum(ground * directions[:, :2], axis=1)
+    np.testing.assert_allclose(dot_products, np.hypot(*ground.T) * np.hypot(*directions[:, :2].T))
 
 
 def test_camera_is_above_origin_for_any_mounting_position() -> None:
     attitude = tilt_body(30.0, 45.0, 10.0)
     lever = np.array([0.5, -1.0, -2.0])
     camera = CAMERA.bin(1, ROWS_SUMMED).transform(RigidTransform.from_translation(lever))
-    image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, camera, calibration())
+    image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, camera, make_calibration())
     view = build_view(image, attitude, 1400.0, (256, 256))
     np.testing.assert_allclose(view.camera.c, view.centre, atol=1e-9)
     np.testing.assert_allclose(view.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever)[2]], atol=1e-9)
 
 
-def test_pixel_angle_and_search_geometry() -> None:
+def test_pixel_angle_and_search_geometry_match_the_paper() -> None:
     first, second = make_views(Rotation.identity(), Rotation.identity())
     # 4 x 12 um / 14.67 mm = 3.272 mrad; distortion changes it by less than 0.1 % near the image centre.
     assert pixel_angle_rad(second) == pytest.approx(4 * 12e-6 / 0.01467, rel=2e-3)
@@ -113,7 +113,7 @@ def test_pixel_angle_and_search_geometry() -> None:
     assert geometry.window_px == OPTIONS.template_px + 2 * geometry.search_px
 
 
-def test_square_windows() -> None:
+def test_square_and_outline_have_the_expected_points() -> None:
     assert square(3.0, 4).shape == (16, 2)
     outline = square_outline(3.0, 4)
     assert outline.shape == (12, 2)
@@ -123,16 +123,17 @@ def test_square_windows() -> None:
 def test_nadir_overlap_is_the_smaller_image() -> None:
     first, second = make_views(Rotation.identity(), Rotation.identity())
     polygon = overlap_polygon(first, second, OPTIONS)
-    # Without distortion the border of the second image is at 1719 / 2000 of the distance from the principal point.
-    middle = np.array([(515.0 - 1.5) / 4, (508.5 - 1.5) / 4])
-    expected = middle + (border_pixels(second.size) - middle) * 0.8595
+    # The second image is taken from 1719 m, the first from 2000 m: without distortion the border of the second image,
+    # seen in the first, is at 1719 / 2000 = 0.8595 of its distance from the principal point.
+    principal_point = np.array([(515.0 - 1.5) / 4, (508.5 - 1.5) / 4])
+    expected = principal_point + (border_pixels(second.size) - principal_point) * 0.8595
     np.testing.assert_allclose(polygon, expected, atol=1.2)
 
 
 def test_candidates_lie_within_the_overlap_polygon() -> None:
     first, second = make_views(tilt_body(15.0, 10.0, 0.0), tilt_body(12.0, 120.0, 77.0))
     polygon = overlap_polygon(first, second, OPTIONS).astype(np.float32)
-    positions = candidates(first, second).pixels
+    positions = find_candidates(first, second).pixels
     assert len(positions) > 20
     inside = [cv2.pointPolygonTest(polygon, (float(u), float(v)), True) for u, v in positions]
     assert min(inside) > 0.5 * OPTIONS.template_px * 0.7  # half the window width in the first image
@@ -144,7 +145,7 @@ def test_each_candidate_fits_template_and_window() -> None:
         attitudes = [tilt_body(*rng.uniform([0.0, 0.0, 0.0], [25.0, 360.0, 360.0])) for _ in range(2)]
         first, second = make_views(attitudes[0], attitudes[1])
         geometry = search_geometry(first, second, OPTIONS)
-        result = candidates(first, second).ground
+        result = find_candidates(first, second).ground
         assert len(result) > 0
         for ground in result:
             assert inside_frame(first, ground + square_outline(geometry.template_half_m, 15), 0.0, LIMIT).all()
@@ -160,10 +161,10 @@ def test_each_candidate_fits_template_and_window() -> None:
     ],
 )
 def test_images_without_overlap_have_no_candidates(first: Rotation, second: Rotation) -> None:
-    assert len(candidates(*make_views(first, second)).pixels) == 0
+    assert len(find_candidates(*make_views(first, second)).pixels) == 0
 
 
-def test_zero_phase_spot_is_at_the_lander_shadow() -> None:
+def test_zero_phase_pixel_is_at_the_lander_shadow() -> None:
     # The sun is in the east, 60 deg high: the shadow is in the west, at altitude / tan 60 from the nadir.
     sun = direction(np.radians(90.0), np.radians(60.0))
     view = make_blank_view(tilt_body(10.0, 200.0, 30.0), 2000.0)
@@ -179,29 +180,29 @@ def test_templates_and_windows_avoid_zero_phase_spot() -> None:
         sun = direction(azimuth, np.radians(80.0))
         first, second = make_views(tilt_body(5.0, 30.0, 0.0), tilt_body(8.0, 60.0, 140.0))
         geometry = search_geometry(first, second, OPTIONS)
-        positions = candidates(first, second, sun)
-        free = candidates(first, second)
-        assert 0 < len(positions.pixels) < len(free.pixels)
-        assert 0 < positions.preferred.sum() < len(positions.pixels)
+        selectable = find_candidates(first, second, sun)
+        all_candidates = find_candidates(first, second)
+        assert 0 < len(selectable.pixels) < len(all_candidates.pixels)
+        assert 0 < selectable.preferred.sum() < len(selectable.pixels)
         for view in (first, second):
-            for ground, preferred in zip(positions.ground, positions.preferred, strict=True):
+            for ground, preferred in zip(selectable.ground, selectable.preferred, strict=True):
                 half = geometry.window_half_m if preferred and view is second else geometry.template_half_m
                 points = np.column_stack([ground + square(half, 25), np.zeros(625)]) - view.centre
                 cosines = points @ -sun / np.linalg.norm(points, axis=1)
                 # Between lattice points the spot may extend into the window by a fraction of a degree.
                 assert np.degrees(np.arccos(cosines.max())) > np.degrees(radius) - 0.6
-        chosen, _ = select_templates(first, positions, OPTIONS)
-        assert all(positions.preferred[k] for k in chosen)
+        chosen, _ = select_templates(first, selectable, OPTIONS)
+        assert all(selectable.preferred[k] for k in chosen)
 
 
-def test_grid_is_coarse_and_centred() -> None:
+def test_grid_has_the_given_step_and_is_centred() -> None:
     pixels = grid_pixels((256, 256), 8)
     assert pixels.shape == (32 * 32, 2)
     assert pixels.min() == 3.0
     assert pixels.max() == 251.0
 
 
-def test_best_candidates_are_selected_with_min_spacing() -> None:
+def test_candidates_with_highest_contrast_are_selected_with_min_spacing() -> None:
     pixels = np.array([[10.0, 10.0], [20.0, 12.0], [60.0, 10.0], [10.0, 90.0]])
     contrasts = np.array([0.9, 0.8, 0.1, 0.5])
     everywhere = np.ones(4, dtype=bool)
@@ -214,27 +215,27 @@ def test_best_candidates_are_selected_with_min_spacing() -> None:
     assert best_candidates(np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=bool), 2, 31.0) == []
 
 
-def test_selection_finds_the_only_textured_area() -> None:
+def test_only_textured_area_is_selected() -> None:
     counts = np.full((256, 1024), 1000, dtype=np.uint16)
     rng = np.random.default_rng(6)
     counts[140:170, 4 * 60 : 4 * 90] = np.repeat(rng.integers(700, 1300, (30, 30), dtype=np.uint16), 4, axis=1)
     view = make_blank_view(Rotation.identity(), 2000.0, 0.0, counts)
     pixels = grid_pixels(view.size, OPTIONS.grid_step_px)
     positions = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
-    chosen, of_chosen = select_templates(view, positions, OPTIONS)
+    chosen, contrasts_of_chosen = select_templates(view, positions, OPTIONS)
     np.testing.assert_allclose(pixels[chosen[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
-    assert of_chosen[0] > 0.02
-    assert of_chosen[1] < 0.001
-    assert contrasts(view, pixels, OPTIONS.template_px)[chosen[0]] == of_chosen[0]
+    assert contrasts_of_chosen[0] > 0.02
+    assert contrasts_of_chosen[1] < 0.001
+    assert contrasts(view, pixels, OPTIONS.template_px)[chosen[0]] == contrasts_of_chosen[0]
 
 
-def make_chart() -> Texture:
-    """A smooth image that is known analytically: waves of 60 to 200 m without a ramp."""
-    along_m = 1.5 * np.arange(2048)
-    return Texture(chart_at(along_m[None, :], -along_m[:, None]).astype(np.float32), 1.5)
+def make_wave_texture() -> Texture:
+    """Texture of the plane with the analytic brightness `wave_brightness`: waves of 60 to 200 m."""
+    offsets_m = 1.5 * np.arange(2048)
+    return Texture(wave_brightness(offsets_m[None, :], -offsets_m[:, None]).astype(np.float32), 1.5)
 
 
-def chart_at(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
+def wave_brightness(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
     east, north = (2.0 * np.pi * x / (2048 * 1.5) for x in (east_m, north_m))
     return 1.0 + 0.2 * np.sin(30 * east + 0.4) * np.cos(17 * north) + 0.2 * np.cos(41 * north - 12 * east)
 
@@ -250,24 +251,25 @@ def test_ground_lattice_is_north_up() -> None:
 )
 def test_rectified_patch_shows_its_lattice_positions(attitude: Rotation) -> None:
     position = np.array([700.0, -300.0, 1700.0])
-    counts = expose_scene(trace_scene(make_chart(), attitude, position), calibration(), level=1600.0)
+    counts = expose_scene(trace_scene(make_wave_texture(), attitude, position), make_calibration(), level=1600.0)
     view = make_blank_view(attitude, 1700.0, 0.0, counts)
-    centre, near = ground_from_pixels(view, np.array([[150.0, 90.0]]), LIMIT)
-    assert near[0]
+    centre, is_within_limit = ground_from_pixels(view, np.array([[150.0, 90.0]]), LIMIT)
+    assert is_within_limit[0]
     patch = rectify_patch(view, centre[0], 61, 5.5)
     lattice = ground_lattice(centre[0], 61, 5.5) + position[:2]
-    expected = chart_at(lattice[..., 0], lattice[..., 1])
-    shift = _shift(patch / 1600.0, expected, lattice)
+    expected = wave_brightness(lattice[..., 0], lattice[..., 1])
+    shift = _estimate_shift(patch / 1600.0, expected, lattice)
     # 0.01 of a binned pixel: 0.06 m, or 0.015 m/s over 3.75 s.
     assert np.abs(shift).max() < 0.06
     np.testing.assert_allclose(patch / 1600.0, expected, atol=0.02)
 
 
-def _shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-    """Mean displacement (east, north) of the patch relative to the chart, metres, by one least-squares step."""
+def _estimate_shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray) -> np.ndarray:
+    """Mean displacement (east, north) of the patch relative to the expected one, metres, by one least-squares step."""
     east, north = lattice[..., 0], lattice[..., 1]
     slopes = [
-        (chart_at(east + dx, north + dy) - chart_at(east - dx, north - dy)) / 0.2 for dx, dy in ((0.1, 0.0), (0.0, 0.1))
+        (wave_brightness(east + dx, north + dy) - wave_brightness(east - dx, north - dy)) / 0.2
+        for dx, dy in ((0.1, 0.0), (0.0, 0.1))
     ]
     design = np.column_stack([slopes[0].ravel(), slopes[1].ravel(), np.ones(patch.size)])
     solution, *_ = np.linalg.lstsq(design, (patch - expected).ravel())

@@ -1,4 +1,4 @@
-"""Tests of radiometric corrections against a forward model of each physical row."""
+"""Tests of the radiometric corrections of DIMES against a forward model of each physical row."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import (
     CAMERA,
     ROWS_SUMMED,
-    calibration,
+    compute_fall_off,
     draw_terrain,
     expose_scene,
-    fall_off,
+    make_calibration,
     trace_scene,
 )
 
 LEVEL = 1600.0
-TIMES = [(5e-6, 2e-6), (5e-6, 0.0), (0.0, 2e-6), (3e-6, 3e-6), (1e-6, 5e-6), (0.0, 0.0)]
+ROW_TIMES_S = [(5e-6, 2e-6), (5e-6, 0.0), (0.0, 2e-6), (3e-6, 3e-6), (1e-6, 5e-6), (0.0, 0.0)]
 
 
 def simulate_transfer(rates: np.ndarray, exposure_s: float, transfer_row_s: float, clear_row_s: float) -> np.ndarray:
-    """Charge of each physical row, by a loop over the rows that a charge packet passes."""
+    """Charge of each physical row: its exposure plus the smear of the rows passed in clearing and in transfer."""
     charge = exposure_s * rates
     for r in range(len(rates)):
         for passed in range(len(rates) - 1, r, -1):
@@ -36,31 +36,29 @@ def simulate_transfer(rates: np.ndarray, exposure_s: float, transfer_row_s: floa
     return charge
 
 
-@pytest.mark.parametrize("times", TIMES)
+@pytest.mark.parametrize("row_times_s", ROW_TIMES_S)
 @pytest.mark.parametrize("rows_summed", [1, 2, 4])
-def test_inversion_is_exact_for_uniform_summed_rows(times: tuple[float, float], rows_summed: int) -> None:
+def test_smear_removal_is_exact_for_uniform_summed_rows(row_times_s: tuple[float, float], rows_summed: int) -> None:
     rng = np.random.default_rng(5)
     rates = np.repeat(rng.uniform(0.0, 1e6, (16, 3)), rows_summed, axis=0)
     # A short exposure makes the smear as strong as the image.
-    detector = replace(
-        calibration(), exposure_s=1e-4, transfer_row_s=times[0], clear_row_s=times[1], rows_summed=rows_summed
-    )
-    charge = simulate_transfer(rates, detector.exposure_s, *times)
+    detector = replace(make_calibration(*row_times_s), exposure_s=1e-4, rows_summed=rows_summed)
+    charge = simulate_transfer(rates, detector.exposure_s, *row_times_s)
     signal = charge.reshape(16, rows_summed, 3).mean(axis=1)
     exposed = remove_frame_transfer(signal, detector, rows_summed)
-    # Rounding only; in the steepest case the recursion loses at most a factor of ten per row block.
+    # Only rounding errors remain; the recursion amplifies them by at most a factor of ten per row block.
     np.testing.assert_allclose(exposed, detector.exposure_s * rates[::rows_summed], rtol=1e-9, atol=1e-9)
 
 
 def test_exposure_shorter_than_transfer_is_rejected() -> None:
-    detector = replace(calibration(), exposure_s=1e-6)
+    detector = replace(make_calibration(), exposure_s=1e-6)
     with pytest.raises(ValueError, match="1e-06 s is too short"):
         remove_frame_transfer(np.ones((256, 4)), detector, 4)
 
 
 def test_exposure_is_optional_without_frame_transfer() -> None:
     """Real images have no exposure metadata and need no smear correction."""
-    detector = replace(calibration(0.0, 0.0), exposure_s=0.0)
+    detector = replace(make_calibration(0.0, 0.0), exposure_s=0.0)
     signal = np.arange(12.0).reshape(4, 3)
     np.testing.assert_array_equal(remove_frame_transfer(signal, detector, 2), signal)
 
@@ -69,17 +67,17 @@ def render_view(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, 
     """Radiance of a textured scene and the DIMES view of its image."""
     attitude = Rotation.from_euler("zy", [30.0, 12.0], degrees=True)
     radiance = trace_scene(draw_terrain(), attitude, np.array([500.0, 300.0, 1700.0]))
-    detector = calibration(transfer_row_s, clear_row_s)
+    detector = make_calibration(transfer_row_s, clear_row_s)
     image = DetectorImage(expose_scene(radiance, detector, level=LEVEL), 0.0, CAMERA.bin(1, ROWS_SUMMED), detector)
     return radiance, build_view(image, attitude, 1700.0, (256, 256))
 
 
-@pytest.mark.parametrize("times", [(5e-6, 2e-6), (1e-6, 5e-6), (0.0, 0.0)])
-def test_static_scene_is_restored_within_tolerance(times: tuple[float, float]) -> None:
-    radiance, view = render_view(*times)
-    irradiance = bin_mean(LEVEL * radiance * fall_off(), 4, 4)
+@pytest.mark.parametrize("row_times_s", [(5e-6, 2e-6), (1e-6, 5e-6), (0.0, 0.0)])
+def test_static_scene_is_restored_within_tolerance(row_times_s: tuple[float, float]) -> None:
+    radiance, view = render_view(*row_times_s)
+    irradiance = bin_mean(LEVEL * radiance * compute_fall_off(), 4, 4)
     restored = remove_frame_transfer(view.signal, view.calibration, view.rows_summed)
-    assert np.abs(view.signal - irradiance).max() > (0.1 * 4095 if times[0] else 0.0)  # the smear is significant
+    assert np.abs(view.signal - irradiance).max() > (0.1 * 4095 if row_times_s[0] else 0.0)  # the smear is significant
     # Rows within a delivered row differ slightly and counts are rounded: at most 0.2 % of full scale, 0.1 % rms.
     assert np.abs(restored - irradiance).max() < 0.002 * 4095
     assert np.sqrt(np.mean((restored - irradiance) ** 2)) < 0.001 * 4095

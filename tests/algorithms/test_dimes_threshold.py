@@ -25,14 +25,14 @@ EXACT = ThresholdInputs(
 )
 
 
-def errors_of(inputs: ThresholdInputs, seed: int = 1) -> np.ndarray:
+def draw_errors(inputs: ThresholdInputs, seed: int = 1) -> np.ndarray:
     return right_track_errors(inputs, np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
-def specified() -> np.ndarray:
-    """Errors of the stored derivation with another seed."""
-    return errors_of(replace(ThresholdInputs(), descents=250), seed=77)
+def confirmation_errors() -> np.ndarray:
+    """Track errors for the inputs of the stored derivation, with a confirmation seed."""
+    return draw_errors(replace(ThresholdInputs(), descents=250), seed=77)
 
 
 def test_default_threshold_matches_stored_derivation() -> None:
@@ -42,8 +42,8 @@ def test_default_threshold_matches_stored_derivation() -> None:
     assert low < STORED["threshold_m_s"] < high
 
 
-def test_confirmation_seed_gives_similar_availability(specified: np.ndarray) -> None:
-    result = discrepancies(specified, ThresholdInputs().imu_sd_m_s, np.random.default_rng(2))
+def test_confirmation_seed_has_similar_availability(confirmation_errors: np.ndarray) -> None:
+    result = discrepancies(confirmation_errors, ThresholdInputs().imu_sd_m_s, np.random.default_rng(2))
     # The stored derivation accepts 99.52 %: of 250 cases, 1.2 +- 1.1 fail.
     assert np.sum(result.single >= STORED["threshold_m_s"]) <= 5
     assert np.all(result.best <= result.single)
@@ -54,35 +54,35 @@ def test_confirmation_seed_gives_similar_availability(specified: np.ndarray) -> 
 
 @pytest.mark.parametrize("tracks_per_pair", [1, 2])
 @pytest.mark.parametrize("wrong_by_m_s", [(10.0, 10.0), (10.0, 60.0)])
-def test_one_wrong_track_rarely_gives_wrong_velocity(
-    specified: np.ndarray, tracks_per_pair: int, wrong_by_m_s: tuple[float, float]
+def test_one_wrong_track_rarely_causes_a_wrong_velocity(
+    confirmation_errors: np.ndarray, tracks_per_pair: int, wrong_by_m_s: tuple[float, float]
 ) -> None:
     # With one track wrong by at least 10 m/s, 99.5 % of cases report a correct velocity or none.
     rng = np.random.default_rng(5)
-    tracks = np.concatenate([specified[:, :, :tracks_per_pair]] * 8)
-    fraction = harm(tracks, wrong_by_m_s, STORED["threshold_m_s"], ThresholdInputs().imu_sd_m_s, rng)
-    assert fraction.right + fraction.refused >= 0.995
-    assert fraction.right + fraction.refused + fraction.wrong == pytest.approx(1.0)
-    # With a second track in the pair, the correct velocity is almost always found.
-    assert fraction.right > 0.99 if tracks_per_pair == 2 else fraction.refused > 0.99
+    tracks = np.concatenate([confirmation_errors[:, :, :tracks_per_pair]] * 8)
+    fractions = harm(tracks, wrong_by_m_s, STORED["threshold_m_s"], ThresholdInputs().imu_sd_m_s, rng)
+    assert fractions.right + fractions.refused >= 0.995
+    assert fractions.right + fractions.refused + fractions.wrong == pytest.approx(1.0)
+    # With a second track in the pair, the correct velocity is almost always reported.
+    assert fractions.right > 0.99 if tracks_per_pair == 2 else fractions.refused > 0.99
 
 
 def test_error_free_tracks_are_exact() -> None:
     # The tolerance covers rounding between pixels and ground.
-    assert np.abs(errors_of(EXACT)).max() < 1e-6
+    assert np.abs(draw_errors(EXACT)).max() < 1e-6
 
 
-def test_velocity_errors_have_the_match_error_spread() -> None:
-    errors = errors_of(replace(EXACT, descents=80, match_sd_m_s=0.3))
+def test_velocity_errors_have_the_match_error_deviation() -> None:
+    errors = draw_errors(replace(EXACT, descents=80, match_sd_m_s=0.3))
     assert errors.std() == pytest.approx(0.3, rel=0.1)  # 640 values: 3 % is one standard deviation
 
 
-def test_common_attitude_error_turns_descent_into_drift() -> None:
+def test_common_attitude_error_causes_apparent_drift() -> None:
     # A tilt b causes an apparent velocity b x v. For 75 m/s down and 0.5 deg per axis it is 0.65 m/s per axis. A
     # heading error of 0.5 deg adds at most 0.26 m/s at 30 m/s of drift.
-    errors = errors_of(replace(EXACT, descents=120, common_attitude_sd_deg=0.5))
-    slip = np.radians(0.5) * 281.0 / 3.75
-    assert 0.8 * slip < errors.std() < 1.7 * slip
+    errors = draw_errors(replace(EXACT, descents=120, common_attitude_sd_deg=0.5))
+    apparent_m_s = np.radians(0.5) * 281.0 / 3.75
+    assert 0.8 * apparent_m_s < errors.std() < 1.7 * apparent_m_s
     # All tracks have the same error: the IMU check is hardly affected.
     result = discrepancies(errors, 0.0, np.random.default_rng(1))
     assert np.median(result.single) < 0.5 * np.median(np.linalg.norm(errors[:, 1, 0], axis=-1))
@@ -94,12 +94,12 @@ def test_threshold_is_rounded_up_to_its_step() -> None:
     assert threshold_m_s(values, 0.81, 0.05) == 0.85
 
 
-def test_harm_counts_reported_wrong_velocities() -> None:
+def test_harm_is_the_fraction_of_reported_wrong_velocities() -> None:
     exact = np.zeros((50, 2, 2, 2))
     rng = np.random.default_rng(3)
     assert harm(exact, (10.0, 10.0), 4.5, 0.0, rng) == derivation.Harm(1.0, 0.0, 0.0)
     assert harm(exact[:, :, :1], (10.0, 10.0), 4.5, 0.0, rng) == derivation.Harm(0.0, 1.0, 0.0)
     # Without a threshold the wrong track is reported if it is in the second pair: half of the cases.
-    loose = harm(exact[:, :, :1], (10.0, 10.0), 100.0, 0.0, rng)
-    assert loose.wrong == pytest.approx(0.5, abs=0.25)
-    assert loose.refused == 0.0
+    unchecked = harm(exact[:, :, :1], (10.0, 10.0), 100.0, 0.0, rng)
+    assert unchecked.wrong == pytest.approx(0.5, abs=0.25)
+    assert unchecked.refused == 0.0

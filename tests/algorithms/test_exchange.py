@@ -54,19 +54,19 @@ def run_program(spec: str, measurements: DescentMeasurements, **limits: float) -
     return ExecutableVelocityEstimator(command, ExecutableLimits(**{"time_s": 60.0, **limits})).estimate(measurements)
 
 
-@pytest.mark.parametrize("pictures", ["pgm", "png"])
-def test_case_files_round_trip(measurements: DescentMeasurements, tmp_path: Path, pictures: str) -> None:
-    write_case(tmp_path, measurements, pictures)  # type: ignore[arg-type]
+@pytest.mark.parametrize("image_format", ["pgm", "png"])
+def test_case_files_round_trip(measurements: DescentMeasurements, tmp_path: Path, image_format: str) -> None:
+    write_case(tmp_path, measurements, image_format)  # type: ignore[arg-type]
     back = read_case(tmp_path)
     assert isinstance(back, DescentMeasurements)
-    for one, other in zip(measurements.images, back.images, strict=True):
-        np.testing.assert_array_equal(one.counts, other.counts)
-        np.testing.assert_array_equal(one.calibration.flat_field, other.calibration.flat_field)
-        assert dataclasses.replace(one.calibration, flat_field=np.zeros((1, 1))) == dataclasses.replace(
-            other.calibration, flat_field=np.zeros((1, 1))
+    for image, copy in zip(measurements.images, back.images, strict=True):
+        np.testing.assert_array_equal(image.counts, copy.counts)
+        np.testing.assert_array_equal(image.calibration.flat_field, copy.calibration.flat_field)
+        assert dataclasses.replace(image.calibration, flat_field=np.zeros((1, 1))) == dataclasses.replace(
+            copy.calibration, flat_field=np.zeros((1, 1))
         )
         for letter in "cahvor":
-            np.testing.assert_array_equal(getattr(one.camera, letter), getattr(other.camera, letter))
+            np.testing.assert_array_equal(getattr(image.camera, letter), getattr(copy.camera, letter))
     np.testing.assert_array_equal(measurements.interval_velocities_m_s, back.interval_velocities_m_s)
     np.testing.assert_array_equal(measurements.sun_direction, back.sun_direction)
     assert measurements.altitudes == back.altitudes
@@ -99,31 +99,32 @@ def test_case_files_contain_no_truth(measurements: DescentMeasurements, tmp_path
     cameras, images = [f"camera_{k}.cahvor" for k in (1, 2, 3)], [f"image_{k}.pgm" for k in (1, 2, 3)]
     assert names == [*cameras, "case.json", "flat_field_1.f64", *images]
     # Each number in the files is a measurement; the true velocity is absent.
-    written = json.loads((tmp_path / "case.json").read_text())
-    numbers = np.array(list(_check_numbers(written)))
-    inputs = np.array(list(_check_numbers(_plain(measurements))))
-    counted = {float(k) for k in range(max(512, *measurements.images[0].counts.shape) + 1)}
-    assert set(numbers) <= set(inputs) | counted
+    case = json.loads((tmp_path / "case.json").read_text())
+    numbers = np.array(list(_iterate_numbers(case)))
+    inputs = np.array(list(_iterate_numbers(_to_plain_values(measurements))))
+    indices = {float(k) for k in range(max(512, *measurements.images[0].counts.shape) + 1)}
+    assert set(numbers) <= set(inputs) | indices
     assert not np.isclose(numbers[:, None], TRUE, atol=1e-3).any()
 
 
-def _plain(value: object) -> object:
+def _to_plain_values(value: object) -> object:
     """Convert a measurement to lists and dictionaries, with rotations as quaternions."""
     if dataclasses.is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {field.name: _to_plain_values(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Rotation):
         return value.as_quat().tolist()
     if isinstance(value, np.ndarray):
         return value.ravel().tolist() if value.size < 100 else []
-    return [_plain(one) for one in value] if isinstance(value, (tuple, list)) else value
+    return [_to_plain_values(item) for item in value] if isinstance(value, (tuple, list)) else value
 
 
-def _check_numbers(value: object) -> Iterator[float]:
+def _iterate_numbers(value: object) -> Iterator[float]:
+    """Yield all numbers of nested lists and dictionaries."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list):
-        for one in value:
-            yield from _check_numbers(one)
+        for item in value:
+            yield from _iterate_numbers(item)
     elif isinstance(value, (int, float)):
         yield float(value)
 
@@ -141,9 +142,9 @@ ANSWER = (
 )
 
 
-def test_program_answer_and_log_are_stored(measurements: DescentMeasurements, tmp_path: Path) -> None:
-    reads = 'assert json.load(open(sys.argv[-1] + "/case.json"))["task"] == "velocity"'
-    body = f'{reads}\nprint("hm\\x07", file=sys.stderr)\nprint({ANSWER})'
+def test_program_answer_and_stderr_are_stored(measurements: DescentMeasurements, tmp_path: Path) -> None:
+    check_task = 'assert json.load(open(sys.argv[-1] + "/case.json"))["task"] == "velocity"'
+    body = f'{check_task}\nprint("hm\\x07", file=sys.stderr)\nprint({ANSWER})'
     result = run_program(f"exec:{write_program(tmp_path, body)} --flag", measurements)
     assert result.outcome is VelocityOutcome.VALID
     np.testing.assert_array_equal(result.velocity_m_s, [1.5, -2.0])
@@ -179,10 +180,13 @@ def test_program_errors_are_reported_as_faults(
 ) -> None:
     spec = f"exec:{write_program(tmp_path, 'print(chr(33), file=sys.stderr, flush=True)' + chr(10) + body)}"
     started = time.monotonic()
-    patient = fault in (Fault.TIMED_OUT,)
+    times_out = fault is Fault.TIMED_OUT
     with pytest.raises(AlgorithmError, match=message.replace("[", r"\[")) as caught:
         run_program(
-            spec, measurements, time_s=2.0 if patient else 60.0, memory_gb=0.2 if fault is Fault.OUT_OF_MEMORY else 2.0
+            spec,
+            measurements,
+            time_s=2.0 if times_out else 60.0,
+            memory_gb=0.2 if fault is Fault.OUT_OF_MEMORY else 2.0,
         )
     assert caught.value.fault is fault
     assert caught.value.stderr.startswith("!")
@@ -198,10 +202,10 @@ for number, line in enumerate(sys.stdin):
 """
 
 
-def test_persistent_program_answers_cases_and_restarts(measurements: DescentMeasurements, tmp_path: Path) -> None:
+def test_persistent_program_restarts_after_a_crash(measurements: DescentMeasurements, tmp_path: Path) -> None:
     spec = f"serve:{write_program(tmp_path, SERVER)}"
-    answers = [run_program(spec, measurements).velocity_m_s for _ in range(2)]
-    assert [float(one[0]) for one in answers if one is not None] == [0.0, 1.0]
+    velocities = [run_program(spec, measurements).velocity_m_s for _ in range(2)]
+    assert [float(velocity[0]) for velocity in velocities if velocity is not None] == [0.0, 1.0]
     with pytest.raises(AlgorithmError, match="SIGABRT"):
         run_program(spec, measurements)
     repeated = run_program(spec, measurements).velocity_m_s
@@ -210,11 +214,11 @@ def test_persistent_program_answers_cases_and_restarts(measurements: DescentMeas
     end_persistent()
 
 
-#: Answers each case with its number after `{pause_s}`, and again after the same time.
-TWICE = """
+#: A program that answers each case twice: `{pause_s}` after the request, and again after the same time.
+DOUBLE_ANSWERS = """
 print(json.dumps({"exchange": {version}, "ready": True}), flush=True)
 for number, line in enumerate(sys.stdin):
-    asked = json.loads(line)
+    request = json.loads(line)
     time.sleep({pause_s})
     answer = {"exchange": {version}, {identity}"outcome": "VALID", "velocity_m_s": [number, 0]}
     print(json.dumps(answer), flush=True)
@@ -224,13 +228,13 @@ for number, line in enumerate(sys.stdin):
 
 
 def format_double_answers(version: int, pause_s: float = 0.05) -> str:
-    identity = '"id": asked["id"], ' if version > 1 else ""
-    text = TWICE.replace("{version}", str(version)).replace("{identity}", identity)
+    identity = '"id": request["id"], ' if version > 1 else ""
+    text = DOUBLE_ANSWERS.replace("{version}", str(version)).replace("{identity}", identity)
     return text.replace("{pause_s}", str(pause_s))
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_late_second_answer_is_not_used_for_next_case(
+def test_late_second_answer_is_not_used_for_the_next_case(
     measurements: DescentMeasurements, tmp_path: Path, version: int
 ) -> None:
     spec = f"serve:{write_program(tmp_path, format_double_answers(version))}"
@@ -299,14 +303,14 @@ def test_missing_programs_are_reported(spec: str, message: str) -> None:
 
 def test_python_answers_are_validated() -> None:
     velocity = np.array([1.0, 2.0])
-    good = VelocityEstimate(VelocityOutcome.VALID, velocity)
-    assert check_velocity(good).velocity_m_s is not velocity
+    valid = VelocityEstimate(VelocityOutcome.VALID, velocity)
+    assert check_velocity(valid).velocity_m_s is not velocity
     for invalid in (
         None,
-        dataclasses.replace(good, velocity_m_s=None),
+        dataclasses.replace(valid, velocity_m_s=None),
         VelocityEstimate(VelocityOutcome.IMU_MISMATCH, velocity),
-        dataclasses.replace(good, velocity_m_s=np.array([1.0, np.inf])),
-        dataclasses.replace(good, covariance_m2_s2=np.array([[1.0, 0.5], [0.4, 1.0]])),
+        dataclasses.replace(valid, velocity_m_s=np.array([1.0, np.inf])),
+        dataclasses.replace(valid, covariance_m2_s2=np.array([[1.0, 0.5], [0.4, 1.0]])),
     ):
         with pytest.raises(AlgorithmError) as caught:
             check_velocity(invalid)
@@ -318,11 +322,11 @@ def test_python_answers_are_validated() -> None:
 def test_c_example_estimates_velocity(measurements: DescentMeasurements, tmp_path: Path) -> None:
     compiler = shutil.which("cc") or shutil.which("gcc")
     assert compiler is not None, "the set-up script installs a C compiler"
-    built = tmp_path / "velocity_estimator"
+    executable = tmp_path / "velocity_estimator"
     warnings = ("-Wall", "-Wextra", "-Werror", "-Wno-format-truncation")
     source = str(EXAMPLES / "velocity_estimator.c")
-    subprocess.run([compiler, "-O2", "-std=c11", *warnings, "-o", str(built), source, "-lm"], check=True)
-    for spec in (f"exec:{built}", f"serve:{built} --serve"):
+    subprocess.run([compiler, "-O2", "-std=c11", *warnings, "-o", str(executable), source, "-lm"], check=True)
+    for spec in (f"exec:{executable}", f"serve:{executable} --serve"):
         result = run_program(spec, measurements)
         assert result.velocity_m_s is not None
         # Whole pixels of 1.6 m (4 rows: 6.5 m) over 3.75 s; the median of 25 has a quarter of that error.
@@ -330,9 +334,9 @@ def test_c_example_estimates_velocity(measurements: DescentMeasurements, tmp_pat
         assert isinstance(result.details, ProgramDetails)
         assert "templates found" in result.details.stderr
     end_persistent()
-    flat = tuple(dataclasses.replace(one, counts=np.full_like(one.counts, 4095)) for one in measurements.images)
-    blank = dataclasses.replace(measurements, images=flat)
-    assert run_program(f"exec:{built}", blank).outcome is VelocityOutcome.NO_VALID_TRACK
+    images = tuple(dataclasses.replace(image, counts=np.full_like(image.counts, 4095)) for image in measurements.images)
+    saturated = dataclasses.replace(measurements, images=images)
+    assert run_program(f"exec:{executable}", saturated).outcome is VelocityOutcome.NO_VALID_TRACK
 
 
 def test_python_example_estimates_velocity(measurements: DescentMeasurements, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,36 +29,36 @@ from marsyard.sim.measurements import PixelTarget, RoverTarget, SiteTarget, Targ
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "target_tracker.py"
 
-#: Serves Marsyard's tracker over the exchange; each update contains the process id.
+#: A program that serves Marsyard's tracker by the exchange format; each update writes its process id to stderr.
 SERVER = """
 import json, os, sys
 from pathlib import Path
 from marsyard.algorithms.exchange import read_mast, read_pose, read_stop, read_target
 from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
 tracker, masts = VisualTargetTracker(VttOptions()), {}
-def mast(asked):
-    return masts.setdefault(asked["mast"], read_mast(Path(asked["mast"])))
-def box(one):
-    return {"corner": one.corner, "size": one.size}
+def mast(request):
+    return masts.setdefault(request["mast"], read_mast(Path(request["mast"])))
+def encode_box(box):
+    return {"corner": box.corner, "size": box.size}
 print(json.dumps({"exchange": 1, "ready": True}), flush=True)
 for line in sys.stdin:
-    asked = json.loads(line)
-    if asked["do"] == "designate":
-        tracker.designate(read_target(asked["target"]), read_pose(asked["world_from_rover"]))
+    request = json.loads(line)
+    if request["do"] == "designate":
+        tracker.designate(read_target(request["target"]), read_pose(request["world_from_rover"]))
         answer = {"state": tracker.state.name}
-    elif asked["do"] == "clear":
+    elif request["do"] == "clear":
         tracker.clear()
         answer = {"state": tracker.state.name}
-    elif asked["do"] == "aim":
-        aim = tracker.aim(read_pose(asked["world_from_rover"]), mast(asked))
+    elif request["do"] == "aim":
+        aim = tracker.aim(read_pose(request["world_from_rover"]), mast(request))
         answer = {"aim": aim and {"azimuth_rad": aim.azimuth_rad, "elevation_rad": aim.elevation_rad,
-                                  "left": box(aim.left), "right": box(aim.right)}}
+                                  "left": encode_box(aim.left), "right": encode_box(aim.right)}}
     else:
         print(os.getpid(), file=sys.stderr, flush=True)
-        found = tracker.update(read_stop(Path(asked["stop"]), mast(asked)))
-        where = found.position_rover
-        answer = {"state": found.state.name, "losses": [one.name for one in found.losses],
-                  "position_rover": None if where is None else where.tolist()}
+        update = tracker.update(read_stop(Path(request["stop"]), mast(request)))
+        position = update.position_rover
+        answer = {"state": update.state.name, "losses": [loss.name for loss in update.losses],
+                  "position_rover": None if position is None else position.tolist()}
     print(json.dumps({"exchange": 1, **answer}), flush=True)
 """
 
@@ -75,30 +75,30 @@ def write_server(folder: Path, text: str = SERVER) -> str:
     return f"{sys.executable} {path}"
 
 
-def process_of(update: TargetUpdate) -> int:
+def process_id(update: TargetUpdate) -> int:
     assert isinstance(update.details, ProgramDetails)
     return int(update.details.stderr)
 
 
 @pytest.fixture
-def paths(monkeypatch: pytest.MonkeyPatch) -> None:
+def import_path(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make Marsyard's packages importable in programs."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
 
 
-@pytest.mark.usefixtures("paths")
+@pytest.mark.usefixtures("import_path")
 def test_program_matches_python_tracker(tmp_path: Path) -> None:
     python_tracker = VisualTargetTracker(VttOptions())
     reference = trackers.drive(python_tracker)
     program = make_tracker(f"serve:{write_server(tmp_path)}")
     actual = trackers.drive(program)
-    assert [one.state for one in actual] == [TrackingState.NORMAL] * len(reference)
-    for one, other in zip(reference, actual, strict=True):
-        assert one.position_rover is not None
-        assert other.position_rover is not None
+    assert [update.state for update in actual] == [TrackingState.NORMAL] * len(reference)
+    for expected_update, update in zip(reference, actual, strict=True):
+        assert expected_update.position_rover is not None
+        assert update.position_rover is not None
         # Numbers are exchanged exactly; quaternions are normalised again.
-        np.testing.assert_allclose(other.position_rover, one.position_rover, rtol=0.0, atol=1e-12)
-    lost, expected = (trackers.stop(one, trackers.pose(2.0), blank=0) for one in (program, python_tracker))
+        np.testing.assert_allclose(update.position_rover, expected_update.position_rover, rtol=0.0, atol=1e-12)
+    lost, expected = (trackers.stop(tracker, trackers.pose(2.0), blank=0) for tracker in (program, python_tracker))
     assert lost is not None
     assert expected is not None
     assert lost.state is program.state is TrackingState.LOST
@@ -109,33 +109,33 @@ def test_program_matches_python_tracker(tmp_path: Path) -> None:
     end_persistent()
 
 
-@pytest.mark.usefixtures("paths")
-def test_process_serves_one_run_or_many(tmp_path: Path) -> None:
-    words = write_server(tmp_path)
+@pytest.mark.usefixtures("import_path")
+def test_persistent_process_serves_many_runs(tmp_path: Path) -> None:
+    command = write_server(tmp_path)
     for prefix, shared in (("serve", True), ("exec", False)):
         processes = []
         for _ in range(2):
-            one = make_tracker(f"{prefix}:{words}")
-            processes.append({process_of(update) for update in trackers.drive(one)})
-            del one
+            tracker = make_tracker(f"{prefix}:{command}")
+            processes.append({process_id(update) for update in trackers.drive(tracker)})
+            del tracker
             gc.collect()
-        assert all(len(reference) == 1 for reference in processes)
+        assert all(len(process_ids) == 1 for process_ids in processes)
         assert (processes[0] == processes[1]) is shared
     end_persistent()
-    gone = [one for result in processes for one in result if Path(f"/proc/{one}").exists()]
-    assert gone == []
+    still_running = [number for process_ids in processes for number in process_ids if Path(f"/proc/{number}").exists()]
+    assert still_running == []
 
 
-@pytest.mark.usefixtures("paths")
+@pytest.mark.usefixtures("import_path")
 def test_example_tracks_the_target() -> None:
     updates = trackers.drive(make_tracker(f"exec:{sys.executable} {EXAMPLE}"))
     assert [update.state for update in updates] == [TrackingState.NORMAL] * 4
     for number, update in enumerate(updates):
-        true = trackers.pose(0.4 * number).inv().apply(trackers.TARGET_M)
+        true_position = trackers.pose(0.4 * number).inv().apply(trackers.TARGET_M)
         assert update.position_rover is not None
-        # Half a pixel of disparity at 8 m with a baseline of 0.2 m is 0.13 m of range, and 7 mm across.
-        assert np.abs(update.position_rover - true)[0] < 0.27
-        assert np.abs(update.position_rover - true)[1:].max() < 0.05
+        # Half a pixel of disparity at 8 m with a baseline of 0.2 m is 0.13 m in range and 7 mm laterally.
+        assert np.abs(update.position_rover - true_position)[0] < 0.27
+        assert np.abs(update.position_rover - true_position)[1:].max() < 0.05
 
 
 READY = 'import json, sys\nprint(json.dumps({"exchange": 1, "ready": True}), flush=True)\n'
@@ -188,9 +188,9 @@ def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: str, me
 
 
 def test_hanging_program_is_terminated(tmp_path: Path) -> None:
-    one = make_tracker(f"exec:{write_server(tmp_path, READY + 'import time; time.sleep(60)')}", time_s=1.0)
+    tracker = make_tracker(f"exec:{write_server(tmp_path, READY + 'import time; time.sleep(60)')}", time_s=1.0)
     with pytest.raises(AlgorithmError, match="no answer within 1 s") as caught:
-        one.designate(trackers.designation(), trackers.pose(0.0))
+        tracker.designate(trackers.designation(), trackers.pose(0.0))
     assert caught.value.fault is Fault.TIMED_OUT
 
 

@@ -1,4 +1,4 @@
-"""Tests of template matching under shift, scale, roll and warp against definitions and analytic images."""
+"""Tests of template matching with shift, scale, roll and warp, against the definitions and analytic images."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from marsyard.algorithms.image.registration import Warp, register_template, simi
 WARPS: tuple[Warp, ...] = ("shift", "stretch", "bend")
 
 
-def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:
+def correlate(template: np.ndarray, window: np.ndarray) -> np.ndarray:
     n, m = template.shape
     result = np.zeros((window.shape[0] - n + 1, window.shape[1] - m + 1))
     for i, j in np.ndindex(*result.shape):
@@ -32,7 +32,7 @@ def test_correlation_equals_its_definition(n: int, m: int, rows: int, columns: i
     rng = np.random.default_rng(n * rows)
     template, window = 1000.0 + 30.0 * rng.normal(size=(n, m)), 1500.0 + 50.0 * rng.normal(size=(rows, columns))
     # Sums of products are float32: 1e-7 of the energy.
-    np.testing.assert_allclose(normalized_correlation(template, window), brute_force(template, window), atol=1e-5)
+    np.testing.assert_allclose(normalized_correlation(template, window), correlate(template, window), atol=1e-5)
 
 
 def test_correlation_ignores_gain_and_offset() -> None:
@@ -57,7 +57,7 @@ def test_template_larger_than_window_is_rejected() -> None:
         coarse_to_fine_peak(np.zeros((5, 5)), np.zeros((20, 20)), 2, 3)
 
 
-def test_halving_averages_pixels() -> None:
+def test_halved_image_contains_means_of_2x2_pixels() -> None:
     image = np.arange(35.0).reshape(5, 7)
     np.testing.assert_allclose(halve(image), [[4.0, 6.0, 8.0], [18.0, 20.0, 22.0]])
 
@@ -70,11 +70,11 @@ def test_coarse_to_fine_search_equals_full_search() -> None:
         row, column = rng.integers(0, 100, 2)
         template = window[row : row + 21, column : column + 21] + rng.normal(0.0, 40.0, (21, 21))
         full = coarse_to_fine_peak(template, window, 0, 1)
-        quick = coarse_to_fine_peak(template, window, 1, 6)
+        coarse_to_fine = coarse_to_fine_peak(template, window, 1, 6)
         assert (full.row, full.column) == (row, column)
-        assert (quick.row, quick.column) == (row, column)
-        assert quick.value == pytest.approx(full.value, abs=1e-5)
-        assert quick.on_border == full.on_border
+        assert (coarse_to_fine.row, coarse_to_fine.column) == (row, column)
+        assert coarse_to_fine.value == pytest.approx(full.value, abs=1e-5)
+        assert coarse_to_fine.on_border == full.on_border
 
 
 def render_blobs(seed: int, points: np.ndarray, width: float = 2.0) -> np.ndarray:
@@ -103,9 +103,9 @@ def test_patches_are_scaled_and_rolled_about_the_point(magnification: float, rol
     patch = similarity_patch(image, centre, 21, magnification, np.deg2rad(roll_deg))
     offsets = (pixel_grid(21) - 10.0) / magnification
     # Before a clockwise roll, the content right of the centre was above and to the right.
-    turn = np.deg2rad(roll_deg)
-    back = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    np.testing.assert_allclose(patch, render_blobs(4, centre + offsets @ back.T), atol=2e-3 * image.std())
+    roll = np.deg2rad(roll_deg)
+    rotation = np.array([[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]])
+    np.testing.assert_allclose(patch, render_blobs(4, centre + offsets @ rotation.T), atol=2e-3 * image.std())
 
 
 def test_registration_finds_subpixel_shifts() -> None:
@@ -126,10 +126,10 @@ def test_stretched_image_biases_match_without_stretch_model() -> None:
     errors: dict[Warp, list[float]] = {warp: [] for warp in WARPS}
     for centre in np.random.default_rng(2).uniform(35.0, 45.0, (20, 2)):
         template = render_blobs(7, centre + (pixel_grid(21) - 10.0) @ np.linalg.inv(stretch).T)
-        for warp, result in errors.items():
+        for warp, distances in errors.items():
             match = register_template(template, image, centre[::-1] - 10.0, warp)
             assert match is not None
-            result.append(float(np.hypot(*(match.corner + 10.0 - centre[::-1]))))
+            distances.append(float(np.hypot(*(match.corner + 10.0 - centre[::-1]))))
     assert np.max(errors["stretch"]) < 0.02
     assert np.max(errors["bend"]) < 0.02
     assert np.sqrt(np.mean(np.square(errors["shift"]))) > 0.05
@@ -142,10 +142,10 @@ def test_bent_image_biases_match_without_bend_model() -> None:
     errors: dict[Warp, list[float]] = {"stretch": [], "bend": []}
     for centre in np.random.default_rng(4).uniform(35.0, 45.0, (20, 2)):
         template = render_blobs(11, centre + bent)
-        for warp, result in errors.items():
+        for warp, distances in errors.items():
             match = register_template(template, image, centre[::-1] - 10.0, warp)
             assert match is not None
-            result.append(float(match.corner[0] + 10.0 - centre[1]))
+            distances.append(float(match.corner[0] + 10.0 - centre[1]))
     assert np.max(np.abs(errors["bend"])) < 0.02
     assert np.mean(errors["stretch"]) > 0.2
 

@@ -1,4 +1,4 @@
-"""Tests of image operators against brute force and closed forms."""
+"""Tests of correlation, subpixel refinement, peak measures and corner interest, against loops and closed forms."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from marsyard.algorithms.image.kernels import cubic
 from marsyard.algorithms.image.registration import refine_shift, shifted_patch, spline_coefficients
 
 
-def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:
+def correlate_directly(template: np.ndarray, window: np.ndarray) -> np.ndarray:
     n, m = template.shape
     a = template - template.mean()
     result = np.zeros((window.shape[0] - n + 1, window.shape[1] - m + 1))
@@ -39,9 +39,9 @@ def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:
 def test_correlation_equals_its_definition(n: int, m: int, rows: int, columns: int) -> None:
     rng = np.random.default_rng(n * rows)
     template, window = 1000.0 + rng.normal(size=(n, m)), 1500.0 + 3.0 * rng.normal(size=(rows, columns))
-    # Values of 1e3 with deviations of 1 leave about 1e-16 * 1e6 of the squares.
+    # The squares of values of 1e3 are rounded to about 1e-16 * 1e6 = 1e-10; the deviations are 1.
     np.testing.assert_allclose(
-        pseudo_normalized_correlation(template, window), brute_force(template, window), atol=1e-10
+        pseudo_normalized_correlation(template, window), correlate_directly(template, window), atol=1e-10
     )
 
 
@@ -123,14 +123,14 @@ def test_shifted_patch_equals_scipys_spline() -> None:
     positions = np.mgrid[:9, :11] + corner[:, None, None]
     np.testing.assert_allclose(patch, ndimage.map_coordinates(image, positions, order=5, mode="mirror"), atol=1e-12)
     step = 1e-4
-    ahead = shifted_patch(spline_coefficients(image), corner + np.array([step, 0.0]), (9, 11))[0]
-    right = shifted_patch(spline_coefficients(image), corner + np.array([0.0, step]), (9, 11))[0]
-    np.testing.assert_allclose(by_row, (ahead - patch) / step, atol=1e-3)
-    np.testing.assert_allclose(by_column, (right - patch) / step, atol=1e-3)
+    next_row = shifted_patch(spline_coefficients(image), corner + np.array([step, 0.0]), (9, 11))[0]
+    next_column = shifted_patch(spline_coefficients(image), corner + np.array([0.0, step]), (9, 11))[0]
+    np.testing.assert_allclose(by_row, (next_row - patch) / step, atol=1e-3)
+    np.testing.assert_allclose(by_column, (next_column - patch) / step, atol=1e-3)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 2), (23, 17)])
-def test_cubic_sampling_equals_scipys(shape: tuple[int, int]) -> None:
+def test_cubic_sampling_equals_scipys_spline(shape: tuple[int, int]) -> None:
     """A part of an image that starts at row 40 and column 30, up to the centres of its outermost pixels."""
     rng = np.random.default_rng(6)
     image = rng.normal(size=shape)
@@ -151,13 +151,13 @@ def test_pixels_are_clamped_to_the_image() -> None:
     assert extent == (0.0, 19.0, 0.0, 9.0)
 
 
-def test_biquadratic_is_exact_on_a_quadric() -> None:
+def test_biquadratic_offset_is_exact_for_a_quadric() -> None:
     rows, columns = np.mgrid[:9, :9].astype(float)
     surface = 1.0 - 0.02 * (rows - 4.3) ** 2 - 0.05 * (columns - 3.8) ** 2 + 0.01 * (rows - 4.3) * (columns - 3.8)
     np.testing.assert_allclose(biquadratic_offset(surface, highest_peak(surface)), [0.3, -0.2], atol=1e-12)
 
 
-def test_biquadratic_without_maximum_keeps_whole_pixel() -> None:
+def test_biquadratic_offset_is_zero_without_maximum() -> None:
     rows, columns = np.mgrid[:9, :9].astype(float)
     saddle = (rows - 4.0) ** 2 - (columns - 4.0) ** 2
     assert np.all(biquadratic_offset(saddle, Peak(4, 4, 0.0, False)) == 0.0)
@@ -166,7 +166,7 @@ def test_biquadratic_without_maximum_keeps_whole_pixel() -> None:
     assert np.all(biquadratic_offset(rows, ramp) == 0.0)
 
 
-def gaussian(rows: float, columns: float, widths: tuple[float, float] = (1.5, 1.5)) -> np.ndarray:
+def make_gaussian(rows: float, columns: float, widths: tuple[float, float] = (1.5, 1.5)) -> np.ndarray:
     y, x = np.mgrid[:41, :41]
     return np.asarray(np.exp(-((y - rows) ** 2) / (2 * widths[0] ** 2) - (x - columns) ** 2 / (2 * widths[1] ** 2)))
 
@@ -174,7 +174,7 @@ def gaussian(rows: float, columns: float, widths: tuple[float, float] = (1.5, 1.
 def test_peak_width_uses_the_widest_direction() -> None:
     # A Gaussian of width s exceeds 3/4 within s sqrt(2 ln 4/3) = 0.759 s: full width 1.517 s, in whole pixels.
     for s in (2.0, 4.0, 6.0):
-        surface = gaussian(20.0, 20.0, (2.0, s))
+        surface = make_gaussian(20.0, 20.0, (2.0, s))
         assert peak_width(surface, highest_peak(surface)) == pytest.approx(1.517 * max(s, 2.0), abs=1.0)
     spike = np.zeros((9, 9))
     spike[4, 4] = 1.0
@@ -183,22 +183,22 @@ def test_peak_width_uses_the_widest_direction() -> None:
 
 
 def test_second_peak_is_a_separate_maximum() -> None:
-    one = gaussian(20.0, 20.0, (4.0, 4.0))
-    assert second_peak(one, highest_peak(one), 3.0) == 0.0  # the flanks of a peak are not a second peak
-    two = np.maximum(one, 0.7 * gaussian(31.0, 9.0))
-    assert second_peak(two, highest_peak(two), 3.0) == pytest.approx(0.7)
-    near = np.maximum(gaussian(20.0, 20.0), 0.9 * gaussian(20.0, 23.0))
-    assert second_peak(near, highest_peak(near), 3.0) == 0.0
-    assert second_peak(near, highest_peak(near), 2.0) == pytest.approx(0.9)
+    single_peak = make_gaussian(20.0, 20.0, (4.0, 4.0))
+    assert second_peak(single_peak, highest_peak(single_peak), 3.0) == 0.0  # the flanks of a peak are not a second peak
+    two_peaks = np.maximum(single_peak, 0.7 * make_gaussian(31.0, 9.0))
+    assert second_peak(two_peaks, highest_peak(two_peaks), 3.0) == pytest.approx(0.7)
+    close_peaks = np.maximum(make_gaussian(20.0, 20.0), 0.9 * make_gaussian(20.0, 23.0))
+    assert second_peak(close_peaks, highest_peak(close_peaks), 3.0) == 0.0
+    assert second_peak(close_peaks, highest_peak(close_peaks), 2.0) == pytest.approx(0.9)
 
 
 def test_interest_requires_gradients_in_both_directions() -> None:
     u, v = np.meshgrid(np.arange(64.0), np.arange(64.0))
-    one_way, both_ways = 10.0 * np.sin(0.3 * u), 10.0 * (np.sin(0.3 * u) + np.sin(0.3 * v))
-    interest = [harris_interest(*structure_tensor(image, 21)) for image in (one_way, both_ways)]
+    one_gradient, two_gradients = 10.0 * np.sin(0.3 * u), 10.0 * (np.sin(0.3 * u) + np.sin(0.3 * v))
+    interest = [harris_interest(*structure_tensor(image, 21)) for image in (one_gradient, two_gradients)]
     assert interest[0][32, 32] < 0.05 * interest[1][32, 32]
-    # The RMS gradient per axis is 10 * 0.3 / sqrt(2) = 2.12. Sobel's difference over two pixels attenuates by sin(0.3)
-    # / 0.3. 21 pixels are one period of 20.9.
+    # The RMS gradient per axis is 10 * 0.3 / sqrt(2) = 2.12. Sobel's difference over two pixels attenuates it by
+    # sin(0.3) / 0.3. The window of 21 pixels is one period of 20.9.
     assert interest[1][32, 32] == pytest.approx(2.12 * np.sin(0.3) / 0.3, rel=0.02)
     assert np.all(harris_interest(*structure_tensor(np.full((64, 64), 7.0), 21)) == 0.0)
 

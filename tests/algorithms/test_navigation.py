@@ -33,17 +33,17 @@ def _make_rock(east: float, north: float, radius: float = 0.25, height: float = 
 
 def _apply_command(pose: RigidTransform, command: DriveCommand) -> RigidTransform:
     """The pose after a command on level ground, without slip."""
-    moved = np.array([*command.displacement_m, 0.0])
-    return pose * rigid(Rotation.from_rotvec([0.0, 0.0, command.turn_left_rad]), moved)
+    translation = np.array([*command.displacement_m, 0.0])
+    return pose * rigid(Rotation.from_rotvec([0.0, 0.0, command.turn_left_rad]), translation)
 
 
 def _drive_to_goal(
-    terrain: TerrainMap, pose: RigidTransform, goal: np.ndarray, step_m: float, **more: object
+    terrain: TerrainMap, pose: RigidTransform, goal: np.ndarray, step_m: float, **options: object
 ) -> np.ndarray:
     """Positions (east, north) of the rover with a new plan at each step, until it reaches the goal."""
     positions = [pose.translation[:2]]
     for _ in range(60):
-        plan = navigate(terrain, pose, goal, step_m, OPTIONS, **more)  # type: ignore[arg-type]
+        plan = navigate(terrain, pose, goal, step_m, OPTIONS, **options)  # type: ignore[arg-type]
         if plan.outcome is NavigationOutcome.AT_GOAL:
             return np.array(positions)
         assert plan.outcome is NavigationOutcome.PATH
@@ -77,31 +77,31 @@ def test_lateral_goal_is_reached_along_gentle_arcs() -> None:
 
 def test_goal_behind_requires_turn_or_reverse_drive() -> None:
     goal = np.array([-3.0, 0.0])
-    rotated = navigate(EVERYWHERE, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS)
-    assert rotated.commands[0].length_m == 0.0
-    assert abs(rotated.commands[0].turn_left_rad) > np.radians(90.0)
-    back = navigate(EVERYWHERE, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS, backwards=True)
-    assert len(back.commands) == 1
-    assert back.commands[0].forward_m == pytest.approx(-0.5)
-    assert back.commands[0].turn_left_rad == pytest.approx(0.0)
-    aside = _drive_to_goal(EVERYWHERE, _make_pose(0.0, 0.0), np.array([-3.0, 0.5]), 0.5, backwards=True)
-    assert aside[-1] == pytest.approx([-3.0, 0.5], abs=0.02)
+    turn_plan = navigate(EVERYWHERE, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS)
+    assert turn_plan.commands[0].length_m == 0.0
+    assert abs(turn_plan.commands[0].turn_left_rad) > np.radians(90.0)
+    reverse_plan = navigate(EVERYWHERE, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS, backwards=True)
+    assert len(reverse_plan.commands) == 1
+    assert reverse_plan.commands[0].forward_m == pytest.approx(-0.5)
+    assert reverse_plan.commands[0].turn_left_rad == pytest.approx(0.0)
+    positions = _drive_to_goal(EVERYWHERE, _make_pose(0.0, 0.0), np.array([-3.0, 0.5]), 0.5, backwards=True)
+    assert positions[-1] == pytest.approx([-3.0, 0.5], abs=0.02)
 
 
-@pytest.mark.parametrize("aside", [-0.3, 0.0, 0.4])
+@pytest.mark.parametrize("offset_m", [-0.3, 0.0, 0.4])
 @pytest.mark.parametrize("yaw_deg", [0.0, 135.0])
-def test_obstacle_is_passed_with_clearance(aside: float, yaw_deg: float) -> None:
-    turn = Rotation.from_euler("Z", yaw_deg, degrees=True).as_matrix()[:2, :2]
-    rock = _make_rock(*(turn @ np.array([3.0, aside])).tolist())
+def test_obstacle_is_passed_with_clearance(offset_m: float, yaw_deg: float) -> None:
+    rotation = Rotation.from_euler("Z", yaw_deg, degrees=True).as_matrix()[:2, :2]
+    rock = _make_rock(*(rotation @ np.array([3.0, offset_m])).tolist())
     terrain = TerrainMap(EVERYWHERE.wedges, (rock,))
-    goal = turn @ np.array([7.0, 0.0])
+    goal = rotation @ np.array([7.0, 0.0])
     positions = _drive_to_goal(terrain, _make_pose(0.0, 0.0, yaw_deg), goal, 0.5)
     assert positions[-1] == pytest.approx(goal, abs=0.02)
     closest = np.hypot(*(positions - rock.position_m).T).min()
     # Paths are sampled every 0.1 m: between samples the clearance may be 0.01 m smaller.
     assert closest > OPTIONS.half_width_m + OPTIONS.margin_m + rock.radius_m - 0.01
-    way = np.hypot(*np.diff(positions, axis=0).T).sum()
-    assert way < 1.25 * 7.0
+    path_length_m = np.hypot(*np.diff(positions, axis=0).T).sum()
+    assert path_length_m < 1.25 * 7.0
 
 
 def test_small_rocks_are_driven_over() -> None:
@@ -114,14 +114,14 @@ def test_target_rock_is_avoided_unless_it_is_named() -> None:
     terrain = TerrainMap(EVERYWHERE.wedges, (rock,))
     goal = np.array([4.8, 0.0])
     assert navigate(terrain, _make_pose(0.0, 0.0), goal, 6.0, OPTIONS).outcome is NavigationOutcome.PATH
-    near = _make_pose(3.0, 0.0)
-    assert navigate(terrain, near, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
-    named = navigate(terrain, near, goal, 0.5, OPTIONS, target="target")
-    assert named.commands == (DriveCommand(forward_m=0.5),)
+    near_pose = _make_pose(3.0, 0.0)
+    assert navigate(terrain, near_pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
+    plan = navigate(terrain, near_pose, goal, 0.5, OPTIONS, target="target")
+    assert plan.commands == (DriveCommand(forward_m=0.5),)
 
 
-def _is_mapped(apex_east: float, azimuths_deg: tuple[float, ...], rocks: tuple[Obstacle, ...]) -> TerrainMap:
-    """Wedges of navcam images, 45 deg wide, that show the ground from 1.8 m."""
+def _map_wedges(apex_east: float, azimuths_deg: tuple[float, ...], rocks: tuple[Obstacle, ...]) -> TerrainMap:
+    """Terrain map from navcam images, 45 deg wide, that show the ground from 1.8 m to 20 m."""
     terrain = TerrainMap()
     for azimuth in azimuths_deg:
         wedge = Wedge(np.array([apex_east, 0.0]), float(np.radians(azimuth)), 0.5 * NAVCAM, 1.8, 20.0)
@@ -133,46 +133,46 @@ def test_passing_an_obstacle_needs_two_wedges() -> None:
     # The wedges start 2.6 m behind the rover; the obstacle is 2 m ahead.
     rocks = (_make_rock(2.0, 0.0),)
     goal = np.array([6.0, 0.0])
-    one, two = (_is_mapped(-2.6, azimuths, rocks) for azimuths in ((90.0,), (70.0, 110.0)))
-    assert navigate(one, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
-    positions = _drive_to_goal(two, _make_pose(0.0, 0.0), goal, 0.5)
+    one_wedge, two_wedges = (_map_wedges(-2.6, azimuths, rocks) for azimuths in ((90.0,), (70.0, 110.0)))
+    assert navigate(one_wedge, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
+    positions = _drive_to_goal(two_wedges, _make_pose(0.0, 0.0), goal, 0.5)
     assert positions[-1] == pytest.approx(goal, abs=0.02)
-    assert two.contains(positions).all()
+    assert two_wedges.contains(positions).all()
     # Without the obstacle one wedge is wide enough.
-    free = _is_mapped(-2.6, (90.0,), ())
-    assert navigate(free, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
+    without_rock = _map_wedges(-2.6, (90.0,), ())
+    assert navigate(without_rock, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
 
 
-def test_ground_near_mast_is_mapped_after_two_metres() -> None:
+def test_path_starts_on_mapped_ground_after_two_metres() -> None:
     goal = np.array([7.0, 0.0])
-    terrain = _is_mapped(0.0, (70.0, 110.0), ())
+    terrain = _map_wedges(0.0, (70.0, 110.0), ())
     outcomes = {
         east: navigate(terrain, _make_pose(east, 0.0), goal, 0.5, OPTIONS).outcome for east in (0.0, 1.0, 2.0, 2.6, 3.0)
     }
-    assert [east for east, one in outcomes.items() if one is NavigationOutcome.NOT_MAPPED] == [0.0, 1.0, 2.0]
+    assert [east for east, outcome in outcomes.items() if outcome is NavigationOutcome.NOT_MAPPED] == [0.0, 1.0, 2.0]
     assert outcomes[2.6] is outcomes[3.0] is NavigationOutcome.PATH
 
 
 def test_paths_stay_on_mapped_ground() -> None:
-    terrain = _is_mapped(-2.6, (90.0,), ())
-    adjacent = navigate(terrain, _make_pose(0.0, 0.0), np.array([2.2, 2.2]), 0.5, OPTIONS)
-    assert adjacent.outcome is NavigationOutcome.NO_PATH
+    terrain = _map_wedges(-2.6, (90.0,), ())
+    plan = navigate(terrain, _make_pose(0.0, 0.0), np.array([2.2, 2.2]), 0.5, OPTIONS)
+    assert plan.outcome is NavigationOutcome.NO_PATH
 
 
-def test_rocks_in_a_wedge_are_mapped_once() -> None:
-    ahead, adjacent = _make_rock(5.0, 0.0, name="ahead"), _make_rock(0.0, 5.0, name="adjacent")
-    terrain = _is_mapped(0.0, (90.0,), (ahead, adjacent))
+def test_rock_seen_again_replaces_its_mapped_position() -> None:
+    rock_ahead, rock_outside = _make_rock(5.0, 0.0, name="ahead"), _make_rock(0.0, 5.0, name="adjacent")
+    terrain = _map_wedges(0.0, (90.0,), (rock_ahead, rock_outside))
     assert [rock.name for rock in terrain.obstacles] == ["ahead"]
-    moved = _make_rock(5.2, 0.1, name="ahead")
-    repeated = terrain.add_wedge(terrain.wedges[0], (moved,))
+    moved_rock = _make_rock(5.2, 0.1, name="ahead")
+    repeated = terrain.add_wedge(terrain.wedges[0], (moved_rock,))
     assert len(repeated.wedges) == 2
-    assert repeated.obstacles == (moved,)
+    assert repeated.obstacles == (moved_rock,)
     # A rock is visible if only its rim is inside the wedge.
-    rim = _make_rock(5.0, 5.0 * np.tan(0.5 * NAVCAM) + 0.2, name="rim")
-    assert len(terrain.add_wedge(terrain.wedges[0], (rim,)).obstacles) == 2
+    partly_inside = _make_rock(5.0, 5.0 * np.tan(0.5 * NAVCAM) + 0.2, name="rim")
+    assert len(terrain.add_wedge(terrain.wedges[0], (partly_inside,)).obstacles) == 2
 
 
-def test_wedges_across_south_are_handled() -> None:
+def test_wedge_covers_azimuths_on_both_sides_of_south() -> None:
     wedge = Wedge(np.zeros(2), np.pi, 0.3, 0.5, 5.0)
     positions = np.array([[0.1, -2.0], [-0.1, -2.0], [0.0, 2.0], [0.0, -0.4], [0.0, -5.1], [-2.0, -2.0]])
     assert wedge.covers(positions).tolist() == [True, True, False, False, False, False]

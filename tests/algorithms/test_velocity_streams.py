@@ -37,8 +37,8 @@ def make_estimate(*span_s: float) -> VelocityEstimate:
     return VelocityEstimate(VelocityOutcome.VALID, np.array([1.0, 2.0]), span_s=span)
 
 
-class Noting:
-    """Records its calls; answers from the second image on."""
+class RecordingStream:
+    """A stream that records its calls and returns an estimate from the second image on."""
 
     def __init__(self) -> None:
         self.called: list[object] = []
@@ -56,31 +56,31 @@ class Noting:
 
 
 def test_stream_receives_measurements_of_each_image() -> None:
-    measurements, stream = inputs.descent(5), Noting()
+    measurements, stream = inputs.descent(5), RecordingStream()
     velocities = measurements.interval_velocities_m_s + np.arange(4.0)[:, None]
     measurements = replace(measurements, interval_velocities_m_s=velocities)
     answer = StreamedEstimator(stream).estimate(measurements)
     assert (stream.called[0], stream.called[-1]) == ("start", "finish")
-    frames = [one for one in stream.called if isinstance(one, DescentFrame)]
+    frames = [call for call in stream.called if isinstance(call, DescentFrame)]
     assert [frame.image for frame in frames] == list(measurements.images)
     assert [frame.altitude for frame in frames] == list(measurements.altitudes)
     assert [frame.attitude for frame in frames] == list(measurements.attitudes)
     assert frames[0].interval_velocity_m_s is None
-    for before, frame in zip(velocities, frames[1:], strict=True):
-        np.testing.assert_array_equal(frame.interval_velocity_m_s, before)
+    for velocity, frame in zip(velocities, frames[1:], strict=True):
+        np.testing.assert_array_equal(frame.interval_velocity_m_s, velocity)
     assert answer.span_s == (100.5, 101.0)
     # Without a span the answer is for the last interval.
     first, *later = answer.after_pictures
     assert first is None
     tags = measurements.tags_s
-    assert [one.span_s for one in later if one is not None] == list(pairwise(tags))
+    assert [estimate.span_s for estimate in later if estimate is not None] == list(pairwise(tags))
 
 
-def test_selected_images_keep_intermediate_motion() -> None:
+def test_selection_averages_velocities_over_omitted_images() -> None:
     measurements = inputs.descent(5)
     velocities = np.arange(12.0).reshape(4, 3)
     images = tuple(
-        replace(one, time_s=tag) for one, tag in zip(measurements.images, (0.0, 1.0, 4.0, 6.0, 7.0), strict=True)
+        replace(image, time_s=tag) for image, tag in zip(measurements.images, (0.0, 1.0, 4.0, 6.0, 7.0), strict=True)
     )
     chosen = replace(measurements, images=images, interval_velocities_m_s=velocities).select((0, 2, 3))
     assert chosen.tags_s == (0.0, 4.0, 6.0)
@@ -124,13 +124,13 @@ def test_missing_span_defaults_to_last_interval() -> None:
         check_and_set_span(make_estimate(), (0.0,))
 
 
-def test_stream_cannot_set_its_own_history() -> None:
-    class Claiming(Noting):
+def test_stream_must_not_set_after_pictures() -> None:
+    class StreamWithHistory(RecordingStream):
         def finish(self) -> VelocityEstimate:
             return replace(make_estimate(), after_pictures=(make_estimate(),))
 
     with pytest.raises(AlgorithmError, match="after_pictures is given"):
-        StreamedEstimator(Claiming()).estimate(inputs.descent())
+        StreamedEstimator(StreamWithHistory()).estimate(inputs.descent())
 
 
 @pytest.mark.parametrize("altitude_m", [1500.0, float("nan")])
@@ -152,13 +152,15 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
         read_frame(tmp_path)
 
 
-@pytest.mark.parametrize("number", [1, 5])
-def test_cases_of_any_image_count_round_trip(tmp_path: Path, number: int) -> None:
-    measurements = inputs.descent(5).select(tuple(range(number)))
+@pytest.mark.parametrize("image_count", [1, 5])
+def test_cases_of_any_image_count_round_trip(tmp_path: Path, image_count: int) -> None:
+    measurements = inputs.descent(5).select(tuple(range(image_count)))
     write_case(tmp_path, measurements)
     back = read_case(tmp_path)
     assert isinstance(back, DescentMeasurements)
-    assert hash_inputs([one.counts for one in back.images]) == hash_inputs([one.counts for one in measurements.images])
+    assert hash_inputs([image.counts for image in back.images]) == hash_inputs(
+        [image.counts for image in measurements.images]
+    )
     np.testing.assert_array_equal(back.interval_velocities_m_s, measurements.interval_velocities_m_s)
     np.testing.assert_array_equal(back.inertial_velocities_m_s, measurements.inertial_velocities_m_s)
 
@@ -170,7 +172,7 @@ def make_stream(spec: str, time_s: float = 60.0) -> StreamedEstimator:
     return StreamedEstimator(ExecutableVelocityStream(command, ExecutableLimits(time_s=time_s)))
 
 
-def test_example_is_equal_in_python_and_as_program(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_example_returns_equal_estimates_in_python_and_as_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     monkeypatch.syspath_prepend(str(EXAMPLES))
     ChainedShifts = importlib.import_module("velocity_stream").ChainedShifts
@@ -183,13 +185,13 @@ def test_example_is_equal_in_python_and_as_program(monkeypatch: pytest.MonkeyPat
     assert reference.covariance_m2_s2 is not None
     assert np.all(np.abs(error) < 3.0 * np.sqrt(np.diag(reference.covariance_m2_s2)))
     assert np.all(np.diag(reference.covariance_m2_s2) < 1.0)
-    requested = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'}")
+    program = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'}")
     for _ in range(2):
-        actual = requested.estimate(measurements)
+        actual = program.estimate(measurements)
         np.testing.assert_allclose(actual.velocity_m_s, reference.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
         np.testing.assert_allclose(actual.covariance_m2_s2, reference.covariance_m2_s2, rtol=1e-12)  # type: ignore[arg-type]
         assert actual.span_s == reference.span_s == (107.5, 107.5)
-        assert [one is None for one in actual.after_pictures] == [True, False, False, False, False]
+        assert [estimate is None for estimate in actual.after_pictures] == [True, False, False, False, False]
         assert isinstance(actual.details, ProgramDetails)
         assert actual.details.time_s > 0.0
     end_persistent()

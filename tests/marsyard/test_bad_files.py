@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
-from tests.scenarios.measured.folders import read_rows, velocity_folder, write_texts
+from tests.scenarios.measured.folders import read_rows, write_texts, write_velocity_folder
 
 MARS = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
 DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")
@@ -88,7 +88,7 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
             lambda path: write_flight(path, 9, 7, 2.0),
             "pose 10: the quaternion's length is 2; allowed",
         ),
-        (FLIGHT, "up.csv", lambda path: write_flight(path, 9, 4, 1.0), "at picture 1 the camera looks up, 90.0 deg"),
+        (FLIGHT, "up.csv", lambda path: write_flight(path, 9, 4, 1.0), "at image 1 the camera looks up, 90.0 deg"),
         (FLIGHT, "huge.csv", write_gigabyte, "larger than 512 MiB"),
         (FLIGHT, "empty.csv", write_empty, "has 0 poses; allowed: at least 4"),
         (CAMERA, "empty.yaml", write_empty, "is empty (0 bytes)"),
@@ -128,7 +128,7 @@ def test_campaign_with_invalid_file_is_rejected(
     ],
 )
 def test_invalid_image_is_rejected(tmp_path: Path, write: Write, message: str) -> None:
-    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write(folder / "drop-1.png")
     run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "drop-1.png", message)
     assert not (tmp_path / "out").exists()
@@ -144,7 +144,7 @@ def test_invalid_image_is_rejected(tmp_path: Path, write: Write, message: str) -
     ],
 )
 def test_invalid_table_is_rejected(tmp_path: Path, cells: dict[str, str], message: str) -> None:
-    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_texts(folder, [row | cells if index == 1 else row for index, row in enumerate(read_rows(folder))])
     run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "pictures.csv", message)
 

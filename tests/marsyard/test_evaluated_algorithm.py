@@ -163,6 +163,6 @@ def test_records_of_earlier_versions_are_reported(folder: Path, tmp_path: Path) 
     assert result.exit_code in (1, 3), result.output
     page = (old / "report.html").read_text()
     assert "marsyard run own-campaign -n 3 --seed 9" in page
-    assert "The command was not recorded" in page
+    assert "The original command was not recorded" in page
     (row,) = csv.DictReader(io.StringIO((old / "verification.csv").read_text()))
     assert (row["algorithm"], row["algorithm_version"]) == ("mine:Mine", "")

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
-from tests.scenarios.measured.folders import landing_folder, read_rows, velocity_folder, write_texts
+from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_texts, write_velocity_folder
 
 
 def run_command(*words: str) -> tuple[int, str]:
@@ -25,7 +25,7 @@ def run_command(*words: str) -> tuple[int, str]:
 
 def test_ingested_images_are_run_and_reported(tmp_path: Path) -> None:
     folder, cases, run = (
-        landing_folder(tmp_path / "in", inputs.landing(), "matching"),
+        write_landing_folder(tmp_path / "in", inputs.landing(), "matching"),
         tmp_path / "out",
         tmp_path / "run",
     )
@@ -38,8 +38,8 @@ def test_ingested_images_are_run_and_reported(tmp_path: Path) -> None:
     report = json.loads((run / "report.json").read_text())
     assert np.isclose(report["sections"]["agreement"]["median_of_medians_px"], frame["residual_median_px"][0])
     page = (run / "report.html").read_text()
-    assert "Pictures compared with measured poses" in page
-    assert 'aria-label="Pictures 1 and 2: ' in page
+    assert "Images compared with measured poses" in page
+    assert 'aria-label="Images 1 and 2: ' in page
     status, output = run_command("replay", str(run), "0", "--out", str(tmp_path / "again"))
     assert (status, "the row equals the stored one" in output) == (0, True)
     assert (tmp_path / "again" / "matches-1.png").stat().st_size > 10_000
@@ -47,7 +47,7 @@ def test_ingested_images_are_run_and_reported(tmp_path: Path) -> None:
 
 def test_campaign_with_truth_gets_an_error_requirement(tmp_path: Path) -> None:
     descent = inputs.descent()
-    folder = velocity_folder(
+    folder = write_velocity_folder(
         tmp_path / "in", {"one": descent, "two": descent}, {"two": inputs.DESCENT_VELOCITY_M_S[:2]}
     )
     assert run_command("ingest", str(folder), "--out", str(tmp_path / "out"))[0] == 0
@@ -65,7 +65,7 @@ def test_campaign_with_truth_gets_an_error_requirement(tmp_path: Path) -> None:
 
 
 def test_invalid_input_has_status_2_and_leaves_no_files(tmp_path: Path) -> None:
-    folder = landing_folder(tmp_path / "in", inputs.landing(), "matching")
+    folder = write_landing_folder(tmp_path / "in", inputs.landing(), "matching")
     rows = read_rows(folder)
     rows[1]["file"] = "lost.png"
     write_texts(folder, rows)
@@ -88,7 +88,7 @@ def test_summed_rows_are_inferred_from_the_camera(tmp_path: Path) -> None:
     descent = inputs.descent()
     rows_summed = descent.images[0].calibration.rows_summed
     assert rows_summed > 1
-    folder = velocity_folder(tmp_path / "in", {"one": descent}, {})
+    folder = write_velocity_folder(tmp_path / "in", {"one": descent}, {})
     text = (folder / "ingest.toml").read_text()
     assert f"rows_summed = {rows_summed}\n" in text
     status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "stated"))

@@ -26,14 +26,14 @@ MakeRun = Callable[..., Path]
 
 
 def synthetic_frame(
-    cases: int, *, answered: float = 0.9, crashed: int = 0, spread: float = 1.0, terrains: int = 4, seed: int = 1
+    cases: int, *, answered: float = 0.9, crashed: int = 0, error_scale: float = 1.0, terrains: int = 4, seed: int = 1
 ) -> pd.DataFrame:
-    """Rows of a synthetic descent campaign."""
+    """Return rows of a synthetic descent campaign; `answered` is a probability, `error_scale` multiplies the errors."""
     rng = np.random.default_rng(seed)
     valid = rng.random(cases) < answered
     outcome = np.where(valid, "VALID", rng.choice(["NO_TEMPLATE_AREA", "NO_VALID_TRACK", "IMU_MISMATCH"], cases))
     off_nadir = rng.uniform(0.0, 30.0, cases)
-    error = rng.normal(0.0, spread * (0.5 + off_nadir[:, None] / 30.0), (cases, 2))
+    error = rng.normal(0.0, error_scale * (0.5 + off_nadir[:, None] / 30.0), (cases, 2))
     error[~valid] = np.nan
     frame = pd.DataFrame(
         {
@@ -62,13 +62,13 @@ def synthetic_frame(
 
 
 def _mark_crashed(frame: pd.DataFrame, crashed: int) -> pd.DataFrame:
-    """Turn the last rows into crashed cases, which have only an error message."""
+    """Replace the last `crashed` rows by crashed cases, which have only an error message."""
     if not crashed:
         return frame
     rows = frame.index[-crashed:]
-    numbers = frame.select_dtypes("number").columns.difference(["case", "wall_time_s", "cpu_time_s"])
-    frame = frame.astype(dict.fromkeys(numbers, "float64"))
-    frame.loc[rows, numbers] = np.nan
+    number_columns = frame.select_dtypes("number").columns.difference(["case", "wall_time_s", "cpu_time_s"])
+    frame = frame.astype(dict.fromkeys(number_columns, "float64"))
+    frame.loc[rows, number_columns] = np.nan
     frame.loc[rows, ["image_hash", "gl_backend", "gl_version"]] = None
     frame.loc[rows, "outcome"] = "CRASHED"
     frame.loc[rows, "answered"] = False
@@ -78,7 +78,7 @@ def _mark_crashed(frame: pd.DataFrame, crashed: int) -> pd.DataFrame:
 
 
 def synthetic_products(seed: int = 1) -> dict[str, Any]:
-    """Products of a synthetic DIMES case: textured images, two tracks per pair, one of them invalid."""
+    """Return products of a synthetic DIMES case: textured images and two tracks per pair; one track is invalid."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[0:256, 0:1024]
     products: dict[str, Any] = {}
@@ -98,7 +98,7 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
             products[f"window_{pair}_{k}"] = rng.normal(1500, 300, (61, 61)).astype(np.float32)
             products[f"template_{pair}_{k}"] = rng.normal(1500, 300, (17, 17)).astype(np.float32)
             products[f"match_{pair}_{k}"] = np.array([33.4, 39.2])
-        # nadir camera with 5 m per pixel; the rectified camera has a field 1.5 times as wide
+        # nadir camera with 5 m per pixel; the field of view of the rectified camera is 1.5 times as wide
         lattice = np.stack(np.meshgrid(*(np.linspace(-64.0, 319.0, 17),) * 2), axis=-1)
         products |= {f"rectified_{pair}_{side}": lattice for side in (0, 1)}
         products[f"rectified_frame_{pair}"] = np.array([-64.0 - 128.0, 128.0 + 64.0, 383.0 / 16.0]) * 5.0
@@ -108,11 +108,11 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
 
 
 def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Content of `campaign.json` as the engine writes it."""
+    """Return the content of `campaign.json` in the form that the engine writes."""
     configuration = {
         "name": "dimes-synthetic",
         "scenario": "descent",
-        "description": "Parachute descents over rough terrain, made up to try the report on.",
+        "description": "Parachute descents over rough terrain: synthetic rows for tests of the report.",
         "cases": len(frame),
         "seed": 7,
         "dispersions": {
@@ -137,7 +137,7 @@ def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, An
         "showcase": 3,
         "versions": {"marsyard": "0.1.0", "numpy": "2.4.0", "scipy": "1.17.0"},
         "git_commit": "0123456789abcdef0123456789abcdef01234567",
-        "environment": {"python": "3.11.7", "platform": "Linux", "processor": "made up"},
+        "environment": {"python": "3.11.7", "platform": "Linux", "processor": "synthetic"},
     }
 
 
@@ -177,11 +177,11 @@ def make_rows() -> Callable[..., pd.DataFrame]:
 
 @pytest.fixture
 def dimes_products() -> dict[str, Any]:
-    """Products of a synthetic DIMES case; see `synthetic_products`."""
+    """Return products of a synthetic DIMES case; see `synthetic_products`."""
     return synthetic_products()
 
 
 @pytest.fixture
 def velocity() -> dict[str, Any]:
-    """The requirement on the velocity of valid answers."""
+    """Return the requirement on the velocity error of valid answers."""
     return dict(VELOCITY)

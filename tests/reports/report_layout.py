@@ -1,4 +1,4 @@
-"""Models of `report.json`; they generate and check `reports/report.schema.json`."""
+"""Pydantic models of `report.json`; tests compare them with `reports/report.schema.json` and with written reports."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Word = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
+VerdictWord = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
 
 
 class _Part(BaseModel):
@@ -15,21 +15,21 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class TwinClusters(_Part):
-    """Evidence of cases that share terrains."""
+class ClusterEvidence(_Part):
+    """Evidence from cases that share terrains; a terrain is a cluster."""
 
     terrains: int
     failed_terrains: int
     method: str
     design_effect: float | None = Field(description="null for too few failures or terrains")
-    effective_n: float = Field(description="equivalent number of independent cases")
+    effective_n: float = Field(description="number of independent cases with the same evidence")
     effective_successes: float
     lower: float
     upper: float
 
 
-class TwinVerdict(_Part):
-    """One requirement evaluated."""
+class RequirementVerdict(_Part):
+    """Verdict on one requirement."""
 
     requirement_id: str
     statement: str
@@ -41,31 +41,31 @@ class TwinVerdict(_Part):
     probability: float | None
     confidence: float | None
     population: str
-    decide_by: str = Field(description="`confidence`, or `estimate`: by the rate seen")
-    status: Word
-    confident_status: Word = Field(description="by the bounds, also where the estimate decides")
-    plain_status: Word | None = Field(description="as for independent cases; null where no terrain is shared")
+    decide_by: str = Field(description="`confidence`: by the bounds; `estimate`: by the observed rate")
+    status: VerdictWord
+    confident_status: VerdictWord = Field(description="verdict by the bounds, also where the observed rate decides")
+    plain_status: VerdictWord | None = Field(description="verdict for independent cases; null if no terrain is shared")
     n: int
     failures: int
     estimate: float | None
     lower: float | None = Field(description="one-sided, at `bounds_confidence`")
     upper: float | None = Field(description="one-sided, at `upper_confidence`")
-    bounds_confidence: float | None = Field(description="of the lower bound")
+    bounds_confidence: float | None = Field(description="confidence of the lower bound")
     upper_confidence: float | None
     plain_lower: float | None
     plain_upper: float | None
-    consumer_risk: float | None = Field(description="probability of evidence as good at just the rate asked")
-    margin: float | None = Field(description="deciding bound, or estimate, less the rate asked")
-    further_cases: int | None = Field(description="that would pass it if none fails")
+    consumer_risk: float | None = Field(description="probability of equally good evidence at exactly the required rate")
+    margin: float | None = Field(description="deciding bound or estimate, minus the required rate")
+    further_cases: int | None = Field(description="additional cases that lead to PASS if none of them fails")
     terrains: int | None
-    clustered: TwinClusters | None
+    clustered: ClusterEvidence | None
     reason: str
-    advice: str = Field(description="why more cases cannot help, and the change that does")
-    accept_rate: bool = Field(description="whether MET BY RATE gives the exit status 0")
+    advice: str = Field(description="reason why more cases do not help, and the necessary change")
+    accept_rate: bool = Field(description="true if MET BY RATE has exit status 0")
     note: str
 
 
-class TwinQuantile(_Part):
+class QuantileBounds(_Part):
     """A quantile with one-sided bounds."""
 
     probability: float
@@ -74,7 +74,7 @@ class TwinQuantile(_Part):
     upper: float | None
 
 
-class TwinStatistics(_Part):
+class ErrorStatistics(_Part):
     """Statistics of errors."""
 
     n: int
@@ -89,11 +89,11 @@ class TwinStatistics(_Part):
     median: float | None
     robust_sd: float | None
     largest: float | None
-    quantiles: list[TwinQuantile]
+    quantiles: list[QuantileBounds]
     confidence: float
 
 
-class TwinTerrains(_Part):
+class TerrainBank(_Part):
     """The terrains that cases can use."""
 
     terrains: int
@@ -101,55 +101,55 @@ class TwinTerrains(_Part):
     in_turn: bool
 
 
-class TwinSampling(_Part):
-    """How cases were drawn."""
+class SamplingDescription(_Part):
+    """Sampling design of the cases."""
 
     design: str
     grids: list[str]
     nominal: bool
     max_cases: int | None
-    first_look: int | None = Field(description="cases at the first verdict, where cases were appended")
-    terrains: TwinTerrains | None
+    first_look: int | None = Field(description="cases at the first verdict if cases were appended later")
+    terrains: TerrainBank | None
     independent: bool
     text: str
 
 
-class TwinAlgorithm(_Part):
+class AlgorithmDescription(_Part):
     """An algorithm under test; unknown texts are empty."""
 
-    name: str = Field(description="as the campaign names it")
-    tested: bool = Field(description="false where it is only compared")
+    name: str = Field(description="name in the campaign")
+    tested: bool = Field(description="false for an algorithm that is only compared")
     path: str = Field(description="class as module:name, or file")
     version: str
     options: dict[str, Any]
     source_hash: str
 
 
-class Twin(_Part):
-    """A campaign's report in numbers."""
+class CampaignReport(_Part):
+    """Content of `report.json`: the results of a campaign's report."""
 
     report_schema: Literal[5] = Field(alias="schema")
     campaign: str
-    state: Any = Field(description="as the campaign's record has it, as are seed, git_commit and the times")
+    state: Any = Field(description="from campaign.json, like seed, git_commit and the times")
     seed: Any
     git_commit: Any
     started_utc: Any
     finished_utc: Any
     cases: int
     crashed: int
-    sites: list[str] = Field(description="as the rows name them, at most 24, as are the algorithms")
+    sites: list[str] = Field(description="names in the rows, at most 24; the same holds for the algorithms")
     algorithms: list[str]
-    algorithm_details: list[TwinAlgorithm] = Field(
-        default=[], description="as the campaign's record names them, the algorithm under test first"
+    algorithm_details: list[AlgorithmDescription] = Field(
+        default=[], description="from campaign.json, the algorithm under test first"
     )
-    sampling: TwinSampling
-    verdict: Word | Literal["NO REQUIREMENT"]
+    sampling: SamplingDescription
+    verdict: VerdictWord | Literal["NO REQUIREMENT"]
     sentence: str
     exit_code: Literal[0, 1, 3]
-    verdicts: list[TwinVerdict]
+    verdicts: list[RequirementVerdict]
     outcomes: dict[str, int]
     metric: str | None
-    statistics: dict[str, TwinStatistics]
+    statistics: dict[str, ErrorStatistics]
     worst_cases: list[str]
-    sections: dict[str, Any] = Field(description="of each further section of the page, by its anchor")
-    showcases: list[int] = Field(description="cases whose products are kept")
+    sections: dict[str, Any] = Field(description="data of each further section of the page, by the section's anchor")
+    showcases: list[int] = Field(description="cases with stored products")

@@ -17,7 +17,7 @@ from marsyard.reports.comparison import (
     compare_campaigns,
     list_metrics,
 )
-from marsyard.reports.statistics.changes import difference_p
+from marsyard.reports.statistics.changes import difference_p_value
 from marsyard.reports.stored import StoredRun, read_run
 
 Rows = Callable[..., pd.DataFrame]
@@ -25,57 +25,59 @@ MakeRun = Callable[..., Path]
 
 
 def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricComparison]]:
-    paired, contrasts = compare_campaigns(read_run(first), read_run(second))
-    return paired, {contrast.name: contrast for contrast in contrasts}
+    is_paired, contrasts = compare_campaigns(read_run(first), read_run(second))
+    return is_paired, {contrast.name: contrast for contrast in contrasts}
 
 
-def test_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) -> None:
+def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) -> None:
     frame = make_rows(200, terrains=40)
     worse = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
-    paired, contrasts = _compare(make_run(frame), make_run(worse, name="other"))
-    assert paired
+    is_paired, contrasts = _compare(make_run(frame), make_run(worse, name="other"))
+    assert is_paired
     # errors larger by 2 %: the paired test detects them in spite of the large scatter
     assert contrasts["velocity error (m/s)"].p_value < 1e-9
     assert contrasts["answered"].p_value == 1.0
     assert contrasts["came to an end"].second.summary_value == 1.0
-    # with four terrains the sign test has p = 2 / 2^4, times 4 for the number of figures
-    few = make_rows(200)
-    worse = few.assign(velocity_error_m_s=few["velocity_error_m_s"] * 1.02)
-    _, contrasts = _compare(make_run(few, name="few"), make_run(worse, name="few-other"))
+    # with four terrains the sign test has p = 2 / 2^4, times 4 (Holm's correction) for the 4 metrics
+    four_terrains = make_rows(200)
+    worse = four_terrains.assign(velocity_error_m_s=four_terrains["velocity_error_m_s"] * 1.02)
+    _, contrasts = _compare(make_run(four_terrains, name="four-terrains"), make_run(worse, name="four-terrains-worse"))
     assert contrasts["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
 
 
-def test_different_draws_are_compared_as_two_samples(make_rows: Rows, make_run: MakeRun) -> None:
+def test_campaigns_with_different_draws_are_compared_as_two_samples(make_rows: Rows, make_run: MakeRun) -> None:
     first = make_run(make_rows(300))
-    paired, contrasts = _compare(first, make_run(make_rows(300, seed=2), name="same", seed=8))
-    assert not paired
+    is_paired, contrasts = _compare(first, make_run(make_rows(300, seed=2), name="same", seed=8))
+    assert not is_paired
     assert min(contrast.p_value for contrast in contrasts.values()) > 0.01
-    _, changed = _compare(first, make_run(make_rows(300, seed=2, answered=0.6, spread=2.0), name="worse", seed=8))
-    assert changed["answered"].p_value < 1e-6
+    _, comparisons = _compare(
+        first, make_run(make_rows(300, seed=2, answered=0.6, error_scale=2.0), name="worse", seed=8)
+    )
+    assert comparisons["answered"].p_value < 1e-6
     # no permutation of 10,000 has a larger difference
-    assert changed["velocity error (m/s)"].p_value < 1e-3
-    grid = campaign_diff_grid(["a", "b"], list(changed.values()))
+    assert comparisons["velocity error (m/s)"].p_value < 1e-3
+    grid = campaign_diff_grid(["a", "b"], list(comparisons.values()))
     assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
 
 
 def test_terrains_of_different_sites_are_not_paired(make_rows: Rows, make_run: MakeRun) -> None:
     # Errors depend on the terrain. Terrain numbers of two sites denote different terrains, so no pairs exist.
     def write_site_run(name: str, seed: int) -> Path:
-        level = np.random.default_rng(seed).uniform(1.0, 3.0, 20)
+        terrain_error = np.random.default_rng(seed).uniform(1.0, 3.0, 20)
         frame = make_rows(400, terrains=20, answered=1.0, seed=seed)
-        frame["velocity_error_m_s"] = level[frame["terrain"]] + 0.1 * np.arange(400) / 400
+        frame["velocity_error_m_s"] = terrain_error[frame["terrain"]] + 0.1 * np.arange(400) / 400
         configuration = {"parameters": {"site": name}}
         return make_run(frame, name=name, seed=seed, configuration=configuration)
 
     gusev, meridiani = read_run(write_site_run("gusev", 1)), read_run(write_site_run("meridiani", 6))
     assert min(entry.p_value for entry in compare_campaigns(gusev, meridiani)[1]) > 0.05
     first_sample, second_sample = (build_sample(*_select_errors(entry)) for entry in (gusev, meridiani))
-    assert difference_p(first_sample, second_sample) < 1e-3
+    assert difference_p_value(first_sample, second_sample) < 1e-3
 
 
 def _select_errors(run: StoredRun) -> tuple[pd.DataFrame, Metric]:
-    frame, figures = list_metrics(run)
-    return frame, next(figure for figure in figures if figure.name == "velocity error (m/s)")
+    frame, metrics = list_metrics(run)
+    return frame, next(metric for metric in metrics if metric.name == "velocity error (m/s)")
 
 
 def test_campaigns_without_common_metric_compare_completion(make_rows: Rows, make_run: MakeRun) -> None:

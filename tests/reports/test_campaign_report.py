@@ -41,18 +41,18 @@ class Page(HTMLParser):
         self.tags.append(tag)
         if tag not in VOID_ELEMENTS:
             self.open.append(tag)
-        self._note(attrs)
+        self._record_attributes(attrs)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
-        self._note(attrs)
+        self._record_attributes(attrs)
 
     def handle_endtag(self, tag: str) -> None:
         if tag not in VOID_ELEMENTS:
             assert self.open, f"</{tag}> closes nothing"
             assert self.open.pop() == tag
 
-    def _note(self, attrs: list[tuple[str, str | None]]) -> None:
+    def _record_attributes(self, attrs: list[tuple[str, str | None]]) -> None:
         for name, value in attrs:
             if name == "id":
                 self.ids.append(value or "")
@@ -70,7 +70,7 @@ def _write_and_read(directory: Path) -> tuple[str, Page, dict[str, Any]]:
 
 
 def _check_page(text: str, page: Page) -> None:
-    """Check that a page is well formed, self-contained, free of foreign scripts, and that its links have targets."""
+    """Check that a page is well formed, self-contained, without external scripts, and that its links have targets."""
     assert page.open == []
     assert len(page.ids) == len(set(page.ids))
     # one data element per script; the content security policy names the script by its hash
@@ -103,26 +103,26 @@ FULL_COLUMNS = [
 ]
 RUNS: dict[str, Callable[[Rows], pd.DataFrame]] = {
     "small": lambda rows: rows(24)[FULL_COLUMNS],
-    "large": lambda rows: rows(2000, spread=1.5, terrains=60)[FULL_COLUMNS],
+    "large": lambda rows: rows(2000, error_scale=1.5, terrains=60)[FULL_COLUMNS],
     "crashed": lambda rows: rows(24, crashed=3)[FULL_COLUMNS],
     "only crashed": lambda rows: rows(4, crashed=4)[FULL_COLUMNS],
     "no answer": lambda rows: rows(24, answered=0.0)[FULL_COLUMNS],
     "one case": lambda rows: rows(1, answered=1.0)[FULL_COLUMNS],
     "no rows": lambda rows: rows(24).head(0),
-    "exact": lambda rows: rows(24, answered=1.0, spread=0.0)[FULL_COLUMNS],
-    "few columns": lambda rows: rows(24)[["case", "outcome"]],
+    "exact": lambda rows: rows(24, answered=1.0, error_scale=0.0)[FULL_COLUMNS],
+    "no errors": lambda rows: rows(24)[["case", "outcome"]],
     "only cases": lambda rows: rows(24)[["case"]],
-    "wild": lambda rows: rows(24)[FULL_COLUMNS].assign(velocity_error_m_s=np.geomspace(1e-9, 1e9, 24)),
+    "wide range": lambda rows: rows(24)[FULL_COLUMNS].assign(velocity_error_m_s=np.geomspace(1e-9, 1e9, 24)),
     "infinite": lambda rows: rows(24)[FULL_COLUMNS].assign(velocity_error_x_m_s=np.inf),
 }
 
 
 @pytest.mark.parametrize("kind", RUNS)
 def test_report_is_valid_for_any_run(make_rows: Rows, make_run: MakeRun, kind: str) -> None:
-    text, page, twin = _write_and_read(make_run(RUNS[kind](make_rows)))
+    text, page, report = _write_and_read(make_run(RUNS[kind](make_rows)))
     _check_page(text, page)
-    assert twin["schema"] == 5
-    assert twin["verdict"] in text
+    assert report["schema"] == 5
+    assert report["verdict"] in text
     assert len(text) < 1_000_000
 
 
@@ -130,7 +130,7 @@ def test_small_report_contains_the_main_results(
     make_rows: Rows, make_run: MakeRun, dimes_products: dict[str, Any]
 ) -> None:
     directory = make_run(make_rows(24, crashed=1), products=dimes_products)
-    text, page, twin = _write_and_read(directory)
+    text, page, report = _write_and_read(directory)
     _check_page(text, page)
     visible_text = " ".join(re.sub(r"<[^>]+>", " ", text).split())
     for message in (
@@ -149,16 +149,16 @@ def test_small_report_contains_the_main_results(
         assert message in visible_text, message
     assert "case-3" in page.ids
     assert page.tags.count("svg") > 8
-    assert twin["exit_code"] == 1
-    assert twin["verdicts"][0]["clustered"]["terrains"] == 4
+    assert report["exit_code"] == 1
+    assert report["verdicts"][0]["clustered"]["terrains"] == 4
     assert len(text) < 2_000_000
 
 
 def test_report_without_requirements_has_exit_code_0(make_rows: Rows, make_run: MakeRun) -> None:
-    text, page, twin = _write_and_read(make_run(make_rows(24)[FULL_COLUMNS], []))
+    text, page, report = _write_and_read(make_run(make_rows(24)[FULL_COLUMNS], []))
     _check_page(text, page)
     assert "has no requirement" in text
-    assert (twin["exit_code"], twin["verdicts"]) == (0, [])
+    assert (report["exit_code"], report["verdicts"]) == (0, [])
     assert "velocity error (m/s)" in text
 
 
@@ -167,18 +167,20 @@ def test_requirement_met_by_rate_has_its_own_symbol(
 ) -> None:
     rate = {**velocity, "probability": 0.9, "confidence": 0.999, "decide_by": "estimate"}
     directory = make_run(make_rows(24)[MIN_COLUMNS], [rate])
-    text, _, twin = _write_and_read(directory)
+    text, _, report = _write_and_read(directory)
     assert '<div class="headline status-met-by-rate">' in text
     assert ".status-met-by-rate { --status: var(--rate)" in text
     assert "evaluated by observed rate; bounds at" in text
     diamond = "M12 1L23 12 12 23 1 12z"
     assert diamond in text.split("<span>MET BY RATE</span>")[0].rsplit("<svg", 1)[1]
-    assert (twin["verdict"], twin["exit_code"]) == ("MET BY RATE", 3)
+    assert (report["verdict"], report["exit_code"]) == ("MET BY RATE", 3)
 
 
 def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: MakeRun) -> None:
-    text, _, twin = _write_and_read(make_run(make_rows(400, answered=1.0, spread=0.1)[[*MIN_COLUMNS, "terrain"]]))
-    assert (twin["verdict"], twin["verdicts"][0]["plain_status"]) == ("INSUFFICIENT", "PASS")
+    text, _, report = _write_and_read(
+        make_run(make_rows(400, answered=1.0, error_scale=0.1)[[*MIN_COLUMNS, "terrain"]])
+    )
+    assert (report["verdict"], report["verdicts"][0]["plain_status"]) == ("INSUFFICIENT", "PASS")
     assert "400 cases on 4 terrains: terrains counted instead of cases" in text
 
 
@@ -208,6 +210,7 @@ def test_texts_from_files_are_escaped(
     _check_page(text, page)
     assert "img" not in page.tags
     assert "&lt;script&gt;" in text
+    # the template expression {{ 7*7 }} is not evaluated to 49
     assert "49" not in re.findall(r"alert\(1\)&gt;&#34;&#39;&amp;(\S+)", text)
 
 
@@ -240,12 +243,12 @@ def test_missing_record_and_damaged_products_give_a_valid_page(make_rows: Rows, 
 
 
 def test_interrupted_campaign_is_marked(make_rows: Rows, make_run: MakeRun) -> None:
-    text, _, twin = _write_and_read(make_run(make_rows(6)[MIN_COLUMNS], state="interrupted", cases=24))
+    text, _, report = _write_and_read(make_run(make_rows(6)[MIN_COLUMNS], state="interrupted", cases=24))
     assert "Not finished." in text
-    assert twin["state"] == "interrupted"
+    assert report["state"] == "interrupted"
 
 
-def test_folder_without_rows_is_rejected(tmp_path: Path) -> None:
+def test_folder_without_valid_row_table_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"cases\.parquet"):
         write_report(tmp_path)
     (tmp_path / "cases.parquet").write_bytes(b"not a table")
@@ -260,11 +263,12 @@ def test_report_is_reproducible(make_rows: Rows, make_run: MakeRun) -> None:
 
 
 def test_wrong_answers_are_counted_in_the_unit_of_the_metric(make_run: MakeRun, make_rows: Rows) -> None:
-    """A requirement may scale its metric: 60 times 0.05 is above 2, 60 times 0.01 is not."""
+    """The requirement multiplies the metric by 60: 60 x 0.05 is above the bound of 2, 60 x 0.01 is not."""
     frame = make_rows(24).assign(velocity_error_m_s=np.where(np.arange(24) < 6, 0.05, 0.01), answered=True)
     requirement = {"id": "SCALED", "metric": "velocity_error_m_s", "bound": 2.0, "scale": 60.0}
     _, _, report = _write_and_read(
         make_run(frame=frame, requirements=[requirement | {"probability": 0.9, "confidence": 0.9}])
     )
-    wrong = next(fraction for name, fraction in report["sections"]["answers"].items() if name.startswith("wrong"))
-    assert (wrong["hits"], wrong["n"]) == (6, 24)
+    answers = report["sections"]["answers"]
+    wrong_answers = next(fraction for name, fraction in answers.items() if name.startswith("wrong"))
+    assert (wrong_answers["hits"], wrong_answers["n"]) == (6, 24)

@@ -12,6 +12,7 @@ from marsyard.reports.comparison import compare_algorithms, select_algorithm
 
 
 def make_paired_rows(first_errors: list[float], other_errors: list[float]) -> pd.DataFrame:
+    """Return rows of the algorithm `dimes` and the compared algorithm `other`; NaN denotes a crash."""
     frame: dict[str, Any] = {"case": range(len(first_errors)), "algorithm": "dimes", "velocity_error_m_s": first_errors}
     for prefix, errors in (("", first_errors), ("other.", other_errors)):
         is_answered = np.isfinite(errors)
@@ -22,11 +23,11 @@ def make_paired_rows(first_errors: list[float], other_errors: list[float]) -> pd
 
 def test_paired_comparison_counts_and_mean_difference() -> None:
     nan = float("nan")
-    contenders, (difference,) = compare_algorithms(
+    algorithms, (difference,) = compare_algorithms(
         make_paired_rows([1, 2, 3, 9], [2, 3, nan, 4]), "velocity_error_m_s", 5.0
     )
     assert [
-        (contender.name, contender.answered, contender.failed, contender.succeeded) for contender in contenders
+        (algorithm.name, algorithm.answered, algorithm.failed, algorithm.succeeded) for algorithm in algorithms
     ] == [("dimes", 4, 0, 3), ("other", 3, 1, 3)]
     assert (difference.only_first, difference.only_other, difference.pairs) == (1, 1, 3)
     assert difference.mean == pytest.approx((1 + 1 - 5) / 3)
@@ -35,10 +36,10 @@ def test_paired_comparison_counts_and_mean_difference() -> None:
 def test_p_values_are_corrected_for_the_number_of_algorithms() -> None:
     frame = make_paired_rows([1.0] * 12, [2.0] * 12)
     third = frame.filter(like="other.").rename(columns=lambda name: name.replace("other.", "third."))
-    (single,) = compare_algorithms(frame, "velocity_error_m_s", 1.5)[1]
-    both = compare_algorithms(pd.concat([frame, third], axis=1), "velocity_error_m_s", 1.5)[1]
-    assert [difference.success_p for difference in both] == pytest.approx([2.0 * single.success_p] * 2)
-    assert [difference.error_p for difference in both] == pytest.approx([2.0 * single.error_p] * 2)
+    (pair,) = compare_algorithms(frame, "velocity_error_m_s", 1.5)[1]
+    triple = compare_algorithms(pd.concat([frame, third], axis=1), "velocity_error_m_s", 1.5)[1]
+    assert [difference.success_p for difference in triple] == pytest.approx([2.0 * pair.success_p] * 2)
+    assert [difference.error_p for difference in triple] == pytest.approx([2.0 * pair.error_p] * 2)
 
 
 def test_single_algorithm_gives_no_comparison() -> None:
@@ -55,8 +56,8 @@ def test_columns_of_a_compared_algorithm_are_selected() -> None:
 
 def test_correct_covariances_are_consistent_at_95_percent() -> None:
     rng = np.random.default_rng(7)
-    words = [evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng))["word"] for _ in range(400)]
-    assert 0.91 <= words.count("consistent") / 400 <= 0.985  # 0.95, minus 4 and plus 3 standard deviations
+    verdicts = [evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng))["word"] for _ in range(400)]
+    assert 0.91 <= verdicts.count("consistent") / 400 <= 0.985  # 0.95, minus 4 and plus 3 standard deviations
     overconfident = evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
     assert overconfident["word"] == "too sure"
     assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "too cautious"

@@ -14,6 +14,7 @@ from marsyard.reports.draws import ParameterSample, draws_figure, save_figure
 def _make_draws() -> list[ParameterSample]:
     rng = np.random.default_rng(1)
     x = rng.normal(size=300)
+    # wind components with correlation 0.99; the other parameters are independent or constant
     return [
         ParameterSample("wind.east_m_s", x.tolist(), rng.normal(size=1000).tolist()),
         ParameterSample("wind.north_m_s", (0.9 * x + 0.1 * rng.normal(size=300)).tolist()),
@@ -31,15 +32,15 @@ def test_figure_shows_marginals_and_pairs() -> None:
     assert titles[:5] == ["wind.east (m/s)", "wind.north (m/s)", "heights_m.1", "kind", "sleep (s)"]
     bars = [[patch for patch in axes.patches if isinstance(patch, Rectangle)] for axes in figure.axes[:5]]
     assert [sum(bar.get_height() for bar in group) for group in bars] == [300.0] * 5
-    pairs = figure.axes[5]
-    texts = {text.get_text(): text.get_fontweight() for text in pairs.texts}
+    pair_axes = figure.axes[5]
+    texts = {text.get_text(): text.get_fontweight() for text in pair_axes.texts}
     assert {"east", "north", "heights\nm\n1", "kind"} <= set(texts)
     assert [text for text, weight in texts.items() if weight == "bold"] == ["+0.99"]
-    points = next(collection for collection in pairs.collections if isinstance(collection, PathCollection))
+    points = next(collection for collection in pair_axes.collections if isinstance(collection, PathCollection))
     assert np.shape(points.get_offsets())[0] == 6 * 300
 
 
-def test_one_parameter_has_no_pairs(tmp_path: Path) -> None:
+def test_figure_of_one_parameter_has_no_pairs(tmp_path: Path) -> None:
     figure = draws_figure("[a] $x$", _make_draws()[:1])
     assert len(figure.axes) == 1
     for name in ("one.svg", "one.png"):

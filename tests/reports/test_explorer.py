@@ -18,7 +18,7 @@ Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"
 
 
-def test_points_include_worst_silent_and_crashed_cases(make_rows: Rows) -> None:
+def test_points_include_worst_unanswered_and_crashed_cases(make_rows: Rows) -> None:
     frame = make_rows(12_000, crashed=3)
     selected = choose_points(frame, METRIC)
     assert selected.size == MAX_POINTS
@@ -29,7 +29,7 @@ def test_points_include_worst_silent_and_crashed_cases(make_rows: Rows) -> None:
     assert choose_points(frame.head(50), METRIC).tolist() == list(range(50))
 
 
-def test_explorer_data_have_labels_outcomes_and_values(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_explorer_data_contain_labels_outcomes_and_values(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     frame = make_rows(30, crashed=1)
     run = read_run(make_run(frame))
     data = explorer_data(run, METRIC, 5.0, ["3"])
@@ -40,8 +40,8 @@ def test_explorer_data_have_labels_outcomes_and_values(make_rows: Rows, make_run
     assert (data["cases"], data["pictured"], data["shown"], data["all"]) == (list(range(30)), [3], 30, 30)
     assert data["outcomes"][data["outcome"][29]] == "CRASHED"
     assert data["columns"][data["metric"]][29] is None
-    first = frame[METRIC].iloc[0]
-    assert data["columns"][data["metric"]][0] == (None if np.isnan(first) else float(f"{first:.4g}"))
+    first_error = frame[METRIC].iloc[0]
+    assert data["columns"][data["metric"]][0] == (None if np.isnan(first_error) else float(f"{first_error:.4g}"))
 
 
 def test_embedded_data_are_escaped() -> None:
@@ -51,19 +51,19 @@ def test_embedded_data_are_escaped() -> None:
     assert json.loads(text) == hostile
 
 
-def test_notable_cases_are_worst_silent_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_notable_cases_are_worst_unanswered_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     frame = make_rows(60, crashed=2)
     selected = notable_cases(read_run(make_run(frame)))
-    sizes = frame["velocity_error_m_s"]
-    assert selected[:2] == sizes.nlargest(2).index.tolist()
-    silent = frame.index[sizes.isna() & ~frame["outcome"].eq("CRASHED")].tolist()
-    assert selected[2:4] == silent[:2]
+    errors = frame["velocity_error_m_s"]
+    assert selected[:2] == errors.nlargest(2).index.tolist()
+    unanswered = frame.index[errors.isna() & ~frame["outcome"].eq("CRASHED")].tolist()
+    assert selected[2:4] == unanswered[:2]
     assert len(selected) == len(set(selected)) == 6
     assert not set(selected) & set(frame.index[frame["outcome"].eq("CRASHED")])
     assert notable_cases(read_run(make_run(frame.head(0), name="none"))) == []
 
 
-def test_gallery_has_worst_silent_and_other_cases(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_gallery_starts_with_first_worst_and_unanswered_cases(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     frame = make_rows(40)
     run = replace(read_run(make_run(frame)), showcases=(7, *(case for case in range(40) if case != 7)))
     selected = gallery_cases(run)

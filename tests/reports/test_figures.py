@@ -46,15 +46,15 @@ def test_figures_are_well_formed(make_rows: Rows, cases: int, bound: float | Non
 
 
 def test_missing_data_give_no_figure(make_rows: Rows) -> None:
-    silent = make_rows(5, answered=0.0)
-    assert error_scatter(silent, METRIC, 5.0) is None
-    assert error_histogram(silent, METRIC, 5.0) is None
-    assert error_scatter_against(silent, METRIC, "off_nadir_max_deg", 5.0) is not None
-    assert error_scatter_against(silent, METRIC, "nonesuch", 5.0) is None
-    bare = pd.DataFrame({"case": [0, 1], METRIC: [1.0, 2.0]})
-    assert error_scatter(bare, METRIC, 5.0) is None
-    assert outcome_bars(bare) is None
-    assert error_histogram(bare, METRIC, 5.0) is not None
+    unanswered = make_rows(5, answered=0.0)
+    assert error_scatter(unanswered, METRIC, 5.0) is None
+    assert error_histogram(unanswered, METRIC, 5.0) is None
+    assert error_scatter_against(unanswered, METRIC, "off_nadir_max_deg", 5.0) is not None
+    assert error_scatter_against(unanswered, METRIC, "no_such_column", 5.0) is None
+    without_outcomes = pd.DataFrame({"case": [0, 1], METRIC: [1.0, 2.0]})
+    assert error_scatter(without_outcomes, METRIC, 5.0) is None
+    assert outcome_bars(without_outcomes) is None
+    assert error_histogram(without_outcomes, METRIC, 5.0) is not None
 
 
 def test_figures_have_distinct_identifiers(make_rows: Rows) -> None:
@@ -94,8 +94,8 @@ def test_texts_in_figures_are_escaped(make_rows: Rows) -> None:
 
 def _scale_errors(frame: pd.DataFrame, rows: slice) -> pd.DataFrame:
     """Multiply the errors of some rows by 100."""
-    parts = [METRIC, "velocity_error_x_m_s", "velocity_error_y_m_s"]
-    frame.loc[frame.index[rows], parts] *= 100.0
+    error_columns = [METRIC, "velocity_error_x_m_s", "velocity_error_y_m_s"]
+    frame.loc[frame.index[rows], error_columns] *= 100.0
     return frame
 
 
@@ -113,7 +113,7 @@ def test_histogram_has_an_overflow_bar(make_rows: Rows) -> None:
     assert any("> 15" in text.get_text() for text in figure.axes[0].texts)
 
 
-def test_axis_includes_the_95_percent_quantile(make_rows: Rows) -> None:
+def test_error_axis_includes_the_95_percent_quantile(make_rows: Rows) -> None:
     frame = _scale_errors(make_rows(60, answered=1.0), slice(None))
     for draw in (error_histogram, error_distribution):
         figure = draw(frame, METRIC, 5.0)

@@ -1,4 +1,4 @@
-"""Tests of captions and numbers: intervals, minimum numbers of cases and rounding."""
+"""Tests of captions and printed numbers in reports: intervals, minimum numbers of cases and rounding."""
 
 from __future__ import annotations
 
@@ -35,9 +35,7 @@ def test_rank_correlations_of_maps_have_intervals(maps: int, has_interval: bool)
     rng = np.random.default_rng(1)
     texture = rng.uniform(0.1, 1.0, maps)
     frame = pd.DataFrame({"texture": texture, "rms_share": rng.uniform(0.0, 0.1, maps) / texture})
-    effect = next(
-        candidate for candidate in MAP_EFFECTS.effects(frame) if candidate["error"].startswith("elevation error")
-    )
+    effect = next(entry for entry in MAP_EFFECTS.effects(frame) if entry["error"].startswith("elevation error"))
     assert (" to " in correlation_text(effect)) == has_interval
     assert has_interval or correlation_text(effect) == NOTHING
 
@@ -53,7 +51,7 @@ def test_rounding_errors_are_printed_as_zero() -> None:
     assert number(2e-7) == "2.00e−07"
 
 
-def test_single_crashed_case_is_written_in_singular(make_rows: Rows) -> None:
+def test_message_on_one_crashed_case_is_singular(make_rows: Rows) -> None:
     frame = make_rows(8, crashed=1)
     suite = Xml.fromstring(junit_xml("one", [], combine_verdicts([], frame)))  # noqa: S314
     assert [failure.get("message") for failure in suite.iter("failure")] == ["1 case crashed"]

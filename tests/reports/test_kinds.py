@@ -1,4 +1,4 @@
-"""Tests of declared report sections against rows with known statistics."""
+"""Tests of report sections that are declared by their parts (statistics, rates, figures), with known statistics."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ERROR = Quantity("altitude_error_m")
 ALTITUDE = SectionDeclaration(
     key="altitude",
     name="Altitude",
-    title="Altitude from two pictures",
+    title="Altitude from two images",
     requires=("altitude_error_m",),
     parts=(
         Statistics("altitude_error_m"),
@@ -43,7 +43,7 @@ ALTITUDE = SectionDeclaration(
         RateByCondition(Quantity("altitude_m"), [Rate("answered", "Answered", flag_rate("answered"))]),
         Scatter([Quantity("altitude_m")], [ERROR], "Every case, and medians of bins."),
     ),
-    note="Made up.",
+    note="Synthetic data.",
 )
 
 
@@ -52,7 +52,7 @@ def make_subject(frame: pd.DataFrame, name: str = "altitude-flight-2") -> Subjec
 
 
 def make_rows_of_two_altitudes() -> pd.DataFrame:
-    """40 cases at two altitudes: all answered at 400 m with error 1 m, half answered at 800 m with error 2 m."""
+    """Return 40 cases at two altitudes: all answered at 400 m with error 1 m, half answered at 800 m with error 2 m."""
     is_high = np.arange(40) >= 20
     answered = ~is_high | (np.arange(40) % 2 == 0)
     error = np.where(answered, 1.0 + is_high, np.nan)
@@ -61,14 +61,14 @@ def make_rows_of_two_altitudes() -> pd.DataFrame:
     )
 
 
-def test_declared_section_shows_its_parts_in_order() -> None:
+def test_declared_section_contains_its_parts_in_order() -> None:
     section = ALTITUDE(make_subject(make_rows_of_two_altitudes()))
     assert section is not None
     assert [len(block.figures) for block in section.blocks] == [0, 1, 0, 1, 0, 1, 0]
-    assert section.blocks[-1].note == "Made up."
-    low, is_high = section.data["by_condition"]
+    assert section.blocks[-1].note == "Synthetic data."
+    low, high = section.data["by_condition"]
     assert (low["altitude_m"], low["answered"]["hits"], low["answered"]["n"]) == (400.0, 20, 20)
-    assert (is_high["altitude_m"], is_high["answered"]["hits"], is_high["answered"]["n"]) == (800.0, 10, 20)
+    assert (high["altitude_m"], high["answered"]["hits"], high["answered"]["n"]) == (800.0, 10, 20)
     assert section.data["rates"]["answered"]["share"] == pytest.approx(0.75)
     # medians of the errors: 1 m at 400 m, 2 m at 800 m
     (effect,) = section.data["effects"]
@@ -79,16 +79,16 @@ def test_declared_section_shows_its_parts_in_order() -> None:
 def test_missing_columns_give_no_section() -> None:
     assert ALTITUDE(make_subject(make_rows_of_two_altitudes().drop(columns="altitude_error_m"))) is None
     assert ALTITUDE(make_subject(make_rows_of_two_altitudes().assign(altitude_error_m=np.nan))) is None
-    declaration = SectionDeclaration("alone", "Alone", "Alone", [Distribution([Quantity("missing")], ("", ""), "")])
+    declaration = SectionDeclaration("errors", "Errors", "Errors", [Distribution([Quantity("missing")], ("", ""), "")])
     assert declaration(make_subject(make_rows_of_two_altitudes())) is None
 
 
-def test_cumulative_curve_rises_or_falls() -> None:
+def test_cumulative_curve_rises_and_complementary_curve_falls() -> None:
     values = {"ours": np.array([1.0, 2.0, 3.0, 4.0])}
-    for complementary, at_two in ((False, 0.5), (True, 0.5)):
+    for complementary, fraction_at_2 in ((False, 0.5), (True, 0.5)):
         (line,) = cumulative_figure(values, ("", ""), complementary=complementary).axes[0].get_lines()
         heights = dict(np.column_stack([np.asarray(line.get_xdata()), np.asarray(line.get_ydata())]).tolist())
-        assert heights[2.0] == at_two
+        assert heights[2.0] == fraction_at_2
         assert heights[4.0] == (0.0 if complementary else 1.0)
 
 
@@ -99,7 +99,7 @@ def test_bins_contain_each_finite_value_once() -> None:
     np.testing.assert_array_equal(np.sum(bins, axis=0), np.isfinite(values))
 
 
-def test_values_of_the_paper_are_compared_with_results(tmp_path: Path) -> None:
+def test_paper_values_are_compared_with_results(tmp_path: Path) -> None:
     path = tmp_path / "paper.toml"
     path.write_text(
         """
@@ -124,7 +124,7 @@ def test_values_of_the_paper_are_compared_with_results(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def other_system(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+def register_altitude_system(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Return a function that registers a system with the given report."""
 
     def install(report: str) -> None:
@@ -140,9 +140,9 @@ REPORT = Presentation(sections=(ALTITUDE,))
 
 
 def test_sections_of_a_registered_system_are_written(
-    other_system: Callable[[str], None], make_run: Callable[..., Path]
+    register_altitude_system: Callable[[str], None], make_run: Callable[..., Path]
 ) -> None:
-    other_system(f"{__name__}:REPORT")
+    register_altitude_system(f"{__name__}:REPORT")
     try:
         assert ALTITUDE in section_makers()
         page = write_report(
@@ -157,9 +157,9 @@ def test_sections_of_a_registered_system_are_written(
     ("report", "message"), [("nowhere.at_all:REPORT", "nowhere"), (f"{__name__}:ERROR", "is a Quantity; allowed")]
 )
 def test_invalid_report_of_a_system_gives_a_warning(
-    other_system: Callable[[str], None], report: str, message: str
+    register_altitude_system: Callable[[str], None], report: str, message: str
 ) -> None:
-    other_system(report)
+    register_altitude_system(report)
     try:
         with pytest.warns(UserWarning, match=f"system 'altitude'.*{message}.*are omitted"):
             assert presentations() == ()

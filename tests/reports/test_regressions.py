@@ -17,7 +17,7 @@ from marsyard.reports.history import (
     Comparison,
     History,
     NightCampaign,
-    NightFigure,
+    NightMetric,
     find_changes,
     list_comparisons,
     night_text,
@@ -27,8 +27,8 @@ from marsyard.reports.statistics.changes import Sample
 CASES, TERRAINS = 100, 12
 
 
-def _make_pool(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Errors, shape (terrains, 200), and answer probabilities of terrains with different difficulty."""
+def _make_error_pool(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors in metres, shape (terrains, 200), and answer probabilities of terrains of different difficulty."""
     rng = np.random.default_rng(seed)
     scale = rng.uniform(0.5, 2.0, TERRAINS)
     return np.abs(rng.normal(size=(TERRAINS, 200))) * scale[:, None], rng.uniform(0.85, 1.0, TERRAINS)
@@ -36,42 +36,42 @@ def _make_pool(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _draw_night(
     rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], error_factor: float = 1.0
-) -> list[NightFigure]:
-    """Draw the figures of one night from the pool; `worse` multiplies every error."""
+) -> list[NightMetric]:
+    """Draw the metrics of one night from the pool; `error_factor` multiplies every error."""
     terrains = rng.integers(0, TERRAINS, CASES)
     errors = error_factor * pool[0][terrains, rng.integers(0, 200, CASES)]
     answered = (rng.random(CASES) < pool[1][terrains]).astype(np.float64)
     rates = [("within 2 m", (errors < 2.0).astype(np.float64)), ("answered", answered)]
-    figures = [NightFigure(name, True, float(values.mean()), Sample(values, terrains)) for name, values in rates]
-    return [*figures, NightFigure("error (m)", False, float(np.median(errors)), Sample(errors, terrains))]
+    metrics = [NightMetric(name, True, float(values.mean()), Sample(values, terrains)) for name, values in rates]
+    return [*metrics, NightMetric("error (m)", False, float(np.median(errors)), Sample(errors, terrains))]
 
 
 def _detect_changes(
     rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], error_factor: float = 1.0
 ) -> list[Change]:
-    """Compare one night with seven earlier nights, for two campaigns; `worse` multiplies errors of the first."""
+    """Compare one night with seven earlier nights, for two campaigns; `error_factor` applies to the first campaign."""
     comparisons = []
     for campaign, factor in (("first", error_factor), ("second", 1.0)):
-        before = [_draw_night(rng, pool) for _ in range(7)]
-        for index, figure in enumerate(_draw_night(rng, pool, factor)):
-            comparisons.append(Comparison(campaign, figure, [night[index].sample for night in before]))
+        earlier_nights = [_draw_night(rng, pool) for _ in range(7)]
+        for index, metric in enumerate(_draw_night(rng, pool, factor)):
+            comparisons.append(Comparison(campaign, metric, [night[index].sample for night in earlier_nights]))
     return find_changes(comparisons)
 
 
-def test_noise_is_not_reported() -> None:
+def test_random_variation_is_not_reported_as_change() -> None:
     # 200 nights, family-wise error rate of 1 %: P(more than 6 false alarms) = 0.4 %
-    rng, pool = np.random.default_rng(1), _make_pool(2)
+    rng, pool = np.random.default_rng(1), _make_error_pool(2)
     assert sum(bool(_detect_changes(rng, pool)) for _ in range(200)) <= 6
 
 
-def test_planted_regression_is_detected() -> None:
+def test_simulated_regression_is_detected() -> None:
     # errors larger by 75 % must be detected in 95 % of 60 nights of 100 cases
-    rng, pool = np.random.default_rng(3), _make_pool(4)
+    rng, pool = np.random.default_rng(3), _make_error_pool(4)
     n_detected = 0
     for _ in range(60):
         detected = _detect_changes(rng, pool, 1.75)
         n_detected += ("first", "error (m)", True) in {
-            (change.campaign, change.figure, change.worse) for change in detected
+            (change.campaign, change.metric, change.worse) for change in detected
         }
     assert n_detected >= 57
 
@@ -83,12 +83,12 @@ def _make_campaign(definition: str = "d") -> NightCampaign:
 def _add_night(history: History, seed: int, error_factor: float = 1.0, definition: str = "d") -> int:
     night = history.begin("abc")
     history.add(
-        night, _make_campaign(definition), _draw_night(np.random.default_rng(seed), _make_pool(4), error_factor)
+        night, _make_campaign(definition), _draw_night(np.random.default_rng(seed), _make_error_pool(4), error_factor)
     )
     return night
 
 
-def test_history_stores_campaigns_and_figures(tmp_path: Path) -> None:
+def test_history_stores_campaigns_and_metrics(tmp_path: Path) -> None:
     with History(tmp_path / "history.sqlite") as history:
         night = _add_night(history, 1)
         history.finish(night, FINISHED)
@@ -96,18 +96,18 @@ def test_history_stores_campaigns_and_figures(tmp_path: Path) -> None:
         (stored,) = history.nights()
         assert (stored.night, stored.state, stored.git_commit) == (night, FINISHED, "abc")
         assert history.campaigns(night) == [_make_campaign()]
-        figures = history.figures(night, "first")
-        assert [figure.figure for figure in figures] == ["within 2 m", "answered", "error (m)"]
-        expected = _draw_night(np.random.default_rng(1), _make_pool(4))[2]
-        assert figures[2].sample.values == pytest.approx(expected.sample.values, rel=1e-6)
-        assert figures[2].sample.terrains.tolist() == expected.sample.terrains.tolist()
+        metrics = history.metrics(night, "first")
+        assert [metric.name for metric in metrics] == ["within 2 m", "answered", "error (m)"]
+        expected = _draw_night(np.random.default_rng(1), _make_error_pool(4))[2]
+        assert metrics[2].sample.values == pytest.approx(expected.sample.values, rel=1e-6)
+        assert metrics[2].sample.terrains.tolist() == expected.sample.terrains.tolist()
 
 
 def test_nights_are_compared_with_finished_nights_of_the_campaign(tmp_path: Path) -> None:
     with History(tmp_path / "history.sqlite") as history:
         for seed in range(3):
             history.finish(_add_night(history, seed), FINISHED)
-        _add_night(history, 9, error_factor=5.0)  # killed
+        _add_night(history, 9, error_factor=5.0)  # the process was killed before `finish`
         history.finish(_add_night(history, 3, definition="another"), FINISHED)
         night = _add_night(history, 4)
         states = {entry.night: entry.state for entry in history.nights()}
@@ -123,37 +123,37 @@ def test_reported_change_restarts_the_history(tmp_path: Path) -> None:
             history.finish(_add_night(history, seed), FINISHED)
         night = _add_night(history, 5, error_factor=3.0)
         regressions = find_changes(list_comparisons(history, night))
-        assert "error (m)" in {entry.figure for entry in regressions}
+        assert "error (m)" in {entry.metric for entry in regressions}
         history.finish(
-            night, FINISHED, [(entry.campaign, entry.figure, entry.p_value, entry.worse) for entry in regressions]
+            night, FINISHED, [(entry.campaign, entry.metric, entry.p_value, entry.worse) for entry in regressions]
         )
         # after a reported change, later nights are compared with that night only
         next_night = _add_night(history, 6, error_factor=3.0)
-        n_compared = {entry.figure.figure: len(entry.before) for entry in list_comparisons(history, next_night)}
+        n_compared = {entry.metric.name: len(entry.before) for entry in list_comparisons(history, next_night)}
         assert n_compared["error (m)"] == 1
         assert find_changes(list_comparisons(history, next_night)) == []
 
 
-def test_failed_write_adds_no_figures(tmp_path: Path) -> None:
+def test_failed_write_adds_no_metrics(tmp_path: Path) -> None:
     path = tmp_path / "history.sqlite"
     with History(path) as history:
         night = _add_night(history, 1)
         with pytest.raises(StoreError, match="cannot be written"):
-            history.add(night, _make_campaign(), _draw_night(np.random.default_rng(2), _make_pool(4)))
-        assert len(history.figures(night, "first")) == 3
+            history.add(night, _make_campaign(), _draw_night(np.random.default_rng(2), _make_error_pool(4)))
+        assert len(history.metrics(night, "first")) == 3
 
 
 def test_invalid_history_files_are_rejected(tmp_path: Path) -> None:
     path = tmp_path / "history.sqlite"
-    path.write_bytes(b"nothing of the kind, and long enough to be looked at" * 10)
+    path.write_bytes(b"not an SQLite file, but longer than the header of an SQLite file" * 10)
     with pytest.raises(StoreError, match="not a history of nights"):
         History(path)
-    other = tmp_path / "other.sqlite"
-    connection = sqlite3.connect(other)
+    newer = tmp_path / "newer.sqlite"
+    connection = sqlite3.connect(newer)
     connection.execute("PRAGMA user_version = 99")
     connection.close()
     with pytest.raises(StoreError, match="schema 99"):
-        History(other)
+        History(newer)
 
 
 def test_page_lists_regressions_and_interrupted_nights(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_default_design_is_independent_draws(settings: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(("configuration", "message"), DESIGNS)
-def test_designs_report_rates_without_confidence(
+def test_designs_without_independent_draws_have_no_confidence(
     make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
 ) -> None:
     frame, design = make_rows(2000), read_sampling_design(configuration)
@@ -66,7 +66,7 @@ def test_designs_report_rates_without_confidence(
 
 
 @pytest.mark.parametrize(("configuration", "message"), DESIGNS)
-def test_rate_of_a_design_decides_by_estimate(
+def test_rate_decides_for_designs_without_independent_draws(
     make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
 ) -> None:
     """A rate of 0.98 in 1000 cases meets 0.98 but not 0.99; the verdict has no bounds."""
@@ -110,12 +110,12 @@ def test_nominal_case_is_excluded_from_verdicts(make_rows: Rows, velocity: dict[
 def test_page_and_json_describe_the_design(make_rows: Rows, make_run: MakeRun) -> None:
     frame = make_rows(60)
     frame.loc[0, "velocity_error_m_s"] = 77.0
-    run = make_run(frame)
-    record = json.loads((run / "campaign.json").read_text())
+    directory = make_run(frame)
+    record = json.loads((directory / "campaign.json").read_text())
     record["configuration"]["design"] = {"kind": "latin-hypercube", "nominal": True}
-    (run / "campaign.json").write_text(json.dumps(record))
-    page = write_report(run).read_text()
-    twin = json.loads((run / "report.json").read_text())
+    (directory / "campaign.json").write_text(json.dumps(record))
+    page = write_report(directory).read_text()
+    report = json.loads((directory / "report.json").read_text())
     for text in (
         "The cases are not independent random samples: Latin hypercube; case 0 is the nominal case.",
         "velocity error (m/s) 77.0",
@@ -124,7 +124,7 @@ def test_page_and_json_describe_the_design(make_rows: Rows, make_run: MakeRun) -
     ):
         assert text in page, text
     assert "Additional cases needed</th>" in page
-    assert twin["sampling"] == {
+    assert report["sampling"] == {
         "design": "latin-hypercube",
         "grids": [],
         "nominal": True,
@@ -134,6 +134,6 @@ def test_page_and_json_describe_the_design(make_rows: Rows, make_run: MakeRun) -
         "independent": False,
         "text": "Latin hypercube; case 0 is the nominal case",
     }
-    assert (twin["cases"], twin["exit_code"]) == (60, 3)
-    assert 0 not in [int(case) for case in twin["worst_cases"]]
-    assert twin["statistics"]["velocity error (m/s)"]["largest"] < 77.0
+    assert (report["cases"], report["exit_code"]) == (60, 3)
+    assert 0 not in [int(case) for case in report["worst_cases"]]
+    assert report["statistics"]["velocity error (m/s)"]["largest"] < 77.0

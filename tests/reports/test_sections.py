@@ -28,7 +28,7 @@ def make_subject(frame: pd.DataFrame, bound: float | None = 5.0) -> Subject:
 
 
 def find_cells(section: Section | None, row: str) -> list[str]:
-    """Cells of the row with this name in the section's tables."""
+    """Return the cells of the row with this name in the section's tables."""
     assert section is not None
     grids = [block.grid for block in section.blocks if block.grid is not None]
     (cells,) = [list(cells) for grid in grids for cells in grid.rows if cells[0] == row]
@@ -106,12 +106,12 @@ def test_variance_between_terrains_is_estimated() -> None:
     # standard deviations 3 within and 2 between terrains: 4/13 of the variance, standard error about 0.035
     error = 2.0 * rng.standard_normal(200)[terrain] + 3.0 * rng.standard_normal(1000)
     frame = pd.DataFrame({"answered": True, "terrain": terrain, METRIC: error})
-    spread = terrain_variance(frame, METRIC)
-    assert spread is not None
-    assert spread["share"] == pytest.approx(4.0 / 13.0, abs=0.1)
-    assert spread["within_sd"] == pytest.approx(3.0, rel=0.08)
-    assert spread["between_sd"] == pytest.approx(2.0, rel=0.2)
-    assert spread["p_value"] < 1e-6
+    variance = terrain_variance(frame, METRIC)
+    assert variance is not None
+    assert variance["share"] == pytest.approx(4.0 / 13.0, abs=0.1)
+    assert variance["within_sd"] == pytest.approx(3.0, rel=0.08)
+    assert variance["between_sd"] == pytest.approx(2.0, rel=0.2)
+    assert variance["p_value"] < 1e-6
     uncorrelated = terrain_variance(frame.assign(**{METRIC: rng.standard_normal(1000)}), METRIC)
     assert uncorrelated is not None
     assert uncorrelated["p_value"] > 0.01
@@ -151,7 +151,7 @@ def test_faults_are_grouped_by_kind_and_size() -> None:
 
 
 def make_sensitive_rows(n: int, terrains: int, seed: int = 3) -> pd.DataFrame:
-    """Rows whose mean error grows by 1 m/s from the 5 % to the 95 % quantile of the attitude rate."""
+    """Return rows whose mean error grows by 1 m/s from the 5 % to the 95 % quantile of the attitude rate."""
     rng = np.random.default_rng(seed)
     rate = rng.uniform(0.0, 60.0, n)
     return pd.DataFrame(
@@ -165,7 +165,7 @@ def make_sensitive_rows(n: int, terrains: int, seed: int = 3) -> pd.DataFrame:
     )
 
 
-def test_sensitivity_finds_the_driver_and_bounds_the_others() -> None:
+def test_sensitivity_is_large_for_the_true_driver_only() -> None:
     effects = {
         driver.column: driver for driver in estimate_effects(make_subject(make_sensitive_rows(600, 600)), METRIC)
     }
@@ -183,18 +183,15 @@ def test_sensitivity_finds_the_driver_and_bounds_the_others() -> None:
 def test_sensitivity_intervals_have_90_percent_coverage() -> None:
     n_covered = 0
     for seed in range(40):
-        (driver,) = (
-            candidate
-            for candidate in estimate_effects(make_subject(make_sensitive_rows(120, 120, seed)), METRIC)
-            if candidate.column == "attitude_rate_max_deg_s"
-        )
+        effects = estimate_effects(make_subject(make_sensitive_rows(120, 120, seed)), METRIC)
+        (driver,) = (effect for effect in effects if effect.column == "attitude_rate_max_deg_s")
         # true effect between this sample's quantiles: 1/54 m/s per deg/s
         n_covered += driver.effect[1] <= (driver.high - driver.low) / 54.0 <= driver.effect[2]
     # binomial(40, 0.9): three standard deviations are 6
     assert n_covered >= 36 - 6
 
 
-def test_sensitivity_needs_all_drivers_and_enough_cases() -> None:
+def test_sensitivity_requires_all_drivers_and_enough_cases() -> None:
     assert sensitivity_section(make_subject(make_sensitive_rows(49, 49))) is None
     assert sensitivity_section(make_subject(make_sensitive_rows(60, 60).drop(columns="altitude_1_m"))) is None
     assert sensitivity_section(make_subject(make_sensitive_rows(60, 60).assign(altitude_1_m=2000.0))) is None
@@ -202,7 +199,7 @@ def test_sensitivity_needs_all_drivers_and_enough_cases() -> None:
     assert len(find_cells(section, "descent rate (m/s)")) == 5
 
 
-def test_landing_section_reports_benefit_and_harm() -> None:
+def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
     uncorrected = np.linspace(5.0, 25.0, 100)
     corrected = uncorrected - 4.0
     corrected[:10] = uncorrected[:10] + 2.0
@@ -229,7 +226,7 @@ def test_page_and_json_contain_every_section(make_rows: Rows, make_run: MakeRun)
     )
     directory = make_run(frame)
     text = write_report(directory).read_text(encoding="utf-8")
-    twin: dict[str, Any] = json.loads((directory / "report.json").read_text(encoding="utf-8"))
+    report: dict[str, Any] = json.loads((directory / "report.json").read_text(encoding="utf-8"))
     keys = ["answers", "scatter", "explained", "convergence", "faults", "landing", "sensitivity", "conditions"]
-    assert list(twin["sections"]) == keys
+    assert list(report["sections"]) == keys
     assert all(f'<section id="{key}"' in text for key in keys)

@@ -86,13 +86,13 @@ def test_statistics_table_has_errors_and_components(make_rows: Rows) -> None:
     ]
 
 
-def test_column_names_become_labels() -> None:
+def test_labels_are_derived_from_column_names() -> None:
     assert label("attitude_rate_max_deg_s") == "maximum attitude rate (deg/s)"
     assert label("terrain") == "terrain"
     assert magnitude_label("velocity_error_m_s") == "|velocity error| (m/s)"
 
 
-def test_components_of_an_error_are_found(make_rows: Rows) -> None:
+def test_axis_columns_are_the_components_of_an_error(make_rows: Rows) -> None:
     columns = list(make_rows(1).columns)
     assert axis_columns("velocity_error_m_s", columns) == ["velocity_error_x_m_s", "velocity_error_y_m_s"]
     assert axis_columns("score", columns) == []
@@ -114,7 +114,7 @@ def test_category_column_is_site_or_terrain(make_rows: Rows) -> None:
 def test_primary_metric_is_an_existing_column(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame = make_rows(3)
     assert primary_metric(frame, [{**velocity, "metric": "off_nadir_max_deg"}]) == "off_nadir_max_deg"
-    assert primary_metric(frame, [{**velocity, "metric": "nonesuch"}]) == "velocity_error_m_s"
+    assert primary_metric(frame, [{**velocity, "metric": "no_such_column"}]) == "velocity_error_m_s"
     assert primary_metric(frame[["case", "outcome"]], []) is None
 
 
@@ -130,7 +130,7 @@ def test_primary_metric_is_an_existing_column(make_rows: Rows, velocity: dict[st
         (1.000673416, "100.07 %"),
     ],
 )
-def test_rates_are_never_rounded_to_certainty(fraction: float, text: str) -> None:
+def test_rates_below_1_are_not_rounded_to_100_percent(fraction: float, text: str) -> None:
     assert percent(fraction) == text
 
 
@@ -147,7 +147,7 @@ def test_rate_without_cases_has_the_interval_0_to_1() -> None:
     assert empty.clustered_interval == (0.0, 1.0)
 
 
-def test_criteria_are_sentences_of_the_domain() -> None:
+def test_requirement_texts_describe_metric_and_population() -> None:
     entries = {item["id"]: item for item in tomllib.loads(REQUIREMENTS.read_text(encoding="utf-8"))["requirements"]}
     texts = {
         name: requirement_text(Requirement.model_validate({k: v for k, v in entry.items() if k != "campaigns"}))

@@ -20,7 +20,7 @@ Rows = Callable[..., pd.DataFrame]
 HOSTILE = '=HYPERLINK("x")\x00<&>'
 
 
-def _make_undecided(velocity: dict[str, Any]) -> dict[str, Any]:
+def _make_undecided_requirement(velocity: dict[str, Any]) -> dict[str, Any]:
     return {**velocity, "id": "UNDECIDED", "probability": 0.9999}
 
 
@@ -28,7 +28,7 @@ def test_matrix_has_one_row_per_requirement(make_rows: Rows, velocity: dict[str,
     frame = make_rows(40)
     requirement = {**velocity, "source": "the paper", "kind": "requirement"}
     verdicts = evaluate_requirements(
-        frame, [requirement, {**velocity, "id": HOSTILE, "statement": HOSTILE, "metric": "nonesuch"}]
+        frame, [requirement, {**velocity, "id": HOSTILE, "statement": HOSTILE, "metric": "no_such_column"}]
     )
     first, second = csv.DictReader(io.StringIO(verification_csv(requirement_evidence("dimes", verdicts))))
     assert tuple(first) == COLUMNS
@@ -36,7 +36,7 @@ def test_matrix_has_one_row_per_requirement(make_rows: Rows, velocity: dict[str,
     assert (first["campaign"], first["verdict"], first["bound"]) == ("dimes", str(verdicts[0].status), "5")
     assert int(first["cases"]) == verdicts[0].n
     assert float(first["lower_bound"]) == float(f"{verdicts[0].lower:.9g}")
-    # formulas of spreadsheets are escaped
+    # a leading "=" is escaped: a spreadsheet program would evaluate it as a formula
     assert second["statement"].startswith("'=")
     assert second["lower_bound"] == ""
 
@@ -49,11 +49,11 @@ def _read_message(case: Xml.Element, result: str) -> str:
 
 def test_junit_lists_failures_and_undecided_requirements(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame = make_rows(40, crashed=2, terrains=10_000)
-    # 32 of 34 with the crashed cases as failures: the rate is met, but not its bound
+    # 32 of 34 cases succeed (crashed cases are failures): the rate meets 94 %, its lower bound does not
     by_rate = {**velocity, "id": "RATE", "probability": 0.94, "decide_by": "estimate"}
     requirements = [
         {**velocity, "bound": 0.01, "id": "FAILS"},
-        _make_undecided(velocity),
+        _make_undecided_requirement(velocity),
         {**velocity, "probability": 0.5},
         by_rate,
     ]

@@ -1,4 +1,4 @@
-"""Tests of the layout of `report.json`."""
+"""Tests of `report.json` against its models in `report_layout` and its JSON schema."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import SCHEMA, SCHEMA_FILE, write_report
-from tests.reports.report_layout import Twin
+from tests.reports.report_layout import CampaignReport
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
 
 
 def test_stored_schema_equals_the_layout() -> None:
-    # update: json.dump(Twin.model_json_schema(), file, indent=1), followed by a newline
+    # to update the file: json.dump(CampaignReport.model_json_schema(), file, indent=1), followed by a newline
     stored = SCHEMA_FILE.read_text()
-    assert json.loads(stored) == Twin.model_json_schema()
-    assert get_args(Twin.model_fields["report_schema"].annotation) == (SCHEMA,)
+    assert json.loads(stored) == CampaignReport.model_json_schema()
+    assert get_args(CampaignReport.model_fields["report_schema"].annotation) == (SCHEMA,)
 
 
 @pytest.mark.parametrize(
@@ -37,11 +37,11 @@ def test_stored_schema_equals_the_layout() -> None:
 def test_reports_follow_the_layout(make_rows: Rows, make_run: MakeRun, options: dict[str, float]) -> None:
     directory = make_run(make_rows(**options)[["case", "outcome", "answered", "terrain", "velocity_error_m_s"]])
     write_report(directory)
-    Twin.model_validate_json((directory / "report.json").read_text(), strict=True)
+    CampaignReport.model_validate_json((directory / "report.json").read_text(), strict=True)
 
 
 def test_empty_report_follows_the_layout(make_rows: Rows, make_run: MakeRun) -> None:
     directory = make_run(make_rows(24).head(0), [])
     write_report(directory)
-    report = Twin.model_validate_json((directory / "report.json").read_text(), strict=True)
+    report = CampaignReport.model_validate_json((directory / "report.json").read_text(), strict=True)
     assert (report.verdict, report.verdicts) == ("NO REQUIREMENT", [])

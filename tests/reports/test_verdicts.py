@@ -21,7 +21,7 @@ Rows = Callable[..., pd.DataFrame]
 
 
 def _make_rows(n: int, failures: int, *, error: float = 6.0) -> pd.DataFrame:
-    """Cases with one terrain per case; the first `failures` cases exceed the bound of 5."""
+    """Return cases with one terrain per case; the errors of the first `failures` cases exceed the bound of 5 m/s."""
     errors = np.where(np.arange(n) < failures, error, 1.0)
     return pd.DataFrame(
         {
@@ -39,13 +39,13 @@ def _evaluate(frame: pd.DataFrame, requirement: dict[str, Any], **changes: Any) 
     return verdict
 
 
-def test_minimum_number_of_cases_passes(velocity: dict[str, Any]) -> None:
+def test_verdict_passes_at_the_minimum_number_of_cases(velocity: dict[str, Any]) -> None:
     # 99 % at 90 % confidence needs 230 cases without failure, 388 with one (docs/design.md)
     assert _evaluate(_make_rows(230, 0), velocity).status is Status.PASS
     assert _evaluate(_make_rows(388, 1), velocity).status is Status.PASS
-    short = _evaluate(_make_rows(229, 0), velocity)
+    undecided = _evaluate(_make_rows(229, 0), velocity)
     # appended cases are a second look, so more than one additional case is needed
-    assert (short.status, short.further_cases) == (Status.INSUFFICIENT, 297 - 229)
+    assert (undecided.status, undecided.further_cases) == (Status.INSUFFICIENT, 297 - 229)
 
 
 def test_24_cases_without_failure_are_insufficient(velocity: dict[str, Any]) -> None:
@@ -57,7 +57,7 @@ def test_24_cases_without_failure_are_insufficient(velocity: dict[str, Any]) -> 
     assert (verdict.estimate, verdict.upper) == (1.0, 1.0)
 
 
-def test_failure_of_all_cases_fails(velocity: dict[str, Any]) -> None:
+def test_verdict_fails_if_all_cases_fail(velocity: dict[str, Any]) -> None:
     verdict = _evaluate(_make_rows(24, 24), velocity)
     assert (verdict.status, verdict.estimate, verdict.lower) == (Status.FAIL, 0.0, 0.0)
     assert verdict.further_cases is None
@@ -79,11 +79,11 @@ def test_status_follows_from_the_bounds(counts: tuple[int, int], probability: fl
     assert (verdict.status is Status.FAIL) == (upper < probability)
     if verdict.status is Status.INSUFFICIENT:
         assert verdict.further_cases
-        more = pd.concat([_make_rows(n, failures), _make_rows(verdict.further_cases, 0)], ignore_index=True)
-        more = more.drop(columns="terrain").assign(case=np.arange(len(more)))
-        (later,) = evaluate_requirements(more, [requirement], SamplingDesign(first_look=n))
+        extended = pd.concat([_make_rows(n, failures), _make_rows(verdict.further_cases, 0)], ignore_index=True)
+        extended = extended.drop(columns="terrain").assign(case=np.arange(len(extended)))
+        (later,) = evaluate_requirements(extended, [requirement], SamplingDesign(first_look=n))
         assert later.status is Status.PASS
-        (too_few,) = evaluate_requirements(more[:-1], [requirement], SamplingDesign(first_look=n))
+        (too_few,) = evaluate_requirements(extended[:-1], [requirement], SamplingDesign(first_look=n))
         assert too_few.status is Status.INSUFFICIENT
 
 
@@ -160,8 +160,8 @@ def test_boolean_metric_counts_true_as_success() -> None:
 def test_populations_combine_columns() -> None:
     frame = _make_rows(100, 20).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) < 50)
     criterion = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    both = _evaluate(frame, criterion, population="valid and feasible_overlap")
-    assert (both.n, both.failures) == (40, 10)
+    combined = _evaluate(frame, criterion, population="valid and feasible_overlap")
+    assert (combined.n, combined.failures) == (40, 10)
     assert (
         "feasible_overlap"
         in _evaluate(frame.assign(feasible_overlap=np.arange(100.0)), criterion, population="feasible_overlap").note
@@ -177,12 +177,12 @@ def test_unknown_membership_counts_as_failure(outcome: str) -> None:
     verdict = _evaluate(frame, criterion, population="feasible_overlap")
     assert (verdict.n, verdict.failures) == (54, 4)
     # cases 92 and 93 are excluded by the second condition
-    frame["near"] = np.arange(100) < 92
-    verdict = _evaluate(frame, criterion, population="feasible_overlap and near")
+    frame["is_near"] = np.arange(100) < 92
+    verdict = _evaluate(frame, criterion, population="feasible_overlap and is_near")
     assert (verdict.n, verdict.failures) == (52, 2)
 
 
-def test_crashed_cases_fail_an_availability() -> None:
+def test_crashed_cases_are_failures_of_availability() -> None:
     """4 of 20 cases crash before their conditions are known; the other 16 succeed."""
     frame = _make_rows(20, 0).assign(feasible_overlap=True).astype({"feasible_overlap": object})
     frame.loc[:3, ["outcome", "answered", "feasible_overlap"]] = ["CRASHED", False, None]
@@ -203,11 +203,11 @@ def test_crashed_case_with_a_small_error_fails() -> None:
     assert _evaluate(frame, criterion, population="all", decide_by="estimate").failures == 2
 
 
-@pytest.mark.parametrize("population", ["valid", "completed", "valid and near"])
+@pytest.mark.parametrize("population", ["valid", "completed", "valid and is_near"])
 def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) -> None:
     """The verdict is INSUFFICIENT if it depends on whether crashed cases belong to the population."""
     criterion = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    frame = _make_rows(50, 0).assign(near=True)
+    frame = _make_rows(50, 0).assign(is_near=True)
     frame.loc[:9, "outcome"] = "CRASHED"
     frame.loc[:9, "answered"] = False
     for rule in ("confidence", "estimate"):
@@ -215,12 +215,12 @@ def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) ->
         assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 40, 0)
         assert "10 cases did not finish" in verdict.note
     # too few crashes, or crashes outside the population, do not change the verdict
-    few_crashes = _make_rows(200, 0).assign(near=True)
+    few_crashes = _make_rows(200, 0).assign(is_near=True)
     few_crashes.loc[:1, "outcome"] = "CRASHED"
     few_crashes.loc[:1, "answered"] = False
     assert _evaluate(few_crashes, criterion, population=population).status is Status.PASS
-    outside = frame.assign(near=frame["answered"])
-    assert _evaluate(outside, criterion, population="valid and near").status is Status.PASS
+    outside = frame.assign(is_near=frame["answered"])
+    assert _evaluate(outside, criterion, population="valid and is_near").status is Status.PASS
 
 
 def test_estimate_decides_with_shared_terrains(velocity: dict[str, Any]) -> None:
@@ -239,24 +239,24 @@ def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any
     assert verdict.statement.endswith("(evaluated by observed rate).")
 
 
-def test_rate_without_confidence_never_passes(velocity: dict[str, Any]) -> None:
+def test_verdict_by_rate_is_not_pass(velocity: dict[str, Any]) -> None:
     """8 cases without failure have a rate of 100 %, but a consumer's risk of 97.6 % for 99.7 %."""
-    harm = {**velocity, "probability": 0.997, "decide_by": "estimate"}
-    few = _evaluate(_make_rows(8, 0), harm)
+    probability_997 = {**velocity, "probability": 0.997, "decide_by": "estimate"}
+    eight_cases = _evaluate(_make_rows(8, 0), probability_997)
     # 334 = 1 / 0.003 cases, of which one may fail
-    assert (few.status, few.further_cases) == (Status.INSUFFICIENT, 334 - 8)
-    assert "needs at least 334 cases" in few.note
-    assert _evaluate(_make_rows(333, 0), harm).status is Status.INSUFFICIENT
-    assert _evaluate(_make_rows(334, 1), harm).status is Status.MET_BY_RATE
-    assert _evaluate(_make_rows(334, 2), harm).status is Status.FAIL
+    assert (eight_cases.status, eight_cases.further_cases) == (Status.INSUFFICIENT, 334 - 8)
+    assert "needs at least 334 cases" in eight_cases.note
+    assert _evaluate(_make_rows(333, 0), probability_997).status is Status.INSUFFICIENT
+    assert _evaluate(_make_rows(334, 1), probability_997).status is Status.MET_BY_RATE
+    assert _evaluate(_make_rows(334, 2), probability_997).status is Status.FAIL
     # 99.7 % at 90 % confidence needs 767 cases without failure
-    assert _evaluate(_make_rows(767, 0), harm).status is Status.PASS
-    by_rate = _evaluate(_make_rows(334, 1), harm)
+    assert _evaluate(_make_rows(767, 0), probability_997).status is Status.PASS
+    by_rate = _evaluate(_make_rows(334, 1), probability_997)
     assert exit_code([by_rate], crashed=False) == 3
-    assert exit_code([_evaluate(_make_rows(334, 1), harm, accept_rate=True)], crashed=False) == 0
+    assert exit_code([_evaluate(_make_rows(334, 1), probability_997, accept_rate=True)], crashed=False) == 0
     passing = _evaluate(_make_rows(230, 0), velocity)
     assert combine_verdicts([passing, by_rate], _make_rows(334, 1)).word == "MET BY RATE"
-    assert combine_verdicts([passing, by_rate, few], _make_rows(334, 1)).word == "INSUFFICIENT"
+    assert combine_verdicts([passing, by_rate, eight_cases], _make_rows(334, 1)).word == "INSUFFICIENT"
 
 
 @pytest.mark.parametrize(("probability", "min_cases"), [(0.5, 2), (0.9, 10), (0.92, 13), (0.95, 20), (0.99, 100)])
@@ -280,8 +280,8 @@ def test_appended_cases_share_the_risk_of_two_looks(velocity: dict[str, Any]) ->
     assert (later.status, later.bounds_confidence > 0.99) == (Status.INSUFFICIENT, True)
     assert "evaluated more than once" in later.note
     assert first.further_cases == 1049 - 230
-    (enough,) = evaluate_requirements(_make_rows(1049, 1), [velocity], design)
-    assert (enough.status, enough.n) == (Status.PASS, 1049)
+    (sufficient,) = evaluate_requirements(_make_rows(1049, 1), [velocity], design)
+    assert (sufficient.status, sufficient.n) == (Status.PASS, 1049)
     # 60 failures also fail at the second look
     assert evaluate_requirements(_make_rows(388, 60), [velocity], design)[0].status is Status.FAIL
 
@@ -297,7 +297,7 @@ def test_appended_terrains_share_the_risk_of_two_looks(velocity: dict[str, Any])
     assert later.status is Status.INSUFFICIENT
 
 
-def test_consumer_risk_at_the_minimum_number_of_cases(velocity: dict[str, Any]) -> None:
+def test_consumer_risk_is_exact_at_the_minimum_number_of_cases(velocity: dict[str, Any]) -> None:
     # 0.99^230 = 0.0991 is below 10 %
     assert _evaluate(_make_rows(230, 0), velocity).consumer_risk == pytest.approx(0.99**230)
     # ten cases on each of 230 terrains count as 230 cases
@@ -323,8 +323,8 @@ def test_shared_terrains_count_as_single_cases(velocity: dict[str, Any]) -> None
     assert verdict.further_cases == 297 - 8
     for message in ("8 terrains", "terrains counted instead of cases", "289 additional terrains", "PASS"):
         assert message in verdict.note
-    enough = _evaluate(_make_rows(460, 0).assign(terrain=np.arange(460) % 230), velocity)
-    assert enough.status is Status.PASS
+    many_terrains = _evaluate(_make_rows(460, 0).assign(terrain=np.arange(460) % 230), velocity)
+    assert many_terrains.status is Status.PASS
 
 
 def test_additional_cases_account_for_the_design_effect(velocity: dict[str, Any]) -> None:
@@ -336,15 +336,15 @@ def test_additional_cases_account_for_the_design_effect(velocity: dict[str, Any]
     assert verdict.clustered is not None
     assert verdict.clustered.design_effect == pytest.approx(5.0, rel=0.02)
     assert verdict.further_cases
-    more = pd.concat(
+    extended = pd.concat(
         [frame, _make_rows(verdict.further_cases, 0).assign(terrain=1000 + np.arange(verdict.further_cases) // 5)]
     )
-    more["case"] = np.arange(len(more))
+    extended["case"] = np.arange(len(extended))
     rule = [{**velocity, "probability": 0.82}]
-    (later,) = evaluate_requirements(more, rule, SamplingDesign(first_look=1000))
+    (later,) = evaluate_requirements(extended, rule, SamplingDesign(first_look=1000))
     assert later.status is Status.PASS
     (earlier,) = evaluate_requirements(
-        more.iloc[: 1000 + int(0.9 * verdict.further_cases)], rule, SamplingDesign(first_look=1000)
+        extended.iloc[: 1000 + int(0.9 * verdict.further_cases)], rule, SamplingDesign(first_look=1000)
     )
     assert earlier.status is Status.INSUFFICIENT
 
@@ -358,7 +358,7 @@ def _make_terrain_design(bank: int, **dispersion: Any) -> SamplingDesign:
     )
 
 
-def test_advice_names_the_limiting_number_of_terrains(velocity: dict[str, Any]) -> None:
+def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, Any]) -> None:
     """8 terrains cannot show 99 % at 90 % confidence, so no number of additional cases is given."""
     frame = _make_rows(400, 0).assign(terrain=np.arange(400) % 8)
     design = _make_terrain_design(8, distribution="integer", low=0, high="location.bank - 1")
@@ -415,7 +415,7 @@ def test_evaluation_does_not_change_its_inputs(make_rows: Rows, velocity: dict[s
     assert requirement == velocity
 
 
-def test_overall_verdict_is_the_worst(velocity: dict[str, Any]) -> None:
+def test_overall_verdict_is_the_worst_verdict(velocity: dict[str, Any]) -> None:
     frame = _make_rows(230, 0)
     passing, failing = _evaluate(frame, velocity), _evaluate(frame, velocity, bound=0.5)
     undecided = _evaluate(frame, velocity, probability=0.999)

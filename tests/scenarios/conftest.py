@@ -1,4 +1,4 @@
-"""Checks that each row of a scenario has only the columns of `scenarios/columns.toml`."""
+"""Fixture for all scenario tests: each row contains only the columns that `scenarios/columns.toml` declares."""
 
 from __future__ import annotations
 
@@ -13,27 +13,29 @@ from marsyard.scenarios.user_files import import_object
 
 
 def _list_undeclared_columns(row: Any, declared: RowColumns, custom_prefixes: tuple[str, ...]) -> list[str]:
-    """Return undeclared columns of numbers and truth values; prefixes of other algorithms are removed first."""
+    """Return undeclared columns of numbers and booleans; the prefixes of compared algorithms are removed first."""
     undeclared_names = []
     for name, value in row.items():
-        plain = name.rpartition(".")[2] if not name.startswith("footprints_") else name
+        column = name.rpartition(".")[2] if not name.startswith("footprints_") else name
         is_flag = isinstance(value, bool)
-        known = declared.has_flag(plain) or plain == "answered" if is_flag else declared.has_number(plain)
-        if not isinstance(value, str) and not known and not plain.startswith(custom_prefixes):
+        is_declared = declared.has_flag(column) or column == "answered" if is_flag else declared.has_number(column)
+        if not isinstance(value, str) and not is_declared and not column.startswith(custom_prefixes):
             undeclared_names.append(name)
     return undeclared_names
 
 
-def _check_columns_of(run: Callable[..., CaseResult], declared: RowColumns) -> Callable[..., CaseResult]:
+def add_column_check(run: Callable[..., CaseResult], declared: RowColumns) -> Callable[..., CaseResult]:
+    """Wrap a scenario's `run` method: check the columns of each row."""
+
     def run_and_check(self: Any, parameters: Any, streams: Any) -> CaseResult:
         result = run(self, parameters, streams)
-        named = [flag.name for flag in getattr(parameters, declared.named_flags, ())] if declared.named_flags else []
+        flags = getattr(parameters, declared.named_flags, ()) if declared.named_flags else ()
         # Columns of custom scores start with the function name.
-        holder = parameters if getattr(parameters, "scores", ()) else getattr(parameters, "drive", None)
-        specs: tuple[str, ...] = getattr(holder, "scores", ())
-        custom_prefixes = (*named, *(f"{spec.rpartition(':')[2]}_" for spec in specs))
+        score_parameters = parameters if getattr(parameters, "scores", ()) else getattr(parameters, "drive", None)
+        score_specs: tuple[str, ...] = getattr(score_parameters, "scores", ())
+        custom_prefixes = (*(flag.name for flag in flags), *(f"{spec.rpartition(':')[2]}_" for spec in score_specs))
         undeclared = _list_undeclared_columns(result.row, declared, custom_prefixes)
-        assert not undeclared, f"columns that scenarios/columns.toml does not state for {self.name}: {undeclared}"
+        assert not undeclared, f"columns that scenarios/columns.toml does not declare for {self.name}: {undeclared}"
         return result
 
     return run_and_check
@@ -46,5 +48,5 @@ def _check_row_columns() -> Iterator[None]:
             scenario_class = import_object(path)
             declared = row_columns(name)
             assert declared is not None
-            patch.setattr(scenario_class, "run", _check_columns_of(scenario_class.run, declared))
+            patch.setattr(scenario_class, "run", add_column_check(scenario_class.run, declared))
         yield

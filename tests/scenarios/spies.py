@@ -1,4 +1,4 @@
-"""Algorithms that record their inputs, and scores that record the truth of the same case."""
+"""Algorithms and scores for tests: spies record inputs and truth; other algorithms write to images, raise or exit."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from marsyard.sim.measurements import (
     TargetDesignation,
 )
 
-#: Inputs of algorithms and scored cases, in call order.
-GIVEN: list[Any] = []
-TRUE: list[Any] = []
+#: Inputs of the algorithms, and the cases with the truth, in call order.
+RECORDED_INPUTS: list[Any] = []
+RECORDED_CASES: list[Any] = []
 
 
 class VelocitySpy:
@@ -36,7 +36,7 @@ class VelocitySpy:
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
-        GIVEN.append(measurements)
+        RECORDED_INPUTS.append(measurements)
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 
 
@@ -45,12 +45,12 @@ class SiteSpy:
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """See `SiteEstimator`."""
-        GIVEN.append(measurements)
+        RECORDED_INPUTS.append(measurements)
         return SiteEstimate(SiteOutcome.NO_STRUCTURE, np.array(measurements.apriori_site_world))
 
 
 class TrackerSpy:
-    """The paper's tracker; records (pose, mast) of each aim and the measurements of each update."""
+    """The paper's tracker; records (pose, mast) of each `aim` call and the measurements of each update."""
 
     def __init__(self) -> None:
         self.inner = VisualTargetTracker()
@@ -66,12 +66,12 @@ class TrackerSpy:
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
         """See `TargetTracker`."""
-        GIVEN.append((world_from_rover, mast))
+        RECORDED_INPUTS.append((world_from_rover, mast))
         return self.inner.aim(world_from_rover, mast)
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
-        GIVEN.append(measurements)
+        RECORDED_INPUTS.append(measurements)
         return self.inner.update(measurements)
 
     def clear(self) -> None:
@@ -79,69 +79,69 @@ class TrackerSpy:
         self.inner.clear()
 
 
-def keep(case: ScoredVelocity | ScoredSite) -> dict[str, float]:
-    """A score that records the case."""
-    TRUE.append(case)
-    return {"kept": 1.0}
+def record_case(case: ScoredVelocity | ScoredSite) -> dict[str, float]:
+    """Custom score that records the case."""
+    RECORDED_CASES.append(case)
+    return {"recorded": 1.0}
 
 
-def _blacken(picture: Any, how: str) -> None:
-    if how == "by force":
-        picture.counts.setflags(write=True)
-    picture.counts[:] = 0
+def _set_counts_to_zero(image: Any, *, make_writable: bool) -> None:
+    if make_writable:
+        image.counts.setflags(write=True)
+    image.counts[:] = 0
 
 
-class WritingVelocity(VelocitySpy):
-    """Writes to its images."""
+class VelocityWriter(VelocitySpy):
+    """Writes to its read-only image."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
-        _blacken(measurements.images[0], "as if it could")
+        _set_counts_to_zero(measurements.images[0], make_writable=False)
         return super().estimate(measurements)
 
 
-class SpoilingVelocity(VelocitySpy):
-    """Makes its images writable before it writes."""
+class ForcedVelocityWriter(VelocitySpy):
+    """Makes an image writable and overwrites it."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
-        _blacken(measurements.images[0], "by force")
+        _set_counts_to_zero(measurements.images[0], make_writable=True)
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 
 
-class SpoilingSite(SiteSpy):
-    """Makes site images writable before it writes."""
+class ForcedSiteWriter(SiteSpy):
+    """Makes an image writable and overwrites it."""
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """See `SiteEstimator`."""
-        _blacken(measurements.images[0], "by force")
+        _set_counts_to_zero(measurements.images[0], make_writable=True)
         return SiteEstimate(SiteOutcome.NO_STRUCTURE, np.array(measurements.apriori_site_world))
 
 
-class SpoilingTracker(TrackerSpy):
-    """Makes tracker images writable before it writes."""
+class ForcedTrackerWriter(TrackerSpy):
+    """Makes an image writable and overwrites it."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
         update = self.inner.update(measurements)
-        _blacken(measurements.left, "by force")
+        _set_counts_to_zero(measurements.left, make_writable=True)
         return update
 
 
 class RaisingTracker(TrackerSpy):
-    """Raises at its second stop."""
+    """Raises an exception at the second stop."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
-        if any(isinstance(one, RoverMeasurements) for one in GIVEN):
+        if any(isinstance(inputs, RoverMeasurements) for inputs in RECORDED_INPUTS):
             raise RuntimeError("the tracker raised")
         return super().update(measurements)
 
 
-class Leaving:
-    """An algorithm that ends its process for any task, simulated within a test."""
+class ExitingAlgorithm:
+    """Algorithm for any task that raises SystemExit in each method."""
 
-    def _leave(self, *_: object) -> None:
-        raise SystemExit("left")
+    def _exit(self, *_: object) -> None:
+        raise SystemExit("the algorithm exits")
 
-    estimate = designate = aim = update = clear = state = _leave
+    estimate = designate = aim = update = clear = state = _exit

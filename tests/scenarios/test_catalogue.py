@@ -1,4 +1,4 @@
-"""Tests that requirements of catalogue campaigns use existing columns."""
+"""Tests that the requirements of the catalogue's campaigns use columns that their scenarios report."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from marsyard.sim.streams import Streams
 
 
 def _run_small_case(scenario: str) -> Row:
-    """Return the row of a small case."""
+    """Return the row of a small case of a scenario."""
     if scenario == "rover-drive":
         result = SharedDriveScenario().run(_make_short_drive(), Streams(1, "catalogue", 0))
     else:
-        small = {
+        small_campaigns = {
             load_campaign(name, settings).configuration.scenario: (name, settings)
             for system in systems()
             for name, settings in system.compiled_by.items()
         }
-        campaign = load_campaign(*small.get(scenario, ("dimes-fieldtest", ())))
+        campaign = load_campaign(*small_campaigns.get(scenario, ("dimes-fieldtest", ())))
         result = campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
     return {"case": 0, "outcome": result.outcome, "answered": result.answered, **result.row}
 
 
 def _make_short_drive() -> SharedDriveParameters:
-    """Return a drive of one step with the bands of all campaigns."""
-    names = {
-        band["name"] for campaign in _list_campaigns("rover-drive") for band in _read_requirements(campaign)["bands"]
+    """Return a drive of one step with the bands (column names) of all campaigns."""
+    band_names = {
+        band["name"] for campaign in _list_campaigns("rover-drive") for band in _read_parameters(campaign)["bands"]
     }
     return SharedDriveParameters.model_validate(
         {
@@ -43,12 +43,12 @@ def _make_short_drive() -> SharedDriveParameters:
             },
             "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
             "targets": [{"across": 0.0, "up": 0.5}],
-            "bands": [{"name": name, "min": 0.0, "max": 10.0} for name in sorted(names)],
+            "bands": [{"name": name, "min": 0.0, "max": 10.0} for name in sorted(band_names)],
         }
     )
 
 
-def _read_requirements(campaign: str) -> dict[str, list[dict[str, str]]]:
+def _read_parameters(campaign: str) -> dict[str, list[dict[str, str]]]:
     return dict(load_campaign(campaign).configuration.parameters)
 
 
@@ -57,7 +57,7 @@ def _list_campaigns(scenario: str) -> list[str]:
 
 
 @pytest.mark.parametrize("scenario", ["descent", "fieldtest", "rover", "rover-drive", "landing"])
-def test_requirements_use_existing_columns(scenario: str) -> None:
+def test_requirements_use_columns_of_their_scenario(scenario: str) -> None:
     row = _run_small_case(scenario)
     for name in _list_campaigns(scenario):
         check_metrics(load_campaign(name).configuration, row, Path(name))

@@ -1,4 +1,4 @@
-"""Tests of algorithms by name, path and entry point, and of several algorithms in one case."""
+"""Tests of algorithm selection by name, import path and entry point, and of several algorithms in one case."""
 
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -22,46 +22,47 @@ from marsyard.scenarios.velocity import consistency_row
 LIMITS = ExecutableLimits()
 
 
-def test_algorithm_in_the_current_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "lying_here.py").write_text("class Mine:\n    def estimate(self, measurements): ...\n")
+def test_algorithm_is_imported_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "local_algorithm.py").write_text("class Mine:\n    def estimate(self, measurements): ...\n")
     monkeypatch.chdir(tmp_path)
-    VELOCITY.check("lying_here:Mine")
-    assert type(VELOCITY.make("lying_here:Mine", DimesOptions(), LIMITS)).__name__ == "Mine"
+    VELOCITY.check("local_algorithm:Mine")
+    assert type(VELOCITY.make("local_algorithm:Mine", DimesOptions(), LIMITS)).__name__ == "Mine"
     with pytest.raises(ValueError, match="target tracker: missing members: designate, aim, update, clear, state"):
-        TRACKING.check("lying_here:Mine")
+        TRACKING.check("local_algorithm:Mine")
 
 
 def test_module_that_raises_gives_a_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "broken_here.py").write_text("1 / 0\n")
+    (tmp_path / "raising_module.py").write_text("1 / 0\n")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match="cannot import algorithm 'broken_here:Mine': ZeroDivisionError"):
-        VELOCITY.check("broken_here:Mine")
+    with pytest.raises(ValueError, match="cannot import algorithm 'raising_module:Mine': ZeroDivisionError"):
+        VELOCITY.check("raising_module:Mine")
 
 
-def test_entry_point_is_named_like_builtin_algorithms(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entry_point_is_an_algorithm_name_unless_it_is_built_in(monkeypatch: pytest.MonkeyPatch) -> None:
     group = estimators.GROUP
-    points = [
-        EntryPoint(name, "marsyard.algorithms.baselines:HomographyEstimator", group) for name in ("theirs", "dimes")
+    entry_points = [
+        EntryPoint(name, "marsyard.algorithms.baselines:HomographyEstimator", group) for name in ("installed", "dimes")
     ]
-    monkeypatch.setattr(estimators, "list_installed", lambda: {point.name: point for point in points})
-    assert isinstance(VELOCITY.make("theirs", DimesOptions(), LIMITS), HomographyEstimator)
+    installed = {entry_point.name: entry_point for entry_point in entry_points}
+    monkeypatch.setattr(estimators, "list_installed", lambda: installed)
+    assert isinstance(VELOCITY.make("installed", DimesOptions(), LIMITS), HomographyEstimator)
     assert not isinstance(VELOCITY.make("dimes", DimesOptions(), LIMITS), HomographyEstimator)
-    with pytest.raises(ValueError, match=r"did you mean 'theirs'.*dimes, phase-correlation, homography, theirs"):
-        VELOCITY.check("their")
+    with pytest.raises(ValueError, match=r"did you mean 'installed'.*dimes, phase-correlation, homography, installed"):
+        VELOCITY.check("installedd")
 
 
 def test_programs_are_accepted_as_algorithms() -> None:
-    made = VELOCITY.make("exec:cat --number", DimesOptions(), LIMITS)
-    assert isinstance(made, ExecutableVelocityEstimator)
-    assert made.command.words == ("cat", "--number")
+    algorithm = VELOCITY.make("exec:cat --number", DimesOptions(), LIMITS)
+    assert isinstance(algorithm, ExecutableVelocityEstimator)
+    assert algorithm.command.words == ("cat", "--number")
     LANDING.check("serve:cat")
     TRACKING.check("exec:cat")
     assert isinstance(TRACKING.make("serve:cat", VttOptions(), LIMITS), ExecutableTargetTracker)
 
 
 def test_labels_are_unique_column_names() -> None:
-    inputs = labels(["dimes", "phase-correlation", "a.b:Mine", "exec:./x/mine-1 --fast", "c:Mine", "exec:./7"])
-    assert inputs == ("dimes", "phase_correlation", "Mine", "mine_1", "Mine_2", "a_7")
+    names = labels(["dimes", "phase-correlation", "a.b:Mine", "exec:./x/mine-1 --fast", "c:Mine", "exec:./7"])
+    assert names == ("dimes", "phase_correlation", "Mine", "mine_1", "Mine_2", "a_7")
 
 
 def test_duplicate_algorithm_is_rejected() -> None:
@@ -73,12 +74,12 @@ def test_duplicate_algorithm_is_rejected() -> None:
 
 def test_failing_algorithm_does_not_affect_others() -> None:
     def run_with(spec: str) -> CaseResult:
-        def ask() -> float:
+        def compute_answer() -> float:
             return 1.0 / float(spec)
 
-        tried = run_algorithm(ask, lambda answer: answer)
+        result = run_algorithm(compute_answer, lambda answer: answer)
         return CaseResult(
-            tried.outcome(lambda _: "VALID"), tried.answer is not None, {"error_m": 0.5}, failure=tried.failure
+            result.outcome(lambda _: "VALID"), result.answer is not None, {"error_m": 0.5}, failure=result.failure
         )
 
     case = case_result(["2", "0"], run_with, {"altitude_m": 7.0})
@@ -88,11 +89,11 @@ def test_failing_algorithm_does_not_affect_others() -> None:
     assert case.row["a_0.answered"] is False
     assert case.row["a_0.error"] == "ZeroDivisionError: float division by zero"
     assert "a_0.altitude_m" not in case.row
-    other = case_result(["0", "2"], run_with, {"altitude_m": 7.0})
-    assert other.failure is not None
-    assert other.outcome == other.failure.outcome == "CRASHED"
-    assert other.row["altitude_m"] == 7.0
-    assert other.row["a_2.outcome"] == "VALID"
+    swapped_case = case_result(["0", "2"], run_with, {"altitude_m": 7.0})
+    assert swapped_case.failure is not None
+    assert swapped_case.outcome == swapped_case.failure.outcome == "CRASHED"
+    assert swapped_case.row["altitude_m"] == 7.0
+    assert swapped_case.row["a_2.outcome"] == "VALID"
 
 
 def test_normalised_error_uses_the_covariance() -> None:
@@ -106,27 +107,27 @@ def test_normalised_error_uses_the_covariance() -> None:
     assert consistency_row(VelocityEstimate(VelocityOutcome.VALID, np.zeros(2)), np.zeros(2)) == {}
 
 
-STREAM = "class Mine:\n    def start(self): ...\n    def picture(self, frame): ...\n"
+STREAM_CLASS = "class Mine:\n    def start(self): ...\n    def picture(self, frame): ...\n"
 
 
-def test_streams_are_distinguished_from_three_image_estimators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stream_and_three_image_estimators_are_distinguished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     finish = "    def finish(self): ...\n"
-    (tmp_path / "streams_here.py").write_text(f"{STREAM}{finish}\ndef made():\n    return Mine()\n")
-    (tmp_path / "streams_half.py").write_text(STREAM)
+    (tmp_path / "stream_module.py").write_text(f"{STREAM_CLASS}{finish}\ndef make():\n    return Mine()\n")
+    (tmp_path / "incomplete_stream.py").write_text(STREAM_CLASS)
     monkeypatch.chdir(tmp_path)
-    point = EntryPoint("theirs", "streams_here:Mine", estimators.GROUP)
-    monkeypatch.setattr(estimators, "list_installed", lambda: {"theirs": point})
-    for spec in ("streams_here:Mine", "streams_here:made", "theirs", "exec-stream:cat", "serve-stream:cat -u"):
+    entry_point = EntryPoint("installed", "stream_module:Mine", estimators.GROUP)
+    monkeypatch.setattr(estimators, "list_installed", lambda: {"installed": entry_point})
+    for spec in ("stream_module:Mine", "stream_module:make", "installed", "exec-stream:cat", "serve-stream:cat -u"):
         VELOCITY.check(spec)
         assert isinstance(VELOCITY.make(spec, DimesOptions(), LIMITS), StreamedEstimator)
-    kinds = {spec: VELOCITY.takes_stream(spec) for spec in ("theirs", "serve-stream:cat", "exec:cat", "dimes")}
-    assert kinds == {"theirs": True, "serve-stream:cat": True, "exec:cat": False, "dimes": False}
-    # Only the return type of a function distinguishes them.
-    assert VELOCITY.takes_stream("streams_here:made") is None
+    kinds = {spec: VELOCITY.takes_stream(spec) for spec in ("installed", "serve-stream:cat", "exec:cat", "dimes")}
+    assert kinds == {"installed": True, "serve-stream:cat": True, "exec:cat": False, "dimes": False}
+    # The result of a factory function is unknown without a call.
+    assert VELOCITY.takes_stream("stream_module:make") is None
     with pytest.raises(ValueError, match="is not a valid velocity estimator: missing members: finish"):
-        VELOCITY.check("streams_half:Mine")
+        VELOCITY.check("incomplete_stream:Mine")
     with pytest.raises(ValueError, match="a target tracker does not accept a stream of images; allowed: exec:, serve:"):
         TRACKING.check("exec-stream:cat")
     with pytest.raises(ValueError, match="is not a valid estimator of landing sites: missing members: estimate"):
-        LANDING.check("streams_here:Mine")
+        LANDING.check("stream_module:Mine")
     assert labels(["exec-stream:./mine --fast", "serve-stream:./mine"]) == ("mine", "mine_2")

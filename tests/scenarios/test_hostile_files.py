@@ -1,4 +1,4 @@
-"""Tests that oversized, expanding or blocking files are rejected with one message."""
+"""Tests of malicious files: oversized, compressed and blocking files are rejected with a message."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from marsyard.sim.sensor import read_datasheet
 
 
 def test_calibration_with_aliases_is_rejected(tmp_path: Path) -> None:
-    """Nine lists of nine aliases each, in 500 bytes, expand to 9**8 numbers."""
+    """Nested aliases: each list contains nine aliases of the list before, so 500 bytes expand to 9**8 numbers."""
     lines = ["a0: &a0 [0,0,0,0,0,0,0,0,0]"]
     lines += [f"a{n}: &a{n} [{','.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 8)]
     path = tmp_path / "camera.yaml"
@@ -43,9 +43,9 @@ def test_calibration_with_aliases_is_rejected(tmp_path: Path) -> None:
         read_cameras(path)
 
 
-@pytest.mark.parametrize("ending", ["zip", "tar.gz", "bz2"])
-def test_archives_are_rejected_as_meshes(tmp_path: Path, ending: str) -> None:
-    path = tmp_path / f"rock.{ending}"
+@pytest.mark.parametrize("suffix", ["zip", "tar.gz", "bz2"])
+def test_archives_are_rejected_as_meshes(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"rock.{suffix}"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("rock.stl", b"solid\n" + b" " * 10_000_000)
     with pytest.raises(MeshFileError, match="is not a supported mesh format; allowed: "):
@@ -53,9 +53,9 @@ def test_archives_are_rejected_as_meshes(tmp_path: Path, ending: str) -> None:
 
 
 def test_zipped_mesh_size_is_checked_before_expansion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """300 MB of blanks in an archive of 300 kB; trimesh reads 3MF if lxml and networkx are installed."""
+    """An archive of 300 kB contains 300 MB of blanks; trimesh reads 3MF if lxml and networkx are installed."""
     monkeypatch.setattr(trimesh, "available_formats", lambda: {"3mf", "stl"})
-    monkeypatch.setattr(trimesh, "load", lambda *_, **__: pytest.fail("was expanded"))
+    monkeypatch.setattr(trimesh, "load", lambda *_, **__: pytest.fail("the archive was expanded"))
     path = tmp_path / "rock.3mf"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("3D/3dmodel.model", "w") as member:
         for _ in range(30):
@@ -66,7 +66,7 @@ def test_zipped_mesh_size_is_checked_before_expansion(tmp_path: Path, monkeypatc
 
 
 def test_gltf_accessor_size_is_checked_before_expansion(tmp_path: Path) -> None:
-    """glTF accessors without a buffer expand to the stated number of zeros."""
+    """A glTF accessor without a buffer expands to `count` zero vectors."""
     scene = {
         "asset": {"version": "2.0"},
         "accessors": [{"componentType": 5126, "count": 1_000_000_000, "type": "VEC3"}],
@@ -97,9 +97,9 @@ def test_pose_table_with_too_many_rows_is_rejected(tmp_path: Path) -> None:
         read_poses(path)
 
 
-def test_only_numeric_pose_columns_are_read(tmp_path: Path) -> None:
+def test_pose_columns_must_be_numeric(tmp_path: Path) -> None:
     path = _write_parquet(tmp_path / "flight.parquet", 10, qw=pa.array(["a"] * 10))
-    with pytest.raises(TrajectoryFileError, match="the column qw holds string; allowed: numbers"):
+    with pytest.raises(TrajectoryFileError, match="the column qw contains string; allowed: numbers"):
         read_poses(path)
 
 
@@ -126,28 +126,28 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.fixture
-def alarm() -> Iterator[None]:
-    """Interrupt a test that blocks."""
+def time_limit() -> Iterator[None]:
+    """Interrupt a blocked test after 60 s."""
 
     def raise_timeout(*_: object) -> None:
-        raise TimeoutError("waited for a file that never ends")
+        raise TimeoutError("the test waited for a blocking file")
 
-    before = signal.signal(signal.SIGALRM, raise_timeout)
+    previous_handler = signal.signal(signal.SIGALRM, raise_timeout)
     signal.alarm(60)
     yield
     signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
+    signal.signal(signal.SIGALRM, previous_handler)
 
 
-@pytest.mark.usefixtures("alarm")
+@pytest.mark.usefixtures("time_limit")
 @pytest.mark.parametrize("name", READERS)
 def test_named_pipe_is_rejected_by_each_reader(tmp_path: Path, name: str) -> None:
-    """Opening a pipe without a writer blocks forever."""
+    """A named pipe without a writer would block the reader."""
     path = tmp_path / name
     os.mkfifo(path)
-    with pytest.raises(ValueError, match="is a named pipe; a regular file is needed") as raised:
+    with pytest.raises(ValueError, match="is a named pipe; a regular file is needed") as error_info:
         READERS[name](path)
-    assert name in str(raised.value)
+    assert name in str(error_info.value)
 
 
 def test_device_file_is_rejected(tmp_path: Path) -> None:

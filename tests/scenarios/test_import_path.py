@@ -1,4 +1,4 @@
-"""Tests of import paths `module:name`."""
+"""Tests of import paths `module:name`, also with module names of earlier releases."""
 
 from pathlib import Path
 
@@ -17,8 +17,8 @@ def test_former_module_names_are_resolved() -> None:
 
 
 def test_custom_module_may_have_a_former_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "reports_of_mine.py").write_text("class Estimator: ...\n")
+    (tmp_path / "reports_custom.py").write_text("class Estimator: ...\n")
     monkeypatch.chdir(tmp_path)
     assert current_module("reports.mine") == "reports.mine"
     assert current_module("sim") == "marsyard.sim"
-    assert import_object("reports_of_mine:Estimator").__name__ == "Estimator"
+    assert import_object("reports_custom:Estimator").__name__ == "Estimator"

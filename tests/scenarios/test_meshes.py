@@ -1,4 +1,4 @@
-"""Tests of custom meshes: position and size in scenes and in the truth of landings."""
+"""Tests of meshes from user files: formats, size and position in scenes, and hazards in the landing truth."""
 
 from __future__ import annotations
 
@@ -29,59 +29,59 @@ def write_box(folder: Path, name: str = "box.stl", extents: tuple[float, float, 
     return str(folder / name)
 
 
-@pytest.mark.parametrize("ending", ["stl", "obj", "ply", "glb", "off"])
-def test_mesh_formats_give_the_same_box(tmp_path: Path, surface: Surface, ending: str) -> None:
-    file = write_box(tmp_path, f"box.{ending}")
-    stated = MeshParameters(file=file, kind="lander", east_m=20.0, north_m=30.0, sink_m=0.1, sha256=None)
-    own = stated.place_on_ground(surface, (25.0, 25.0))
-    corners = own.triangles.reshape(-1, 3)
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb", "off"])
+def test_mesh_formats_give_the_same_box(tmp_path: Path, surface: Surface, suffix: str) -> None:
+    file = write_box(tmp_path, f"box.{suffix}")
+    parameters = MeshParameters(file=file, kind="lander", east_m=20.0, north_m=30.0, sink_m=0.1, sha256=None)
+    body = parameters.place_on_ground(surface, (25.0, 25.0))
+    corners = body.triangles.reshape(-1, 3)
     ground = float(surface.height(20.0, 30.0))
     assert np.allclose(corners.min(axis=0), [19.0, 29.5, ground - 0.1], atol=1e-6)
     assert np.allclose(corners.max(axis=0), [21.0, 30.5, ground + 0.4], atol=1e-6)
-    assert len(own.albedo) == 1
-    assert own.albedo[0] == 0.5
+    assert len(body.albedo) == 1
+    assert body.albedo[0] == 0.5
     # Lander faces are flat: each normal is perpendicular to its triangle and points outwards.
-    middle = own.triangles.mean(axis=1)
-    outwards = np.sum(own.normals[:, 0] * (middle - corners.mean(axis=0)), axis=1)
-    assert np.all(outwards > 0.0)
-    assert np.allclose(np.abs(own.normals).max(axis=2), 1.0)
+    face_centres = body.triangles.mean(axis=1)
+    outward_components = np.sum(body.normals[:, 0] * (face_centres - corners.mean(axis=0)), axis=1)
+    assert np.all(outward_components > 0.0)
+    assert np.allclose(np.abs(body.normals).max(axis=2), 1.0)
 
 
 def test_size_heading_and_up_axis_are_applied(tmp_path: Path, surface: Surface) -> None:
     file = write_box(tmp_path, extents=(2.0, 0.5, 1.0))  # y axis up
-    own = MeshParameters(file=file, up="y", size_m=4.0, heading_deg=90.0, east_m=20.0, north_m=30.0)
-    extent = np.ptp(own.place_on_ground(surface, (20.0, 30.0)).triangles.reshape(-1, 3), axis=0)
+    body = MeshParameters(file=file, up="y", size_m=4.0, heading_deg=90.0, east_m=20.0, north_m=30.0)
+    extent = np.ptp(body.place_on_ground(surface, (20.0, 30.0)).triangles.reshape(-1, 3), axis=0)
     assert np.allclose(extent, [2.0, 4.0, 1.0], atol=1e-6)
 
 
 def test_rocks_have_smooth_normals(tmp_path: Path, surface: Surface) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
-    ball.export(tmp_path / "ball.stl")  # separate triangles: each corner is stored three times
-    own = MeshParameters(file=str(tmp_path / "ball.stl")).place_on_ground(surface, (0.0, 0.0))
-    corners = own.triangles.reshape(-1, 3)
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    sphere.export(tmp_path / "ball.stl")  # separate triangles: each corner is stored three times
+    body = MeshParameters(file=str(tmp_path / "ball.stl")).place_on_ground(surface, (0.0, 0.0))
+    corners = body.triangles.reshape(-1, 3)
     radial = corners - (corners.min(axis=0) + corners.max(axis=0)) / 2.0
     radial /= np.linalg.norm(radial, axis=1, keepdims=True)
-    assert np.min(np.sum(radial * own.normals.reshape(-1, 3), axis=1)) > 0.999
+    assert np.min(np.sum(radial * body.normals.reshape(-1, 3), axis=1)) > 0.999
 
 
-def test_meshes_repeat_with_the_terrain_period(tmp_path: Path, surface: Surface) -> None:
-    one = MeshParameters(file=write_box(tmp_path), east_m=2.0, north_m=60.0)
-    corners = one.place_on_ground(surface, (65.0, 3.0)).triangles.reshape(-1, 3)
+def test_mesh_is_moved_to_the_terrain_period_next_to_the_scene(tmp_path: Path, surface: Surface) -> None:
+    parameters = MeshParameters(file=write_box(tmp_path), east_m=2.0, north_m=60.0)
+    corners = parameters.place_on_ground(surface, (65.0, 3.0)).triangles.reshape(-1, 3)
     assert np.allclose((corners.min(axis=0) + corners.max(axis=0))[:2] / 2.0, [66.0, -4.0])
 
 
-def test_meshes_are_hazards_for_landers(tmp_path: Path, surface: Surface) -> None:
+def test_mesh_raises_the_true_heights_of_a_landing(tmp_path: Path, surface: Surface) -> None:
     ground = SiteGround(site("heli-benign"), TerrainParameters(samples=64), surface, None)
     # The edges lie between grid points.
-    one = MeshParameters(file=write_box(tmp_path), east_m=20.02, north_m=30.02)
+    parameters = MeshParameters(file=write_box(tmp_path), east_m=20.02, north_m=30.02)
     low, high = np.array([15.0, 25.0]), np.array([25.0, 35.0])
-    bare, raised = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (one,)))
-    higher = raised.heights_m - bare.heights_m
-    assert higher.max() == pytest.approx(0.5, abs=1e-6)
-    assert np.count_nonzero(higher > 0.25) * 0.05**2 == pytest.approx(2.0, rel=0.06)
+    without_mesh, with_mesh = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (parameters,)))
+    height_difference = with_mesh.heights_m - without_mesh.heights_m
+    assert height_difference.max() == pytest.approx(0.5, abs=1e-6)
+    assert np.count_nonzero(height_difference > 0.25) * 0.05**2 == pytest.approx(2.0, rel=0.06)
 
 
-def test_campaigns_store_mesh_and_detect_changes(tmp_path: Path) -> None:
+def test_changed_mesh_file_is_rejected(tmp_path: Path) -> None:
     file = write_box(tmp_path)
     p = LandingScenarioParameters.model_validate({"meshes": [{"file": file, "kind": "rock", "size_m": 1.0}]})
     stored = p.model_dump(mode="json", round_trip=True)
@@ -91,11 +91,11 @@ def test_campaigns_store_mesh_and_detect_changes(tmp_path: Path) -> None:
         LandingScenarioParameters.model_validate(stored)
 
 
-def test_mesh_faults_are_reported(tmp_path: Path) -> None:
+def test_invalid_mesh_files_are_rejected(tmp_path: Path) -> None:
     def expect_error(path: Path, fault: str) -> None:
-        with pytest.raises(MeshFileError, match=fault) as raised:
+        with pytest.raises(MeshFileError, match=fault) as error_info:
             read_mesh(str(path))
-        assert path.name in str(raised.value)
+        assert path.name in str(error_info.value)
 
     expect_error(tmp_path / "absent.stl", "cannot be read")
     (tmp_path / "text.txt").write_text("hello")

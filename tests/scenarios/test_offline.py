@@ -1,4 +1,4 @@
-"""Tests of answer tables: valid tables are read, invalid tables are rejected with line, column and allowed values."""
+"""Tests of answer tables (CSV files that replace an algorithm), and of exported cases for offline algorithms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, algorithm
 from marsyard.scenarios.offline import SITE_FORMAT, VELOCITY_FORMAT, read_answers
 
 LIMITS = ExecutableLimits()
-HEAD = "case,outcome,velocity_east_m_s,velocity_north_m_s\n"
+HEADER = "case,outcome,velocity_east_m_s,velocity_north_m_s\n"
 COVARIANCE = "covariance_east_m2_s2,covariance_east_north_m2_s2,covariance_north_m2_s2"
 
 
@@ -30,7 +30,7 @@ def write_table(folder: Path, text: str) -> Path:
 
 def test_velocity_answers_are_read(tmp_path: Path) -> None:
     path = write_table(
-        tmp_path, HEAD.strip() + f",{COVARIANCE}\n7,,1.5,-2,4,1,9\n\n 0 , NO_VALID_TRACK ,,,,,\n1,VALID,3,4,,,\n"
+        tmp_path, HEADER.strip() + f",{COVARIANCE}\n7,,1.5,-2,4,1,9\n\n 0 , NO_VALID_TRACK ,,,,,\n1,VALID,3,4,,,\n"
     )
     answers = read_answers(path, VELOCITY_FORMAT)
     assert sorted(answers) == [0, 1, 7]
@@ -48,30 +48,30 @@ def test_velocity_answers_are_read(tmp_path: Path) -> None:
         ("case,velocity_east_m_s\n", "the column 'velocity_north_m_s' is missing"),
         ("case,velocity_east_km_h,velocity_north_m_s\n", "'velocity_east_km_h' (did you mean 'velocity_east_m_s'?)"),
         ("case,velocity_east_km_h,velocity_north_m_s\n", "the suffix of a name is its unit"),
-        (f"case,{HEAD}", "duplicate column 'case'"),
-        (f"{HEAD}1,VALID,2\n", "line 2: it has 3 cells; the first line has 4"),
-        (f"{HEAD}-1,VALID,2,3\n", "line 2: case is '-1'; allowed: a whole number from 0"),
-        (f"{HEAD}1,VALID,nan,3\n", "line 2: velocity_east_m_s is 'nan'; allowed: a finite number, or an empty cell"),
-        (f"{HEAD}1,VALID,2,fast\n", "velocity_north_m_s is 'fast'; allowed: a finite number"),
-        (f"{HEAD}1,VALID,2500,3\n", "velocity_east_m_s is 2500, beyond 1000; the suffix of the name"),
-        (f"{HEAD}1,VALID,2,\n", "velocity_east_m_s is given, but velocity_north_m_s is not"),
-        (f"{HEAD}1,,,\n", "neither an outcome nor numbers are given"),
-        (f"{HEAD}1,GOOD,2,3\n", "outcome is 'GOOD'; allowed: VALID, NO_TEMPLATE_AREA"),
-        (f"{HEAD}1,VALID,,\n", "outcome is VALID, but velocity_m_s is missing"),
-        (f"{HEAD}1,NO_VALID_TRACK,2,3\n", "outcome is NO_VALID_TRACK, but velocity_m_s is given"),
-        (f"{HEAD}1,VALID,2,3\n2,VALID,2,3\n1,VALID,2,3\n", "line 4: case 1 has two answers, the first in line 2"),
-        (f"{HEAD.strip()},{COVARIANCE}\n1,,2,3,1,2,1\n", "covariance_m2_s2 is not positive definite"),
+        (f"case,{HEADER}", "duplicate column 'case'"),
+        (f"{HEADER}1,VALID,2\n", "line 2: it has 3 cells; the first line has 4"),
+        (f"{HEADER}-1,VALID,2,3\n", "line 2: case is '-1'; allowed: a whole number from 0"),
+        (f"{HEADER}1,VALID,nan,3\n", "line 2: velocity_east_m_s is 'nan'; allowed: a finite number, or an empty cell"),
+        (f"{HEADER}1,VALID,2,fast\n", "velocity_north_m_s is 'fast'; allowed: a finite number"),
+        (f"{HEADER}1,VALID,2500,3\n", "velocity_east_m_s is 2500, beyond 1000; the suffix of the name"),
+        (f"{HEADER}1,VALID,2,\n", "velocity_east_m_s is given, but velocity_north_m_s is not"),
+        (f"{HEADER}1,,,\n", "neither an outcome nor numbers are given"),
+        (f"{HEADER}1,GOOD,2,3\n", "outcome is 'GOOD'; allowed: VALID, NO_TEMPLATE_AREA"),
+        (f"{HEADER}1,VALID,,\n", "outcome is VALID, but velocity_m_s is missing"),
+        (f"{HEADER}1,NO_VALID_TRACK,2,3\n", "outcome is NO_VALID_TRACK, but velocity_m_s is given"),
+        (f"{HEADER}1,VALID,2,3\n2,VALID,2,3\n1,VALID,2,3\n", "line 4: case 1 has two answers, the first in line 2"),
+        (f"{HEADER.strip()},{COVARIANCE}\n1,,2,3,1,2,1\n", "covariance_m2_s2 is not positive definite"),
     ],
 )
 def test_invalid_tables_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     path = write_table(tmp_path, text)
-    with pytest.raises(ValueError, match=r"answers\.csv") as caught:
+    with pytest.raises(ValueError, match=r"answers\.csv") as error_info:
         read_answers(path, VELOCITY_FORMAT)
-    assert message in str(caught.value)
+    assert message in str(error_info.value)
 
 
 def test_all_errors_are_reported_up_to_a_limit(tmp_path: Path) -> None:
-    path = write_table(tmp_path, HEAD + "".join(f"{case},VALID,x,1\n" for case in range(30)))
+    path = write_table(tmp_path, HEADER + "".join(f"{case},VALID,x,1\n" for case in range(30)))
     with pytest.raises(ValueError, match=r"(?s)line 2:.*line 21:.*\.\.\. and 10 more"):
         read_answers(path, VELOCITY_FORMAT)
     with pytest.raises(ValueError, match="No such file"):
@@ -79,7 +79,7 @@ def test_all_errors_are_reported_up_to_a_limit(tmp_path: Path) -> None:
 
 
 def test_answer_table_replaces_an_algorithm(tmp_path: Path) -> None:
-    spec = f"answers:{write_table(tmp_path, HEAD + '3,,1,2')}"
+    spec = f"answers:{write_table(tmp_path, HEADER + '3,,1,2')}"
     VELOCITY.check(spec)
     assert labels(["dimes", spec]) == ("dimes", "answers")
     assert algorithm_sources(spec) == []
@@ -96,7 +96,7 @@ def test_landing_site_answers_are_read(tmp_path: Path) -> None:
         tmp_path,
         "case,outcome,site_east_m,site_north_m,site_up_m\n0,SAFE_SITE,1,2,3\n1,NO_SAFE_SITE,,,\n2,NO_MOTION,,,\n",
     )
-    assert [one.outcome for one in read_answers(path, SITE_FORMAT).values()] == [
+    assert [entry.outcome for entry in read_answers(path, SITE_FORMAT).values()] == [
         SiteOutcome.SAFE_SITE,
         SiteOutcome.NO_SAFE_SITE,
         SiteOutcome.NO_MOTION,
@@ -118,9 +118,9 @@ def test_exported_cases_equal_the_measurements(tmp_path: Path, task: str) -> Non
         measurements = inputs.descent()
         answer = VELOCITY.make(f"export:{tmp_path}", DimesOptions(), LIMITS, 12).estimate(measurements)
         assert answer.velocity_m_s is None
-        read = read_case(tmp_path / "cases" / "000012")
-        assert [hash_inputs(one.counts) for one in read.images] == [
-            hash_inputs(one.counts) for one in measurements.images
+        exported = read_case(tmp_path / "cases" / "000012")
+        assert [hash_inputs(entry.counts) for entry in exported.images] == [
+            hash_inputs(entry.counts) for entry in measurements.images
         ]
     else:
         site = LANDING.make(f"export:{tmp_path}", HdaOptions(), LIMITS, 12).estimate(inputs.landing())

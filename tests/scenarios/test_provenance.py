@@ -1,4 +1,4 @@
-"""Tests of image hashes in rows."""
+"""Tests of the image hash and backend columns of a row."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render.backend import default_backend
 
 
-def test_image_hash_does_not_depend_on_memory_layout() -> None:
+def test_image_hash_depends_on_values_and_order_only() -> None:
     first, second = (np.arange(start, start + 12, dtype=np.uint16).reshape(3, 4) for start in (0, 50))
     columns = image_columns(default_backend(), hash_images([first, second]))
     assert columns["image_hash"] == hashlib.sha256(first.tobytes() + second.tobytes()).hexdigest()

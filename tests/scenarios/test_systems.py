@@ -1,4 +1,4 @@
-"""Tests of the registry of systems: installed packages are found, and invalid systems are skipped."""
+"""Tests of the registry of systems: systems of installed packages are registered, invalid systems are omitted."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ from marsyard.scenarios.systems import (
     template_paths,
 )
 
-CACHED = (registry, row_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
-HEAD = "from pathlib import Path\nfrom marsyard.scenarios.systems import System\nHERE = Path(__file__).parent\n"
+CACHED_FUNCTIONS = (registry, row_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
+HEADER = "from pathlib import Path\nfrom marsyard.scenarios.systems import System\nHERE = Path(__file__).parent\n"
 Install = Callable[..., None]
 
 
 def _clear_caches() -> None:
-    for one in CACHED:
-        one.cache_clear()
+    for function in CACHED_FUNCTIONS:
+        function.cache_clear()
 
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Install a package with one module and entry points for systems: files in a folder of `sys.path`."""
+    """Return a function that writes a package with one module and entry points for systems to `sys.path`."""
     monkeypatch.syspath_prepend(str(tmp_path))
     modules: list[str] = []
 
-    def install_package(package: str, source: str, *points: str, **files: str) -> None:
-        info = tmp_path / f"{package}-1.0.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-        stated = "".join(f"{point} = {package}:SYSTEM\n" for point in points or (package,))
-        (info / "entry_points.txt").write_text(f"[marsyard.systems]\n{stated}")
-        (tmp_path / f"{package}.py").write_text(HEAD + source)
+    def install_package(package: str, source: str, *entry_point_names: str, **files: str) -> None:
+        metadata_folder = tmp_path / f"{package}-1.0.dist-info"
+        metadata_folder.mkdir()
+        (metadata_folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+        entry_points = "".join(f"{entry_point} = {package}:SYSTEM\n" for entry_point in entry_point_names or (package,))
+        (metadata_folder / "entry_points.txt").write_text(f"[marsyard.systems]\n{entry_points}")
+        (tmp_path / f"{package}.py").write_text(HEADER + source)
         for name, text in files.items():
             (tmp_path / f"{name}.toml").write_text(text)
         modules.append(package)
@@ -66,13 +66,13 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     _clear_caches()
 
 
-def _format_system(name: str, more: str = "") -> str:
-    return f"SYSTEM = System(name={name!r}, title='T', summary='S', scenarios={{'{name}-case': 'x:Y'}}{more})\n"
+def _format_system(name: str, arguments: str = "") -> str:
+    return f"SYSTEM = System(name={name!r}, title='T', summary='S', scenarios={{'{name}-case': 'x:Y'}}{arguments})\n"
 
 
-def test_marsyard_systems_are_complete() -> None:
+def test_built_in_systems_are_complete() -> None:
     assert not problems()
-    assert [one.name for one in systems()][: len(BUILT_IN)] == ["measured", "dimes", "fieldtest", "vtt", "hda"]
+    assert [entry.name for entry in systems()][: len(BUILT_IN)] == ["measured", "dimes", "fieldtest", "vtt", "hda"]
     for system in systems():
         assert system.title, system.name
         assert system.summary.endswith("."), system.name
@@ -90,13 +90,13 @@ def test_marsyard_systems_are_complete() -> None:
     assert {"dimes", "vtt", "hda", "homography"} <= shipped_names()
 
 
-def test_system_of_another_package_is_found(install: Install) -> None:
-    files = ", catalogue=HERE / 'mine-*.toml', requirements=HERE / 'asked.toml', columns=HERE / 'columns.toml'"
-    stated = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
+def test_system_of_another_package_is_registered(install: Install) -> None:
+    files = ", catalogue=HERE / 'mine-*.toml', requirements=HERE / 'limits.toml', columns=HERE / 'columns.toml'"
+    requirement = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
     install(
         "mine",
         _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
-        **{"mine-one": 'scenario = "mine-case"\n', "asked": f'[[requirements]]\nid = "MINE"\n{stated}'},
+        **{"mine-one": 'scenario = "mine-case"\n', "limits": f'[[requirements]]\nid = "MINE"\n{requirement}'},
         columns='[mine-case]\nflags = []\nnumbers = ["metres"]\n',
     )
     assert not problems()
@@ -107,8 +107,8 @@ def test_system_of_another_package_is_found(install: Install) -> None:
     columns = row_columns("mine-case")
     assert columns is not None
     assert columns.has_number("metres")
-    listed = json.loads(CliRunner().invoke(app, ["list", "--json"]).stdout)
-    assert "mine-one" in [one["name"] for one in listed]
+    campaigns = json.loads(CliRunner().invoke(app, ["list", "--json"]).stdout)
+    assert "mine-one" in [entry["name"] for entry in campaigns]
 
 
 def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_path: Path) -> None:
@@ -147,35 +147,35 @@ def test_invalid_system_does_not_affect_others(install: Install, source: str, re
     (message,) = problems()
     assert message.startswith("system 'mine' (mine:SYSTEM) is omitted: ")
     assert reason in message
-    assert [one.name for one in systems()[len(BUILT_IN) :]] == ["sound"]
-    ended = CliRunner().invoke(app, ["list"])
-    assert (ended.exit_code, ended.stderr) == (0, f"warning: {message}\n")
-    assert "dimes-smoke" in ended.stdout
+    assert [entry.name for entry in systems()[len(BUILT_IN) :]] == ["sound"]
+    result = CliRunner().invoke(app, ["list"])
+    assert (result.exit_code, result.stderr) == (0, f"warning: {message}\n")
+    assert "dimes-smoke" in result.stdout
     checks = list(check_systems())
     assert checks[0].finding.endswith("from other packages: sound")
-    assert [one.finding for one in checks if one.verdict is Verdict.WARN] == [message]
+    assert [entry.finding for entry in checks if entry.verdict is Verdict.WARN] == [message]
     with pytest.raises(UnknownScenarioError, match="is omitted"):
-        scenario("unheard-of")
+        scenario("unknown-scenario")
 
 
 def test_first_of_two_entry_points_is_used(install: Install) -> None:
     install("mine", _format_system("mine"), "a", "b")
-    assert [one.name for one in systems()].count("mine") == 1
+    assert [entry.name for entry in systems()].count("mine") == 1
     assert problems() == ("system 'b' (mine:SYSTEM) is omitted: the system 'mine' already has the name 'mine'",)
 
 
 def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path) -> None:
     install(
-        "mine", _format_system("mine", ", requirements=HERE / 'asked.toml'"), asked='[[requirements]]\nid = "MINE"\n'
+        "mine", _format_system("mine", ", requirements=HERE / 'limits.toml'"), limits='[[requirements]]\nid = "MINE"\n'
     )
     assert "DIMES-VEL" in requirements.shipped_requirements()
     campaign = tmp_path / "campaign.toml"
     campaign.write_text('name = "c"\nscenario = "descent"\ncases = 1\n[[requirements]]\nid = "MINE"\n')
-    with pytest.raises(ConfigurationError, match=r"unknown requirement 'MINE'.*asked\.toml: .*metric.*required"):
+    with pytest.raises(ConfigurationError, match=r"unknown requirement 'MINE'.*limits\.toml: .*metric.*required"):
         load_campaign(str(campaign))
 
 
-def test_invalid_columns_stop_only_campaigns_of_the_system(install: Install, tmp_path: Path) -> None:
+def test_invalid_columns_affect_only_campaigns_of_the_system(install: Install, tmp_path: Path) -> None:
     scenario_path = "marsyard.scenarios.measured.scenarios:MatchingScenario"
     install(
         "mine", _format_system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = ["

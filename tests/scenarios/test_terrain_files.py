@@ -1,6 +1,4 @@
-"""Tests of custom terrain files: a real tile passes, and invalid files are rejected with a message before they are
-read.
-"""
+"""Tests of terrain files from users: valid files pass; invalid files are rejected before their data are read."""
 
 from __future__ import annotations
 
@@ -57,26 +55,26 @@ def write_tif(folder: Path, name: str = "dtm.tif", **changes: Any) -> Path:
     return path
 
 
-def test_hirise_tile_passes(shared_data: Path) -> None:
+def test_hirise_tile_is_valid(shared_data: Path) -> None:
     folder = shared_data / "gale_hirise"
     check_source(RealTerrain(dtm=folder / "dem.tif"))
     check_source(RealTerrain(dtm=folder / "gale_1m_dem_0p5m_ortho.npz"))
 
 
 @pytest.mark.parametrize("name", ["dimes-hirise", "hda-hirise"])
-def test_campaigns_over_the_tile_are_complete(shared_data: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """The campaigns name the file relative to the checkout."""
+def test_campaigns_over_the_tile_are_valid(shared_data: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """The campaigns contain paths relative to the repository."""
     monkeypatch.chdir(shared_data.parents[1] / Path(__file__).parents[2].name)
     loaded = load_campaign(f"docs/examples/{name}.toml")
     assert loaded.draws(7)
 
 
-def test_dtm_and_orthoimage_pass(tmp_path: Path) -> None:
-    picture = write_tif(tmp_path, "ortho.tif", values=np.full((100, 80), 120, dtype=np.uint8), nodata=0)
-    check_source(RealTerrain(dtm=write_tif(tmp_path), ortho=picture))
+def test_dtm_with_orthoimage_is_valid(tmp_path: Path) -> None:
+    ortho = write_tif(tmp_path, "ortho.tif", values=np.full((100, 80), 120, dtype=np.uint8), nodata=0)
+    check_source(RealTerrain(dtm=write_tif(tmp_path), ortho=ortho))
 
 
-FAULTS: list[tuple[dict[str, Any], str]] = [
+GEOTIFF_FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"crs": CRS.from_string("+proj=longlat +R=3396190 +no_defs")}, r"is in degrees; project it to metres"),
     ({"crs": None}, "has no projection"),
     ({"crs": CRS.from_string("+proj=geocent +R=3396190 +units=m +no_defs")}, "are not those of a map projection"),
@@ -88,21 +86,21 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"transform": Affine(1.0, 0.0, 0.0, 0.0, -2.0, 0.0)}, "rotated or oblong cells"),
     ({"values": np.full((3, 40), 1.0, dtype=np.float32)}, "has 40 x 3 values; allowed: at least 4 x 4"),
     ({"values": np.full((8, 6000), 1.0, dtype=np.float32)}, "at most 5461 along a side"),
-    ({"values": np.full((50, 40), 120, dtype=np.uint8), "nodata": None}, "8-bit values, as in a picture"),
+    ({"values": np.full((50, 40), 120, dtype=np.uint8), "nodata": None}, "8-bit values, as in an image"),
     ({"values": np.full((50, 40), -32767.0, dtype=np.float32)}, "has no valid height at all"),
     ({"tags": {"units": ("ft",)}}, "heights are in 'ft'; allowed: metres"),
     ({"tags": {"scales": (0.1,)}}, "has scale 0.1 and offset 0; apply them"),
 ]
 
 
-@pytest.mark.parametrize(("changes", "fault"), FAULTS, ids=[fault for _, fault in FAULTS])
+@pytest.mark.parametrize(("changes", "fault"), GEOTIFF_FAULTS, ids=[fault for _, fault in GEOTIFF_FAULTS])
 def test_terrain_file_faults_are_reported(tmp_path: Path, changes: dict[str, Any], fault: str) -> None:
-    with pytest.raises(TerrainFileError, match=fault) as raised:
+    with pytest.raises(TerrainFileError, match=fault) as error_info:
         check_source(RealTerrain(dtm=write_tif(tmp_path, **changes)))
-    assert "dtm.tif" in str(raised.value)
+    assert "dtm.tif" in str(error_info.value)
 
 
-MOON, MARS_ELLIPSOID = "+R=1737400", "+a=3396190 +b=3376200"
+MOON_SPHERE, MARS_ELLIPSOID = "+R=1737400", "+a=3396190 +b=3376200"
 #: Projection, longitude, latitude and grid convergence of a file in degrees (Snyder 1987). Equations 8-9 for transverse
 #: Mercator; (lon - lon_0) times the cone constant n for polar and conic projections.
 CONFORMAL: list[tuple[str, float, float, float]] = [
@@ -113,39 +111,39 @@ CONFORMAL: list[tuple[str, float, float, float]] = [
     *[
         (
             "+proj=tmerc +lat_0=0 +lon_0=137 +k=0.9996",
-            137.0 + off,
+            137.0 + lon_offset,
             60.0,
-            math.degrees(math.atan(math.tan(math.radians(off)) * math.sin(math.radians(60.0)))),
+            math.degrees(math.atan(math.tan(math.radians(lon_offset)) * math.sin(math.radians(60.0)))),
         )
-        for off in (-5.0, 0.0, 5.0)
+        for lon_offset in (-5.0, 0.0, 5.0)
     ],
 ]
 
 
-@pytest.mark.parametrize("body", [MOON, MARS_ELLIPSOID], ids=["moon", "mars"])
+@pytest.mark.parametrize("body", [MOON_SPHERE, MARS_ELLIPSOID], ids=["moon", "mars"])
 @pytest.mark.parametrize(("projection", "lon", "lat", "convergence"), CONFORMAL)
-def test_conformal_maps_pass_away_from_central_meridian(
+def test_conformal_maps_are_valid_with_their_grid_convergence(
     tmp_path: Path, projection: str, lon: float, lat: float, convergence: float, body: str
 ) -> None:
     crs = CRS.from_string(f"{projection} {body} +units=m")
     (x,), (y,) = transform(CRS.from_string(f"+proj=longlat {body} +no_defs"), crs, [lon], [lat])
     path = write_tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))
     check_source(RealTerrain(dtm=path))
-    # The formulas are spherical; the flattening of Mars rotates north by thousandths of a degree.
+    # Tolerance: the formulas are spherical; the flattening of Mars changes the convergence by thousandths of a degree.
     assert grid_north_deg(path) == pytest.approx(convergence, abs=0.01)
 
 
-def test_map_centred_on_pole_passes_without_true_north(tmp_path: Path) -> None:
-    crs = CRS.from_string(f"+proj=stere +lat_0=-90 +lon_0=0 +k=1 {MOON} +units=m")
+def test_map_centred_on_the_pole_is_valid_without_true_north(tmp_path: Path) -> None:
+    crs = CRS.from_string(f"+proj=stere +lat_0=-90 +lon_0=0 +k=1 {MOON_SPHERE} +units=m")
     path = write_tif(tmp_path, crs=crs, transform=Affine(5.0, 0.0, -100.0, 0.0, -5.0, 125.0))
     check_source(RealTerrain(dtm=path))
     assert grid_north_deg(path) is None
 
 
 def test_sheared_map_is_rejected(tmp_path: Path) -> None:
-    """Sinusoidal projection 10 deg off its meridian at 60 deg: equal area, but x and y are not perpendicular."""
-    crs = CRS.from_string(f"+proj=sinu +lon_0=0 {MOON} +units=m")
-    (x,), (y,) = transform(CRS.from_string(f"+proj=longlat {MOON} +no_defs"), crs, [10.0], [60.0])
+    """Sinusoidal projection at longitude 10 deg and latitude 60 deg: equal area, but x and y are not perpendicular."""
+    crs = CRS.from_string(f"+proj=sinu +lon_0=0 {MOON_SPHERE} +units=m")
+    (x,), (y,) = transform(CRS.from_string(f"+proj=longlat {MOON_SPHERE} +no_defs"), crs, [10.0], [60.0])
     path = write_tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))
     # The shear s = lon sin(lat) = 0.1511 has the singular values (sqrt(4 + s**2) -+ s) / 2.
     with pytest.raises(TerrainFileError, match=r"stretches lengths by 0\.927 to 1\.078"):
@@ -177,14 +175,14 @@ NPZ_FAULTS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("arrays", "fault"), NPZ_FAULTS, ids=[fault for _, fault in NPZ_FAULTS])
-def test_archives_have_the_same_checks_as_geotiffs(tmp_path: Path, arrays: dict[str, Any], fault: str) -> None:
-    with pytest.raises(TerrainFileError, match=fault) as raised:
+def test_invalid_npz_archives_are_rejected(tmp_path: Path, arrays: dict[str, Any], fault: str) -> None:
+    with pytest.raises(TerrainFileError, match=fault) as error_info:
         check_source(RealTerrain(dtm=write_npz(tmp_path, **arrays)))
-    assert "dtm.npz" in str(raised.value)
+    assert "dtm.npz" in str(error_info.value)
 
 
 def test_oversized_archive_is_rejected_from_its_headers(tmp_path: Path) -> None:
-    """20000 x 20000 zeros, 3.2 GB; the archive contains only the header."""
+    """The header specifies 20000 x 20000 zeros (3.2 GB); the archive contains only the header and one value."""
     path = tmp_path / "bomb.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, shape in (("dem", (20000, 20000)), ("dem_gsd", ())):
@@ -211,14 +209,15 @@ def test_missing_nodata_is_detected_from_implausible_heights(tmp_path: Path) -> 
 
 
 def test_image_with_another_projection_is_rejected(tmp_path: Path) -> None:
-    other = CRS.from_string(MARS.replace("lon_0=0", "lon_0=137"))
-    picture = write_tif(tmp_path, "ortho.tif", values=np.full((100, 80), 120, dtype=np.uint8), nodata=0, crs=other)
+    other_projection = CRS.from_string(MARS.replace("lon_0=0", "lon_0=137"))
+    values = np.full((100, 80), 120, dtype=np.uint8)
+    ortho = write_tif(tmp_path, "ortho.tif", values=values, nodata=0, crs=other_projection)
     with pytest.raises(TerrainFileError, match=r"ortho.tif: its projection differs from that of .*dtm.tif"):
-        check_source(RealTerrain(dtm=write_tif(tmp_path), ortho=picture))
+        check_source(RealTerrain(dtm=write_tif(tmp_path), ortho=ortho))
 
 
 def test_oversized_image_is_rejected_from_its_header(tmp_path: Path) -> None:
-    """32768 x 32768 bytes that are not written."""
+    """A sparse file with a header for 32768 x 32768 bytes."""
     path = tmp_path / "huge.tif"
     profile = {"driver": "GTiff", "height": 32768, "width": 32768, "count": 1, "dtype": "uint8", "SPARSE_OK": "TRUE"}
     position = {"crs": CRS.from_string(MARS), "transform": Affine(0.25, 0.0, 0.0, 0.0, -0.25, 0.0)}
@@ -251,7 +250,7 @@ def test_campaigns_reject_invalid_terrain_on_load(tmp_path: Path) -> None:
         DescentScenarioParameters.model_validate({"terrain": {"source": {"dtm": str(path)}}})
 
 
-def test_advice_names_installed_commands() -> None:
-    named = set(re.findall(r"\brio ([a-z]+(?:-[a-z]+)*)", Path(terrain_files.__file__).read_text()))
-    assert "warp" in named
-    assert named <= {command.name for command in entry_points(group="rasterio.rio_commands")}
+def test_messages_mention_only_installed_rio_commands() -> None:
+    commands = set(re.findall(r"\brio ([a-z]+(?:-[a-z]+)*)", Path(terrain_files.__file__).read_text()))
+    assert "warp" in commands
+    assert commands <= {command.name for command in entry_points(group="rasterio.rio_commands")}

@@ -1,5 +1,5 @@
-"""Tests that no algorithm receives the truth: each input field differs from the truth in each of several cases. Spy
-algorithms record their inputs. Not compared: images, exposure times, the sun direction (known from the ephemeris),
+"""Tests that no algorithm receives the truth: spy algorithms record their inputs, and each input field has to differ
+from the truth in several cases. Not compared: images, exposure times, the sun direction (known from the ephemeris)
 and the mast geometry (its errors are in angles and cameras).
 """
 
@@ -32,7 +32,7 @@ from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
 from tests.scenarios import spies
 
-SPIES = {"scores": ["tests.scenarios.spies:keep"]}
+RECORDING_SCORE = {"scores": ["tests.scenarios.spies:record_case"]}
 
 Numbers = Float[np.ndarray, "..."]
 
@@ -40,8 +40,8 @@ Numbers = Float[np.ndarray, "..."]
 @pytest.fixture(autouse=True)
 def _clear_spies() -> Iterator[None]:
     yield
-    spies.GIVEN.clear()
-    spies.TRUE.clear()
+    spies.RECORDED_INPUTS.clear()
+    spies.RECORDED_CASES.clear()
 
 
 def assert_differs(name: str, inputs: Any, true: Any) -> None:
@@ -60,7 +60,7 @@ def assert_cameras_differ(name: str, inputs: CameraModel, true: CameraModel) -> 
 
 def assert_poses_differ(name: str, inputs: RigidTransform, true: RigidTransform) -> None:
     """Assert that the poses differ in position and attitude."""
-    assert_differs(f"{name}: place", inputs.translation, true.translation)
+    assert_differs(f"{name}: position", inputs.translation, true.translation)
     assert_rotations_differ(name, inputs.rotation, true.rotation)
 
 
@@ -78,7 +78,7 @@ def assert_flat_field_differs(inputs: Numbers, detector: Detector) -> None:
 
 def assert_all_fields_are_compared(measurement_class: type[Any], names: set[str]) -> None:
     """Assert that each field of the measurements is compared, or exempted with a reason."""
-    assert {one.name for one in fields(measurement_class)} == names
+    assert {entry.name for entry in fields(measurement_class)} == names
 
 
 @pytest.mark.parametrize("case", range(3))
@@ -86,22 +86,22 @@ def test_descent_inputs_differ_from_truth(case: int) -> None:
     from tests.scenarios.descent.settings import DESCENT, WORLD
 
     p = DescentScenarioParameters.model_validate(
-        {**WORLD, "descent": DESCENT, "algorithm": "tests.scenarios.spies:VelocitySpy", **SPIES}
+        {**WORLD, "descent": DESCENT, "algorithm": "tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE}
     )
     streams = Streams(1, "truth", case)
     row = DescentScenario().run(p, streams).row
-    (inputs,), (true,) = spies.GIVEN, spies.TRUE
+    (inputs,), (true,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
     assert isinstance(true, ScoredDescent)
     camera = camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed)
     response = Detector.draw(camera_optics(p.camera).fall_off, p.detector, streams.generator("detector response"))
     assert_flight_inputs_differ(inputs, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
     assert_flat_field_differs(inputs.images[0].calibration.flat_field, response)
-    times = np.array(p.picture_times_s)
+    times = np.array(p.image_times_s)
     for image, attitude, time_s in zip(inputs.images, inputs.attitudes, times, strict=True):
         assert_differs("time tag", image.time_s, time_s)
         assert_differs("attitude's time tag", attitude.time_s, time_s)
-    transformed = np.diff([state.position_m for state in true.states], axis=0)
-    assert_differs("interval velocities", inputs.interval_velocities_m_s, transformed / np.diff(times)[:, None])
+    true_displacements = np.diff([state.position_m for state in true.states], axis=0)
+    assert_differs("interval velocities", inputs.interval_velocities_m_s, true_displacements / np.diff(times)[:, None])
     for inertial, state in zip(inputs.inertial_velocities_m_s, true.states, strict=True):
         assert_differs("inertial velocity", inertial, state.velocity_m_s)
 
@@ -122,64 +122,65 @@ def assert_flight_inputs_differ(
 
 @pytest.mark.parametrize("case", range(3))
 def test_field_test_inputs_differ_from_truth(case: int) -> None:
-    """The time tags are one virtual interval apart, as in the paper (III.D)."""
+    """As in the paper (III.D), the intervals between time tags equal the virtual interval."""
     from tests.scenarios.test_fieldtest import make_parameters
 
     runs = [make_parameters().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}]
-    p = make_parameters(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **SPIES)
+    p = make_parameters(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE)
     row = FieldTestScenario().run(p, Streams(5, "test", case)).row
-    (inputs,), (true,) = spies.GIVEN, spies.TRUE
+    (inputs,), (true,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
     camera = field_camera().bin(columns=1, rows=p.detector.rows_summed)
     assert_flight_inputs_differ(inputs, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
-    transformed = np.diff([state.position_m for state in true.states], axis=0)
-    assert_differs("interval velocities", inputs.interval_velocities_m_s, transformed / p.triples.virtual_interval_s)
+    true_displacements = np.diff([state.position_m for state in true.states], axis=0)
+    true_velocities = true_displacements / p.triples.virtual_interval_s
+    assert_differs("interval velocities", inputs.interval_velocities_m_s, true_velocities)
 
 
 @pytest.mark.parametrize("helicopter", [None, {}])
 @pytest.mark.parametrize("case", range(3))
 def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] | None) -> None:
-    """Time tags are exact by assumption: pose errors include the clock error."""
+    """Time tags are not compared: they are exact, and the pose errors include the clock error."""
     p = LandingScenarioParameters.model_validate(
         {
             "site": "heli-benign",
             "terrain": {"samples": 256},
             "helicopter": helicopter,
             "algorithm": "tests.scenarios.spies:SiteSpy",
-            **SPIES,
+            **RECORDING_SCORE,
         }
     )
     row: dict[str, Scalar] = dict(LandingScenario().run(p, Streams(1, "truth", case)).row)
-    (inputs,), (true,) = spies.GIVEN, spies.TRUE
+    (inputs,), (true,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
     assert_all_fields_are_compared(
         LandingMeasurements, {"images", "poses", "slant_range_m", "up_body", "apriori_site_world"}
     )
     for image, pose, state in zip(inputs.images, inputs.poses, true.states, strict=True):
         assert_cameras_differ("camera", image.camera, p.optics.bin(columns=1, rows=p.detector.rows_summed))
         assert_poses_differ("pose", pose.world_from_body, rigid(state.attitude, state.position_m))
-    first, range_m = true.states[0], float(row["range_m"])
+    first_state, range_m = true.states[0], float(row["range_m"])
     assert_differs("slant range", inputs.slant_range_m, range_m)
-    assert_differs("vertical", inputs.up_body, first.attitude.inv().apply([0.0, 0.0, 1.0]))
+    assert_differs("vertical", inputs.up_body, first_state.attitude.inv().apply([0.0, 0.0, 1.0]))
     site = inputs.apriori_site_world
-    assert_differs("a-priori site", site, first.world_from_body.apply(range_m * np.array(p.optics.a)))
-    for pose in (inputs.poses[0].world_from_body, first.world_from_body):
+    assert_differs("a-priori site", site, first_state.world_from_body.apply(range_m * np.array(p.optics.a)))
+    for pose in (inputs.poses[0].world_from_body, first_state.world_from_body):
         assert_differs("distance of the a-priori site", np.linalg.norm(site - pose.translation), range_m)
 
 
 @pytest.mark.parametrize("case", range(2))
 def test_rover_inputs_differ_from_truth(case: int) -> None:
-    """The estimated pose is exact by definition at the start only."""
-    from tests.scenarios.rover.short_run import SHORT
+    """The first stop is not compared: the estimated pose is defined as exact at the start."""
+    from tests.scenarios.rover.short_run import SHORT_RUN
 
-    p = RoverScenarioParameters.model_validate({**SHORT, "algorithm": "tests.scenarios.spies:TrackerSpy"})
+    p = RoverScenarioParameters.model_validate({**SHORT_RUN, "algorithm": "tests.scenarios.spies:TrackerSpy"})
     run = run_case(p, Streams(1, "truth", case))
-    aims = [one for one in spies.GIVEN if isinstance(one, tuple)]
-    updates = [one for one in spies.GIVEN if isinstance(one, RoverMeasurements)]
-    assert len(aims) == len(updates) == len(run.stops) >= 3
+    aim_calls = [entry for entry in spies.RECORDED_INPUTS if isinstance(entry, tuple)]
+    updates = [entry for entry in spies.RECORDED_INPUTS if isinstance(entry, RoverMeasurements)]
+    assert len(aim_calls) == len(updates) == len(run.stops) >= 3
     assert_all_fields_are_compared(
         RoverMeasurements, {"left", "right", "mast", "azimuth_rad", "elevation_rad", "world_from_rover"}
     )
     assert_all_fields_are_compared(MastCalibration, {"geometry", "left", "right"})
-    for stop, (aim_pose, aim_mast), inputs in zip(run.stops, aims, updates, strict=True):
+    for stop, (aim_pose, aim_mast), inputs in zip(run.stops, aim_calls, updates, strict=True):
         for mast in (aim_mast, inputs.mast):
             assert_cameras_differ("left camera", mast.left, run.rig.left)
             assert_cameras_differ("right camera", mast.right, run.rig.right)

@@ -1,4 +1,4 @@
-"""Tests of views of a site: camera poses, drawn rocks and rendered scenes."""
+"""Tests of views of a site: camera poses, selection of rocks and rendered scenes."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ SUN = Sun(direction(np.radians(250.0), np.radians(35.0)))
 
 
 def _make_small_site(name: str, samples: int = 512) -> Site:
-    """Return a preset with ground that is built quickly."""
-    full = site(name)
-    assert full.ground is not None
-    return full.model_copy(update={"ground": full.ground.model_copy(update={"samples": samples})})
+    """Return a preset site with fewer terrain samples, which is built quickly."""
+    preset_site = site(name)
+    assert preset_site.ground is not None
+    return preset_site.model_copy(update={"ground": preset_site.ground.model_copy(update={"samples": samples})})
 
 
 @pytest.fixture(scope="module")
@@ -46,21 +46,21 @@ def test_each_camera_has_a_default_stance() -> None:
     assert set(STANCES) == set(PRESETS)
 
 
-def test_site_without_this_scale_is_rejected() -> None:
+def test_site_without_terrain_at_a_scale_is_rejected() -> None:
     with pytest.raises(ValueError, match="no terrain at the scale 'descent'"):
         SiteGround.of(site("mars-yard"), "descent")
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 @pytest.mark.parametrize(("azimuth", "elevation"), [(0.0, -90.0), (70.0, -40.0), (200.0, -10.0)])
-def test_camera_points_in_the_stated_direction(ground: SiteGround, name: str, azimuth: float, elevation: float) -> None:
+def test_camera_has_the_specified_direction(ground: SiteGround, name: str, azimuth: float, elevation: float) -> None:
     design = preset(name).design
     pose = camera_pose(ground.surface, design, 3.0, 4.0, 5.0, azimuth, elevation)
     axes = [camera.transform(pose).a for camera in preset(name).cameras()]
-    # The axes of a pair with toe-in point to both sides of the centre.
-    middle = np.mean(axes, axis=0)
+    # The mean is the direction of a stereo pair, whose axes have a toe-in.
+    mean_axis = np.mean(axes, axis=0)
     expected = direction(np.radians(azimuth), np.radians(elevation))
-    np.testing.assert_allclose(middle / np.linalg.norm(middle), expected, atol=1e-12)
+    np.testing.assert_allclose(mean_axis / np.linalg.norm(mean_axis), expected, atol=1e-12)
     height = float(ground.surface.height(3.0, 4.0)) + 5.0
     np.testing.assert_allclose(pose.translation, [3.0, 4.0, height], atol=1e-12)
 
@@ -70,7 +70,7 @@ def test_upper_edge_of_nadir_image_faces_the_azimuth(ground: SiteGround) -> None
     np.testing.assert_allclose(-camera.down, direction(np.radians(70.0), 0.0), atol=1e-12)
 
 
-def test_mast_is_upright(ground: SiteGround) -> None:
+def test_mast_pair_is_level_with_the_specified_baseline(ground: SiteGround) -> None:
     left, right = (
         camera.transform(mast_pose(ground.surface, 0.0, 0.0, 1.5, 120.0, -20.0))
         for camera in preset("mer-navcam").cameras()
@@ -81,66 +81,66 @@ def test_mast_is_upright(ground: SiteGround) -> None:
 
 
 def test_horizontal_view_covers_sector_and_nadir_view_disc(ground: SiteGround) -> None:
-    def eye(name: str, height: float, azimuth: float, elevation: float) -> Eye:
-        of_camera = preset(name)
-        pose = camera_pose(ground.surface, of_camera.design, 1.0, 2.0, height, azimuth, elevation)
-        return Eye.of(PixelRays.of(of_camera.cameras()[0]), pose, ground.surface)
+    def make_eye(name: str, height: float, azimuth: float, elevation: float) -> Eye:
+        camera_preset = preset(name)
+        pose = camera_pose(ground.surface, camera_preset.design, 1.0, 2.0, height, azimuth, elevation)
+        return Eye.of(PixelRays.of(camera_preset.cameras()[0]), pose, ground.surface)
 
-    pancam = eye("research-pancam", 1.5, 90.0, -10.0)
-    assert pancam.azimuth_rad == pytest.approx(np.radians(91.0), abs=0.01)  # the left camera, with 1 deg of toe-in
-    assert pancam.half_width_rad < np.radians(20.0)
-    assert np.isinf(pancam.reach_m)
-    assert pancam.height_m == pytest.approx(1.5, abs=0.05)
-    above = eye("xc-55", 10.0, 0.0, -90.0)
-    assert above.half_width_rad == np.pi
-    # 26 deg to the corner: 4.9 m.
-    assert 4.9 < above.reach_m < 20.0
+    pancam_eye = make_eye("research-pancam", 1.5, 90.0, -10.0)
+    assert pancam_eye.azimuth_rad == pytest.approx(np.radians(91.0), abs=0.01)  # the left camera, with 1 deg of toe-in
+    assert pancam_eye.half_width_rad < np.radians(20.0)
+    assert np.isinf(pancam_eye.reach_m)
+    assert pancam_eye.height_m == pytest.approx(1.5, abs=0.05)
+    nadir_eye = make_eye("xc-55", 10.0, 0.0, -90.0)
+    assert nadir_eye.half_width_rad == np.pi
+    # Half the diagonal field of view is 26 deg: 4.9 m at a height of 10 m.
+    assert 4.9 < nadir_eye.reach_m < 20.0
 
 
 def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
     field = ground.rocks
     assert field is not None
-    # Within half a period, so that no rock occurs twice.
+    # The radius is less than half a terrain period, so that no rock occurs twice.
     eye = Eye(2.0, 3.0, 1.5, pixel_rad=5e-3, reach_m=12.0)
-    observed = select_rocks(ground, eye)
-    assert len(observed) > 100
-    # Each body is above the position of its rock in one period.
-    apart = observed.spheres[:, :2] - field.position_m[observed.names, :2]
-    apart -= field.period_m * np.rint(apart / field.period_m)
-    diameter = field.diameter_m[observed.names]
-    assert (np.hypot(*apart.T) <= diameter).all()
-    # No rock is far too small; all rocks larger by one class width are present.
-    distance = np.hypot(np.hypot(observed.spheres[:, 0] - 2.0, observed.spheres[:, 1] - 3.0), 1.5)
+    selected = select_rocks(ground, eye)
+    assert len(selected) > 100
+    # Each body has the horizontal position of its rock, except for multiples of the period.
+    offsets_m = selected.spheres[:, :2] - field.position_m[selected.names, :2]
+    offsets_m -= field.period_m * np.rint(offsets_m / field.period_m)
+    diameter = field.diameter_m[selected.names]
+    assert (np.hypot(*offsets_m.T) <= diameter).all()
+    # Selected rocks have at least 0.8 of the minimum size; all rocks above 1.25 of the minimum size are selected.
+    distance = np.hypot(np.hypot(selected.spheres[:, 0] - 2.0, selected.spheres[:, 1] - 3.0), 1.5)
     limit = SMALLEST_ROCK_PX * eye.pixel_rad
     assert (diameter / distance > 0.8 * limit).all()
     assert distance.max() <= 13.0
-    every = field.near(2.0, 3.0, 11.9, detail=0)
-    centres = every.vertices[every.faces].mean(axis=1)[::20]
+    all_rocks = field.near(2.0, 3.0, 11.9, detail=0)
+    centres = all_rocks.vertices[all_rocks.faces].mean(axis=1)[::20]
     slant = np.hypot(np.hypot(*(centres[:, :2] - (2.0, 3.0)).T), 1.5)
-    required = field.diameter_m[every.rock_of_face[::20]] > 1.25 * limit * slant
-    assert set(every.rock_of_face[::20][required]) <= set(observed.names)
+    is_required = field.diameter_m[all_rocks.rock_of_face[::20]] > 1.25 * limit * slant
+    assert set(all_rocks.rock_of_face[::20][is_required]) <= set(selected.names)
 
 
 def test_triangle_count_stays_within_budget() -> None:
-    crowded = SiteGround.of(_make_small_site("pisgah", 1024), "ground")
+    rocky_ground = SiteGround.of(_make_small_site("pisgah", 1024), "ground")
     eye = Eye(0.0, 0.0, 1.5, pixel_rad=3e-4, half_width_rad=np.radians(30.0))
     max_triangles = ROCK_TRIANGLES + DETAIL_TRIANGLES
-    assert 0.25 * max_triangles < len(select_rocks(crowded, eye).triangles) < 1.7 * max_triangles
+    assert 0.25 * max_triangles < len(select_rocks(rocky_ground, eye).triangles) < 1.7 * max_triangles
 
 
 def test_ground_without_rocks_has_no_objects() -> None:
-    bare = SiteGround.of(_make_small_site("ivanpah"), "ground")
-    assert bare.rocks is None
-    assert len(select_rocks(bare, Eye(0.0, 0.0, 1.5, 1e-3))) == 0
+    ground_without_rocks = SiteGround.of(_make_small_site("ivanpah"), "ground")
+    assert ground_without_rocks.rocks is None
+    assert len(select_rocks(ground_without_rocks, Eye(0.0, 0.0, 1.5, 1e-3))) == 0
 
 
-def test_sky_brightness_matches_its_light(ground: SiteGround) -> None:
-    light = ground.photometry(SUN)
-    assert light.sky_share == light.sky_radiance == ground.site.environment.sky_share(np.radians(35.0))
-    assert light.surrounding_albedo == ground.terrain.albedo
+def test_photometry_has_the_sky_radiance_of_the_environment(ground: SiteGround) -> None:
+    photometry = ground.photometry(SUN)
+    assert photometry.sky_share == photometry.sky_radiance == ground.site.environment.sky_share(np.radians(35.0))
+    assert photometry.surrounding_albedo == ground.terrain.albedo
 
 
-def test_scene_renders_from_mast_and_from_above(ground: SiteGround) -> None:
+def test_scene_from_mast_and_nadir_has_the_terrain_heights(ground: SiteGround) -> None:
     renderer = process_renderer(default_backend())
     for axis, pose in (
         ((1.0, 0.0, 0.0), mast_pose(ground.surface, 5.0, 6.0, 1.5, 40.0, -15.0)),
@@ -152,25 +152,25 @@ def test_scene_renders_from_mast_and_from_above(ground: SiteGround) -> None:
         # Distant ground is smoothed.
         points = frame.points_world()[(frame.body == -1) & (frame.range_m < 12.0)]
         assert len(points) > 5000
-        # A few pixels at grazing angles use a smoothed level or the height of the mesh.
-        off = np.abs(points[:, 2] - ground.surface.height(*points[:, :2].T))
-        assert np.mean(off > 0.02) < 0.005
+        # Exceptions are a few pixels at grazing angles, with a smoothed terrain level.
+        height_errors = np.abs(points[:, 2] - ground.surface.height(*points[:, :2].T))
+        assert np.mean(height_errors > 0.02) < 0.005
         assert np.isfinite(frame.radiance).all()
         assert (frame.body >= 0).any()
 
 
 @pytest.mark.parametrize("azimuth", [0.4, -2.8])
 def test_sector_contains_the_rocks_of_the_full_circle(azimuth: float) -> None:
-    """Compare each triangle, also for rocks that repeat with the terrain period."""
+    """The sector has the same triangles as the full circle, also for rocks that repeat with the terrain period."""
     ground = SiteGround.of(_make_small_site("gusev", 512), "ground", seed=3)
-    all_round = Eye(0.4, 1.0, 1.2, 4e-3, reach_m=1.4 * ground.surface.period_m)
-    eye = replace(all_round, azimuth_rad=azimuth, half_width_rad=0.3)
-    full, some = (select_rocks(ground, one) for one in (all_round, eye))
-    away = full.triangles[:, 0, :2] - (0.4, 1.0)
-    rotated = np.abs((np.arctan2(away[:, 0], away[:, 1]) - azimuth + np.pi) % (2.0 * np.pi) - np.pi)
-    inside = (rotated <= 0.3) | (np.hypot(*away.T) <= 5.0)
-    assert 0.05 < np.mean(inside) < 0.6
-    np.testing.assert_array_equal(some.triangles, full.triangles[inside])
-    np.testing.assert_array_equal(some.normals, full.normals[inside])
-    names = np.repeat(full.names, np.diff(full.first_triangle))[inside]
-    np.testing.assert_array_equal(np.repeat(some.names, np.diff(some.first_triangle)), names)
+    full_eye = Eye(0.4, 1.0, 1.2, 4e-3, reach_m=1.4 * ground.surface.period_m)
+    eye = replace(full_eye, azimuth_rad=azimuth, half_width_rad=0.3)
+    full_circle, sector = (select_rocks(ground, entry) for entry in (full_eye, eye))
+    offsets_m = full_circle.triangles[:, 0, :2] - (0.4, 1.0)
+    angle_from_axis = np.abs((np.arctan2(offsets_m[:, 0], offsets_m[:, 1]) - azimuth + np.pi) % (2.0 * np.pi) - np.pi)
+    in_sector = (angle_from_axis <= 0.3) | (np.hypot(*offsets_m.T) <= 5.0)
+    assert 0.05 < np.mean(in_sector) < 0.6
+    np.testing.assert_array_equal(sector.triangles, full_circle.triangles[in_sector])
+    np.testing.assert_array_equal(sector.normals, full_circle.normals[in_sector])
+    names = np.repeat(full_circle.names, np.diff(full_circle.first_triangle))[in_sector]
+    np.testing.assert_array_equal(np.repeat(sector.names, np.diff(sector.first_triangle)), names)

@@ -25,12 +25,12 @@ def _list_files(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_oldest_used_files_are_evicted(folder: Path) -> None:
+def test_least_recently_used_files_are_evicted(folder: Path) -> None:
     evict_files(folder, 150)
     assert _list_files(folder) == {"2", "3", "4"}
 
 
-def test_used_file_is_kept(folder: Path) -> None:
+def test_recently_touched_file_is_kept(folder: Path) -> None:
     touch(folder / "0")
     evict_files(folder, 150)
     assert _list_files(folder) == {"0", "3", "4"}

@@ -24,18 +24,18 @@ def test_site_axes_are_north_east_down() -> None:
 
 def test_rigid_transform_rotates_then_translates() -> None:
     quarter_turn = Rotation.from_euler("z", 90, degrees=True)
-    moved = rigid(quarter_turn, np.array([10.0, 0.0, 0.0])).apply([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(moved, [10.0, 1.0, 0.0], atol=1e-15)
+    transformed = rigid(quarter_turn, np.array([10.0, 0.0, 0.0])).apply([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(transformed, [10.0, 1.0, 0.0], atol=1e-15)
 
 
 def test_unchecked_transforms_match_scipy() -> None:
-    turns, positions = Rotation.random(20, rng=1), np.random.default_rng(1).normal(size=(20, 3))
-    for turn, position in zip(turns, positions, strict=True):
-        checked = RigidTransform.from_components(position, turn)
+    rotations, positions = Rotation.random(20, rng=1), np.random.default_rng(1).normal(size=(20, 3))
+    for rotation, position in zip(rotations, positions, strict=True):
+        checked = RigidTransform.from_components(position, rotation)
         np.testing.assert_allclose(
-            rigid_from_axes(turn.as_matrix(), position).as_matrix(), checked.as_matrix(), atol=1e-15
+            rigid_from_axes(rotation.as_matrix(), position).as_matrix(), checked.as_matrix(), atol=1e-15
         )
-        twice = compose(checked, rigid(turns[0], positions[0]))
+        composed = compose(checked, rigid(rotations[0], positions[0]))
         np.testing.assert_allclose(
-            twice.as_matrix(), (checked * rigid(turns[0], positions[0])).as_matrix(), rtol=0.0, atol=4e-15
+            composed.as_matrix(), (checked * rigid(rotations[0], positions[0])).as_matrix(), rtol=0.0, atol=4e-15
         )

@@ -1,11 +1,11 @@
-"""Statistics of pictures: known spectra, contrasts and fall-offs are measured."""
+"""Tests of image statistics on synthetic images with known spectrum, contrast and fall-off."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from marsyard.sim.image_statistics import SIDE, image_statistics, spectral_slope
+from marsyard.sim.image_statistics import SIDE, compute_image_statistics, spectral_slope
 
 
 @pytest.mark.parametrize("exponent", [-1.5, -2.5])
@@ -18,21 +18,21 @@ def test_slope_of_a_power_law_is_measured(exponent: float) -> None:
     assert spectral_slope(100.0 + field / field.std()) == pytest.approx(exponent, abs=0.15)
 
 
-def test_patchiness_is_the_ratio_of_contrasts() -> None:
+def test_patchiness_is_the_ratio_of_local_contrasts() -> None:
     """Noise of 10 % on one half and of 2 % on the other."""
     rng = np.random.default_rng(3)
     sd = np.where(np.arange(SIDE) < SIDE // 2, 0.1, 0.02)
-    found = image_statistics(1000.0 * (1.0 + sd * rng.standard_normal((SIDE, SIDE))))
-    assert found.local_p10 == pytest.approx(0.02, rel=0.1)
-    assert found.local_p90 == pytest.approx(0.1, rel=0.1)
-    assert found.patchiness == pytest.approx(found.local_p90 / found.local_p10)
+    statistics = compute_image_statistics(1000.0 * (1.0 + sd * rng.standard_normal((SIDE, SIDE))))
+    assert statistics.local_p10 == pytest.approx(0.02, rel=0.1)
+    assert statistics.local_p90 == pytest.approx(0.1, rel=0.1)
+    assert statistics.patchiness == pytest.approx(statistics.local_p90 / statistics.local_p10)
 
 
-def test_corners_are_compared_with_the_centre() -> None:
-    """A linear fall-off, in a wide picture whose central square counts."""
+def test_corner_brightness_is_relative_to_the_centre() -> None:
+    """An image with linear fall-off, padded on both sides; only its central square is used."""
     offset = np.arange(512) - 255.5
     radius = np.hypot(offset[:, None], offset) / np.hypot(255.5, 255.5)
-    picture = np.pad(1.0 - 0.4 * radius, ((0, 0), (100, 100)))
-    found = image_statistics(picture)
-    assert found.corner == pytest.approx((1.0 - 0.4 * 0.93) / (1.0 - 0.4 * 0.165), abs=0.01)
-    assert 0.0 < found.rms < 0.2
+    image = np.pad(1.0 - 0.4 * radius, ((0, 0), (100, 100)))
+    statistics = compute_image_statistics(image)
+    assert statistics.corner == pytest.approx((1.0 - 0.4 * 0.93) / (1.0 - 0.4 * 0.165), abs=0.01)
+    assert 0.0 < statistics.rms < 0.2

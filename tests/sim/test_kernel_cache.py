@@ -14,31 +14,31 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def _print_cache_folder(sources: Path, cache: Path, **environment: str) -> str:
-    stored = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
-    done = subprocess.run(
+    inherited = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    result = subprocess.run(
         [sys.executable, "-c", "import os, marsyard.sim; print(os.environ['NUMBA_CACHE_DIR'])"],
         cwd=sources,
-        env=stored | {"MARSYARD_CACHE": str(cache), "PYTHONPATH": str(sources)} | environment,
+        env=inherited | {"MARSYARD_CACHE": str(cache), "PYTHONPATH": str(sources)} | environment,
         capture_output=True,
         text=True,
         check=True,
         timeout=60,
     )
-    return done.stdout.strip()
+    return result.stdout.strip()
 
 
 @pytest.mark.parametrize("kernels", ["sim/terrain/kernels.py", "algorithms/hda/kernels/motion.py"])
-def test_changed_kernel_recompiles_its_callers(kernels: str, tmp_path: Path) -> None:
+def test_changed_kernel_changes_the_cache_folder(kernels: str, tmp_path: Path) -> None:
     sources = tmp_path / "sources"
     shutil.copytree(ROOT / "marsyard", sources / "marsyard", ignore=shutil.ignore_patterns("__pycache__"))
-    before = _print_cache_folder(sources, tmp_path / "cache")
-    assert _print_cache_folder(sources, tmp_path / "cache") == before
-    changed = sources / "marsyard" / kernels
-    changed.write_text(changed.read_text() + "\n# changed\n")
-    assert _print_cache_folder(sources, tmp_path / "cache") != before
+    original_folder = _print_cache_folder(sources, tmp_path / "cache")
+    assert _print_cache_folder(sources, tmp_path / "cache") == original_folder
+    kernel_file = sources / "marsyard" / kernels
+    kernel_file.write_text(kernel_file.read_text() + "\n# changed\n")
+    assert _print_cache_folder(sources, tmp_path / "cache") != original_folder
 
 
-def test_user_cache_folder_is_kept(tmp_path: Path) -> None:
+def test_cache_folder_set_by_the_user_is_used(tmp_path: Path) -> None:
     assert _print_cache_folder(ROOT, tmp_path, NUMBA_CACHE_DIR="/somewhere") == "/somewhere"
 
 

@@ -13,12 +13,12 @@ def _draw_first(streams: Streams, name: str) -> tuple[int, ...]:
 
 
 def test_stream_depends_only_on_its_key() -> None:
-    one = Streams(7, "campaign", 3)
-    alone = _draw_first(one, "wind")
-    _draw_first(one, "sun")
-    one.generator("wind").standard_normal(100)
-    assert _draw_first(one, "wind") == alone
-    assert _draw_first(Streams(7, "campaign", 3), "wind") == alone
+    streams = Streams(7, "campaign", 3)
+    expected = _draw_first(streams, "wind")
+    _draw_first(streams, "sun")
+    streams.generator("wind").standard_normal(100)
+    assert _draw_first(streams, "wind") == expected
+    assert _draw_first(Streams(7, "campaign", 3), "wind") == expected
 
 
 @given(
@@ -41,7 +41,7 @@ def test_each_key_part_selects_another_stream(
 
 
 def test_key_parts_are_hashed_separately() -> None:
-    """Names are hashed completely: moving letters between parts gives another key."""
+    """The parts of a key are hashed separately: moving a letter from one part to another changes the stream."""
     assert _draw_first(Streams(0, "ab", 0), "c") != _draw_first(Streams(0, "a", 0), "bc")
     assert _draw_first(Streams(1, "a", 0), "b") != _draw_first(Streams(0, "a", 1), "b")
 
@@ -58,11 +58,11 @@ def test_streams_of_neighbouring_cases_are_uncorrelated() -> None:
 )
 def test_seeds_match_numpy(seed: int, campaign: str, case: int, name: str) -> None:
     actual = seeds(stream_words(seed, campaign, np.array([case]), name))[0]
-    numpys = np.random.SeedSequence(seed, spawn_key=stream_key(campaign, case, name)).pool
-    assert actual.tolist() == numpys.view(np.uint64).tolist()
+    expected = np.random.SeedSequence(seed, spawn_key=stream_key(campaign, case, name)).pool
+    assert actual.tolist() == expected.view(np.uint64).tolist()
 
 
-def test_no_two_of_four_hundred_thousand_streams_share_a_seed() -> None:
+def test_400_000_streams_have_different_seeds() -> None:
     """The probability of a collision is 1 in 4e27; `make validate` tests ten million."""
     names = [*(f"dispersion:{letter}" for letter in "abcdefghijklmnop"), "gusts", "landing", "altimeter", "clock"]
     result = all_seeds(campaigns=10, cases=2000, names=names)

@@ -1,4 +1,4 @@
-"""Compiled geometry of a rocker-bogie suspension; `marsyard.sim.dynamics.rover` states the model and its angles."""
+"""Compiled geometry of a rocker-bogie suspension; `marsyard.sim.dynamics.rover` defines the model and its angles."""
 
 from __future__ import annotations
 
@@ -14,40 +14,40 @@ WHEELS_PER_SIDE = 3
 
 
 @njit(cache=True)
-def rotate(x: float, z: float, angle: float, about: Array) -> tuple[float, float]:
-    """Rotate a point (x, z) about another; a positive angle lowers points in front."""
+def rotate_about_pivot(x: float, z: float, angle: float, pivot: Array) -> tuple[float, float]:
+    """Rotate a point (x, z) about a pivot (x, z); a positive angle lowers points in front of the pivot."""
     sine, cosine = math.sin(angle), math.cos(angle)
-    x -= about[0]
-    z -= about[1]
-    return about[0] + cosine * x + sine * z, about[1] + cosine * z - sine * x
+    x -= pivot[0]
+    z -= pivot[1]
+    return pivot[0] + cosine * x + sine * z, pivot[1] + cosine * z - sine * x
 
 
 @njit(cache=True)
-def wheel_centres(level: Array, rocker_pivot: Array, bogie_pivot: Array, joints: Array) -> Array:
-    """Centres of the wheels in the rover frame.
+def compute_wheel_centres(centres0: Array, rocker_pivot: Array, bogie_pivot: Array, joints: Array) -> Array:
+    """Compute the centres of the wheels in the rover frame, metres, shape (6, 3).
 
-    - level: wheel centres on level ground, shape (6, 3): left front, middle, rear, right front, middle, rear
+    - centres0: the same on level ground (all joint angles zero), in the order of the rover's `WHEELS`
     - rocker_pivot, bogie_pivot: (x, z) of the axes on level ground
-    - joints: angles of the differential, the left and the right bogie
+    - joints: angles of the differential, the left and the right bogie, radians
     """
     centres = np.empty((2 * WHEELS_PER_SIDE, 3))
     for wheel in range(2 * WHEELS_PER_SIDE):
         side = wheel // WHEELS_PER_SIDE
-        x, z = level[wheel, 0], level[wheel, 2]
+        x, z = centres0[wheel, 0], centres0[wheel, 2]
         if wheel % WHEELS_PER_SIDE > 0:
-            x, z = rotate(x, z, joints[1 + side], bogie_pivot)
-        x, z = rotate(x, z, joints[0] if side == 0 else -joints[0], rocker_pivot)
-        centres[wheel, 0], centres[wheel, 1], centres[wheel, 2] = x, level[wheel, 1], z
+            x, z = rotate_about_pivot(x, z, joints[1 + side], bogie_pivot)
+        x, z = rotate_about_pivot(x, z, joints[0] if side == 0 else -joints[0], rocker_pivot)
+        centres[wheel, 0], centres[wheel, 1], centres[wheel, 2] = x, centres0[wheel, 1], z
     return centres
 
 
 @njit(cache=True)
-def tread_points(
-    states: Array, yaw: float, position: Array, level: Array, rocker_pivot: Array, bogie_pivot: Array, treads: Array
+def compute_tread_points(
+    states: Array, yaw: float, position: Array, centres0: Array, rocker_pivot: Array, bogie_pivot: Array, treads: Array
 ) -> tuple[Array, Array, Array]:
-    """World x, y and z of points of the wheels' treads, each of shape (n, 6, points).
+    """Compute world x, y and z of points on the wheels' treads, each of shape (n, 6, points).
 
-    - states: heights, pitches, rolls, and joints as for `wheel_centres`, shape (n, 6)
+    - states: height, pitch, roll, and joints as for `compute_wheel_centres`, shape (n, 6)
     - yaw, position: rotation of the rover about the vertical, and world x and y of its origin
     - treads: points relative to the wheels' centres, shape (6, points, 3), or (1, points, 3) if common to all wheels
     """
@@ -59,7 +59,7 @@ def tread_points(
         # rotation by roll about x, then by -pitch about y, then by yaw about z
         sp, cp = math.sin(-states[n, 1]), math.cos(-states[n, 1])
         sr, cr = math.sin(states[n, 2]), math.cos(states[n, 2])
-        centres = wheel_centres(level, rocker_pivot, bogie_pivot, states[n, 3:])
+        centres = compute_wheel_centres(centres0, rocker_pivot, bogie_pivot, states[n, 3:])
         for wheel in range(2 * WHEELS_PER_SIDE):
             tread = treads[wheel % treads.shape[0]]
             for k in range(points_per_tread):

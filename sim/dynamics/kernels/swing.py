@@ -1,7 +1,7 @@
-"""Compiled equations of motion of the two-stage pendulum; `marsyard.sim.dynamics.swing` derives them and their symbols.
+"""Compiled equations of motion of the two-stage pendulum; `marsyard.sim.dynamics.swing` defines equations and symbols.
 
-A state is a vector of 22: position and velocity of the canopy, the line's direction and its rate, the lander's axis and
-its rate, and the lander's x axis, each with three components in world axes; and the lander's spin about its axis.
+A state vector has 22 components: position and velocity of the canopy, direction of the line and its rate, direction of
+the lander's axis and its rate, and the lander's x axis (three components each, world axes), then the lander's spin.
 """
 
 from __future__ import annotations
@@ -16,15 +16,18 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: First components of the vectors in a state, and its size.
+#: Index of the first component of each vector in a state, and the size of a state.
 CANOPY, CANOPY_RATE, LINE, LINE_RATE, AXIS, AXIS_RATE, SIDE, SPIN, SIZE = 0, 3, 6, 9, 12, 15, 18, 21, 22
 
 
 class Chain(NamedTuple):
-    """Constants of canopy, backshell, lander and air.
+    """Constants of canopy, backshell, lander and air, SI units; symbols of `marsyard.sim.dynamics.swing` in brackets.
 
-    `tangential` and `normal` are half density times area times coefficient, kg/m, at `reference_height_m`; `reach_m` is
-    the camera's distance from the hinge, `mass_centre_m` the lander's centre of mass.
+    - mass_kg, lander_mass_kg: total mass (M) and mass of the lander (m_l)
+    - first_moment, second_moment: moments of mass about the canopy (S, J)
+    - line_m, mass_centre_m, camera_m: distances from canopy to hinge (L), from hinge to centre of mass (d) and camera
+    - transverse_inertia, axial_inertia, hinge_damping: (I_t, I_a, c)
+    - tangential, normal: rho A C_T / 2 and rho A C_N / 2, kg/m, at `reference_height_m`
     """
 
     mass_kg: float
@@ -33,7 +36,7 @@ class Chain(NamedTuple):
     second_moment: float
     line_m: float
     mass_centre_m: float
-    reach_m: float
+    camera_m: float
     transverse_inertia: float
     axial_inertia: float
     hinge_damping: float
@@ -45,9 +48,9 @@ class Chain(NamedTuple):
 
 
 class WindField(NamedTuple):
-    """Mean wind and gusts as functions of height: see `marsyard.sim.dynamics.trajectory`.
+    """Mean wind and gusts as functions of height: see `marsyard.sim.dynamics.trajectory.Wind`.
 
-    A row of `waves`: wavenumber, rad/m; amplitudes east, north and up of its cosine, then of its sine.
+    Columns of `waves`: wavenumber, rad/m; amplitudes east, north and up of the cosine; then of the sine, m/s.
     """
 
     ground_height_m: float
@@ -59,20 +62,20 @@ class WindField(NamedTuple):
 
 
 CHAIN_SIZE = len(Chain._fields)
-#: Fields without the waves.
+#: Number of fields of a wind field without the waves.
 FIELD_SIZE = len(WindField._fields) - 1
 
-#: Coefficients of SciPy's polynomial over a step of DOP853.
+#: Number of coefficients of SciPy's polynomial over a step of DOP853.
 TERMS = 7
 
 
 @njit(cache=True)
-def wind_at(height: float, field: WindField) -> tuple[float, float, float]:
-    """East, north and upward wind at a height of the world's z."""
-    above = max(height - field.ground_height_m, 0.0)
+def compute_wind(height: float, field: WindField) -> tuple[float, float, float]:
+    """Compute the east, north and upward wind at a world z, m/s."""
+    altitude = max(height - field.ground_height_m, 0.0)
     profile = 1.0
-    if above < field.layer_m:
-        profile = math.log1p(above / field.roughness_m) / math.log1p(field.layer_m / field.roughness_m)
+    if altitude < field.layer_m:
+        profile = math.log1p(altitude / field.roughness_m) / math.log1p(field.layer_m / field.roughness_m)
     east = profile * field.mean_east_m_s
     north = profile * field.mean_north_m_s
     up = 0.0
@@ -87,11 +90,11 @@ def wind_at(height: float, field: WindField) -> tuple[float, float, float]:
 
 
 @njit(cache=True)
-def wind_profile(heights: Array, field: WindField) -> Array:
-    """Rows (east, north, up) of the wind at many heights."""
+def compute_wind_profile(heights: Array, field: WindField) -> Array:
+    """Compute the wind at many heights, a row (east, north, up) each."""
     rows = np.empty((heights.size, 3))
     for i in range(heights.size):
-        rows[i] = wind_at(heights[i], field)
+        rows[i] = compute_wind(heights[i], field)
     return rows
 
 
@@ -107,33 +110,33 @@ def _cross(a: Array, b: Array) -> Array:
 
 @njit(cache=True)
 def _vector(y: Array, first: int) -> Array:
-    """The three components of a state from a first one on."""
+    """Return the three components of a state that begin with index `first`."""
     return y[first : first + 3]
 
 
 @njit(cache=True)
-def aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array:
-    """Force of the air on the canopy, N, world axes."""
+def compute_aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array:
+    """Compute the force F of the air on the canopy, N, world axes."""
     height, line = y[CANOPY + 2], _vector(y, LINE)
-    relative = _vector(y, CANOPY_RATE) - np.array(wind_at(height, field))
-    speed = math.sqrt(_dot(relative, relative))
-    along = _dot(relative, line)
+    velocity = _vector(y, CANOPY_RATE) - np.array(compute_wind(height, field))  # relative to the air
+    speed = math.sqrt(_dot(velocity, velocity))
+    axial = _dot(velocity, line)
     density = math.exp((chain.reference_height_m - height) / chain.scale_height_m)
-    force: Array = -density * speed * (chain.tangential * speed * line + chain.normal * (relative - along * line))
+    force: Array = -density * speed * (chain.tangential * speed * line + chain.normal * (velocity - axial * line))
     return force
 
 
 @njit(cache=True)
 def state_derivative(_t: float, y: Array, constants: Array, waves: Array) -> Array:
-    """`derivatives` with the signature of an integrator; see `pack_constants`, as numba converts tuples slowly."""
+    """Call `compute_derivatives` from an integrator, with arrays of `pack_constants`: numba converts tuples slowly."""
     chain = Chain(*to_fixed_tuple(constants[:CHAIN_SIZE], CHAIN_SIZE))
     mean = to_fixed_tuple(constants[CHAIN_SIZE:], FIELD_SIZE)
-    rates: Array = derivatives(y, chain, WindField(mean[0], mean[1], mean[2], mean[3], mean[4], waves))
+    rates: Array = compute_derivatives(y, chain, WindField(mean[0], mean[1], mean[2], mean[3], mean[4], waves))
     return rates
 
 
 def pack_constants(chain: Chain, field: WindField) -> tuple[Array, Array]:
-    """The last two arguments of `state_derivative`."""
+    """Convert the constants to the last two arguments of `state_derivative`."""
     return np.array([*chain, *field[:FIELD_SIZE]]), field.waves
 
 
@@ -141,7 +144,7 @@ def pack_constants(chain: Chain, field: WindField) -> tuple[Array, Array]:
 def interpolate_states(
     times: Array, knots: Array, starts: Array, lengths: Array, states: Array, polynomials: Array
 ) -> Array:
-    """States at many times, a row each, from the polynomials of `marsyard.sim.dynamics.swing.Path`."""
+    """Evaluate the polynomials of `marsyard.sim.dynamics.swing.Path` at many times, a row with a state each."""
     rows = np.empty((times.size, SIZE))
     for n in range(times.size):
         i = max(np.searchsorted(knots, times[n], side="right") - 1, 0)
@@ -155,47 +158,47 @@ def interpolate_states(
 
 
 @njit(cache=True)
-def derivatives(y: Array, chain: Chain, field: WindField) -> Array:
-    """Time derivatives of the state."""
+def compute_derivatives(y: Array, chain: Chain, field: WindField) -> Array:
+    """Compute the time derivatives of a state from equations (1) to (4) of `marsyard.sim.dynamics.swing`."""
     lander_moment = chain.lander_mass_kg * chain.mass_centre_m
-    # moments of the line, of both, and of the lander with the canopy's position eliminated
+    # coefficients A, C and B of n'' and e'' in equations (2) and (3), after r'' is eliminated with equation (1)
     a = chain.second_moment - chain.first_moment**2 / chain.mass_kg
     c = lander_moment * (chain.line_m - chain.first_moment / chain.mass_kg)
     b = chain.transverse_inertia + lander_moment * (chain.mass_centre_m - lander_moment / chain.mass_kg)
 
     line, line_rate = _vector(y, LINE), _vector(y, LINE_RATE)
     axis, axis_rate, spin = _vector(y, AXIS), _vector(y, AXIS_RATE), y[SPIN]
-    force = aerodynamic_force(y, chain, field)
+    force = compute_aerodynamic_force(y, chain, field)
     lander_rotation = _cross(axis, axis_rate)
-    rolling = _dot(lander_rotation, line) + spin * _dot(axis, line)
-    slip = lander_rotation + spin * axis - rolling * line - _cross(line, line_rate)
+    line_spin = _dot(lander_rotation, line) + spin * _dot(axis, line)
+    hinge_rate = lander_rotation + spin * axis - line_spin * line - _cross(line, line_rate)  # s of the equations
 
     line_speed2, axis_speed2, cosine = _dot(line_rate, line_rate), _dot(axis_rate, axis_rate), _dot(line, axis)
-    on_line = (
-        chain.hinge_damping * _cross(slip, line)
+    line_source = (
+        chain.hinge_damping * _cross(hinge_rate, line)
         - chain.first_moment / chain.mass_kg * (force - _dot(force, line) * line)
         + c * axis_speed2 * (axis - cosine * line)
     )
-    on_axis = (
-        -chain.hinge_damping * _cross(slip, axis)
+    axis_source = (
+        -chain.hinge_damping * _cross(hinge_rate, axis)
         - chain.axial_inertia * spin * _cross(axis_rate, axis)
         - lander_moment / chain.mass_kg * (force - _dot(force, axis) * axis)
         + c * line_speed2 * (line - cosine * axis)
     )
-    # A w + C P_n x = on_line and B x + C P_e w = on_axis, w across the line n, x across the axis e
-    source = on_line - c / b * (on_axis - _dot(on_axis, line) * line)
-    across = axis - cosine * line
-    stiff = a - c * c / b
-    extra = c * c / b
-    along = _dot(across, source) / (stiff + extra * _dot(across, across))
-    w = (source - extra * across * along) / stiff
-    x = (on_axis - c * (w - _dot(w, axis) * axis)) / b
+    # solve A p + C P_n q = line_source and B q + C P_e p = axis_source for p = P_n n'' and q = P_e e''
+    source = line_source - c / b * (axis_source - _dot(axis_source, line) * line)
+    axis_lateral = axis - cosine * line
+    reduced_a = a - c * c / b
+    coupling = c * c / b
+    projection = _dot(axis_lateral, source) / (reduced_a + coupling * _dot(axis_lateral, axis_lateral))
+    p = (source - coupling * axis_lateral * projection) / reduced_a
+    q = (axis_source - c * (p - _dot(p, axis) * axis)) / b
 
     rates = np.empty(SIZE)
     rates[CANOPY : CANOPY + 3] = _vector(y, CANOPY_RATE)
     rates[LINE : LINE + 3] = line_rate
     rates[AXIS : AXIS + 3] = axis_rate
-    line_acceleration, axis_acceleration = w - line_speed2 * line, x - axis_speed2 * axis
+    line_acceleration, axis_acceleration = p - line_speed2 * line, q - axis_speed2 * axis
     rates[LINE_RATE : LINE_RATE + 3] = line_acceleration
     rates[AXIS_RATE : AXIS_RATE + 3] = axis_acceleration
     rates[CANOPY_RATE : CANOPY_RATE + 3] = (
@@ -203,30 +206,30 @@ def derivatives(y: Array, chain: Chain, field: WindField) -> Array:
     ) / chain.mass_kg
     rates[CANOPY_RATE + 2] -= chain.gravity_m_s2
     rates[SIDE : SIDE + 3] = _cross(lander_rotation + spin * axis, _vector(y, SIDE))
-    rates[SPIN] = -chain.hinge_damping * _dot(slip, axis) / chain.axial_inertia
+    rates[SPIN] = -chain.hinge_damping * _dot(hinge_rate, axis) / chain.axial_inertia
     return rates
 
 
 @njit(cache=True)
 def compute_truth(states: Array, chain: Chain, field: WindField) -> tuple[Array, Array, Array, Array, Array]:
-    """Position, velocity, rotation matrix from body to world, body rate and specific force for rows of states."""
+    """Compute position, velocity, rotation matrix from body to world, body rate and specific force of many states."""
     count = states.shape[0]
     positions, velocities = np.empty((count, 3)), np.empty((count, 3))
     body_rates, forces = np.empty((count, 3)), np.empty((count, 3))
     matrices = np.empty((count, 3, 3))
     for k in range(count):
         y = states[k]
-        rates = derivatives(y, chain, field)
+        rates = compute_derivatives(y, chain, field)
         axis, axis_rate, side = _vector(y, AXIS), _vector(y, AXIS_RATE), _vector(y, SIDE)
-        positions[k] = _vector(y, CANOPY) + chain.line_m * _vector(y, LINE) + chain.reach_m * axis
-        velocities[k] = _vector(y, CANOPY_RATE) + chain.line_m * _vector(y, LINE_RATE) + chain.reach_m * axis_rate
+        positions[k] = _vector(y, CANOPY) + chain.line_m * _vector(y, LINE) + chain.camera_m * axis
+        velocities[k] = _vector(y, CANOPY_RATE) + chain.line_m * _vector(y, LINE_RATE) + chain.camera_m * axis_rate
         force = (
             _vector(rates, CANOPY_RATE)
             + chain.line_m * _vector(rates, LINE_RATE)
-            + chain.reach_m * _vector(rates, AXIS_RATE)
+            + chain.camera_m * _vector(rates, AXIS_RATE)
         )
         force[2] += chain.gravity_m_s2
-        # Gram-Schmidt: removes the integration error of the side along the axis
+        # Gram-Schmidt: make the x axis perpendicular to the lander's axis in spite of integration errors
         axis_norm = math.sqrt(_dot(axis, axis))
         x = side - _dot(side, axis) / axis_norm**2 * axis
         x = x / math.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)

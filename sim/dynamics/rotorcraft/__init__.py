@@ -1,16 +1,16 @@
-"""Small autonomous helicopter: flight at constant height for pictures, and landing on a site (landing paper, V).
+"""Small autonomous helicopter: flight at constant height for images, and landing on a site (landing paper, V).
 
-Thrust acts along the body's z axis, drag is proportional to the airspeed, so that the helicopter pitches forward to fly
-and leans into the wind. Pitch, roll and yaw follow the autopilot's commands as second-order systems, disturbed by
-gusts; thrust follows with a lag. The autopilot commands speed by distance, acceleration by speed, and tilt by
-acceleration, with a trim against steady wind, from a delayed state.
+Thrust acts along the body's z axis, and drag is proportional to the airspeed: the helicopter pitches forward to fly and
+tilts into the wind. Pitch, roll and yaw follow the autopilot's commands as second-order systems, disturbed by gusts;
+thrust follows with a lag. The autopilot uses a delayed state. It computes the speed from the distance to the goal, the
+acceleration from the speed error, and the tilt from the acceleration, with a trim against steady wind.
 
-The flight over the ground is controlled with true states, as its deviation from the path does not matter. The landing
-is controlled with navigation's states, so that navigation errors become touchdown errors. Below the height of the flare
-the helicopter only stops its drift, and gusts displace it.
+The flight for images is controlled with true states, because its deviation from the path has no influence on results.
+The landing is controlled with navigation's states, so that navigation errors become touchdown errors. Below the height
+of the flare the autopilot only controls the velocity to zero, and gusts displace the helicopter.
 
-Not modelled: inflow near the ground, sliding or tipping after the touchdown (the skids stay at the first contact and
-level out), and wind that depends on position.
+Not modelled: inflow near the ground, wind that depends on position, and sliding or tipping after the touchdown. The
+skids stay at the point of first contact, and the tilt decays to zero.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_f
 
 Gain = Annotated[float, Field(gt=0.0, le=10.0)]
 
-#: Duration of the flight after the last picture, s: clocks may be late.
+#: Duration of the flight after the last image, because the camera's clock can be late.
 TAIL_S = 0.1
 
 
 class VibrationParameters(Parameters):
-    """Vibration by the main rotor: a sine along and about each axis, its phase drawn. All assumed.
+    """Vibration by the main rotor: a sine along and about each axis with random phase. All values are assumed.
 
-    A rotor of 1.8 m at 22 turns per second has a tip speed of 125 m/s, usual for its size.
+    A rotor of 1.8 m diameter at 22 revolutions per second has a tip speed of 125 m/s, common for this size.
     """
 
     rate_hz: Annotated[Positive, Field(le=45.0, description="frequency of the rotor, 1/s")] = 22.0
@@ -47,7 +47,7 @@ class VibrationParameters(Parameters):
 
 
 class AirParameters(Parameters):
-    """Wind at the helicopter: a mean, and gusts correlated in time (first-order, as Dryden's along the flow)."""
+    """Wind at the helicopter: mean wind, and gusts as first-order Markov processes (Dryden's longitudinal spectrum)."""
 
     east_m_s: Annotated[float, bounded_field(-15.0, 15.0, "mean wind to the east")] = 1.0
     north_m_s: Annotated[float, bounded_field(-15.0, 15.0, "mean wind to the north")] = 1.0
@@ -57,9 +57,9 @@ class AirParameters(Parameters):
 
 
 class RotorcraftParameters(Parameters):
-    """A helicopter similar to JPL's (2 m long, gas powered) with its autopilot.
+    """Parameters of a helicopter similar to JPL's (2 m long, gas powered) and of its autopilot.
 
-    The paper gives no values. All are assumed: an attitude loop of about 1 Hz, position loops several times slower.
+    The paper contains no values. All are assumed: an attitude loop of about 1 Hz, position loops several times slower.
     """
 
     drag_s: Annotated[Positive, Field(description="time constant of the speed under drag alone, s")] = 5.0
@@ -69,10 +69,10 @@ class RotorcraftParameters(Parameters):
     thrust_lag_s: Annotated[Positive, Field(le=1.0, description="time constant of the thrust, s")] = 0.15
     max_tilt_deg: Annotated[Positive, Field(le=30.0, description="maximum commanded pitch or roll, deg")] = 12.0
     gust_tilt_deg_s_m: Annotated[NonNegative, Field(le=10.0, description="tilt by a gust, deg per m/s")] = 0.8
-    gust_yaw_deg_s_m: Annotated[NonNegative, Field(le=10.0, description="turn into a gust, deg per m/s")] = 0.8
-    position_gain: Annotated[Gain, Field(description="commanded speed per distance, 1/s")] = 0.5
-    speed_gain: Annotated[Gain, Field(description="commanded acceleration per error of speed, 1/s")] = 1.2
-    trim_gain: Annotated[NonNegative, Field(le=5.0, description="growth of trim per error of speed, 1/s2")] = 0.3
+    gust_yaw_deg_s_m: Annotated[NonNegative, Field(le=10.0, description="yaw into a gust, deg per m/s")] = 0.8
+    position_gain: Annotated[Gain, Field(description="commanded speed / distance, 1/s")] = 0.5
+    speed_gain: Annotated[Gain, Field(description="commanded acceleration / speed error, 1/s")] = 1.2
+    trim_gain: Annotated[NonNegative, Field(le=5.0, description="rate of trim / speed error, 1/s2")] = 0.3
     delay_s: Annotated[NonNegative, Field(le=0.5, description="delay of the autopilot's command, s")] = 0.1
     gear_m: Annotated[NonNegative, Field(le=5.0, description="height of the camera above the skids, m")] = 0.4
     contact_s: Annotated[Positive, Field(le=1.0, description="time constant of the motion on the ground, s")] = 0.1
@@ -80,50 +80,51 @@ class RotorcraftParameters(Parameters):
     vibration: VibrationParameters = VibrationParameters()
 
     def craft(self, gravity_m_s2: float) -> kernels.Craft:
-        """Convert to SI units for the kernels."""
-        rad, turn = math.radians(1.0), 2.0 * math.pi
+        """Convert the parameters to SI units for the kernels."""
+        rad_per_deg, rad_per_cycle = math.radians(1.0), 2.0 * math.pi
         return kernels.Craft(
             **self.model_dump(include=set(kernels.Craft._fields)),
             gravity_m_s2=gravity_m_s2,
-            attitude_rad_s=turn * self.attitude_hz,
+            attitude_rad_s=rad_per_cycle * self.attitude_hz,
             attitude_damping=self.damping,
-            heading_rad_s=turn * self.heading_hz,
-            max_tilt_rad=rad * self.max_tilt_deg,
-            gust_tilt_s_m=rad * self.gust_tilt_deg_s_m,
-            gust_yaw_s_m=rad * self.gust_yaw_deg_s_m,
+            heading_rad_s=rad_per_cycle * self.heading_hz,
+            max_tilt_rad=rad_per_deg * self.max_tilt_deg,
+            gust_tilt_s_m=rad_per_deg * self.gust_tilt_deg_s_m,
+            gust_yaw_s_m=rad_per_deg * self.gust_yaw_deg_s_m,
             delay_steps=round(self.delay_s / self.step_s),
         )
 
 
 class TransitParameters(Parameters):
-    """The flight at constant height while pictures are taken (paper, V). Height and number of pictures are assumed.
+    """Parameters of the flight at constant height during which images are taken (paper, V).
 
-    The paper's "several seconds" are five here. Time 0 is the first picture's.
+    Height and number of images are assumed. The paper's "several seconds" are 5 s. Time 0 is the time of the first
+    image.
     """
 
-    height_m: Annotated[Positive, Field(le=200.0, description="height above ground at the first picture")] = 10.0
+    height_m: Annotated[Positive, Field(le=200.0, description="height above ground at the first image")] = 10.0
     speed_m_s: Annotated[Positive, Field(le=15.0, description="commanded speed, m/s (assumed)")] = 1.0
-    acceleration_m_s2: Annotated[Positive, Field(le=3.0, description="to that speed (assumed)")] = 1.0
-    hover_s: Annotated[NonNegative, Field(le=600.0, description="duration of the hover before, s (assumed)")] = 15.0
-    settle_s: Annotated[NonNegative, Field(le=60.0, description="at speed before the first picture (assumed)")] = 1.5
-    pictures: Annotated[int, bounded_field(2, 1000, "pictures taken")] = 40
-    pictures_s: Annotated[Positive, Field(le=120.0, description="from the first to the last picture, s")] = 5.0
+    acceleration_m_s2: Annotated[Positive, Field(le=3.0, description="acceleration to that speed (assumed)")] = 1.0
+    hover_s: Annotated[NonNegative, Field(le=600.0, description="duration of the initial hover, s (assumed)")] = 15.0
+    settle_s: Annotated[NonNegative, Field(le=60.0, description="at speed before the first image (assumed)")] = 1.5
+    pictures: Annotated[int, bounded_field(2, 1000, "number of images")] = 40
+    pictures_s: Annotated[Positive, Field(le=120.0, description="from the first to the last image, s")] = 5.0
 
     @property
     def lead_s(self) -> float:
-        """Time from the flight's start to the first picture."""
+        """Time from the flight's start to the first image."""
         return self.hover_s + self.speed_m_s / self.acceleration_m_s2 + self.settle_s
 
 
 class LandingGuidance(Parameters):
-    """Guidance from the last picture to the ground (paper, V).
+    """Parameters of the guidance from the last image to the ground (paper, V).
 
-    The distances of 2 m and 1.5 m are the paper's, the wait is its run time; the rest is assumed. In the paper the
-    descent continues to reduce the distance from the site; below 1.5 m only the blades' pitch changes slowly. Here the
-    helicopter stops its drift below that height, and no longer steers to the site.
+    The distances of 2 m and 1.5 m are from the paper, and the wait is its run time; the other values are assumed. In
+    the paper the helicopter approaches the site during the descent, and below 1.5 m only the blades' pitch changes
+    slowly. Here the autopilot below that height controls the velocity to zero, no longer the position.
     """
 
-    wait_s: Annotated[NonNegative, Field(le=60.0, description="from the last picture to the answer, s")] = 1.8
+    wait_s: Annotated[NonNegative, Field(le=60.0, description="from the last image to the answer, s")] = 1.8
     approach_m_s: Annotated[Positive, Field(le=15.0, description="maximum commanded speed to the site")] = 2.0
     near_m: Annotated[Positive, Field(le=50.0, description="distance from the site at which the descent begins")] = 2.0
     descent_m_s: Annotated[Positive, Field(le=5.0, description="commanded speed of the descent, m/s")] = 0.7
@@ -135,7 +136,7 @@ class LandingGuidance(Parameters):
 
 @dataclass(frozen=True)
 class Vibration:
-    """Sines along the world's axes and in yaw, pitch and roll, added to positions (m) and angles (rad)."""
+    """Sines that are added to positions along the world's axes (m) and to yaw, pitch and roll (rad)."""
 
     rate_rad_s: float
     amplitudes: Float64[np.ndarray, "6"]
@@ -149,17 +150,17 @@ class Vibration:
         return cls(rate, amplitudes, 2.0 * np.pi * rng.random(6))
 
     def derivative(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 6"]:
-        """Displacement (order 0) or a derivative of it."""
+        """Compute the displacement (order 0) or its time derivative of an order."""
         phases = self.rate_rad_s * times_s[:, None] + self.phases_rad + 0.5 * np.pi * order
         return np.asarray(self.amplitudes * self.rate_rad_s**order * np.sin(phases))
 
 
 @dataclass(frozen=True)
 class FlownPath(Trajectory):
-    """Motion through states at equidistant times (rows: see `kernels`), exact between them, with vibration added.
+    """Simulated motion: states at equidistant times (rows: see `kernels`), interpolated exactly, plus vibration.
 
-    Position and angles are twice continuously differentiable. The body frame has its origin in camera, laser and
-    instruments, x forward, y to the left, z up along the rotor.
+    Position and angles are twice continuously differentiable. The body frame has its origin at camera, laser and
+    instruments, x forward, y to the left, z up along the rotor's axis.
     """
 
     start_s: float
@@ -179,7 +180,7 @@ class FlownPath(Trajectory):
         return np.asarray(self.start_s + self.step_s * np.arange(len(self.rows)))
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
-        """True states at many times. Raises ValueError outside of the span."""
+        """Compute the true states at many times. Raises ValueError for times outside the span."""
         check_times(times_s, self.span_s, 1e-6 * self.step_s)  # sums of steps have rounding errors
         interval = np.clip(((times_s - self.start_s) / self.step_s).astype(int), 0, len(self.rows) - 2)
         elapsed = (times_s - self.start_s - self.step_s * interval)[:, None]
@@ -187,13 +188,13 @@ class FlownPath(Trajectory):
         vibration = [self.vibration.derivative(times_s, order) for order in range(3)]
         attitudes, rates = attitudes_and_body_rates(angles + vibration[0][:, 3:], angle_rates + vibration[1][:, 3:])
         path = self._interpolate(interval, elapsed, kernels.POSITION)
-        derivatives = [smooth + added[:, :3] for smooth, added in zip(path, vibration, strict=True)]
+        derivatives = [smooth + sine[:, :3] for smooth, sine in zip(path, vibration, strict=True)]
         return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
     def _interpolate(
         self, interval: np.ndarray, t: Float64[np.ndarray, "n 1"], column: int
     ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-        """A vector and its first two derivatives, in consecutive columns; the second is linear between knots."""
+        """Interpolate a vector and its first two derivatives (consecutive columns); the second one is linear."""
         value, first, second = np.split(self.rows[interval, column : column + 9], 3, axis=1)
         third = (self.rows[interval + 1, column + 6 : column + 9] - second) / self.step_s
         return (
@@ -205,33 +206,33 @@ class FlownPath(Trajectory):
 
 @dataclass(frozen=True)
 class Air:
-    """Wind at the helicopter: its mean, and gusts at the knots of the simulation from the flight's start on."""
+    """Wind at the helicopter: mean wind, and gusts at the knots of the simulation from the flight's start on."""
 
     mean_m_s: Float64[np.ndarray, "3"]
     gusts_m_s: Float64[np.ndarray, "knots 3"]
 
     @classmethod
     def draw(cls, parameters: AirParameters, step_s: float, duration_s: float, rng: np.random.Generator) -> Air:
-        """Draw stationary gusts for a duration."""
+        """Draw stationary gusts for a flight of `duration_s`."""
         p = parameters
         correlation = np.exp(-step_s / p.correlation_s)
-        shocks = rng.standard_normal((int(np.ceil(duration_s / step_s)) + 2, 3))
-        shocks[1:] *= np.sqrt(1.0 - correlation**2)
+        white_noise = rng.standard_normal((int(np.ceil(duration_s / step_s)) + 2, 3))
+        white_noise[1:] *= np.sqrt(1.0 - correlation**2)
         deviations = np.array([p.gust_m_s, p.gust_m_s, p.vertical_gust_m_s])
-        gusts = deviations * scipy.signal.lfilter([1.0], [1.0, -correlation], shocks, axis=0)
+        gusts = deviations * scipy.signal.lfilter([1.0], [1.0, -correlation], white_noise, axis=0)
         return cls(np.array([p.east_m_s, p.north_m_s, 0.0]), gusts)
 
-    def check_lasts(self, knots: int) -> None:
-        """Raises ValueError where there are gusts for fewer knots than a flight may take."""
+    def check_duration(self, knots: int) -> None:
+        """Raise ValueError if there are gusts for fewer than `knots` knots."""
         if len(self.gusts_m_s) < knots:
-            raise ValueError(f"there are gusts for {len(self.gusts_m_s)} knots; the flight may take {knots}")
+            raise ValueError(f"there are gusts for {len(self.gusts_m_s)} knots; the flight can have {knots}")
 
 
 @dataclass(frozen=True)
 class GroundPatch:
     """Heights of the ground around a site on a grid, bilinear within it and constant beyond its edges.
 
-    - corner_m: east and north of the first height; row i lies at north + i * spacing, column j at east + j * spacing
+    - corner_m: east and north of the first height; row i is at north + i * spacing, column j at east + j * spacing
     """
 
     corner_m: Float64[np.ndarray, "2"]
@@ -239,20 +240,20 @@ class GroundPatch:
     heights_m: Float64[np.ndarray, "rows columns"]
 
     def height_m(self, position_m: Float64[np.ndarray, "2"]) -> float:
-        """Height at a position (east, north)."""
-        return float(kernels.ground_height(self.as_kernel(), float(position_m[0]), float(position_m[1])))
+        """Interpolate the height at a position (east, north)."""
+        return float(kernels.compute_ground_height(self.as_kernel(), float(position_m[0]), float(position_m[1])))
 
     def as_kernel(self) -> kernels.Ground:
-        """The same as a struct of the kernels."""
+        """Convert the patch to the type of the kernels."""
         east, north = self.corner_m.tolist()
         return kernels.Ground(east, north, self.spacing_m, self.heights_m)
 
 
 @dataclass(frozen=True)
 class LandingLaser:
-    """Laser altimeter of the landing.
+    """Errors of the laser altimeter during the landing.
 
-    - scale: readings over true ranges
+    - scale: reading / true range
     - noise_m: noise of the reading at each knot from the flight's start on
     - stuck_m: the constant reading of a failed altimeter
     """
@@ -263,7 +264,7 @@ class LandingLaser:
 
 
 class Phase(Enum):
-    """Phases of a flight; the values are those of the kernels."""
+    """Phases of a flight, with the numbers of the kernels as values."""
 
     TRANSIT = kernels.FOLLOW
     WAIT = kernels.WAIT
@@ -278,8 +279,8 @@ class RotorcraftFlight:
     """A simulated flight, and the autopilot's state, from which the simulation can be continued.
 
     - phases: value of `Phase` at each knot
-    - autopilot: thrust and trim at the last knot
-    - heading_rad: commanded yaw
+    - autopilot: thrust divided by mass, and trim (east, north, up) at the last knot, m/s2
+    - heading_rad: commanded yaw, counterclockwise from east
     """
 
     path: FlownPath
@@ -289,12 +290,12 @@ class RotorcraftFlight:
     craft: RotorcraftParameters
 
     def first(self, phase: Phase) -> float | None:
-        """Time at which a phase began; None if it did not occur."""
+        """Return the time at which a phase began; None if it did not occur."""
         knots = np.flatnonzero(self.phases == phase.value)
         return float(self.path.knots_s[knots[0]]) if knots.size else None
 
 
-def transit_flight(
+def simulate_transit(
     craft: RotorcraftParameters,
     transit: TransitParameters,
     over_m: Float64[np.ndarray, "3"],
@@ -304,27 +305,27 @@ def transit_flight(
     air: Air,
     rng: np.random.Generator,
 ) -> RotorcraftFlight:
-    """Simulate the flight until `TAIL_S` after the last picture.
+    """Simulate the flight at constant height until `TAIL_S` after the last image.
 
-    `over_m` is the commanded position at the first picture; course and heading are the directions of flight and nose,
-    counterclockwise from east. `rng` draws the vibration. Raises ValueError where the gusts end before the flight.
+    `over_m` is the commanded position at the first image; course and heading are the directions of flight and nose,
+    counterclockwise from east. `rng` draws the vibration. Raises ValueError if the gusts end before the flight.
     """
     p, step = transit, craft.step_s
     count = int(np.ceil((p.lead_s + p.pictures_s + TAIL_S) / step - 1e-9)) + 1
-    air.check_lasts(count)
+    air.check_duration(count)
     times = -p.lead_s + step * np.arange(count)
-    # commanded distance from the first picture's position, speed and acceleration along the course
+    # commanded distance from the position of the first image, speed and acceleration along the course
     ramp_s = p.speed_m_s / p.acceleration_m_s2
     since_start = times + p.settle_s + ramp_s
     elapsed_ramp = np.clip(since_start, 0.0, ramp_s)
     distance = 0.5 * p.acceleration_m_s2 * elapsed_ramp**2 + p.speed_m_s * (np.maximum(since_start, ramp_s) - ramp_s)
     distance -= 0.5 * p.speed_m_s * ramp_s + p.speed_m_s * p.settle_s
     acceleration = np.where((since_start > 0.0) & (since_start < ramp_s), p.acceleration_m_s2, 0.0)
-    along = np.array([np.cos(course_rad), np.sin(course_rad), 0.0])
+    course = np.array([np.cos(course_rad), np.sin(course_rad), 0.0])
     profile = (distance, p.acceleration_m_s2 * elapsed_ramp, acceleration)
-    reference = np.concatenate([np.multiply.outer(values, along) for values in profile], axis=1)
+    reference = np.concatenate([np.multiply.outer(values, course) for values in profile], axis=1)
     reference[:, :3] += over_m
-    # hover trimmed against the mean wind
+    # start: hover, with the trim that balances the mean wind
     constants = craft.craft(gravity_m_s2)
     trim = -air.mean_m_s / constants.drag_s
     east, north, _ = trim.tolist()
@@ -339,12 +340,12 @@ def transit_flight(
     rows[0, kernels.POSITION :][:3] = reference[0, :3]
     rows[0, kernels.ANGLE :][:3] = [heading_rad, pitch, roll]
     flight = kernels.Flight(rows, autopilot, heading_rad, air.mean_m_s, air.gusts_m_s, step)
-    kernels.follow(flight, reference, constants)
+    kernels.follow_path(flight, reference, constants)
     path = FlownPath(-p.lead_s, step, rows, Vibration.draw(craft.vibration, rng), gravity_m_s2)
     return RotorcraftFlight(path, np.full(count, Phase.TRANSIT.value), autopilot, heading_rad, craft)
 
 
-def landing_flight(
+def simulate_landing(
     flown: RotorcraftFlight,
     guidance: LandingGuidance,
     site_m: Float64[np.ndarray, "2"],
@@ -354,17 +355,17 @@ def landing_flight(
     laser: LandingLaser,
     end_s: float | None = None,
 ) -> RotorcraftFlight:
-    """Continue a flight to a site and down, until `end_s`, or else `rest_s` after the touchdown or at the time limit.
+    """Continue a flight to a site and land, until `end_s`, by default `rest_s` after touchdown or time limit.
 
-    `site_m` is the site's east and north in navigation's coordinates. `errors` are navigation's minus true position,
-    velocity and angles (yaw, pitch, roll) at the knots from the flight's start on; the last row remains afterwards.
-    Raises ValueError where the gusts or the laser's noise end before the longest possible flight.
+    `site_m` is the site's east and north in navigation's coordinates. `errors` are navigation's position, velocity and
+    angles (yaw, pitch, roll) minus the true ones at the knots from the flight's start on; the last row also applies to
+    all later knots. Raises ValueError if the gusts or the laser's noise end before the longest possible flight.
     """
     step, before = flown.craft.step_s, len(flown.path.rows)
     count = before + int(np.ceil((guidance.wait_s + guidance.max_duration_s) / step))
-    air.check_lasts(count)
+    air.check_duration(count)
     if len(laser.noise_m) < count:
-        raise ValueError(f"the laser's noise is known for {len(laser.noise_m)} knots; the flight may take {count}")
+        raise ValueError(f"there is laser noise for {len(laser.noise_m)} knots; the flight can have {count}")
     rows = np.concatenate([flown.path.rows, np.zeros((count - before, kernels.SIZE))])
     phases = np.concatenate([flown.phases, np.full(count - before, Phase.WAIT.value)])
     padded_errors = np.concatenate([errors, np.repeat(errors[-1:], max(count - len(errors), 0), axis=0)])

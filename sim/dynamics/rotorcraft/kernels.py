@@ -1,7 +1,7 @@
-"""Compiled flight dynamics of a small helicopter; `marsyard.sim.dynamics.rotorcraft` states the model.
+"""Compiled flight dynamics of a small helicopter; `marsyard.sim.dynamics.rotorcraft` describes the model.
 
-A row is the state at a knot: position, velocity and acceleration, then angles (yaw, pitch, roll), their rates and
-accelerations. Accelerations are linear between knots: this defines the motion exactly at every time.
+A row is the state at a knot, a time step of the simulation: position, velocity and acceleration, then angles (yaw,
+pitch, roll), their rates and accelerations. Accelerations are linear between knots, which defines the motion exactly.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: First columns of the vectors in a row.
+#: First column of each vector in a row, and the number of columns.
 POSITION, VELOCITY, ACCELERATION, ANGLE, RATE, ANGULAR_ACCELERATION, SIZE = 0, 3, 6, 9, 12, 15, 18
 #: State of the autopilot: thrust per mass, then the trim against steady wind (east, north, up).
 THRUST, TRIM, AUTOPILOT_SIZE = 0, 1, 4
@@ -24,7 +24,7 @@ FOLLOW, WAIT, APPROACH, DESCEND, FLARE, REST = range(6)
 
 
 class Craft(NamedTuple):
-    """The helicopter and its autopilot: see `RotorcraftParameters`, in SI units."""
+    """Constants of the helicopter and its autopilot: `RotorcraftParameters` in SI units."""
 
     gravity_m_s2: float
     drag_s: float
@@ -44,7 +44,7 @@ class Craft(NamedTuple):
 
 
 class Landing(NamedTuple):
-    """Commands of the landing: see `LandingGuidance`, in SI units."""
+    """Constants of the landing: `LandingGuidance`, the site in navigation's coordinates, and the laser's errors."""
 
     site_east_m: float
     site_north_m: float
@@ -60,7 +60,7 @@ class Landing(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """A simulated flight: rows and the autopilot's state, both updated, commanded yaw, wind, and gusts of each row."""
+    """A simulated flight: rows and autopilot's state (both updated), commanded yaw, mean wind, gusts of each row."""
 
     rows: Array
     autopilot: Array
@@ -71,7 +71,7 @@ class Flight(NamedTuple):
 
 
 class Ground(NamedTuple):
-    """Heights on a grid: bilinear within it, constant beyond. Row i lies at north_m + i * spacing_m."""
+    """Heights on a grid, bilinear within it, constant beyond its edges; row i is at north_m + i * spacing_m."""
 
     east_m: float
     north_m: float
@@ -80,8 +80,8 @@ class Ground(NamedTuple):
 
 
 @njit(cache=True)
-def ground_height(ground: Ground, east: float, north: float) -> float:
-    """Height of the ground at a position."""
+def compute_ground_height(ground: Ground, east: float, north: float) -> float:
+    """Interpolate the height of the ground at a position."""
     rows, columns = ground.heights.shape
     y = min(max((north - ground.north_m) / ground.spacing_m, 0.0), rows - 1.0)
     x = min(max((east - ground.east_m) / ground.spacing_m, 0.0), columns - 1.0)
@@ -89,14 +89,14 @@ def ground_height(ground: Ground, east: float, north: float) -> float:
     j = min(int(x), columns - 2)
     fy = y - i
     fx = x - j
-    low = (1.0 - fx) * ground.heights[i, j] + fx * ground.heights[i, j + 1]
-    high = (1.0 - fx) * ground.heights[i + 1, j] + fx * ground.heights[i + 1, j + 1]
-    return float((1.0 - fy) * low + fy * high)
+    south_edge = (1.0 - fx) * ground.heights[i, j] + fx * ground.heights[i, j + 1]
+    north_edge = (1.0 - fx) * ground.heights[i + 1, j] + fx * ground.heights[i + 1, j + 1]
+    return float((1.0 - fy) * south_edge + fy * north_edge)
 
 
 @njit(cache=True)
-def laser_range(ground: Ground, row: Array) -> float:
-    """Range along body -z to the ground by four fixed-point iterations, enough for a beam near the vertical."""
+def compute_laser_range(ground: Ground, row: Array) -> float:
+    """Compute the range along body -z to the ground by four fixed-point iterations; the beam is nearly vertical."""
     yaw, pitch, roll = row[ANGLE], row[ANGLE + 1], row[ANGLE + 2]
     cp, sp, cr, sr = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
     forward = cr * sp
@@ -106,33 +106,33 @@ def laser_range(ground: Ground, row: Array) -> float:
     north = -(math.sin(yaw) * forward + math.cos(yaw) * left)
     distance = 0.0
     for _ in range(4):
-        above = row[2] - ground_height(ground, row[0] + distance * east, row[1] + distance * north)
-        distance = above / down
+        height = row[2] - compute_ground_height(ground, row[0] + distance * east, row[1] + distance * north)
+        distance = height / down
     return distance
 
 
 @njit(cache=True)
-def _limit(east: float, north: float, limit: float) -> tuple[float, float]:
-    size = math.hypot(east, north)
-    return (east, north) if size <= limit else (limit * east / size, limit * north / size)
+def _limit_length(east: float, north: float, limit: float) -> tuple[float, float]:
+    length = math.hypot(east, north)
+    return (east, north) if length <= limit else (limit * east / length, limit * north / length)
 
 
 @njit(cache=True)
 def _command_acceleration(
     state: Array, autopilot: Array, goal: Array, speed: Array, acceleration: Array, step: float, c: Craft
 ) -> tuple[float, float, float]:
-    """Acceleration commanded by the autopilot (east, north, up); updates its trim."""
+    """Compute the acceleration that the autopilot commands (east, north, up), and update the autopilot's trim."""
     error = speed + c.position_gain * (goal - state[:VELOCITY]) - state[VELOCITY:ACCELERATION]
     autopilot[TRIM:] += c.trim_gain * error * step
     command = acceleration + c.speed_gain * error + autopilot[TRIM:]
     limit = c.gravity_m_s2 * math.tan(c.max_tilt_rad)
-    east, north = _limit(command[0], command[1], limit)
+    east, north = _limit_length(command[0], command[1], limit)
     return east, north, min(max(command[2], -0.4 * c.gravity_m_s2), 0.4 * c.gravity_m_s2)
 
 
 @njit(cache=True)
-def _advance(row: Array, after: Array, step: float) -> None:
-    """Positions and velocities at the next knot from accelerations at both knots."""
+def _integrate(row: Array, after: Array, step: float) -> None:
+    """Compute positions, angles and their rates at the next knot from the accelerations at both knots."""
     for value, rate, acceleration in ((POSITION, VELOCITY, ACCELERATION), (ANGLE, RATE, ANGULAR_ACCELERATION)):
         for i in range(3):
             first, second = row[acceleration + i], after[acceleration + i]
@@ -142,7 +142,7 @@ def _advance(row: Array, after: Array, step: float) -> None:
 
 @njit(cache=True)
 def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float, float, float], c: Craft) -> None:
-    """Compute the row after row k: angles from the commands, accelerations from thrust along body z, drag, gravity."""
+    """Compute the row after row k: angles from the commands; accelerations from thrust (body z), drag and gravity."""
     row, after, gust = flight.rows[k], flight.rows[k + 1], flight.gusts[k + 1]
     autopilot, step, g = flight.autopilot, flight.step, c.gravity_m_s2
     yaw_estimate = row[ANGLE] + tilt_error[0]
@@ -153,13 +153,13 @@ def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float
     autopilot[THRUST] += (thrust_command - autopilot[THRUST]) * min(step / c.thrust_lag_s, 1.0)
 
     cy, sy = math.cos(row[ANGLE]), math.sin(row[ANGLE])
-    along = cy * gust[0] + sy * gust[1]
-    across = cy * gust[1] - sy * gust[0]
+    gust_forward = cy * gust[0] + sy * gust[1]
+    gust_left = cy * gust[1] - sy * gust[0]
     # the autopilot controls the estimated angles; a gust tilts the rotor along its direction and turns the nose into it
     targets = (
-        flight.heading - tilt_error[0] - c.gust_yaw_s_m * across,
-        pitch_command - tilt_error[1] + c.gust_tilt_s_m * along,
-        roll_command - tilt_error[2] - c.gust_tilt_s_m * across,
+        flight.heading - tilt_error[0] - c.gust_yaw_s_m * gust_left,
+        pitch_command - tilt_error[1] + c.gust_tilt_s_m * gust_forward,
+        roll_command - tilt_error[2] - c.gust_tilt_s_m * gust_left,
     )
     for i in range(3):
         natural = c.heading_rad_s if i == 0 else c.attitude_rad_s
@@ -179,24 +179,24 @@ def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float
     after[ACCELERATION + 2] = thrust * math.cos(roll) * math.cos(pitch) - g
     velocity = row[VELOCITY:ACCELERATION] + step * row[ACCELERATION:ANGLE]
     after[ACCELERATION:ANGLE] += (flight.wind + gust - velocity) / c.drag_s
-    _advance(row, after, step)
+    _integrate(row, after, step)
 
 
 @njit(cache=True)
 def _step_on_ground(row: Array, after: Array, step: float, c: Craft) -> None:
-    """Compute the next row on the ground: the remaining motion and tilt decay."""
+    """Compute the next row on the ground: velocity and tilt decay to zero with the time constant `contact_s`."""
     for i in range(3):
         after[ACCELERATION + i] = -(row[VELOCITY + i] + step * row[ACCELERATION + i]) / c.contact_s
         natural = 0.5 / c.contact_s
         angle = 0.0 if i == 0 else row[ANGLE + i] + step * row[RATE + i]
         rate = row[RATE + i] + step * row[ANGULAR_ACCELERATION + i]
         after[ANGULAR_ACCELERATION + i] = -natural * natural * angle - 2.0 * natural * rate
-    _advance(row, after, step)
+    _integrate(row, after, step)
 
 
 @njit(cache=True)
-def follow(flight: Flight, path: Array, c: Craft) -> None:
-    """Simulate a flight along a path (position, velocity, acceleration), controlled by true states."""
+def follow_path(flight: Flight, path: Array, c: Craft) -> None:
+    """Simulate a flight along a path (position, velocity, acceleration of each knot), controlled by true states."""
     no_error = np.zeros(3)
     for k in range(flight.rows.shape[0] - 1):
         delayed = flight.rows[max(k - c.delay_steps, 0)]
@@ -217,9 +217,10 @@ def land(
     landing: Landing,
     c: Craft,
 ) -> None:
-    """Simulate a landing after row `start`, controlled by estimated states; updates rows and phases.
+    """Simulate a landing from row `start` on, controlled by estimated states; updates rows and phases.
 
-    Rows of `errors` are estimated minus true position, velocity and angles (yaw, pitch, roll).
+    - errors: estimated minus true position, velocity and angles (yaw, pitch, roll) of each knot
+    - laser_noise: noise of the laser's range of each knot, metres
     """
     rows = flight.rows
     goal = np.empty(3)
@@ -235,22 +236,22 @@ def land(
             continue
         if phase == WAIT and k >= landing.wait_until:
             phase = APPROACH
-        east_left, north_left = landing.site_east_m - estimate[0], landing.site_north_m - estimate[1]
-        if phase == APPROACH and math.hypot(east_left, north_left) < landing.near_m:
+        to_site_east, to_site_north = landing.site_east_m - estimate[0], landing.site_north_m - estimate[1]
+        if phase == APPROACH and math.hypot(to_site_east, to_site_north) < landing.near_m:
             phase = DESCEND
         if phase == DESCEND:
-            reading = landing.laser_scale * laser_range(ground, rows[delayed]) + laser_noise[delayed]
+            reading = landing.laser_scale * compute_laser_range(ground, rows[delayed]) + laser_noise[delayed]
             if not math.isnan(landing.laser_stuck_m):
                 reading = landing.laser_stuck_m
             if reading < landing.flare_range_m:
                 phase = FLARE
-        # while waiting and landing the goal is the current position; else the site, within the commanded speed
+        # goal: the current position in WAIT and FLARE, otherwise a point towards the site, limited by the speed
         goal[2] = landing.hover_m
         speed[2] = 0.0
         if phase in (WAIT, FLARE):
             goal[0], goal[1] = estimate[0], estimate[1]
         else:
-            east, north = _limit(east_left, north_left, landing.approach_m_s / c.position_gain)
+            east, north = _limit_length(to_site_east, to_site_north, landing.approach_m_s / c.position_gain)
             goal[0], goal[1] = estimate[0] + east, estimate[1] + north
         if phase >= DESCEND:
             speed[2] = -landing.descent_m_s if phase == DESCEND else -landing.flare_m_s
@@ -258,6 +259,6 @@ def land(
         command = _command_acceleration(estimate, flight.autopilot, goal, speed, zero, flight.step, c)
         _step_flight(flight, k, errors[k, ACCELERATION:], command, c)
         after = rows[k + 1]
-        if phase != WAIT and after[2] - c.gear_m <= ground_height(ground, after[0], after[1]):
+        if phase != WAIT and after[2] - c.gear_m <= compute_ground_height(ground, after[0], after[1]):
             phase = REST
         phases[k + 1] = phase

@@ -7,10 +7,11 @@ Fifteen errors are estimated (landing paper, section IV, and its reference [12])
 constant errors of compass and inclinometers) are *considered* (Schmidt 1966): they are part of the covariance, but not
 estimated. Without them the covariance would be too small, because averaging does not remove these errors.
 
-The filter uses the standard deviations of the instrument parameters, not the drawn errors. The receiver reports the
-standard deviation of its position. Each solution is propagated from its time to its delivery time by inertial
+The filter uses the standard deviations in the instruments' parameters, not the drawn errors. The receiver reports the
+standard deviation of its position. Each RTK solution is propagated from its time to its delivery time by inertial
 navigation. The assumed noise of inclinometers and compass grows with acceleration. Readings outside the gate and
-readings of stuck instruments are rejected. After a number of rejected solutions the filter restarts at the next one.
+readings of stuck instruments are rejected. After `max_rejected_fixes` rejected solutions the filter restarts at the
+next solution.
 """
 
 from __future__ import annotations
@@ -32,26 +33,22 @@ from marsyard.sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassR
 
 
 class FilterParameters(Parameters):
-    """Assumptions of the filter in addition to the parameters of its instruments."""
+    """Assumptions of the filter in addition to the parameters of its instruments; sd: standard deviation."""
 
-    initial_position_sd_m: Annotated[Positive, Field(description="deviation of position before the first fix, m")] = (
-        30.0
-    )
-    initial_velocity_sd_m_s: Annotated[Positive, Field(description="deviation of velocity before the first fix")] = 3.0
-    initial_tilt_sd_deg: Annotated[Positive, Field(description="deviation of pitch and roll before readings, deg")] = (
-        5.0
-    )
-    initial_heading_sd_deg: Annotated[Positive, Field(description="deviation of heading before readings, deg")] = 20.0
-    disturbance: Annotated[Positive, Field(description="tilt error per (acceleration / gravity)")] = 3.0
+    initial_position_sd_m: Annotated[Positive, Field(description="initial sd of the position, m")] = 30.0
+    initial_velocity_sd_m_s: Annotated[Positive, Field(description="initial sd of the velocity, m/s")] = 3.0
+    initial_tilt_sd_deg: Annotated[Positive, Field(description="initial sd of pitch and roll, deg")] = 5.0
+    initial_heading_sd_deg: Annotated[Positive, Field(description="initial sd of the heading, deg")] = 20.0
+    disturbance: Annotated[Positive, Field(description="tilt error / (acceleration / gravity), rad")] = 3.0
     unmodelled_acceleration_m_s2: Annotated[Positive, Field(description="assumed unmodelled acceleration, m/s2")] = 0.3
     gate: Annotated[Positive, Field(description="maximum normalised innovation of an accepted reading")] = 5.0
     max_rejected_fixes: Annotated[int, Field(ge=1, description="rejected consecutive fixes before a restart")] = 10
-    max_repeated_fixes: Annotated[int, Field(ge=2, description="equal consecutive readings if stuck")] = 8
+    max_repeated_fixes: Annotated[int, Field(ge=2, description="equal consecutive readings of a stuck sensor")] = 8
 
 
 @dataclass(frozen=True)
 class FilterState:
-    """State, covariance and memory of the filter between two runs (see `kernels`)."""
+    """State, covariance and memory of the filter between two runs; `kernels` defines their components."""
 
     state: Float64[np.ndarray, "16"]
     covariance: Float64[np.ndarray, "24 24"]
@@ -77,7 +74,7 @@ class Innovations:
 
 @dataclass(frozen=True)
 class NavigationSolution:
-    """Estimates at each sample boundary of the inertial unit; times are its time tags.
+    """Estimates at each sample boundary of the inertial unit; times are the unit's time tags.
 
     - positions_m, velocities_m_s: world axes
     - attitudes: rotations from body to world axes
@@ -100,7 +97,7 @@ class NavigationSolution:
     end: FilterState
 
     def pose(self, time_s: float) -> RigidTransform:
-        """Extrapolate the pose to a time tag from the previous boundary. Raises ValueError outside the boundaries."""
+        """Extrapolate the pose from the previous boundary to a time tag. Raises ValueError outside the boundaries."""
         tags = self.increments.times_s
         if not tags[0] <= time_s <= tags[-1]:
             raise ValueError(f"time {time_s:.4f} s is outside the solution times, {tags[0]:.4f} s to {tags[-1]:.4f} s")
@@ -114,7 +111,7 @@ class NavigationSolution:
 
 @dataclass(frozen=True)
 class NavigationFilter:
-    """Navigation filter for given instrument parameters and gravity."""
+    """Navigation filter for an inertial unit, a receiver and a compass with these parameters, and for a gravity."""
 
     parameters: FilterParameters
     imu: ImuParameters
@@ -173,11 +170,11 @@ class NavigationFilter:
             step=increments.period_s,
             angles=increments.delta_angles_rad,
             velocities=increments.delta_velocities_m_s,
-            gps=self._gps_rows(solutions),
-            tilts=self._tilt_rows(readings),
+            gps=self._convert_solutions(solutions),
+            tilts=self._convert_readings(readings),
             covariance_indices=indices,
         )
-        tuning = self._tuning(increments.period_s)
+        tuning = self._create_tuning(increments.period_s)
         states, covariances, deviations, log = kernels.run(inputs, start.state, covariance, memory, tuning)
         blocks = [kernels.VELOCITY, kernels.QUATERNION, kernels.STATE_GYRO_BIAS, kernels.STATE_ACCELEROMETER_BIAS]
         positions, velocities, quaternions, gyro_biases, accelerometer_biases = np.split(states, blocks, axis=1)
@@ -196,11 +193,11 @@ class NavigationFilter:
             end=FilterState(states[-1].copy(), covariance, memory),
         )
 
-    def _gps_rows(self, s: RtkSolutions) -> Float64[np.ndarray, "n 15"]:
+    def _convert_solutions(self, s: RtkSolutions) -> Float64[np.ndarray, "n 15"]:
         """Convert solutions to rows for the kernels; reported deviations are split as in the receiver's parameters."""
         fixed, floating = self.rtk.fixed, self.rtk.floating
         wanders, noises = (
-            np.where(s.fixed[:, None], _fraction(fixed, part), _fraction(floating, part)) * s.reported_m
+            np.where(s.fixed[:, None], _error_fraction(fixed, part), _error_fraction(floating, part)) * s.reported_m
             for part in ("wander_m", "noise_m")
         )
         delivery_times = s.times_s + self.rtk.latency_s
@@ -208,21 +205,21 @@ class NavigationFilter:
         rows[_is_stuck(s.positions_m, self.parameters.max_repeated_fixes), kernels.GPS_POSITION] = np.nan
         return rows
 
-    def _tilt_rows(self, r: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
+    def _convert_readings(self, r: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
         """Convert readings to rows for the kernels."""
         rows = np.column_stack([r.times_s, r.up_body, 0.5 * np.pi - r.headings_rad])
         for column, values in ((kernels.UP, r.up_body), (kernels.YAW, r.headings_rad[:, None])):
             rows[_is_stuck(values, self.parameters.max_repeated_fixes), column] = np.nan
         return rows
 
-    def _tuning(self, step_s: float) -> kernels.Tuning:
+    def _create_tuning(self, step_s: float) -> kernels.Tuning:
         i, r, c, p = self.imu, self.rtk, self.compass, self.parameters
         force_wander = i.accelerometer_wander_mg * MILLI_G
         return kernels.Tuning(
             gravity_m_s2=self.gravity_m_s2,
             attitude_density=i.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
             velocity_density=1e-3 * i.velocity_random_walk_ug_sqrt_hz * MILLI_G,
-            # a Gauss-Markov bias is a random walk of this density over times much shorter than its correlation time
+            # over times much shorter than its correlation time a Gauss-Markov bias is a random walk of this density
             gyro_bias_density=i.gyro_wander_deg_h * DEG_H * float(np.sqrt(2.0 / i.gyro_wander_s)),
             accelerometer_bias_density=force_wander * float(np.sqrt(2.0 / i.accelerometer_wander_s)),
             fixed_wander_decay=float(np.exp(-step_s / r.fixed.correlation_s)),
@@ -244,8 +241,8 @@ class NavigationFilter:
         )
 
 
-def _fraction(errors: SolutionErrors, part: str) -> Float64[np.ndarray, "3"]:
-    """Fraction of a solution's standard deviation that is wander or noise; 0 for solutions without errors."""
+def _error_fraction(errors: SolutionErrors, part: str) -> Float64[np.ndarray, "3"]:
+    """Compute the fraction of a solution's standard deviation that is wander or noise; 0 without errors."""
     return np.asarray(np.array(getattr(errors, part)) / np.maximum(errors.total_m, np.finfo(float).tiny))
 
 

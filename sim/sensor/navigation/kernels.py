@@ -1,9 +1,9 @@
 """Compiled error-state Kalman filter of `marsyard.sim.sensor.navigation`.
 
 A state has 16 values: position, velocity, quaternion (x, y, z, w; world from body), gyro bias, accelerometer bias.
-Errors are true minus estimated; the attitude error is a rotation vector in world axes. The covariance has 15 estimated
-errors and nine considered errors: the wander of the receiver's position (in units of its standard deviation) and
-velocity, the compass bias, and the biases of the two inclinometers.
+Errors are true minus estimated; the attitude error is a rotation vector in world axes. The covariance is that of 15
+estimated errors and nine considered errors: the wander of the receiver's position (in units of its standard deviation)
+and velocity, the compass bias, and the biases of the two inclinometers. "Fix" means a receiver's solution.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Blocks of the error vector.
+#: First index of each block of the error vector; number of estimated errors and of all errors.
 POSITION, VELOCITY, ATTITUDE_ERROR, GYRO_BIAS, ACCELEROMETER_BIAS = 0, 3, 6, 9, 12
 ESTIMATED = 15
 POSITION_WANDER, VELOCITY_WANDER, HEADING_BIAS, TILT_BIAS = 15, 18, 21, 22
 ERRORS = 24
-#: Blocks of the state, after position and velocity.
+#: First index of each block of the state after position and velocity; number of values.
 QUATERNION, STATE_GYRO_BIAS, STATE_ACCELEROMETER_BIAS, STATE = 6, 10, 13, 16
-#: Columns of a receiver row: time tag, delivery time, solution, deviations of wander and noise, whether fixed.
+#: First columns in a receiver row: time tag, delivery time, solution, deviations of wander and noise, whether fixed.
 TAG, DELIVERY, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED = 0, 1, 2, 5, 8, 11, 14
 #: Columns of a compass row after the time tag; yaw is counterclockwise from east.
 UP, YAW = 1, 4
@@ -33,11 +33,11 @@ POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
 #: Memory between runs: whether the last receiver solution was fixed (-1: no solution yet), filtered acceleration in
 #: world axes, and number of consecutive rejected solutions.
 LAST_FIX, FILTERED_ACCELERATION, REJECTED, MEMORY = 0, 1, 4, 5
-INNOVATION = 5  #: Number of columns: time, type, axis, normalised innovation, whether it was used.
+INNOVATION = 5  #: Number of columns of an innovation: time, type, axis, normalised innovation, whether it was used.
 
 
 class Tuning(NamedTuple):
-    """Parameters of the filter, SI units: see `FilterParameters`. A decay is the factor over one step."""
+    """Parameters of the filter in SI units, see `FilterParameters`; a decay is the factor of an error over one step."""
 
     gravity_m_s2: float
     attitude_density: float
@@ -63,9 +63,11 @@ class Tuning(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """Inputs of a run: boundaries and increments of the inertial samples, receiver rows and compass rows.
+    """Inputs of a run.
 
-    `covariance_indices`: boundaries with stored covariances, ascending.
+    - times, step, angles, velocities: boundaries, nominal period and increments of the inertial samples
+    - gps, tilts: receiver rows and compass rows
+    - covariance_indices: boundaries with stored covariances, ascending
     """
 
     times: Array
@@ -86,7 +88,7 @@ class Estimate(NamedTuple):
 
 @njit(cache=True)
 def write_rotation_matrix(q: Array, matrix: Array) -> None:
-    """Write the rotation matrix of a quaternion."""
+    """Write the rotation matrix of a quaternion into `matrix`."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
     matrix[1, 0], matrix[1, 1], matrix[1, 2] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
@@ -133,7 +135,10 @@ def propagate_state(state: Array, after: Array, angle: Array, velocity: Array, g
 
 @njit(cache=True)
 def apply_transition(m: Array, matrix: Array, force: Array, decay: float, velocity_decay: float, step: float) -> None:
-    """Multiply error vectors (the columns of `m`) by the transition matrix of a step, in place."""
+    """Multiply error vectors (the columns of `m`) by the transition matrix of a step, in place.
+
+    `matrix` rotates from body to world; `force` is minus the cross-product matrix of the velocity change.
+    """
     velocity, rotation = np.empty(3), np.empty(3)
     for j in range(ERRORS):
         for i in range(3):
@@ -205,7 +210,7 @@ def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, g
 
 @njit(cache=True)
 def _interpolate(times: Array, values: Array, last: int, time: float) -> Array:
-    """Interpolate linearly in the rows up to index `last`."""
+    """Interpolate the rows of `values` at a time; only rows up to index `last` are used."""
     k = last
     while k > 0 and times[k] > time:
         k -= 1
@@ -237,27 +242,27 @@ def _restart(estimate: Estimate, row: Array, t: Tuning) -> None:
 
 
 @njit(cache=True)
-def update_solution(row: Array, estimate: Estimate, since: Array, time: float, t: Tuning, log: Array) -> None:
-    """Update with a solution, propagated by the displacement and velocity change `since` its time; six innovations."""
+def update_fix(row: Array, estimate: Estimate, change: Array, time: float, t: Tuning, log: Array) -> None:
+    """Update with a solution and the displacement and velocity `change` since its time tag; write six innovations."""
     state, _ = estimate
     h = np.empty(ERRORS)
     for i in range(3):
         h[:] = 0.0
         h[POSITION + i], h[VELOCITY + i], h[POSITION_WANDER + i] = 1.0, row[TAG] - time, row[GPS_WANDER + i]
         log[i, 0], log[i, 1], log[i, 2] = time, POSITION_FIX, i
-        residual = row[GPS_POSITION + i] + since[i] - state[POSITION + i]
+        residual = row[GPS_POSITION + i] + change[i] - state[POSITION + i]
         update_scalar(estimate, h, residual, row[GPS_NOISE + i], t.gate, log[i])
     for i in range(3):
         h[:] = 0.0
         h[VELOCITY + i], h[VELOCITY_WANDER + i] = 1.0, 1.0
         log[3 + i, 0], log[3 + i, 1], log[3 + i, 2] = time, VELOCITY_FIX, i
-        residual = row[GPS_VELOCITY + i] + since[3 + i] - state[VELOCITY + i]
+        residual = row[GPS_VELOCITY + i] + change[3 + i] - state[VELOCITY + i]
         update_scalar(estimate, h, residual, t.velocity_noise_m_s[i], t.gate, log[3 + i])
 
 
 @njit(cache=True)
 def update_tilt(row: Array, estimate: Estimate, disturbance_rad: float, time: float, t: Tuning, log: Array) -> None:
-    """Update with the inclinometers' x and y components of up; two innovations."""
+    """Update with the x and y components of the inclinometers' up direction; write two innovations."""
     h, matrix = np.empty(ERRORS), np.empty((3, 3))
     for i in range(2):
         write_rotation_matrix(estimate.state[QUATERNION:], matrix)
@@ -270,7 +275,7 @@ def update_tilt(row: Array, estimate: Estimate, disturbance_rad: float, time: fl
 
 @njit(cache=True)
 def update_heading(row: Array, estimate: Estimate, disturbance_rad: float, time: float, t: Tuning, log: Array) -> None:
-    """Update with the compass; one innovation."""
+    """Update with the compass; write one innovation."""
     h, matrix = np.zeros(ERRORS), np.empty((3, 3))
     write_rotation_matrix(estimate.state[QUATERNION:], matrix)
     horizontal = matrix[0, 0] ** 2 + matrix[1, 0] ** 2
@@ -301,7 +306,7 @@ def _propagate(inputs: Inputs, k: int, states: Array, p: Array, memory: Array, t
 def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tuple[Array, Array, Array, Array]:
     """Run the filter; return states, stored covariances, deviations at all boundaries, and innovations.
 
-    `memory` and `p` are updated in place. Readings tagged before the first boundary are ignored.
+    `memory` and the covariance `p` are updated in place. Readings with tags before the first boundary are ignored.
     """
     times, gps, tilts, indices = inputs.times, inputs.gps, inputs.tilts, inputs.covariance_indices
     states = np.empty((times.size, STATE))
@@ -309,7 +314,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
     inertial = np.zeros((times.size, 6))
     deviations, covariances = np.empty((times.size, ESTIMATED)), np.empty((indices.size, ESTIMATED, ESTIMATED))
     log = np.empty((6 * gps.shape[0] + 3 * tilts.shape[0], INNOVATION))
-    logged = fix = tilt = stored = 0
+    log_count = next_fix = next_tilt = covariance_count = 0
     states[0] = start
     for k in range(times.size):
         state = states[k]
@@ -319,39 +324,39 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
             change = state[VELOCITY : VELOCITY + 3] - states[k - 1, VELOCITY : VELOCITY + 3]
             inertial[k, :3] = inertial[k - 1, :3] + (inertial[k - 1, 3:] + 0.5 * change) * inputs.step
             inertial[k, 3:] = inertial[k - 1, 3:] + change
-        while fix < gps.shape[0] and gps[fix, DELIVERY] <= times[k]:
-            row = gps[fix]
-            fix += 1
+        while next_fix < gps.shape[0] and gps[next_fix, DELIVERY] <= times[k]:
+            row = gps[next_fix]
+            next_fix += 1
             if math.isnan(row[GPS_POSITION]) or row[TAG] < times[0]:
                 continue
             if memory[LAST_FIX] != row[FIXED]:
                 _reset_errors(p, POSITION_WANDER, 1.0, 0.0)
                 memory[LAST_FIX] = row[FIXED]
             # displacement since the time of the solution, from the current velocity estimate
-            since = inertial[k] - _interpolate(times, inertial, k, row[TAG])
-            since[:3] += (state[VELOCITY : VELOCITY + 3] - inertial[k, 3:]) * (times[k] - row[TAG])
+            fix_change = inertial[k] - _interpolate(times, inertial, k, row[TAG])
+            fix_change[:3] += (state[VELOCITY : VELOCITY + 3] - inertial[k, 3:]) * (times[k] - row[TAG])
             if memory[REJECTED] >= t.max_rejected_fixes:
                 _restart(estimate, row, t)
-            update_solution(row, estimate, since, times[k], t, log[logged : logged + 6])
-            memory[REJECTED] = 0.0 if log[logged : logged + 6, 4].all() else memory[REJECTED] + 1.0
-            logged += 6
+            update_fix(row, estimate, fix_change, times[k], t, log[log_count : log_count + 6])
+            memory[REJECTED] = 0.0 if log[log_count : log_count + 6, 4].all() else memory[REJECTED] + 1.0
+            log_count += 6
         east, north = memory[FILTERED_ACCELERATION], memory[FILTERED_ACCELERATION + 1]
         acceleration = math.sqrt(east**2 + north**2 + t.unmodelled_acceleration_m_s2**2)
         disturbance_rad = t.disturbance * acceleration / t.gravity_m_s2
-        while tilt < tilts.shape[0] and tilts[tilt, TAG] <= times[k]:
-            row = tilts[tilt]
-            tilt += 1
+        while next_tilt < tilts.shape[0] and tilts[next_tilt, TAG] <= times[k]:
+            row = tilts[next_tilt]
+            next_tilt += 1
             if row[TAG] < times[0]:
                 continue
             if not math.isnan(row[UP]):
-                update_tilt(row, estimate, disturbance_rad, times[k], t, log[logged : logged + 2])
-                logged += 2
+                update_tilt(row, estimate, disturbance_rad, times[k], t, log[log_count : log_count + 2])
+                log_count += 2
             if not math.isnan(row[YAW]):
-                update_heading(row, estimate, disturbance_rad, times[k], t, log[logged : logged + 1])
-                logged += 1
+                update_heading(row, estimate, disturbance_rad, times[k], t, log[log_count : log_count + 1])
+                log_count += 1
         for i in range(ESTIMATED):
             deviations[k, i] = math.sqrt(p[i, i])
-        while stored < indices.size and indices[stored] == k:
-            covariances[stored] = p[:ESTIMATED, :ESTIMATED]
-            stored += 1
-    return states, covariances, deviations, log[:logged]
+        while covariance_count < indices.size and indices[covariance_count] == k:
+            covariances[covariance_count] = p[:ESTIMATED, :ESTIMATED]
+            covariance_count += 1
+    return states, covariances, deviations, log[:log_count]

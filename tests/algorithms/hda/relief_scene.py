@@ -1,6 +1,5 @@
-"""Textured relief seen through CAHVOR cameras: the ray of each pixel is intersected with the ground. The formula of
-the relief gives the ground; no epipolar geometry is used.
-"""
+"""Synthetic landing images for hazard-detection tests: textured relief seen by a CAHVOR camera at two poses. The ray
+of each pixel is intersected with an analytic height function; no epipolar geometry is used."""
 
 from __future__ import annotations
 
@@ -18,14 +17,15 @@ from marsyard.sim.measurements import DetectorCalibration, DetectorImage, Landin
 
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
-#: The XC-55's angle of view (6 mm, 640 x 480 pixels of 7.4 um) with barrel distortion of several pixels in the corners.
 TEXEL_M = 0.01
 TEXELS = 2048
 
 
 @cache
-def camera(columns: int = 320) -> Cahvor:
-    """Camera 0.3 m in front of the origin of the body that looks straight down; image right is body right (-y)."""
+def make_camera(columns: int = 320) -> Cahvor:
+    """Camera 0.3 m in front of the body origin that looks straight down; image right is body right (-y). Field of view
+    of the XC-55 (6 mm, 640 x 480 pixels of 7.4 um), with barrel distortion of several pixels in the corners.
+    """
     size = (columns, columns * 3 // 4)
     linear = Cahv.from_focal_length(
         0.006, 7.4e-6 * 640 / columns, size, axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0), centre=(0.3, 0.0, -0.1)
@@ -34,8 +34,8 @@ def camera(columns: int = 320) -> Cahvor:
 
 
 @cache
-def texture() -> np.ndarray:
-    """Spline coefficients of a periodic texture of mean 1: detail from 3 cm (below a pixel's 2.5 cm pair) to metres."""
+def make_texture() -> np.ndarray:
+    """Spline coefficients of a periodic texture of mean 1: details of 3 cm to metres; a pixel is 2.5 cm."""
     rng = np.random.default_rng(7)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(TEXELS), fft.rfftfreq(TEXELS), indexing="ij"))
     frequency[0, 0] = np.inf
@@ -46,41 +46,44 @@ def texture() -> np.ndarray:
 
 def brightness(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     positions = np.stack([y.ravel(), x.ravel()]) / TEXEL_M
-    return ndimage.map_coordinates(texture(), positions, order=3, mode="grid-wrap", prefilter=False).reshape(x.shape)
+    return ndimage.map_coordinates(make_texture(), positions, order=3, mode="grid-wrap", prefilter=False).reshape(
+        x.shape
+    )
 
 
-def plane(slope_x: float = 0.0, slope_y: float = 0.0) -> Height:
+def make_plane(slope_x: float = 0.0, slope_y: float = 0.0) -> Height:
     return lambda x, y: slope_x * x + slope_y * y
 
 
-def make_bumps(*each: tuple[float, float, float, float], base: Height | None = None) -> Height:
-    """Smooth bumps (x, y, height, radius) on a base: Gaussians of this standard deviation."""
-    under = plane() if base is None else base
+def make_bumps(*bumps: tuple[float, float, float, float], base: Height | None = None) -> Height:
+    """Height function of Gaussian bumps (x, y, height, standard deviation) on a base, metres."""
+    base_height = make_plane() if base is None else base
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        z = under(x, y)
-        for cx, cy, top, radius in each:
+        z = base_height(x, y)
+        for cx, cy, top, radius in bumps:
             z = z + top * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2.0 * radius**2))
         return z
 
     return height
 
 
-def ground_along(height: Height, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Intersections of rays with the relief, by marching to within one step and bisection; shape of the rays."""
-    far = (origin[2] + 2.0) / -rays[..., 2]
-    near = np.maximum((origin[2] - 3.0) / -rays[..., 2], 0.0)
+def intersect_relief(height: Height, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Intersect rays with the relief: march to the first step below ground, then refine; shape of the rays."""
+    # The relief is between the heights -2 m and 3 m.
+    last = (origin[2] + 2.0) / -rays[..., 2]
+    first = np.maximum((origin[2] - 3.0) / -rays[..., 2], 0.0)
     steps = 24
-    low, high = near.copy(), far.copy()
-    result = np.zeros(near.shape, dtype=bool)
+    low, high = first.copy(), last.copy()
+    has_hit = np.zeros(first.shape, dtype=bool)
     for n in range(1, steps + 1):
-        s = near + (far - near) * n / steps
+        s = first + (last - first) * n / steps
         p = origin + s[..., None] * rays
-        under = ~result & (p[..., 2] <= height(p[..., 0], p[..., 1]))
-        low = np.where(under, s - (far - near) / steps, low)
-        high = np.where(under, s, high)
-        result |= under
-    # Regula falsi converges fast on smooth relief; bisection guards it.
+        is_below = ~has_hit & (p[..., 2] <= height(p[..., 0], p[..., 1]))
+        low = np.where(is_below, s - (last - first) / steps, low)
+        high = np.where(is_below, s, high)
+        has_hit |= is_below
+    # Regula falsi converges fast on smooth relief; every third step is a bisection.
     for n in range(30):
         a = origin + low[..., None] * rays
         b = origin + high[..., None] * rays
@@ -91,8 +94,8 @@ def ground_along(height: Height, origin: np.ndarray, rays: np.ndarray) -> np.nda
         else:
             s = low + (high - low) * np.clip(fa / (fa - fb), 0.0, 1.0)
         p = origin + s[..., None] * rays
-        above = p[..., 2] > height(p[..., 0], p[..., 1])
-        low, high = np.where(above, s, low), np.where(above, high, s)
+        is_above = p[..., 2] > height(p[..., 0], p[..., 1])
+        low, high = np.where(is_above, s, low), np.where(is_above, high, s)
         if n > 6 and float(np.max(np.abs(p[..., 2] - height(p[..., 0], p[..., 1])))) < 1e-7:
             break
     return np.asarray(origin + s[..., None] * rays)
@@ -106,60 +109,60 @@ class Pass:
     poses: tuple[RigidTransform, RigidTransform]
     columns: int = 320
 
-    def camera(self, which: int) -> Cahvor:
+    def camera(self, index: int) -> Cahvor:
         """The camera in the world."""
-        return camera(self.columns).transform(self.poses[which])
+        return make_camera(self.columns).transform(self.poses[index])
 
-    def ground(self, which: int, pixels: np.ndarray) -> np.ndarray:
-        """Points of the relief at pixels."""
-        one = self.camera(which)
-        _, rays = one.rays(pixels)
-        return ground_along(self.height, np.array(one.c), rays)
+    def ground(self, index: int, pixels: np.ndarray) -> np.ndarray:
+        """Points of the relief, in the world, at these pixels of an image."""
+        model = self.camera(index)
+        _, rays = model.rays(pixels)
+        return intersect_relief(self.height, np.array(model.c), rays)
 
     @property
     def slant_range_m(self) -> float:
         """Distance to the ground from the first camera along its optical axis."""
-        one = self.camera(0)
-        point = ground_along(self.height, np.array(one.c), np.array(one.a)[None])[0]
-        return float(np.linalg.norm(point - one.c))
+        model = self.camera(0)
+        point = intersect_relief(self.height, np.array(model.c), np.array(model.a)[None])[0]
+        return float(np.linalg.norm(point - model.c))
 
     @property
     def second_from_first(self) -> RigidTransform:
         """True motion between the camera frames (z along A, x along columns)."""
-        first, second = (rigid(_axes(self.camera(i)), np.array(self.camera(i).c)) for i in (0, 1))
+        first, second = (rigid(_camera_rotation(self.camera(i)), np.array(self.camera(i).c)) for i in (0, 1))
         return second.inv() * first
 
 
-def _axes(one: Cahvor) -> Rotation:
-    return Rotation.from_matrix(np.column_stack([one.right, np.cross(one.a, one.right), one.a]))
+def _camera_rotation(model: Cahvor) -> Rotation:
+    return Rotation.from_matrix(np.column_stack([model.right, np.cross(model.a, model.right), model.a]))
 
 
-def pose(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> RigidTransform:
+def make_pose(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> RigidTransform:
     """Pose of a body, angles in degrees."""
     return rigid(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True), np.array([x, y, z]))
 
 
 def render_image(
-    flown: Pass, which: int, noise: np.random.Generator | None = None, paint: Callable[..., np.ndarray] = brightness
+    scene: Pass, index: int, noise: np.random.Generator | None = None, albedo: Callable[..., np.ndarray] = brightness
 ) -> DetectorImage:
-    """A 12-bit picture, 1500 counts for brightness 1; noise of 8 counts."""
-    points = flown.ground(which, camera(flown.columns).pixel_grid())
-    counts = 1500.0 * paint(points[..., 0], points[..., 1])
+    """A 12-bit image, 1500 counts for brightness 1, with optional noise of 8 counts (1 sigma)."""
+    points = scene.ground(index, make_camera(scene.columns).pixel_grid())
+    counts = 1500.0 * albedo(points[..., 0], points[..., 1])
     if noise is not None:
         counts = counts + noise.normal(0.0, 8.0, counts.shape)
-    known = DetectorCalibration(np.ones(counts.shape), 0.001, 0.0, 0.0, 1, 0.0, 4095)
-    delivered = np.clip(np.rint(counts), 0, 4095).astype(np.uint16)
-    return DetectorImage(delivered, float(which), camera(flown.columns), known)
+    calibration = DetectorCalibration(np.ones(counts.shape), 0.001, 0.0, 0.0, 1, 0.0, 4095)
+    rounded = np.clip(np.rint(counts), 0, 4095).astype(np.uint16)
+    return DetectorImage(rounded, float(index), make_camera(scene.columns), calibration)
 
 
-def measure_pass(flown: Pass, noise: np.random.Generator | None = None) -> LandingMeasurements:
+def measure_pass(scene: Pass, noise: np.random.Generator | None = None) -> LandingMeasurements:
     """Exact measurements of a pass; the a-priori site is the ground below the first pose."""
-    below = np.array(flown.poses[0].translation)
-    below[2] = float(flown.height(below[0], below[1]))
+    site = np.array(scene.poses[0].translation)
+    site[2] = float(scene.height(site[0], site[1]))
     return LandingMeasurements(
-        images=(render_image(flown, 0, noise), render_image(flown, 1, noise)),
-        poses=(PoseMeasurement(flown.poses[0], 0.0), PoseMeasurement(flown.poses[1], 1.0)),
-        slant_range_m=flown.slant_range_m,
-        up_body=flown.poses[0].rotation.inv().apply([0.0, 0.0, 1.0]),
-        apriori_site_world=below,
+        images=(render_image(scene, 0, noise), render_image(scene, 1, noise)),
+        poses=(PoseMeasurement(scene.poses[0], 0.0), PoseMeasurement(scene.poses[1], 1.0)),
+        slant_range_m=scene.slant_range_m,
+        up_body=scene.poses[0].rotation.inv().apply([0.0, 0.0, 1.0]),
+        apriori_site_world=site,
     )

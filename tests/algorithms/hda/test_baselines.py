@@ -21,14 +21,14 @@ from marsyard.algorithms.hda.tracking import select_features, track_features
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
-from tests.algorithms.hda.relief_scene import Pass, make_bumps, measure_pass, plane, pose
+from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_plane, make_pose, measure_pass
 
 OPTIONS = HdaOptions(block_px=32, grid_px=8)
 
 
 def make_scene(second: tuple[float, ...] = (0.25, -0.65, 10.1, 23.0, 1.0, -1.5)) -> Pass:
-    relief = make_bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=plane(0.05, 0.02))
-    return Pass(relief, (pose(0.0, 0.0, 10.0, 20.0), pose(*second)))
+    relief = make_bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=make_plane(0.05, 0.02))
+    return Pass(relief, (make_pose(0.0, 0.0, 10.0, 20.0), make_pose(*second)))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def landing_scene(measurements: LandingMeasurements) -> LandingScene:
     return build_scene(measurements)
 
 
-def test_rectified_pictures_share_rows_and_disparity_is_inverse_depth(landing_scene: LandingScene) -> None:
+def test_rectified_points_have_equal_rows_and_inverse_depth_disparity(landing_scene: LandingScene) -> None:
     true_motion = make_scene().second_from_first
     pair = rectify_views(landing_scene.views, true_motion)
     assert pair is not None
@@ -61,38 +61,38 @@ def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene) -> No
     features = select_features(landing_scene.views[0].counts, OPTIONS)
     tracks = track_features(landing_scene.views[0].counts, landing_scene.views[1].counts, features, features, OPTIONS)
     motion = motion_from_tracks(landing_scene, tracks, OPTIONS)
-    true = make_scene()
+    scene = make_scene()
     motion = motion.scale(
-        float(np.linalg.norm(true.second_from_first.translation))
+        float(np.linalg.norm(scene.second_from_first.translation))
         / float(np.linalg.norm(motion.second_from_first.translation))
     )
     matches = semi_global_structure(landing_scene, motion, OPTIONS)
-    one = true.camera(0)
-    depths = (true.ground(0, matches.first) - one.c) @ one.a
+    first_camera = scene.camera(0)
+    depths = (scene.ground(0, matches.first) - first_camera.c) @ first_camera.a
     assert matches.accepted.mean() > 0.9
     # The disparity is 33 px at 10 m: a third of a pixel is 0.1 m. Grid pixels use the disparity of the nearest
     # rectified pixel.
     assert np.sqrt(np.mean((matches.depths - depths)[matches.accepted] ** 2)) < 0.1
 
 
-def test_essential_matrix_motion_matches_least_squares(landing_scene: LandingScene) -> None:
+def test_essential_matrix_motion_matches_exact_scene(landing_scene: LandingScene) -> None:
     features = select_features(landing_scene.views[0].counts, OPTIONS)
     tracks = track_features(landing_scene.views[0].counts, landing_scene.views[1].counts, features, features, OPTIONS)
     result = essential_motion(landing_scene, tracks, OPTIONS)
     assert result is not None
-    true = make_scene().second_from_first
-    assert np.rad2deg((result.second_from_first.rotation * true.rotation.inv()).magnitude()) < 0.2
-    actual, expected = (t / np.linalg.norm(t) for t in (result.second_from_first.translation, true.translation))
+    true_motion = make_scene().second_from_first
+    assert np.rad2deg((result.second_from_first.rotation * true_motion.rotation.inv()).magnitude()) < 0.2
+    actual, expected = (t / np.linalg.norm(t) for t in (result.second_from_first.translation, true_motion.translation))
     assert actual @ expected > np.cos(np.deg2rad(2.0))
 
 
 def test_motion_along_optical_axis_cannot_be_rectified(landing_scene: LandingScene) -> None:
-    ahead = rigid(Rotation.identity(), np.array([0.0, 0.0, -1.0]))
-    assert rectify_views(landing_scene.views, ahead) is None
+    axial_motion = rigid(Rotation.identity(), np.array([0.0, 0.0, -1.0]))
+    assert rectify_views(landing_scene.views, axial_motion) is None
 
 
 def test_vertical_descent_has_no_semi_global_structure() -> None:
-    inputs = measure_pass(make_scene((0.0, 0.0, 8.6, 20.0)))
-    result = SemiGlobalEstimator(OPTIONS).estimate(inputs)
+    measurements = measure_pass(make_scene((0.0, 0.0, 8.6, 20.0)))
+    result = SemiGlobalEstimator(OPTIONS).estimate(measurements)
     assert result.outcome in (SiteOutcome.NO_STRUCTURE, SiteOutcome.NO_MOTION)
-    np.testing.assert_array_equal(result.site_world, inputs.apriori_site_world)
+    np.testing.assert_array_equal(result.site_world, measurements.apriori_site_world)

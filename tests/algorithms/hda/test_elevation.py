@@ -1,4 +1,4 @@
-"""Tests of elevation maps from known points, and of the surface frame."""
+"""Tests of elevation maps built from points with known heights, and of the rotation to the surface frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from marsyard.algorithms.hda import ElevationMap, HdaOptions, SurfaceFrame
 from marsyard.algorithms.hda.estimator import plane_normal, surface_from_camera, up_direction, world_from_surface
 from marsyard.algorithms.hda.hazards import elevation_map
 from marsyard.algorithms.hda.motion import View, camera_pose
-from tests.algorithms.hda.relief_scene import camera, pose
+from tests.algorithms.hda.relief_scene import make_camera, make_pose
 
 
 def draw_points(count: int, rng: np.random.Generator, slopes: tuple[float, float] = (0.2, -0.1)) -> np.ndarray:
@@ -18,7 +18,7 @@ def draw_points(count: int, rng: np.random.Generator, slopes: tuple[float, float
     return np.column_stack([x, y, -10.0 + slopes[0] * x + slopes[1] * y])
 
 
-def test_cell_size_gives_one_point_per_cell() -> None:
+def test_map_has_one_point_per_cell_on_average() -> None:
     points = draw_points(600, np.random.default_rng(1))
     ground = elevation_map(points)
     assert ground is not None
@@ -28,7 +28,7 @@ def test_cell_size_gives_one_point_per_cell() -> None:
     assert ground.elevation_m.shape == tuple(int(np.ceil(e / ground.cell_m)) for e in extent[::-1])
 
 
-def test_cell_positions_invert_to_indices() -> None:
+def test_cell_positions_and_indices_are_inverse() -> None:
     ground = ElevationMap(np.zeros((4, 6)), np.array([-1.0, 2.0]), 0.5)
     # Rows run along -y, columns along x.
     np.testing.assert_allclose(
@@ -49,9 +49,9 @@ def test_points_are_distributed_by_bilinear_weights() -> None:
     for point in points:
         for row, column in np.ndindex(weights.shape):
             x, y = ground.positions(np.array([row, column], dtype=np.float64))
-            near = max(0.0, 1.0 - abs(point[0] - x) / cell) * max(0.0, 1.0 - abs(point[1] - y) / cell)
-            weights[row, column] += near
-            sums[row, column] += near * point[2]
+            weight = max(0.0, 1.0 - abs(point[0] - x) / cell) * max(0.0, 1.0 - abs(point[1] - y) / cell)
+            weights[row, column] += weight
+            sums[row, column] += weight * point[2]
     expected = np.where(weights >= 0.1, sums / np.where(weights > 0.0, weights, 1.0), np.nan)
     np.testing.assert_allclose(ground.elevation_m, expected)
 
@@ -63,7 +63,7 @@ def test_plane_is_reconstructed_from_even_points() -> None:
     assert ground is not None
     positions = ground.positions(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
     plane = 0.2 * positions[..., 0] - 0.1 * positions[..., 1] - 9.0
-    # Points lie up to half a cell from the cell centre: the error is at most the rise over half a cell.
+    # Points are up to half a cell from the cell centre: the error is at most the rise within half a cell.
     assert np.nanmax(np.abs(ground.elevation_m - plane)) < 0.5 * 0.3 * ground.cell_m
     assert not np.any(np.isnan(ground.elevation_m))
 
@@ -85,10 +85,12 @@ def test_collinear_points_are_rejected() -> None:
 
 
 def make_view(yaw: float, pitch: float, roll: float) -> View:
-    body_from_camera = camera_pose(camera())
+    body_from_camera = camera_pose(make_camera())
     counts = np.zeros((240, 320), dtype=np.uint16)
     return View(
-        counts, camera().transform(body_from_camera.inv()), pose(3.0, 4.0, 10.0, yaw, pitch, roll) * body_from_camera
+        counts,
+        make_camera().transform(body_from_camera.inv()),
+        make_pose(3.0, 4.0, 10.0, yaw, pitch, roll) * body_from_camera,
     )
 
 
@@ -108,18 +110,18 @@ def test_surface_frame_is_level_and_differs_from_world_by_yaw(attitude: tuple[fl
 
 def test_gravity_source_follows_the_options() -> None:
     first = make_view(30.0, 5.0, -5.0)
-    state = first.world_from_camera.rotation.inv().apply(np.array([0.0, 0.0, 1.0]))
-    leaning = Rotation.from_rotvec([0.02, 0.0, 0.0]).apply(state)
+    state_up = first.world_from_camera.rotation.inv().apply(np.array([0.0, 0.0, 1.0]))
+    tilted_up = Rotation.from_rotvec([0.02, 0.0, 0.0]).apply(state_up)
     rng = np.random.default_rng(4)
     flat = draw_points(500, rng, (0.0, 0.0)) + np.array([0.0, 0.0, 1.0]) * rng.normal(0.0, 0.01, (500, 1))
     flat[:150, 2] += rng.uniform(0.5, 2.0, 150)
-    points = surface_from_camera(state).inv().apply(flat)
-    result = {frame: up_direction(first, leaning, points, HdaOptions(surface_frame=frame)) for frame in SurfaceFrame}
-    np.testing.assert_allclose(result[SurfaceFrame.INCLINOMETER], leaning)
-    np.testing.assert_allclose(result[SurfaceFrame.STATE], state)
+    points = surface_from_camera(state_up).inv().apply(flat)
+    result = {frame: up_direction(first, tilted_up, points, HdaOptions(surface_frame=frame)) for frame in SurfaceFrame}
+    np.testing.assert_allclose(result[SurfaceFrame.INCLINOMETER], tilted_up)
+    np.testing.assert_allclose(result[SurfaceFrame.STATE], state_up)
     # The fit error is 0.01 / (sqrt(350) 2.3 m) = 2e-4 rad: 350 points with 1 cm of noise over 8 m. One third are
     # outliers.
-    assert np.arccos(min(float(result[SurfaceFrame.PLANE] @ state), 1.0)) < 2e-3
+    assert np.arccos(min(float(result[SurfaceFrame.PLANE] @ state_up), 1.0)) < 2e-3
 
 
 def test_robust_normal_points_to_the_camera() -> None:

@@ -26,14 +26,14 @@ CELL_M = 0.1
 OPTIONS = HdaOptions(lander_diameter_m=1.0, max_roughness_m=0.2, max_slope_rad=float(np.deg2rad(15.0)))
 
 
-def make_ground(rows: int = 80, columns: int = 100, by_x: float = 0.0, by_y: float = 0.0) -> ElevationMap:
+def make_ground(rows: int = 80, columns: int = 100, slope_x: float = 0.0, slope_y: float = 0.0) -> ElevationMap:
     empty = ElevationMap(np.zeros((rows, columns)), np.array([-2.0, 5.0]), CELL_M)
     x, y = np.moveaxis(empty.positions(np.moveaxis(np.indices((rows, columns)).astype(np.float64), 0, -1)), -1, 0)
-    return replace(empty, elevation_m=by_x * x + by_y * y)
+    return replace(empty, elevation_m=slope_x * x + slope_y * y)
 
 
 def add_bump(flat: ElevationMap, row: int, column: int, radius: float, height: float) -> ElevationMap:
-    """Add a cylinder with this height and a radius in cells."""
+    """Add a cylinder; its radius is in cells, its height in metres."""
     rows, columns = np.indices(flat.elevation_m.shape)
     inside = np.hypot(rows - row, columns - column) <= radius
     return replace(flat, elevation_m=flat.elevation_m + height * inside)
@@ -42,16 +42,16 @@ def add_bump(flat: ElevationMap, row: int, column: int, radius: float, height: f
 @pytest.mark.parametrize("refine", [False, True])
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.2, 0.0), (0.1, -0.25)])
 def test_plane_has_exact_slope_and_no_roughness(slopes: tuple[float, float], refine: bool) -> None:
-    maps = hazard_maps(make_ground(by_x=slopes[0], by_y=slopes[1]), replace(OPTIONS, refine_planes=refine))
+    maps = hazard_maps(make_ground(slope_x=slopes[0], slope_y=slopes[1]), replace(OPTIONS, refine_planes=refine))
     np.testing.assert_allclose(maps.roughness_m, 0.0, atol=1e-10)
     np.testing.assert_allclose(maps.slope_rad, np.arctan(np.hypot(*slopes)), atol=1e-10)
 
 
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.15, -0.1)])
 @pytest.mark.parametrize("height", [0.3, -0.3])
-def test_boulder_height_equals_roughness_on_a_slope(slopes: tuple[float, float], height: float) -> None:
+def test_roughness_equals_boulder_height_on_a_slope(slopes: tuple[float, float], height: float) -> None:
     # A radius of 2.5 cells covers 21 of the 100 cells of a footprint: no effect on the median.
-    flat = make_ground(by_x=slopes[0], by_y=slopes[1])
+    flat = make_ground(slope_x=slopes[0], slope_y=slopes[1])
     for row, column in ((40, 50), (45, 55), (12, 33)):
         maps = hazard_maps(add_bump(flat, row, column, 2.5, height), OPTIONS)
         assert maps.roughness_m[row, column] == pytest.approx(abs(height), abs=1e-9)
@@ -66,14 +66,14 @@ def test_robust_fit_tolerates_almost_half_outliers() -> None:
     z = 3.0 + 0.2 * x - 0.1 * y + rng.normal(0.0, 0.01, 100)
     z[rng.permutation(100)[:45]] += rng.uniform(1.0, 5.0, 45)
     triples = rng.uniform(size=(300, 3))
-    value, by_x, by_y = robust_plane(x, y, z, triples, True)
+    value, slope_x, slope_y = robust_plane(x, y, z, triples, True)
     # The slope error of 55 points with 0.01 of noise is 0.01 / (sqrt(55) 2.9) = 5e-4; the tolerance is four times that.
-    assert by_x == pytest.approx(0.2, abs=2e-3)
-    assert by_y == pytest.approx(-0.1, abs=2e-3)
+    assert slope_x == pytest.approx(0.2, abs=2e-3)
+    assert slope_y == pytest.approx(-0.1, abs=2e-3)
     assert value == pytest.approx(3.0, abs=0.02)
-    # Least squares has errors of some tenths.
-    plain = np.linalg.lstsq(np.column_stack([np.ones(100), x, y]), z, rcond=None)[0]
-    assert abs(plain[0] - 3.0) > 0.3
+    # The ordinary least-squares plane has an error of several tenths.
+    least_squares = np.linalg.lstsq(np.column_stack([np.ones(100), x, y]), z, rcond=None)[0]
+    assert abs(least_squares[0] - 3.0) > 0.3
 
 
 def test_robust_fit_has_least_median_of_tested_triples() -> None:
@@ -108,12 +108,12 @@ def test_refinement_reduces_noise() -> None:
         triples = rng.uniform(size=(30, 3))
         errors.append([robust_plane(x, y, z, triples, refine)[1] for refine in (False, True)])
     raw, refined = np.std(errors, axis=0)
-    # Least squares over all 100 points has 1 / (sqrt(100) 2.87) = 0.035; almost all points are inliers.
+    # Slope error of least squares with all 100 points: 1 / (sqrt(100) 2.87) = 0.035; almost all points are inliers.
     assert refined < 0.045 < raw
 
 
 def test_smooth_surface_is_bilinear_between_footprints() -> None:
-    # The elevation x y / 10 is bilinear: interpolation between footprint centres is exact.
+    # The elevation is bilinear in row and column: interpolation between footprint centres is exact.
     flat = make_ground(60, 60)
     rows, columns = np.indices((60, 60))
     saddle = replace(flat, elevation_m=1e-4 * (rows - 29.5) * (columns - 29.5))
@@ -125,7 +125,7 @@ def test_smooth_surface_is_bilinear_between_footprints() -> None:
 
 @pytest.mark.parametrize("shape", [(80, 14), (14, 80), (12, 13)])
 def test_strip_of_one_footprint_width_is_a_plane(shape: tuple[int, int]) -> None:
-    maps = hazard_maps(make_ground(*shape, by_x=0.1, by_y=0.2), OPTIONS)
+    maps = hazard_maps(make_ground(*shape, slope_x=0.1, slope_y=0.2), OPTIONS)
     np.testing.assert_allclose(maps.roughness_m, 0.0, atol=1e-10)
 
 
@@ -193,33 +193,33 @@ def test_hazard_takes_precedence_over_unknown() -> None:
 
 
 def test_slope_and_roughness_hazards_are_combined() -> None:
-    nothing = np.zeros((80, 100))
-    rough, steep = nothing.copy(), nothing.copy()
+    zero = np.zeros((80, 100))
+    rough, steep = zero.copy(), zero.copy()
     rough[40, 30], steep[40, 70] = 1.0, 1.0
     safety = safe_landing_map(steep, rough, CELL_M, OPTIONS)
     assert safety[40, 30] == safety[40, 70] == Safety.HAZARD
     assert safety[40, 50] == Safety.SAFE
 
 
-def test_grassfire_equals_nearest_seed_distance() -> None:
+def test_grassfire_equals_distance_to_nearest_seed() -> None:
     rng = np.random.default_rng(4)
-    burning = rng.random((40, 50)) < 0.01
-    fires = np.argwhere(burning)
-    cells = np.moveaxis(np.indices(burning.shape), 0, -1).reshape(-1, 1, 2)
-    expected = np.linalg.norm(cells - fires, axis=-1).min(axis=1).reshape(burning.shape)
-    np.testing.assert_allclose(grassfire(burning), expected, rtol=1e-5)
+    is_seed = rng.random((40, 50)) < 0.01
+    seeds = np.argwhere(is_seed)
+    cells = np.moveaxis(np.indices(is_seed.shape), 0, -1).reshape(-1, 1, 2)
+    expected = np.linalg.norm(cells - seeds, axis=-1).min(axis=1).reshape(is_seed.shape)
+    np.testing.assert_allclose(grassfire(is_seed), expected, rtol=1e-5)
     assert np.all(np.isinf(grassfire(np.zeros((3, 3), dtype=bool))))
 
 
-def test_site_is_farthest_from_unsafe_cells() -> None:
+def test_site_has_maximum_distance_to_unsafe_cells() -> None:
     safety = np.full((60, 60), Safety.SAFE, dtype=np.uint8)
     safety[10, 10] = Safety.HAZARD
     safety[50, 20] = Safety.UNKNOWN
     site = safe_site(safety, np.array([0.0, 0.0]))
-    others = np.pad(safety != Safety.SAFE, 1, constant_values=True)
-    fires = np.argwhere(others) - 1
+    is_unsafe = np.pad(safety != Safety.SAFE, 1, constant_values=True)
+    unsafe_cells = np.argwhere(is_unsafe) - 1
     cells = np.moveaxis(np.indices(safety.shape), 0, -1).reshape(-1, 1, 2)
-    distances = np.linalg.norm(cells - fires, axis=-1).min(axis=1).reshape(safety.shape)
+    distances = np.linalg.norm(cells - unsafe_cells, axis=-1).min(axis=1).reshape(safety.shape)
     assert site is not None
     assert distances[site] == pytest.approx(distances.max())
 

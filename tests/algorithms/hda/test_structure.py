@@ -23,15 +23,15 @@ from marsyard.algorithms.hda.structure import (
     triangulate,
 )
 from marsyard.sim.frames import rigid
-from tests.algorithms.hda.relief_scene import Pass, make_bumps, measure_pass, plane, pose
+from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_plane, make_pose, measure_pass
 
 OPTIONS = HdaOptions(block_px=32, grid_px=8)
-RELIEF = make_bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=plane(0.05, 0.02))
+RELIEF = make_bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=make_plane(0.05, 0.02))
 
 
 @pytest.fixture(scope="module")
 def scene() -> Pass:
-    return Pass(RELIEF, (pose(0.0, 0.0, 10.0, 20.0, 2.0, -3.0), pose(0.3, -0.7, 10.1, 23.0, 3.0, -1.0)))
+    return Pass(RELIEF, (make_pose(0.0, 0.0, 10.0, 20.0, 2.0, -3.0), make_pose(0.3, -0.7, 10.1, 23.0, 3.0, -1.0)))
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +40,8 @@ def landing_scene(scene: Pass) -> LandingScene:
 
 
 def true_depths(scene: Pass, pixels: np.ndarray) -> np.ndarray:
-    one = scene.camera(0)
-    return np.asarray((scene.ground(0, pixels) - one.c) @ one.a)
+    first_camera = scene.camera(0)
+    return np.asarray((scene.ground(0, pixels) - first_camera.c) @ first_camera.a)
 
 
 def test_motion_from_poses_equals_camera_motion(scene: Pass, landing_scene: LandingScene) -> None:
@@ -52,41 +52,41 @@ def test_motion_from_poses_equals_camera_motion(scene: Pass, landing_scene: Land
 
 def test_segments_contain_the_exact_match(scene: Pass, landing_scene: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 16, 10)
-    true = scene.camera(1).project(scene.ground(0, pixels))[0]
+    true_pixels = scene.camera(1).project(scene.ground(0, pixels))[0]
     positions = undistort(landing_scene.views[0].camera, pixels)
-    starts, ends, room = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
-    assert room.sum() > 100
-    along = (ends - starts)[room]
-    length = np.linalg.norm(along, axis=1)
-    offset = (true - starts)[room]
-    fraction = np.sum(offset * along, axis=1) / length**2
+    starts, ends, inside = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
+    assert inside.sum() > 100
+    segments = (ends - starts)[inside]
+    length = np.linalg.norm(segments, axis=1)
+    offset = (true_pixels - starts)[inside]
+    fraction = np.sum(offset * segments, axis=1) / length**2
     assert np.all((fraction > 0.0) & (fraction < 1.0))
     # Lens distortion bends the epipolar line by a few hundredths of a pixel over 25 px.
-    across = np.abs(offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / length
-    assert across.max() < 0.1
+    normal_distance = np.abs(offset[:, 0] * segments[:, 1] - offset[:, 1] * segments[:, 0]) / length
+    assert normal_distance.max() < 0.1
 
 
 def test_segment_position_determines_depth(scene: Pass, landing_scene: LandingScene) -> None:
     # With both depth bounds at the true depth, both ends are the true match: Eqs. 6-8 are exact through the lens.
     pixels = np.array([[100.0, 80.0]])
     depth = float(true_depths(scene, pixels)[0])
-    true = scene.camera(1).project(scene.ground(0, pixels))[0]
+    true_pixels = scene.camera(1).project(scene.ground(0, pixels))[0]
     positions = undistort(landing_scene.views[0].camera, pixels)
     starts, ends, _ = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (depth, depth), 6)
-    np.testing.assert_allclose(starts, true, atol=1e-6)
-    np.testing.assert_allclose(ends, true, atol=1e-6)
+    np.testing.assert_allclose(starts, true_pixels, atol=1e-6)
+    np.testing.assert_allclose(ends, true_pixels, atol=1e-6)
 
 
 def test_segments_outside_the_image_are_rejected(scene: Pass, landing_scene: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 8, 6)
     positions = undistort(landing_scene.views[0].camera, pixels)
-    starts, ends, room = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
-    both = np.concatenate([starts, ends], axis=1)
-    inside = np.all((both >= 6.0) & (both <= np.array([313.0, 233.0, 313.0, 233.0])), axis=1)
-    np.testing.assert_array_equal(room, inside)
-    assert 0 < room.sum() < len(pixels)
+    starts, ends, inside = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
+    endpoints = np.concatenate([starts, ends], axis=1)
+    expected = np.all((endpoints >= 6.0) & (endpoints <= np.array([313.0, 233.0, 313.0, 233.0])), axis=1)
+    np.testing.assert_array_equal(inside, expected)
+    assert 0 < inside.sum() < len(pixels)
     matches = match_pixels(landing_scene.views, scene.second_from_first, pixels, (7.0, 13.0), OPTIONS)
-    np.testing.assert_array_equal(matches.first, pixels[room])
+    np.testing.assert_array_equal(matches.first, pixels[inside])
 
 
 def test_best_match_has_minimum_absolute_difference() -> None:
@@ -104,14 +104,14 @@ def test_best_match_has_minimum_absolute_difference() -> None:
 def test_matches_and_depths_equal_exact_scene(scene: Pass, landing_scene: LandingScene) -> None:
     depths = true_depths(scene, pixel_lattice((320, 240), 16, 6))
     matches = dense_structure(landing_scene.views, scene.second_from_first, (depths.min(), depths.max()), OPTIONS)
-    true = scene.camera(1).project(scene.ground(0, matches.first))[0]
+    true_pixels = scene.camera(1).project(scene.ground(0, matches.first))[0]
     assert matches.accepted.mean() > 0.98
-    error = np.linalg.norm(matches.second - true, axis=1)[matches.accepted]
+    error = np.linalg.norm(matches.second - true_pixels, axis=1)[matches.accepted]
     # Sources of error: the bias of the biquadratic fit (up to 0.09 px on each axis) and relief within a window.
     assert np.sqrt(np.mean(error**2)) < 0.15
-    misses = (matches.depths - true_depths(scene, matches.first))[matches.accepted]
-    # This error over a parallax of 32 px is half a percent of the height.
-    assert np.sqrt(np.mean(misses**2)) < 0.005 * 10.0
+    depth_errors = (matches.depths - true_depths(scene, matches.first))[matches.accepted]
+    # This error divided by the parallax of 32 px is half a percent of the height.
+    assert np.sqrt(np.mean(depth_errors**2)) < 0.005 * 10.0
 
 
 def test_grid_keeps_search_windows_inside_the_image(scene: Pass, landing_scene: LandingScene) -> None:
@@ -121,7 +121,7 @@ def test_grid_keeps_search_windows_inside_the_image(scene: Pass, landing_scene: 
     assert np.all(matches.first <= np.array([320, 240]) - 1 - border)
 
 
-def test_plane_of_features_gives_scale_without_local_matches(scene: Pass, landing_scene: LandingScene) -> None:
+def test_plane_of_features_determines_scale_without_local_matches(scene: Pass, landing_scene: LandingScene) -> None:
     rng = np.random.default_rng(8)
     positions = rng.uniform(-0.3, 0.3, (30, 2))
     depths = 1.0 / (0.1 + positions @ np.array([0.02, -0.03]))  # a plane at 10 m on the axis
@@ -133,7 +133,7 @@ def test_plane_of_features_gives_scale_without_local_matches(scene: Pass, landin
     assert scale_factor(views, motion, positions, 12.0, OPTIONS) == pytest.approx(1.2, rel=1e-9)
 
 
-def test_unrelated_image_gives_few_matches(scene: Pass, landing_scene: LandingScene) -> None:
+def test_unrelated_image_has_few_matches(scene: Pass, landing_scene: LandingScene) -> None:
     noise = np.random.default_rng(2).integers(500, 2500, (240, 320)).astype(np.uint16)
     views = (landing_scene.views[0], replace(landing_scene.views[1], counts=noise))
     matches = dense_structure(views, scene.second_from_first, (9.0, 11.0), OPTIONS)
@@ -150,8 +150,8 @@ def test_triangulation_is_exact_and_precision_follows_parallax() -> None:
     np.testing.assert_allclose(triangulate(positions, second, true_motion), depths, rtol=1e-10)
     noise = 1e-4
     noisy = triangulate(positions, second + rng.normal(0.0, noise, second.shape), true_motion)
-    # dz = z^2 / baseline times the error along the epipolar line; rotation and field of view change this by some
-    # percent.
+    # dz = z^2 / baseline times the error along the epipolar line; rotation and field of view change this by
+    # several percent.
     assert np.std((noisy - depths) / depths**2) == pytest.approx(noise, rel=0.1)
 
 
@@ -188,7 +188,7 @@ def test_matches_failing_the_reverse_check_are_counted(scene: Pass, landing_scen
     counts = landing_scene.views[1].counts.copy()
     counts[:, 160:] = np.random.default_rng(2).integers(500, 2500, (240, 160))
     views = (landing_scene.views[0], replace(landing_scene.views[1], counts=counts))
-    plain, checked = (
+    unchecked, checked = (
         dense_structure(
             views,
             scene.second_from_first,
@@ -197,35 +197,37 @@ def test_matches_failing_the_reverse_check_are_counted(scene: Pass, landing_scen
         )
         for tolerance in (None, 1.5)
     )
-    true = scene.camera(1).project(scene.ground(0, plain.first))[0]
-    is_wrong = np.linalg.norm(plain.second - true, axis=1) > 1.5
-    assert np.sum(plain.accepted & is_wrong) > 100
-    # Segments are about 25 px long: one in eight random matches passes the reverse check.
-    assert np.sum(checked.accepted & is_wrong) < 0.3 * np.sum(plain.accepted & is_wrong)
-    assert np.sum(checked.accepted & ~is_wrong) > 0.95 * np.sum(plain.accepted & ~is_wrong)
+    true_pixels = scene.camera(1).project(scene.ground(0, unchecked.first))[0]
+    is_wrong = np.linalg.norm(unchecked.second - true_pixels, axis=1) > 1.5
+    assert np.sum(unchecked.accepted & is_wrong) > 100
+    # Segments are about 25 px long and the tolerance is +-1.5 px: one in eight random matches passes the reverse check.
+    assert np.sum(checked.accepted & is_wrong) < 0.3 * np.sum(unchecked.accepted & is_wrong)
+    assert np.sum(checked.accepted & ~is_wrong) > 0.95 * np.sum(unchecked.accepted & ~is_wrong)
     # Other matches are unchanged, and each match has one outcome.
-    np.testing.assert_array_equal(checked.second, plain.second)
-    dropped = checked.statuses == MatchStatus.NOT_RETURNED
-    np.testing.assert_array_equal(checked.accepted | dropped, plain.accepted)
-    np.testing.assert_array_equal(np.where(dropped, MatchStatus.ACCEPTED, checked.statuses), plain.statuses)
+    np.testing.assert_array_equal(checked.second, unchecked.second)
+    is_dropped = checked.statuses == MatchStatus.NOT_RETURNED
+    np.testing.assert_array_equal(checked.accepted | is_dropped, unchecked.accepted)
+    np.testing.assert_array_equal(np.where(is_dropped, MatchStatus.ACCEPTED, checked.statuses), unchecked.statuses)
     assert len(checked.points) == checked.accepted.sum()
 
 
 def test_correct_matches_pass_the_reverse_check(scene: Pass, landing_scene: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 16, 6)
     positions = undistort(landing_scene.views[0].camera, pixels)
-    _, _, room = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
-    pixels, positions = pixels[room].astype(np.int64), positions[room]
-    true = np.rint(scene.camera(1).project(scene.ground(0, pixels.astype(np.float64)))[0]).astype(np.int64)
-    off = return_distance(landing_scene.views, scene.second_from_first, pixels, true, positions, (7.0, 13.0), 5)
+    _, _, is_inside = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
+    pixels, positions = pixels[is_inside].astype(np.int64), positions[is_inside]
+    true_pixels = np.rint(scene.camera(1).project(scene.ground(0, pixels.astype(np.float64)))[0]).astype(np.int64)
+    return_distance_px = return_distance(
+        landing_scene.views, scene.second_from_first, pixels, true_pixels, positions, (7.0, 13.0), 5
+    )
     # Both searches use whole pixels: 0.7 px each, plus the effect of relief within a window.
-    assert np.mean(off <= 1.5) > 0.98
+    assert np.mean(return_distance_px <= 1.5) > 0.98
 
 
 def test_segments_are_clipped_at_the_image_border() -> None:
-    inside = np.array([[50.0, 50.0], [50.0, 50.0], [10.0, 10.0], [50.0, 50.0]])
+    starts = np.array([[50.0, 50.0], [50.0, 50.0], [10.0, 10.0], [50.0, 50.0]])
     ends = np.array([[60.0, 40.0], [110.0, 80.0], [0.0, 20.0], [np.nan, 10.0]])
-    cut = clip_to_image((100, 80), inside, ends, 10.0)
+    clipped = clip_to_image((100, 80), starts, ends, 10.0)
     np.testing.assert_allclose(
-        cut, [[60.0, 40.0], [50.0 + 39.0 * 19.0 / 30.0 * 60.0 / 39.0, 69.0], [10.0, 10.0], [50.0, 10.0]]
+        clipped, [[60.0, 40.0], [50.0 + 39.0 * 19.0 / 30.0 * 60.0 / 39.0, 69.0], [10.0, 10.0], [50.0, 10.0]]
     )

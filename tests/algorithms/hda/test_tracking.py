@@ -1,4 +1,4 @@
-"""Tests of features and tracks: Eqs. 1-5 against direct computation, tracks against the exact scene."""
+"""Tests of feature selection and tracking: Eqs. 1-5 against direct computation, tracks against the exact scene."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marsyard.algorithms.hda.tracking import (
     track_features,
 )
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, pseudo_normalized_correlation
-from tests.algorithms.hda.relief_scene import Pass, camera, make_bumps, plane, pose, render_image
+from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_camera, make_plane, make_pose, render_image
 
 OPTIONS = HdaOptions(block_px=32)
 
@@ -31,25 +31,25 @@ def noise() -> np.ndarray:
 
 def test_interest_is_product_of_eigenvalue_excesses(noise: np.ndarray) -> None:
     image = noise.astype(np.float32)
-    p = eigenvalue_test(image, 11, 300.0)
+    interest = eigenvalue_test(image, 11, 300.0)
     # Independent computation: loops over one template for gradients and sums.
     for row, column in ((20, 30), (60, 81), (100, 140)):
-        part = image[row - 6 : row + 7, column - 6 : column + 7].astype(np.float64)
-        smooth_rows = part[:-2] + 2.0 * part[1:-1] + part[2:]
+        patch = image[row - 6 : row + 7, column - 6 : column + 7].astype(np.float64)
+        smooth_rows = patch[:-2] + 2.0 * patch[1:-1] + patch[2:]
         g_u = (smooth_rows[:, 2:] - smooth_rows[:, :-2]) / 8.0
-        smooth_columns = part[:, :-2] + 2.0 * part[:, 1:-1] + part[:, 2:]
+        smooth_columns = patch[:, :-2] + 2.0 * patch[:, 1:-1] + patch[:, 2:]
         g_v = (smooth_columns[2:] - smooth_columns[:-2]) / 8.0
         tensor = np.array([[np.mean(g_u * g_u), np.mean(g_u * g_v)], [np.mean(g_u * g_v), np.mean(g_v * g_v)]])
         excess = np.linalg.eigvalsh(tensor) - 300.0
         expected = excess.prod() if excess.min() > 0.0 else -np.inf
-        assert p[row, column] == pytest.approx(expected, rel=1e-3)
+        assert interest[row, column] == pytest.approx(expected, rel=1e-3)
 
 
 def test_two_small_eigenvalues_are_not_a_feature() -> None:
     # The product of two negative excesses is positive; only the condition a > l distinguishes it from two large
     # eigenvalues.
-    faint = np.random.default_rng(2).integers(0, 3, (60, 60)).astype(np.float32)
-    assert not np.any(np.isfinite(eigenvalue_test(faint, 11, 50.0)))
+    low_contrast = np.random.default_rng(2).integers(0, 3, (60, 60)).astype(np.float32)
+    assert not np.any(np.isfinite(eigenvalue_test(low_contrast, 11, 50.0)))
 
 
 def test_straight_edges_and_uniform_images_have_no_features() -> None:
@@ -58,7 +58,7 @@ def test_straight_edges_and_uniform_images_have_no_features() -> None:
     assert len(select_features(np.full((120, 160), 77, dtype=np.uint16), OPTIONS)) == 0
 
 
-def test_each_block_gives_its_best_feature_within_border() -> None:
+def test_best_feature_of_each_block_is_selected() -> None:
     counts = np.random.default_rng(3).integers(0, 256, (150, 200)).astype(np.uint16)
     options = HdaOptions(block_px=40, window_half_px=8)
     features = select_features(counts, options)
@@ -69,9 +69,9 @@ def test_each_block_gives_its_best_feature_within_border() -> None:
         for left in range(0, 200, 40):
             rows = slice(max(top, border), min(top + 40, 150 - border))
             columns = slice(max(left, border), min(left + 40, 200 - border))
-            part = interest[rows, columns]
-            if part.size:
-                row, column = np.unravel_index(int(part.argmax()), part.shape)
+            block = interest[rows, columns]
+            if block.size:
+                row, column = np.unravel_index(int(block.argmax()), block.shape)
                 expected.append((columns.start + column, rows.start + row))
     np.testing.assert_array_equal(features, expected)
 
@@ -131,24 +131,27 @@ def test_integer_shifts_within_the_window_are_found(shift: tuple[int, int]) -> N
 
 
 def make_pass(second: tuple[float, ...] = (0.2, -0.6, 10.05, 21.5, 0.5, -0.8)) -> Pass:
-    return Pass(make_bumps((1.2, 0.8, 0.4, 0.3), base=plane(0.05, 0.02)), (pose(0.0, 0.0, 10.0, 20.0), pose(*second)))
+    return Pass(
+        make_bumps((1.2, 0.8, 0.4, 0.3), base=make_plane(0.05, 0.02)),
+        (make_pose(0.0, 0.0, 10.0, 20.0), make_pose(*second)),
+    )
 
 
 def test_tracks_over_relief_match_exact_scene() -> None:
     scene = make_pass()
     first, second = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first, OPTIONS)
-    true = scene.camera(1).project(scene.ground(0, features))[0]
-    plain, fine = (
+    true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
+    unaligned, aligned = (
         track_features(first, second, features, features, replace(OPTIONS, align=align)) for align in (False, True)
     )
-    assert fine.accepted.sum() >= 40
-    is_correct = fine.accepted & (np.hypot(*(plain.second - true).T) < 1.0)
-    assert is_correct.sum() >= 0.95 * fine.accepted.sum()
+    assert aligned.accepted.sum() >= 40
+    is_correct = aligned.accepted & (np.hypot(*(unaligned.second - true_pixels).T) < 1.0)
+    assert is_correct.sum() >= 0.95 * aligned.accepted.sum()
     # The biquadratic fit is biased by up to 0.09 px. After alignment the error comes from rounding to counts and
     # relief.
-    assert np.sqrt(np.mean((plain.second - true)[is_correct] ** 2)) < 0.1
-    assert np.sqrt(np.mean((fine.second - true)[is_correct] ** 2)) < 0.015
+    assert np.sqrt(np.mean((unaligned.second - true_pixels)[is_correct] ** 2)) < 0.1
+    assert np.sqrt(np.mean((aligned.second - true_pixels)[is_correct] ** 2)) < 0.015
 
 
 @pytest.mark.parametrize(
@@ -163,18 +166,18 @@ def test_tracks_over_relief_match_exact_scene() -> None:
     ids=["lower by 23 %", "higher by 20 %", "rolled by 10 deg", "pitched by 20 deg", "yawed by 20 deg"],
 )
 def test_largest_changes_of_the_paper_are_tracked(second: tuple[float, ...]) -> None:
-    """Section II.A and slightly lower: at least 90 % of the features visible in the second image are tracked."""
+    """Changes of pose from Section II.A: at least 90 % of the features visible in the second image are tracked."""
     rng = np.random.default_rng(5)
     boulders = [(*rng.uniform(-3.0, 3.0, 2), rng.uniform(0.1, 0.3), rng.uniform(0.1, 0.3)) for _ in range(30)]
-    scene = Pass(make_bumps(*boulders), (pose(0.0, 0.0, 10.0, 20.0), pose(*second)))
-    one, other = (render_image(scene, i).counts for i in (0, 1))
-    features = select_features(one, OPTIONS)
-    true = scene.camera(1).project(scene.ground(0, features))[0]
-    shown = np.all((true >= 12.0) & (true <= np.array([307.0, 227.0])), axis=1)
-    tracks = track_features(one, other, features, true + 3.0, OPTIONS)
-    is_correct = tracks.accepted & (np.hypot(*(tracks.second - true).T) < 1.0)
-    assert shown.sum() >= 15
-    assert np.mean(is_correct[shown]) >= 0.9
+    scene = Pass(make_bumps(*boulders), (make_pose(0.0, 0.0, 10.0, 20.0), make_pose(*second)))
+    first_counts, second_counts = (render_image(scene, i).counts for i in (0, 1))
+    features = select_features(first_counts, OPTIONS)
+    true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
+    is_visible = np.all((true_pixels >= 12.0) & (true_pixels <= np.array([307.0, 227.0])), axis=1)
+    tracks = track_features(first_counts, second_counts, features, true_pixels + 3.0, OPTIONS)
+    is_correct = tracks.accepted & (np.hypot(*(tracks.second - true_pixels).T) < 1.0)
+    assert is_visible.sum() >= 15
+    assert np.mean(is_correct[is_visible]) >= 0.9
     # One or two features that left the image may match similar ground.
     assert np.sum(tracks.accepted & ~is_correct) <= 2
 
@@ -183,9 +186,9 @@ def test_features_leaving_the_image_are_rejected() -> None:
     scene = make_pass((0.0, -1.0, 10.0, 20.0))
     first, second = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first, replace(OPTIONS, window_half_px=60))
-    true = scene.camera(1).project(scene.ground(0, features))[0]
+    true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
     tracks = track_features(first, second, features, features, replace(OPTIONS, window_half_px=60))
-    outside = ~camera().in_frame(true)
+    outside = ~make_camera().in_frame(true_pixels)
     assert outside.sum() >= 3
     assert not np.any(tracks.accepted & outside)
 
@@ -194,27 +197,27 @@ def test_search_starts_at_predicted_positions() -> None:
     scene = make_pass((0.0, -1.8, 10.0, 20.0))
     first, second = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first, OPTIONS)
-    true = scene.camera(1).project(scene.ground(0, features))[0]
-    inside = np.all((true > 30) & (true < np.array([290, 210])), axis=1)
-    # At least 70 px: outside the window without a prediction.
-    lost = track_features(first, second, features, features, OPTIONS)
-    result = track_features(first, second, features, true + 9.0, OPTIONS)
-    assert np.mean(np.hypot(*(lost.second - true).T)[inside] < 1.0) < 0.1
-    assert np.mean(np.hypot(*(result.second - true).T)[inside] < 1.0) > 0.9
+    true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
+    inside = np.all((true_pixels > 30) & (true_pixels < np.array([290, 210])), axis=1)
+    # Features move by at least 70 px: without a prediction they leave the search window.
+    unpredicted = track_features(first, second, features, features, OPTIONS)
+    predicted = track_features(first, second, features, true_pixels + 9.0, OPTIONS)
+    assert np.mean(np.hypot(*(unpredicted.second - true_pixels).T)[inside] < 1.0) < 0.1
+    assert np.mean(np.hypot(*(predicted.second - true_pixels).T)[inside] < 1.0) > 0.9
 
 
 def test_tracks_near_boulders_are_correct_or_rejected() -> None:
     rng = np.random.default_rng(5)
     boulders = [(*rng.uniform(-3.0, 3.0, 2), rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.3)) for _ in range(20)]
-    scene = Pass(make_bumps(*boulders), (pose(0.0, 0.0, 10.0, 20.0), pose(0.1, -0.7, 10.1, 21.0, 1.0, 1.0)))
+    scene = Pass(make_bumps(*boulders), (make_pose(0.0, 0.0, 10.0, 20.0), make_pose(0.1, -0.7, 10.1, 21.0, 1.0, 1.0)))
     first, second = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first, OPTIONS)
-    true = scene.camera(1).project(scene.ground(0, features))[0]
-    plain, fine = (
+    true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
+    unaligned, aligned = (
         track_features(first, second, features, features, replace(OPTIONS, align=align)) for align in (False, True)
     )
-    is_wrong = np.hypot(*(fine.second - true).T) > 0.5
+    is_wrong = np.hypot(*(aligned.second - true_pixels).T) > 0.5
     # Correlation alone would accept features that left the image and occluding edges.
-    assert np.sum(plain.accepted & is_wrong) >= 3
-    assert np.sum(fine.accepted & is_wrong) <= 1
-    assert np.sum(fine.accepted) > 40
+    assert np.sum(unaligned.accepted & is_wrong) >= 3
+    assert np.sum(aligned.accepted & is_wrong) <= 1
+    assert np.sum(aligned.accepted) > 40

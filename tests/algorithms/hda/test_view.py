@@ -9,12 +9,12 @@ from marsyard.algorithms.hda.motion import apply_flat_field
 from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
 from marsyard.sim.sensor.optics import OpticsParameters
-from tests.algorithms.hda.relief_scene import camera
+from tests.algorithms.hda.relief_scene import make_camera
 
 
 def render_detector_image(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, DetectorImage]:
-    """A scene with a brightness gradient, and its image at 4 ms with negligible noise."""
-    optics = camera(320)
+    """A scene with a brightness gradient and its image, exposed for 4 ms with negligible noise."""
+    optics = make_camera(320)
     rows, columns = optics.size[1], optics.size[0]
     rng = np.random.default_rng(3)
     scene = (0.2 + 0.1 * np.arange(columns) / columns + 0.02 * rng.standard_normal((rows, columns))).astype(np.float32)
@@ -33,14 +33,14 @@ def render_detector_image(transfer_row_s: float, clear_row_s: float) -> tuple[np
     return scene, DetectorImage(detector.expose(scene, rng), 0.0, optics, detector.calibration)
 
 
-@pytest.mark.parametrize("times", [(0.0, 0.0), (5e-6, 0.0), (5e-6, 1e-6)])
-def test_corrected_counts_match_ideal_image(times: tuple[float, float]) -> None:
-    scene, image = render_detector_image(*times)
+@pytest.mark.parametrize("row_times_s", [(0.0, 0.0), (5e-6, 0.0), (5e-6, 1e-6)])
+def test_corrected_counts_match_ideal_image(row_times_s: tuple[float, float]) -> None:
+    scene, image = render_detector_image(*row_times_s)
     counts = apply_flat_field(image).astype(np.float64)
-    # The exposure time is counts per second. Each count is rounded twice, and the response is at least 0.65.
+    # Ideal counts: 4 ms x 4e9 e/s / 4000 e/DN. Each count is rounded twice, and the response is at least 0.65.
     expected = 0.004 * 4e9 / 4000.0 * scene
     assert np.abs(counts - expected).max() < 0.01 * expected.mean()
     smeared = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
-    ramp = np.abs(smeared - expected).max() / expected.mean()
-    # 240 rows of 5 us over 4 ms, with lens fall-off.
-    assert (ramp > 0.2) == (times[0] > 0.0)
+    max_smear = np.abs(smeared - expected).max() / expected.mean()
+    # The transfer of 240 rows takes 240 x 5 us = 1.2 ms, 30 % of the exposure time; lens fall-off reduces it.
+    assert (max_smear > 0.2) == (row_times_s[0] > 0.0)

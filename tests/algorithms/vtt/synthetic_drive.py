@@ -1,6 +1,7 @@
-"""A rover among textured bodies: the ray of each pixel is intersected with a plane or sphere. The solid texture is a
-sum of plane waves with amplitudes proportional to 1/frequency. The average over the pixel extent is taken per wave
-in closed form: no aliasing.
+"""Synthetic mast images and drives for the tests of target tracking: a rover among textured planes and spheres.
+
+The ray of each pixel is intersected with the nearest body. The solid texture is a sum of plane waves; each wave is
+averaged over the pixel extent in closed form, so that the images have no aliasing.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ MAST = MastGeometry(
 )
 
 
-def stereo_pair(
+def make_stereo_pair(
     focal_px: float, size: tuple[int, int], baseline_m: float, toe_in_rad: float = 0.0
 ) -> tuple[CameraModel, CameraModel]:
     """Head cameras with the lens distortion of Opportunity's navcam and an off-centre axis."""
     cameras = []
     for side in (1.0, -1.0):
-        turn = Rotation.from_rotvec([0.0, 0.0, -side * toe_in_rad])
+        toe_in_rotation = Rotation.from_rotvec([0.0, 0.0, -side * toe_in_rad])
         linear = Cahv.from_axes(
             (focal_px, focal_px),
             size,
-            axis=turn.apply([1.0, 0.0, 0.0]),
-            right=turn.apply([0.0, -1.0, 0.0]),
+            axis=toe_in_rotation.apply([1.0, 0.0, 0.0]),
+            right=toe_in_rotation.apply([0.0, -1.0, 0.0]),
             centre=np.array([0.0, 0.5 * side * baseline_m, 0.0]),
             image_centre=(0.5 * size[0] + 3.0, 0.5 * size[1] - 4.0),
         )
@@ -47,13 +48,13 @@ def stereo_pair(
 @cache
 def navcam() -> MastCalibration:
     """MER navcam: 0.82 mrad pixels, 20 cm baseline."""
-    return MastCalibration(MAST, *stereo_pair(1222.5, (1024, 1024), 0.20))
+    return MastCalibration(MAST, *make_stereo_pair(1222.5, (1024, 1024), 0.20))
 
 
 @cache
 def pancam() -> MastCalibration:
     """Pancam of the research rover: 0.29 mrad pixels, 30 cm baseline, 516 px of disparity at 2 m."""
-    return MastCalibration(MAST, *stereo_pair(3440.9, (1024, 768), 0.30))
+    return MastCalibration(MAST, *make_stereo_pair(3440.9, (1024, 768), 0.30))
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,8 @@ class Waves:
     phases: np.ndarray
 
 
-def waves(seed: int, longest_m: float = 0.6, shortest_m: float = 0.003, count: int = 160) -> Waves:
-    """Waves in all directions, their lengths spread evenly over octaves: each octave has the same variance."""
+def draw_waves(seed: int, longest_m: float = 0.6, shortest_m: float = 0.003, count: int = 160) -> Waves:
+    """Draw waves in all directions with log-uniform wavelengths: each octave has the same variance."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -119,33 +120,33 @@ class Scene:
     contrast: float = 0.15
     level_dn: float = 1500.0
 
-    def hit(self, camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
+    def intersect(self, camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
         """World points at pixels of a camera in the world; NaN for the sky."""
         origins, directions = camera.rays(pixels)
         ranges = np.stack([body.ranges(origins, directions) for body in self.bodies])
         nearest = np.where(np.isnan(ranges), np.inf, ranges).min(axis=0)
         return np.asarray(origins + np.where(np.isinf(nearest), np.nan, nearest)[..., None] * directions)
 
-    def picture(
+    def render_image(
         self, camera: CameraModel, box: PixelBox, noise: np.random.Generator | None = None, noise_dn: float = 8.0
     ) -> MastImage:
-        """Counts of a part of the frame; the pixel extent is that of the part's centre."""
+        """Counts of a part of the frame. Texture is averaged over the extent of the pixel at the centre of the part."""
         u = box.corner[0] + np.arange(box.size[0], dtype=np.float64)
         v = box.corner[1] + np.arange(box.size[1], dtype=np.float64)
-        points = self.hit(camera, np.stack(np.meshgrid(u, v), axis=-1))
+        points = self.intersect(camera, np.stack(np.meshgrid(u, v), axis=-1))
         middle = points[box.size[1] // 2, box.size[0] // 2]
         by_u = points[box.size[1] // 2, box.size[0] // 2 + 1] - middle
         by_v = points[box.size[1] // 2 + 1, box.size[0] // 2] - middle
-        kept = self.texture.amplitudes.copy()
+        attenuated = self.texture.amplitudes.copy()
         for extent in (by_u, by_v):
-            kept *= np.sinc(self.texture.vectors @ extent / (2.0 * np.pi))
-        used = np.abs(kept) > 1e-4
+            attenuated *= np.sinc(self.texture.vectors @ extent / (2.0 * np.pi))
+        used = np.abs(attenuated) > 1e-4
         vectors, phases, amplitudes = (
-            x.astype(np.float32) for x in (self.texture.vectors[used].T, self.texture.phases[used], kept[used])
+            x.astype(np.float32) for x in (self.texture.vectors[used].T, self.texture.phases[used], attenuated[used])
         )
         value = np.empty(points.shape[:2])
-        for row, seen in zip(value, (points - self.origin).astype(np.float32), strict=True):
-            row[:] = np.cos(seen @ vectors + phases) @ amplitudes
+        for row, offsets in zip(value, (points - self.origin).astype(np.float32), strict=True):
+            row[:] = np.cos(offsets @ vectors + phases) @ amplitudes
         counts = self.level_dn * (1.0 + self.contrast * value)
         counts = np.where(np.isnan(counts), 0.3 * self.level_dn, counts)
         if noise is not None:
@@ -155,14 +156,16 @@ class Scene:
 
 def pose(x: float, y: float, heading_rad: float = 0.0, tilt: Rotation | None = None) -> RigidTransform:
     """Pose of the rover on level ground, heading counter-clockwise from +x, tilted in its own axes."""
-    turn = Rotation.from_rotvec([0.0, 0.0, heading_rad])
-    return rigid(turn if tilt is None else turn * tilt, np.array([x, y, 0.0]))
+    heading = Rotation.from_rotvec([0.0, 0.0, heading_rad])
+    return rigid(heading if tilt is None else heading * tilt, np.array([x, y, 0.0]))
 
 
 @dataclass
 class Drive:
-    """A rover that observes a scene with a tracker, stop by stop. `mast` is the true mast and `calibrated` the rover's
-    model. `pointing_error_rad` is the difference between true and commanded mast angles.
+    """A rover that tracks a target from stop to stop.
+
+    `mast` is the true mast, `calibrated` the model used by the tracker (default: the true mast). `pointing_error_rad`
+    is the true minus the commanded mast angle, for azimuth and elevation.
     """
 
     scene: Scene
@@ -178,31 +181,33 @@ class Drive:
         chosen = self.mast.right if right else self.mast.left
         return chosen.transform(world_from_rover * self.mast.geometry.rover_from_head(*angles))
 
-    def stop(self, true: RigidTransform, estimated: RigidTransform | None = None) -> TargetUpdate | None:
-        """Aim, capture images and update; return None where the tracker has no aim."""
-        estimated_x = true if estimated is None else estimated
-        is_known = self.mast if self.calibrated is None else self.calibrated
-        aim = self.tracker.aim(estimated_x, is_known)
+    def stop(self, true_pose: RigidTransform, estimated_pose: RigidTransform | None = None) -> TargetUpdate | None:
+        """Aim, capture images at the true pose and update; return None if the tracker has no aim."""
+        rover_estimate = true_pose if estimated_pose is None else estimated_pose
+        known_mast = self.mast if self.calibrated is None else self.calibrated
+        aim = self.tracker.aim(rover_estimate, known_mast)
         if aim is None:
             return None
         angles = (aim.azimuth_rad, aim.elevation_rad)
         actual = (angles[0] + self.pointing_error_rad[0], angles[1] + self.pointing_error_rad[1])
         self.measurements.append(
             RoverMeasurements(
-                left=self.scene.picture(self.camera(true, actual), aim.left, self.noise),
-                right=self.scene.picture(self.camera(true, actual, right=True), aim.right, self.noise),
-                mast=is_known,
+                left=self.scene.render_image(self.camera(true_pose, actual), aim.left, self.noise),
+                right=self.scene.render_image(self.camera(true_pose, actual, right=True), aim.right, self.noise),
+                mast=known_mast,
                 azimuth_rad=angles[0],
                 elevation_rad=angles[1],
-                world_from_rover=estimated_x,
+                world_from_rover=rover_estimate,
             )
         )
         return self.tracker.update(self.measurements[-1])
 
-    def true_pixel(self, true: RigidTransform, point_world: np.ndarray) -> np.ndarray:
+    def true_pixel(self, true_pose: RigidTransform, point_world: np.ndarray) -> np.ndarray:
         """True pixel of a world point in the left image of the last stop."""
         last, error = self.measurements[-1], self.pointing_error_rad
-        return self.camera(true, (last.azimuth_rad + error[0], last.elevation_rad + error[1])).project(point_world)[0]
+        return self.camera(true_pose, (last.azimuth_rad + error[0], last.elevation_rad + error[1])).project(
+            point_world
+        )[0]
 
 
 #: A smaller window than the paper's reduces the computed image parts.
@@ -211,14 +216,14 @@ SMALL = VttOptions(search_px=101)
 Body = Callable[[int, np.ndarray], Plane | Sphere]
 
 
-def slanted(seed: int, target: np.ndarray) -> Plane:
+def make_face(seed: int, target: np.ndarray) -> Plane:
     """A face through the target with a random tilt, visible to a rover at the origin."""
     rng = np.random.default_rng(seed)
     normal = np.array([-1.0, rng.uniform(-0.5, 0.5), rng.uniform(0.0, 1.0)])
     return Plane(target, normal / np.linalg.norm(normal))
 
 
-def boulder(seed: int, target: np.ndarray) -> Sphere:
+def make_boulder(seed: int, target: np.ndarray) -> Sphere:
     """A sphere of 0.3 to 0.6 m with the target on its front."""
     rng = np.random.default_rng(seed)
     normal = np.array([-1.0, rng.uniform(-0.4, 0.4), rng.uniform(0.2, 0.8)])
@@ -226,18 +231,18 @@ def boulder(seed: int, target: np.ndarray) -> Sphere:
     return Sphere(target - radius * normal / np.linalg.norm(normal), radius)
 
 
-def scene_of(body: Plane | Sphere, target: np.ndarray, seed: int) -> Scene:
-    return Scene((body,), waves(seed, count=100), target)
+def make_scene(body: Plane | Sphere, target: np.ndarray, seed: int) -> Scene:
+    return Scene((body,), draw_waves(seed, count=100), target)
 
 
-def details(update: TargetUpdate | None) -> VttDetails:
+def details_of(update: TargetUpdate | None) -> VttDetails:
     assert update is not None
     assert isinstance(update.details, VttDetails)
     return update.details
 
 
 def pixel_of(update: TargetUpdate) -> np.ndarray:
-    match = details(update).match
+    match = details_of(update).match
     assert match is not None
     return match.pixel
 
@@ -245,14 +250,14 @@ def pixel_of(update: TargetUpdate) -> np.ndarray:
 def approach(
     drive: Drive, target: np.ndarray, fraction: float, goal_m: float = 2.0, slip: float = 0.0
 ) -> list[tuple[RigidTransform, TargetUpdate]]:
-    """Stops on the way to the target until it is near or lost; each step is a fraction of the distance."""
+    """Drive towards the target until it is near or lost; each step is a fraction of the distance. Poses and updates."""
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     stops, x, estimated_x = [], 0.0, 0.0
     while True:
         update = drive.stop(pose(x, 0.0), pose(estimated_x, 0.0))
         assert update is not None
         stops.append((pose(x, 0.0), update))
-        distance = details(update).distance_m
+        distance = details_of(update).distance_m
         if not update.found or distance < goal_m + 0.02:
             return stops
         step = min(fraction * distance, 1.3 * (distance - goal_m))

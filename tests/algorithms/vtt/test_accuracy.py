@@ -33,12 +33,12 @@ def test_ten_pixel_drift_matches_the_paper() -> None:
 
 
 def test_table_1_requires_the_specified_pixel_pitch() -> None:
-    # The text derives 4.69 um from the sensor size, which gives 9.8 and 39.1 cm.
-    wide = [StereoDesign(d.name, d.focal_length_m, 4.8e-3 / 1024, d.baseline_m) for d in (PANCAM, NAVCAM)]
-    assert [accuracy_row(d).designation_cm for d in wide] == [9.8, 39.1]
+    # The text derives 4.69 um from the sensor size, which results in 9.8 and 39.1 cm.
+    designs = [StereoDesign(d.name, d.focal_length_m, 4.8e-3 / 1024, d.baseline_m) for d in (PANCAM, NAVCAM)]
+    assert [accuracy_row(d).designation_cm for d in designs] == [9.8, 39.1]
 
 
-def test_error_scaling_laws() -> None:
+def test_errors_scale_with_range_and_focal_length() -> None:
     assert stereo_range_error_m(6.0, 1000.0, 0.2) == pytest.approx(9.0 * stereo_range_error_m(2.0, 1000.0, 0.2))
     assert stereo_range_error_m(2.0, 1000.0, 0.2, 0.5) == pytest.approx(0.01)
     # A pixel at 2 m: 0.58 mm and 1.55 mm.

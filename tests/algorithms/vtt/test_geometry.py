@@ -26,7 +26,7 @@ from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget
 from tests.algorithms.vtt.synthetic_drive import MAST, navcam, pancam, pose
 
 
-def random_pose(rng: np.random.Generator) -> RigidTransform:
+def draw_pose(rng: np.random.Generator) -> RigidTransform:
     return rigid(Rotation.random(rng=rng), rng.normal(0.0, 5.0, 3))
 
 
@@ -51,10 +51,10 @@ def test_rover_and_site_coordinates_agree() -> None:
 
 def test_target_is_fixed_while_the_rover_moves() -> None:
     # 5 m ahead; after a drive of 1 m and a left turn of 90 deg the target is 4 m to the right.
-    moved = predicted_position(np.array([5.0, 0.0, 0.2]), pose(0.0, 0.0), pose(1.0, 0.0, np.pi / 2))
-    np.testing.assert_allclose(moved, [0.0, -4.0, 0.2], atol=1e-12)
+    predicted = predicted_position(np.array([5.0, 0.0, 0.2]), pose(0.0, 0.0), pose(1.0, 0.0, np.pi / 2))
+    np.testing.assert_allclose(predicted, [0.0, -4.0, 0.2], atol=1e-12)
     rng = np.random.default_rng(1)
-    old, new, point = random_pose(rng), random_pose(rng), rng.normal(size=3)
+    old, new, point = draw_pose(rng), draw_pose(rng), rng.normal(size=3)
     np.testing.assert_allclose(new.apply(predicted_position(point, old, new)), old.apply(point), atol=1e-12)
 
 
@@ -68,7 +68,7 @@ def test_bearings_are_clockwise_from_north(direction: tuple[int, int, int], degr
 # ----- the mast -----
 
 
-def test_azimuth_turns_to_the_right_and_elevation_up() -> None:
+def test_positive_azimuth_is_right_and_positive_elevation_is_up() -> None:
     forward = np.array([1.0, 0.0, 0.0])
     np.testing.assert_allclose(MAST.rover_from_head(np.pi / 2, 0.0).rotation.apply(forward), [0, -1, 0], atol=1e-12)
     np.testing.assert_allclose(MAST.rover_from_head(0.3, np.pi / 2).rotation.apply(forward), [0, 0, 1], atol=1e-12)
@@ -80,20 +80,20 @@ def test_azimuth_turns_to_the_right_and_elevation_up() -> None:
 def test_mast_rotates_about_both_axes_in_order() -> None:
     for azimuth, elevation in ((0.7, -0.4), (-2.1, 0.3)):
         pan = Rotation.from_rotvec([0.0, 0.0, -azimuth])
-        turn = pan * Rotation.from_rotvec([0.0, -elevation, 0.0])
-        head = MAST.rover_from_head(azimuth, elevation)
-        np.testing.assert_allclose(head.rotation.as_matrix(), turn.as_matrix(), atol=1e-14)
-        position = MAST.base_m + pan.apply(MAST.elbow_m) + turn.apply(MAST.head_m)
-        np.testing.assert_allclose(head.translation, position, atol=1e-14)
+        rotation = pan * Rotation.from_rotvec([0.0, -elevation, 0.0])
+        rover_from_head = MAST.rover_from_head(azimuth, elevation)
+        np.testing.assert_allclose(rover_from_head.rotation.as_matrix(), rotation.as_matrix(), atol=1e-14)
+        position = MAST.base_m + pan.apply(MAST.elbow_m) + rotation.apply(MAST.head_m)
+        np.testing.assert_allclose(rover_from_head.translation, position, atol=1e-14)
 
 
 def test_rounding_does_not_shift_subframe_borders() -> None:
-    # A centred target puts the borders on whole pixels, where the last bit decides the rounding.
+    # A centred target puts the borders on whole pixels, where rounding depends on the last bit.
     target, options = np.array([6.0, 0.5, 0.1]), VttOptions()
     aim = aim_at_position(target, navcam(), options)
     assert aim is not None
-    for nudge in (-1e-13, 1e-13, -3e-12, 3e-12):
-        repeated = aim_at_position(target + nudge, navcam(), options)
+    for offset_m in (-1e-13, 1e-13, -3e-12, 3e-12):
+        repeated = aim_at_position(target + offset_m, navcam(), options)
         assert repeated is not None
         assert (repeated.left, repeated.right) == (aim.left, aim.right)
 
@@ -103,8 +103,8 @@ def test_pointing_centres_the_target(mast: MastCalibration) -> None:
     for target in draw_targets(2, 20):
         angles = mast_angles(target, mast)
         assert angles is not None
-        head = mast.geometry.rover_from_head(*angles).inv().apply(target)
-        np.testing.assert_allclose(mast.left.project(head)[0], image_centre(mast.left), atol=1e-4)
+        target_in_head = mast.geometry.rover_from_head(*angles).inv().apply(target)
+        np.testing.assert_allclose(mast.left.project(target_in_head)[0], image_centre(mast.left), atol=1e-4)
 
 
 def test_pointing_a_pair_splits_the_disparity() -> None:
@@ -112,28 +112,29 @@ def test_pointing_a_pair_splits_the_disparity() -> None:
     for target in draw_targets(3, 20):
         angles = mast_angles(target, mast, use_both=True)
         assert angles is not None
-        head = mast.geometry.rover_from_head(*angles).inv().apply(target)
-        left, right = (camera.project(head)[0] - image_centre(camera) for camera in (mast.left, mast.right))
+        target_head = mast.geometry.rover_from_head(*angles).inv().apply(target)
+        left, right = (camera.project(target_head)[0] - image_centre(camera) for camera in (mast.left, mast.right))
         np.testing.assert_allclose(left + right, 0.0, atol=1e-4)
-        distance = float(np.linalg.norm(head))
+        distance = float(np.linalg.norm(target_head))
         # The disparity is f B / R to second order in the small angles.
         assert left[0] - right[0] == pytest.approx(3440.9 * 0.3 / distance, rel=0.02)
 
 
 def test_near_targets_need_pair_centred_pointing() -> None:
     # 516 px of disparity at 2 m: more than half of 1024.
-    near = np.array([1.2, -0.1, 0.1])
-    assert aim_at_position(near, pancam(), VttOptions()) is None
-    aim = aim_at_position(near, pancam(), VttOptions(aim_pair=True))
+    target = np.array([1.2, -0.1, 0.1])
+    assert aim_at_position(target, pancam(), VttOptions()) is None
+    aim = aim_at_position(target, pancam(), VttOptions(aim_pair=True))
     assert aim is not None
     assert aim.left.corner[0] - aim.right.corner[0] > 400
 
 
 def test_mast_limits_are_enforced() -> None:
-    bound = replace(navcam(), geometry=replace(MAST, azimuth_limits_rad=(-0.5, 0.5), elevation_limits_rad=(-0.6, 0.5)))
-    assert mast_angles(np.array([8.0, 1.0, 0.0]), bound) is not None
-    assert mast_angles(np.array([0.0, -8.0, 0.0]), bound) is None  # to the right
-    assert mast_angles(np.array([1.0, 0.0, 0.0]), bound) is None  # at the foot of the mast
+    geometry = replace(MAST, azimuth_limits_rad=(-0.5, 0.5), elevation_limits_rad=(-0.6, 0.5))
+    limited = replace(navcam(), geometry=geometry)
+    assert mast_angles(np.array([8.0, 1.0, 0.0]), limited) is not None
+    assert mast_angles(np.array([0.0, -8.0, 0.0]), limited) is None  # to the right
+    assert mast_angles(np.array([1.0, 0.0, 0.0]), limited) is None  # at the foot of the mast
 
 
 def test_aim_subframes_cover_the_search_windows() -> None:
@@ -141,18 +142,18 @@ def test_aim_subframes_cover_the_search_windows() -> None:
     aim = aim_at_position(np.array([6.0, 0.5, 0.1]), navcam(), options)
     assert aim is not None
     angles = (aim.azimuth_rad, aim.elevation_rad)
-    head = navcam().geometry.rover_from_head(*angles).inv().apply(np.array([6.0, 0.5, 0.1]))
+    target_in_head = navcam().geometry.rover_from_head(*angles).inv().apply(np.array([6.0, 0.5, 0.1]))
     # Half the window on each side. The right image adds half the disparity range and two rows of epipolar tolerance.
-    for camera, box, reach in (
+    for camera, box, half_size in (
         (navcam().left, aim.left, np.array([80.0, 80.0])),
         (navcam().right, aim.right, np.array([120.0, 82.0])),
     ):
-        pixel = camera.project(head)[0]
-        assert np.all(pixel - reach >= box.corner)
-        assert np.all(pixel + reach <= np.add(box.corner, box.size) - 1)
+        pixel = camera.project(target_in_head)[0]
+        assert np.all(pixel - half_size >= box.corner)
+        assert np.all(pixel + half_size <= np.add(box.corner, box.size) - 1)
 
 
-def test_pixel_designation_keeps_pixel_and_covers_all_ranges() -> None:
+def test_pixel_designation_uses_its_pixel_and_covers_all_ranges() -> None:
     mast, options = navcam(), VttOptions(seed_range_m=(2.0, 30.0))
     aim = aim_at_pixel(PixelTarget(np.array([400.0, 700.0]), 0.3, -0.2), mast, options)
     assert aim is not None
@@ -169,9 +170,11 @@ def test_pixel_designation_keeps_pixel_and_covers_all_ranges() -> None:
 
 
 def test_magnification_is_the_ratio_of_distances() -> None:
-    at = np.zeros(3)
-    assert magnification(np.array([10.0, 0.0, 0.0]), at, np.array([0.0, 9.0, 0.0]), at) == pytest.approx(10.0 / 9.0)
-    assert magnification(np.array([2.0, 0.0, 0.0]), at, np.array([4.0, 0.0, 1.0]), np.array([0, 0, 1.0])) == 0.5
+    origin = np.zeros(3)
+    assert magnification(np.array([10.0, 0.0, 0.0]), origin, np.array([0.0, 9.0, 0.0]), origin) == pytest.approx(
+        10.0 / 9.0
+    )
+    assert magnification(np.array([2.0, 0.0, 0.0]), origin, np.array([4.0, 0.0, 1.0]), np.array([0, 0, 1.0])) == 0.5
 
 
 def test_horizontal_axis_follows_skewed_image() -> None:
@@ -185,9 +188,9 @@ def test_horizontal_axis_follows_skewed_image() -> None:
 def test_image_roll_is_opposite_to_camera_roll(roll_deg: float) -> None:
     camera = navcam().left
     # The head rolls clockwise about its line of sight (+x forward): the image rolls counter-clockwise.
-    turn = rigid(Rotation.from_rotvec(np.deg2rad(roll_deg) * camera.a), np.zeros(3))
+    roll_motion = rigid(Rotation.from_rotvec(np.deg2rad(roll_deg) * camera.a), np.zeros(3))
     target = camera.c + 5.0 * camera.rays(image_centre(camera))[1]
-    observed = roll_points(target, camera, camera, turn.inv(), 0.05)
+    observed = roll_points(target, camera, camera, roll_motion.inv(), 0.05)
     assert observed is not None
     roll = roll_angle(observed)
     # The lens axis is 5 px from the rotation centre: the target moves in the image.
@@ -195,13 +198,13 @@ def test_image_roll_is_opposite_to_camera_roll(roll_deg: float) -> None:
 
 
 def test_passing_a_target_rolls_its_image() -> None:
-    # Fig. 4: a level rover. A horizontal line perpendicular to the line of sight is seen at atan(tan t sin d). The
-    # direction has turned by t at a depression angle d.
+    # Fig. 4: a level rover. After the azimuth to the target has changed by t at a depression angle d, a horizontal line
+    # that was perpendicular to the line of sight is inclined by atan(tan t sin d) in the image.
     mast = replace(navcam(), geometry=MastGeometry(np.array([0.0, 0.0, 1.5]), np.zeros(3), np.zeros(3)))
     mast = replace(mast, left=mast.left.transform(rigid(Rotation.identity(), np.array([0.0, -0.1, 0.0]))))
-    target, where = np.array([6.8, 0.0, 0.0]), [(0.0, 0.0), (5.6, 0.9)]
+    target, positions_m = np.array([6.8, 0.0, 0.0]), [(0.0, 0.0), (5.6, 0.9)]
     heads = []
-    for x, y in where:
+    for x, y in positions_m:
         stop = pose(x, y)
         angles = mast_angles(stop.inv().apply(target), mast)
         assert angles is not None
@@ -210,9 +213,10 @@ def test_passing_a_target_rolls_its_image() -> None:
     observed = roll_points(heads[0].inv().apply(target), mast.left, mast.left, new_from_old, 0.001)
     assert observed is not None
     roll = roll_angle(observed)
-    rotated = np.arctan2(0.9, 1.2)  # to the right
-    down = np.arctan2(1.5, np.hypot(0.9, 1.2))
-    assert abs(np.degrees(roll)) == pytest.approx(np.degrees(np.arctan(np.tan(rotated) * np.sin(down))), abs=0.5)
+    azimuth_change = np.arctan2(0.9, 1.2)  # to the right
+    depression = np.arctan2(1.5, np.hypot(0.9, 1.2))
+    expected = np.arctan(np.tan(azimuth_change) * np.sin(depression))
+    assert abs(np.degrees(roll)) == pytest.approx(np.degrees(expected), abs=0.5)
     assert abs(np.degrees(roll)) > 25.0
     # The former right-hand side is now farther away and higher in the image: counter-clockwise roll.
     assert roll < 0.0
@@ -240,12 +244,12 @@ def test_epipolar_curve_contains_points_of_the_ray(mast: MastCalibration) -> Non
 
 def test_search_ranges_follow_disparity_steps() -> None:
     left, right = navcam().left, navcam().right
-    near, far = search_ranges(left, right, 5.0, 20.0)
+    min_range_m, max_range_m = search_ranges(left, right, 5.0, 20.0)
     scale = disparity_px_m(left, right)
     assert scale == pytest.approx(1222.5 * 0.2)
-    assert scale / near - scale / 5.0 == pytest.approx(20.0)
-    assert scale / 5.0 - scale / far == pytest.approx(20.0)
-    assert search_ranges(left, right, 30.0, 20.0)[1] > 1e5  # to infinity and not beyond
+    assert scale / min_range_m - scale / 5.0 == pytest.approx(20.0)
+    assert scale / 5.0 - scale / max_range_m == pytest.approx(20.0)
+    assert search_ranges(left, right, 30.0, 20.0)[1] > 1e5  # 20 px exceed the disparity of 8 px: no upper limit
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
@@ -257,10 +261,10 @@ def test_triangulation_inverts_projection(mast: MastCalibration) -> None:
         np.testing.assert_allclose(result, point, atol=1e-6)
 
 
-def test_diverging_lines_of_sight_give_no_range() -> None:
+def test_diverging_lines_of_sight_have_no_range() -> None:
     left, right = navcam().left, navcam().right
-    far = np.array([1e3, 0.0, 0.0])
-    a, b = left.project(far)[0], right.project(far)[0]
+    distant_point = np.array([1e3, 0.0, 0.0])
+    a, b = left.project(distant_point)[0], right.project(distant_point)[0]
     assert triangulate(left, right, a, b) is not None
     assert triangulate(left, right, a, b + np.array([3.0, 0.0])) is None  # they diverge
     assert triangulate(left, left, a, a) is None

@@ -20,7 +20,7 @@ ALLOWED = Tolerances(distance_m=0.2, position_m=0.4)
 
 
 @pytest.mark.parametrize(
-    ("changed", "value", "expected"),
+    ("criterion", "value", "expected"),
     [
         ("match_score", 0.71, None),
         ("match_score", 0.69, TargetLoss.LOW_MATCH_SCORE),
@@ -33,8 +33,8 @@ ALLOWED = Tolerances(distance_m=0.2, position_m=0.4)
         ("position_correction_m", 0.41, TargetLoss.POSITION_JUMP),
     ],
 )
-def test_each_loss_criterion_is_independent(changed: str, value: float, expected: TargetLoss | None) -> None:
-    result = find_losses(Evidence(**(GOOD | {changed: value})), ALLOWED, OPTIONS)
+def test_each_loss_criterion_is_independent(criterion: str, value: float, expected: TargetLoss | None) -> None:
+    result = find_losses(Evidence(**(GOOD | {criterion: value})), ALLOWED, OPTIONS)
     assert result == (() if expected is None else (expected,))
 
 
@@ -55,11 +55,11 @@ def test_tolerances_match_the_formula() -> None:
     assert result.position_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2 + 0.27**2), abs=1e-3)
 
 
-def test_tolerances_shrink_with_target_distance() -> None:
+def test_tolerances_decrease_with_target_distance() -> None:
     distances = [10.0 * 0.9**i for i in range(16)]
     allowed = [
-        tolerances(Journey(10.0, before, now, before - now, 10.0 - now), navcam().left, navcam().right, OPTIONS)
-        for before, now in pairwise(distances)
+        tolerances(Journey(10.0, old, new, old - new, 10.0 - new), navcam().left, navcam().right, OPTIONS)
+        for old, new in pairwise(distances)
     ]
     assert np.all(np.diff([a.distance_m for a in allowed]) < 0.0)
     assert allowed[-1].distance_m < 0.11
@@ -84,7 +84,7 @@ NORMAL, LOST, FAILURE = TrackingState.NORMAL, TrackingState.LOST, TrackingState.
 
 
 @pytest.mark.parametrize(
-    ("limit", "result", "expected"),
+    ("limit", "results", "expected"),
     [
         (2, [True, False, False, True, False], [NORMAL, LOST, LOST, NORMAL, LOST]),
         (2, [False, False, False, True], [LOST, LOST, FAILURE, FAILURE]),
@@ -93,12 +93,13 @@ NORMAL, LOST, FAILURE = TrackingState.NORMAL, TrackingState.LOST, TrackingState.
         (0, [True, False, True], [NORMAL, FAILURE, FAILURE]),
     ],
 )
-def test_state_transitions_match_figure_6(limit: int, result: list[bool], expected: list[TrackingState]) -> None:
-    state, tries, is_visible = NORMAL, 0, []
-    for one in result:
-        state, tries = next_state(state, tries, one, limit)
-        is_visible.append(state)
-    assert is_visible == expected
+def test_state_transitions_match_figure_6(limit: int, results: list[bool], expected: list[TrackingState]) -> None:
+    """`results`: whether the target was found in each image."""
+    state, tries, states = NORMAL, 0, []
+    for is_found in results:
+        state, tries = next_state(state, tries, is_found, limit)
+        states.append(state)
+    assert states == expected
 
 
 def test_state_without_target_is_unchanged() -> None:
@@ -106,15 +107,15 @@ def test_state_without_target_is_unchanged() -> None:
 
 
 def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
-    here, goal = np.array([1.5, 0.0, 0.1]), GoalCriterion(distance_m=1.5, tolerance_m=0.05)
-    tracked = TargetUpdate(NORMAL, (), here)
-    inputs = hand_off(tracked, goal, navcam())
-    assert inputs.outcome is HandOffOutcome.HANDED_OVER
-    assert inputs.target is not None
-    np.testing.assert_array_equal(inputs.target.position_rover, here)
+    target_m, goal = np.array([1.5, 0.0, 0.1]), GoalCriterion(distance_m=1.5, tolerance_m=0.05)
+    tracked = TargetUpdate(NORMAL, (), target_m)
+    handed_over = hand_off(tracked, goal, navcam())
+    assert handed_over.outcome is HandOffOutcome.HANDED_OVER
+    assert handed_over.target is not None
+    np.testing.assert_array_equal(handed_over.target.position_rover, target_m)
     # Eq. 5 at 1.75 m (from the axis at 0.35, 1.4): 1.25 cm of stereo error, 0.36 cm of drift.
-    assert inputs.target.error_m == pytest.approx(np.hypot(1.735**2 / 244.5, 2.5 * 1.735 / 1222.5), rel=0.01)
-    lost = hand_off(TargetUpdate(LOST, (TargetLoss.LOW_MATCH_SCORE,), here), goal, navcam())
+    assert handed_over.target.error_m == pytest.approx(np.hypot(1.735**2 / 244.5, 2.5 * 1.735 / 1222.5), rel=0.01)
+    lost = hand_off(TargetUpdate(LOST, (TargetLoss.LOW_MATCH_SCORE,), target_m), goal, navcam())
     assert (lost.outcome, lost.target) == (HandOffOutcome.NOT_TRACKED, None)
-    far = hand_off(TargetUpdate(NORMAL, (), np.array([1.6, 0.0, 0.1])), goal, navcam())
-    assert (far.outcome, far.target) == (HandOffOutcome.NOT_AT_GOAL, None)
+    away_from_goal = hand_off(TargetUpdate(NORMAL, (), np.array([1.6, 0.0, 0.1])), goal, navcam())
+    assert (away_from_goal.outcome, away_from_goal.target) == (HandOffOutcome.NOT_AT_GOAL, None)

@@ -22,59 +22,60 @@ from tests.algorithms.vtt.synthetic_drive import (
     Plane,
     Scene,
     approach,
-    boulder,
-    details,
+    details_of,
+    draw_waves,
+    make_boulder,
+    make_face,
+    make_scene,
     navcam,
     pancam,
     pixel_of,
     pose,
-    scene_of,
-    slanted,
-    waves,
 )
 
 # ----- drift -----
 
 
 @pytest.mark.parametrize(
-    ("fraction", "body", "seeds"), [(0.1, slanted, range(3)), (0.1, boulder, range(3)), (0.05, slanted, range(10, 11))]
+    ("fraction", "body", "seeds"),
+    [(0.1, make_face, range(3)), (0.1, make_boulder, range(3)), (0.05, make_face, range(10, 11))],
 )
 def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, body: Body, seeds: range) -> None:
     # Requirement: 1 px rms, 2.5 px maximum without noise. A pixel at 10 m is 5 px at 2 m.
     drifts = []
     for seed in seeds:
         target = np.array([10.0, 0.2 - 0.1 * seed, 0.2])
-        drive = Drive(scene_of(body(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL))
+        drive = Drive(make_scene(body(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL))
         stops = approach(drive, target, fraction)
-        true, last = stops[-1]
+        true_pose, last = stops[-1]
         assert last.found
-        assert details(last).distance_m < 2.05
-        drifts.append(pixel_of(last) - drive.true_pixel(true, target))
+        assert details_of(last).distance_m < 2.05
+        drifts.append(pixel_of(last) - drive.true_pixel(true_pose, target))
         assert last.position_rover is not None
         # One tenth of the required 3 cm, with exact poses and cameras.
-        assert np.linalg.norm(last.position_rover - true.inv().apply(target)) < 0.003
-        for (_, before), (_, after) in pairwise(stops):
-            change = details(after).change
+        assert np.linalg.norm(last.position_rover - true_pose.inv().apply(target)) < 0.003
+        for (_, previous), (_, current) in pairwise(stops):
+            change = details_of(current).change
             assert change is not None
             # Predicted by the pose, measured by stereo: a tenth of a pixel of disparity is 0.4 % at 10 m.
-            measured = details(before).distance_m / details(after).distance_m
+            measured = details_of(previous).distance_m / details_of(current).distance_m
             assert change.magnification == pytest.approx(measured, abs=0.012)
     assert np.sqrt(np.mean(np.sum(np.square(drifts), axis=1))) < 1.0
     assert np.max(np.linalg.norm(drifts, axis=1)) < 2.5
 
 
-def test_whole_pixel_matching_drifts() -> None:
+def test_track_drifts_without_subpixel_matching() -> None:
     # Each of 32 steps has an error of up to half a pixel, magnified by later steps: 0.4 px rms times 15.
     drifts = []
     for seed in (0, 3):
         target = np.array([10.0, 0.0, 0.2])
         drive = Drive(
-            scene_of(slanted(seed, target), target, seed),
+            make_scene(make_face(seed, target), target, seed),
             navcam(),
             VisualTargetTracker(replace(SMALL, subpixel=False, min_match_score=0.0)),
         )
-        true, last = approach(drive, target, 0.05)[-1]
-        drifts.append(np.linalg.norm(pixel_of(last) - drive.true_pixel(true, target)))
+        true_pose, last = approach(drive, target, 0.05)[-1]
+        drifts.append(np.linalg.norm(pixel_of(last) - drive.true_pixel(true_pose, target)))
     assert max(drifts) > 2.5
 
 
@@ -83,10 +84,10 @@ def test_whole_pixel_matching_drifts() -> None:
 
 def test_scaling_allows_larger_steps_than_pure_ncc() -> None:
     target = np.array([10.0, 0.1, 0.2])
-    scene = scene_of(slanted(2, target), target, 2)
+    scene = make_scene(make_face(2, target), target, 2)
     scaled = approach(Drive(scene, navcam(), VisualTargetTracker(SMALL)), target, 0.23)
     assert scaled[-1][1].found
-    assert details(scaled[-1][1]).distance_m < 2.05
+    assert details_of(scaled[-1][1]).distance_m < 2.05
     pure = approach(Drive(scene, navcam(), VisualTargetTracker(replace(PURE_NCC, search_px=101))), target, 0.23)
     assert pure[-1][1].state is TrackingState.LOST
     assert TargetLoss.LOW_MATCH_SCORE in pure[-1][1].losses
@@ -95,28 +96,28 @@ def test_scaling_allows_larger_steps_than_pure_ncc() -> None:
 @pytest.mark.parametrize("roll", [True, False])
 def test_tilted_rover_requires_roll_correction(roll: bool) -> None:
     target = np.array([5.0, 0.1, 0.3])
-    drive = Drive(scene_of(slanted(1, target), target, 1), navcam(), VisualTargetTracker(replace(SMALL, roll=roll)))
+    drive = Drive(make_scene(make_face(1, target), target, 1), navcam(), VisualTargetTracker(replace(SMALL, roll=roll)))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     # The body tilts by 25 deg to its right: its image rolls counter-clockwise by about the same angle.
-    leaning = pose(0.3, 0.0, tilt=Rotation.from_rotvec([np.deg2rad(25.0), 0.0, 0.0]))
-    update = drive.stop(leaning)
-    change = details(update).change
+    tilted_pose = pose(0.3, 0.0, tilt=Rotation.from_rotvec([np.deg2rad(25.0), 0.0, 0.0]))
+    update = drive.stop(tilted_pose)
+    change = details_of(update).change
     assert change is not None
     assert np.degrees(change.roll_rad) == pytest.approx(-25.0, abs=4.0)
     assert update is not None
     assert update.found == roll
     if roll:
-        np.testing.assert_allclose(pixel_of(update), drive.true_pixel(leaning, target), atol=0.3)
+        np.testing.assert_allclose(pixel_of(update), drive.true_pixel(tilted_pose, target), atol=0.3)
 
 
 def test_turn_in_place_changes_only_mast_angles() -> None:
     target = np.array([6.0, 0.5, 0.2])
-    drive = Drive(scene_of(slanted(4, target), target, 4), navcam(), VisualTargetTracker(SMALL))
+    drive = Drive(make_scene(make_face(4, target), target, 4), navcam(), VisualTargetTracker(SMALL))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0, np.deg2rad(45.0)))
-    result = details(update)
+    result = details_of(update)
     assert update is not None
     assert update.found
     assert result.match is not None
@@ -128,10 +129,10 @@ def test_turn_in_place_changes_only_mast_angles() -> None:
     assert np.degrees(result.azimuth_rad) == pytest.approx(45.0, abs=5.0)
 
 
-def test_circling_lowers_score_but_keeps_match() -> None:
-    # Table III gives 0.85 to 0.88 at 6 to 9 deg and 0.79 at 15 deg; a flat face has no relief.
+def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
+    # Table III lists 0.85 to 0.88 at 6 to 9 deg and 0.79 at 15 deg; a flat face has no relief.
     target = np.array([4.0, 0.0, 0.3])
-    scene = scene_of(Plane(target, np.array([-0.96, 0.0, 0.28])), target, 5)
+    scene = make_scene(Plane(target, np.array([-0.96, 0.0, 0.28])), target, 5)
     scores = {}
     for step in (2.0, 8.0, 15.0):
         drive = Drive(scene, navcam(), VisualTargetTracker(SMALL))
@@ -144,9 +145,9 @@ def test_circling_lowers_score_but_keeps_match() -> None:
         assert update is not None
         assert update.found
         # The mast is ahead and to the left of the rover origin; the angle is that of the line of sight.
-        assert abs(np.degrees(details(update).azimuth_change_rad)) == pytest.approx(step, rel=0.02)
+        assert abs(np.degrees(details_of(update).azimuth_change_rad)) == pytest.approx(step, rel=0.02)
         np.testing.assert_allclose(pixel_of(update), drive.true_pixel(second, target), atol=0.2)
-        match = details(update).match
+        match = details_of(update).match
         assert match is not None
         scores[step] = match.score
     assert 0.79 < scores[15.0] < scores[8.0] < scores[2.0]
@@ -154,12 +155,12 @@ def test_circling_lowers_score_but_keeps_match() -> None:
 
 def test_driving_backwards_shrinks_the_template() -> None:
     target = np.array([4.0, 0.1, 0.2])
-    drive = Drive(scene_of(slanted(2, target), target, 2), navcam(), VisualTargetTracker(SMALL))
+    drive = Drive(make_scene(make_face(2, target), target, 2), navcam(), VisualTargetTracker(SMALL))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     for x in (-0.4, -0.8, -1.2):
         update = drive.stop(pose(x, 0.0))
-        change = details(update).change
+        change = details_of(update).change
         assert update is not None
         assert update.found
         assert change is not None
@@ -170,18 +171,18 @@ def test_driving_backwards_shrinks_the_template() -> None:
 # ----- designation, stereo, poses -----
 
 
-def test_all_three_designations_give_the_same_target() -> None:
+def test_all_three_designations_define_the_same_target() -> None:
     target = np.array([7.0, 0.3, 0.2])
     start = pose(0.0, 0.0)
-    scene = scene_of(slanted(5, target), target, 5)
+    scene = make_scene(make_face(5, target), target, 5)
     north_east_down = np.array([target[1], target[0], -target[2]])
     camera = navcam().left.transform(start * navcam().geometry.rover_from_head(0.02, -0.12))
-    picked: list[TargetDesignation] = [
+    designations: list[TargetDesignation] = [
         RoverTarget(target),
         SiteTarget(north_east_down),
         PixelTarget(camera.project(target)[0], 0.02, -0.12),
     ]
-    for designation in picked:
+    for designation in designations:
         drive = Drive(scene, navcam(), VisualTargetTracker(replace(SMALL, seed_range_m=(3.0, 15.0))))
         drive.tracker.designate(designation, start)
         update = drive.stop(start)
@@ -190,16 +191,16 @@ def test_all_three_designations_give_the_same_target() -> None:
         assert update.position_rover is not None
         # A tenth of a pixel of disparity at 7 m: 2 cm.
         np.testing.assert_allclose(update.position_rover, target, atol=0.02)
-        after = drive.stop(pose(0.7, 0.0))
-        assert after is not None
-        assert after.found
-        np.testing.assert_allclose(pixel_of(after), drive.true_pixel(pose(0.7, 0.0), target), atol=0.1)
+        second_update = drive.stop(pose(0.7, 0.0))
+        assert second_update is not None
+        assert second_update.found
+        np.testing.assert_allclose(pixel_of(second_update), drive.true_pixel(pose(0.7, 0.0), target), atol=0.1)
 
 
 def test_near_target_range_uses_pair_centred_pointing() -> None:
     target = np.array([2.2, -0.1, 0.3])
     options = replace(SMALL, aim_pair=True)
-    drive = Drive(scene_of(slanted(6, target), target, 6), pancam(), VisualTargetTracker(options))
+    drive = Drive(make_scene(make_face(6, target), target, 6), pancam(), VisualTargetTracker(options))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0))
     assert update is not None
@@ -213,39 +214,39 @@ def test_slanted_face_score_includes_second_camera_view() -> None:
     face = Plane(target, np.array([-np.cos(slant), np.sin(slant), 0.0]))
     scores = {}
     for warp in ("shift", "bend"):
-        drive = Drive(scene_of(face, target, 3), navcam(), VisualTargetTracker(replace(SMALL, warp=warp)))
+        drive = Drive(make_scene(face, target, 3), navcam(), VisualTargetTracker(replace(SMALL, warp=warp)))
         drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-        stereo = details(drive.stop(pose(0.0, 0.0))).stereo
+        stereo = details_of(drive.stop(pose(0.0, 0.0))).stereo
         scores[warp] = 0.0 if stereo is None else stereo.score
     assert scores["bend"] > 0.95
     assert scores["shift"] < scores["bend"] - 0.1
 
 
 def test_slip_appears_as_a_position_correction() -> None:
-    # The rover drives 4 % less than estimated: 4 cm of the first metre, at most 5 px at the image centre.
+    # The rover drives 4 % less than estimated: 4 cm in the first metre, a displacement of at most 5 px in the image.
     target = np.array([8.0, 0.1, 0.2])
-    drive = Drive(scene_of(slanted(7, target), target, 7), navcam(), VisualTargetTracker(SMALL))
+    drive = Drive(make_scene(make_face(7, target), target, 7), navcam(), VisualTargetTracker(SMALL))
     stops = approach(drive, target, 0.1, slip=0.04)
-    true, last = stops[-1]
+    true_pose, last = stops[-1]
     assert last.found
     assert last.position_rover is not None
-    np.testing.assert_allclose(last.position_rover, true.inv().apply(target), atol=0.01)
-    evidence = details(last).evidence
+    np.testing.assert_allclose(last.position_rover, true_pose.inv().apply(target), atol=0.01)
+    evidence = details_of(last).evidence
     assert evidence is not None
     # After 6 m the target has moved by 4 % of that in the estimated world frame.
     assert evidence.position_correction_m == pytest.approx(0.24, abs=0.05)
 
 
-def test_pointing_error_moves_image_but_not_match() -> None:
+def test_pointing_error_does_not_change_the_match() -> None:
     target = np.array([6.0, 0.1, 0.2])
-    drive = Drive(scene_of(slanted(5, target), target, 5), navcam(), VisualTargetTracker(SMALL))
+    drive = Drive(make_scene(make_face(5, target), target, 5), navcam(), VisualTargetTracker(SMALL))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     drive.pointing_error_rad = (np.deg2rad(0.5), np.deg2rad(-0.3))
     update = drive.stop(pose(0.5, 0.0))
     assert update is not None
     assert update.found
-    result = details(update)
+    result = details_of(update)
     assert result.predicted_pixel is not None
     # 0.82 mrad per pixel: pointing too far right and down moves the target left and up.
     correction = pixel_of(update) - result.predicted_pixel
@@ -253,18 +254,18 @@ def test_pointing_error_moves_image_but_not_match() -> None:
     np.testing.assert_allclose(pixel_of(update), drive.true_pixel(pose(0.5, 0.0), target), atol=0.1)
 
 
-@pytest.mark.parametrize(("rows", "result"), [(1.4, True), (5.0, False)])
-def test_point_stereo_tolerates_two_pixel_misalignment(rows: float, result: bool) -> None:
+@pytest.mark.parametrize(("rows_px", "is_found"), [(1.4, True), (5.0, False)])
+def test_point_stereo_tolerates_two_pixel_misalignment(rows_px: float, is_found: bool) -> None:
     target = np.array([6.0, 0.1, 0.2])
-    true = navcam()
-    assert isinstance(true.right, Cahvor)
-    misaligned = replace(true, right=replace(true.right, v=true.right.v + rows * true.right.a))
-    drive = Drive(scene_of(slanted(5, target), target, 5), true, VisualTargetTracker(SMALL), calibrated=misaligned)
+    mast = navcam()
+    assert isinstance(mast.right, Cahvor)
+    misaligned = replace(mast, right=replace(mast.right, v=mast.right.v + rows_px * mast.right.a))
+    drive = Drive(make_scene(make_face(5, target), target, 5), mast, VisualTargetTracker(SMALL), calibrated=misaligned)
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0))
     assert update is not None
-    assert update.found == result
-    if result:
+    assert update.found == is_found
+    if is_found:
         # Row errors hardly affect the range: a tenth of a pixel of disparity is 1.5 cm here.
         assert np.linalg.norm(update.position_rover - target) < 0.03
     else:
@@ -274,7 +275,8 @@ def test_point_stereo_tolerates_two_pixel_misalignment(rows: float, result: bool
 def test_spinning_wheels_are_detected() -> None:
     # The estimated drive is 1.5 m of 8 m. The target is still 8 m away, and its image is not magnified.
     target = np.array([8.0, 0.1, 0.2])
-    drive = Drive(scene_of(slanted(8, target), target, 8), navcam(), VisualTargetTracker(replace(SMALL, search_px=161)))
+    tracker = VisualTargetTracker(replace(SMALL, search_px=161))
+    drive = Drive(make_scene(make_face(8, target), target, 8), navcam(), tracker)
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0), pose(1.5, 0.0))
@@ -284,25 +286,25 @@ def test_spinning_wheels_are_detected() -> None:
 
 def test_detector_noise_has_little_effect() -> None:
     target = np.array([6.0, 0.1, 0.2])
-    scene = replace(scene_of(slanted(9, target), target, 9), contrast=0.08)
+    scene = replace(make_scene(make_face(9, target), target, 9), contrast=0.08)
     drive = Drive(scene, navcam(), VisualTargetTracker(SMALL), noise=np.random.default_rng(1))
-    true, last = approach(drive, target, 0.1)[-1]
+    true_pose, last = approach(drive, target, 0.1)[-1]
     assert last.found
-    assert np.linalg.norm(pixel_of(last) - drive.true_pixel(true, target)) < 1.0
+    assert np.linalg.norm(pixel_of(last) - drive.true_pixel(true_pose, target)) < 1.0
 
 
-# ----- another tracker behind the same protocol -----
+# ----- another tracker with the same protocol -----
 
 
 def test_lucas_kanade_tracks_in_the_same_loop() -> None:
     target = np.array([6.0, 0.1, 0.2])
     tracker: TargetTracker = lucas_kanade_tracker(SMALL)
-    drive = Drive(scene_of(slanted(1, target), target, 1), navcam(), tracker)
+    drive = Drive(make_scene(make_face(1, target), target, 1), navcam(), tracker)
     assert [tracker.state] == [TrackingState.NO_TARGET]
-    true, last = approach(drive, target, 0.1)[-1]
+    true_pose, last = approach(drive, target, 0.1)[-1]
     assert last.found
     assert tracker.state is TrackingState.NORMAL
-    assert np.linalg.norm(pixel_of(last) - drive.true_pixel(true, target)) < 2.5
+    assert np.linalg.norm(pixel_of(last) - drive.true_pixel(true_pose, target)) < 2.5
 
 
 @pytest.mark.parametrize(
@@ -328,40 +330,40 @@ def test_invalid_options_are_rejected(invalid: dict[str, object]) -> None:
 def hide_behind_board(scene: Scene) -> Scene:
     """The scene behind a board with another texture, half-way to the target."""
     board = Plane(np.array([3.0, 0.0, 0.5]), np.array([-1.0, 0.0, 0.0]))
-    return Scene((board,), waves(99, count=100), board.point)
+    return Scene((board,), draw_waves(99, count=100), board.point)
 
 
 @pytest.mark.parametrize(
-    ("behind", "expected"),
+    ("occluded_stops", "expected"),
     [
         ([1], [TrackingState.LOST, TrackingState.NORMAL, TrackingState.NORMAL]),
         ([1, 2, 3], [TrackingState.LOST, TrackingState.LOST, TrackingState.FAILURE]),
     ],
 )
-def test_occluded_target_is_recovered_or_abandoned(behind: list[int], expected: list[TrackingState]) -> None:
+def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], expected: list[TrackingState]) -> None:
     target = np.array([6.0, 0.1, 0.2])
-    clear = scene_of(slanted(3, target), target, 3)
+    clear_scene = make_scene(make_face(3, target), target, 3)
     tracker = VisualTargetTracker(SMALL)
-    drive = Drive(clear, navcam(), tracker)
+    drive = Drive(clear_scene, navcam(), tracker)
     tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     states = []
     for stop in (1, 2, 3):
-        drive.scene = hide_behind_board(clear) if stop in behind else clear
-        true = pose(0.25 * stop, 0.0)
-        update = drive.stop(true)
+        drive.scene = hide_behind_board(clear_scene) if stop in occluded_stops else clear_scene
+        true_pose = pose(0.25 * stop, 0.0)
+        update = drive.stop(true_pose)
         assert update is not None
         states.append(update.state)
         if update.found:
-            np.testing.assert_allclose(pixel_of(update), drive.true_pixel(true, target), atol=0.2)
+            np.testing.assert_allclose(pixel_of(update), drive.true_pixel(true_pose, target), atol=0.2)
         else:
-            # The predicted position is exact, as the poses are.
+            # The predicted position is exact because the poses are exact.
             assert update.losses
             assert update.position_rover is not None
-            np.testing.assert_allclose(update.position_rover, true.inv().apply(target), atol=0.03)
+            np.testing.assert_allclose(update.position_rover, true_pose.inv().apply(target), atol=0.03)
     assert states == expected
     if states[-1] is TrackingState.FAILURE:
-        drive.scene = clear
+        drive.scene = clear_scene
         repeated = drive.stop(pose(1.0, 0.0))
         assert repeated is not None
         assert (repeated.state, repeated.losses, repeated.found) == (TrackingState.FAILURE, (), False)
@@ -373,42 +375,42 @@ def test_occluded_target_is_recovered_or_abandoned(behind: list[int], expected: 
 
 def test_image_without_the_target_is_a_loss() -> None:
     target = np.array([6.0, 0.1, 0.2])
-    scene = scene_of(slanted(3, target), target, 3)
+    scene = make_scene(make_face(3, target), target, 3)
     drive = Drive(scene, navcam(), VisualTargetTracker(SMALL))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
-    observed = drive.measurements[-1]
+    measurements = drive.measurements[-1]
     blank = MastImage(np.full((40, 40), 1000, dtype=np.uint16), (0, 0))
     for invalid, loss in (
-        (replace(observed, left=blank), TargetLoss.OUT_OF_VIEW),
-        (replace(observed, right=blank), TargetLoss.OUT_OF_VIEW),
-        (replace(observed, azimuth_rad=observed.azimuth_rad + 2.5), TargetLoss.OUT_OF_VIEW),
+        (replace(measurements, left=blank), TargetLoss.OUT_OF_VIEW),
+        (replace(measurements, right=blank), TargetLoss.OUT_OF_VIEW),
+        (replace(measurements, azimuth_rad=measurements.azimuth_rad + 2.5), TargetLoss.OUT_OF_VIEW),
         (
-            replace(observed, left=replace(observed.left, counts=np.full_like(observed.left.counts, 900))),
+            replace(measurements, left=replace(measurements.left, counts=np.full_like(measurements.left.counts, 900))),
             TargetLoss.LOW_MATCH_SCORE,
         ),
         (
-            replace(observed, right=replace(observed.right, counts=observed.left.counts * 0)),
+            replace(measurements, right=replace(measurements.right, counts=measurements.left.counts * 0)),
             TargetLoss.LOW_STEREO_SCORE,
         ),
     ):
         drive.tracker.clear()
         drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-        assert drive.tracker.update(observed).found
+        assert drive.tracker.update(measurements).found
         update = drive.tracker.update(invalid)
         assert update.state is TrackingState.LOST
         assert loss in update.losses
 
 
-def test_unseeded_target_is_abandoned() -> None:
+def test_target_never_seen_is_abandoned() -> None:
     tracker = VisualTargetTracker(SMALL)
     target = np.array([6.0, 0.1, 0.2])
-    drive = Drive(scene_of(slanted(3, target), target, 3), navcam(), tracker)
+    drive = Drive(make_scene(make_face(3, target), target, 3), navcam(), tracker)
     tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
-    away = replace(drive.measurements[-1], azimuth_rad=2.0)
+    other_direction = replace(drive.measurements[-1], azimuth_rad=2.0)
     tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    assert [tracker.update(away).state for _ in range(3)] == [
+    assert [tracker.update(other_direction).state for _ in range(3)] == [
         TrackingState.LOST,
         TrackingState.LOST,
         TrackingState.FAILURE,

@@ -280,8 +280,8 @@ def test_crash_after_other_case_is_repeated_in_fresh_worker() -> None:
     _held_objects.clear()
     results = run_items(crash_after_other_case, range(5))
     assert {item: result.result for item, result in results.items()} == {0: 0, 1: 1, 2: 2, 3: -1, 4: 4}
-    # spoiled_by names the earlier case; case 3 crashes in a fresh worker too
-    assert [results[item].spoiled_by for item in range(5)] == [None, 0, 1, None, None]
+    # crashed_only_after names the earlier case; case 3 crashes in a fresh worker too
+    assert [results[item].crashed_only_after for item in range(5)] == [None, 0, 1, None, None]
     assert [results[item].crashed for item in range(5)] == [False, False, False, True, False]
 
 

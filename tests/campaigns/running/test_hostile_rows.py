@@ -31,15 +31,15 @@ population = "near"
 """
 #: Recorded error of each fault; other cases are valid.
 REASONS = {
-    "text in a metric": "column velocity_error_m_s holds 'small'; error needs a number",
-    "text in a population": "column near holds 'yes'; error needs true or false",
-    "int of 400 digits": "column number holds an integer of 1329 bits",
-    "int of 5000 digits": "column velocity_error_m_s holds an integer of 16610 bits",
+    "text in a metric": "column velocity_error_m_s contains 'small'; error needs a number",
+    "text in a population": "column near contains 'yes'; error needs true or false",
+    "int of 400 digits": "column number contains an integer of 1329 bits",
+    "int of 5000 digits": "column velocity_error_m_s contains an integer of 16610 bits",
     "closes files": "the case closed or replaced the worker's file descriptors",
     "error without a message": "SilentError (its message cannot be formatted)",
     "raises": "ValueError: the algorithm raised",
     "exits": "the worker process died: EXIT (3)",
-    "list in a column": "column text holds a list",
+    "list in a column": "column text contains a list",
 }
 
 

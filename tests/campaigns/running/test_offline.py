@@ -16,9 +16,9 @@ from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.offline import (
+    create_scoring_campaign,
     export_campaign,
     find_cases_with_changed_images,
-    scored_campaign,
     truth_folder,
 )
 from marsyard.campaigns.running.replay import differing_columns
@@ -82,7 +82,7 @@ def write_answers(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
 
 def test_external_answers_score_as_a_normal_run(exported: Exported, tmp_path: Path) -> None:
     watch = RecordingWatch()
-    scored = scored_campaign(*exported, write_answers(tmp_path / "theirs.csv", estimate_exported(exported)))
+    scored = create_scoring_campaign(*exported, write_answers(tmp_path / "theirs.csv", estimate_exported(exported)))
     run_campaign(scored, tmp_path / "scored", ExecutorConfig(1), watch)
     normal_run = load_campaign(str(exported.directory.parent / "fake.toml"))
     run_campaign(normal_run, tmp_path / "own", ExecutorConfig(1), watch)
@@ -125,14 +125,14 @@ def test_tables_with_missing_or_unknown_cases_are_rejected(exported: Exported, t
     answers = estimate_exported(exported)
     incomplete = write_answers(tmp_path / "few.csv", {case: answers[case] for case in (0, 2)})
     with pytest.raises(CampaignError, match=r"no answer to 1 of 3 cases: 1; .*such as NO_TEMPLATE_AREA"):
-        scored_campaign(*exported, incomplete)
+        create_scoring_campaign(*exported, incomplete)
     unknown_case = write_answers(tmp_path / "many.csv", {**answers, 7: answers[0]})
     with pytest.raises(CampaignError, match="unknown case 7; allowed: 0 to 2"):
-        scored_campaign(*exported, unknown_case)
+        create_scoring_campaign(*exported, unknown_case)
     with pytest.raises(CampaignError, match="No such file"):
-        scored_campaign(*exported, tmp_path / "none.csv")
+        create_scoring_campaign(*exported, tmp_path / "none.csv")
     with pytest.raises(StoreError, match="contains no finished export"):
-        scored_campaign(tmp_path, exported.truth, incomplete)
+        create_scoring_campaign(tmp_path, exported.truth, incomplete)
 
 
 def test_closed_loops_cannot_be_exported(tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ def test_products_are_kept_as_configured(
         stored_row = json.loads((directory / "cases" / str(case) / "row.json").read_text())
         assert differing_columns(stored_row, rows[case]) == ()
     assert [note for note in watch.notes if "budget" in note] == (
-        ["the budget for kept products (retain.budget_gb) is used: none is kept from case 1 on"]
+        ["the disk space for products (retain.budget_gb) is used: none are stored from case 1 on"]
         if "retain.budget_gb=1e-6" in overrides
         else []
     )

@@ -181,10 +181,7 @@ def test_folder_lock_is_exclusive(tmp_path: Path) -> None:
     assert not is_locked(tmp_path)
     with folder_lock(tmp_path):
         assert is_locked(tmp_path)
-        with (
-            pytest.raises(StoreError, match=f"is in use: process {os.getpid()} on .* works in it"),
-            folder_lock(tmp_path),
-        ):
+        with pytest.raises(StoreError, match=f"is in use: process {os.getpid()} on .* uses it"), folder_lock(tmp_path):
             pass
     assert not is_locked(tmp_path)
     with folder_lock(tmp_path):

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import pytest
 
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.reports.dashboard.entries import (
@@ -44,7 +43,7 @@ def test_index_lists_all_requirements_and_campaigns(make_rows: Rows, make_run: M
     for name in shipped_requirements():
         assert f'data-requirement="{name}"' in text
     # only DIMES-VEL has stored campaigns
-    assert text.count("No stored campaign shows it.") == len(shipped_requirements()) - 1
+    assert text.count("No stored campaign tests this requirement.") == len(shipped_requirements()) - 1
     assert len(re.findall(r'<tr id="dimes-synthetic-', text)) == 3
     assert '<svg class="spark"' in text
     assert "3 stored campaigns" in text
@@ -90,7 +89,7 @@ def test_links_have_targets_in_the_site(
     assert (next(site.glob("c/*")) / "report.html").is_file()
 
 
-def test_security_policy_names_the_script(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_security_policy_contains_the_hash_of_the_script(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
     make_run(make_rows(6)[MIN_COLUMNS])
     text = _write_index(tmp_path)
     (script,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
@@ -123,7 +122,7 @@ def test_folder_names_have_only_letters_digits_and_hyphens(tmp_path: Path) -> No
     assert make_slug(tmp_path / "a", "x") != make_slug(tmp_path / "b", "x")
 
 
-def test_campaigns_are_found_once(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_overlapping_search_folders_list_each_campaign_once(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
     first = make_run(make_rows(6)[MIN_COLUMNS], name="a/b")
     make_run(make_rows(6)[MIN_COLUMNS], name="c")
     assert find_campaigns([tmp_path, first, tmp_path / "a"]) == [first, tmp_path / "c"]
@@ -133,25 +132,25 @@ def test_campaigns_are_found_once(make_rows: Rows, make_run: MakeRun, tmp_path: 
 def test_unreadable_campaign_is_reported_and_others_are_shown(
     make_rows: Rows, make_run: MakeRun, tmp_path: Path
 ) -> None:
-    make_run(make_rows(6)[MIN_COLUMNS], name="good")
-    bad = make_run(make_rows(6)[MIN_COLUMNS], name="bad")
-    (bad / "cases.parquet").write_bytes(b"nothing")
+    make_run(make_rows(6)[MIN_COLUMNS], name="readable")
+    damaged = make_run(make_rows(6)[MIN_COLUMNS], name="damaged")
+    (damaged / "cases.parquet").write_bytes(b"not a table")
     site = write_site(tmp_path / "site", [tmp_path])
     assert site.campaigns == 1
     assert len(site.problems) == 1
-    assert "bad" in site.index.read_text(encoding="utf-8")
+    assert "damaged" in site.index.read_text(encoding="utf-8")
 
 
-def test_pages_of_unchanged_campaigns_are_kept(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_pages_of_unchanged_campaigns_are_not_rewritten(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     _write_index(tmp_path)
     page = next((tmp_path / "site" / "c").glob("*/index.html"))
-    page.write_text("as it was", encoding="utf-8")
+    page.write_text("page of the first run", encoding="utf-8")
     _write_index(tmp_path)
-    assert page.read_text(encoding="utf-8") == "as it was"
+    assert page.read_text(encoding="utf-8") == "page of the first run"
     (directory / "report.json").unlink()
     _write_index(tmp_path)
-    assert "as it was" not in page.read_text(encoding="utf-8")
+    assert "page of the first run" not in page.read_text(encoding="utf-8")
 
 
 def _make_verdict(estimate: float, margin: float = -0.05) -> RequirementVerdict:
@@ -160,22 +159,22 @@ def _make_verdict(estimate: float, margin: float = -0.05) -> RequirementVerdict:
     )
 
 
-def test_sparkline_draws_higher_rates_higher() -> None:
+def test_sparkline_rises_with_the_rate() -> None:
     line = sparkline([_make_verdict(0.9), _make_verdict(0.97), _make_verdict(1.0)])
     assert line is not None
     heights = [float(point.split(",")[1]) for point in line.points.split()]
+    # y of SVG points down: a higher rate has a smaller y
     assert heights[0] > line.required_y > heights[1] > heights[2]
     assert sparkline([_make_verdict(0.9)]) is None
     assert sparkline([_make_verdict(float("nan"))] * 3) is None
 
 
-def test_margin_is_given_in_percentage_points() -> None:
+def test_margin_is_printed_in_percentage_points() -> None:
     assert margin_text(_make_verdict(0.9)) == "−5.00 pp"
     assert margin_text(_make_verdict(0.9, margin=0.0123)) == "+1.23 pp"
     assert margin_text(_make_verdict(0.9, margin=float("nan"))) == "–"
 
 
-@pytest.mark.parametrize("entries", [[]])
-def test_index_without_campaigns_is_written(entries: list[Any], tmp_path: Path) -> None:
-    assert all(row.latest is None for row in requirement_rows(entries, shipped_requirements()))
+def test_index_without_campaigns_is_written(tmp_path: Path) -> None:
+    assert all(row.latest is None for row in requirement_rows([], shipped_requirements()))
     assert "0 stored campaigns" in _write_index(tmp_path)

@@ -50,7 +50,7 @@ def test_images_are_binned_to_square_pixels(dimes_products: dict[str, Any]) -> N
     assert sizes == [(384, 384), (384, 384), *patches, (256, 256), (256, 256)]
 
 
-def test_squares_are_at_the_track_positions(dimes_products: dict[str, Any]) -> None:
+def test_template_squares_are_at_the_track_positions(dimes_products: dict[str, Any]) -> None:
     table = np.asarray(dimes_products["tracks"])
     rectified, _, square, _ = _find_squares(draw_dimes_pair(dimes_products, 0), TEMPLATE)
     assert _find_centre(square) == pytest.approx(tuple(table[0, 2:4]))
@@ -68,7 +68,7 @@ def test_rectified_matches_are_inside_their_windows(dimes_products: dict[str, An
     assert window.get_width() == pytest.approx(61.0)
 
 
-def test_rectified_image_is_resampled_by_the_lattice(dimes_products: dict[str, Any]) -> None:
+def test_rectified_image_is_resampled_with_the_lattice(dimes_products: dict[str, Any]) -> None:
     counts = np.zeros((256, 256))
     counts[100:110, 40:60] = 1000.0
     figure = draw_dimes_pair({**dimes_products, "image_1": counts}, 0)
@@ -104,7 +104,7 @@ def test_missing_products_are_tolerated(dimes_products: dict[str, Any], changes:
     assert draw_dimes_case({**dimes_products, **changes}).axes
 
 
-def test_other_products_are_not_a_dimes_case(dimes_products: dict[str, Any]) -> None:
+def test_incomplete_products_are_not_a_dimes_case(dimes_products: dict[str, Any]) -> None:
     assert is_dimes_case(dimes_products)
     assert not is_dimes_case({})
     assert not is_dimes_case({**dimes_products, "image_3": np.zeros(3)})
@@ -116,10 +116,10 @@ def test_other_products_are_not_a_dimes_case(dimes_products: dict[str, Any]) -> 
 def test_case_without_tracks_shows_only_images(dimes_products: dict[str, Any]) -> None:
     image_products = {name: value for name, value in dimes_products.items() if name.startswith(("image_", "velocity_"))}
     case_view = view(image_products, "k")
-    (pictures,) = case_view.figures
-    assert pictures.wide
-    assert "templates" not in str(pictures.svg)
-    assert "Picture 3" in str(pictures.svg)
+    (image_figure,) = case_view.figures
+    assert image_figure.wide
+    assert "templates" not in str(image_figure.svg)
+    assert "Image 3" in str(image_figure.svg)
     assert (case_view.head, case_view.rows) == ([], [])
     assert case_view.legend is not None
     assert "squares mark" not in case_view.legend

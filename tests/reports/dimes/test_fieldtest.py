@@ -21,26 +21,26 @@ MakeRows = Callable[..., pd.DataFrame]
 
 @pytest.fixture
 def field_frame(make_rows: MakeRows) -> pd.DataFrame:
-    """20 image triples in each of three cells, with 20, 10 and 0 answers; the paper has two of the cells."""
+    """Return 20 image triples in each of three cells, with 20, 10 and 0 answers; the paper lists two of them."""
     frame = make_rows(60, answered=1.0)
     frame["category"] = ["short time"] * 20 + ["same direction"] * 20 + ["opposite direction"] * 20
     frame["run"] = ["Kelso Run 3"] * 40 + ["Mojave Run 9"] * 20
-    silent = np.arange(60) >= 30
-    frame.loc[silent, "answered"] = False
-    frame.loc[silent, [name for name in frame if str(name).startswith("velocity_error")]] = np.nan
+    unanswered = np.arange(60) >= 30
+    frame.loc[unanswered, "answered"] = False
+    frame.loc[unanswered, [name for name in frame if str(name).startswith("velocity_error")]] = np.nan
     return frame
 
 
 def test_cells_are_compared_with_the_paper(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
     run = read_run(make_run(field_frame, requirements=[VELOCITY]))
-    short, same, other = field_cells(Subject(run, "velocity_error_m_s", 5.0))
-    assert (short["valid"].hits, short["paper_percent"]) == (20, 100)
-    assert short["difference_points"] == pytest.approx(0.0)
-    assert (same["valid"].hits, same["paper_percent"]) == (10, 40)
-    assert same["difference_points"] == pytest.approx(10.0)
-    assert other["paper_percent"] is None
-    assert np.isnan(other["difference_points"])
-    assert np.isnan(other["largest"])
+    short_time, same_direction, opposite_direction = field_cells(Subject(run, "velocity_error_m_s", 5.0))
+    assert (short_time["valid"].hits, short_time["paper_percent"]) == (20, 100)
+    assert short_time["difference_points"] == pytest.approx(0.0)
+    assert (same_direction["valid"].hits, same_direction["paper_percent"]) == (10, 40)
+    assert same_direction["difference_points"] == pytest.approx(10.0)
+    assert opposite_direction["paper_percent"] is None
+    assert np.isnan(opposite_direction["difference_points"])
+    assert np.isnan(opposite_direction["largest"])
 
 
 def test_page_reports_misprints_and_categories(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
@@ -54,7 +54,7 @@ def test_page_reports_misprints_and_categories(make_run: MakeRun, field_frame: p
     assert len(section.blocks[1].figures) == 2  # the third category has no answers
 
 
-def test_table_of_the_paper_has_its_known_misprints() -> None:
+def test_stored_table_has_the_misprints_of_the_paper() -> None:
     """The totals of two printed rows are wrong, and one percentage (97 is printed as 99)."""
     wrong_totals = [key for key, cell in FIG_11.items() if cell["valid"] + cell["invalid"] != cell["total"]]
     assert wrong_totals == [("short time", "Pisgah Run 3"), ("same direction", "Pisgah Run 3")]

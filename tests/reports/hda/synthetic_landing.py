@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+#: Rows and columns of the elevation map, and image width / 2 = 160 px at 10 m height and 240 px focal length.
 SHAPE = (24, 32)
 CELL_M, HEIGHT_M, FOCAL_PX = 0.25, 10.0, 240.0
 
 
 def synthetic_products() -> dict[str, Any]:
-    """Products in the layout of `marsyard.scenarios.landing.score.products`, for a nadir camera with x to the east."""
+    """Return products in the layout of `landing.score.products`, for a nadir camera with its x axis to the east."""
     rng = np.random.default_rng(1)
     rows, columns = SHAPE
     corner = np.array([-0.5 * (columns - 1), 0.5 * (rows - 1)]) * CELL_M
@@ -28,11 +29,12 @@ def synthetic_products() -> dict[str, Any]:
     features = rng.uniform(20.0, 220.0, (30, 2))
     grid = np.stack(np.meshgrid(np.arange(20.0, 300.0, 8.0), np.arange(20.0, 220.0, 8.0)), axis=-1).reshape(-1, 2)
     accepted = rng.random(30) < 0.8
-    rays = np.array([[-160, -120, 240], [160, -120, 240], [160, 120, 240], [-160, 120, 240]]) / FOCAL_PX
+    corner_rays = np.array([[-160, -120, 240], [160, -120, 240], [160, 120, 240], [-160, 120, 240]]) / FOCAL_PX
     camera = np.eye(4)
     camera[:3, 3] = (100.0, 50.0, HEIGHT_M)
-    spacing = 0.1
-    true_x, true_y = np.meshgrid(100.0 + np.arange(-40, 41) * spacing, 50.0 + np.arange(-30, 31) * spacing)
+    true_spacing_m = 0.1
+    offset_x, offset_y = np.arange(-40, 41) * true_spacing_m, np.arange(-30, 31) * true_spacing_m
+    true_x, true_y = np.meshgrid(100.0 + offset_x, 50.0 + offset_y)
     true_rock = 0.5 * np.exp(-((true_x - 102.0) ** 2 + (true_y - 51.0) ** 2) / 0.1)
     is_near_rock = np.hypot(true_x - 102.0, true_y - 51.0) < 1.2
     return {
@@ -46,8 +48,8 @@ def synthetic_products() -> dict[str, Any]:
         "true_rotation": np.eye(3),
         "true_translation": np.array([-1.1, 0.0, 0.0]),
         "sparse_points": rng.uniform([-5.0, -4.0, 9.5], [5.0, 4.0, 10.0], (int(accepted.sum()), 3)),
-        "frustum_0": rays,
-        "frustum_1": rays,
+        "frustum_0": corner_rays,
+        "frustum_1": corner_rays,
         "grid": grid,
         "segment_starts": grid + np.array([24.0, 0.0]),
         "segment_ends": grid + np.array([36.0, 0.0]),
@@ -69,7 +71,7 @@ def synthetic_products() -> dict[str, Any]:
         "true_places": np.stack([true_x, true_y], axis=-1),
         "true_heights": 0.1 * np.sin(true_x - 100.0) + true_rock,
         "true_corner": np.array([true_x[0, 0], true_y[0, 0]]),
-        "true_spacing": np.array([spacing]),
+        "true_spacing": np.array([true_spacing_m]),
         "true_slope": np.full(true_x.shape, 0.05),
         "true_roughness": np.where(is_near_rock, 0.5, 0.02),
         "true_safe": ~is_near_rock,
@@ -78,29 +80,29 @@ def synthetic_products() -> dict[str, Any]:
 
 
 def landing_frame(cases: int, seed: int = 1) -> pd.DataFrame:
-    """Rows of flights over rocks: 10 % find no site, 5 % report an unsafe site."""
+    """Return rows of flights over rocks: 10 % report no safe site, 5 % have no result, 5 % of the sites are unsafe."""
     rng = np.random.default_rng(seed)
     outcome = rng.choice(["SAFE_SITE", "NO_SAFE_SITE", "NO_MOTION"], cases, p=[0.85, 0.1, 0.05])
-    reported = outcome == "SAFE_SITE"
-    safe = rng.random(cases) < 0.95
-    error = np.where(reported, rng.rayleigh(0.8, cases), np.nan)
+    is_reported = outcome == "SAFE_SITE"
+    is_safe = rng.random(cases) < 0.95
+    error = np.where(is_reported, rng.rayleigh(0.8, cases), np.nan)
     frame = pd.DataFrame(
         {
             "case": np.arange(cases),
             "outcome": outcome,
             "answered": outcome != "NO_MOTION",
             "converged": outcome != "NO_MOTION",
-            "site_reported": reported,
+            "site_reported": is_reported,
             "no_site_reported": outcome == "NO_SAFE_SITE",
-            "site_safe": safe & (outcome != "NO_SAFE_SITE"),
+            "site_safe": is_safe & (outcome != "NO_SAFE_SITE"),
             "safe_site_exists": outcome != "NO_SAFE_SITE",
             "no_safe_site_exists": outcome == "NO_SAFE_SITE",
-            "wide_site_exists": reported,
-            "site_hazard_distance_m": np.where(reported, rng.uniform(0.2, 3.0, cases), np.nan),
+            "wide_site_exists": is_reported,
+            "site_hazard_distance_m": np.where(is_reported, rng.uniform(0.2, 3.0, cases), np.nan),
             "true_safe_fraction": rng.random(cases),
-            "landed": reported,
-            "touchdown_safe": safe & reported,
-            "touchdown_hazard_distance_m": np.where(reported, rng.uniform(0.1, 2.0, cases), np.nan),
+            "landed": is_reported,
+            "touchdown_safe": is_safe & is_reported,
+            "touchdown_hazard_distance_m": np.where(is_reported, rng.uniform(0.1, 2.0, cases), np.nan),
             "touchdown_error_gps_m": error,
             "touchdown_error_m": 1.1 * error,
             "gps_deviation_north_m": 0.5,

@@ -84,7 +84,7 @@ def test_maps_have_the_colours_of_the_paper(hda_products: dict[str, Any]) -> Non
     assert [to_hex(colour) for colour in safety.to_rgba(np.arange(3))] == [GREEN, YELLOW, RED]
 
 
-def test_colours_differ_without_hue() -> None:
+def test_safety_colours_differ_in_luminance() -> None:
     """Yellow differs from green and red in luminance; hatching marks red."""
     luminance = [float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))) for colour in (GREEN, YELLOW, RED)]
     assert luminance[1] > 1.5 * max(luminance[0], luminance[2])
@@ -93,14 +93,14 @@ def test_colours_differ_without_hue() -> None:
 
 
 def test_sites_are_marked_in_image_and_map(hda_products: dict[str, Any]) -> None:
-    picture = draw_site(hda_products).axes[0]
-    markers = {line.get_marker(): line for line in picture.lines}
+    image_axes = draw_site(hda_products).axes[0]
+    markers = {line.get_marker(): line for line in image_axes.lines}
     assert to_hex(markers["x"].get_color()) == BLACK
     assert to_hex(markers["+"].get_color()) == PURPLE
     site = np.array(markers["+"].get_data()).ravel()
     np.testing.assert_allclose(site, hda_products["map_pixels"][18, 5])
-    on_map = next(line for line in draw_maps(hda_products).axes[3].lines if line.get_marker() == "+")
-    np.testing.assert_allclose(np.array(on_map.get_data()).ravel(), [5.0, 18.0])
+    map_marker = next(line for line in draw_maps(hda_products).axes[3].lines if line.get_marker() == "+")
+    np.testing.assert_allclose(np.array(map_marker.get_data()).ravel(), [5.0, 18.0])
 
 
 def test_true_terrain_is_aligned_with_the_map(hda_products: dict[str, Any]) -> None:
@@ -115,9 +115,9 @@ def test_true_terrain_is_aligned_with_the_map(hda_products: dict[str, Any]) -> N
     assert abs(float(truth.elevation_m.max() - maps.elevation_m.max())) < 0.2
 
 
-def test_missing_safe_site_is_not_marked(hda_products: dict[str, Any]) -> None:
-    picture = draw_site({**hda_products, "site": np.array(())}).axes[0]
-    assert [line.get_marker() for line in picture.lines] == ["x"]
+def test_figure_without_safe_site_has_no_site_marker(hda_products: dict[str, Any]) -> None:
+    image_axes = draw_site({**hda_products, "site": np.array(())}).axes[0]
+    assert [line.get_marker() for line in image_axes.lines] == ["x"]
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_invalid_maps_are_omitted(hda_products: dict[str, Any], changes: dict[st
     assert available_figures({**hda_products, **changes}) == ["fig1-tracks", "fig2-motion", "fig3-epipolar"]
 
 
-def test_unknown_cells_are_drawn(hda_products: dict[str, Any]) -> None:
+def test_maps_with_unknown_cells_are_drawn(hda_products: dict[str, Any]) -> None:
     elevation = hda_products["elevation"].copy()
     elevation[3:6, 4:9] = np.nan
     unknown = {name: np.where(np.isnan(elevation), np.nan, hda_products[name]) for name in ("roughness", "slope")}

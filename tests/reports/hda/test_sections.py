@@ -47,15 +47,15 @@ def test_flights_with_one_footprint_are_pooled() -> None:
     assert (rate.hits, rate.of, rate.flights, rate.flights_hit) == (3, 4, 3, 2)
 
 
-def test_interval_of_a_pooled_rate_covers_the_truth() -> None:
-    """90 % intervals cover the true rate although flights have different rates."""
+def test_pooled_rate_interval_covers_the_true_rate() -> None:
+    """90 % intervals cover the true rate of 10 %, although flights have different rates."""
     rng = np.random.default_rng(3)
     n_covered = 0
     for _ in range(60):
         rates = rng.beta(1.0, 9.0, 40)
         rate = pooled_rate(pd.DataFrame({"hits": rng.binomial(500, rates), "of": np.full(40, 500)}), "hits", "of")
         n_covered += rate.lower <= 0.1 <= rate.upper
-    assert n_covered >= 45
+    assert n_covered >= 45  # binomial(60, 0.9): mean 54, standard deviation 2.3
 
 
 def test_rate_of_zero_has_no_bootstrap_interval() -> None:
@@ -138,14 +138,14 @@ def test_faults_are_grouped_by_kind_and_size() -> None:
         ("laser_stuck", 0.05, 10),
         ("laser_stuck", 1.0, 10),
     ]
-    ends = ("safe", "refused", "unconverged", "wrong", "unfinished")
-    assert all(sum(row[end] for end in ends) == row["n"] for row in rows)
+    result_columns = ("safe", "refused", "unconverged", "wrong", "unfinished")
+    assert all(sum(row[column] for column in result_columns) == row["n"] for row in rows)
     assert sum(row["wrong"] for row in rows) == (frame["site_reported"] & ~frame["site_safe"]).sum()
     assert FAULTS(_make_subject(landing_frame(20))) is None
 
 
 def _make_motion_rows(column: str, sizes: list[float], fractions: list[float]) -> pd.DataFrame:
-    """Flights with one motion change each and fractions of 100 visible features that are tracked."""
+    """Return flights with one motion change each; `fractions` of their 100 visible features are tracked."""
     frame = landing_frame(len(sizes)).assign(roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0, height_change_fraction=0.0)
     frame[column] = sizes
     return frame.assign(features_in_view=100, tracks_correct=100.0 * np.array(fractions), tracked_well=True)
@@ -162,9 +162,10 @@ def test_knee_is_at_90_percent_of_the_curve() -> None:
     assert curve.knee_up == float("inf")
 
 
-def test_curve_that_starts_below_has_its_knee_at_0() -> None:
+def test_knee_is_0_if_the_curve_starts_below_90_percent() -> None:
     points = [
-        SizeResult(size, PooledRate(0, 1, share, 0.0, 1.0, 1, 0), 1, 0) for size, share in ((0.0, 0.5), (5.0, 1.0))
+        SizeResult(size, PooledRate(0, 1, fraction, 0.0, 1.0, 1, 0), 1, 0)
+        for size, fraction in ((0.0, 0.5), (5.0, 1.0))
     ]
     assert find_knee(points, 1.0) == 0.0
 
@@ -174,7 +175,7 @@ def test_combined_changes_have_no_curve() -> None:
     assert tracking_curves(frame) == []
 
 
-def test_map_errors_are_correlated_with_their_drivers() -> None:
+def test_map_errors_have_the_expected_rank_correlations() -> None:
     rng = np.random.default_rng(4)
     n = 60
     frame = landing_frame(n).assign(
@@ -193,13 +194,13 @@ def test_map_errors_are_correlated_with_their_drivers() -> None:
     noise = effects["baseline / height", "elevation error rms without its plane (% of height)"]
     assert noise["rank_correlation"] == pytest.approx(-1.0)
     assert np.all(np.diff(noise["medians"]) < 0.0)
-    scale_error = effects["altimeter's error (% of the range)", "elevation error rms (% of height)"]
+    scale_error = effects["altimeter error (% of range)", "elevation error rms (% of height)"]
     np.testing.assert_allclose(scale_error["centres"], scale_error["medians"])
 
 
 def test_page_and_json_have_the_sections(make_run: Callable[..., Path]) -> None:
     directory = make_run(frame=landing_frame(40), requirements=[])
     page = write_report(directory)
-    twin = json.loads((directory / "report.json").read_text(encoding="utf-8"))
-    assert {"touchdown", "sites", "run-times"} <= set(twin["sections"])
+    report = json.loads((directory / "report.json").read_text(encoding="utf-8"))
+    assert {"touchdown", "sites", "run-times"} <= set(report["sections"])
     assert "0.89" in page.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Tests of the section and figures of recorded images, with complete and missing data."""
+"""Tests of the report section on recorded images: match residuals, and figures with complete and missing data."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports.measured.presentation import MEASURED, agreement_section, read_matched_pairs
-from marsyard.reports.presentation import case_kind
+from marsyard.reports.presentation import find_case_kind
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 
@@ -24,8 +24,8 @@ def make_products(matches: int) -> dict[str, object]:
         [rng.uniform(0, 60, (matches, 4)), rng.normal(0, 0.5, (matches, 2)), np.ones((matches, 1))], 1
     )
     table[: matches // 4, 6] = 0.0
-    pictures = {f"image_{k}": rng.integers(0, 4095, (48, 64)).astype(np.uint16) for k in (1, 2)}
-    return {**pictures, "matches_1": table}
+    images = {f"image_{k}": rng.integers(0, 4095, (48, 64)).astype(np.uint16) for k in (1, 2)}
+    return {**images, "matches_1": table}
 
 
 def test_section_reports_residuals_and_unmatched_cases() -> None:
@@ -66,8 +66,8 @@ def test_invalid_matches_and_images_give_no_pairs() -> None:
     products = make_products(40)
     (pair,) = read_matched_pairs(products)
     assert np.count_nonzero(pair.inlier) == 30
-    assert pair.caption.startswith("Pictures 1 and 2: 30 matches, median residual ")
+    assert pair.caption.startswith("Images 1 and 2: 30 matches, median residual ")
     assert read_matched_pairs({**products, "matches_1": np.zeros((4, 3))}) == []
     assert read_matched_pairs({**products, "image_2": None}) == []
     # recorded cases are recognised before the other systems
-    assert case_kind(products) is MEASURED.cases[0]
+    assert find_case_kind(products) is MEASURED.cases[0]

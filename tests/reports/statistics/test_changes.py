@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from marsyard.reports.statistics.changes import Sample, difference_p, holm
+from marsyard.reports.statistics.changes import Sample, correct_holm, difference_p_value
 
 
 def _make_sample(values: np.ndarray, terrains: np.ndarray | None = None) -> Sample:
@@ -21,25 +21,25 @@ def _make_single_terrain_sample(values: np.ndarray) -> Sample:
 
 
 def test_rates_on_one_terrain_agree_with_fisher() -> None:
-    now, before = np.repeat([1, 0], [7, 33]), np.repeat([1, 0], [2, 58])
+    new, old = np.repeat([1, 0], [7, 33]), np.repeat([1, 0], [2, 58])
     greater = stats.fisher_exact(np.array([[7, 33], [2, 58]]), "greater").pvalue
-    assert difference_p(_make_single_terrain_sample(now), _make_single_terrain_sample(before)) == pytest.approx(
+    assert difference_p_value(_make_single_terrain_sample(new), _make_single_terrain_sample(old)) == pytest.approx(
         2 * greater
     )
 
 
 def test_errors_on_one_terrain_agree_with_mann_whitney() -> None:
     rng = np.random.default_rng(1)
-    now, before = rng.exponential(1.4, 60), rng.exponential(1.0, 200)
-    expected = stats.mannwhitneyu(now, before, use_continuity=False, method="asymptotic").pvalue
+    new, old = rng.exponential(1.4, 60), rng.exponential(1.0, 200)
+    expected = stats.mannwhitneyu(new, old, use_continuity=False, method="asymptotic").pvalue
     # about 50 permutations are more extreme: tolerance of three standard deviations
-    assert difference_p(_make_single_terrain_sample(now), _make_single_terrain_sample(before)) == pytest.approx(
+    assert difference_p_value(_make_single_terrain_sample(new), _make_single_terrain_sample(old)) == pytest.approx(
         expected, rel=3 / math.sqrt(50)
     )
     similar = rng.exponential(1.0, 60)
-    expected = stats.mannwhitneyu(similar, before, use_continuity=False, method="asymptotic").pvalue
+    expected = stats.mannwhitneyu(similar, old, use_continuity=False, method="asymptotic").pvalue
     assert expected > 0.05
-    assert difference_p(_make_single_terrain_sample(similar), _make_single_terrain_sample(before)) == pytest.approx(
+    assert difference_p_value(_make_single_terrain_sample(similar), _make_single_terrain_sample(old)) == pytest.approx(
         expected
     )
 
@@ -47,77 +47,79 @@ def test_errors_on_one_terrain_agree_with_mann_whitney() -> None:
 def test_tied_values_agree_with_the_hypergeometric_test() -> None:
     # 5 of 20 against 6 of 140 with equal errors: the count in the first sample is hypergeometric. The normal
     # approximation is too small by a factor of 3.
-    now, before = np.repeat([3.0, 0.0], [5, 15]), np.repeat([3.0, 0.0], [6, 134])
+    new, old = np.repeat([3.0, 0.0], [5, 15]), np.repeat([3.0, 0.0], [6, 134])
     exact = stats.hypergeom.sf(4, 160, 11, 20)
-    normal = stats.mannwhitneyu(now, before, use_continuity=False, method="asymptotic").pvalue
+    normal = stats.mannwhitneyu(new, old, use_continuity=False, method="asymptotic").pvalue
     assert normal < exact / 2.5
-    assert difference_p(_make_single_terrain_sample(now), _make_single_terrain_sample(before), 40_000) == pytest.approx(
-        exact, rel=3 / math.sqrt(50)
-    )
-    assert difference_p(
-        _make_single_terrain_sample(np.full(20, 3.0)), _make_single_terrain_sample(before), 1_000
+    assert difference_p_value(
+        _make_single_terrain_sample(new), _make_single_terrain_sample(old), 40_000
+    ) == pytest.approx(exact, rel=3 / math.sqrt(50))
+    assert difference_p_value(
+        _make_single_terrain_sample(np.full(20, 3.0)), _make_single_terrain_sample(old), 1_000
     ) == pytest.approx(1 / 1_001)
 
 
-def test_number_of_cases_per_terrain_is_no_change() -> None:
-    # skewed errors with 1 case per terrain now and 12 before: most terrain means are lower now
+def test_different_numbers_of_cases_per_terrain_are_not_a_change() -> None:
+    # skewed errors; new campaign: 1 case per terrain, old: 12. Most terrain means of the new campaign are lower.
     rng = np.random.default_rng(5)
 
-    def draw_night(first: int, cases: int) -> Sample:
+    def draw_campaign(first: int, cases: int) -> Sample:
         terrains = np.repeat(np.arange(first, first + 40), cases)
         return _make_sample(np.exp(1.5 * rng.normal(size=terrains.size)), terrains)
 
-    p_values = [difference_p(draw_night(0, 1), draw_night(100, 12)) for _ in range(200)]
+    p_values = [difference_p_value(draw_campaign(0, 1), draw_campaign(100, 12)) for _ in range(200)]
+    # standard deviation of a rate of 5 % in 200 comparisons: 1.54 %
     assert np.mean(np.array(p_values) < 0.05) <= 0.05 + 3 * 0.0154
 
 
 def test_large_counts_agree_with_the_exact_test() -> None:
-    now, before = np.repeat([1, 0], [21_000, 30_000]), np.repeat([1, 0], [41_500, 60_500])
+    new, old = np.repeat([1, 0], [21_000, 30_000]), np.repeat([1, 0], [41_500, 60_500])
     exact = stats.fisher_exact(np.array([[21_000, 30_000], [41_500, 60_500]])).pvalue
-    assert difference_p(_make_single_terrain_sample(now), _make_single_terrain_sample(before)) == pytest.approx(
+    assert difference_p_value(_make_single_terrain_sample(new), _make_single_terrain_sample(old)) == pytest.approx(
         exact, rel=0.05
     )
 
 
-def test_different_shares_of_terrains_are_no_change() -> None:
-    # terrain 1 is difficult and has more cases now: pooled rates change
+def test_different_fractions_of_terrains_are_not_a_change() -> None:
+    # terrain 1 is difficult and has more cases in the new campaign: pooled rates change
     rng = np.random.default_rng(2)
 
-    def draw_night(easy: int, hard: int) -> Sample:
+    def draw_campaign(easy: int, hard: int) -> Sample:
         terrains = np.repeat([0, 1], [easy, hard])
         return _make_sample(rng.random(easy + hard) < np.where(terrains == 1, 0.4, 0.02), terrains)
 
-    p_values = [difference_p(draw_night(40, 160), draw_night(160, 40)) for _ in range(300)]
+    p_values = [difference_p_value(draw_campaign(40, 160), draw_campaign(160, 40)) for _ in range(300)]
+    # standard deviation of a rate of 5 % in 300 comparisons: 1.26 %
     assert np.mean(np.array(p_values) < 0.05) <= 0.05 + 3 * 0.0126
     pooled = [
-        difference_p(
-            _make_single_terrain_sample(draw_night(40, 160).values),
-            _make_single_terrain_sample(draw_night(160, 40).values),
+        difference_p_value(
+            _make_single_terrain_sample(draw_campaign(40, 160).values),
+            _make_single_terrain_sample(draw_campaign(160, 40).values),
         )
         for _ in range(20)
     ]
     assert max(pooled) < 0.05
 
 
-@pytest.mark.parametrize("rates", [True, False])
-def test_separate_terrains_are_compared_as_units(rates: bool) -> None:
-    # new terrains every night with correlated cases: treating cases as independent gives many false alarms
+@pytest.mark.parametrize("is_rate", [True, False])
+def test_correlated_cases_are_compared_by_terrain(is_rate: bool) -> None:
+    # each campaign has new terrains with correlated cases: independent cases would give many false alarms
     rng = np.random.default_rng(3)
 
-    def draw_night(first: int) -> Sample:
+    def draw_campaign(first: int) -> Sample:
         terrains = np.repeat(np.arange(first, first + 20), 10)
-        if rates:
+        if is_rate:
             return _make_sample(rng.random(200) < rng.beta(0.5, 0.5, 20)[terrains - first], terrains)
         return _make_sample(rng.normal(rng.normal(0.0, 3.0, 20)[terrains - first]), terrains)
 
-    nights = [(draw_night(0), draw_night(100)) for _ in range(300)]
-    assert np.mean([difference_p(*pair) < 0.05 for pair in nights]) <= 0.05 + 3 * 0.0126
-    # pooled test of 40 nights
+    campaign_pairs = [(draw_campaign(0), draw_campaign(100)) for _ in range(300)]
+    assert np.mean([difference_p_value(*pair) < 0.05 for pair in campaign_pairs]) <= 0.05 + 3 * 0.0126
+    # a test that ignores terrains has too many false alarms (40 pairs of campaigns)
     assert (
         np.mean(
             [
-                difference_p(_make_single_terrain_sample(a.values), _make_single_terrain_sample(b.values)) < 0.05
-                for a, b in nights[:40]
+                difference_p_value(_make_single_terrain_sample(a.values), _make_single_terrain_sample(b.values)) < 0.05
+                for a, b in campaign_pairs[:40]
             ]
         )
         > 0.2
@@ -125,14 +127,14 @@ def test_separate_terrains_are_compared_as_units(rates: bool) -> None:
 
 
 def test_too_few_values_give_nan() -> None:
-    empty, few = _make_sample(np.full(5, math.nan)), _make_sample(np.array([0.3, 1.2, 4.0]))
-    assert math.isnan(difference_p(empty, few))
-    assert math.isnan(difference_p(few, few))
-    assert difference_p(_make_single_terrain_sample(np.ones(40)), _make_single_terrain_sample(np.ones(40))) == 1.0
+    empty, short = _make_sample(np.full(5, math.nan)), _make_sample(np.array([0.3, 1.2, 4.0]))
+    assert math.isnan(difference_p_value(empty, short))
+    assert math.isnan(difference_p_value(short, short))
+    assert difference_p_value(_make_single_terrain_sample(np.ones(40)), _make_single_terrain_sample(np.ones(40))) == 1.0
 
 
-def test_holm_correction_of_p_values() -> None:
+def test_holm_correction_agrees_with_the_closed_form() -> None:
     # Holm 1979: 0.01 * 3, max(0.02 * 2, 0.03), 0.5
-    assert holm([0.02, math.nan, 0.5, 0.01])[::2] == pytest.approx([0.04, 0.5])
-    assert holm([0.02, math.nan, 0.5, 0.01])[3] == pytest.approx(0.03)
-    assert holm([]) == []
+    assert correct_holm([0.02, math.nan, 0.5, 0.01])[::2] == pytest.approx([0.04, 0.5])
+    assert correct_holm([0.02, math.nan, 0.5, 0.01])[3] == pytest.approx(0.03)
+    assert correct_holm([]) == []

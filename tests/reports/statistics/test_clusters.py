@@ -13,25 +13,25 @@ from marsyard.reports.statistics.proportions import (
     proportion_upper,
 )
 
-SIZE = 8
+CASES_PER_TERRAIN = 8
 
 
 def _draw_cases(
     rng: np.random.Generator, rate: float, correlation: float, terrains: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw beta-binomial cases: the success rates of terrains are beta distributed."""
+    """Draw beta-binomial cases: success rates of terrains follow a beta distribution with the given correlation."""
     if correlation == 1.0:
         rates = (rng.random(terrains) < rate).astype(float)
     else:
         weight = (1 - correlation) / correlation
         rates = rng.beta(rate * weight, (1 - rate) * weight, terrains)
-    terrain = np.repeat(np.arange(terrains), SIZE)
+    terrain = np.repeat(np.arange(terrains), CASES_PER_TERRAIN)
     return rng.random(terrain.size) < rates[terrain], terrain
 
 
 @pytest.mark.parametrize("correlation", [0.05, 0.3, 1.0])
 @pytest.mark.parametrize(("rate", "terrains"), [(0.99, 60), (0.95, 60), (0.8, 60), (0.9, 20)])
-def test_bounds_cover_clustered_cases(rate: float, terrains: int, correlation: float) -> None:
+def test_bounds_for_clustered_cases_cover_the_true_rate(rate: float, terrains: int, correlation: float) -> None:
     # 400 campaigns: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(11)
     campaigns = [clustered_evidence(*_draw_cases(rng, rate, correlation, terrains), 0.9) for _ in range(400)]
@@ -44,10 +44,10 @@ def test_bounds_cover_clustered_cases(rate: float, terrains: int, correlation: f
     [(40, 8, 0.1, 0.3, (0.2, 0.99)), (49, 20, 0.05, 0.3, (0.0, 0.99)), (60, 8, 0.3, 0.1, (0.0, 1.0)),
      (60, 20, 0.2, 0.1, (0.0, 1.0)), (60, 8, 0.2, 0.3, (0.6, 0.97))],
 )  # fmt: skip
-def test_bounds_cover_if_bad_terrains_answer_less_often(
+def test_bounds_cover_the_rate_if_bad_terrains_have_fewer_answers(
     terrains: int, size: int, answer_rate: float, bad_fraction: float, rates: tuple[float, float]
 ) -> None:
-    """Counting terrains only, the upper bound would miss the rate in up to 99 % of these campaigns."""
+    """A bound that counts only terrains would miss the true rate in up to 99 % of these campaigns."""
     rng = np.random.default_rng(15)
     weights = np.array([bad_fraction * answer_rate, 1.0 - bad_fraction])
     rate, n_missed = float(weights @ np.array(rates) / weights.sum()), np.zeros(2)
@@ -61,7 +61,7 @@ def test_bounds_cover_if_bad_terrains_answer_less_often(
     assert (n_missed / 400 <= 0.1 + 2 * 0.015).all()
 
 
-def test_bounds_for_independent_cases_do_not_cover() -> None:
+def test_bounds_for_independent_cases_miss_the_rate_of_clustered_cases() -> None:
     # the bound for independent cases is too high for correlated cases
     rng = np.random.default_rng(12)
     n_exceeded = 0
@@ -71,7 +71,7 @@ def test_bounds_for_independent_cases_do_not_cover() -> None:
     assert n_exceeded / 300 > 0.2
 
 
-def test_too_few_failures_count_terrains() -> None:
+def test_terrains_are_counted_if_failures_are_too_few() -> None:
     success, terrain = np.ones(600, dtype=bool), np.arange(600) % 60
     success[[0, 60, 1]] = False  # two on terrain 0, one on terrain 1
     evidence = clustered_evidence(success, terrain, 0.9)

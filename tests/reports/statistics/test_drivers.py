@@ -1,4 +1,4 @@
-"""Tests of the effect of conditions on errors: rank correlation, explained variance and intervals."""
+"""Tests of `estimate_driver`, the effect of a condition on errors: rank correlation, explained variance, intervals."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ def test_intervals_of_an_unrelated_condition_contain_zero(n: int) -> None:
     results = [_find_driver(rng.normal(size=n), rng.exponential(size=n)) for _ in range(200)]
     assert np.mean([result.lower <= 0.0 <= result.upper for result in results]) >= 0.9 - 3 * 0.021
     assert np.mean([result.p_value < 0.1 for result in results]) <= 0.1 + 3 * 0.021
-    # one-sided lower bound: above zero in at most 5 %
+    # one-sided lower bound: above zero in at most 5 % of samples
     assert np.mean([result.share_lower > 0.0 for result in results]) <= 0.05 + 3 * 0.015
 
 
-def test_interval_of_a_terrain_condition_counts_terrains() -> None:
+def test_interval_for_a_condition_of_the_terrain_counts_terrains() -> None:
     # Errors differ between 40 terrains and do not depend on the slope. The interval for 800 independent cases excludes
     # zero in more than 10 % of samples.
     rng = np.random.default_rng(4)
     groups = np.repeat(np.arange(40), 20)
     n_missed = {True: 0, False: 0}
     for _ in range(100):
-        slope, level = rng.normal(size=(2, 40))
-        errors = level[groups] + rng.normal(size=800)
+        slope, terrain_error = rng.normal(size=(2, 40))
+        errors = terrain_error[groups] + rng.normal(size=800)
         for use_groups in n_missed:
             result = _find_driver(slope[groups], errors, groups if use_groups else None)
             n_missed[use_groups] += not result.lower <= 0.0 <= result.upper
@@ -69,12 +69,12 @@ def test_binary_condition_has_a_significant_effect() -> None:
     assert result.p_value < 1e-4
 
 
-def test_constant_or_short_samples_have_no_effect() -> None:
+def test_constant_or_short_samples_give_no_result() -> None:
     assert estimate_driver(np.ones(50), np.arange(50.0), None, 0.9) is None
     assert estimate_driver(np.arange(19.0), np.arange(19.0), None, 0.9) is None
 
 
-def test_condition_that_explains_all_variance() -> None:
+def test_explained_fraction_is_1_for_constant_responses() -> None:
     """Two conditions with constant responses: the explained fraction is 1 and the F ratio infinite."""
     condition = np.repeat([400.0, 800.0], 20)
     result = estimate_driver(condition, condition / 400.0, None, 0.9)

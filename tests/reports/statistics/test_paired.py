@@ -12,30 +12,30 @@ from marsyard.reports.statistics.changes import compare_errors, compare_successe
 TERRAINS = np.repeat(np.arange(25), 8)
 
 
-def test_mcnemar_is_exact() -> None:
-    first = np.array([True] * 9 + [False] * 1 + [True] * 5)
-    other = np.array([False] * 9 + [True] * 1 + [True] * 5)
-    only_first, only_other, p = compare_successes(first, other)
-    assert (only_first, only_other) == (9, 1)
+def test_mcnemar_p_value_agrees_with_the_binomial_test() -> None:
+    first_succeeds = np.array([True] * 9 + [False] * 1 + [True] * 5)
+    second_succeeds = np.array([False] * 9 + [True] * 1 + [True] * 5)
+    only_first, only_second, p = compare_successes(first_succeeds, second_succeeds)
+    assert (only_first, only_second) == (9, 1)
     assert p == pytest.approx(2 * (1 + 10) / 2**10)  # two-sided binomial test, n = 10
-    assert compare_successes(first, first)[2] == 1.0
+    assert compare_successes(first_succeeds, first_succeeds)[2] == 1.0
 
 
-def test_false_alarm_rate_of_equal_algorithms_on_shared_terrains() -> None:
+def test_false_alarm_rate_of_equal_algorithms_is_nominal_on_shared_terrains() -> None:
     # the better algorithm depends on the terrain; 150 repetitions: standard deviation of a rate of 5 % is 1.8 %
     rng = np.random.default_rng(1)
-    success_alarms, error_alarms, naive_alarms = 0, 0, 0
+    success_alarms, error_alarms, independent_alarms = 0, 0, 0
     for _ in range(150):
         terrain_effect = rng.normal(size=25)[TERRAINS]
         differences = terrain_effect + 0.1 * rng.normal(size=TERRAINS.size)
         success_alarms += compare_successes(terrain_effect < 0.5, terrain_effect > -0.5, TERRAINS)[2] < 0.05
-        naive_alarms += compare_successes(terrain_effect < 0.5, terrain_effect > -0.5)[2] < 0.05
+        independent_alarms += compare_successes(terrain_effect < 0.5, terrain_effect > -0.5)[2] < 0.05
         error_alarms += compare_errors(differences, TERRAINS, 0.9)[3] < 0.05
     assert max(success_alarms, error_alarms) / 150 <= 0.05 + 3 * 0.018
-    assert naive_alarms / 150 > 0.3
+    assert independent_alarms / 150 > 0.3
 
 
-def test_paired_mean_interval_covers_on_shared_terrains() -> None:
+def test_paired_mean_interval_covers_the_mean_on_shared_terrains() -> None:
     # 200 repetitions at 90 %: standard deviation 2.1 %
     rng = np.random.default_rng(2)
     draws = (0.3 + rng.normal(size=25)[TERRAINS] + 0.3 * rng.normal(size=TERRAINS.size) for _ in range(200))

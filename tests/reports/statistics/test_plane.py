@@ -17,7 +17,7 @@ def _draw_errors(rng: np.random.Generator, n: int) -> np.ndarray:
     return np.asarray(np.array([2.0, -1.0]) + (rng.normal(size=(n, 2)) * [3.0, 1.0]) @ rotation.T)
 
 
-def test_error_ellipse_of_normal_errors() -> None:
+def test_error_ellipse_of_normal_errors_has_the_true_axes() -> None:
     ellipse = error_ellipse(_draw_errors(np.random.default_rng(1), 40_000), 0.95)
     assert ellipse is not None
     # chi-square quantile with two degrees of freedom: -2 ln 0.05 = 5.991 = 2.4477^2
@@ -50,7 +50,7 @@ def test_too_few_points_have_no_ellipse() -> None:
     assert (line.semi_minor, line.angle_deg) == (0.0, 0.0)
 
 
-def test_circular_error_probable_of_normal_errors() -> None:
+def test_circular_error_probable_of_normal_errors_is_the_median_radius() -> None:
     # median radius of two independent standard normal components: sqrt(2 ln 2) = 1.1774
     points = np.random.default_rng(3).normal(size=(20_000, 2))
     median_radius = circular_error(points, 0.5, 0.95)
@@ -58,7 +58,7 @@ def test_circular_error_probable_of_normal_errors() -> None:
     assert median_radius.lower < math.sqrt(2 * math.log(2)) < median_radius.upper
 
 
-def test_reach_of_an_ellipse_is_its_bounding_square() -> None:
+def test_half_extent_of_an_ellipse_covers_its_bounding_box() -> None:
     # semi-axes 3 and 1 rotated by 30 deg: half widths sqrt((3 cos 30)^2 + (sin 30)^2) = 2.6458 and 1.7321
     ellipse = ErrorEllipse((0.5, -2.0), 3.0, 1.0, 30.0, 0.95, 0.9)
     assert ellipse.half_extent == pytest.approx(2.0 + math.sqrt(3.0))

@@ -30,7 +30,7 @@ CONFIDENCES = st.sampled_from([0.5, 0.8, 0.9, 0.95, 0.99])
 COUNTS = st.integers(0, 400).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
 
-def test_two_sided_interval_of_seven_in_fifty() -> None:
+def test_two_sided_interval_of_7_in_50_has_the_known_bounds() -> None:
     lower, upper = proportion_interval(7, 50, 0.95)
     assert (round(lower, 4), round(upper, 4)) == (0.0582, 0.2674)
 
@@ -106,7 +106,7 @@ def test_sample_sizes_agree_with_the_table(
 
 
 @given(st.floats(0.5, 0.999), st.sampled_from([0.8, 0.9, 0.95]), st.integers(0, 5))
-def test_sample_size_is_the_smallest(reliability: float, confidence: float, failures: int) -> None:
+def test_sample_size_is_the_smallest_that_meets_the_risk(reliability: float, confidence: float, failures: int) -> None:
     # independent method: n is the smallest with P(Bin(n, 1 - reliability) <= failures) <= 1 - confidence
     n = minimum_sample_size(reliability, confidence, failures)
     risk = 1 - confidence
@@ -125,7 +125,7 @@ def test_negative_failures_are_rejected() -> None:
         minimum_sample_size(0.9, 0.9, -1)
 
 
-def test_additional_cases_needed() -> None:
+def test_additional_cases_complete_the_minimum_sample_size() -> None:
     assert further_cases_needed(24, 0, 0.99, 0.9) == 230 - 24
     assert further_cases_needed(24, 1, 0.99, 0.9) == 388 - 24
     assert further_cases_needed(500, 0, 0.99, 0.9) == 0

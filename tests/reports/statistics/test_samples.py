@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, spread_interval, summarize
+from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, standard_deviation_interval, summarize
 
 
 @pytest.mark.parametrize(("quantile", "confidence", "n"), [(0.95, 0.95, 59), (0.99, 0.9, 230), (0.99, 0.95, 299)])
@@ -35,7 +35,7 @@ def test_mean_interval_has_nominal_coverage() -> None:
     assert np.mean((intervals[:, 0] <= 1.0) & (intervals[:, 1] >= 1.0)) >= 0.95 - 0.02 - 3 * 0.014
 
 
-def test_mean_interval_of_a_large_sample() -> None:
+def test_mean_interval_of_a_large_sample_agrees_with_the_normal_interval() -> None:
     values = np.random.default_rng(7).normal(3.0, 2.0, 10000)
     # 1.96 * 2 / sqrt(10000) = 0.039
     lower, upper = mean_interval(values, 0.95)
@@ -43,13 +43,13 @@ def test_mean_interval_of_a_large_sample() -> None:
     assert lower < 3.0 < upper
 
 
-def test_mean_interval_of_few_values() -> None:
+def test_mean_interval_needs_two_values() -> None:
     assert all(math.isnan(bound) for bound in mean_interval(np.array([1.0]), 0.9))
     assert mean_interval(np.full(5, 2.5), 0.9) == (2.5, 2.5)
     assert len(mean_interval(np.array([1.0, 2.0]), 0.9)) == 2
 
 
-def test_summary_of_known_values() -> None:
+def test_summary_agrees_with_known_values() -> None:
     summary = summarize(np.array([3.0, -4.0, math.nan, 0.0, math.inf]))
     assert (summary.n, summary.missing, summary.median, summary.largest) == (3, 2, 0.0, 4.0)
     assert summary.mean == pytest.approx(-1 / 3)
@@ -58,14 +58,14 @@ def test_summary_of_known_values() -> None:
 
 
 @pytest.mark.parametrize("sample", [[], [math.nan], [2.0]])
-def test_summary_of_too_few_values(sample: list[float]) -> None:
+def test_summary_of_too_few_values_is_nan(sample: list[float]) -> None:
     summary = summarize(np.array(sample, dtype=np.float64))
     assert summary.n == (sample == [2.0])
     assert math.isnan(summary.sd)
     assert all(quantile.upper == math.inf for quantile in summary.quantiles)
 
 
-def test_radial_quantiles_of_normal_errors() -> None:
+def test_radial_quantiles_of_normal_errors_agree_with_the_rayleigh_distribution() -> None:
     # median radius of two independent standard normal components: sqrt(2 ln 2) = 1.1774
     rng = np.random.default_rng(8)
     summary = summarize(np.hypot(*rng.standard_normal((2, 20000))))
@@ -73,21 +73,21 @@ def test_radial_quantiles_of_normal_errors() -> None:
     assert summary.quantiles[1].estimate == pytest.approx(math.sqrt(2 * math.log(20)), abs=0.05)
 
 
-def test_spread_interval_has_nominal_coverage() -> None:
+def test_standard_deviation_interval_has_nominal_coverage() -> None:
     # 250 samples: standard deviation of the coverage 1.4 %
     rng = np.random.default_rng(9)
-    intervals = np.array([spread_interval(rng.normal(0.0, 2.0, 30), 0.95) for _ in range(250)])
+    intervals = np.array([standard_deviation_interval(rng.normal(0.0, 2.0, 30), 0.95) for _ in range(250)])
     assert np.mean((intervals[:, 0] <= 2.0) & (intervals[:, 1] >= 2.0)) >= 0.95 - 3 * 0.014
 
 
-def test_spread_interval_of_normal_values_agrees_with_chi_square() -> None:
+def test_standard_deviation_interval_of_normal_values_agrees_with_chi_square() -> None:
     # independent method: (n - 1) s^2 / chi2, exact for normal values
     values = np.random.default_rng(10).normal(0.0, 3.0, 5000)
     squares = float(((values - values.mean()) ** 2).sum())
     exact = np.sqrt(squares / stats.chi2.ppf([0.975, 0.025], values.size - 1))
-    assert spread_interval(values, 0.95) == pytest.approx(tuple(exact), rel=0.003)
+    assert standard_deviation_interval(values, 0.95) == pytest.approx(tuple(exact), rel=0.003)
 
 
-def test_spread_interval_of_few_or_equal_values() -> None:
-    assert all(math.isnan(bound) for bound in spread_interval(np.arange(7.0), 0.9))
-    assert spread_interval(np.full(8, 2.5), 0.9) == (0.0, 0.0)
+def test_standard_deviation_interval_of_few_or_equal_values_is_nan_or_zero() -> None:
+    assert all(math.isnan(bound) for bound in standard_deviation_interval(np.arange(7.0), 0.9))
+    assert standard_deviation_interval(np.full(8, 2.5), 0.9) == (0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Tests of repeated looks at a campaign: planned looks, spent risk and additional cases."""
+"""Tests of repeated (interim) looks at a campaign: planned looks, fraction of the risk per look, additional cases."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from marsyard.reports.statistics.proportions import (
 )
 
 
-def test_looks_halve_from_the_last_case() -> None:
+def test_planned_looks_are_at_halved_case_numbers() -> None:
     assert [look.cases for look in planned_looks(1000)] == [31, 62, 125, 250, 500, 1000]
     assert [look.cases for look in planned_looks(64)] == [16, 32, 64]
     assert [look.cases for look in planned_looks(20)] == [20]
@@ -34,7 +34,7 @@ def test_looks_spend_the_full_risk(cases: int) -> None:
     assert looks[-1].cases == cases
 
 
-def test_spent_fraction_of_a_look() -> None:
+def test_spent_fraction_is_that_of_the_last_look_reached() -> None:
     looks = planned_looks(64)
     assert [spent_fraction(looks, cases) for cases in (1, 16, 17, 64, 900)] == [0.25, 0.25, 0.25, 0.5, 0.5]
     assert confidence_at(0.9, 0.25) == pytest.approx(0.975)
@@ -50,10 +50,10 @@ def test_probability_of_false_verdicts_is_below_the_risk(required_rate: float) -
     # exact probability that any look at 512 cases gives a verdict, at a true rate equal to the required rate
     looks, risk = planned_looks(512), 0.1
     for wrong_verdict in ("PASS", "FAIL"):
-        undecided, p_decided, before = np.ones(1), 0.0, 0
+        undecided, p_decided, previous_cases = np.ones(1), 0.0, 0
         for look in looks:
-            added = look.cases - before
-            before = look.cases
+            added = look.cases - previous_cases
+            previous_cases = look.cases
             failures = np.arange(added + 1)
             undecided = np.convolve(undecided, stats.binom.pmf(failures, added, 1.0 - required_rate))
             confidence = confidence_at(1.0 - risk, look.risk_fraction)
@@ -81,7 +81,7 @@ def test_repeated_looks_at_full_risk_pass_too_often() -> None:
 def _follow_advice(
     rng: np.random.Generator, first: int, max_cases: int, passes: LaterLook, fails: LaterLook
 ) -> set[str]:
-    """Verdicts of one campaign with true and required rate 0.99 that appends the advised numbers of cases."""
+    """Return the verdicts of a campaign with true and required rate 0.99 that appends the advised numbers of cases."""
     cases, failures, verdicts = first, int(rng.binomial(first, 0.01)), set()
     pass_risk = fail_risk = 0.1
     while True:

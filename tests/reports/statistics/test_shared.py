@@ -1,4 +1,4 @@
-"""Tests of intervals of values on shared terrains: coverage by simulation, and closed forms."""
+"""Tests of statistics for samples in which several values share a terrain: simulated coverage, and closed forms."""
 
 from __future__ import annotations
 
@@ -8,31 +8,37 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from marsyard.reports.statistics.samples import MIN_TERRAINS, mean_interval, quantile_bounds, spread_interval, summarize
+from marsyard.reports.statistics.samples import (
+    MIN_TERRAINS,
+    mean_interval,
+    quantile_bounds,
+    standard_deviation_interval,
+    summarize,
+)
 
 
 def _draw_values(rng: np.random.Generator, terrains: int, correlation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Standard normal values with 1 to 14 values per terrain and the given correlation within a terrain."""
+    """Draw standard normal values, 1 to 14 per terrain, with this correlation between the values of a terrain."""
     groups = np.repeat(np.arange(terrains), rng.integers(1, 15, terrains))
     terrain_part, case_part = rng.normal(size=terrains)[groups], rng.normal(size=groups.size)
     return math.sqrt(correlation) * terrain_part + math.sqrt(1.0 - correlation) * case_part, groups
 
 
 @pytest.mark.parametrize(("terrains", "correlation"), [(12, 0.3), (60, 0.9)])
-def test_intervals_of_mean_and_spread_have_nominal_coverage(terrains: int, correlation: float) -> None:
+def test_intervals_of_mean_and_standard_deviation_have_nominal_coverage(terrains: int, correlation: float) -> None:
     # 200 samples at 95 %: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(1)
-    n_mean, n_spread, n_naive = 0, 0, 0
+    n_mean, n_sd, n_independent = 0, 0, 0
     for _ in range(200):
         values, groups = _draw_values(rng, terrains, correlation)
         lower, upper = mean_interval(values, 0.95, groups)
         n_mean += lower <= 0.0 <= upper
-        lower, upper = spread_interval(values, 0.95, groups)
-        n_spread += lower <= 1.0 <= upper
+        lower, upper = standard_deviation_interval(values, 0.95, groups)
+        n_sd += lower <= 1.0 <= upper
         lower, upper = stats.t.interval(0.95, values.size - 1, values.mean(), stats.sem(values))
-        n_naive += lower <= 0.0 <= upper
-    assert min(n_mean, n_spread) / 200 >= 0.95 - 3 * 0.015
-    assert n_naive / 200 < 0.85
+        n_independent += lower <= 0.0 <= upper
+    assert min(n_mean, n_sd) / 200 >= 0.95 - 3 * 0.015
+    assert n_independent / 200 < 0.85
 
 
 @pytest.mark.parametrize(("terrains", "correlation"), [(20, 0.3), (60, 0.3), (60, 0.9)])
@@ -61,7 +67,10 @@ def test_identical_values_of_a_terrain_count_once() -> None:
     groups = np.repeat(np.arange(100), 10)
     single, repeated = mean_interval(values, 0.95), mean_interval(np.repeat(values, 10), 0.95, groups)
     assert repeated == pytest.approx(single, abs=0.02)
-    single, repeated = spread_interval(values, 0.95), spread_interval(np.repeat(values, 10), 0.95, groups)
+    single, repeated = (
+        standard_deviation_interval(values, 0.95),
+        standard_deviation_interval(np.repeat(values, 10), 0.95, groups),
+    )
     assert repeated == pytest.approx(single, rel=0.06)
 
 
@@ -73,7 +82,7 @@ def test_one_value_per_terrain_equals_independent_values() -> None:
 def test_few_terrains_give_no_interval() -> None:
     values, groups = np.random.default_rng(5).normal(size=40), np.repeat(np.arange(MIN_TERRAINS - 1), 10)
     assert all(math.isnan(bound) for bound in mean_interval(values, 0.9, groups))
-    assert all(math.isnan(bound) for bound in spread_interval(values, 0.9, groups))
+    assert all(math.isnan(bound) for bound in standard_deviation_interval(values, 0.9, groups))
 
 
 def test_missing_values_are_removed_with_their_terrains() -> None:

@@ -43,22 +43,22 @@ def test_squares_mark_target_and_search_window() -> None:
     assert window.get_linestyle() != left.get_linestyle()  # distinct without colour
 
 
-def test_match_is_enlarged() -> None:
+def test_template_around_the_match_is_enlarged() -> None:
     case_products = make_products()
     counts = np.zeros((161, 161), dtype=np.uint16)
     counts[70, 80] = 4000
     figure = draw_stops(case_products | {"stop_1_left": counts})
     enlarged = np.asarray(figure.axes[1].get_images()[0].get_array())[..., 0]
     bright = np.argwhere(enlarged > 128)
-    # 21 pixels are enlarged to 126: one bright pixel covers 6 by 6
+    # 21 pixels are enlarged to 126: one bright pixel becomes 6 x 6 pixels
     assert bright.min(axis=0).tolist() == [60, 60]
     assert bright.max(axis=0).tolist() == [65, 65]
 
 
-def test_titles_state_range_azimuth_and_score() -> None:
+def test_titles_contain_range_azimuth_and_match_score() -> None:
     figure = draw_stops(make_products())
     titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
-    assert titles[0].startswith("1: 10.00 m, azimuth +0.0°")  # no negative zero
+    assert titles[0].startswith("1: 10.00 m, azimuth +0.0°")  # -0.04 deg is rounded to +0.0, not to -0.0
     assert titles[1].startswith("2: 6.00 m")
     assert "NCC 0.90" in titles[1]
     assert titles[2].startswith("3 (lost): 2.00 m")
@@ -74,11 +74,11 @@ def test_path_and_estimates_are_drawn_at_their_positions() -> None:
     top_view, detail = draw_path(make_products(4)).axes
     lines = {line.get_label(): np.column_stack(line.get_data()) for line in top_view.lines}
     assert lines["stops"][-1].tolist() == [8.0, 0.0]
-    assert lines["stops as estimated"][0].tolist() == pytest.approx([0.05, 0.05])
+    assert lines["estimated stops"][0].tolist() == pytest.approx([0.05, 0.05])
     assert lines["designated target"].tolist() == [[10.0, 0.0]]
-    # three of four stops found the target, 0, 3 and 6 cm east of the designated point
+    # the target is tracked at three of four stops; the estimates are 0, 3 and 6 cm east of the designated point
     (name,) = [str(line.get_label()) for line in detail.lines if "estimated" in str(line.get_label())]
-    assert name == "target as estimated (6 cm from first to last)"
+    assert name == "estimated target (6 cm from first to last estimate)"
     offsets = next(np.column_stack(line.get_data()) for line in detail.lines if line.get_label() == name)
     assert offsets == pytest.approx(np.array([[0.0, 0.0], [3.0, 0.0], [6.0, 0.0]]), abs=1e-9)
     for axes in (top_view, detail):
@@ -111,13 +111,13 @@ def test_missing_products_are_tolerated(changes: dict[str, Any]) -> None:
     assert len(view(case_products, "case1").rows) == 3
 
 
-def test_other_products_are_not_a_tracking_case() -> None:
+def test_incomplete_products_are_not_a_tracking_case() -> None:
     assert is_vtt_case(make_products())
     assert not is_vtt_case({})
     assert not is_vtt_case(make_products() | {"template_px": None})
     assert read_stops({}) == []
     assert read_rover_path(make_products() | {"rover_true_m": np.zeros((2, 3))}) is None
-    with pytest.raises(ValueError, match="no picture"):
+    with pytest.raises(ValueError, match="no image"):
         draw_stops({})
     with pytest.raises(ValueError, match="no path of a rover"):
         draw_path({})

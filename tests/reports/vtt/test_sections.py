@@ -28,12 +28,12 @@ from tests.reports.vtt.tracking_rows import make_rows, make_subject, read_table,
 
 
 def test_table_1_agrees_with_the_printed_digits() -> None:
-    computed = read_table(table_1_section(make_subject(make_rows(4))))
-    for printed, result in (computed[:2], computed[2:]):
-        assert (printed.pop(""), result.pop("")) == ("printed", "computed")
-        assert result == printed
-    assert computed[0]["Designation (cm)"] == "9.7"
-    assert computed[2]["Error at the goal without tracking (cm)"] == "42.0"
+    table_rows = read_table(table_1_section(make_subject(make_rows(4))))
+    for printed_row, computed_row in (table_rows[:2], table_rows[2:]):
+        assert (printed_row.pop(""), computed_row.pop("")) == ("printed", "computed")
+        assert computed_row == printed_row
+    assert table_rows[0]["Designation (cm)"] == "9.7"
+    assert table_rows[2]["Error at the goal without tracking (cm)"] == "42.0"
 
 
 def test_measured_accuracy_is_3_sigma_per_camera() -> None:
@@ -46,9 +46,9 @@ def test_measured_accuracy_is_3_sigma_per_camera() -> None:
     # Eq. 3: sqrt(0.1^2 + 0.05^2)
     assert navcam["untracked_cm"] == pytest.approx(300.0 * np.hypot(0.1, 0.05))
     assert pancam["drift_px"] == pytest.approx(np.sqrt(12.5))
-    result = read_table(table_1_section(make_subject(frame)), 1)
+    table = read_table(table_1_section(make_subject(frame)), 1)
     # Navcam, 2 px of drift: sqrt(1.6^2 + 0.32^2) = 1.63
-    assert result[0]["Paper's formula (cm)"] == "1.6"
+    assert table[0]["Paper's formula (cm)"] == "1.6"
     # runs from other ranges, at unselectable targets or without result are excluded
     assert measured_accuracy(frame.assign(range_start_m=7.0)) == []
     assert measured_accuracy(frame.assign(selectable=False)) == []
@@ -56,7 +56,7 @@ def test_measured_accuracy_is_3_sigma_per_camera() -> None:
 
 
 def _make_two_tracker_rows(skips: int = 5) -> pd.DataFrame:
-    """Two trackers, ten targets per step of 1 - 0.95^(n+1); pure NCC loses one more target with every step."""
+    """Return ten targets per tracker and step of 1 - 0.95^(n+1) of the range; pure NCC loses one more at each step."""
     frames = []
     for algorithm in ("vtt", "pure_ncc"):
         for skip in range(skips):
@@ -84,23 +84,23 @@ def test_step_rates_are_compared_with_fig_8() -> None:
     assert "Fig. 8" in section.title
 
 
-def test_steps_of_circles_and_turns_are_in_degrees() -> None:
+def test_step_rates_of_circles_and_turns_are_per_degree() -> None:
     frame = pd.concat([make_rows(11, skip=k, step=5.0 * (k + 1), search_px=px) for k in range(3) for px in (200, 600)])
     frame = frame.reset_index(drop=True)
-    around = step_rates(make_subject(frame, legs=[{"motion": "circle"}]))
-    assert [(rate["line"], rate["step"]) for rate in around[:3]] == [
+    circle_rates = step_rates(make_subject(frame, legs=[{"motion": "circle"}]))
+    assert [(rate["line"], rate["step"]) for rate in circle_rates[:3]] == [
         ("200 px", 5.0),
         ("200 px", 10.0),
         ("200 px", 15.0),
     ]
-    assert around[2]["paper_percent"] == pytest.approx(100.0 * 9 / 11)
-    in_place = step_rates(make_subject(frame, legs=[{"motion": "turn"}]))
-    assert {rate["paper_percent"] for rate in in_place} == {None}
+    assert circle_rates[2]["paper_percent"] == pytest.approx(100.0 * 9 / 11)
+    turn_rates = step_rates(make_subject(frame, legs=[{"motion": "turn"}]))
+    assert {rate["paper_percent"] for rate in turn_rates} == {None}
     assert steps_section(make_subject(make_rows(3))) is None
 
 
 def test_oblique_targets_are_reported_separately() -> None:
-    """The rate compared with the paper contains only targets on the face; oblique targets are listed separately."""
+    """The rate for the comparison with the paper excludes oblique targets; a separate table lists their rate."""
     face_on = make_rows(6, skip=0, step=5.0, obliquity_max_deg=40.0, in_view=True, on_face=True)
     oblique = make_rows(4, skip=0, step=5.0, obliquity_max_deg=72.0, in_view=True, on_face=False, tracked=False)
     hidden = make_rows(3, skip=0, step=5.0, obliquity_max_deg=80.0, in_view=False, on_face=False, tracked=False)
@@ -127,12 +127,12 @@ def _make_update_rows(n_updates: int, cases: int = 3) -> pd.DataFrame:
 def test_updates_are_compared_with_table_3() -> None:
     frame = _make_update_rows(8)
     frame.loc[0, "update_8_match_score"] = 0.5
-    result = read_table(updates_section(make_subject(frame, CHECKOUT_1)))
-    score_row = next(k for k, row in enumerate(result) if row["Parameter"] == "NCC score")
-    assert (result[score_row]["8"], result[score_row]["1"]) == ("0.79", "–")
-    assert result[score_row + 1]["8"] == "0.90 (0.50 to 0.90)"
-    roll_row = next(k for k, row in enumerate(result) if row["Parameter"] == "Roll change (deg)")
-    assert result[roll_row + 1]["2"] == "2.00"  # absolute value, as printed in the paper
+    table = read_table(updates_section(make_subject(frame, CHECKOUT_1)))
+    score_row = next(k for k, row in enumerate(table) if row["Parameter"] == "NCC score")
+    assert (table[score_row]["8"], table[score_row]["1"]) == ("0.79", "–")
+    assert table[score_row + 1]["8"] == "0.90 (0.50 to 0.90)"
+    roll_row = next(k for k, row in enumerate(table) if row["Parameter"] == "Roll change (deg)")
+    assert table[roll_row + 1]["2"] == "2.00"  # absolute value, as printed in the paper
     other_campaign = read_table(updates_section(make_subject(frame, "another")))
     assert other_campaign[7]["NCC score"] == "0.90 (0.50 to 0.90)"
     assert other_campaign[7]["Roll change (deg)"] == "−2.00"
@@ -140,28 +140,28 @@ def test_updates_are_compared_with_table_3() -> None:
 
 
 def test_table_3_agrees_with_the_text_of_the_paper() -> None:
-    """Ranges stated in the text of the paper hold for the stored table."""
-    printed = {name: list(values.values()) for name, values in PAPER["table_3"].items()}
+    """The stored table has the minimum and maximum values that the text of the paper reports."""
+    printed_values = {name: list(values.values()) for name, values in PAPER["table_3"].items()}
     ranges = {"match_score": (0.79, 0.94), "magnification": (0.97, 1.04), "roll_change_deg": (0.06, 6.25)}
-    assert {name: (min(printed[name]), max(printed[name])) for name in ranges} == ranges
-    # from -3.4 to 50.1 deg, which is the sum of the changes
-    assert sum(printed["azimuth_change_deg"]) == pytest.approx(53.5, abs=0.1)
+    assert {name: (min(printed_values[name]), max(printed_values[name])) for name in ranges} == ranges
+    # text of the paper: azimuth from -3.4 to 50.1 deg; the difference is the sum of the changes
+    assert sum(printed_values["azimuth_change_deg"]) == pytest.approx(53.5, abs=0.1)
 
 
 def test_single_runs_are_compared_with_the_paper() -> None:
     frame = make_rows(4, target_motion_m=[0.1, 0.2, 0.3, 0.4], tracked=[True, True, True, False])
-    result = {row[""]: row for row in read_table(SINGLE_RUNS(make_subject(frame, "vtt-checkout-2")))}
-    target_motion = result["target moved, first to last estimate (cm)"]
+    table = {row[""]: row for row in read_table(SINGLE_RUNS(make_subject(frame, "vtt-checkout-2")))}
+    target_motion = table["target moved, first to last estimate (cm)"]
     assert (target_motion["Paper"], target_motion["Ours"]) == ("36", "25.0 (10.0 to 40.0)")
-    assert result["tracked to the goal"]["Ours"] == "3 of 4: 75.00 %"
-    assert result["maximum correction (px)"]["Ours"] == "–"
-    roll = make_rows(4, roll_compensated=[True, True, False, False], tracked=[True, True, True, False])
-    result = {row[""]: row for row in read_table(SINGLE_RUNS(make_subject(roll, "vtt-roll")))}
-    assert result["tracked with compensation"]["Ours"] == "2 of 2: 100 %"
+    assert table["tracked to the goal"]["Ours"] == "3 of 4: 75.00 %"
+    assert table["maximum correction (px)"]["Ours"] == "–"
+    roll_rows = make_rows(4, roll_compensated=[True, True, False, False], tracked=[True, True, True, False])
+    table = {row[""]: row for row in read_table(SINGLE_RUNS(make_subject(roll_rows, "vtt-roll")))}
+    assert table["tracked with compensation"]["Ours"] == "2 of 2: 100 %"
     assert SINGLE_RUNS(make_subject(frame, "another")) is None
 
 
-def test_updates_and_minutes_by_mode_of_table_4() -> None:
+def test_updates_and_minutes_are_listed_per_mode_of_table_4() -> None:
     legs_driven: list[dict[str, object]] = [{"motion": motion} for motion in ("stay", "turn", "back-off")]
     legs_driven += [{"motion": "back-off", "autonav": True}, {"visual_odometry": True}]
     legs_driven += [{"motion": "approach", "autonav": True}]
@@ -169,11 +169,11 @@ def test_updates_and_minutes_by_mode_of_table_4() -> None:
     legs = [-1, 0, *[1] * 7, *[2] * 9, 3, *[4] * 4, *[5] * 4]
     for n, leg in enumerate(legs, start=1):
         frame[f"update_{n}_leg"], frame[f"update_{n}_time_s"] = float(leg), 60.0 * n
-    frame.loc[1, ["update_27_leg", "update_27_time_s"]] = np.nan  # ended one step early
-    result = read_table(SINGLE_RUNS(make_subject(frame, CHECKOUT_3, legs=legs_driven)), 1)
-    assert [row["Updates, paper"] for row in result] == ["2", "7", "10", "4", "4"]
-    assert [row["Updates, ours"] for row in result] == ["2", "7", "10", "4", "4 (3 to 4)"]
-    assert [row["Minutes, ours"] for row in result[:4]] == ["2.0", "7.0", "10.0", "4.0"]
+    frame.loc[1, ["update_27_leg", "update_27_time_s"]] = np.nan  # the second run ended one step earlier
+    table = read_table(SINGLE_RUNS(make_subject(frame, CHECKOUT_3, legs=legs_driven)), 1)
+    assert [row["Updates, paper"] for row in table] == ["2", "7", "10", "4", "4"]
+    assert [row["Updates, ours"] for row in table] == ["2", "7", "10", "4", "4 (3 to 4)"]
+    assert [row["Minutes, ours"] for row in table[:4]] == ["2.0", "7.0", "10.0", "4.0"]
 
 
 def test_table_4_has_the_printed_sums() -> None:
@@ -189,14 +189,14 @@ def test_terrains_list_failures_and_causes() -> None:
     frame.loc[8, "outcome"] = "STUCK"
     set_values(frame, 9, outcome="LOST", losses="STEREO_SCORE")
     frame.loc[15, ["selectable", "tracked"]] = False
-    result = {row["Terrain"]: row for row in read_table(terrains_section(make_subject(frame, TERRAINS)))}
-    assert list(result) == ["flat ground", "steep incline", "a ledge"]
-    assert result["flat ground"]["Failures, paper"] == "1 of 11"
-    assert result["flat ground"]["Failures, ours"] == "2 of 8: 25.00 %"
-    assert result["flat ground"]["Cause, ours"] == "excessive azimuth change: 1; lighting change: 1"
-    assert result["steep incline"]["Failures, ours"] == "3 of 7: 42.86 %"
-    assert result["steep incline"]["Failures, all targets"] == "4 of 8: 50.00 %"
-    assert set(result["steep incline"]["Cause, ours"].split("; ")) == {"stuck: 1", "stereo score: 1", "drift: 1"}
+    table = {row["Terrain"]: row for row in read_table(terrains_section(make_subject(frame, TERRAINS)))}
+    assert list(table) == ["flat ground", "steep incline", "a ledge"]
+    assert table["flat ground"]["Failures, paper"] == "1 of 11"
+    assert table["flat ground"]["Failures, ours"] == "2 of 8: 25.00 %"
+    assert table["flat ground"]["Cause, ours"] == "excessive azimuth change: 1; lighting change: 1"
+    assert table["steep incline"]["Failures, ours"] == "3 of 7: 42.86 %"
+    assert table["steep incline"]["Failures, all targets"] == "4 of 8: 50.00 %"
+    assert set(table["steep incline"]["Cause, ours"].split("; ")) == {"stuck: 1", "stereo score: 1", "drift: 1"}
     assert terrains_section(make_subject(frame, "another")) is None
 
 
@@ -210,8 +210,8 @@ def test_regression_runs_are_listed_by_driving_mode() -> None:
     frame = frame.assign(map_by=["none", "none", "body", "mast"], rock_height_m=[0.09, 0.09, 0.5, 0.5])
     set_values(frame, 3, tracked=False, outcome="NO_PATH", losses="none")
     section = regression_section(make_subject(frame, REGRESSION))
-    result = [(row["Driving"], row["Rock"], row["Tracked to the goal"]) for row in read_table(section)]
-    assert result == [
+    listed = [(row["Driving"], row["Rock"], row["Tracked to the goal"]) for row in read_table(section)]
+    assert listed == [
         ("Autonav by body cameras", "large", "1 of 1: 100 %"),
         ("Autonav by mast cameras", "large", "0 of 1: 0 %"),
         ("blind", "small", "1 of 1: 100 %"),
@@ -220,7 +220,7 @@ def test_regression_runs_are_listed_by_driving_mode() -> None:
     assert read_table(section, 1)[0]["Outcome"] == "NO_PATH"
 
 
-def test_goal_statistics_by_camera() -> None:
+def test_goal_statistics_are_computed_per_camera() -> None:
     n = 300
     frame = make_rows(2 * n, camera=["research-navcam"] * n + ["research-pancam"] * n)
     frame.loc[: n - 1, "position_error_m"] = np.linspace(0.0, 0.0399, n)
@@ -236,14 +236,14 @@ def test_goal_statistics_by_camera() -> None:
     assert pancam["false_tracks"].hits == 1
     assert np.isfinite(pancam["quantile_bound_m"])
     assert losses_grid(frame).rows == [["LOST", "match score", "1", "3.5 to 3.5", "3.0", "0"]]
-    result = read_table(GOAL(make_subject(frame)), 1)
-    assert result[1]["Median (mm)"] == "4.000"
+    table = read_table(GOAL(make_subject(frame)), 1)
+    assert table[1]["Median (mm)"] == "4.000"
     small_sample = read_table(GOAL(make_subject(frame.iloc[:20])), 1)
     assert small_sample[0]["Bound of the 99 % quantile (mm)"] == "too few cases"
 
 
 def test_other_campaigns_have_no_tracking_section() -> None:
-    """Rows of other systems have none of the columns of tracking."""
+    """Rows of other systems have no columns of tracking."""
     assert VTT in presentations()
     sections = [*VTT.first, *VTT.sections]
     assert len(sections) == 7

@@ -14,7 +14,7 @@ from marsyard.reports.stored import StoredRun
 
 
 def make_rows(cases: int, **columns: Any) -> pd.DataFrame:
-    """Completed, tracked runs from 10 m to 2 m at selectable targets; `columns` replace values."""
+    """Return completed runs from 10 m to 2 m that track selectable targets; `columns` replaces default values."""
     defaults: dict[str, Any] = {
         "case": np.arange(cases),
         "outcome": "COMPLETED",
@@ -44,7 +44,7 @@ def make_rows(cases: int, **columns: Any) -> pd.DataFrame:
 def make_subject(
     frame: pd.DataFrame, name: str = "a-campaign", legs: Sequence[Mapping[str, Any]] | None = None
 ) -> Subject:
-    """Subject of a report on these rows, for a campaign with this name and these legs."""
+    """Return the subject of a report on these rows, for a campaign with this name and these legs of the drive."""
     parameters = {"drive": {"legs": legs}} if legs else {}
     record = {"name": name, "configuration": {"parameters": parameters}}
     return Subject(StoredRun(Path("run"), frame, frame, record, ()), "position_error_m", 0.03)
@@ -57,14 +57,14 @@ def set_values(frame: pd.DataFrame, index: int, **values: Any) -> None:
 
 
 def read_table(section: Section | None, block: int = 0) -> list[dict[str, str]]:
-    """Rows of a section's table as dictionaries from heading to cell."""
+    """Return the rows of a section's table number `block` as dictionaries from heading to cell."""
     assert section is not None
     grids = [part.grid for part in section.blocks if isinstance(part, Block) and part.grid is not None]
     return [dict(zip(grids[block].head, row, strict=True)) for row in grids[block].rows]
 
 
 def make_products(stops: int = 3) -> dict[str, Any]:
-    """A case with the target at (80, 70) of subframes of 161 px with origin (400, 300); lost at the last stop."""
+    """Return a case with subframes of 161 px at (400, 300), the target at (80, 70) in them, lost at the last stop."""
     rng = np.random.default_rng(3)
     case_products: dict[str, Any] = {"template_px": 21}
     for number in range(1, stops + 1):

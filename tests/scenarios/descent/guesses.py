@@ -1,4 +1,4 @@
-"""Custom velocity estimators for tests: they return the inertial velocity."""
+"""Custom velocity estimators for tests of algorithm selection: they return the measured inertial velocity."""
 
 import time
 
@@ -10,16 +10,16 @@ class Inertial:
     """Return the inertial velocity over the second pair."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """Return a valid velocity in each case."""
+        """Return the horizontal velocity (m/s) with the outcome VALID."""
         return VelocityEstimate(VelocityOutcome.VALID, measurements.interval_velocities_m_s[1, :2].copy())
 
 
 class SlowInertial(Inertial):
-    """Return the same velocity after a delay that exceeds the deadline of the flight computer."""
+    """Return the same velocity after 0.1 s; on the slower flight computer the answer comes after the firing."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """Return a valid velocity after the delay."""
-        until = time.process_time() + 0.1
-        while time.process_time() < until:
+        """Return the velocity after 0.1 s of processor time."""
+        end_s = time.process_time() + 0.1
+        while time.process_time() < end_s:
             pass
         return super().estimate(measurements)

@@ -1,4 +1,4 @@
-"""Settings of descent tests: a small world, a descent, and ideal instruments."""
+"""Settings shared by the descent tests: a small terrain, one descent, ideal instruments and a noiseless detector."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,8 +8,9 @@ from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
-#: A small world that is built quickly.
+#: A small terrain (3 km) that is generated quickly.
 WORLD: dict[str, Any] = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "location": {"bank": 1}}
+#: The same terrain without relief.
 FLAT = {"samples": 1024, "spacing_m": 3.0, "rms_slope_deg": 0.0, "craters_per_km2": 0.0}
 DESCENT = {
     "wind_east_m_s": 14.0,
@@ -19,12 +20,12 @@ DESCENT = {
     "nod_rate_deg_s": 30.0,
     "heading_deg": 70.0,
 }
-_NO_CLOCK = {"offset_sd_s": 0.0, "jitter_sd_s": 0.0}
+_IDEAL_CLOCK = {"offset_sd_s": 0.0, "jitter_sd_s": 0.0}
 #: Instruments without errors.
 PERFECT: Mapping[str, Mapping[str, Any]] = {
     "camera": {"alignment_error_deg": 0.0, "focal_error": 0.0, "centre_error_px": 0.0, "distortion_error_px": 0.0},
-    "altimeter": {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": _NO_CLOCK},
-    "clock": _NO_CLOCK,
+    "altimeter": {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": _IDEAL_CLOCK},
+    "clock": _IDEAL_CLOCK,
     "approach": {"attitude_sd_deg": 0.0, "velocity_sd_m_s": 0.0, "spin_scale_ppm": 0.0},
     "imu": {
         "gyro_bias_deg_h": 0.0,
@@ -39,10 +40,10 @@ PERFECT: Mapping[str, Mapping[str, Any]] = {
         "accelerometer_scale_ppm": 0.0,
         "accelerometer_misalignment_mrad": 0.0,
         "accelerometer_count_m_s": 0.0,
-        "clock": _NO_CLOCK,
+        "clock": _IDEAL_CLOCK,
     },
 }
-#: A detector with negligible noise: a million times the light and full well of the flight camera.
+#: A detector with negligible shot noise: response and full well are a million times those of the flight camera.
 NOISELESS = {
     "responsivity_e_s": 1.019e13,
     "full_well_e": 1.7e11,
@@ -53,10 +54,10 @@ NOISELESS = {
 
 
 def parameters(**parts: Any) -> DescentScenarioParameters:
-    """Return parameters of a descent over the small world."""
+    """Return parameters of a descent over the small terrain; `parts` replaces tables."""
     return DescentScenarioParameters.model_validate(WORLD | {"descent": DESCENT} | parts)
 
 
 def run(case: int = 0, /, **parts: Any) -> CaseResult:
-    """Run one descent over the small world."""
+    """Run one descent over the small terrain; `parts` replaces tables of its parameters."""
     return DescentScenario().run(parameters(**parts), Streams(1, "test", case))

@@ -1,4 +1,4 @@
-"""Tests of injected faults: each has its specified effect and size."""
+"""Tests of injected faults of the descent: each fault has the specified effect and size."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,7 +18,7 @@ from marsyard.scenarios.descent.exposure import (
     camera_optics,
     take_exposures,
 )
-from marsyard.scenarios.descent.flight import create_flight, picture_states
+from marsyard.scenarios.descent.flight import create_flight, states_at_images
 from marsyard.scenarios.descent.parameters import (
     CameraParameters,
     Faults,
@@ -37,17 +37,17 @@ from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment, TerrainParameters
 from tests.scenarios.descent.settings import NOISELESS, parameters, run
 
-SMALL = CameraParameters(columns=256, rows=256, pixel_pitch_um=48.0)
+SMALL_CAMERA = CameraParameters(columns=256, rows=256, pixel_pitch_um=48.0)
 SUN = Sun(direction(4.0, 0.7))
 
 
 def _render_level_ground(height_m: float, radiance: np.ndarray) -> Frame:
-    """Frame of level ground from a small camera that looks straight down."""
-    rays = PixelRays.of(camera_optics(SMALL).camera)
-    down = -rays.directions[:, 2].astype(np.float64)
+    """Return the frame of level ground for a small camera that looks straight down."""
+    rays = PixelRays.of(camera_optics(SMALL_CAMERA).camera)
+    downward_component = -rays.directions[:, 2].astype(np.float64)
     return Frame(
         radiance=radiance.astype(np.float32),
-        range_m=(height_m / down).reshape(256, 256),
+        range_m=(height_m / downward_component).reshape(256, 256),
         body=np.full((256, 256), -1, dtype=np.int32),
         normal=np.tile(np.array([0.0, 0.0, 1.0], dtype=np.float32), (256, 256, 1)),
         world_from_body=rigid(Rotation.identity(), np.array([0.0, 0.0, height_m])),
@@ -56,17 +56,17 @@ def _render_level_ground(height_m: float, radiance: np.ndarray) -> Frame:
 
 
 def _make_state(height_m: float) -> State:
-    static = np.zeros(3)
-    return State(0.0, np.array([0.0, 0.0, height_m]), static, Rotation.identity(), static, static)
+    zero = np.zeros(3)
+    return State(0.0, np.array([0.0, 0.0, height_m]), zero, Rotation.identity(), zero, zero)
 
 
 def test_disabled_faults_have_no_effect() -> None:
-    none = Faults()
+    no_faults = Faults()
     terrain, detector = TerrainParameters(), DetectorParameters()
-    assert add_terrain_fault(none, terrain) == terrain
-    assert add_detector_faults(none, detector) == detector
-    assert add_time_fault(none, [0.0, 3.75, 7.5]) == [0.0, 3.75, 7.5]
-    assert none.columns == {"fault": "none", "fault_size": 0.0}
+    assert add_terrain_fault(no_faults, terrain) == terrain
+    assert add_detector_faults(no_faults, detector) == detector
+    assert add_time_fault(no_faults, [0.0, 3.75, 7.5]) == [0.0, 3.75, 7.5]
+    assert no_faults.columns == {"fault": "none", "fault_size": 0.0}
 
 
 @pytest.mark.parametrize(("name", "field"), Faults.model_fields.items())
@@ -82,59 +82,60 @@ def test_multiple_faults_have_no_size() -> None:
 
 
 def test_haze_reduces_contrast_but_not_brightness() -> None:
-    """At nadir the contrast falls as exp(-depth), and the mean brightness hardly changes."""
+    """Haze of optical depth 1 multiplies the contrast at nadir by exp(-1); the mean brightness is of the same order."""
     pattern = np.where(np.indices((256, 256)).sum(axis=0) % 2, 0.12, 0.10)
     frame = _render_level_ground(2000.0, pattern)
-    clear, hazy = (add_haze(frame, Environment(), SUN, depth / 2000.0) for depth in (0.0, 1.0))
-    np.testing.assert_allclose(clear, pattern, rtol=1e-6)
-    middle = np.s_[126:130, 126:130]
-    assert np.ptp(hazy[middle]) == pytest.approx(np.exp(-1.0) * 0.02, rel=0.03)
-    assert 0.5 < hazy.mean() / pattern.mean() < 2.0
+    clear_image, hazy_image = (add_haze(frame, Environment(), SUN, depth / 2000.0) for depth in (0.0, 1.0))
+    np.testing.assert_allclose(clear_image, pattern, rtol=1e-6)
+    centre_pixels = np.s_[126:130, 126:130]
+    assert np.ptp(hazy_image[centre_pixels]) == pytest.approx(np.exp(-1.0) * 0.02, rel=0.03)
+    assert 0.5 < hazy_image.mean() / pattern.mean() < 2.0
 
 
 @pytest.mark.parametrize("angle_deg", [1.0, 4.0])
 def test_heat_shield_has_the_specified_size(angle_deg: float) -> None:
-    """The disc seen face on covers pi / 4 of the square of its angle."""
+    """A disc with angular diameter a, perpendicular to the line of sight, covers the solid angle pi / 4 a^2."""
     frame = _render_level_ground(2000.0, np.full((256, 256), 0.5))
     first = _make_state(2000.0)
-    samples = HeatShield.draw(first, np.radians(angle_deg), np.random.default_rng(3))
-    towards = samples.centre_m - first.position_m
-    faced = replace(samples, normal=towards / np.linalg.norm(towards), spin_rad_s=np.zeros(3))
-    observed = faced.draw_over(frame.radiance, frame, SUN, 0.0)
-    solid = frame.rays.pixel_angles.astype(np.float64) ** 2
-    covered = solid[(observed != frame.radiance).reshape(-1)].sum()
-    assert covered == pytest.approx(np.pi / 4.0 * np.radians(angle_deg) ** 2, rel=0.1)
-    # 20 m/s away for 3.75 s
-    later = faced.draw_over(frame.radiance, frame, SUN, 3.75)
-    distance = SHIELD_DIAMETER_M / np.radians(angle_deg)
-    shrunk = solid[(later != frame.radiance).reshape(-1)].sum() / covered
-    assert shrunk == pytest.approx((distance / (distance + 75.0)) ** 2, abs=0.05)
+    heat_shield = HeatShield.draw(first, np.radians(angle_deg), np.random.default_rng(3))
+    shield_direction = heat_shield.centre_m - first.position_m
+    face_on = replace(heat_shield, normal=shield_direction / np.linalg.norm(shield_direction), spin_rad_s=np.zeros(3))
+    first_radiance = face_on.paint_over(frame.radiance, frame, SUN, 0.0)
+    solid_angles_sr = frame.rays.pixel_angles.astype(np.float64) ** 2
+    covered_sr = solid_angles_sr[(first_radiance != frame.radiance).reshape(-1)].sum()
+    assert covered_sr == pytest.approx(np.pi / 4.0 * np.radians(angle_deg) ** 2, rel=0.1)
+    # the shield moves away at 20 m/s: 75 m in 3.75 s
+    later_radiance = face_on.paint_over(frame.radiance, frame, SUN, 3.75)
+    distance_m = SHIELD_DIAMETER_M / np.radians(angle_deg)
+    area_ratio = solid_angles_sr[(later_radiance != frame.radiance).reshape(-1)].sum() / covered_sr
+    assert area_ratio == pytest.approx((distance_m / (distance_m + 75.0)) ** 2, abs=0.05)
 
 
 def test_images_can_be_repeated_or_black() -> None:
-    pictures = [np.full((4, 4), value, dtype=np.uint16) for value in (1, 2, 3)]
-    assert [int(one[0, 0]) for one in corrupt_images(pictures, 3, 0)] == [1, 2, 2]
-    assert [int(one[0, 0]) for one in corrupt_images(pictures, 0, 1)] == [0, 2, 3]
-    assert [int(one[0, 0]) for one in pictures] == [1, 2, 3]
+    images = [np.full((4, 4), value, dtype=np.uint16) for value in (1, 2, 3)]
+    assert [int(entry[0, 0]) for entry in corrupt_images(images, 3, 0)] == [1, 2, 2]
+    assert [int(entry[0, 0]) for entry in corrupt_images(images, 0, 1)] == [0, 2, 3]
+    assert [int(entry[0, 0]) for entry in images] == [1, 2, 3]
 
 
-def test_reading_errors_have_the_specified_size() -> None:
+def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
     faults = Faults(altitude_error=0.1, altitude_error_once=0.2, attitude_error_deg=3.0, attitude_error_once_deg=5.0)
     altitudes = add_altitude_faults(faults, [AltitudeMeasurement(100.0, t) for t in (0.0, 1.0, 2.0)])
-    assert [one.altitude_m for one in altitudes] == pytest.approx([110.0, 130.0, 110.0])
-    locked = add_altitude_faults(Faults(shield_range_m=60.0), [AltitudeMeasurement(2000.0, t) for t in (0.0, 1.0, 2.0)])
-    assert [one.altitude_m for one in locked] == [60.0, 80.0, 100.0]
-    level = [AttitudeMeasurement(Rotation.identity(), t) for t in (0.0, 1.0, 2.0)]
-    tilted = [one.world_from_body for one in add_attitude_faults(faults, level, np.random.default_rng(0))]
-    assert np.degrees([one.magnitude() for one in (tilted[0], tilted[2])]) == pytest.approx([3.0, 3.0])
-    assert np.degrees((tilted[1] * tilted[0].inv()).magnitude()) == pytest.approx(5.0)
-    assert tilted[0].as_rotvec()[2] == 0.0
+    assert [entry.altitude_m for entry in altitudes] == pytest.approx([110.0, 130.0, 110.0])
+    readings = [AltitudeMeasurement(2000.0, t) for t in (0.0, 1.0, 2.0)]
+    shield_ranges = add_altitude_faults(Faults(shield_range_m=60.0), readings)
+    assert [entry.altitude_m for entry in shield_ranges] == [60.0, 80.0, 100.0]
+    attitudes = [AttitudeMeasurement(Rotation.identity(), t) for t in (0.0, 1.0, 2.0)]
+    tilts = [entry.world_from_body for entry in add_attitude_faults(faults, attitudes, np.random.default_rng(0))]
+    assert np.degrees([tilts[0].magnitude(), tilts[2].magnitude()]) == pytest.approx([3.0, 3.0])
+    assert np.degrees((tilts[1] * tilts[0].inv()).magnitude()) == pytest.approx(5.0)
+    assert tilts[0].as_rotvec()[2] == 0.0
 
 
 def _render_descent(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]:
     p = parameters(faults=faults, detector=NOISELESS, **parts)
     world, streams = World.from_parameters(p), Streams(1, "faults", 0)
-    states = picture_states(p, create_flight(p, world.surface, streams))
+    states = states_at_images(p, create_flight(p, world.surface, streams))
     optics = camera_optics(p.camera)
     detector = Detector.draw(optics.fall_off, add_detector_faults(p.faults, p.detector), streams.generator("detector"))
     return [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
@@ -142,44 +143,46 @@ def _render_descent(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]
 
 def test_image_faults_change_the_expected_pixels() -> None:
     """Each fault changes a fraction of the pixels in all images, or all pixels in one image."""
-    clear = _render_descent({})
+    clear_images = _render_descent({})
 
-    def changed_fractions(faults: Mapping[str, Any]) -> list[float]:
-        return [float(np.mean(np.abs(a / b - 1.0) > 0.02)) for a, b in zip(_render_descent(faults), clear, strict=True)]
+    def compute_changed_fractions(faults: Mapping[str, Any]) -> list[float]:
+        pairs = zip(_render_descent(faults), clear_images, strict=True)
+        return [float(np.mean(np.abs(faulty / clear - 1.0) > 0.02)) for faulty, clear in pairs]
 
-    dust = changed_fractions({"dust_discs": 10})
+    dust = compute_changed_fractions({"dust_discs": 10})
     assert all(0.002 < fraction < 0.3 for fraction in dust)
     assert np.ptp(dust) < 0.02
-    # One of the four rows summed into a pixel is enough.
-    assert changed_fractions({"bad_pixels": 0.01})[0] > 0.02
-    late = changed_fractions({"late_s": 0.5})
+    # A binned pixel sums four rows: one defective pixel among them changes its value.
+    assert compute_changed_fractions({"bad_pixels": 0.01})[0] > 0.02
+    late = compute_changed_fractions({"late_s": 0.5})
     assert late[0] == late[2] == 0.0 < late[1]
-    shield = changed_fractions({"heat_shield_deg": 5.0})
-    # The shadows of the clouds, and pixels that are brighter because of scattered light.
-    assert min(changed_fractions({"cloud_cover": 0.4})) > 0.2
-    # The shield tumbles: edge on it may be invisible in one image.
+    shield = compute_changed_fractions({"heat_shield_deg": 5.0})
+    # Shadows of clouds darken pixels; scattered light brightens others.
+    assert min(compute_changed_fractions({"cloud_cover": 0.4})) > 0.2
+    # The shield tumbles: it may be invisible in one image if its edge points to the camera.
     assert max(shield) > 0.001
 
 
-def test_calibration_errors_have_the_specified_spread() -> None:
-    """The spread of focal length, image centre and corner position over many draws."""
+def test_calibration_errors_have_the_specified_standard_deviation() -> None:
+    """Standard deviations of image centre and corner position over many draws of the calibration."""
     p = CameraParameters()
     true = camera_optics(p).camera
-    samples = [calibrated_camera(p, np.random.default_rng(seed)) for seed in range(300)]
-    ahead = np.array([[0.0, 0.0, -1.0]])
-    centres = np.stack([one.project(ahead)[0][0] for one in samples]) - true.project(ahead)[0][0]
+    cameras = [calibrated_camera(p, np.random.default_rng(seed)) for seed in range(300)]
+    nadir = np.array([[0.0, 0.0, -1.0]])
+    centre_shifts = np.stack([camera.project(nadir)[0][0] for camera in cameras]) - true.project(nadir)[0][0]
     # 300 draws determine a standard deviation to 4 %.
-    assert centres.std(axis=0) == pytest.approx([p.centre_error_px] * 2, rel=0.15)
-    _, towards = true.rays(np.array([[0.0, 0.0]]))
-    moved = np.stack([one.project(towards)[0][0] for one in samples]) - centres - true.project(towards)[0][0]
-    outwards = moved @ np.array([-1.0, -1.0]) / np.sqrt(2.0)
+    assert centre_shifts.std(axis=0) == pytest.approx([p.centre_error_px] * 2, rel=0.15)
+    _, corner = true.rays(np.array([[0.0, 0.0]]))
+    corners = np.stack([camera.project(corner)[0][0] for camera in cameras])
+    corner_shifts = corners - centre_shifts - true.project(corner)[0][0]
+    radial_shifts = corner_shifts @ np.array([-1.0, -1.0]) / np.sqrt(2.0)
     expected = np.hypot(p.distortion_error_px, p.focal_error * np.hypot(511.5, 511.5))
-    assert outwards.std() == pytest.approx(expected, rel=0.15)
-    assert np.abs(moved @ np.array([1.0, -1.0])).max() < 0.02
+    assert radial_shifts.std() == pytest.approx(expected, rel=0.15)
+    assert np.abs(corner_shifts @ np.array([1.0, -1.0])).max() < 0.02
 
 
 def test_regular_dunes_trigger_the_second_peak_check() -> None:
-    """The paper's ratio of peaks detects repetitive terrain."""
+    """The paper's ratio of the second to the first correlation peak detects repetitive terrain."""
     result = run(faults={"dunes_m": 4.0}, descent={"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 10.0})
     columns = list(result.products["tracks_columns"])
     ratios = result.products["tracks"][:, columns.index("second_peak_ratio")]

@@ -1,4 +1,4 @@
-"""Tests of the touchdown velocity after steering with an estimated velocity."""
+"""Tests of the horizontal touchdown velocity: the thrusters cancel the estimated velocity, within their limits."""
 
 import numpy as np
 import pytest
@@ -6,46 +6,47 @@ import pytest
 from marsyard.scenarios.descent.parameters import LandingParameters
 from marsyard.scenarios.descent.score import compute_touchdown
 
-EXACT = LandingParameters(steering_error=0.0, burn_error_m_s=0.0)
+IDEAL = LandingParameters(steering_error=0.0, burn_error_m_s=0.0)
+#: True horizontal velocity before the firing, m/s, with a magnitude of 15.
 DRIFT = np.array([12.0, -9.0])
 
 
-def _rng() -> np.random.Generator:
+def make_rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
 def test_correct_answer_cancels_the_velocity() -> None:
-    result = compute_touchdown(EXACT, DRIFT, DRIFT.copy(), 17.0, _rng())
+    result = compute_touchdown(IDEAL, DRIFT, DRIFT.copy(), 17.0, make_rng())
     np.testing.assert_allclose(result.with_answer, 0.0, atol=1e-12)
     np.testing.assert_allclose(result.without_answer, DRIFT)
 
 
 def test_steering_is_limited_by_its_capability() -> None:
     fast = 2.0 * DRIFT
-    result = compute_touchdown(EXACT, fast, fast.copy(), 17.0, _rng())
-    np.testing.assert_allclose(np.hypot(*result.with_answer), 30.0 - EXACT.max_steering_m_s)
+    result = compute_touchdown(IDEAL, fast, fast.copy(), 17.0, make_rng())
+    np.testing.assert_allclose(np.hypot(*result.with_answer), 30.0 - IDEAL.max_steering_m_s)
 
 
 def test_wrong_answer_increases_the_velocity() -> None:
     """Steering with the negated velocity doubles the velocity."""
-    result = compute_touchdown(EXACT, DRIFT, -DRIFT, 17.0, _rng())
+    result = compute_touchdown(IDEAL, DRIFT, -DRIFT, 17.0, make_rng())
     np.testing.assert_allclose(result.with_answer, 2.0 * DRIFT)
 
 
 @pytest.mark.parametrize(
-    ("estimate", "available_s"), [(None, 17.0), (DRIFT, EXACT.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)]
+    ("estimate", "available_s"), [(None, 17.0), (DRIFT, IDEAL.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)]
 )
 def test_late_or_missing_answer_disables_steering(estimate: np.ndarray | None, available_s: float) -> None:
-    result = compute_touchdown(EXACT, DRIFT, estimate, available_s, _rng())
+    result = compute_touchdown(IDEAL, DRIFT, estimate, available_s, make_rng())
     np.testing.assert_array_equal(result.with_answer, result.without_answer)
-    assert result.is_in_time == (available_s >= EXACT.computation_s)
+    assert result.is_in_time == (available_s >= IDEAL.computation_s)
 
 
-def test_burn_and_steering_errors_have_specified_spread() -> None:
+def test_burn_and_steering_errors_have_the_specified_standard_deviation() -> None:
     p = LandingParameters(steering_error=0.1, burn_error_m_s=1.0)
-    result = [compute_touchdown(p, DRIFT, DRIFT.copy(), 17.0, np.random.default_rng(seed)) for seed in range(2000)]
-    without = np.stack([samples.without_answer for samples in result]) - DRIFT
-    steered = np.stack([samples.with_answer - samples.without_answer for samples in result]) + DRIFT
+    touchdowns = [compute_touchdown(p, DRIFT, DRIFT.copy(), 17.0, np.random.default_rng(seed)) for seed in range(2000)]
+    without_answer = np.stack([touchdown.without_answer for touchdown in touchdowns]) - DRIFT
+    steering = np.stack([touchdown.with_answer - touchdown.without_answer for touchdown in touchdowns]) + DRIFT
     # 4000 draws determine a standard deviation to 1.1 %.
-    assert without.std() == pytest.approx(1.0, rel=0.05)
-    assert steered.std() == pytest.approx(1.5, rel=0.05)
+    assert without_answer.std() == pytest.approx(1.0, rel=0.05)
+    assert steering.std() == pytest.approx(1.5, rel=0.05)

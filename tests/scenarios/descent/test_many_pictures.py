@@ -13,13 +13,13 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 from tests.scenarios.descent.settings import DESCENT, PERFECT, parameters, run
 
-STREAM = "tests.scenarios.descent.test_many_pictures:Inertial"
+STREAM_ESTIMATOR = "tests.scenarios.descent.test_many_pictures:Inertial"
 #: Nine images of a descent that contain the three images of a standard descent.
-NINE: dict[str, Any] = {"pictures": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
+NINE_IMAGES: dict[str, Any] = {"pictures": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
 
 
 class Inertial:
-    """Return the inertial velocity: of the last interval for each image, of the last instant at the end."""
+    """Return the inertial velocity: after each image for the last interval, at the end for the last instant."""
 
     def start(self) -> None:
         self.frames: list[DescentFrame] = []
@@ -32,12 +32,12 @@ class Inertial:
     def finish(self) -> VelocityEstimate:
         last = self.frames[-1]
         assert last.inertial_velocity_m_s is not None
-        tag = last.image.time_s
+        last_time_s = last.image.time_s
         return VelocityEstimate(
             VelocityOutcome.VALID,
             last.inertial_velocity_m_s[:2],
             covariance_m2_s2=np.diag([0.01, 0.04]),
-            span_s=(tag, tag),
+            span_s=(last_time_s, last_time_s),
         )
 
 
@@ -52,79 +52,82 @@ class Halfway(Inertial):
 @pytest.fixture(scope="module")
 def nine_images() -> CaseResult:
     """Nine images with ideal instruments: the inertial velocity is exact."""
-    return run(algorithm=STREAM, compared=["dimes"], **NINE, **PERFECT)
+    return run(algorithm=STREAM_ESTIMATOR, compared=["dimes"], **NINE_IMAGES, **PERFECT)
 
 
 def test_truth_has_the_span_of_the_answer(nine_images: CaseResult) -> None:
-    """The inertial unit has no errors: its velocities are exact for each span."""
+    """Each answer is compared with the true mean velocity over its own span; the inertial unit has no errors."""
     row: Any = nine_images.row
     assert (nine_images.outcome, row["stream_pictures"], row["pictures_before_answer"]) == ("VALID", 9, 2)
     assert np.isnan(row["velocity_error_after_1_m_s"])
-    after = [row[f"velocity_error_after_{number}_m_s"] for number in range(2, 10)]
-    # Trapezoidal integration of 400 Hz samples of a swinging descent.
-    assert max(after) < 1e-3
+    interval_errors = [row[f"velocity_error_after_{number}_m_s"] for number in range(2, 10)]
+    # Tolerance: trapezoidal integration of 400 Hz samples of a swinging descent.
+    assert max(interval_errors) < 1e-3
     assert float(row["velocity_error_m_s"]) < 1e-3
     assert float(row["firing_velocity_error_m_s"]) < 2e-2
-    # The span is an instant, not the last interval: the camera swings and its velocity changes.
-    means = nine_images.products["after_true_m_s"][-1]
-    assert np.hypot(*(means - nine_images.products["velocity_true_m_s"])) > 0.05
+    # The span of the final answer is an instant: the velocity of the swinging camera differs from the interval's mean.
+    interval_mean = nine_images.products["after_true_m_s"][-1]
+    assert np.hypot(*(interval_mean - nine_images.products["velocity_true_m_s"])) > 0.05
 
 
-def test_three_image_estimator_gets_standard_images(nine_images: CaseResult) -> None:
-    three = run(**PERFECT).row
+def test_three_image_estimator_receives_first_middle_and_last_image(nine_images: CaseResult) -> None:
+    three_images = run(**PERFECT).row
     assert [nine_images.row[f"altitude_{number}_m"] for number in (1, 5, 9)] == [
-        three[f"altitude_{number}_m"] for number in (1, 2, 3)
+        three_images[f"altitude_{number}_m"] for number in (1, 2, 3)
     ]
     for name in ("velocity_true_x_m_s", "velocity_true_y_m_s"):
-        assert nine_images.row[f"dimes.{name}"] == pytest.approx(three[name], rel=1e-12)
+        assert nine_images.row[f"dimes.{name}"] == pytest.approx(three_images[name], rel=1e-12)
     assert (nine_images.row["feasible_overlap_first_pair"], nine_images.row["feasible_overlap_second_pair"]) == (
-        three["feasible_overlap_first_pair"],
-        three["feasible_overlap_second_pair"],
+        three_images["feasible_overlap_first_pair"],
+        three_images["feasible_overlap_second_pair"],
     )
     assert float(nine_images.row["dimes.velocity_error_m_s"]) < 1.0
     assert "dimes.stream_pictures" not in nine_images.row
 
 
 def test_dimes_input_images_are_stored_for_figures() -> None:
-    case = run(compared=[STREAM], triple=[1, 2, 3], **NINE)
-    assert [name for name in case.products if name.startswith("image_")] == ["image_1", "image_2", "image_3"]
-    assert {"Inertial.stream_pictures", "Inertial.velocity_nees"} <= set(case.row)
+    result = run(compared=[STREAM_ESTIMATOR], triple=[1, 2, 3], **NINE_IMAGES)
+    assert [name for name in result.products if name.startswith("image_")] == ["image_1", "image_2", "image_3"]
+    assert {"Inertial.stream_pictures", "Inertial.velocity_nees"} <= set(result.row)
 
 
 def test_span_between_images_is_interpolated() -> None:
-    """A quarter of an interval: interpolation between the true image times along the true motion."""
+    """The span starts a quarter of the descent after the first image: the truth is interpolated between the images."""
     spec = "tests.scenarios.descent.test_many_pictures:Halfway"
-    two, nine = (
+    first, second = (
         run(algorithm=spec, pictures=pictures, descent=DESCENT | {"interval_s": 4.0 / (pictures - 1)}, **PERFECT)
         for pictures in (2, 9)
     )
-    # The same instants of the same flight with other images.
+    # Both cases have the same flight and span, but different images.
     for axis in "xy":
-        assert two.row[f"velocity_true_{axis}_m_s"] == pytest.approx(nine.row[f"velocity_true_{axis}_m_s"], abs=1e-9)
-    assert "feasible_overlap" not in two.row
-    assert "velocity_change_error_m_s" not in two.row
+        name = f"velocity_true_{axis}_m_s"
+        assert first.row[name] == pytest.approx(second.row[name], abs=1e-9)
+    assert "feasible_overlap" not in first.row
+    assert "velocity_change_error_m_s" not in first.row
 
 
 def test_many_image_case_is_deterministic() -> None:
-    errors: dict[str, Any] = {"pictures": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM}
-    first, repeated = run(**errors), run(**errors)
+    parts: dict[str, Any] = {"pictures": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
+    first, repeated = run(**parts), run(**parts)
     assert differing_columns(dict(first.row), dict(repeated.row)) == ()
 
 
-def test_exported_images_can_be_answered_offline(tmp_path: Path) -> None:
+def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
     run(algorithm=f"export:{tmp_path}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
-    written = read_case(tmp_path / "cases" / "000000")
-    assert isinstance(written, DescentMeasurements)
-    assert len(written.images) == len(written.attitudes) == len(written.altitudes) == 4
-    assert written.interval_velocities_m_s.shape == (3, 3)
-    assert written.inertial_velocities_m_s is not None
-    # An answer with its own span is scored over that span.
-    start, end = written.tags_s[0], written.tags_s[2]
-    table = tmp_path / "answers.csv"
-    table.write_text(f"case,velocity_east_m_s,velocity_north_m_s,start_s,end_s\n0,1,2,{start!r},{end!r}\n")
-    scored = run(algorithm=f"answers:{table}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
-    three = run(algorithm=STREAM, pictures=2, descent=DESCENT | {"interval_s": 2.0}).products["after_true_m_s"][1]
-    assert [scored.row[f"velocity_true_{axis}_m_s"] for axis in "xy"] == pytest.approx(three, abs=1e-9)
+    exported = read_case(tmp_path / "cases" / "000000")
+    assert isinstance(exported, DescentMeasurements)
+    assert len(exported.images) == len(exported.attitudes) == len(exported.altitudes) == 4
+    assert exported.interval_velocities_m_s.shape == (3, 3)
+    assert exported.inertial_velocities_m_s is not None
+    # The answer is scored over its span.
+    start, end = exported.tags_s[0], exported.tags_s[2]
+    answer_table = tmp_path / "answers.csv"
+    answer_table.write_text(f"case,velocity_east_m_s,velocity_north_m_s,start_s,end_s\n0,1,2,{start!r},{end!r}\n")
+    scored_case = run(algorithm=f"answers:{answer_table}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
+    same_span = run(algorithm=STREAM_ESTIMATOR, pictures=2, descent=DESCENT | {"interval_s": 2.0})
+    assert [scored_case.row[f"velocity_true_{axis}_m_s"] for axis in "xy"] == pytest.approx(
+        same_span.products["after_true_m_s"][1], abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -135,8 +138,8 @@ def test_exported_images_can_be_answered_offline(tmp_path: Path) -> None:
         ({"pictures": 5, "triple": [1, 3, 6]}, r"triple is \[1, 3, 6\]; allowed: three in ascending order, 1 to 5"),
         ({"triple": [1, 3, 2]}, "three in ascending order, 1 to 3"),
         (
-            {"algorithm": STREAM, "pictures": 2, "faults": {"black_picture": 3}},
-            "a fault affects picture 3, but the descent",
+            {"algorithm": STREAM_ESTIMATOR, "pictures": 2, "faults": {"black_picture": 3}},
+            "a fault affects image 3, but the descent",
         ),
     ],
 )
@@ -146,10 +149,10 @@ def test_invalid_image_counts_are_rejected(parts: dict[str, Any], message: str) 
 
 
 @pytest.mark.parametrize(("pictures", "positions"), [(3, (0, 1, 2)), (4, (1, 2, 3)), (5, (0, 2, 4)), (10, (1, 5, 9))])
-def test_three_images_are_spread_evenly(pictures: int, positions: tuple[int, int, int]) -> None:
+def test_default_image_triple_is_evenly_spaced(pictures: int, positions: tuple[int, int, int]) -> None:
     assert parameters(pictures=pictures).triple_indices == positions
 
 
 def test_no_image_is_captured_after_firing() -> None:
-    with pytest.raises(ValueError, match=r"picture \d of 9 would be taken at .* s, after the thrusters' firing"):
+    with pytest.raises(ValueError, match=r"image \d of 9 would be taken at .* s, after the thrusters' firing"):
         run(pictures=9)

@@ -17,7 +17,7 @@ SITES = ("gusev", "ivanpah")
 
 
 @pytest.mark.parametrize(
-    ("invalid", "names"),
+    ("invalid", "message"),
     [
         ({"location": {"bank": 2, "terrain": 2}}, "0 to 1"),
         ({"descent": {"altitude_first_m": -5.0}}, "altitude_first_m"),
@@ -31,23 +31,23 @@ SITES = ("gusev", "ivanpah")
         ({"faults": {"hase": 1.0}}, "hase"),
     ],
 )
-def test_invalid_parameters_are_reported(invalid: dict[str, Any], names: str) -> None:
-    with pytest.raises(ValidationError, match=names):
+def test_invalid_parameters_are_reported(invalid: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         DescentScenarioParameters.model_validate(invalid)
 
 
 def test_site_terrain_can_be_overridden() -> None:
     settings = {"site": "gusev", "terrain": {"samples": 512, "spacing_m": 8.0, "rocks": {"smallest_m": 2.0}}}
     p = DescentScenarioParameters.model_validate(settings)
-    of_site = site("gusev").terrain("descent")
-    rocks = of_site.rocks
+    site_terrain = site("gusev").terrain("descent")
+    rocks = site_terrain.rocks
     assert rocks is not None
-    changed = {"samples": 512, "spacing_m": 8.0, "rocks": rocks.model_copy(update={"smallest_m": 2.0})}
-    assert p.terrain == of_site.model_copy(update=changed)
+    site_changes = {"samples": 512, "spacing_m": 8.0, "rocks": rocks.model_copy(update={"smallest_m": 2.0})}
+    assert p.terrain == site_terrain.model_copy(update=site_changes)
 
 
 def test_site_cannot_be_dispersed() -> None:
-    """The terrain is completed when the campaign is read: a dispersed site name would only change the light."""
+    """The site's terrain is read once with the campaign: a dispersed site name would change only the illumination."""
     complete = DescentScenarioParameters.model_validate({"site": "gusev"}).model_dump(mode="json", round_trip=True)
     with pytest.raises(ValidationError, match="terrain is of gusev"):
         DescentScenarioParameters.model_validate(complete | {"site": "kelso"})
@@ -55,24 +55,23 @@ def test_site_cannot_be_dispersed() -> None:
 
 @pytest.mark.parametrize("settings", [{}, {"site": "kelso"}, {"dimes": {"subpixel": False}, "faults": {"haze": 2.0}}])
 def test_complete_parameters_round_trip(settings: dict[str, Any]) -> None:
-    """As in the workers of a campaign."""
+    """Workers of a campaign receive the parameters as JSON."""
     p = DescentScenarioParameters.model_validate(settings)
     assert DescentScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True)) == p
 
 
 def test_illumination_follows_the_site() -> None:
-    """The site defines sunlight and reflectance; signals follow sunlight and atmosphere."""
-    small = {"terrain": {"samples": 256, "spacing_m": 16.0}, "location": {"bank": 1}}
-    mars, earth = (
-        World.from_parameters(DescentScenarioParameters.model_validate({"site": name} | small)) for name in SITES
-    )
+    """The site defines sunlight and reflectance; the brightness depends on sunlight and atmosphere."""
+    small_terrain = {"terrain": {"samples": 256, "spacing_m": 16.0}, "location": {"bank": 1}}
+    parameters = [DescentScenarioParameters.model_validate({"site": name} | small_terrain) for name in SITES]
+    mars, earth = (World.from_parameters(p) for p in parameters)
     assert mars.ground is not None
     assert mars.sun.angular_radius_rad == pytest.approx(0.00308, rel=0.01)
-    # At least twice the sunlight: the air of Mars is dusty.
+    # Earth receives 1 / 0.44 of the sunlight on Mars; dust in the atmosphere of Mars increases the ratio.
     assert earth.brightness / mars.brightness > 1.0 / 0.44
-    # For a detector specified for Earth's sun, the light on Mars is 0.44 of that.
-    stated_for_earth = {"site": SITES[0], "detector": {"sun_au": 1.0}} | small
-    dimmer = World.from_parameters(DescentScenarioParameters.model_validate(stated_for_earth))
+    # A detector specified for the sun at 1 au receives 1 / 1.5^2 = 0.44 of its light on Mars.
+    earth_detector = {"site": SITES[0], "detector": {"sun_au": 1.0}} | small_terrain
+    dimmer = World.from_parameters(DescentScenarioParameters.model_validate(earth_detector))
     assert dimmer.brightness == pytest.approx(mars.brightness / 1.5**2)
     scene = mars.scene(0.0, 0.0, 1400.0, 8.2e-4)
     assert scene.photometry == mars.ground.photometry(mars.sun)
@@ -98,26 +97,27 @@ def test_custom_cameras_are_stored_in_the_campaign(tmp_path: Path) -> None:
     calibration.unlink()
     sheet.unlink()
     assert DescentScenarioParameters.model_validate(repeated.model_dump(mode="json", round_trip=True)) == p
-    # The calibrated camera differs by the specified errors: at the corner by at most their sum.
+    # The calibrated camera differs by the specified errors (4 standard deviations): at the corner by their sum.
     true, calibrated = camera_optics(p.camera).camera, calibrated_camera(p.camera, np.random.default_rng(1))
     directions = true.rays(np.array([[0.0, 0.0], [320.0, 240.0], [639.0, 479.0]]))[1]
-    moved = np.linalg.norm(calibrated.project(directions)[0] - true.project(directions)[0], axis=1)
-    assert 0.0 < moved[1] < 4.0 * p.camera.centre_error_px
-    assert moved.max() < 4.0 * (p.camera.centre_error_px + p.camera.distortion_error_px + 400 * p.camera.focal_error)
+    shifts_px = np.linalg.norm(calibrated.project(directions)[0] - true.project(directions)[0], axis=1)
+    assert 0.0 < shifts_px[1] < 4.0 * p.camera.centre_error_px
+    sum_px = p.camera.centre_error_px + p.camera.distortion_error_px + 400 * p.camera.focal_error
+    assert shifts_px.max() < 4.0 * sum_px
 
 
 def test_custom_camera_distortion_error_applies_at_corner() -> None:
     p = CameraParameters(focal_error=0.0, centre_error_px=0.0, distortion_error_px=2.0)
     custom = p.model_copy(update={"model": CustomCamera.from_camera(camera_optics(p).camera)})
-    for one in (p, custom):
+    for camera_parameters in (p, custom):
         rng = np.random.default_rng(3)
-        samples = np.random.default_rng(3).standard_normal(4)[3]
-        true, calibrated = camera_optics(one).camera, calibrated_camera(one, rng)
+        normal_draw = np.random.default_rng(3).standard_normal(4)[3]
+        true, calibrated = camera_optics(camera_parameters).camera, calibrated_camera(camera_parameters, rng)
         corner = true.rays(np.array([0.0, 0.0]))[1]
-        outwards = np.linalg.norm(calibrated.project(corner)[0] - 511.5) - np.linalg.norm(
+        radial_shift_px = np.linalg.norm(calibrated.project(corner)[0] - 511.5) - np.linalg.norm(
             true.project(corner)[0] - 511.5
         )
-        assert outwards == pytest.approx(2.0 * samples, rel=0.02)
+        assert radial_shift_px == pytest.approx(2.0 * normal_draw, rel=0.02)
 
 
 def test_indivisible_image_size_is_rejected_with_suggestion() -> None:

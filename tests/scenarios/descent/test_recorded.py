@@ -32,7 +32,7 @@ def _write_poses(folder: Path, times: np.ndarray, positions: np.ndarray, attitud
 
 
 def _write_vertical_fall(folder: Path, **changes: Any) -> str:
-    """20 s of fall at 70 m/s from 2200 m with the camera down, in camera axes."""
+    """Write 25 s of descent at 70 m/s from 2200 m, 10 m/s east; attitudes of a camera that looks down."""
     times = np.arange(0.0, 25.0, 0.1)
     positions = np.column_stack([10.0 * times, 0.0 * times, changes.get("height", 2200.0) - 70.0 * times])
     down = Rotation.from_matrix([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -41,26 +41,26 @@ def _write_vertical_fall(folder: Path, **changes: Any) -> str:
 
 
 def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
-    """50 Hz, north-east-down, camera axes and another time origin."""
+    """The file has 50 Hz, north-east-down axes, attitudes of the camera and another time origin."""
     simulated, p = run(), parameters()
     world = World.from_parameters(p)
     flight = create_flight(p, world.surface, Streams(1, "test", 0))
     times = np.arange(-5.0, flight.firing_s + 1.0, 0.02)
     truth = flight.motion.motion(times)
-    position = np.array(
+    origin = np.array(
         [p.location.east_m, p.location.north_m, world.surface.height(p.location.east_m, p.location.north_m)]
     )
     file = _write_poses(
         tmp_path,
         times + 1234.0,
-        NED_FROM_ENU.apply(truth.positions_m - position),
+        NED_FROM_ENU.apply(truth.positions_m - origin),
         NED_FROM_ENU * truth.attitudes * CAMERA_IN_BODY.inv(),
     )
     recorded = run(flight={"file": file, "axes": "ned", "first_picture_s": 1234.0})
     assert recorded.outcome == simulated.outcome == "VALID"
     for name in ("velocity_true_x_m_s", "velocity_true_y_m_s", "altitude_1_m", "off_nadir_3_deg", "firing_after_s"):
         assert recorded.row[name] == pytest.approx(simulated.row[name], abs=1e-2), name
-    # Images differ by the effect of 0.1 mm of motion; the estimate differs by less than its error.
+    # Interpolation moves the camera by up to 0.1 mm: images and estimate change slightly.
     for axis in "xy":
         name = f"velocity_estimated_{axis}_m_s"
         assert recorded.row[name] == pytest.approx(simulated.row[name], abs=0.05)
@@ -71,22 +71,22 @@ def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
     assert not any(name.startswith("descent_wind") for name in recorded.row)
 
 
-def test_flight_is_transformed_with_its_start(tmp_path: Path) -> None:
+def test_flight_is_rotated_and_moved_to_its_start(tmp_path: Path) -> None:
     file = _write_vertical_fall(tmp_path)
     p = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu", "turn_deg": 90.0}})
     assert isinstance(p.flight, FlightFile)
     motion = p.flight.motion(np.array([100.0, 200.0, 30.0]), 3.7)
-    # East becomes south.
+    # The rotation by 90 deg turns east into south; after 5 s: 50 m south, 350 m lower.
     assert np.allclose(motion.state(0.0).position_m, [100.0, 200.0 - 50.0, 30.0 + 2200.0 - 350.0])
     assert np.allclose(motion.state(0.0).velocity_m_s, [0.0, -10.0, -70.0])
     assert np.allclose(motion.state(0.0).specific_force_m_s2, [0.0, 0.0, 3.7], atol=1e-9)
-    # The -z axis of the body points down; its columns point to the former east.
+    # The body's -z axis points down; its x axis, east in the file, points south.
     assert np.allclose(motion.state(0.0).attitude.apply([0.0, 0.0, -1.0]), [0.0, 0.0, -1.0])
     assert np.allclose(motion.state(0.0).attitude.apply([1.0, 0.0, 0.0]), [0.0, -1.0, 0.0])
 
 
 def test_lever_arm_and_mounting_are_applied(tmp_path: Path) -> None:
-    """A vehicle with world axes and a camera 2 m below that looks along its -z axis."""
+    """The vehicle's axes are the world axes; the camera is 2 m below and looks along the vehicle's -z axis."""
     times = np.arange(0.0, 20.0, 0.1)
     positions = np.column_stack([0.0 * times, 0.0 * times, 2000.0 - 50.0 * times])
     file = _write_poses(tmp_path, times, positions, Rotation.identity(times.size))
@@ -105,12 +105,12 @@ def test_invalid_flights_are_rejected_on_load(tmp_path: Path) -> None:
             DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"} | settings})
 
     expect_error(
-        "at picture 1 the camera looks up, 60.0 deg above the horizon", _write_vertical_fall(tmp_path, tilt_deg=150.0)
+        "at image 1 the camera looks up, 60.0 deg above the horizon", _write_vertical_fall(tmp_path, tilt_deg=150.0)
     )
-    expect_error("at picture 1 the camera looks up", _write_vertical_fall(tmp_path), attitude_of="body")
-    expect_error(r"at picture 3 the camera is 5.0 m below the ground", _write_vertical_fall(tmp_path, height=870.0))
+    expect_error("at image 1 the camera looks up", _write_vertical_fall(tmp_path), attitude_of="body")
+    expect_error(r"at image 3 the camera is 5.0 m below the ground", _write_vertical_fall(tmp_path, height=870.0))
     expect_error(
-        r"covers 0.000 to 24.900 s; pictures from 23.000 to", _write_vertical_fall(tmp_path), first_picture_s=23.0
+        r"covers 0.000 to 24.900 s; images from 23.000 to", _write_vertical_fall(tmp_path), first_picture_s=23.0
     )
     expect_error("flight.axes|axes", _write_vertical_fall(tmp_path), axes="xyz")
     expect_error("not a quaternion of length 1", _write_vertical_fall(tmp_path), mounting=(0.0, 0.0, 0.0, 2.0))

@@ -23,33 +23,33 @@ def _drop_times(row: Any) -> dict[str, Any]:
 
 
 def test_case_is_deterministic(nominal: CaseResult) -> None:
-    other = run(1)
+    second_case = run(1)
     repeated = run()
     assert _drop_times(repeated.row) == _drop_times(nominal.row)
-    assert other.row["image_hash"] != nominal.row["image_hash"]
+    assert second_case.row["image_hash"] != nominal.row["image_hash"]
 
 
 def test_each_catalogue_dispersion_is_reported() -> None:
-    """Each column has the path, or an end of it, as its name and the simulated value; a fault has name and size."""
+    """The row has the value of each dispersion in a column that is named by the path or by the end of the path."""
     dispersed = load_campaign("dimes-gusev").draws(3)
     samples = {path: value for path, value in dispersed.items() if path != "location.terrain"}
-    tables: dict[str, Any] = {"location": dict(WORLD["location"]), "faults": {"late_s": 0.25}, "site": "gusev"}
-    tables["terrain"] = dict(WORLD["terrain"])
+    settings: dict[str, Any] = {"location": dict(WORLD["location"]), "faults": {"late_s": 0.25}, "site": "gusev"}
+    settings["terrain"] = dict(WORLD["terrain"])
     for path, value in samples.items():
         *names, last = path.split(".")
-        table = tables
+        table = settings
         for name in names:
             table = table.setdefault(name, {})
         table[last] = value
-    row = run(**tables).row
+    row = run(**settings).row
     for path, value in samples.items():
         parts = path.split(".")
         column = next(name for name in ("_".join(parts[start:]) for start in range(len(parts))) if name in row)
         assert row[column] == pytest.approx(value, rel=1e-9), path
     assert (row["fault"], row["fault_size"], row["terrain"]) == ("late_s", 0.25, 0)
     campaigns = [load_campaign(name).configuration for name in catalogue()]
-    of_descents = {path for one in campaigns if one.scenario == "descent" for path in one.dispersions}
-    assert of_descents == {*dispersed, "faults"}
+    dispersed_paths = {path for entry in campaigns if entry.scenario == "descent" for path in entry.dispersions}
+    assert dispersed_paths == {*dispersed, "faults"}
 
 
 @pytest.mark.parametrize("name", ["velocity", "firing_velocity"])
@@ -71,10 +71,10 @@ def test_figures_use_the_scored_data(nominal: CaseResult) -> None:
     assert all(nominal.products[f"image_{k}"].shape == (256, 1024) for k in (1, 2, 3))
 
 
-def test_truth_is_mean_camera_velocity() -> None:
+def test_true_velocity_is_the_mean_camera_velocity() -> None:
     """Without swing and gusts the lander drifts with the wind, which is uniform above the boundary layer of 500 m."""
-    static = {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "gust_intensity_m_s": 0.0}
-    row = run(descent=DESCENT | static).row
+    no_swing = {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "gust_intensity_m_s": 0.0}
+    row = run(descent=DESCENT | no_swing).row
     assert row["velocity_true_x_m_s"] == pytest.approx(14.0, abs=1e-6)
     assert row["velocity_true_y_m_s"] == pytest.approx(-9.0, abs=1e-6)
     # In the boundary layer the wind decreases, and the parachute follows.
@@ -83,8 +83,9 @@ def test_truth_is_mean_camera_velocity() -> None:
 
 @pytest.mark.parametrize("wind", [(25.0, 0.0), (0.0, 25.0), (-18.0, -18.0)])
 def test_ideal_instruments_over_flat_ground_give_exact_velocity(wind: tuple[float, float]) -> None:
-    """Signs and axes of the complete chain: 0.15 m/s is a tenth of a binned pixel over 3.75 s. Propagation to the
-    firing with an ideal inertial unit keeps the error.
+    """Test of signs and axes of the complete chain. Tolerance 0.15 m/s: a tenth of a binned pixel over 3.75 s.
+
+    Propagation to the firing with an ideal inertial unit does not change the error.
     """
     east, north = wind
     descent = DESCENT | {"wind_east_m_s": east, "wind_north_m_s": north}
@@ -97,17 +98,17 @@ def test_ideal_instruments_over_flat_ground_give_exact_velocity(wind: tuple[floa
 
 
 def test_ideal_instruments_are_reported_without_errors(nominal: CaseResult) -> None:
-    """Over flat ground the only error is the altitude change between the last radar reading and the image."""
+    """Over flat ground the only error is the altitude change between the last altimeter reading and the image."""
     row = run(**PERFECT, terrain=FLAT).row
     for name in ("attitude_error_common_deg", "attitude_error_independent_deg"):
         assert float(row[name]) < 1e-4 < float(nominal.row[name])
-    # A tenth of a second at 0.3 m/s2 and at a swing velocity of 2 m/s: 0.1 m of 1400 m.
+    # A tenth of a second at 0.3 m/s^2 and a swing velocity of 2 m/s changes the altitude of 1400 m by 0.1 m.
     assert abs(float(row["altitude_error_common"])) < 1e-4 < abs(float(nominal.row["altitude_error_common"]))
     assert float(row["velocity_change_error_m_s"]) < 1e-3 < float(nominal.row["velocity_change_error_m_s"])
 
 
 def test_instrument_errors_have_the_specified_size() -> None:
-    """Radar: 1 % is 3 sigma of all errors. Navigation: 1.4 deg after 38 turns with a scale error of 100 ppm."""
+    """Altimeter: 3 sigma of all errors is 1 %. Attitude: 1.4 deg (38 revolutions, gyro scale error of 100 ppm)."""
     rows = [run(case).row for case in range(4)]
     altitude = np.array([float(row["altitude_error_common"]) for row in rows])
     attitude = np.array([float(row["attitude_error_common_deg"]) for row in rows])
@@ -119,18 +120,20 @@ def test_instrument_errors_have_the_specified_size() -> None:
 
 
 def test_attitude_error_causes_predicted_velocity_error() -> None:
-    """An attitude error common to all images rotates the observed displacement, including the descent. First order in
-    the error b: ``b x v``. Tolerance: a template 20 deg from nadir adds 13 % to the part of the descent.
+    """An attitude error common to all images rotates the measured displacement, including its vertical component.
+
+    The velocity error is ``b x v`` to first order in the attitude error b. Tolerance: for a template 20 deg from
+    nadir the contribution of the vertical velocity is 13 % larger.
     """
-    steady = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
+    steady_descent = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
     errors, expected = [], []
     for case in range(4):
-        row = run(case, **PERFECT, terrain=FLAT, descent=steady, faults={"attitude_error_deg": 0.8}).row
-        fallen = float(row["altitude_2_m"]) - float(row["altitude_3_m"])
-        velocity = [float(row["velocity_true_x_m_s"]), float(row["velocity_true_y_m_s"]), -fallen / 3.75]
+        row = run(case, **PERFECT, terrain=FLAT, descent=steady_descent, faults={"attitude_error_deg": 0.8}).row
+        descent_m = float(row["altitude_2_m"]) - float(row["altitude_3_m"])
+        velocity = [float(row["velocity_true_x_m_s"]), float(row["velocity_true_y_m_s"]), -descent_m / 3.75]
         errors.append([float(row[f"velocity_error_{axis}_m_s"]) for axis in "xy"])
-        turn = Streams(1, "test", case).generator("attitude fault").uniform(-np.pi, np.pi)
-        tilt = np.radians(0.8) * np.array([np.cos(turn), np.sin(turn), 0.0])
+        direction_rad = Streams(1, "test", case).generator("attitude fault").uniform(-np.pi, np.pi)
+        tilt = np.radians(0.8) * np.array([np.cos(direction_rad), np.sin(direction_rad), 0.0])
         expected.append(np.cross(tilt, velocity)[:2])
         assert row["attitude_error_common_deg"] == pytest.approx(0.8, abs=1e-3)
         assert float(row["attitude_error_independent_deg"]) < 1e-3
@@ -140,13 +143,13 @@ def test_attitude_error_causes_predicted_velocity_error() -> None:
 
 def test_common_altitude_error_scales_the_velocity() -> None:
     """An altitude error of +2 % makes displacements and velocity 2 % too large."""
-    steady = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 25.0}
-    row = run(**PERFECT, terrain=FLAT, descent=steady, faults={"altitude_error": 0.02}).row
+    steady_descent = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 25.0}
+    row = run(**PERFECT, terrain=FLAT, descent=steady_descent, faults={"altitude_error": 0.02}).row
     assert row["velocity_error_x_m_s"] == pytest.approx(0.02 * float(row["velocity_true_x_m_s"]), abs=0.12)
     assert row["altitude_error_common"] == pytest.approx(0.02, abs=1e-4)
 
 
-def test_conditions_come_from_simulated_objects(nominal: CaseResult) -> None:
+def test_condition_columns_have_the_simulated_values(nominal: CaseResult) -> None:
     row: Any = nominal.row
     assert row["altitude_1_m"] == pytest.approx(2000.0, abs=20.0)
     assert row["altitude_1_m"] - row["altitude_3_m"] == pytest.approx(7.5 * row["descent_rate_m_s"], abs=40.0)
@@ -163,9 +166,9 @@ def test_conditions_come_from_simulated_objects(nominal: CaseResult) -> None:
 
 
 def test_insufficient_overlap_gives_no_velocity() -> None:
-    """A swing from 42 deg to the opposite side: the images do not overlap enough in truth or measurement."""
-    swinging = {"cone_angle_deg": 42.0, "cone_phase_deg": 0.0, "cone_minor_fraction": 0.0}
-    result = run(descent=DESCENT | swinging)
+    """The camera swings by 42 deg to opposite sides: the overlap of the images is too small."""
+    wide_swing = {"cone_angle_deg": 42.0, "cone_phase_deg": 0.0, "cone_minor_fraction": 0.0}
+    result = run(descent=DESCENT | wide_swing)
     assert result.outcome == "NO_TEMPLATE_AREA"
     assert result.row["feasible_overlap"] is False
     assert not result.answered
@@ -175,14 +178,14 @@ def test_insufficient_overlap_gives_no_velocity() -> None:
 
 
 def test_feasible_overlap_is_computed_from_truth(nominal: CaseResult) -> None:
-    """Half the true altitude makes DIMES search in the wrong areas; the true geometry is unchanged."""
-    low_altitude = run(faults={"altitude_error": 0.4})
+    """An altitude error of 40 % makes DIMES search in wrong areas; the true overlap is unchanged."""
+    wrong_altitude = run(faults={"altitude_error": 0.4})
     for name in ("feasible_overlap", "feasible_overlap_first_pair", "feasible_overlap_second_pair"):
-        assert low_altitude.row[name] == nominal.row[name]
+        assert wrong_altitude.row[name] == nominal.row[name]
     assert nominal.row["feasible_overlap"] is True
 
 
-def test_darkness_gives_no_velocity() -> None:
+def test_dark_images_give_no_velocity() -> None:
     result = run(detector={"responsivity_e_s": 1.0})
     assert result.outcome == "NO_VALID_TRACK"
     assert not result.answered
@@ -196,44 +199,45 @@ def test_velocity_over_a_site_is_accurate() -> None:
     assert float(result.row["velocity_error_m_s"]) < 1.0
 
 
-def test_descent_over_imported_terrain(tmp_path: Path) -> None:
-    """A terrain model from a file in the surround of a site appears in the images."""
+def test_imported_terrain_is_rendered(tmp_path: Path) -> None:
+    """The terrain model from a file, inside the terrain of the site, changes the images."""
     heights = 30.0 * np.sin(np.arange(200) / 9.0)[:, None] * np.cos(np.arange(200) / 7.0)
     heights += np.random.default_rng(1).normal(0.0, 1.5, heights.shape)
     np.savez(tmp_path / "dtm.npz", dem=heights, dem_gsd=8.0)
-    middle = {"location": {"bank": 1, "east_m": 1536.0, "north_m": 1536.0}}
+    location = {"location": {"bank": 1, "east_m": 1536.0, "north_m": 1536.0}}
     source = {"source": {"dtm": str(tmp_path / "dtm.npz")}}
-    result = run(site="gusev", terrain=WORLD["terrain"] | source, **middle)
-    without = run(site="gusev", **middle)
+    result = run(site="gusev", terrain=WORLD["terrain"] | source, **location)
+    without_source = run(site="gusev", **location)
     assert result.outcome == "VALID"
-    assert result.row["image_hash"] != without.row["image_hash"]
-    # Crests and hollows of 30 m up to 500 m away.
+    assert result.row["image_hash"] != without_source.row["image_hash"]
+    # The imported relief has an amplitude of 30 m within 500 m.
     assert float(result.row["velocity_error_m_s"]) < 4.0
 
 
-def test_compared_algorithm_gets_the_same_inputs() -> None:
+def test_custom_algorithm_receives_the_measurements() -> None:
     result = run(algorithm="tests.scenarios.descent.guesses:Inertial")
     assert result.outcome == "VALID"
     assert result.row["velocity_estimated_x_m_s"] == pytest.approx(14.0, abs=8.0)
     assert "tracks" not in result.products
 
 
-def test_slow_algorithm_misses_the_firing() -> None:
+def test_slow_algorithm_is_not_in_time_for_the_firing() -> None:
     """The measured time is scaled by the flight computer's factor: 0.1 s become 60 s, but 14 to 24 s are available."""
     slow = run(algorithm="tests.scenarios.descent.guesses:SlowInertial").row
     quick = run(algorithm="tests.scenarios.descent.guesses:Inertial").row
     assert float(slow["estimation_time_s"]) >= 0.1
     assert (slow["in_time_measured"], quick["in_time_measured"]) == (False, True)
-    unhurried = run(algorithm="tests.scenarios.descent.guesses:SlowInertial", landing={"processor_factor": 1.0}).row
-    assert unhurried["in_time_measured"] is True
+    spec = "tests.scenarios.descent.guesses:SlowInertial"
+    fast_processor = run(algorithm=spec, landing={"processor_factor": 1.0}).row
+    assert fast_processor["in_time_measured"] is True
 
 
 def test_dimes_run_time_requirement_uses_measured_time() -> None:
-    requested = {one.id: one for one in load_campaign("dimes-landing").configuration.requirements}
-    assert requested["DIMES-TIME"].metric == "in_time_measured"
+    requirements = {entry.id: entry for entry in load_campaign("dimes-landing").configuration.requirements}
+    assert requirements["DIMES-TIME"].metric == "in_time_measured"
 
 
-def test_exact_instruments_leave_only_the_error_of_the_images() -> None:
+def test_exact_instruments_have_no_instrument_errors() -> None:
     row = run(exact_instruments=True).row
     for name in ("attitude_error_common_deg", "attitude_error_independent_deg", "velocity_change_error_m_s"):
         assert float(row[name]) < 1e-6

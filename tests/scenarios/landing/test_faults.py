@@ -13,7 +13,7 @@ from marsyard.scenarios.landing.parameters import (
     LandingScenarioParameters,
     add_range_faults,
     add_receiver_outage,
-    draw_received_pictures,
+    draw_received_images,
     stuck_range_m,
 )
 from marsyard.sim.sensor import preset
@@ -22,19 +22,20 @@ from marsyard.sim.streams import Streams
 HELICOPTER = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}})
 
 
-def test_outage_covers_images_and_landing() -> None:
-    """The filter starts normally and then coasts: its errors grow by metres in 40 s."""
-    off: dict[float, list[float]] = {0.0: [], 40.0: []}
-    for outage, errors in off.items():
+def test_receiver_outage_covers_images_and_landing() -> None:
+    """During the outage the filter propagates without updates: its errors grow by metres in 40 s."""
+    position_errors_m: dict[float, list[float]] = {0.0: [], 40.0: []}
+    for outage, errors in position_errors_m.items():
         flight = add_receiver_outage(Faults(gps_outage_s=outage), HELICOPTER)
         for case in range(6):
             transit = Transit.fly(flight, np.array([0.0, 0.0, 10.0]), 0.5, 0.5, 9.8, Streams(7, "outage", case))
             estimate = np.array(transit.pose(0).world_from_body.translation)
             errors.append(float(np.hypot(*(estimate - transit.state(0).position_m)[:2])))
-            known = np.isfinite(transit.navigated.solutions.positions_m[:, 0])
-            assert known.all() if not outage else not known[transit.navigated.fix_times_s >= -outage].any()
-            assert known[transit.navigated.fix_times_s < -outage].all()
-    assert np.median(off[40.0]) > 10.0 * np.median(off[0.0])
+            has_solution = np.isfinite(transit.navigated.solutions.positions_m[:, 0])
+            fix_times_s = transit.navigated.fix_times_s
+            assert has_solution.all() if not outage else not has_solution[fix_times_s >= -outage].any()
+            assert has_solution[fix_times_s < -outage].all()
+    assert np.median(position_errors_m[40.0]) > 10.0 * np.median(position_errors_m[0.0])
 
 
 def test_stuck_altimeter_repeats_an_earlier_range() -> None:
@@ -42,18 +43,18 @@ def test_stuck_altimeter_repeats_an_earlier_range() -> None:
     np.testing.assert_array_equal(add_range_faults(Faults(), ranges, 10.0), ranges)
     np.testing.assert_allclose(add_range_faults(Faults(laser_stuck=0.2), ranges, 10.0), 12.0)
     assert np.isnan(add_range_faults(Faults(laser_silent=1), ranges, 10.0)).all()
-    # This height is always above the height at which the landing slows down.
+    # A silent altimeter has an infinite range: always above the height at which the landing slows down.
     assert stuck_range_m(Faults(laser_silent=1), 10.0) == np.inf
     assert stuck_range_m(Faults(), 10.0) is None
 
 
-def test_two_images_always_remain() -> None:
+def test_at_least_two_images_are_received() -> None:
     rng = np.random.default_rng(0)
-    assert len(draw_received_pictures(Faults(), 40, rng)) == 40
-    subset = draw_received_pictures(Faults(lost_pictures=0.75), 40, rng)
-    assert len(np.unique(subset)) == 10
-    assert np.all(np.diff(subset) > 0)
-    assert len(draw_received_pictures(Faults(lost_pictures=1.0), 40, rng)) == 2
+    assert len(draw_received_images(Faults(), 40, rng)) == 40
+    received = draw_received_images(Faults(lost_pictures=0.75), 40, rng)
+    assert len(np.unique(received)) == 10
+    assert np.all(np.diff(received) > 0)
+    assert len(draw_received_images(Faults(lost_pictures=1.0), 40, rng)) == 2
 
 
 @pytest.mark.parametrize("fault", [{"lost_pictures": 0.5}, {"gps_outage_s": 5.0}])
@@ -65,9 +66,9 @@ def test_flight_faults_require_a_flight(fault: dict[str, float]) -> None:
 
 def test_bad_pixels_can_be_listed() -> None:
     detector = preset("xc-55").detector
-    plain, listed = (
+    unlisted, listed = (
         add_detector_faults(Faults.model_validate({name: 0.01}), detector).defects
         for name in ("bad_pixels", "listed_bad_pixels")
     )
-    assert (plain.dead_fraction, plain.hot_fraction, plain.listed) == (0.01, 0.01, False)
+    assert (unlisted.dead_fraction, unlisted.hot_fraction, unlisted.listed) == (0.01, 0.01, False)
     assert (listed.dead_fraction, listed.hot_fraction, listed.listed) == (0.01, 0.01, True)

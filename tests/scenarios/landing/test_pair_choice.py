@@ -17,15 +17,13 @@ HEIGHT = 10.0
 RANGES = np.full(40, HEIGHT)
 
 
-def _make_poses(
-    step_m: float, count: int = 40, turned_deg: float = 0.0, pitched_deg: float = 0.0
-) -> list[PoseMeasurement]:
-    """Nadir views `step_m` apart along the image columns; later views are rotated."""
+def _make_poses(step_m: float, count: int = 40, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> list[PoseMeasurement]:
+    """Return nadir poses with a distance of `step_m` along the image columns; all but the first are rotated."""
     poses = []
     for number in range(count):
-        angles = [turned_deg * (number > 0), pitched_deg * (number > 0)]
-        turn = Rotation.from_euler("zy", angles, degrees=True)
-        poses.append(PoseMeasurement(rigid(turn, np.array([number * step_m, 0.0, HEIGHT])), 0.1 * number))
+        angles = [yaw_deg * (number > 0), pitch_deg * (number > 0)]
+        rotation = Rotation.from_euler("zy", angles, degrees=True)
+        poses.append(PoseMeasurement(rigid(rotation, np.array([number * step_m, 0.0, HEIGHT])), 0.1 * number))
     return poses
 
 
@@ -33,12 +31,12 @@ def test_shortest_sufficient_baseline_has_max_overlap() -> None:
     choice = choose_pair(_make_poses(0.125), RANGES, CAMERA, PairParameters(max_baseline_fraction=0.2), HEIGHT)
     assert (choice.first, choice.second) == (0, 16)
     assert choice.baseline_m == pytest.approx(2.0)
-    # 640 px of 7.4 um behind 6 mm are 7.89 m wide from 10 m; with distortion (1.8 % in the corners) 8.04 m.
+    # Field width at 10 m: 640 px of 7.4 um and a focal length of 6 mm give 7.89 m, with lens distortion 8.04 m.
     assert choice.overlap == pytest.approx(1.0 - 2.0 / 8.0, abs=0.006)
 
 
 def test_insufficient_overlap_maximises_baseline_times_overlap() -> None:
-    """b (1 - b / w) is maximal at half the width, 4.0 m, if the required overlap allows it."""
+    """With the field width w, b (1 - b / w) is maximal at b = w / 2 = 4.0 m, if the required overlap allows it."""
     choice = choose_pair(
         _make_poses(0.125), RANGES, CAMERA, PairParameters(max_baseline_fraction=1.0, min_overlap=0.1), HEIGHT
     )
@@ -51,22 +49,22 @@ def test_insufficient_overlap_maximises_baseline_times_overlap() -> None:
 
 
 def test_rotation_reduces_overlap() -> None:
-    """A pitch of 10 deg shifts the ground of the second image by 10 m tan 10 deg = 1.76 m."""
-    straight, with_it, against = (
-        choose_pair(_make_poses(0.5, 2, pitched_deg=deg), RANGES[:2], CAMERA, PairParameters(), HEIGHT).overlap
+    """A pitch of 10 deg shifts the footprint of the second image by 10 m tan 10 deg = 1.76 m."""
+    no_pitch, pitch_with_motion, pitch_against_motion = (
+        choose_pair(_make_poses(0.5, 2, pitch_deg=deg), RANGES[:2], CAMERA, PairParameters(), HEIGHT).overlap
         for deg in (0.0, -10.0, 10.0)
     )
-    assert straight == pytest.approx(1.0 - 0.5 / 8.0, abs=0.005)
-    for overlap, sign in ((with_it, 1.0), (against, -1.0)):
+    assert no_pitch == pytest.approx(1.0 - 0.5 / 8.0, abs=0.005)
+    for overlap, sign in ((pitch_with_motion, 1.0), (pitch_against_motion, -1.0)):
         assert overlap == pytest.approx(1.0 - abs(0.5 + sign * 1.76) / 8.0, abs=0.03)
 
 
 def test_missing_range_uses_commanded_height() -> None:
-    silent = choose_pair(_make_poses(0.125), np.full(40, np.nan), CAMERA, PairParameters(), HEIGHT)
-    assert (silent.first, silent.second) == (0, 16)
+    choice = choose_pair(_make_poses(0.125), np.full(40, np.nan), CAMERA, PairParameters(), HEIGHT)
+    assert (choice.first, choice.second) == (0, 16)
 
 
-def test_best_available_overlap_is_accepted() -> None:
+def test_pair_with_too_small_overlap_is_accepted_without_alternative() -> None:
     choice = choose_pair(_make_poses(5.0, 3), RANGES[:3], CAMERA, PairParameters(min_overlap=0.9), HEIGHT)
     assert (choice.first, choice.second) == (0, 1)
     with pytest.raises(ValueError, match="at least 2"):

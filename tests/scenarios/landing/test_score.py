@@ -29,37 +29,38 @@ REPORTED, REFUSED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
 
 
 def make_flight() -> Flight:
-    """A flight with exact navigation."""
+    """Return a flight with exact navigation."""
     states = swinging_fall().state(0.0), swinging_fall().state(3.75)
-    first, second = (PoseMeasurement(rigid(one.attitude, one.position_m), one.time_s) for one in states)
+    first, second = (PoseMeasurement(rigid(entry.attitude, entry.position_m), entry.time_s) for entry in states)
     return Flight(states, (first, second), np.array([0.0, 0.0, 1.0]))
 
 
-def make_truth(safe_places: int) -> GroundTruth:
-    """Return 12 m of ground, level in the west and too steep in the east, on a lattice of 1 m. The given number of
-    safe positions is at the centre. A square of 5 x 5 has one position with a margin of one lander radius; three in
-    a row have none.
+def make_truth(n_safe: int) -> GroundTruth:
+    """Return 12 m x 12 m of ground, level in the west and too steep in the east, with `n_safe` safe positions.
+
+    Positions have a spacing of 1 m. 25 safe positions are a square, whose centre has a margin of one lander radius;
+    3 safe positions are a row without such a margin.
     """
     x, _ = np.meshgrid(np.arange(-6.0, 6.0, 0.1), np.arange(-6.0, 6.0, 0.1))
-    line = np.linspace(-4.0, 4.0, 9)
-    places_m = np.stack(np.meshgrid(line, line), axis=-1)
-    safe = np.zeros(places_m.shape[:2], dtype=bool)
-    if safe_places == 25:
+    axis_m = np.linspace(-4.0, 4.0, 9)
+    positions_m = np.stack(np.meshgrid(axis_m, axis_m), axis=-1)
+    safe = np.zeros(positions_m.shape[:2], dtype=bool)
+    if n_safe == 25:
         safe[2:7, 2:7] = True
     else:
-        safe[4, 3 : 3 + safe_places] = True
-    static = np.zeros(safe.shape)
-    footprints = Footprints(static, static, static, safe)
+        safe[4, 3 : 3 + n_safe] = True
+    zeros = np.zeros(safe.shape)
+    footprints = Footprints(zeros, zeros, zeros, safe)
     return GroundTruth(
-        Relief(np.maximum(x, 0.0), -6.0, -6.0, 0.1), Limits(2.0, 0.26, 0.2), places_m, footprints, safe | True, 1.0
+        Relief(np.maximum(x, 0.0), -6.0, -6.0, 0.1), Limits(2.0, 0.26, 0.2), positions_m, footprints, safe | True, 1.0
     )
 
 
 @pytest.mark.parametrize(
-    ("safe_places", "population"), [(0, "no_safe_site_exists"), (3, "narrow_site_exists"), (25, "wide_site_exists")]
+    ("n_safe", "population"), [(0, "no_safe_site_exists"), (3, "narrow_site_exists"), (25, "wide_site_exists")]
 )
-def test_each_flight_is_in_one_population(safe_places: int, population: str) -> None:
-    row = site_populations(make_truth(safe_places))
+def test_each_flight_is_in_one_population(n_safe: int, population: str) -> None:
+    row = site_populations(make_truth(n_safe))
     populations = ("no_safe_site_exists", "narrow_site_exists", "wide_site_exists")
     assert [name for name in populations if row[name]] == [population]
 
@@ -70,7 +71,7 @@ def test_each_flight_is_in_one_population(safe_places: int, population: str) -> 
         (REPORTED, SAFE_SITE, True),
         (REPORTED, UNSAFE_SITE, False),
         (REFUSED, None, True),
-        # The a-priori site stays if the algorithm does not converge; it is safe by chance.
+        # Without convergence the answer is the a-priori site, which is safe by chance.
         (SiteOutcome.NO_MOTION, SAFE_SITE, False),
     ],
 )
@@ -88,19 +89,19 @@ def test_flight_without_landing_has_no_touchdown_score() -> None:
     check_metrics(load_campaign("hda-benign").configuration, {**row, "answered": True}, Path())
 
 
-def test_each_hazardous_population_has_a_requirement() -> None:
+def test_each_population_of_the_hazardous_campaign_has_a_requirement() -> None:
     requirements = load_campaign("hda-hazardous").configuration.requirements
-    populations = {one.population for one in requirements}
+    populations = {entry.population for entry in requirements}
     assert {"no_safe_site_exists", "narrow_site_exists", "wide_site_exists"} <= populations
-    (narrow,) = [one for one in requirements if one.population == "narrow_site_exists"]
-    # The verdict uses confidence: "met" needs a confidence bound.
-    assert (narrow.metric, narrow.decide_by) == ("safe_or_no_site_reported", "confidence")
+    (requirement,) = [entry for entry in requirements if entry.population == "narrow_site_exists"]
+    # The verdict requires a confidence bound.
+    assert (requirement.metric, requirement.decide_by) == ("safe_or_no_site_reported", "confidence")
 
 
 def test_matches_are_counted_by_outcome() -> None:
     statuses = np.repeat(np.array(list(MatchStatus), dtype=np.uint8), [50, 4, 3, 2])
-    pixels, nothing = np.zeros((59, 2)), np.zeros(59)
-    matches = Matches(pixels, pixels, pixels, pixels, nothing, nothing, statuses, np.zeros((50, 3)))
+    pixels, no_values = np.zeros((59, 2)), np.zeros(59)
+    matches = Matches(pixels, pixels, pixels, pixels, no_values, no_values, statuses, np.zeros((50, 3)))
     camera = preset("xc-55").cameras()[0]
     view = View(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
     row = stage_row(HdaDetails((view, view), matches=matches))

@@ -1,4 +1,4 @@
-"""Tests of the light of a landing and of the terrain bank built before a campaign."""
+"""Tests of the illumination of a landing and of the terrains that a campaign builds in advance."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from marsyard.sim.terrain import site
 
 
 @pytest.mark.parametrize(("site_name", "camera"), [("gusev", "mer-descent-flown"), ("heli-hazardous", "xc-55")])
-def test_camera_at_its_specified_planet_has_unit_sun_factor(site_name: str, camera: str) -> None:
-    # Mars at 1.5 AU has 0.44 of Earth's sunlight; the factor must not be applied twice.
-    air = site(site_name).environment
-    assert air.solar_irradiance / preset(camera).detector.sunlight == pytest.approx(1.0, abs=0.02)
+def test_sun_factor_is_1_at_the_planet_of_the_camera_specification(site_name: str, camera: str) -> None:
+    # The datasheet refers to sunlight on the same planet, so the factor of 0.44 for Mars (1.5 au) is not applied again.
+    environment = site(site_name).environment
+    assert environment.solar_irradiance / preset(camera).detector.sunlight == pytest.approx(1.0, abs=0.02)
 
 
 def test_electron_count_is_independent_of_datasheet_sun() -> None:
-    """Responsivity scales with the sunlight stated in the datasheet."""
-    small = {"terrain": {"samples": 256}, "location": {"bank": 1}}
+    """Responsivity (electrons per second) scales with the sunlight that the datasheet specifies."""
+    small_terrain = {"terrain": {"samples": 256}, "location": {"bank": 1}}
     electrons = []
     for sun_au in (1.0, 1.5, 3.0):
         detector = {"preset": "xc-55", "sun_au": sun_au, "responsivity_e_s": 1e7 / sun_au**2}
-        p = LandingScenarioParameters.model_validate({**small, "detector": detector})
+        p = LandingScenarioParameters.model_validate({**small_terrain, "detector": detector})
         electrons.append(World.from_parameters(p).brightness * p.detector.responsivity_e_s)
     assert electrons == pytest.approx([electrons[0]] * 3, rel=1e-12)
 
 
 @pytest.mark.parametrize(("bank", "built"), [(1, 1), (MAX_GROUNDS, MAX_GROUNDS), (MAX_GROUNDS + 1, 0), (10_000, 0)])
-def test_large_bank_terrains_are_built_per_flight(bank: int, built: int) -> None:
+def test_only_small_banks_are_built_in_advance(bank: int, built: int) -> None:
     parameters = LandingScenarioParameters.model_validate({"location": {"bank": bank}})
     assert LandingScenario().shared_inputs(parameters) == tuple(range(built))

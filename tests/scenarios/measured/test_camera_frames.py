@@ -1,4 +1,4 @@
-"""Tests that each written camera file states the frame of its vectors, and that all images state the same frame."""
+"""Tests that exported and ingested camera files name the frame of their vectors in the first line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from marsyard.scenarios.measured.store import write_camera
 from marsyard.sim.camera import BODY_FRAME, read_cahvor
 
 
-def test_exports_and_ingested_cases_state_the_body_frame(tmp_path: Path) -> None:
+def test_exported_and_ingested_cameras_name_the_body_frame(tmp_path: Path) -> None:
     measurements = inputs.descent()
     write_case(tmp_path, measurements)
     write_camera(tmp_path, 0, measurements.images[0].camera)

@@ -1,4 +1,4 @@
-"""Tests of ingested folders: invalid input is rejected with file and line; supported formats are read."""
+"""Tests of `ingest`, which reads folders of recorded images: formats, and messages with file and line on errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marsyard.scenarios.measured.layout import IngestError
 from marsyard.scenarios.measured.scenarios import MatchingScenario
 from marsyard.scenarios.measured.store import CasesFile, load_images
 from marsyard.sim.streams import Streams
-from tests.scenarios.measured.folders import landing_folder, read_rows, velocity_folder, write_texts
+from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_texts, write_velocity_folder
 
 Rows = list[dict[str, str]]
 
@@ -25,9 +25,9 @@ Rows = list[dict[str, str]]
 def ingest_and_expect_error(folder: Path, tmp_path: Path) -> str:
     out = tmp_path / "out"
     out.mkdir()
-    with pytest.raises(ValueError, match=str(tmp_path)) as caught:
+    with pytest.raises(ValueError, match=str(tmp_path)) as error_info:
         ingest(folder, out)
-    return str(caught.value)
+    return str(error_info.value)
 
 
 def change_cells(rows: Rows, position: int, **cells: str) -> Rows:
@@ -49,7 +49,7 @@ def drop_columns(rows: Rows, *names: str) -> Rows:
         (lambda rows: change_cells(rows, 0, altitude_m="-3"), "line 2: altitude_m is -3; allowed: above 0"),
         (lambda rows: change_cells(rows, 0, altitude_m=""), "line 2: altitude_m is empty"),
         (lambda rows: change_cells(rows, 0, qx="1", qy="0", qz="0", qw="0"), "line 2: the camera looks up, 90.0 deg"),
-        (lambda rows: rows[:2], "line 2: case 'drop' has 2 pictures; allowed for velocity: 3"),
+        (lambda rows: rows[:2], "line 2: case 'drop' has 2 images; allowed for velocity: 3"),
         (lambda rows: drop_columns(rows, "vx_m_s", "vy_m_s", "vz_m_s"), "vx_m_s to vz_m_s and the positions are empty"),
         (lambda rows: drop_columns(rows, "sun_azimuth_deg", "sun_elevation_deg"), "line 2: no sun"),
         (lambda rows: drop_columns(rows, "altitude_m"), "the column 'altitude_m' is missing"),
@@ -59,7 +59,7 @@ def drop_columns(rows: Rows, *names: str) -> Rows:
     ],
 )
 def test_invalid_tables_are_rejected(tmp_path: Path, change: Callable[[Rows], Rows], message: str) -> None:
-    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_texts(folder, change(read_rows(folder)))
     assert message in ingest_and_expect_error(folder, tmp_path)
 
@@ -70,22 +70,22 @@ def replace_by_pipe(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("write", "message"),
+    ("change_image", "message"),
     [
         (lambda path: cv2.imwrite(str(path), np.zeros((480, 640), np.uint16)), "has 640 x 480 pixels; its camera has"),
         (lambda path: path.write_bytes(b""), "is empty (0 bytes)"),
         (replace_by_pipe, "is a named pipe; a regular file is needed"),
-        (lambda path: path.write_bytes(b"GIF89a" + bytes(100)), "is not a supported picture; allowed: PNG"),
+        (lambda path: path.write_bytes(b"GIF89a" + bytes(100)), "is not a supported image; allowed: PNG"),
         (lambda path: cv2.imwrite(str(path), np.full((256, 1024), 5000, np.uint16)), "bits = 12 allows 4095"),
         (lambda path: cv2.imwrite(str(path), np.zeros((256, 1024, 3), np.uint8)), "has 3 bands"),
         (lambda path: path.write_bytes(path.read_bytes()[:900]), "cannot be decoded"),
-        # The header alone states 6 gigapixels: no pixel is decoded.
+        # The header specifies 6 gigapixels: the file is rejected before decoding.
         (lambda path: path.write_bytes(b"P5 80000 80000 65535\n"), "has 80000 x 80000 pixels; its camera has"),
     ],
 )
-def test_invalid_images_are_rejected(tmp_path: Path, write: Callable[[Path], object], message: str) -> None:
-    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
-    write(folder / "drop-1.png")
+def test_invalid_images_are_rejected(tmp_path: Path, change_image: Callable[[Path], object], message: str) -> None:
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    change_image(folder / "drop-1.png")
     output = ingest_and_expect_error(folder, tmp_path)
     assert "drop-1.png" in output
     assert message in output
@@ -100,20 +100,20 @@ def test_invalid_images_are_rejected(tmp_path: Path, write: Callable[[Path], obj
         ('axes = "enu"', 'axes = "xyz"', "poses.axes: Input should be 'enu' or 'ned', got 'xyz'"),
         ('attitude_of = "body"', "", 'poses.attitude_of must be "body"'),
         ("[poses]", "[poses", "not valid TOML"),
-        ("flat.npy", "camera.cahvor", "camera.cahvor: is not a supported picture"),
+        ("flat.npy", "camera.cahvor", "camera.cahvor: is not a supported image"),
     ],
 )
 def test_invalid_settings_are_rejected(tmp_path: Path, old: str, new: str, message: str) -> None:
-    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     path = folder / "ingest.toml"
     path.write_text(path.read_text().replace(old, new))
     assert message in ingest_and_expect_error(folder, tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".pgm"])
-def test_image_formats_keep_the_counts(tmp_path: Path, suffix: str) -> None:
+def test_image_formats_preserve_the_counts(tmp_path: Path, suffix: str) -> None:
     measurements = inputs.landing()
-    folder = landing_folder(tmp_path / "in", measurements, "matching")
+    folder = write_landing_folder(tmp_path / "in", measurements, "matching")
     rows = read_rows(folder)
     for row, image in zip(rows, measurements.images, strict=True):
         row["file"] = Path(row["file"]).stem + suffix
@@ -127,8 +127,8 @@ def test_image_formats_keep_the_counts(tmp_path: Path, suffix: str) -> None:
         assert image.camera == original.camera
 
 
-def test_opportunity_frames_agree_with_their_labels(tmp_path: Path, shared_data: Path) -> None:
-    """Two frames of one position with different mast angles: the label cameras agree with the images to a pixel."""
+def test_opportunity_images_agree_with_the_cameras_of_their_labels(tmp_path: Path, shared_data: Path) -> None:
+    """Two frames from one position with different mast angles agree with the cameras of their labels to a pixel."""
     folder = tmp_path / "opportunity"
     folder.mkdir()
     frames = shared_data / "mer_opportunity"
@@ -143,18 +143,18 @@ def test_opportunity_frames_agree_with_their_labels(tmp_path: Path, shared_data:
     assert row["matches"] >= 80
     assert 0.2 < row["residual_median_px"] < 1.0
     assert row["residual_90_percent_px"] < 2.0
-    # From the mast encoders: azimuth from -0.340 to 0.254 rad, elevation from -0.110 to -0.209 rad.
+    # Mast encoders of the labels: azimuth from -0.340 to 0.254 rad, elevation from -0.110 to -0.209 rad.
     assert 33.0 < row["max_rotation_deg"] < 36.0
     assert np.isclose(row["max_translation_m"], 0.0671, atol=1e-3)
-    # The label times are 143 s apart. One fisheye frame alone is not a case.
+    # The time tags of the labels differ by 143 s. A single fisheye frame is not a case.
     assert np.isclose(row["duration_s"], 143.258)
     (folder / "pictures.csv").write_text(f"case,file\nhazcam,{frames}/{hazcam}\n")
-    with pytest.raises(IngestError, match="case 'hazcam' has 1 pictures; allowed for matching: 2 to 50"):
+    with pytest.raises(IngestError, match="case 'hazcam' has 1 images; allowed for matching: 2 to 50"):
         ingest(folder, tmp_path / "out")
 
 
-def test_hazcam_frame_with_label_attitude_looks_down(tmp_path: Path, shared_data: Path) -> None:
-    """The same fisheye frame twice: the residual of an image with itself is zero."""
+def test_hazcam_image_with_the_attitude_of_its_label_looks_down(tmp_path: Path, shared_data: Path) -> None:
+    """The case contains the same fisheye frame twice: the residuals between the two images are zero."""
     folder = tmp_path / "hazcam"
     folder.mkdir()
     frame = shared_data / "mer_opportunity" / "1F483288473EFFCMUFP1214L0M1.IMG"

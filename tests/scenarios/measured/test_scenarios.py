@@ -16,34 +16,34 @@ from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.scenarios import MatchingScenario, MeasuredLandingScenario, MeasuredVelocityScenario
 from marsyard.scenarios.parts import ScoredSite, ScoredVelocity
 from marsyard.sim.streams import Streams
-from tests.scenarios.measured.folders import landing_folder, read_rows, velocity_folder, write_texts
+from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_texts, write_velocity_folder
 
 STREAMS = Streams(seed=1, campaign="measured", case=0)
-TRUE = inputs.DESCENT_VELOCITY_M_S[:2]
+TRUE_VELOCITY_M_S = inputs.DESCENT_VELOCITY_M_S[:2]
 
 
 def run_ingested(folder: Path, out: Path, **parameters: object) -> CaseResult:
     out.mkdir()
     path, stored = ingest(folder, out)
-    scenarios = {one.name: one for one in (MatchingScenario(), MeasuredLandingScenario(), MeasuredVelocityScenario())}
-    scenario = scenarios[f"measured-{stored.task}"]
+    scenarios = (MatchingScenario(), MeasuredLandingScenario(), MeasuredVelocityScenario())
+    scenario = next(entry for entry in scenarios if entry.name == f"measured-{stored.task}")
     return scenario.run(scenario.parameters_type.model_validate({"cases": {"file": str(path)}, **parameters}), STREAMS)
 
 
 def score_descent(case: ScoredVelocity) -> dict[str, float | bool]:
-    """A custom score of a descent: its error if the truth is known."""
-    true, estimated = case.true_velocity_m_s, case.answer.velocity_m_s
-    if true is None or estimated is None:
+    """Custom score of a descent: the velocity error if the true velocity is known."""
+    true_velocity, estimated = case.true_velocity_m_s, case.answer.velocity_m_s
+    if true_velocity is None or estimated is None:
         return {"error_m_s": float("nan"), "known": False}
-    return {"error_m_s": float(np.hypot(*(estimated - true))), "known": True}
+    return {"error_m_s": float(np.hypot(*(estimated - true_velocity))), "known": True}
 
 
 def score_site(case: ScoredSite) -> dict[str, float]:
-    """A custom score of a landing flight: the true distance between the images if it is known."""
+    """Custom score of a landing flight: the true distance between the two images if it is known."""
     if case.true_poses is None:
-        return {"moved_m": np.nan}
+        return {"distance_m": np.nan}
     first, second = case.true_poses
-    return {"moved_m": float(np.linalg.norm(second.translation - first.translation))}
+    return {"distance_m": float(np.linalg.norm(second.translation - first.translation))}
 
 
 @pytest.mark.parametrize("ned", [False, True])
@@ -51,22 +51,23 @@ def test_ingested_descents_equal_the_measurements(tmp_path: Path, ned: bool) -> 
     measurements = inputs.descent()
     expected = DimesEstimator().estimate(measurements)
     assert expected.velocity_m_s is not None
-    folder = velocity_folder(tmp_path / "in", {"drop": measurements}, {"drop": TRUE}, ned=ned)
+    folder = write_velocity_folder(tmp_path / "in", {"drop": measurements}, {"drop": TRUE_VELOCITY_M_S}, ned=ned)
     result = run_ingested(
         folder, tmp_path / "out", compared=["phase-correlation"], scores=[f"{__name__}:score_descent"]
     )
     row: dict[str, Any] = dict(result.row)
     estimate = [row["velocity_estimated_x_m_s"], row["velocity_estimated_y_m_s"]]
-    # The rotation of the axes and back causes rounding.
+    # Tolerance: rounding of the rotation to the folder's axes and back.
     assert np.allclose(estimate, expected.velocity_m_s, rtol=0.0, atol=1e-6)
-    assert np.isclose(row["velocity_error_m_s"], np.hypot(*(expected.velocity_m_s - TRUE)), atol=1e-6)
+    assert np.isclose(row["velocity_error_m_s"], np.hypot(*(expected.velocity_m_s - TRUE_VELOCITY_M_S)), atol=1e-6)
     assert np.isclose(
-        row["inertial_difference_m_s"], np.hypot(*(expected.velocity_m_s - TRUE - [9.0, -4.0])), atol=1e-6
+        row["inertial_difference_m_s"], np.hypot(*(expected.velocity_m_s - TRUE_VELOCITY_M_S - [9.0, -4.0])), atol=1e-6
     )
     assert row["pair_discrepancy_m_s"] < 1.0
-    other = np.array([row[f"phase_correlation.velocity_estimated_{axis}_m_s"] for axis in "xy"], dtype=np.float64)
-    assert np.isclose(row["phase_correlation.difference_m_s"], np.linalg.norm(other - estimate))
-    # The answer removes the constant error of (9, -4) m/s from the inertial velocities: 34 m between images.
+    columns = [f"phase_correlation.velocity_estimated_{axis}_m_s" for axis in "xy"]
+    compared_estimate = np.array([row[name] for name in columns], dtype=np.float64)
+    assert np.isclose(row["phase_correlation.difference_m_s"], np.linalg.norm(compared_estimate - estimate))
+    # The residuals use the estimate, not the inertial velocities, whose error of (9, -4) m/s is 34 m between images.
     assert row["residual_median_px"] < 1.5
     assert row["matches"] == row["phase_correlation.matches"]
     for label in ("", "phase_correlation."):
@@ -76,7 +77,7 @@ def test_ingested_descents_equal_the_measurements(tmp_path: Path, ned: bool) -> 
 
 
 def test_missing_truth_gives_no_error_column(tmp_path: Path) -> None:
-    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     row: dict[str, Any] = dict(run_ingested(folder, tmp_path / "out", scores=[f"{__name__}:score_descent"]).row)
     assert row["score_descent_known"] is False
     assert np.isnan(row.pop("score_descent_error_m_s"))
@@ -85,17 +86,17 @@ def test_missing_truth_gives_no_error_column(tmp_path: Path) -> None:
 
 
 def test_positions_replace_inertial_velocities_and_truth(tmp_path: Path) -> None:
-    folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     rows = read_rows(folder)
-    for number, written in enumerate(rows):
+    for number, table_row in enumerate(rows):
         for axis in "xyz":
-            written.pop(f"v{axis}_m_s")
+            table_row.pop(f"v{axis}_m_s")
         position = 3.75 * number * inputs.DESCENT_VELOCITY_M_S
-        written |= {f"{axis}_m": str(value) for axis, value in zip("xyz", position, strict=True)}
-        written |= {f"true_{axis}_m": str(value) for axis, value in zip("xyz", position, strict=True)}
+        table_row |= {f"{axis}_m": str(value) for axis, value in zip("xyz", position, strict=True)}
+        table_row |= {f"true_{axis}_m": str(value) for axis, value in zip("xyz", position, strict=True)}
     write_texts(folder, rows)
     row: dict[str, Any] = dict(run_ingested(folder, tmp_path / "out").row)
-    assert np.isclose(row["velocity_true_x_m_s"], TRUE[0])
+    assert np.isclose(row["velocity_true_x_m_s"], TRUE_VELOCITY_M_S[0])
     assert np.isclose(row["inertial_difference_m_s"], row["velocity_error_m_s"])
     # The poses are exact: the residual is the matching error of noisy images with rows summed by four.
     assert row["residual_median_px"] < 1.0
@@ -103,26 +104,26 @@ def test_positions_replace_inertial_velocities_and_truth(tmp_path: Path) -> None
 
 
 def test_landings_are_compared_with_measured_and_true_poses(tmp_path: Path) -> None:
-    folder = landing_folder(tmp_path / "in", inputs.landing(), "landing", true_poses=True)
+    folder = write_landing_folder(tmp_path / "in", inputs.landing(), "landing", true_poses=True)
     row: dict[str, Any] = dict(run_ingested(folder, tmp_path / "out", scores=[f"{__name__}:score_site"]).row)
     assert row["site_reported"]
     assert row["rotation_error_deg"] == row["rotation_pose_difference_deg"]
     assert row["rotation_error_deg"] < 0.5
     assert row["residual_median_px"] < 0.5
     assert np.isclose(row["max_translation_m"], np.linalg.norm([1.2, 0.2, -0.2]))
-    assert np.isclose(row["score_site_moved_m"], row["max_translation_m"])
+    assert np.isclose(row["score_site_distance_m"], row["max_translation_m"])
 
 
-@pytest.mark.parametrize(("turned_deg", "min_residual_px", "max_residual_px"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
+@pytest.mark.parametrize(("error_deg", "min_residual_px", "max_residual_px"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
 def test_attitude_errors_are_detected(
-    tmp_path: Path, turned_deg: float, min_residual_px: float, max_residual_px: float
+    tmp_path: Path, error_deg: float, min_residual_px: float, max_residual_px: float
 ) -> None:
-    """A rotation about the direction of motion moves each match off its epipolar line by its angle in pixels."""
-    folder = landing_folder(tmp_path / "in", inputs.landing(), "matching")
+    """A rotation about the direction of motion moves each match from its epipolar line by the angle in pixels."""
+    folder = write_landing_folder(tmp_path / "in", inputs.landing(), "matching")
     rows = read_rows(folder)
-    turn = Rotation.from_euler("x", turned_deg, degrees=True)
-    wrong = (turn * Rotation.from_quat([float(rows[1][f"q{axis}"]) for axis in "xyzw"])).as_quat()
-    rows[1] |= {f"q{axis}": repr(float(value)) for axis, value in zip("xyzw", wrong, strict=True)}
+    error_rotation = Rotation.from_euler("x", error_deg, degrees=True)
+    wrong_attitude = (error_rotation * Rotation.from_quat([float(rows[1][f"q{axis}"]) for axis in "xyzw"])).as_quat()
+    rows[1] |= {f"q{axis}": repr(float(value)) for axis, value in zip("xyzw", wrong_attitude, strict=True)}
     write_texts(folder, rows)
     result = run_ingested(folder, tmp_path / "out")
     assert result.outcome == "MATCHED"
@@ -132,11 +133,11 @@ def test_attitude_errors_are_detected(
 
 
 def test_changed_image_is_rejected(tmp_path: Path) -> None:
-    folder = landing_folder(tmp_path / "in", inputs.landing(), "matching")
+    folder = write_landing_folder(tmp_path / "in", inputs.landing(), "matching")
     out = tmp_path / "out"
     run_ingested(folder, out)
-    picture = out / "pictures" / "000000-2.png"
-    picture.write_bytes(picture.read_bytes() + b"\0")
+    image_path = out / "pictures" / "000000-2.png"
+    image_path.write_bytes(image_path.read_bytes() + b"\0")
     parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(out / "cases.json")}})
     with pytest.raises(ValueError, match=r"000000-2\.png: has changed since it was ingested"):
         MatchingScenario().run(parameters, STREAMS)

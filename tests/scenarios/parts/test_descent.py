@@ -17,42 +17,42 @@ from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import FLAT, PERFECT, parameters, run
 
-HERE = f"{__name__}:"
+MODULE = f"{__name__}:"
 
 
 @dataclass(frozen=True)
-class Falling:
-    """Falls at a constant rate while it rotates about the vertical; `wrong` selects one error."""
+class RotatingDescent:
+    """Custom motion: constant velocity and rotation about the vertical; `defect` selects an invalid output."""
 
     random: ClassVar[bool] = True
 
     height_m: float = 2000.0
     east_m_s: float = 11.0
     lasts_s: float = 26.0
-    wrong: str = ""
+    defect: str = ""
 
     def fly(self, place: DescentPlace, rng: np.random.Generator) -> Poses:
         north = float(rng.normal(0.0, 5.0))
         times = np.arange(place.from_s, self.lasts_s, 0.05)
-        if self.wrong == "short":
+        if self.defect == "short":
             times = np.arange(place.from_s, 3.0, 0.1)
         positions = np.column_stack([self.east_m_s * times, north * times, self.height_m - 75.0 * times])
         quaternions = Rotation.from_rotvec(np.outer(0.1 * times, [0.0, 0.0, 1.0])).as_quat()
-        if self.wrong == "length":
+        if self.defect == "length":
             quaternions *= 1.1
-        if self.wrong == "up":
+        if self.defect == "up":
             quaternions = (Rotation.from_euler("x", np.pi) * Rotation.from_quat(quaternions)).as_quat()
-        if self.wrong == "order":
+        if self.defect == "order":
             times = times[::-1]
-        if self.wrong == "nan":
+        if self.defect == "nan":
             positions[7, 1] = np.nan
-        columns = {"height_m": 1.0} if self.wrong == "column" else {"north_m_s": north}
+        columns = {"height_m": 1.0} if self.defect == "column" else {"north_m_s": north}
         return Poses(times, positions, quaternions, columns)
 
 
 @dataclass(frozen=True)
-class Exact:
-    """Altitudes or attitudes with a constant error."""
+class OffsetAltimeter:
+    """Custom altimeter with a constant error."""
 
     quantity: ClassVar[str] = "altitude"
     random: ClassVar[bool] = False
@@ -65,8 +65,8 @@ class Exact:
 
 
 @dataclass(frozen=True)
-class Turned:
-    """Attitudes rotated about the vertical."""
+class RotatedAttitude:
+    """Custom attitude source: true attitudes rotated about the vertical."""
 
     quantity: ClassVar[str] = "attitude"
     random: ClassVar[bool] = False
@@ -74,17 +74,18 @@ class Turned:
     turn_deg: float = 0.3
 
     def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
-        turn = Rotation.from_euler("z", self.turn_deg, degrees=True)
-        return InstrumentReadings(truth.times_s, (turn * truth.motion.motion(truth.times_s).attitudes).as_quat())
+        rotation = Rotation.from_euler("z", self.turn_deg, degrees=True)
+        return InstrumentReadings(truth.times_s, (rotation * truth.motion.motion(truth.times_s).attitudes).as_quat())
 
 
 def record_inputs(case: ScoredDescent) -> dict[str, float | bool]:
     """Return the inputs of the score for comparison with the row."""
     estimated = case.answer.velocity_m_s
-    true = (case.states[2].position_m - case.states[1].position_m)[:2] / (case.states[2].time_s - case.states[1].time_s)
+    first, second = case.states[1:3]
+    true_velocity = (second.position_m - first.position_m)[:2] / (second.time_s - first.time_s)
     return {
         "altitude_m": case.measurements.altitudes[1].altitude_m,
-        "error_m_s": float("nan") if estimated is None else float(np.hypot(*(estimated - true))),
+        "error_m_s": float("nan") if estimated is None else float(np.hypot(*(estimated - true_velocity))),
         "touchdown_m_s": float(np.hypot(*case.touchdown_m_s)),
         "firing_s": case.at_firing.time_s,
         "at_firing": bool(np.allclose(case.motion.state(case.at_firing.time_s).position_m, case.at_firing.position_m)),
@@ -92,37 +93,38 @@ def record_inputs(case: ScoredDescent) -> dict[str, float | bool]:
 
 
 def return_existing_column(case: ScoredDescent) -> dict[str, float]:
+    """Return a column; as `velocity_error`, its full name `velocity_error_m_s` exists in the row."""
     return {"m_s": 1.0}
 
 
 velocity_error = return_existing_column
 
-OWN: dict[str, Any] = {
-    "flight": {"motion": f"{HERE}Falling", "attitude_of": "body"},
-    "altimeter": {"instrument": f"{HERE}Exact", "options": {"off_m": 6.0}},
-    "attitude_source": {"instrument": f"{HERE}Turned"},
-    "scores": [f"{HERE}record_inputs"],
+CUSTOM_PARTS: dict[str, Any] = {
+    "flight": {"motion": f"{MODULE}RotatingDescent", "attitude_of": "body"},
+    "altimeter": {"instrument": f"{MODULE}OffsetAltimeter", "options": {"off_m": 6.0}},
+    "attitude_source": {"instrument": f"{MODULE}RotatedAttitude"},
+    "scores": [f"{MODULE}record_inputs"],
 }
 
 
 def test_case_uses_custom_motion_instruments_and_score() -> None:
-    made = {name: part for name, part in PERFECT.items() if name != "altimeter"}
-    result = run(terrain=FLAT, **made, **OWN)
+    ideal_instruments = {name: part for name, part in PERFECT.items() if name != "altimeter"}
+    result = run(terrain=FLAT, **ideal_instruments, **CUSTOM_PARTS)
     row = result.row
     assert result.outcome == "VALID"
-    # The motion: the true velocity is that of the flight, and firing occurs 100 m above level ground.
+    # Motion: the row has the velocity of the custom flight; the firing is at 100 m above level ground.
     assert row["velocity_true_x_m_s"] == pytest.approx(11.0, abs=1e-6)
     assert row["velocity_true_y_m_s"] == pytest.approx(row["flight_north_m_s"], abs=1e-6)
     assert row["altitude_1_m"] == pytest.approx(2000.0, abs=1e-3)
     assert row["record_inputs_firing_s"] == pytest.approx(1900.0 / 75.0, abs=1e-4)
-    # The instruments: the row reports their errors.
+    # Instruments: the row has their errors.
     for number in (1, 2, 3):
         assert row[f"altitude_error_{number}_m"] == pytest.approx(6.0, abs=1e-6)
         assert row[f"attitude_error_{number}_deg"] == pytest.approx(0.3, abs=1e-6)
     assert (row["altimeter_off_m"], row["altimeter_applied_m"], row["altimeter_instrument"]) == (
         6.0,
         6.0,
-        f"{HERE}Exact",
+        f"{MODULE}OffsetAltimeter",
     )
     assert row["attitude_source_turn_deg"] == 0.3
     # The score receives the algorithm, its answer and the truth.
@@ -133,51 +135,52 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
 
 
 def test_motion_is_deterministic_per_case() -> None:
-    p = parameters(terrain=FLAT, **OWN)
+    p = parameters(terrain=FLAT, **CUSTOM_PARTS)
     surface = World.from_parameters(p).surface
-    first, again, other = (create_flight(p, surface, Streams(1, "test", case)).row for case in (0, 0, 1))
-    assert first == again
-    assert first["flight_north_m_s"] != other["flight_north_m_s"]
+    first, repeated, second_case = (create_flight(p, surface, Streams(1, "test", case)).row for case in (0, 0, 1))
+    assert first == repeated
+    assert first["flight_north_m_s"] != second_case["flight_north_m_s"]
     assert not any(name.startswith("descent_") for name in first)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("defect", "message"),
     [
         ("short", "covers -5 to 2.9 s; allowed: from at most -5 s to at least 8 s"),
         ("length", r"returns a quaternion of length 1\.1 \(pose 1\); allowed: 1"),
-        ("up", "at picture 1 the camera looks up"),
+        ("up", "at image 1 the camera looks up"),
         ("order", "covers 25.95 to -5 s"),
         ("nan", "returns positions_m that are not finite"),
         ("column", "reports the column height_m, which is also the name of an option"),
     ],
 )
-def test_invalid_motion_is_reported(wrong: str, message: str) -> None:
-    flight = {**OWN["flight"], "options": {"wrong": wrong}}
+def test_invalid_motion_is_reported(defect: str, message: str) -> None:
+    flight = {**CUSTOM_PARTS["flight"], "options": {"defect": defect}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=message):
         create_flight(p, World.from_parameters(p).surface, Streams(1, "test", 0))
 
 
 @pytest.mark.parametrize("lasts_s", [20.0, 20.05, 27.95, 28.0])
-def test_short_motion_is_followed_to_its_end(lasts_s: float) -> None:
-    """The last instant is reached for any rounding of the sum of times."""
-    flight = {**OWN["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}
+def test_firing_is_at_the_end_of_a_short_motion(lasts_s: float) -> None:
+    """If the motion ends above the firing altitude, the firing is 0.1 s before its end, for any rounding of times."""
+    flight = {**CUSTOM_PARTS["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}
     p = parameters(terrain=FLAT, flight=flight)
     world, streams = World.from_parameters(p), Streams(1, "test", 0)
-    flown = create_flight(p, world.surface, streams)
-    assert flown.firing_s == pytest.approx(flown.motion.span_s[1] - 0.1)
-    assert Instruments.draw(p, world, flown, streams).navigation.velocity(np.array([flown.firing_s])).shape == (1, 3)
+    created_flight = create_flight(p, world.surface, streams)
+    assert created_flight.firing_s == pytest.approx(created_flight.motion.span_s[1] - 0.1)
+    navigation = Instruments.draw(p, world, created_flight, streams).navigation
+    assert navigation.velocity(np.array([created_flight.firing_s])).shape == (1, 3)
 
 
 def test_motion_below_the_ground_is_reported() -> None:
-    flight = {**OWN["flight"], "options": {"height_m": 500.0}}
+    flight = {**CUSTOM_PARTS["flight"], "options": {"height_m": 500.0}}
     p = parameters(terrain=FLAT, flight=flight)
-    with pytest.raises(ValueError, match=r"at picture 3 the camera is 62\.5 m below the ground"):
+    with pytest.raises(ValueError, match=r"at image 3 the camera is 62\.5 m below the ground"):
         create_flight(p, World.from_parameters(p).surface, Streams(1, "test", 0))
 
 
 def test_score_cannot_replace_a_column() -> None:
-    spec = f"{HERE}velocity_error"
+    spec = f"{MODULE}velocity_error"
     with pytest.raises(ValueError, match="returns the column velocity_error_m_s, which the row already contains"):
         compute_scores([spec], None, {"velocity_error_m_s"})  # type: ignore[arg-type]

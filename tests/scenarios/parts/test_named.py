@@ -33,9 +33,9 @@ def _examples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def find_problem(**parts: Any) -> tuple[str, str]:
     """Return the invalid key of descent parameters and the message."""
-    with pytest.raises(ValidationError) as caught:
+    with pytest.raises(ValidationError) as error_info:
         DescentScenarioParameters.model_validate(parts)
-    ((key, message),) = validation_problems(caught.value, DescentScenarioParameters)
+    ((key, message),) = validation_problems(error_info.value, DescentScenarioParameters)
     return ".".join(map(str, key)), message
 
 
@@ -74,9 +74,9 @@ def find_problem(**parts: Any) -> tuple[str, str]:
         ({"scores": ["custom_parts:sideways"] * 2}, "scores", "the score 'custom_parts:sideways' is listed twice"),
     ],
 )
-def test_errors_are_reported_at_their_key(parts: dict[str, Any], key: str, message: str) -> None:
-    where, output = find_problem(**parts)
-    assert where == key
+def test_errors_are_reported_with_the_invalid_key(parts: dict[str, Any], key: str, message: str) -> None:
+    reported_key, output = find_problem(**parts)
+    assert reported_key == key
     assert message in output
 
 
@@ -108,32 +108,32 @@ def test_part_is_found_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_score_annotation_determines_its_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "scores_here.py").write_text(
+    (tmp_path / "custom_scores.py").write_text(
         "from marsyard.scenarios.parts import ScoredDescent, ScoredFlight, ScoredLanding\n"
         "def any_case(case): return {}\n"
-        "def two(case: ScoredDescent | ScoredLanding): return {}\n"
+        "def descent_or_landing(case: ScoredDescent | ScoredLanding): return {}\n"
         "def landing(case: 'ScoredLanding'): return {}\n"
-        "def flown(case: ScoredFlight): return {}\n"
-        "def none_at_all(): return {}\n"
-        "class Kept:\n    def __call__(self, case: ScoredLanding): return {}\n"
-        "kept = Kept()\n"
+        "def flight(case: ScoredFlight): return {}\n"
+        "def without_argument(): return {}\n"
+        "class CallableScore:\n    def __call__(self, case: ScoredLanding): return {}\n"
+        "callable_object = CallableScore()\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    names = ("any_case", "two", "landing", "flown", "kept")
-    taken = {name: accepted_cases(load_score(f"scores_here:{name}")) for name in names}
-    assert taken["any_case"] == SCORED
-    assert taken["two"] == (ScoredDescent, ScoredLanding)
-    assert taken["landing"] == taken["kept"] == (ScoredLanding,)
-    # Annotations that include more types are accepted.
-    assert taken["flown"] == (ScoredFlight, ScoredDescent)
+    names = ("any_case", "descent_or_landing", "landing", "flight", "callable_object")
+    accepted = {name: accepted_cases(load_score(f"custom_scores:{name}")) for name in names}
+    assert accepted["any_case"] == SCORED
+    assert accepted["descent_or_landing"] == (ScoredDescent, ScoredLanding)
+    assert accepted["landing"] == accepted["callable_object"] == (ScoredLanding,)
+    # ScoredFlight is a base class of ScoredDescent.
+    assert accepted["flight"] == (ScoredFlight, ScoredDescent)
     with pytest.raises(ValueError, match="accepts ScoredLanding; allowed here: ScoredDescent"):
-        load_score("scores_here:landing", ScoredDescent)
+        load_score("custom_scores:landing", ScoredDescent)
     with pytest.raises(ValueError, match="must accept one argument"):
-        load_score("scores_here:none_at_all")
+        load_score("custom_scores:without_argument")
 
 
 @pytest.mark.parametrize(
-    ("reported", "message"),
+    ("columns", "message"),
     [
         ([1.0], "returns columns of type list; allowed: a mapping"),
         ({"a b": 1.0}, "returns the invalid column name 'a b'"),
@@ -142,13 +142,13 @@ def test_score_annotation_determines_its_inputs(tmp_path: Path, monkeypatch: pyt
         ({"a": None}, "returns a of type NoneType"),
     ],
 )
-def test_invalid_columns_are_rejected(reported: object, message: str) -> None:
+def test_invalid_columns_are_rejected(columns: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        check_columns("x:y", reported, texts=False)
+        check_columns("x:y", columns, texts=False)
 
 
-def test_the_identity_covers_the_modules_of_parts() -> None:
-    """Modules of stated parts and of parts in a dispersion, alone or in a table."""
+def test_campaign_identity_includes_the_modules_of_parts() -> None:
+    """The identity includes modules of parts in the parameters and in dispersions, there as value or in a table."""
     configuration = CampaignConfiguration.model_validate(
         {
             "name": "parts",

@@ -12,11 +12,11 @@ from marsyard.scenarios.conformance import Finding, Subject, check_names, determ
 from marsyard.scenarios.conformance import parts as suite
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
-HEAD = """
+MODULE_HEADER = """
 import os
 import numpy as np
 from marsyard.scenarios.parts import InstrumentReadings, Poses, ScoredDescent, ScoredLanding, ScoredRun
-KEPT = []
+CALLS = []
 def poses(place, east=0.0):
     times = np.arange(place.from_s, 20.0, 0.1)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (times.size, 1))
@@ -24,28 +24,28 @@ def poses(place, east=0.0):
 """
 
 
-def run_suite(spec: str, *only: str) -> dict[str, Finding]:
+def run_suite(spec: str, *checks: str) -> dict[str, Finding]:
     subject = Subject(spec, determine_task(spec), 60.0)
     names = [name for name, _ in check_names(subject)]
-    return {name: run_check(subject, names.index(name)) for name in (only or names)}
+    return {name: run_check(subject, names.index(name)) for name in (checks or names)}
 
 
 @pytest.mark.parametrize(
     ("name", "kind"),
     [("Glider", "dynamics"), ("PulsedLidar", "instrument"), ("StarTracker", "instrument"), ("sideways", "score")],
 )
-def test_the_examples_conform(name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_of_the_documentation_conform(name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
     assert determine_task(f"custom_parts:{name}") == kind
     result = run_suite(f"custom_parts:{name}")
-    assert {check: one.problem for check, one in result.items() if not one.passed} == {}
+    assert {check: finding.problem for check, finding in result.items() if not finding.passed} == {}
     assert ("random" in result) == (kind != "score")
 
 
-def write_bad_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
-    """Write a module with a unique name, as Python caches modules."""
+def write_defective_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
+    """Write a module with a unique name (Python caches modules) and return the name."""
     name = f"bad_part_{abs(hash(body))}"
-    (folder / f"{name}.py").write_text(HEAD + textwrap.dedent(body))
+    (folder / f"{name}.py").write_text(MODULE_HEADER + textwrap.dedent(body))
     monkeypatch.syspath_prepend(str(folder))
     return name
 
@@ -61,7 +61,7 @@ def write_bad_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> 
             "answer",
             False,
             "t, x, q = poses(place)\nq[1::2] = [1.0, 0.0, 0.0, 0.0]\nreturn Poses(t, x, q)",
-            "turns by 180",
+            "rotates by 180",
         ),
         ("answer", False, "return 1 / 0", "it raised ZeroDivisionError"),
         ("random", True, "return Poses(*poses(place))", "its attribute random is true, but two streams give the same"),
@@ -75,7 +75,7 @@ def write_bad_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> 
         (
             "deterministic",
             False,
-            "self.asked = getattr(self, 'asked', 0) + 1\nreturn Poses(*poses(place, self.asked))",
+            "self.calls = getattr(self, 'calls', 0) + 1\nreturn Poses(*poses(place, self.calls))",
             "depends on earlier cases",
         ),
         (
@@ -90,9 +90,10 @@ def write_bad_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> 
 def test_motion_defects_are_reported(
     check: str, random: bool, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    body = f"class Bad:\n    random = {random}\n    def fly(self, place, rng):\n" + textwrap.indent(lines, " " * 8)
-    name = write_bad_part(tmp_path, monkeypatch, body)
-    (result,) = run_suite(f"{name}:Bad", check).values()
+    head = f"class Defective:\n    random = {random}\n    def fly(self, place, rng):\n"
+    body = head + textwrap.indent(lines, " " * 8)
+    name = write_defective_part(tmp_path, monkeypatch, body)
+    (result,) = run_suite(f"{name}:Defective", check).values()
     assert problem in result.problem
     assert result.next_step
 
@@ -125,9 +126,9 @@ def test_motion_defects_are_reported(
 def test_instrument_defects_are_reported(
     check: str, quantity: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    head = f"class Bad:\n    random = False\n    quantity = '{quantity}'\n    def read(self, truth, rng):\n"
-    name = write_bad_part(tmp_path, monkeypatch, head + textwrap.indent(lines, " " * 8))
-    (result,) = run_suite(f"{name}:Bad", check).values()
+    head = f"class Defective:\n    random = False\n    quantity = '{quantity}'\n    def read(self, truth, rng):\n"
+    name = write_defective_part(tmp_path, monkeypatch, head + textwrap.indent(lines, " " * 8))
+    (result,) = run_suite(f"{name}:Defective", check).values()
     assert problem in result.problem
 
 
@@ -141,7 +142,7 @@ def test_instrument_defects_are_reported(
         (
             "deterministic",
             "ScoredRun",
-            "KEPT.append(1)\nreturn {'asked': len(KEPT)}",
+            "CALLS.append(1)\nreturn {'calls': len(CALLS)}",
             "its answers to the same case differ between two calls",
         ),
     ],
@@ -150,24 +151,24 @@ def test_score_defects_are_reported(
     check: str, annotation: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     body = f"def bad(case: {annotation}):\n" + textwrap.indent(lines, " " * 4)
-    name = write_bad_part(tmp_path, monkeypatch, body)
+    name = write_defective_part(tmp_path, monkeypatch, body)
     (result,) = run_suite(f"{name}:bad", check).values()
     assert problem in result.problem
 
 
-def test_nearest_ground_of_suite_matches_the_plane() -> None:
-    """Compare with rays over the cone that are intersected with the plane."""
+def test_nearest_ground_distance_in_a_cone_matches_the_plane() -> None:
+    """Independent method: intersect a grid of rays in the cone with the plane z = 0.05 x."""
     apex = np.array([30.0, -20.0, 500.0])
     tilt = 0.4
     axis = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
-    across, along = np.array([0.0, 1.0, 0.0]), np.array([np.cos(tilt), 0.0, np.sin(tilt)])
-    half = np.radians(20.0)
-    away, turn = np.meshgrid(np.linspace(0.0, half, 200), np.linspace(0.0, 2.0 * np.pi, 361))
+    lateral, tilted = np.array([0.0, 1.0, 0.0]), np.array([np.cos(tilt), 0.0, np.sin(tilt)])
+    half_angle_rad = np.radians(20.0)
+    off_axis, azimuth = np.meshgrid(np.linspace(0.0, half_angle_rad, 200), np.linspace(0.0, 2.0 * np.pi, 361))
     rays = (
-        np.cos(away)[..., None] * axis
-        + (np.sin(away) * np.cos(turn))[..., None] * along
-        + (np.sin(away) * np.sin(turn))[..., None] * across
+        np.cos(off_axis)[..., None] * axis
+        + (np.sin(off_axis) * np.cos(azimuth))[..., None] * tilted
+        + (np.sin(off_axis) * np.sin(azimuth))[..., None] * lateral
     )
     ranges = (apex[2] - 0.05 * apex[0]) / (0.05 * rays[..., 0] - rays[..., 2])
-    nearest = suite.instrument_cases()[0].nearest_ground(apex, axis, half, 1e4)
+    nearest = suite.instrument_cases()[0].nearest_ground(apex, axis, half_angle_rad, 1e4)
     assert nearest == pytest.approx(float(ranges.min()), rel=1e-4)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-#: A short approach with two legs of 0.3 m over a small, almost bare ground.
-SHORT: dict[str, Any] = {
+#: A short approach from 3.6 m to 3.3 m over a small terrain with few rocks.
+SHORT_RUN: dict[str, Any] = {
     "world": {"samples": 1024, "rock_abundance": 0.005, "bank": 1},
     "start": {"distance_m": 3.6},
     "target": {"diameter_m": 0.8, "shape": 8, "yaw_deg": 30.0},

@@ -16,14 +16,14 @@ from marsyard.sim.camera import write_cahvor
 from marsyard.sim.frames import rigid
 from marsyard.sim.sensor import preset, stereo_mast
 from marsyard.sim.streams import Streams
-from tests.scenarios.rover.short_run import SHORT
+from tests.scenarios.rover.short_run import SHORT_RUN
 
-OPENCV = (
+OPENCV_CALIBRATION = (
     "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [640, 0, 321, 0, 640, 238, 0, 0, 1]}\n"
     "distortion_coefficients: {data: [-0.1, 0.02, 0, 0]}\n"
 )
-#: A machine vision sensor, specified on Earth.
-SHEET = (
+#: Datasheet of a machine vision sensor, specified for sunlight on Earth.
+SENSOR_DATASHEET = (
     "pixel_pitch_um = 4.8\nfull_well_e = 10000\nread_noise_e = 5\nbits = 10\nquantum_efficiency = 0.5\n"
     "dark_current_e_s = 20\ndark_temperature_c = 20\nrows = 480\nreadout_s = 0.02\nsun_au = 1.0\n"
     "[lens]\nf_number = 4\nband_nm = [450, 700]\n"
@@ -36,38 +36,38 @@ SHEET = (
 def test_pair_from_preset_files_equals_the_preset(
     name: str, baseline_m: float, toe_in_deg: float, tmp_path: Path
 ) -> None:
-    """The pair is equal for any position of the cameras in the files."""
-    anywhere = rigid(Rotation.from_euler("xyz", [20.0, -50.0, 130.0], degrees=True), np.array([3.0, -8.0, 1.5]))
+    """The mast is the same for any common pose of the two cameras in the files."""
+    file_pose = rigid(Rotation.from_euler("xyz", [20.0, -50.0, 130.0], degrees=True), np.array([3.0, -8.0, 1.5]))
     for side, camera in zip(("left", "right"), preset(name).cameras(), strict=True):
-        write_cahvor(camera.transform(anywhere), tmp_path / f"{side}.cahvor")
+        write_cahvor(camera.transform(file_pose), tmp_path / f"{side}.cahvor")
     files = {side: str(tmp_path / f"{side}.cahvor") for side in ("left", "right")}
-    move_pair = {"baseline_m": baseline_m, "toe_in_deg": toe_in_deg}
-    result, expected = (
-        CameraParameters.model_validate({"preset": name, "custom": files | move_pair}).mast(),
+    pair_geometry = {"baseline_m": baseline_m, "toe_in_deg": toe_in_deg}
+    mast, preset_mast = (
+        CameraParameters.model_validate({"preset": name, "custom": files | pair_geometry}).mast(),
         stereo_mast(name),
     )
     points = np.array([[2.0, 0.3, -0.2], [4.0, -0.5, 0.4], [30.0, 1.0, 1.0]])
-    for one, other in ((result.left, expected.left), (result.right, expected.right)):
-        assert np.allclose(one.project(points)[0], other.project(points)[0], rtol=0.0, atol=1e-4)
-    assert result.geometry is expected.geometry
+    for camera, expected_camera in ((mast.left, preset_mast.left), (mast.right, preset_mast.right)):
+        assert np.allclose(camera.project(points)[0], expected_camera.project(points)[0], rtol=0.0, atol=1e-4)
+    assert mast.geometry is preset_mast.geometry
 
 
 def test_target_is_tracked_with_a_custom_pair(tmp_path: Path) -> None:
     camera, sheet = tmp_path / "cam0.yaml", tmp_path / "sensor.toml"
-    camera.write_text(OPENCV)
-    sheet.write_text(SHEET)
+    camera.write_text(OPENCV_CALIBRATION)
+    sheet.write_text(SENSOR_DATASHEET)
     custom = {"preset": "research-navcam", "custom": {"left": str(camera), "baseline_m": 0.24}, "detector": str(sheet)}
-    p = RoverScenarioParameters.model_validate({**SHORT, "camera": custom})
-    # The campaign contains all calibration values.
+    p = RoverScenarioParameters.model_validate({**SHORT_RUN, "camera": custom})
+    # The campaign stores all calibration values, so the files are not necessary.
     camera.unlink()
     sheet.unlink()
     p = RoverScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True))
     result = RoverScenario().run(p, Streams(1, "own pair", 0))
     row = dict(result.row)
     assert (result.outcome, row["camera"], row["navcam"]) == ("COMPLETED", str(camera), False)
-    # A pixel of disparity at 3.5 m is 8 cm here (Eq. 1); the calibration error is up to half a pixel.
+    # One pixel of disparity is 8 cm of range at 3.5 m (Eq. 1); the calibration error is at most half a pixel.
     assert 0.0 < float(row["position_error_m"]) < 0.06
-    # Ten bits, exposed for the available light.
+    # The exposure uses the range of 10 bits.
     counts = result.products["stop_1_left"]
     assert 200 < np.percentile(counts, 99) <= 1023
 
@@ -83,11 +83,11 @@ def test_target_is_tracked_with_a_custom_pair(tmp_path: Path) -> None:
         ({"detector": {"preset": "mer-descent-flown"}}, "rows_summed is 4; allowed for cameras on a mast: 1"),
     ],
 )
-def test_invalid_pairs_are_refused(
+def test_invalid_camera_pairs_are_rejected(
     settings: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "small.yaml").write_text(OPENCV)
-    (tmp_path / "large.yaml").write_text(OPENCV.replace("640\nimage_height", "800\nimage_height"))
+    (tmp_path / "small.yaml").write_text(OPENCV_CALIBRATION)
+    (tmp_path / "large.yaml").write_text(OPENCV_CALIBRATION.replace("640\nimage_height", "800\nimage_height"))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValidationError, match=message):
         CameraParameters.model_validate(settings)

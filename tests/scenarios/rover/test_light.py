@@ -1,4 +1,4 @@
-"""Tests of light during a run: the sun moves, and a bright sky affects the exposure of full frames."""
+"""Tests of the illumination of a rover run: motion of the sun, and exposure of full frames with a bright sky."""
 
 from typing import Any
 
@@ -8,44 +8,46 @@ import pytest
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters
 from marsyard.scenarios.rover.run import Run, run_case
 from marsyard.sim.streams import Streams
-from tests.scenarios.rover.short_run import SHORT
+from tests.scenarios.rover.short_run import SHORT_RUN
 
 
 def make_run(**changes: Any) -> Run:
-    return run_case(RoverScenarioParameters.model_validate({**SHORT, **changes}), Streams(1, "rover tests", 0))
+    return run_case(RoverScenarioParameters.model_validate({**SHORT_RUN, **changes}), Streams(1, "rover tests", 0))
 
 
-def test_the_sun_rotates_westwards_about_the_pole() -> None:
-    # At the equator the zenith sun moves west by its hour angle: 16 deg in the 66 minutes of Table IV.
+def test_sun_moves_westwards_with_its_hour_angle() -> None:
+    # A sun in the zenith of the equator moves west by the hour angle: 16 deg in the 66 minutes of Table IV.
     sun = SunParameters(azimuth_deg=0.0, elevation_deg=90.0, latitude_deg=0.0)
     for minutes in (0.0, 66.0, 132.0):
         angle = np.radians(16.0 * minutes / 66.0)
         np.testing.assert_allclose(sun.direction(60.0 * minutes), [-np.sin(angle), 0.0, np.cos(angle)], atol=1e-12)
 
 
-def test_images_use_the_sun_at_their_time() -> None:
-    # One hour passes between the images: only the second differs from a run with a fixed sun.
-    slow = {"timing": {"track_s": 3600.0}, "camera": {"detector_noise": False}}
-    static = {"sun": {**SHORT["sun"], "hour_angle_deg_min": 0.0}, "rover_shadow": False}
-    moving = {"sun": {**SHORT["sun"], "held_s": 1.0}, "rover_shadow": False}
-    under_one, under_moving = make_run(**slow, **static), make_run(**slow, **moving)
-    assert under_one.stops[1].time_s - under_one.stops[0].time_s >= 3600.0
-    suns = [under_moving.world.scene(stop.time_s).sun.direction for stop in under_moving.stops[:2]]
-    rotated = np.degrees(np.arccos(suns[0] @ suns[1]))
-    assert 10.0 < rotated < 16.0 / 66.0 * (under_moving.stops[1].time_s - under_moving.stops[0].time_s) / 60.0 + 0.01
-    fixed = [under_one.world.scene(stop.time_s).sun.direction for stop in under_one.stops[:2]]
-    np.testing.assert_allclose(fixed[0], fixed[1], atol=1e-12)
+def test_images_use_the_sun_direction_of_their_time() -> None:
+    # One hour between two images: the sun direction changes, but not in the run with a fixed sun.
+    slow_tracking = {"timing": {"track_s": 3600.0}, "camera": {"detector_noise": False}}
+    fixed_sun = {"sun": {**SHORT_RUN["sun"], "hour_angle_deg_min": 0.0}, "rover_shadow": False}
+    moving_sun = {"sun": {**SHORT_RUN["sun"], "held_s": 1.0}, "rover_shadow": False}
+    fixed_sun_run, moving_sun_run = make_run(**slow_tracking, **fixed_sun), make_run(**slow_tracking, **moving_sun)
+    assert fixed_sun_run.stops[1].time_s - fixed_sun_run.stops[0].time_s >= 3600.0
+    moving_directions = [moving_sun_run.world.scene(stop.time_s).sun.direction for stop in moving_sun_run.stops[:2]]
+    sun_rotation_deg = np.degrees(np.arccos(moving_directions[0] @ moving_directions[1]))
+    minutes = (moving_sun_run.stops[1].time_s - moving_sun_run.stops[0].time_s) / 60.0
+    # At most the hour angle: the sun is not on the celestial equator.
+    assert 10.0 < sun_rotation_deg < 16.0 / 66.0 * minutes + 0.01
+    fixed_directions = [fixed_sun_run.world.scene(stop.time_s).sun.direction for stop in fixed_sun_run.stops[:2]]
+    np.testing.assert_allclose(fixed_directions[0], fixed_directions[1], atol=1e-12)
 
 
 def test_bright_sky_underexposes_full_frames() -> None:
-    """Section 4.5: subframe exposure keeps the contrast at the target for any sky in the frame."""
-    eastwards = {"start": {"distance_m": 9.0}, "legs": [{"motion": "approach", "goal_m": 8.5, "step_fraction": 0.1}]}
+    """Section 4.5: with an exposure for the subframe, the sky does not reduce the contrast at the target."""
+    drive_east = {"start": {"distance_m": 9.0}, "legs": [{"motion": "approach", "goal_m": 8.5, "step_fraction": 0.1}]}
     sun_ahead = {"sun": {"azimuth_deg": 90.0, "elevation_deg": 30.0}}
-    first = {
-        of: make_run(**eastwards, **sun_ahead, exposure={"of": of}).stops[0].pictures
-        for of in ("subframe", "full-frame")
+    first_images = {
+        region: make_run(**drive_east, **sun_ahead, exposure={"of": region}).stops[0].images
+        for region in ("subframe", "full-frame")
     }
-    shorter = first["full-frame"].exposure_s / first["subframe"].exposure_s
-    assert shorter < 0.3
-    contrast = {of: float(np.std(pair.left.counts.astype(float))) for of, pair in first.items()}
-    assert contrast["full-frame"] == pytest.approx(contrast["subframe"] * shorter, rel=0.1)
+    exposure_ratio = first_images["full-frame"].exposure_s / first_images["subframe"].exposure_s
+    assert exposure_ratio < 0.3
+    contrast = {region: float(np.std(pair.left.counts.astype(float))) for region, pair in first_images.items()}
+    assert contrast["full-frame"] == pytest.approx(contrast["subframe"] * exposure_ratio, rel=0.1)

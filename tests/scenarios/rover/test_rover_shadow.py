@@ -1,9 +1,9 @@
-"""Tests of the position of the rover's shadow."""
+"""Tests of the shadow of rover and mast on a template patch."""
 
 import numpy as np
 import pytest
 
-from marsyard.scenarios.rover.points import rover_shades_patch, template_patch
+from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
 from marsyard.sim.dynamics import ROCKY_8, settle
 from marsyard.sim.frames import direction
 from marsyard.sim.sensor.mast import RESEARCH_MAST
@@ -14,7 +14,7 @@ EAST = 0.5 * np.pi
 
 @pytest.mark.parametrize("elevation_deg", [25.0, 40.0])
 def test_head_shadow_is_at_the_sun_ray_intersection(elevation_deg: float) -> None:
-    """The rover looks east with the sun in the west: the head shadow is h / tan(elevation) ahead."""
+    """The rover faces east and the sun is in the west: the shadow of the camera head is h / tan(elevation) ahead."""
     stance = settle(ROCKY_8, Plane(), 0.0, 0.0, EAST)
     sun = direction(-EAST, float(np.radians(elevation_deg)))
     head = stance.world_from_rover.apply(RESEARCH_MAST.base_m + RESEARCH_MAST.elbow_m + RESEARCH_MAST.head_m)
@@ -22,11 +22,11 @@ def test_head_shadow_is_at_the_sun_ray_intersection(elevation_deg: float) -> Non
 
     def is_shaded(east_m: float, north_m: float) -> bool:
         position = shadow + np.array([east_m, north_m, 0.0])
-        patch = template_patch(head, position, 0.002)
+        patch = sample_template(head, position, 0.002)
         return rover_shades_patch(ROCKY_8, stance, RESEARCH_MAST, (0.0, 0.0), patch, sun)
 
     assert is_shaded(0.0, 0.0)
-    # The head is at most half a metre wide; farther away and to the side of the mast the ground is lit.
+    # The head is at most half a metre wide: at 0.6 m ahead or to the side the ground is sunlit.
     assert not is_shaded(0.6, 0.0)
     assert not is_shaded(0.0, 0.6)
     assert not is_shaded(0.0, -0.6)
@@ -34,9 +34,9 @@ def test_head_shadow_is_at_the_sun_ray_intersection(elevation_deg: float) -> Non
     assert is_shaded(-0.4, 0.0)
 
 
-def test_shadow_on_template_edge_is_detected() -> None:
+def test_template_patch_has_points_at_centre_half_and_full_radius() -> None:
     eye, point = np.array([0.0, 0.0, 1.5]), np.array([2.0, 0.0, 0.2])
-    patch = template_patch(eye, point, 0.02)
-    away = patch - eye
-    angles = np.arccos(away @ (point - eye) / np.linalg.norm(away, axis=1) / np.linalg.norm(point - eye))
+    patch = sample_template(eye, point, 0.02)
+    ray_vectors = patch - eye
+    angles = np.arccos(ray_vectors @ (point - eye) / np.linalg.norm(ray_vectors, axis=1) / np.linalg.norm(point - eye))
     np.testing.assert_allclose(sorted(set(np.round(angles, 4))), [0.0, 0.01, 0.02], atol=2e-4)

@@ -19,11 +19,11 @@ from marsyard.scenarios.rover.scenario import (
 )
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.streams import Streams
-from tests.scenarios.rover.short_run import SHORT
+from tests.scenarios.rover.short_run import SHORT_RUN
 
 
 def make_parameters(**changes: object) -> RoverScenarioParameters:
-    return RoverScenarioParameters.model_validate({**SHORT, **changes})
+    return RoverScenarioParameters.model_validate({**SHORT_RUN, **changes})
 
 
 def make_streams(case: int = 0) -> Streams:
@@ -38,7 +38,7 @@ def test_run_is_tracked_scored_and_deterministic() -> None:
     assert row["tracked"]
     assert row["true_track"]
     assert not row["not_tracked"]
-    # A pixel of disparity at 3.5 m is 5 cm (Eq. 1); the calibration error is up to half a pixel.
+    # One pixel of disparity is 5 cm of range at 3.5 m (Eq. 1); the calibration error is at most half a pixel.
     assert 0.0 < row["position_error_m"] < 0.04
     assert row["position_error_m"] ** 2 == pytest.approx(row["range_error_m"] ** 2 + row["cross_error_m"] ** 2)
     assert row["drift_px"] < 1.0
@@ -46,9 +46,9 @@ def test_run_is_tracked_scored_and_deterministic() -> None:
     assert abs(row["disparity_error_goal_px"]) <= 0.55
     assert row["update_2_magnification"] == pytest.approx(row["magnification_max"], rel=0.05)
     repeated = dict(scenario.run(p, make_streams()).row)
-    timed = {name for name in row if "time" in name}
-    assert {k: v for k, v in repeated.items() if k not in timed} == pytest.approx(
-        {k: v for k, v in row.items() if k not in timed}, abs=0.0, nan_ok=True
+    time_columns = {name for name in row if "time" in name}
+    assert {k: v for k, v in repeated.items() if k not in time_columns} == pytest.approx(
+        {k: v for k, v in row.items() if k not in time_columns}, abs=0.0, nan_ok=True
     )
     stops = int(row["updates"])
     stored = result.products
@@ -58,27 +58,27 @@ def test_run_is_tracked_scored_and_deterministic() -> None:
 
 
 def test_designated_point_agrees_with_rendered_pixels() -> None:
-    """Compare the pixel truth of the renderer with the projected point of the score."""
+    """The designated point, projected by the score, agrees with the 3-D points of the rendered pixels."""
     p = make_parameters(camera={"detector_noise": False})
     run = run_case(p, make_streams(1))
     stop = run.stops[-1]
     column, row = (round(value) for value in stop.point_px)
     camera = run.rig.left.crop(column - 4, row - 4, (9, 9))
     frame = process_renderer(p.backend).render(run.world.base, PixelRays.of(camera), stop.world_from_head)
-    around = frame.points_world()[3:6, 3:6].reshape(-1, 3)
+    surface_points = frame.points_world()[3:6, 3:6].reshape(-1, 3)
     assert (frame.body[4, 4]) >= 0
-    # A pixel is 3 mm here; the face is oblique and increases this.
-    assert np.linalg.norm(around - run.target.point_world, axis=1).min() < 0.008
+    # A pixel covers 3 mm, and more on the oblique face.
+    assert np.linalg.norm(surface_points - run.target.point_world, axis=1).min() < 0.008
 
 
 @pytest.mark.parametrize("diameter_m", [0.07, 1.2])
-def test_start_has_the_specified_distance(diameter_m: float) -> None:
-    """The distance from mast to designated point does not depend on rock size; the final distance is also met."""
-    target = {**SHORT["target"], "diameter_m": diameter_m, "across": 0.3, "up": 0.5}
+def test_start_and_goal_have_the_specified_distance(diameter_m: float) -> None:
+    """The distances from the mast to the designated point at start and goal do not depend on the rock size."""
+    target = {**SHORT_RUN["target"], "diameter_m": diameter_m, "across": 0.3, "up": 0.5}
     run = run_case(make_parameters(target=target), make_streams(4))
     first, last = run.stops[0], run.stops[-1]
     mast = first.stance.world_from_rover.apply(np.append(run.rig.calibrated.geometry.base_m[:2], 0.0))
-    # Positions off the line are slightly farther away.
+    # Tolerance: lateral offset of the point.
     assert np.hypot(*(run.target.point_world - mast)[:2]) == pytest.approx(3.6, abs=0.06)
     assert np.hypot(*(run.target.point_world - last.stance.world_from_rover.translation)[:2]) == pytest.approx(
         3.3, abs=0.06
@@ -86,43 +86,44 @@ def test_start_has_the_specified_distance(diameter_m: float) -> None:
 
 
 def test_targets_on_occluding_edges_are_rejected() -> None:
-    """The template extends beyond a rock of 7 cm at 3.6 m to ground just behind it. Over a large rock it shows the far
-    background at the top and the near ground at the foot.
+    """Only a template at the top of a large rock contains distant background.
+
+    A template on a rock of 7 cm, or at the foot of a large rock, contains ground next to the rock.
     """
-    chosen = {
+    is_on_edge = {
         (diameter, up): run_case(
-            make_parameters(target={**SHORT["target"], "diameter_m": diameter, "up": up}), make_streams(5)
+            make_parameters(target={**SHORT_RUN["target"], "diameter_m": diameter, "up": up}), make_streams(5)
         ).target.on_edge
         for diameter, up in ((0.07, 0.5), (1.2, 0.5), (1.2, 0.97), (1.2, 0.03))
     }
-    assert chosen == {(0.07, 0.5): False, (1.2, 0.5): False, (1.2, 0.97): True, (1.2, 0.03): False}
+    assert is_on_edge == {(0.07, 0.5): False, (1.2, 0.5): False, (1.2, 0.97): True, (1.2, 0.03): False}
 
 
-def test_ideal_instruments_leave_only_match_error() -> None:
-    exact = {
+def test_ideal_instruments_have_only_match_errors() -> None:
+    exact_instruments = {
         "camera": {"detector_noise": False},
         "stereo": dict.fromkeys(
             ("disparity_error_px", "epipolar_error_px", "alignment_deg", "roll_deg", "focal_error"), 0.0
         ),
         "pointing": dict.fromkeys(("zero_deg", "backlash_deg", "settling_deg", "count_deg"), 0.0),
     }
-    row: Mapping[str, Any] = RoverScenario().run(make_parameters(**exact), make_streams(2)).row
+    row: Mapping[str, Any] = RoverScenario().run(make_parameters(**exact_instruments), make_streams(2)).row
     assert row["disparity_error_goal_px"] == 0.0
-    # A tenth of a pixel of disparity and of lateral position.
+    # Tolerance: a tenth of a pixel of disparity and of lateral position.
     assert row["position_error_m"] < 0.008
     assert row["drift_px"] < 0.3
 
 
 @pytest.mark.parametrize("designation", ["rover", "site"])
 def test_targets_can_be_designated_by_position(designation: str) -> None:
-    run = run_case(make_parameters(target={**SHORT["target"], "designation": designation}), make_streams(3))
+    run = run_case(make_parameters(target={**SHORT_RUN["target"], "designation": designation}), make_streams(3))
     assert run.outcome.name == "COMPLETED"
-    # The mast then points at the position. A backlash of 0.1 deg is 2.1 px per axis; half the epipolar error is 0.2 px.
+    # The mast points at the position: the backlash of 0.1 deg is 2.1 px per axis, half the epipolar error 0.2 px.
     assert np.linalg.norm(run.stops[0].reported_px(run.rig.calibrated) - run.stops[0].point_px) < 3.5
 
 
 def test_wrong_target_reported_as_tracked_is_a_false_track() -> None:
-    p = make_parameters(algorithm="tests.scenarios.rover.trackers:Confident")
+    p = make_parameters(algorithm="tests.scenarios.rover.trackers:OffsetTracker")
     result = RoverScenario().run(p, make_streams())
     assert result.answered
     assert not result.row["tracked"]
@@ -132,7 +133,8 @@ def test_wrong_target_reported_as_tracked_is_a_false_track() -> None:
 
 
 def test_lost_target_is_not_a_valid_answer() -> None:
-    result = RoverScenario().run(make_parameters(algorithm="tests.scenarios.rover.trackers:Blind"), make_streams())
+    p = make_parameters(algorithm="tests.scenarios.rover.trackers:LosingTracker")
+    result = RoverScenario().run(p, make_streams())
     assert (result.outcome, result.answered) == ("LOST", False)
     assert np.isnan(result.row["position_error_m"])
     assert result.row["true_track"]
@@ -140,7 +142,8 @@ def test_lost_target_is_not_a_valid_answer() -> None:
 
 
 def test_missing_answer_is_a_tracker_error() -> None:
-    result = RoverScenario().run(make_parameters(algorithm="tests.scenarios.rover.trackers:Wordless"), make_streams())
+    p = make_parameters(algorithm="tests.scenarios.rover.trackers:SilentTracker")
+    result = RoverScenario().run(p, make_streams())
     assert (result.outcome, result.answered) == ("BAD_ANSWER", False)
     assert result.failure is not None
     assert "the answer is a NoneType; allowed: a TargetUpdate" in result.failure.error
@@ -156,44 +159,44 @@ def test_unknown_trackers_and_cameras_are_rejected() -> None:
 def test_trackers_share_the_images_of_a_drive() -> None:
     scenario = SharedDriveScenario()
     settings: dict[str, Any] = {
-        "drive": {**SHORT, "legs": [{"motion": "circle", "step_deg": 5.0, "steps": 2}]},
+        "drive": {**SHORT_RUN, "legs": [{"motion": "circle", "step_deg": 5.0, "steps": 2}]},
         "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
         "targets": [{"across": 0.0, "up": 0.5}, {"across": 0.4, "up": 0.5}],
         "bands": [{"name": "at_10_deg", "min": 10.0, "max": 10.0}],
     }
-    wordless = "tests.scenarios.rover.trackers:Wordless"
-    settings["drive"] = {**settings["drive"], "compared": ["pure-ncc", wordless]}
-    fine, coarse = (SharedDriveParameters.model_validate({**settings, "skip": skip}) for skip in (0, 1))
-    assert (fine.step, coarse.step) == (5.0, 10.0)
-    results = [scenario.run(one, make_streams(case)) for case, one in enumerate((fine, coarse))]
+    silent_tracker = "tests.scenarios.rover.trackers:SilentTracker"
+    settings["drive"] = {**settings["drive"], "compared": ["pure-ncc", silent_tracker]}
+    small_steps, large_steps = (SharedDriveParameters.model_validate({**settings, "skip": skip}) for skip in (0, 1))
+    assert (small_steps.step, large_steps.step) == (5.0, 10.0)
+    results = [scenario.run(p, make_streams(case)) for case, p in enumerate((small_steps, large_steps))]
     assert [result.row["updates"] for result in results] == [3, 2]
     assert [result.row["at_10_deg"] for result in results] == [False, True]
     assert all(result.row["tracked"] for result in results)
     assert all(result.row["pure_ncc.updates"] == result.row["updates"] for result in results)
-    assert all(result.row["Wordless.outcome"] == "BAD_ANSWER" for result in results)
+    assert all(result.row["SilentTracker.outcome"] == "BAD_ANSWER" for result in results)
     assert [result.failure for result in results] == [None, None]
     # A new scenario object without a cached drive gives the same row.
-    cold = SharedDriveScenario().run(fine, make_streams(0)).row
-    assert _drop_times(cold) == _drop_times(results[0].row)
+    uncached_row = SharedDriveScenario().run(small_steps, make_streams(0)).row
+    assert _drop_times(uncached_row) == _drop_times(results[0].row)
     # All steps observe the same arc; a target is valid if no stop exceeds the allowed viewing angle.
     row = results[0].row
     assert [result.row["obliquity_max_deg"] for result in results] == [row["obliquity_max_deg"]] * 2
     assert isinstance(row["obliquity_max_deg"], float)
-    within, beyond = (
+    allowed, exceeded = (
         scenario.run(SharedDriveParameters.model_validate({**settings, "face_deg": limit}), make_streams(0)).row
         for limit in (row["obliquity_max_deg"] + 0.1, row["obliquity_max_deg"] - 0.1)
     )
-    assert [(one["in_view"], one["on_face"]) for one in (row, within, beyond)] == [
+    assert [(entry["in_view"], entry["on_face"]) for entry in (row, allowed, exceeded)] == [
         (True, True),
         (True, True),
         (True, False),
     ]
-    drive = render_drive(DriveKey.from_parameters(fine, make_streams(0)))
-    other = track_views(SharedDriveParameters.model_validate({**settings, "target": 1}), drive)
-    assert other.stops[0].point_px[0] > drive.views[0].pictures.left.corner[0]
-    assert other.stops[0].pictures is drive.views[0].pictures
+    drive = render_drive(DriveKey.from_parameters(small_steps, make_streams(0)))
+    second_target = track_views(SharedDriveParameters.model_validate({**settings, "target": 1}), drive)
+    assert second_target.stops[0].point_px[0] > drive.views[0].images.left.corner[0]
+    assert second_target.stops[0].images is drive.views[0].images
     # The camera circles the centre of the targets at a constant distance.
-    ranges = [stop.range_m for stop in other.stops]
+    ranges = [stop.range_m for stop in second_target.stops]
     assert np.ptp(ranges) < 0.15
 
 
@@ -201,7 +204,7 @@ def _drop_times(row: Mapping[str, Scalar]) -> dict[str, str]:
     return {name: repr(value) for name, value in row.items() if "time" not in name}
 
 
-@pytest.mark.parametrize(("bank", "built"), [(8, 8), (100_000, 0)])
-def test_only_small_banks_are_built_in_advance(bank: int, built: int) -> None:
-    p = make_parameters(world={**SHORT["world"], "bank": bank})
-    assert RoverScenario().shared_inputs(p) == tuple(range(built))
+@pytest.mark.parametrize(("bank", "n_built"), [(8, 8), (100_000, 0)])
+def test_only_small_banks_are_built_in_advance(bank: int, n_built: int) -> None:
+    p = make_parameters(world={**SHORT_RUN["world"], "bank": bank})
+    assert RoverScenario().shared_inputs(p) == tuple(range(n_built))

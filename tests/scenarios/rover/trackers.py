@@ -13,8 +13,8 @@ from marsyard.algorithms.vtt import VisualTargetTracker
 from marsyard.sim.measurements import MastCalibration, RoverMeasurements, TargetDesignation
 
 
-class Confident:
-    """The paper's tracker with a position error of 0.3 m to the left, reported as tracked."""
+class OffsetTracker:
+    """The paper's tracker with a position error of 0.3 m to the left; the target is reported as tracked."""
 
     def __init__(self) -> None:
         self.inner = VisualTargetTracker()
@@ -43,8 +43,8 @@ class Confident:
         self.inner.clear()
 
 
-class Blind(Confident):
-    """Finds the target only in the first update."""
+class LosingTracker(OffsetTracker):
+    """Reports the target as lost after the first update."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
@@ -54,7 +54,7 @@ class Blind(Confident):
         return TargetUpdate(TrackingState.FAILURE, (TargetLoss.LOW_MATCH_SCORE,), position)
 
 
-class Wordless(Confident):
+class SilentTracker(OffsetTracker):
     """Returns None for each update."""
 
     def update(self, measurements: RoverMeasurements) -> Any:

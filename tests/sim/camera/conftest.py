@@ -1,4 +1,4 @@
-"""Opportunity's cameras with the values of their labels, for tests without the products."""
+"""Fixtures of the camera tests: Opportunity's cameras with the values of their PDS labels."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def pinhole() -> Cahv:
 
 
 @pytest.fixture
-def labelled() -> dict[str, CameraModel]:
+def labelled_cameras() -> dict[str, CameraModel]:
     """Return the cameras by product name."""
     return {
         "1N491020376ILFCNY9P0706L0M1.IMG": _navcam_376(),
@@ -82,5 +82,5 @@ def labelled() -> dict[str, CameraModel]:
 
 @pytest.fixture(params=[_pinhole, _navcam_376, _navcam_519, _hazcam], ids=["cahv", "navcam", "navcam turned", "hazcam"])
 def camera(request: pytest.FixtureRequest) -> CameraModel:
-    made: CameraModel = request.param()
-    return made
+    model: CameraModel = request.param()
+    return model

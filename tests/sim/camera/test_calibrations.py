@@ -1,4 +1,4 @@
-"""Tests of calibration files of other programs, as published, against OpenCV's projection."""
+"""Tests of reading calibration files of OpenCV, ROS, Kalibr and EuRoC, against OpenCV's projection."""
 
 from __future__ import annotations
 
@@ -163,8 +163,8 @@ def max_opencv_distance_px(
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = camera.c + 1e5 * camera.rays(pixels)[1]
     pose = RigidTransform.identity() if pose is None else pose
-    turn, shift = pose.rotation.as_rotvec(), np.asarray(pose.translation)
-    reference, _ = cv2.projectPoints(points.reshape(-1, 1, 3), turn, shift, matrix, np.array(distortion))
+    rotation, translation = pose.rotation.as_rotvec(), np.asarray(pose.translation)
+    reference, _ = cv2.projectPoints(points.reshape(-1, 1, 3), rotation, translation, matrix, np.array(distortion))
     return float(np.max(np.linalg.norm(reference.reshape(-1, 2) - pixels, axis=1)))
 
 
@@ -174,19 +174,19 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
 
 def test_opencv_file_projects_like_opencv(tmp_path: Path) -> None:
     path = write_file(tmp_path, OPENCV)
-    (read,) = read_calibrations(path)
-    assert isinstance(read.camera, Cahvor)
-    assert read.camera.size == (640, 480)
+    (calibration,) = read_calibrations(path)
+    assert isinstance(calibration.camera, Cahvor)
+    assert calibration.camera.size == (640, 480)
     # OpenCV reads its own file.
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     matrix = storage.getNode("camera_matrix").mat()
     distortion = storage.getNode("distortion_coefficients").mat().ravel()
-    off = max_opencv_distance_px(read.camera, matrix, distortion)
-    # The stated residual, with a margin for positions between its samples.
-    assert off < 1.1 * read.residual.max_px
+    distance_px = max_opencv_distance_px(calibration.camera, matrix, distortion)
+    # The reported residual, with a margin for positions between its samples.
+    assert distance_px < 1.1 * calibration.residual.max_px
     # Less than the reprojection error of the calibration: 0.44 px.
-    assert 0.0 < read.residual.rms_px < 0.2
-    assert read_camera(path) == read.camera
+    assert 0.0 < calibration.residual.rms_px < 0.2
+    assert read_camera(path) == calibration.camera
 
 
 def test_file_of_current_opencv_is_read(tmp_path: Path) -> None:
@@ -197,10 +197,10 @@ def test_file_of_current_opencv_is_read(tmp_path: Path) -> None:
         storage.write(name, value)
     storage.write("distortion_coefficients", distortion)
     storage.release()
-    (read,) = read_calibrations(path)
+    (calibration,) = read_calibrations(path)
     # CAHVOR represents k1 and k2 exactly.
-    assert read.residual.max_px < 1e-9
-    assert max_opencv_distance_px(read.camera, matrix, [*distortion]) < 1e-6
+    assert calibration.residual.max_px < 1e-9
+    assert max_opencv_distance_px(calibration.camera, matrix, [*distortion]) < 1e-6
 
 
 def test_opencv_json_is_read(tmp_path: Path) -> None:
@@ -216,22 +216,22 @@ def test_opencv_json_is_read(tmp_path: Path) -> None:
 
 
 def test_ros_camera_info_is_read(tmp_path: Path) -> None:
-    (read,) = read_calibrations(write_file(tmp_path, ROS))
-    assert read.name == "camera_color"
+    (calibration,) = read_calibrations(write_file(tmp_path, ROS))
+    assert calibration.name == "camera_color"
     data = yaml.safe_load(ROS)
     matrix = np.reshape(data["camera_matrix"]["data"], (3, 3))
-    off = max_opencv_distance_px(read.camera, matrix, data["distortion_coefficients"]["data"])
-    assert off < 1.1 * read.residual.max_px
-    assert read.residual.rms_px < 0.2
+    distance_px = max_opencv_distance_px(calibration.camera, matrix, data["distortion_coefficients"]["data"])
+    assert distance_px < 1.1 * calibration.residual.max_px
+    assert calibration.residual.rms_px < 0.2
 
 
 def test_ros_rational_lens_is_fitted(tmp_path: Path) -> None:
     """The eight coefficients of an Azure Kinect colour camera, scaled to the field of view of this telephone."""
     coefficients = [0.52, -2.6, 4e-4, -2e-4, 1.5, 0.40, -2.4, 1.45]
     text = ROS.replace("[0.09370951394834764, -0.1640721737187069, 0.0, 0.0, 0.1224192868301668]", str(coefficients))
-    (read,) = read_calibrations(write_file(tmp_path, text.replace("cols: 5", "cols: 8")))
+    (calibration,) = read_calibrations(write_file(tmp_path, text.replace("cols: 5", "cols: 8")))
     matrix = np.reshape(yaml.safe_load(ROS)["camera_matrix"]["data"], (3, 3))
-    assert max_opencv_distance_px(read.camera, matrix, coefficients) < 1.1 * read.residual.max_px
+    assert max_opencv_distance_px(calibration.camera, matrix, coefficients) < 1.1 * calibration.residual.max_px
 
 
 def test_kalibr_camera_chain_is_read(tmp_path: Path) -> None:
@@ -259,12 +259,12 @@ def test_euroc_sensor_file_equals_kalibr_camera(tmp_path: Path) -> None:
 
 
 def test_equidistant_lens_projects_like_opencv_fisheye(tmp_path: Path) -> None:
-    (read,) = read_calibrations(write_file(tmp_path, EQUIDISTANT))
-    assert isinstance(read.camera, Cahvore)
-    assert read.residual.max_px < 0.5
-    columns, rows = (np.linspace(-0.5, extent - 0.5, 25) for extent in read.camera.size)
+    (calibration,) = read_calibrations(write_file(tmp_path, EQUIDISTANT))
+    assert isinstance(calibration.camera, Cahvore)
+    assert calibration.residual.max_px < 0.5
+    columns, rows = (np.linspace(-0.5, extent - 0.5, 25) for extent in calibration.camera.size)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    points = 1e5 * read.camera.rays(pixels)[1]
+    points = 1e5 * calibration.camera.rays(pixels)[1]
     data = yaml.safe_load(EQUIDISTANT)["cam0"]
     reference, _ = cv2.fisheye.projectPoints(
         points.reshape(-1, 1, 3),
@@ -273,11 +273,11 @@ def test_equidistant_lens_projects_like_opencv_fisheye(tmp_path: Path) -> None:
         camera_matrix(*data["intrinsics"]),
         np.array(data["distortion_coeffs"]),
     )
-    off = np.linalg.norm(reference.reshape(-1, 2) - pixels, axis=1)
-    assert off.max() < 1.1 * read.residual.max_px
+    distances_px = np.linalg.norm(reference.reshape(-1, 2) - pixels, axis=1)
+    assert distances_px.max() < 1.1 * calibration.residual.max_px
 
 
-def test_fisheye_of_two_terms_is_exact_beyond_a_right_angle() -> None:
+def test_fisheye_with_two_coefficients_is_exact_beyond_90_degrees() -> None:
     """Directions from the formula of Kannala and Brandt, inverted by hand for k1 = k2 = 0: theta = r / f."""
     matrix, size = camera_matrix(300.0, 300.0, 499.5, 499.5), (1000, 1000)
     camera, residual = from_opencv_fisheye(matrix, np.zeros(4), size)
@@ -288,7 +288,7 @@ def test_fisheye_of_two_terms_is_exact_beyond_a_right_angle() -> None:
     assert residual.max_px < 1e-9
 
 
-def test_fisheye_pose_in_the_world() -> None:
+def test_fisheye_pose_is_applied() -> None:
     pose = RigidTransform.from_components([0.1, -0.2, 0.3], Rotation.from_rotvec([0.2, -0.1, 0.4]))
     matrix, size = camera_matrix(300.0, 310.0, 320.0, 240.0), (640, 480)
     camera, _ = from_opencv_fisheye(matrix, np.array([0.01, -0.002, 0.0, 0.0]), size, pose)
@@ -313,7 +313,7 @@ FAULTS = [
     (OPENCV, "4.8679847473271927e-002 ]", "", "is not valid YAML"),
     (ROS, "rational_polynomial", "thin_prism", "distortion_model: 'thin_prism'; allowed: equidistant"),
     (ROS, "0.1224192868301668]", "0.1, 0.2]", "distortion must be none"),
-    (KODAK, "", "", "distortion: the nearest camera of the CAHV family is .* px off over the frame"),
+    (KODAK, "", "", "distortion: the nearest camera of the CAHV family differs by .* px over the frame"),
     (OPENCV, "-2.7762353155161251e-001", "-1.8", "folds over within the frame"),
     (KALIBR, "camera_model: pinhole", "camera_model: omni", "cam0.camera_model: 'omni'; allowed: pinhole"),
     (KALIBR, "  - [0.999997256477881, ", "  - [0.799997256477881, ", "cam1.T_cn_cnm1: is not rigid"),
@@ -334,15 +334,13 @@ def test_errors_name_field_and_allowed_values(tmp_path: Path, text: str, old: st
 
 
 def test_lens_not_representable_by_cahvor_is_rejected(tmp_path: Path) -> None:
-    """Strong decentring is not a shift of the axis: some percent of tangential distortion cause errors of pixels for
-    any O.
-    """
+    """No lens axis O represents a tangential distortion of several percent: the residual is several pixels."""
     text = OPENCV.replace("2.1257384355991209e-003", "0.05").replace("-3.9487502777272009e-004", "-0.04")
-    with pytest.raises(CameraFileError, match=r"px at most; allowed: 0.3 and 3 px; crop the picture"):
+    with pytest.raises(CameraFileError, match=r"px at most; allowed: 0.3 and 3 px; crop the image"):
         read_calibrations(write_file(tmp_path, text))
 
 
-def test_large_files_are_rejected_unread(tmp_path: Path) -> None:
+def test_large_files_are_rejected_without_reading(tmp_path: Path) -> None:
     path = tmp_path / "large.yaml"
     with path.open("wb") as file:
         file.write(b"image_width: 640\n")

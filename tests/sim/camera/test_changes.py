@@ -1,4 +1,4 @@
-"""Tests of camera motion, image changes, linear cameras, construction and immutability."""
+"""Tests of operations on cameras: rigid motion, binning, scaling, cropping, construction and immutability."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def transforms(draw: st.DrawFn) -> RigidTransform:
     return RigidTransform.from_components(draw(arrays(float, 3, elements=st.floats(-2000, 2000))), rotation)
 
 
-def points_before(camera: CameraModel) -> np.ndarray:
+def make_points(camera: CameraModel) -> np.ndarray:
     """Return points over the complete frame at a distance of 4 m."""
     origins, directions = camera.rays(camera.pixel_grid()[::100, ::100])
     return np.asarray(origins + 4 * directions)
 
 
-def vectors(camera: CameraModel) -> np.ndarray:
+def stack_cahv(camera: CameraModel) -> np.ndarray:
     return np.stack([getattr(camera, name) for name in "cahv"])
 
 
-# ----- rigid motion: a group acts -----
+# ----- rigid motion -----
 
 
 def test_moved_camera_projects_moved_points_equally(camera: CameraModel) -> None:
     motion = RigidTransform.from_components([100.0, -20.0, 5.0], Rotation.from_rotvec([0.4, -1.2, 2.0]))
-    points = points_before(camera)
+    points = make_points(camera)
     moved_points = motion.apply(points.reshape(-1, 3)).reshape(points.shape)
     # Points 100 m away are rounded to 1e-14 m; at 4 m and 1200 px/rad this is 4e-12 px.
     assert np.allclose(camera.transform(motion).project(moved_points)[0], camera.project(points)[0], rtol=0, atol=1e-10)
@@ -51,22 +51,24 @@ def test_motions_compose(first: RigidTransform, second: RigidTransform) -> None:
     camera = Cahv.from_field_of_view(0.8, (64, 48), axis=(0, 0, -1), right=(1, 0, 0), centre=(1, 2, 3))
     # Coordinates reach 4000 m: 1e-11 is a few roundings.
     assert np.allclose(
-        vectors(camera.transform(first).transform(second)),
-        vectors(camera.transform(second * first)),
+        stack_cahv(camera.transform(first).transform(second)),
+        stack_cahv(camera.transform(second * first)),
         rtol=0,
         atol=1e-11,
     )
-    assert np.allclose(vectors(camera.transform(first).transform(first.inv())), vectors(camera), rtol=0, atol=1e-11)
+    assert np.allclose(
+        stack_cahv(camera.transform(first).transform(first.inv())), stack_cahv(camera), rtol=0, atol=1e-11
+    )
 
 
 def test_motion_rotates_the_lens(hazcam: Cahvore) -> None:
-    turn = Rotation.from_rotvec([0.3, 0.2, 0.1])
-    moved = hazcam.transform(RigidTransform.from_rotation(turn))
-    assert np.allclose(moved.o, turn.apply(np.array(hazcam.o)), atol=1e-15)
-    assert np.array_equal(moved.r, hazcam.r)
-    assert np.array_equal(moved.e, hazcam.e)
-    assert moved.linearity == hazcam.linearity
-    assert moved.size == hazcam.size
+    rotation = Rotation.from_rotvec([0.3, 0.2, 0.1])
+    transformed = hazcam.transform(RigidTransform.from_rotation(rotation))
+    assert np.allclose(transformed.o, rotation.apply(np.array(hazcam.o)), atol=1e-15)
+    assert np.array_equal(transformed.r, hazcam.r)
+    assert np.array_equal(transformed.e, hazcam.e)
+    assert transformed.linearity == hazcam.linearity
+    assert transformed.size == hazcam.size
 
 
 def test_multiple_motions_are_rejected(navcam: Cahvor) -> None:
@@ -81,33 +83,33 @@ def test_multiple_motions_are_rejected(navcam: Cahvor) -> None:
 def test_binned_pixel_is_at_block_centre(camera: CameraModel, columns: int, rows: int) -> None:
     binned = camera.bin(columns, rows)
     assert binned.size == (1024 // columns, 1024 // rows)
-    points = points_before(camera)
+    points = make_points(camera)
     factors = np.array([columns, rows])
     expected = (camera.project(points)[0] - (factors - 1) / 2) / factors
     assert np.allclose(binned.project(points)[0], expected, rtol=0, atol=1e-10)
 
 
 def test_binning_agrees_with_averaged_rays(navcam: Cahvor) -> None:
-    """The centre of four pixels looks between their directions, exact except for curvature over half a pixel."""
+    """The ray of a binned pixel is the mean of its four rays, except for the curvature over half a pixel."""
     grid = navcam.pixel_grid()[500:502, 300:302].reshape(-1, 2)
-    between = navcam.rays(grid)[1].mean(axis=0)
+    mean_ray = navcam.rays(grid)[1].mean(axis=0)
     direction = navcam.bin(2, 2).rays(np.array([150.0, 250.0]))[1]
-    assert np.allclose(between / np.linalg.norm(between), direction, atol=1e-9)
+    assert np.allclose(mean_ray / np.linalg.norm(mean_ray), direction, atol=1e-9)
 
 
-def test_scaling_keeps_the_frame_edges(camera: CameraModel) -> None:
-    points = points_before(camera)
+def test_scaling_preserves_the_frame_edges(camera: CameraModel) -> None:
+    points = make_points(camera)
     for factor in (0.5, 0.25, 2, 1.7):
         scaled = camera.scale(factor)
         expected = (camera.project(points)[0] + 0.5) * factor - 0.5
         assert np.allclose(scaled.project(points)[0], expected, rtol=0, atol=1e-9)
         assert scaled.size == (round(1024 * factor), round(1024 * factor))
-    assert np.allclose(vectors(camera.scale(0.25)), vectors(camera.bin(4, 4)), rtol=0, atol=1e-12)
+    assert np.allclose(stack_cahv(camera.scale(0.25)), stack_cahv(camera.bin(4, 4)), rtol=0, atol=1e-12)
 
 
 def test_cropping_moves_the_origin(camera: CameraModel) -> None:
     cropped = camera.crop(100, 37, (512, 256))
-    points = points_before(camera)
+    points = make_points(camera)
     assert cropped.size == (512, 256)
     assert np.allclose(cropped.project(points)[0], camera.project(points)[0] - [100, 37], rtol=0, atol=1e-10)
 
@@ -115,13 +117,13 @@ def test_cropping_moves_the_origin(camera: CameraModel) -> None:
 @given(st.integers(0, 20), st.integers(0, 30), st.sampled_from([1, 2, 4]), st.sampled_from([1, 2, 4]))
 def test_cropping_and_binning_commute(column: int, row: int, columns: int, rows: int) -> None:
     camera = Cahv.from_field_of_view(1.0, (256, 256), axis=(0, 0, -1), right=(1, 0, 0))
-    one = camera.crop(column * columns, row * rows, (32 * columns, 16 * rows)).bin(columns, rows)
-    other = camera.bin(columns, rows).crop(column, row, (32, 16))
-    assert one.size == other.size
-    assert np.allclose(vectors(one), vectors(other), rtol=0, atol=1e-12)
+    cropped_first = camera.crop(column * columns, row * rows, (32 * columns, 16 * rows)).bin(columns, rows)
+    binned_first = camera.bin(columns, rows).crop(column, row, (32, 16))
+    assert cropped_first.size == binned_first.size
+    assert np.allclose(stack_cahv(cropped_first), stack_cahv(binned_first), rtol=0, atol=1e-12)
 
 
-def test_changes_keep_the_lens(hazcam: Cahvore) -> None:
+def test_changes_preserve_the_lens(hazcam: Cahvore) -> None:
     changed = hazcam.crop(1, 2, (512, 256)).bin(2, 2).scale(3)
     for name in "caore":
         assert np.array_equal(getattr(changed, name), getattr(hazcam, name))
@@ -138,19 +140,19 @@ def test_invalid_changes_are_rejected(navcam: Cahvor) -> None:
     with pytest.raises(ValueError, match="size"):
         navcam.scale(1e-6)
     for column, row, size in ((-1, 0, (4, 4)), (0, 1020, (4, 5)), (1024, 0, (1, 1))):
-        with pytest.raises(ValueError, match="leaves the frame"):
+        with pytest.raises(ValueError, match="extends beyond the frame"):
             navcam.crop(column, row, size)
     with pytest.raises(ValueError, match="size"):
         navcam.crop(0, 0, (0, 4))
 
 
-# ----- linear stand-ins -----
+# ----- mirrored camera -----
 
 
-def test_mirrored_camera_keeps_its_handedness(navcam: Cahvor) -> None:
+def test_mirrored_camera_preserves_its_handedness(navcam: Cahvor) -> None:
     mirrored = dataclasses.replace(navcam, h=1023 * navcam.a - navcam.h)
     assert mirrored.theta > 0
-    points = points_before(navcam)
+    points = make_points(navcam)
     expected = navcam.project(points)[0]
     expected[..., 0] = 1023 - expected[..., 0]
     assert np.allclose(mirrored.project(points)[0], expected, rtol=0, atol=1e-9)
@@ -161,7 +163,7 @@ def test_mirrored_camera_keeps_its_handedness(navcam: Cahvor) -> None:
 # ----- construction -----
 
 
-def test_camera_from_focal_length_and_pitch() -> None:
+def test_camera_from_focal_length_and_pitch_matches_the_navcam() -> None:
     """MER's navcam: 14.67 mm, 12 um pixels, 45 degrees across 1024 (Maki et al. 2003)."""
     camera = Cahv.from_focal_length(14.67e-3, 12e-6, (1024, 1024), axis=(1, 0, 0), right=(0, -1, 0), centre=(0, 0, 1.5))
     assert camera.focal_lengths == pytest.approx((1222.5, 1222.5))
@@ -188,10 +190,10 @@ def test_field_of_view_includes_the_outer_edges() -> None:
     left, right = camera.rays(np.array([[-0.5, 24.5], [99.5, 24.5]]))[1]
     assert math.degrees(math.acos(left @ right)) == pytest.approx(60)
     assert camera.focal_lengths[0] == pytest.approx(camera.focal_lengths[1])
-    both = Cahv.from_field_of_view(1.0, (100, 50), vertical_rad=0.8, axis=(0, 0, 1), right=(1, 0, 0))
-    upper, lower = both.rays(np.array([[49.5, -0.5], [49.5, 49.5]]))[1]
+    with_vertical = Cahv.from_field_of_view(1.0, (100, 50), vertical_rad=0.8, axis=(0, 0, 1), right=(1, 0, 0))
+    upper, lower = with_vertical.rays(np.array([[49.5, -0.5], [49.5, 49.5]]))[1]
     assert math.acos(upper @ lower) == pytest.approx(0.8)
-    assert np.allclose(both.boresight(), (0, 0, 1))
+    assert np.allclose(with_vertical.boresight(), (0, 0, 1))
 
 
 def test_invalid_construction_is_rejected() -> None:
@@ -237,7 +239,7 @@ def test_invalid_linearity_is_rejected(hazcam: Cahvore, linearity: float) -> Non
         dataclasses.replace(hazcam, linearity=linearity)
 
 
-# ----- a camera is a value -----
+# ----- immutability and equality -----
 
 
 def test_cameras_are_immutable(camera: CameraModel) -> None:
@@ -263,11 +265,11 @@ def copy_by_pickle(camera: CameraModel) -> CameraModel:
 @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, copy_by_pickle])
 def test_copies_are_equal_and_immutable(camera: CameraModel, duplicate: Callable[[CameraModel], CameraModel]) -> None:
     camera.rays(np.zeros(2))  # fills the cache
-    twin = duplicate(camera)
-    assert twin == camera
-    assert hash(twin) == hash(camera)
-    assert not twin.c.flags.writeable
-    assert twin in {camera}
+    copied = duplicate(camera)
+    assert copied == camera
+    assert hash(copied) == hash(camera)
+    assert not copied.c.flags.writeable
+    assert copied in {camera}
 
 
 def test_different_cameras_differ(navcam: Cahvor, pinhole: Cahv) -> None:
@@ -278,7 +280,7 @@ def test_different_cameras_differ(navcam: Cahvor, pinhole: Cahv) -> None:
     assert dataclasses.replace(navcam, c=np.array([0.0, 0, 0])) == dataclasses.replace(navcam, c=np.array([-0.0, 0, 0]))
 
 
-def test_derived_quantities_of_the_navcam(navcam: Cahvor) -> None:
+def test_derived_quantities_match_the_formulas_of_cmod(navcam: Cahvor) -> None:
     """Compare with the formulas of cmod_cahv_internal, which assume a unit vector A (six digits in the label)."""
     hs, vs = navcam.focal_lengths
     hc, vc = navcam.image_centre
@@ -286,8 +288,10 @@ def test_derived_quantities_of_the_navcam(navcam: Cahvor) -> None:
     assert vs == pytest.approx(np.linalg.norm(np.cross(navcam.a, navcam.v)), rel=2e-6)
     assert hc == pytest.approx(navcam.a @ navcam.h, rel=3e-6)
     assert vc == pytest.approx(navcam.a @ navcam.v, rel=3e-6)
-    across, along = np.cross(navcam.a, navcam.v), np.cross(navcam.a, navcam.h)
-    assert navcam.theta == pytest.approx(math.atan2(np.cross(navcam.v, navcam.h) @ navcam.a, across @ along), abs=1e-8)
+    a_cross_v, a_cross_h = np.cross(navcam.a, navcam.v), np.cross(navcam.a, navcam.h)
+    assert navcam.theta == pytest.approx(
+        math.atan2(np.cross(navcam.v, navcam.h) @ navcam.a, a_cross_v @ a_cross_h), abs=1e-8
+    )
     assert np.allclose(hs * navcam.right + hc * navcam.a, navcam.h, atol=1e-2)
     half_angles = np.arccos(navcam.corner_rays()[1] @ navcam.boresight())
     assert np.degrees(2 * half_angles.max()) == pytest.approx(61.4, abs=0.1)  # 45 x 45 degrees, along the diagonal

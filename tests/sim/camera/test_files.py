@@ -1,4 +1,4 @@
-"""Tests of camera files: Opportunity's labels, round trips and error messages."""
+"""Tests of camera files: PDS3 labels, JPL's CAHVOR text files, round trips and error messages."""
 
 from __future__ import annotations
 
@@ -100,8 +100,8 @@ def write_file(folder: Path, text: str, name: str = "camera.cahvor") -> Path:
 # ----- PDS3 labels -----
 
 
-def test_opportunity_labels_are_read(labelled: dict[str, CameraModel], shared_data: Path) -> None:
-    for name, expected in labelled.items():
+def test_opportunity_labels_are_read(labelled_cameras: dict[str, CameraModel], shared_data: Path) -> None:
+    for name, expected in labelled_cameras.items():
         label = shared_data / "mer_opportunity" / name
         assert read_camera(label) == expected
         assert read_cameras(str(label)) == (expected,)
@@ -146,7 +146,7 @@ def test_label_with_several_models_needs_a_selection(tmp_path: Path) -> None:
         read_camera(path)
 
 
-def test_subframes_are_rejected_unless_folded_in(tmp_path: Path) -> None:
+def test_subframes_require_subframe_folded_in(tmp_path: Path) -> None:
     for field in ("  FIRST_LINE     ", "  FIRST_LINE_SAMPLE ", "  PIXEL_AVERAGING_HEIGHT", "  PIXEL_AVERAGING_WIDTH"):
         lines = [line[:-1] + "2" if line.startswith(field) else line for line in LABEL.splitlines()]
         path = write_file(tmp_path, "\n".join(lines) + "\n")
@@ -306,7 +306,7 @@ def test_missing_files_and_unknown_formats_are_rejected(tmp_path: Path) -> None:
 
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from([TEXT, LABEL]), st.integers(0, 1700), st.binary(min_size=0, max_size=12), st.integers(0, 30))
-def test_damaged_files_never_crash_the_reader(tmp_path: Path, text: str, at: int, junk: bytes, removed: int) -> None:
+def test_damaged_files_raise_camera_file_errors(tmp_path: Path, text: str, at: int, junk: bytes, removed: int) -> None:
     full = text.encode("latin-1")
     path = tmp_path / "damaged"
     path.write_bytes(full[:at] + junk + full[at + removed :])
@@ -340,7 +340,7 @@ def test_curiosity_labels_are_read(tmp_path: Path, ending: str) -> None:
         ("AVERAGING_WIDTH           = 1", "AVERAGING_WIDTH           = 2 <pixel>", "PIXEL_AVERAGING_WIDTH: 2"),
     ],
 )
-def test_curiosity_subframes_must_be_folded_in(tmp_path: Path, old: str, new: str, field: str) -> None:
+def test_curiosity_subframes_require_subframe_folded_in(tmp_path: Path, old: str, new: str, field: str) -> None:
     path = tmp_path / "curiosity.lbl"
     path.write_text(CURIOSITY.replace(old, new))
     with pytest.raises(CameraFileError, match=field):
@@ -349,15 +349,15 @@ def test_curiosity_subframes_must_be_folded_in(tmp_path: Path, old: str, new: st
 
 
 def test_text_files_without_dimensions_use_the_given_size(tmp_path: Path) -> None:
-    stated, unstated = tmp_path / "stated.cahvor", tmp_path / "unstated.cahvor"
-    stated.write_text(TEXT)
-    unstated.write_text(TEXT.replace("Dimensions = 1024 1024\n", ""))
+    with_size, without_size = tmp_path / "stated.cahvor", tmp_path / "unstated.cahvor"
+    with_size.write_text(TEXT)
+    without_size.write_text(TEXT.replace("Dimensions = 1024 1024\n", ""))
     with pytest.raises(CameraFileError, match=r"Dimensions: missing; allowed: a line .* or size = \[columns, rows\]"):
-        read_cameras(unstated)
-    assert read_cameras(unstated, size=(1024, 1024)) == read_cameras(stated)
+        read_cameras(without_size)
+    assert read_cameras(without_size, size=(1024, 1024)) == read_cameras(with_size)
     with pytest.raises(CameraFileError, match="Dimensions: 1024 1024; allowed: the given size, 512 512"):
-        read_cameras(stated, size=(512, 512))
+        read_cameras(with_size, size=(512, 512))
     campaign: TypeAdapter[CustomCamera] = TypeAdapter(CustomCameraChoice)
-    assert campaign.validate_python({"file": str(unstated), "size": [1024, 1024]}).size == (1024, 1024)
+    assert campaign.validate_python({"file": str(without_size), "size": [1024, 1024]}).size == (1024, 1024)
     with pytest.raises(ValueError, match=r"size is \[1024\]; allowed: \[columns, rows\]"):
-        campaign.validate_python({"file": str(unstated), "size": [1024]})
+        campaign.validate_python({"file": str(without_size), "size": [1024]})

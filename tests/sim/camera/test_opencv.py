@@ -1,4 +1,4 @@
-"""Tests of the conversion from OpenCV against OpenCV."""
+"""Tests of the conversion of OpenCV camera models, against OpenCV's projection."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def make_far_points(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
 
 
 def sample_frame(camera: CameraModel) -> np.ndarray:
-    """Return the pixels for which the residual is stated."""
+    """Return the pixels at which `from_opencv` computes its residual."""
     columns, rows = (np.linspace(-0.5, extent - 0.5, 33) for extent in camera.size)
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
@@ -59,7 +59,7 @@ def test_full_distortion_from_opencv_is_fitted() -> None:
     assert np.linalg.norm(camera.o - camera.a) > 1e-4  # the lens axis is tilted to represent p1 and p2
 
 
-def test_skew_of_the_matrix_is_kept() -> None:
+def test_skew_of_the_matrix_is_preserved() -> None:
     skewed = MATRIX + np.array([[0, 2.0, 0], [0, 0, 0], [0, 0, 0]])
     camera, _ = from_opencv(skewed, np.zeros(0), (1280, 720))
     point = np.array([0.2, -0.1, 1.0])

@@ -89,7 +89,7 @@ LABEL = """<?xml version="1.0" encoding="UTF-8"?>
   </File_Area_Observational>
 </Product_Observational>
 """
-WHOLE = LABEL.replace(">953<", ">1<").replace(">1273<", ">1<")
+FULL_FRAME = LABEL.replace(">953<", ">1<").replace(">1273<", ">1<")
 
 
 def write_label(folder: Path, text: str) -> Path:
@@ -107,36 +107,36 @@ def test_mars_2020_navcam_is_read(tmp_path: Path) -> None:
     assert np.array_equal(camera.h, [-3229.43, 141.993, 229.563])
     assert np.array_equal(camera.r, [1.736e-06, 0.0501396, -0.0171254])
     assert np.array_equal(camera.e, [-8.0e-09, 1.0e-08, -2.9e-08])
-    # The label states the fields of view of the subframe; they follow from the model within the label's definition of
-    # width.
+    # The label lists the field of view of the subframe. Its definition of the width differs by up to 2 %.
     middle = np.array([647.5, 487.5])
-    for ends, stated_deg in (([[-0.5, 487.5], [1295.5, 487.5]], 24.7326), ([[647.5, -0.5], [647.5, 975.5]], 18.6047)):
-        first, last = camera.rays(np.array(ends))[1]
-        assert np.degrees(np.arccos(first @ last)) == pytest.approx(stated_deg, rel=0.02)
+    for edges, fov_deg in (([[-0.5, 487.5], [1295.5, 487.5]], 24.7326), ([[647.5, -0.5], [647.5, 975.5]], 18.6047)):
+        first, last = camera.rays(np.array(edges))[1]
+        assert np.degrees(np.arccos(first @ last)) == pytest.approx(fov_deg, rel=0.02)
     assert np.all(np.isfinite(camera.rays(middle)[1]))
-    # Folded in, with the first sample of the subframe, the image centre is near the centre of the 5120 x 3840 detector.
+    # The model refers to the subframe: with the subframe's first sample and line added, the image centre is near the
+    # centre of the 5120 x 3840 detector.
     hc, vc = camera.image_centre
     assert hc + 1272 == pytest.approx(2560, rel=0.02)
     assert vc + 952 == pytest.approx(1920, rel=0.02)
 
 
-def test_subframes_are_rejected_unless_folded_in(tmp_path: Path) -> None:
+def test_subframes_require_subframe_folded_in(tmp_path: Path) -> None:
     with pytest.raises(CameraFileError, match=r"Subframe.first_line: 953.*subframe_folded_in = true"):
         read_cameras(write_label(tmp_path, LABEL))
-    binned = WHOLE.replace('<img:height_pixels unit="pixel">1', '<img:height_pixels unit="pixel">2')
+    binned = FULL_FRAME.replace('<img:height_pixels unit="pixel">1', '<img:height_pixels unit="pixel">2')
     with pytest.raises(CameraFileError, match=r"Downsampling.height_pixels: 2"):
         read_cameras(write_label(tmp_path, binned))
-    assert read_cameras(write_label(tmp_path, WHOLE))[0].size == (1296, 976)
+    assert read_cameras(write_label(tmp_path, FULL_FRAME))[0].size == (1296, 976)
 
 
 def test_namespace_prefixes_are_ignored(tmp_path: Path) -> None:
-    other = WHOLE.replace("geom:", "g:").replace("xmlns:g:", "xmlns:g").replace('xmlns:geom="', 'xmlns:g="')
-    assert read_camera(write_label(tmp_path, other)) == read_camera(write_label(tmp_path, WHOLE))
+    other_prefix = FULL_FRAME.replace("geom:", "g:").replace("xmlns:g:", "xmlns:g").replace('xmlns:geom="', 'xmlns:g="')
+    assert read_camera(write_label(tmp_path, other_prefix)) == read_camera(write_label(tmp_path, FULL_FRAME))
 
 
 def test_cahvor_and_cahv_are_read(tmp_path: Path) -> None:
     for name, kind in (("CAHVOR", Cahvor), ("CAHV", Cahv)):
-        text = WHOLE.replace(">CAHVORE<", f">{name}<").replace("CAHVORE_Model", f"{name}_Model")
+        text = FULL_FRAME.replace(">CAHVORE<", f">{name}<").replace("CAHVORE_Model", f"{name}_Model")
         camera = read_camera(write_label(tmp_path, text))
         assert isinstance(camera, kind)
         assert np.array_equal(camera.v, [-168.067, 400.716, 3088.89])
@@ -163,8 +163,8 @@ FAULTS = [
 
 @pytest.mark.parametrize(("old", "new", "fault"), FAULTS, ids=[f"{old!r} {new!r}" for old, new, _ in FAULTS])
 def test_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
-    assert old in WHOLE
+    assert old in FULL_FRAME
     with pytest.raises(CameraFileError, match=fault) as raised:
-        read_pds4(write_label(tmp_path, WHOLE.replace(old, new)))
+        read_pds4(write_label(tmp_path, FULL_FRAME.replace(old, new)))
     assert "label.xml" in str(raised.value)
     assert "allowed" in str(raised.value)

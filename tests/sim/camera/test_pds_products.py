@@ -1,4 +1,4 @@
-"""Tests of images in PDS3 products, against the statistics in Opportunity's labels and synthetic products."""
+"""Tests that images and poses of PDS3 products are read: Opportunity's products and synthetic products."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_all_sample_types_are_read(tmp_path: Path, sample: str, pointer: str, ki
         ({"kind": "IEEE_REAL"}, "SAMPLE_TYPE, SAMPLE_BITS: IEEE_REAL, 16; allowed: integers of 8 or 16 bits"),
         ({"bits": 32}, "MSB_INTEGER, 32"),
         ({"pointer": "4"}, "ends after 0 bytes; allowed: 4 x 3 samples"),
-        ({"counts": np.full((3, 4), -1)}, "holds counts down to -1"),
+        ({"counts": np.full((3, 4), -1)}, "contains counts down to -1"),
         ({"quaternion": "(1.0, 1.0, 0.0, 0.0)"}, "is not of length 1"),
         ({"quaternion": "(1.0, 0.0)"}, "4 numbers"),
     ],
@@ -105,7 +105,7 @@ def test_opportunity_images_match_label_statistics(
 
 
 @pytest.mark.parametrize(
-    ("pointer", "before"),
+    ("pointer", "offset_bytes"),
     [
         ('("made_data.IMG", 3)', 1024),
         ('("made_data.IMG", 101 <BYTES>)', 100),
@@ -113,19 +113,19 @@ def test_opportunity_images_match_label_statistics(
         ('"made_data.IMG"', 0),
     ],
 )
-def test_images_with_detached_label_are_read(tmp_path: Path, pointer: str, before: int) -> None:
-    """The pose group of Curiosity is read as well."""
+def test_images_with_detached_label_are_read(tmp_path: Path, pointer: str, offset_bytes: int) -> None:
+    """The label also contains the pose in the group of Curiosity's labels."""
     label = LABEL.replace("PDS_VERSION_ID = PDS3", "ODL_VERSION_ID = ODL3")
     label = label.replace("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
     path = tmp_path / "made.LBL"
     path.write_text(label.format(pointer=pointer, kind="MSB_INTEGER", bits=16, quaternion="(1.0, 0.0, 0.0, 0.0)"))
     data = tmp_path / ("MADE_DATA.IMG" if "MADE" in pointer else "made_data.IMG")
-    data.write_bytes(bytes(before) + COUNTS.astype(">i2").tobytes())
+    data.write_bytes(bytes(offset_bytes) + COUNTS.astype(">i2").tobytes())
     result = read_pds3_product(path)
     assert np.array_equal(result.counts, COUNTS)
     assert result.site_from_rover is not None
     assert np.allclose(result.site_from_rover.translation, [1.0, 2.0, 3.0])
-    data.write_bytes(bytes(before) + b"cut")
+    data.write_bytes(bytes(offset_bytes) + b"cut")
     with pytest.raises(CameraFileError, match="IMAGE: ends after 3 bytes"):
         read_pds3_product(path)
     data.unlink()
@@ -134,5 +134,5 @@ def test_images_with_detached_label_are_read(tmp_path: Path, pointer: str, befor
 
 
 def test_image_in_another_folder_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(CameraFileError, match=r"names '\.\./made\.img', a file elsewhere; allowed: a file next to"):
+    with pytest.raises(CameraFileError, match=r"'\.\./made\.img' is in another folder; allowed: a file next to"):
         read_pds3_product(write_product(tmp_path, pointer='("../made.img", 3)'))

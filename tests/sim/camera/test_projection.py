@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 
-# ----- plausible cameras -----
+# ----- random cameras -----
 
 
 @st.composite
@@ -31,8 +31,8 @@ def cahv_cameras(draw: st.DrawFn) -> Cahv:
 
 
 def tilt_axis(axis: np.ndarray, tilt: np.ndarray) -> np.ndarray:
-    moved = axis + tilt
-    return np.asarray(moved / np.linalg.norm(moved))
+    tilted = axis + tilt
+    return np.asarray(tilted / np.linalg.norm(tilted))
 
 
 tilts = arrays(float, 3, elements=st.floats(-0.03, 0.03))
@@ -61,15 +61,16 @@ cameras = st.one_of(cahv_cameras(), cahvor_cameras(), cahvore_cameras())
 fractions = arrays(float, (4, 2), elements=st.floats(0, 1))
 
 
-def scale_to_pixels(camera: CameraModel, parts: np.ndarray) -> np.ndarray:
-    return np.asarray(parts * np.array(camera.size) - 0.5)
+def pixels_from_fractions(camera: CameraModel, uv: np.ndarray) -> np.ndarray:
+    """Pixels at fractions `uv` (0 to 1) of the frame width and height."""
+    return np.asarray(uv * np.array(camera.size) - 0.5)
 
 
-# ----- closure -----
+# ----- projection and rays are inverse -----
 
 
 @pytest.mark.parametrize("distance", [0.5, 10.0, 1e4])
-def test_real_cameras_invert_over_the_frame(camera: CameraModel, distance: float) -> None:
+def test_projection_inverts_rays_of_real_cameras(camera: CameraModel, distance: float) -> None:
     pixels = camera.pixel_grid()
     origins, directions = camera.rays(pixels)
     repeated, visible = camera.project(origins + distance * directions)
@@ -80,20 +81,20 @@ def test_real_cameras_invert_over_the_frame(camera: CameraModel, distance: float
 
 
 @given(cameras, fractions, st.floats(0.5, 1e5))
-def test_random_cameras_invert(camera: CameraModel, parts: np.ndarray, distance: float) -> None:
-    pixels = scale_to_pixels(camera, parts)
+def test_projection_inverts_rays_of_random_cameras(camera: CameraModel, uv: np.ndarray, distance: float) -> None:
+    pixels = pixels_from_fractions(camera, uv)
     origins, directions = camera.rays(pixels)
-    reached = np.isfinite(directions).all(axis=-1)
+    has_ray = np.isfinite(directions).all(axis=-1)
     repeated, visible = camera.project(origins + distance * directions)
-    assert np.array_equal(visible, reached)
+    assert np.array_equal(visible, has_ray)
     # C is up to 5000 m away: a point at 0.5 m is rounded by 1e-12 m, or 1e-7 px for 4e4 px/rad (2048 px in 0.05 rad).
     # Near the end of the polynomial's range the inverse direction loses digits, but the pixel does not.
-    assert np.max(np.abs(repeated - pixels)[reached], initial=0) < 1e-6
+    assert np.max(np.abs(repeated - pixels)[has_ray], initial=0) < 1e-6
 
 
 @given(cameras, fractions)
-def test_directions_are_unit_vectors(camera: CameraModel, parts: np.ndarray) -> None:
-    directions = camera.rays(scale_to_pixels(camera, parts))[1]
+def test_directions_are_unit_vectors(camera: CameraModel, uv: np.ndarray) -> None:
+    directions = camera.rays(pixels_from_fractions(camera, uv))[1]
     observed = directions[np.isfinite(directions).all(axis=-1)]
     assert np.allclose(np.linalg.norm(observed, axis=-1), 1, rtol=0, atol=1e-15 * 4)
 
@@ -101,13 +102,13 @@ def test_directions_are_unit_vectors(camera: CameraModel, parts: np.ndarray) -> 
 def test_rays_of_cahvore_start_on_the_optical_axis(hazcam: Cahvore) -> None:
     origins, _ = hazcam.rays(hazcam.pixel_grid()[::64, ::64])
     shift = origins - hazcam.c
-    along = shift @ hazcam.o
+    axis_distance = shift @ hazcam.o
     # The length of O is 1 within 1e-6, as labelled; the largest shift is about 10 mm.
-    assert np.allclose(shift, along[..., np.newaxis] * hazcam.o, atol=2e-8)
-    assert along.max() > 1e-3
+    assert np.allclose(shift, axis_distance[..., np.newaxis] * hazcam.o, atol=2e-8)
+    assert axis_distance.max() > 1e-3
 
 
-# ----- the reference: JPL's cmod, scalar and literal -----
+# ----- reference: scalar translation of JPL's cmod -----
 
 
 def project_with_cmod_cahvor(camera: Cahvor, point: np.ndarray) -> tuple[float, float]:
@@ -117,8 +118,8 @@ def project_with_cmod_cahvor(camera: Cahvor, point: np.ndarray) -> tuple[float, 
     lambda_ = difference - omega * camera.o
     tau = (lambda_ @ lambda_) / (omega * omega)
     mu = camera.r[0] + camera.r[1] * tau + camera.r[2] * tau * tau
-    moved = difference + mu * lambda_
-    alpha, beta, gamma = moved @ camera.a, moved @ camera.h, moved @ camera.v
+    distorted = difference + mu * lambda_
+    alpha, beta, gamma = distorted @ camera.a, distorted @ camera.h, distorted @ camera.v
     return beta / alpha, gamma / alpha
 
 
@@ -145,7 +146,7 @@ def project_with_cmod_cahvore(camera: Cahvore, point: np.ndarray) -> tuple[float
         step = (zeta * sine - lambda_ * cosine - (theta - sine) * series) / upsilon
         theta -= step
     if theta < 1e-8:
-        moved = difference
+        distorted = difference
     else:
         linear = camera.linearity * theta
         if camera.linearity < -1e-15:
@@ -155,8 +156,8 @@ def project_with_cmod_cahvore(camera: Cahvore, point: np.ndarray) -> tuple[float
         else:
             chi = theta
         mu = camera.r[0] + camera.r[1] * chi**2 + camera.r[2] * chi**4
-        moved = lambda_ / chi * camera.o + (1 + mu) * lambda3
-    alpha, beta, gamma = moved @ camera.a, moved @ camera.h, moved @ camera.v
+        distorted = lambda_ / chi * camera.o + (1 + mu) * lambda3
+    alpha, beta, gamma = distorted @ camera.a, distorted @ camera.h, distorted @ camera.v
     return beta / alpha, gamma / alpha
 
 
@@ -169,8 +170,8 @@ def project_with_cmod(camera: Cahvor | Cahvore, point: np.ndarray) -> tuple[floa
 
 
 @given(st.one_of(cahvor_cameras(), cahvore_cameras()), fractions, st.floats(1, 1e4))
-def test_projection_matches_cmod(camera: Cahvor | Cahvore, parts: np.ndarray, distance: float) -> None:
-    origins, directions = camera.rays(scale_to_pixels(camera, parts))
+def test_projection_matches_cmod(camera: Cahvor | Cahvore, uv: np.ndarray, distance: float) -> None:
+    origins, directions = camera.rays(pixels_from_fractions(camera, uv))
     points = (origins + distance * directions)[np.isfinite(directions).all(axis=-1)]
     expected = np.array([project_with_cmod(camera, point) for point in points]).reshape(-1, 2)
     # Rounding of points 5000 m away, as above.
@@ -188,19 +189,19 @@ def test_projection_of_real_cameras_matches_cmod(navcam: Cahvor, hazcam: Cahvore
         assert np.max(np.abs(camera.project(points)[0] - expected)) < 2e-4
 
 
-def test_navcam_rays_follow_the_papers_equations(pinhole: Cahv) -> None:
-    """The centre of CAHV's image plane looks along A; one column to the right adds 1 / hs."""
+def test_pinhole_rays_match_the_cahv_equations(pinhole: Cahv) -> None:
+    """The ray of the image centre is A; one column to the right adds 1 / hs to the tangent of the angle."""
     hc, vc = pinhole.image_centre
     hs, _ = pinhole.focal_lengths
-    straight, adjacent = pinhole.rays(np.array([[hc, vc], [hc + 1, vc]]))[1]
-    assert np.allclose(straight, pinhole.a, atol=1e-6)  # A is labelled to six digits
-    assert math.isclose(math.atan(1 / hs), math.acos(straight @ adjacent), rel_tol=1e-5)
+    centre_ray, next_column_ray = pinhole.rays(np.array([[hc, vc], [hc + 1, vc]]))[1]
+    assert np.allclose(centre_ray, pinhole.a, atol=1e-6)  # A is labelled to six digits
+    assert math.isclose(math.atan(1 / hs), math.acos(centre_ray @ next_column_ray), rel_tol=1e-5)
 
 
 # ----- limits -----
 
 
-def test_points_behind_are_not_visible(camera: CameraModel) -> None:
+def test_points_behind_the_camera_are_not_visible(camera: CameraModel) -> None:
     behind = camera.c - 5 * camera.a + np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
     pixels, visible = camera.project(behind)
     assert not visible.any()
@@ -233,8 +234,8 @@ def test_distortion_does_not_fold_back() -> None:
 def test_pixels_beyond_distortion_range_have_no_ray() -> None:
     camera = make_folding_camera()
     hc, vc = camera.image_centre
-    reach = 100 * 2 / 3 * math.sqrt(1 / 0.6)
-    directions = camera.rays(np.array([[hc + 0.9999 * reach, vc], [hc + 1.0001 * reach, vc]]))[1]
+    max_radius_px = 100 * 2 / 3 * math.sqrt(1 / 0.6)
+    directions = camera.rays(np.array([[hc + 0.9999 * max_radius_px, vc], [hc + 1.0001 * max_radius_px, vc]]))[1]
     assert np.isfinite(directions[0]).all()
     assert np.isnan(directions[1]).all()
 
@@ -242,8 +243,8 @@ def test_pixels_beyond_distortion_range_have_no_ray() -> None:
 @pytest.mark.parametrize(
     "r", [(0.0, -0.2, 0.0), (0.0, 0.3, -0.05), (0.0, -0.3, 0.06), (-0.5, 0.0, 0.0), (0.1, 2.0, 3.0)]
 )
-def test_inverse_reaches_every_angle_up_to_the_limit(r: tuple[float, float, float]) -> None:
-    """Includes polynomials with an inflection, where plain Newton iteration leaves the valid range."""
+def test_rays_exist_up_to_the_distortion_limit(r: tuple[float, float, float]) -> None:
+    """Includes polynomials with an inflection, where an unbounded Newton iteration leaves the valid range."""
     cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
     camera = Cahvor.from_cahv(cahv, r=r)
     chi = np.concatenate([np.geomspace(1e-9, 1e-3, 30), np.linspace(0.002, 8, 2000)])
@@ -255,9 +256,9 @@ def test_inverse_reaches_every_angle_up_to_the_limit(r: tuple[float, float, floa
     scale = np.maximum(np.abs(pixels[visible]), 1e4)  # the strongest polynomial reaches 1e7 px
     assert np.max(np.abs(repeated - pixels[visible]) / scale) < 1e-14
     slope = 1 + r[0] + 3 * r[1] * chi**2 + 5 * r[2] * chi**4
-    first_fall = np.argmax(slope <= 0) if (slope <= 0).any() else len(chi)
-    assert visible[:first_fall].all()
-    assert not visible[first_fall:].any()
+    first_invalid = np.argmax(slope <= 0) if (slope <= 0).any() else len(chi)
+    assert visible[:first_invalid].all()
+    assert not visible[first_invalid:].any()
 
 
 def test_fisheye_covers_more_than_ninety_degrees(hazcam: Cahvore) -> None:
@@ -275,12 +276,12 @@ def test_fisheye_covers_more_than_ninety_degrees(hazcam: Cahvore) -> None:
 
 
 def test_cahvore_with_linearity_one_equals_cahvor(navcam: Cahvor) -> None:
-    same = Cahvore(
+    cahvore = Cahvore(
         navcam.c, navcam.a, navcam.h, navcam.v, navcam.o, navcam.r, np.zeros(3), linearity=1, size=navcam.size
     )
     points = navcam.c + 7 * navcam.rays(navcam.pixel_grid()[::50, ::50])[1]
-    assert np.allclose(same.project(points)[0], navcam.project(points)[0], rtol=0, atol=1e-9)
-    assert np.allclose(same.projection_jacobian(points), navcam.projection_jacobian(points), rtol=0, atol=1e-9)
+    assert np.allclose(cahvore.project(points)[0], navcam.project(points)[0], rtol=0, atol=1e-9)
+    assert np.allclose(cahvore.projection_jacobian(points), navcam.projection_jacobian(points), rtol=0, atol=1e-9)
 
 
 # ----- the Jacobian -----
@@ -289,23 +290,23 @@ def test_cahvore_with_linearity_one_equals_cahvor(navcam: Cahvor) -> None:
 def numerical_jacobian(camera: CameraModel, points: np.ndarray, step: float) -> np.ndarray:
     columns = []
     for axis in np.eye(3):
-        ahead, behind = (camera.project(points + sign * step * axis)[0] for sign in (1, -1))
-        farther, before = (camera.project(points + sign * 2 * step * axis)[0] for sign in (1, -1))
-        columns.append((8 * (ahead - behind) - (farther - before)) / (12 * step))
+        plus, minus = (camera.project(points + sign * step * axis)[0] for sign in (1, -1))
+        plus_two, minus_two = (camera.project(points + sign * 2 * step * axis)[0] for sign in (1, -1))
+        columns.append((8 * (plus - minus) - (plus_two - minus_two)) / (12 * step))
     return np.stack(columns, axis=-1)
 
 
-def test_jacobian_of_real_cameras(camera: CameraModel) -> None:
+def test_jacobian_of_real_cameras_matches_finite_differences(camera: CameraModel) -> None:
     origins, directions = camera.rays(camera.pixel_grid()[::60, ::60])
     points = origins + 3 * directions
     analytic = camera.projection_jacobian(points)
-    # Fourth-order differences with 1 mm at 3 m: truncation (3e-4)^4; rounding 1e-12 px / 1e-3 m = 1e-9 px/m of 400
-    # px/m.
+    # Fourth-order differences with 1 mm at 3 m, slopes of 400 px/m: relative truncation (3e-4)^4, rounding of
+    # 1e-12 px / 1e-3 m = 1e-9 px/m.
     assert analytic.shape == (*points.shape[:-1], 2, 3)
     assert np.max(np.abs(analytic - numerical_jacobian(camera, points, 1e-3))) < 1e-7
 
 
-def test_jacobian_on_the_optical_axis(navcam: Cahvor, hazcam: Cahvore) -> None:
+def test_jacobian_on_the_optical_axis_matches_finite_differences(navcam: Cahvor, hazcam: Cahvore) -> None:
     for camera in (navcam, hazcam):
         axis = camera.o / np.linalg.norm(camera.o)
         points = camera.c + 3 * axis + np.array([[0.0, 0.0, 0.0], [1e-12, 0, 0], [1e-7, 0, 1e-7]])
@@ -314,22 +315,24 @@ def test_jacobian_on_the_optical_axis(navcam: Cahvor, hazcam: Cahvore) -> None:
 
 
 @given(cameras, arrays(float, (4, 2), elements=st.floats(0.1, 0.9)), st.floats(5, 50))
-def test_jacobian_of_plausible_cameras(camera: CameraModel, parts: np.ndarray, distance: float) -> None:
-    origins, directions = camera.rays(scale_to_pixels(camera, parts))
+def test_jacobian_of_random_cameras_matches_finite_differences(
+    camera: CameraModel, uv: np.ndarray, distance: float
+) -> None:
+    origins, directions = camera.rays(pixels_from_fractions(camera, uv))
     points = origins + distance * directions
     analytic = camera.projection_jacobian(points)
     numerical = numerical_jacobian(camera, points, 1e-4 * distance)
-    known = np.isfinite(numerical)  # differences may leave the valid range
+    is_valid = np.isfinite(numerical)  # differences may leave the valid range
     size = np.linalg.norm(np.where(np.isfinite(analytic), analytic, 0), axis=(-2, -1), keepdims=True)
-    # Rounding of points 5000 m away: 1e-12 m / (1e-4 * 5 m) = 2e-9 of the slope; the rest is truncation near a limit.
-    assert np.all((np.abs(analytic - numerical) <= 2e-5 * size + 1e-7)[known])
+    # Rounding of points 5000 m away: 1e-12 m / (1e-4 * 5 m) = 2e-9 of the slope; truncation adds to it near a limit.
+    assert np.all((np.abs(analytic - numerical) <= 2e-5 * size + 1e-7)[is_valid])
 
 
 # ----- shapes -----
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3), (0,), (4, 0)])
-def test_leading_dimensions_are_kept(camera: CameraModel, shape: tuple[int, ...]) -> None:
+def test_leading_dimensions_are_preserved(camera: CameraModel, shape: tuple[int, ...]) -> None:
     points = np.broadcast_to(camera.c + 3 * camera.a, (*shape, 3))
     pixels, visible = camera.project(points)
     assert pixels.shape == (*shape, 2)
@@ -344,10 +347,10 @@ def test_leading_dimensions_are_kept(camera: CameraModel, shape: tuple[int, ...]
 def test_single_point_equals_the_point_among_many(camera: CameraModel) -> None:
     """Bitwise equality: results do not depend on the division of work."""
     points = camera.c + 3 * camera.rays(camera.pixel_grid()[::4, ::4].reshape(-1, 2))[1]
-    together = camera.project(points)[0]
+    all_pixels = camera.project(points)[0]
     assert len(points) > 3 * 16384  # several blocks
     for index in (0, 1, 7, 16383, 16384, 40000, len(points) - 1):
-        assert np.array_equal(camera.project(points[index])[0], together[index])
+        assert np.array_equal(camera.project(points[index])[0], all_pixels[index])
 
 
 def test_arguments_are_not_modified(camera: CameraModel) -> None:

@@ -1,4 +1,4 @@
-"""Grounds with closed-form rover stances."""
+"""Analytic grounds for rover tests: planes and single mounds, where the stance of a rover has a closed form."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class Plane:
 
 @dataclass(frozen=True)
 class Steps:
-    """Level ground with smooth mounds under single wheels: (x, y, height) of each, with a flat top within 0.2 m."""
+    """Level ground with smooth mounds (x, y, height) under single wheels; their tops are flat within 0.2 m."""
 
     mounds: tuple[tuple[float, float, float], ...]
 
     def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         ground = np.zeros(np.broadcast_shapes(x.shape, y.shape))
-        for east, north, high in self.mounds:
-            away = np.hypot(x - east, y - north)
-            ground = ground + high * np.clip((0.3 - away) / 0.1, 0.0, 1.0)
+        for east, north, mound_height in self.mounds:
+            distance = np.hypot(x - east, y - north)
+            ground = ground + mound_height * np.clip((0.3 - distance) / 0.1, 0.0, 1.0)
         return ground
 
 

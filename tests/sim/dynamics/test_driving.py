@@ -1,4 +1,4 @@
-"""Tests of the rover motion for given drive commands."""
+"""Tests of rover motion for drive commands: kinematics without slip, slip on slopes, and random soil."""
 
 from __future__ import annotations
 
@@ -53,41 +53,41 @@ def test_command_equals_many_small_motions() -> None:
     assert command.displacement_m == pytest.approx(position, abs=1e-8)
 
 
-def test_sideways_motion_around_target_keeps_it_ahead() -> None:
-    ahead, turn = 7.0, np.radians(10.0)
-    command = DriveCommand(left_m=-ahead * turn, turn_left_rad=turn)
+def test_target_stays_ahead_when_the_rover_circles_it() -> None:
+    distance_m, turn_rad = 7.0, np.radians(10.0)
+    command = DriveCommand(left_m=-distance_m * turn_rad, turn_left_rad=turn_rad)
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
     end = drive(MER, Plane(), PERFECT, start, command, _rng()).end
-    target = end.world_from_rover.inv().apply(np.array([ahead, 0.0, 0.0]))
-    assert target == pytest.approx([ahead, 0.0, 0.0], abs=1e-7)
+    target = end.world_from_rover.inv().apply(np.array([distance_m, 0.0, 0.0]))
+    assert target == pytest.approx([distance_m, 0.0, 0.0], abs=1e-7)
     # A left turn around the target moves the rover right of its initial heading.
     assert end.world_from_rover.translation[1] < 0.0
 
 
 def test_slip_of_one_half_halves_the_distance() -> None:
     # The default curve loses half at 15 deg: s(15 deg) = 0.01 + 0.99 0.75**2.4.
-    lost = 0.01 + 0.99 * 0.75**2.4
-    assert lost == pytest.approx(0.5, abs=0.01)
+    slip = 0.01 + 0.99 * 0.75**2.4
+    assert slip == pytest.approx(0.5, abs=0.01)
     ground = uphill_east(15.0)
     start = settle(MER, ground, 0.0, 0.0, EAST)
     driven = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=2.0), _rng())
-    way = np.linalg.norm(driven.end.world_from_rover.translation - start.world_from_rover.translation)
-    assert way == pytest.approx(2.0 * (1.0 - lost), rel=1e-9)
-    assert driven.slip == pytest.approx(lost, rel=1e-9)
+    distance_m = np.linalg.norm(driven.end.world_from_rover.translation - start.world_from_rover.translation)
+    assert distance_m == pytest.approx(2.0 * (1.0 - slip), rel=1e-9)
+    assert driven.slip == pytest.approx(slip, rel=1e-9)
 
 
 @pytest.mark.parametrize(("slope_deg", "slip"), [(0.0, 0.01), (10.0, 0.2), (20.0, 1.0), (25.0, 1.0)])
-def test_uphill_slip_reaches_one(slope_deg: float, slip: float) -> None:
+def test_uphill_slip_increases_to_one(slope_deg: float, slip: float) -> None:
     ground = uphill_east(slope_deg)
     start = settle(MER, ground, 0.0, 0.0, EAST)
-    up = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.5), _rng())
-    assert up.slip == pytest.approx(slip, abs=0.005)
+    uphill = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.5), _rng())
+    assert uphill.slip == pytest.approx(slip, abs=0.005)
     # Reverse driving uphill has the same slip; downhill the rover moves farther.
-    rotated = settle(MER, ground, 0.0, 0.0, -EAST)
-    back = drive(MER, ground, Soil(STEADY, 1.0), rotated, DriveCommand(forward_m=-0.5), _rng())
-    assert back.slip == pytest.approx(up.slip, abs=1e-9)
-    down = drive(MER, ground, Soil(STEADY, 1.0), rotated, DriveCommand(forward_m=0.5), _rng())
-    assert down.slip == pytest.approx(0.01 - 0.3 * (up.slip - 0.01), abs=1e-9)
+    facing_downhill = settle(MER, ground, 0.0, 0.0, -EAST)
+    reverse = drive(MER, ground, Soil(STEADY, 1.0), facing_downhill, DriveCommand(forward_m=-0.5), _rng())
+    assert reverse.slip == pytest.approx(uphill.slip, abs=1e-9)
+    downhill = drive(MER, ground, Soil(STEADY, 1.0), facing_downhill, DriveCommand(forward_m=0.5), _rng())
+    assert downhill.slip == pytest.approx(0.01 - 0.3 * (uphill.slip - 0.01), abs=1e-9)
 
 
 @pytest.mark.parametrize("azimuth_rad", [NORTH, np.pi])
@@ -95,14 +95,14 @@ def test_rover_slides_downhill_across_a_slope(azimuth_rad: float) -> None:
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, azimuth_rad)
     driven = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=1.0), _rng())
-    moved = driven.end.world_from_rover.translation - start.world_from_rover.translation
+    motion_m = driven.end.world_from_rover.translation - start.world_from_rover.translation
     sideways = 0.5 * (STEADY.slip_fraction(np.radians(10.0)) - STEADY.flat)
     # The ground falls to the west.
-    assert moved[0] == pytest.approx(-sideways * np.cos(np.radians(10.0)), abs=1e-9)
+    assert motion_m[0] == pytest.approx(-sideways * np.cos(np.radians(10.0)), abs=1e-9)
     assert driven.slip == pytest.approx(STEADY.flat, abs=1e-9)
 
 
-def test_turns_lose_angle_by_slip() -> None:
+def test_slip_reduces_the_turn_angle() -> None:
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
     driven = drive(MER, Plane(), Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _rng())
     assert np.degrees(start.azimuth_rad - driven.end.azimuth_rad) == pytest.approx(40.0 * 0.97)
@@ -115,36 +115,36 @@ def test_turns_lose_angle_by_slip() -> None:
     )
 
 
-def test_soil_and_step_scatter_have_specified_spread() -> None:
+def test_soil_step_and_heading_errors_have_the_specified_deviation() -> None:
     parameters = SlipParameters(soil_spread=0.3, step_spread=0.0, wander_deg_m=0.0)
     factors = np.log([Soil.draw(parameters, np.random.default_rng(n)).factor for n in range(400)])
     # 0.3 within four standard errors, 0.3 / sqrt(800).
     assert np.std(factors) == pytest.approx(0.3, abs=0.042)
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, EAST)
-    loose = drive(MER, ground, Soil(STEADY, 1.5), start, DriveCommand(forward_m=0.3), _rng())
-    firm = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.3), _rng())
-    assert loose.slip == pytest.approx(1.5 * firm.slip, rel=1e-9)
-    # 120 draws each: within four standard errors, 1 / sqrt(240) of the spread.
+    slippery = drive(MER, ground, Soil(STEADY, 1.5), start, DriveCommand(forward_m=0.3), _rng())
+    nominal = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.3), _rng())
+    assert slippery.slip == pytest.approx(1.5 * nominal.slip, rel=1e-9)
+    # 120 draws each: within four standard errors, 1 / sqrt(240) of the deviation.
     rng = np.random.default_rng(1)
-    stepping = Soil(SlipParameters(soil_spread=0.0, step_spread=0.2, wander_deg_m=0.0), 1.0)
-    slips = [drive(MER, ground, stepping, start, DriveCommand(forward_m=0.1), rng).slip for _ in range(120)]
+    random_steps = Soil(SlipParameters(soil_spread=0.0, step_spread=0.2, wander_deg_m=0.0), 1.0)
+    slips = [drive(MER, ground, random_steps, start, DriveCommand(forward_m=0.1), rng).slip for _ in range(120)]
     assert np.std(np.log(slips)) == pytest.approx(0.2, abs=0.052)
-    wandering = Soil(SlipParameters(step_spread=0.0, wander_deg_m=1.0), 1.0)
-    turns = [
-        np.degrees(drive(MER, ground, wandering, start, DriveCommand(forward_m=0.09), rng).end.azimuth_rad) - 90.0
+    random_heading = Soil(SlipParameters(step_spread=0.0, wander_deg_m=1.0), 1.0)
+    headings = [
+        np.degrees(drive(MER, ground, random_heading, start, DriveCommand(forward_m=0.09), rng).end.azimuth_rad) - 90.0
         for _ in range(120)
     ]
-    assert np.std(turns) == pytest.approx(0.3, abs=0.078)
+    assert np.std(headings) == pytest.approx(0.3, abs=0.078)
 
 
 def test_drives_are_reproducible_and_continuous() -> None:
     ground = uphill_east(8.0)
     start = settle(MER, ground, 0.0, 0.0, 0.3)
-    one, two = (
+    first, second = (
         drive(MER, ground, Soil(SlipParameters(), 1.1), start, COMMANDS[3], np.random.default_rng(9)) for _ in range(2)
     )
-    assert np.array_equal(one.end.world_from_rover.as_matrix(), two.end.world_from_rover.as_matrix())
-    for before, after in zip(one.parts, one.parts[1:], strict=False):
-        assert before.after is after.before
-    assert all(part.command.length_m <= 0.2 + 1e-12 for part in one.parts)
+    assert np.array_equal(first.end.world_from_rover.as_matrix(), second.end.world_from_rover.as_matrix())
+    for part, next_part in zip(first.parts, first.parts[1:], strict=False):
+        assert part.after is next_part.before
+    assert all(part.command.length_m <= 0.2 + 1e-12 for part in first.parts)

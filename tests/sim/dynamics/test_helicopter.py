@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marsyard.sim.dynamics.helicopter import HelicopterFlight, HelicopterParameters, helicopter_flight
+from marsyard.sim.dynamics.helicopter import HelicopterFlight, HelicopterParameters, draw_helicopter_flight
 
 ORIGIN = np.array([100.0, -200.0, 35.0])
 
 
 def make_flight(**changes: object) -> HelicopterFlight:
     parameters = HelicopterParameters.model_validate(changes)
-    return helicopter_flight(parameters, ORIGIN, np.radians(70.0), 9.8, np.random.default_rng(7))
+    return draw_helicopter_flight(parameters, ORIGIN, np.radians(70.0), 9.8, np.random.default_rng(7))
 
 
 @pytest.mark.parametrize("turns", [False, True])
@@ -27,14 +27,14 @@ def test_velocity_rate_and_force_are_derivatives(turns: bool) -> None:
     specific_force = now.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, 9.8]))
     np.testing.assert_allclose(now.specific_forces_m_s2, specific_force, atol=1e-4)
     rate = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2.0 * step)
-    # The rotation over the interval has no component along the change of rate, but the axes turn by up to half a step.
+    # The body axes rotate by up to half a step during the central difference.
     np.testing.assert_allclose(now.body_rates_rad_s, rate, atol=2e-5)
 
 
-def test_passes_match_the_paper() -> None:
+def test_heights_speed_and_tilt_match_the_paper() -> None:
     flight = make_flight()
-    inside = np.concatenate([np.arange(one.start_s, one.end_s, 0.1) for one in flight.passes])
-    motion = flight.motion(inside)
+    times = np.concatenate([np.arange(p.start_s, p.end_s, 0.1) for p in flight.passes])
+    motion = flight.motion(times)
     heights = motion.positions_m[:, 2] - ORIGIN[2]
     assert abs(heights.min() - 1000.0) < 1.0
     assert abs(heights.max() - 2000.0) < 1.0
@@ -48,20 +48,20 @@ def test_passes_match_the_paper() -> None:
 
 def test_passes_alternate_along_one_line() -> None:
     flight = make_flight()
-    along = np.array([np.sin(np.radians(70.0)), np.cos(np.radians(70.0))])
-    for one in flight.passes:
-        middle = flight.state(0.5 * (one.start_s + one.end_s))
-        assert np.sign(middle.velocity_m_s[:2] @ along) == one.direction == (-1) ** one.number
-        across = (middle.position_m - ORIGIN)[:2] @ np.array([-along[1], along[0]])
-        assert abs(across) < 40.0  # 5 times the RMS of the wander
+    course = np.array([np.sin(np.radians(70.0)), np.cos(np.radians(70.0))])
+    for flight_pass in flight.passes:
+        middle = flight.state(0.5 * (flight_pass.start_s + flight_pass.end_s))
+        assert np.sign(middle.velocity_m_s[:2] @ course) == flight_pass.direction == (-1) ** flight_pass.number
+        cross_track_m = (middle.position_m - ORIGIN)[:2] @ np.array([-course[1], course[0]])
+        assert abs(cross_track_m) < 40.0  # 5 times the RMS of the wander
 
 
 def test_targets_are_overflown_40_minutes_apart() -> None:
     flight = make_flight()
     first, second = ((start + end) / 2.0 for start, end in flight.fly_overs_s)
     assert second - first == pytest.approx(2400.0)
-    for time in (first, second):
-        assert np.hypot(*(flight.state(time).position_m - ORIGIN)[:2]) < 40.0
+    for time_s in (first, second):
+        assert np.hypot(*(flight.state(time_s).position_m - ORIGIN)[:2]) < 40.0
 
 
 def test_inconsistent_parameters_are_rejected() -> None:

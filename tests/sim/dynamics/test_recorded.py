@@ -1,4 +1,4 @@
-"""Tests of recorded motions: files of other programs, and splines against closed-form motions."""
+"""Tests of recorded motions: pose files of TUM, EuRoC and pandas are read, and splines match closed-form motions."""
 
 from __future__ import annotations
 
@@ -85,9 +85,9 @@ def _record_motion(spacing_s: float) -> RecordedMotion:
     return RecordedMotion(times, truth.positions_m, truth.attitudes, GRAVITY)
 
 
-def _errors(spacing_s: float) -> dict[str, float]:
-    motion, at = _record_motion(spacing_s), np.linspace(1.0, 9.0, 501)
-    actual, expected = motion.motion(at), _make_swaying_motion().motion(at)
+def _max_spline_errors(spacing_s: float) -> dict[str, float]:
+    motion, times_s = _record_motion(spacing_s), np.linspace(1.0, 9.0, 501)
+    actual, expected = motion.motion(times_s), _make_swaying_motion().motion(times_s)
     return {
         "position": float(np.abs(actual.positions_m - expected.positions_m).max()),
         "velocity": float(np.abs(actual.velocities_m_s - expected.velocities_m_s).max()),
@@ -102,7 +102,7 @@ def test_splines_converge_to_closed_form_motion() -> None:
     8 and 4.
     """
     assert isinstance(_record_motion(0.1), Trajectory)
-    coarse, fine = _errors(0.1), _errors(0.05)
+    coarse, fine = _max_spline_errors(0.1), _max_spline_errors(0.05)
     for name, order in (("position", 4), ("velocity", 3), ("attitude", 4), ("rate", 3), ("force", 2)):
         assert fine[name] < coarse[name] / 2 ** (order - 0.5), name
     assert fine["position"] < 1e-5
@@ -114,14 +114,14 @@ def test_splines_converge_to_closed_form_motion() -> None:
 def test_rates_and_forces_are_spline_derivatives() -> None:
     """Inertial readings agree with the poses, including recorded noise."""
     rng = np.random.default_rng(3)
-    times = np.arange(0.0, 3.0, 0.1)
+    knots_s = np.arange(0.0, 3.0, 0.1)
     noisy = (
-        Rotation.from_rotvec(0.02 * rng.standard_normal((times.size, 3)))
-        * _make_swaying_motion().motion(times).attitudes
+        Rotation.from_rotvec(0.02 * rng.standard_normal((knots_s.size, 3)))
+        * _make_swaying_motion().motion(knots_s).attitudes
     )
-    positions = _make_swaying_motion().motion(times).positions_m + 0.1 * rng.standard_normal((times.size, 3))
-    motion, at, h = RecordedMotion(times, positions, noisy, GRAVITY), np.linspace(0.5, 2.5, 57), 1e-5
-    before, centre, after = motion.motion(at - h), motion.motion(at), motion.motion(at + h)
+    positions = _make_swaying_motion().motion(knots_s).positions_m + 0.1 * rng.standard_normal((knots_s.size, 3))
+    motion, times_s, h = RecordedMotion(knots_s, positions, noisy, GRAVITY), np.linspace(0.5, 2.5, 57), 1e-5
+    before, centre, after = motion.motion(times_s - h), motion.motion(times_s), motion.motion(times_s + h)
     assert np.allclose((after.positions_m - before.positions_m) / (2 * h), centre.velocities_m_s, atol=1e-4)
     acceleration = (after.velocities_m_s - before.velocities_m_s) / (2 * h)
     assert np.allclose(
@@ -166,7 +166,7 @@ def _write_faulty_poses(tmp_path: Path, **changes: float) -> Path:
         ({"time_s": np.inf}, "pose 8: time_s is not finite"),
         ({"time_s": 0.5}, "pose 8: time goes from 0.600000 to 0.500000 s; allowed: times that increase"),
         ({"time_s": 0.6}, "pose 8: time goes from 0.600000 to 0.600000 s"),
-        ({"qw": 3.0}, r"pose 8: the quaternion's length is 3.\d+; allowed: 1 to 0.005"),
+        ({"qw": 3.0}, r"pose 8: the quaternion's length is 3.\d+; allowed: 1 within 0.005"),
     ],
 )
 def test_invalid_poses_are_reported(tmp_path: Path, changes: dict[str, float], fault: str) -> None:
@@ -183,7 +183,7 @@ def test_invalid_poses_are_reported(tmp_path: Path, changes: dict[str, float], f
         ("", "has 0 poses; allowed: at least 4"),
         (TUM[: TUM.rindex("1305031099.6758")], "has 3 poses"),
         ("hello world\n", "cannot be read as a table"),
-        ("a,b\n\x00\x01", "is no table of poses"),
+        ("a,b\n\x00\x01", "is not a table of poses"),
         ("PAR1 but no more", "cannot be read as a table"),
     ],
 )
@@ -194,8 +194,8 @@ def test_files_without_poses_are_rejected(tmp_path: Path, text: str, fault: str)
         read_poses(tmp_path / "absent.csv")
 
 
-def test_oversized_file_is_rejected_unread(tmp_path: Path) -> None:
-    path = tmp_path / "picture.csv"
+def test_oversized_file_is_rejected_without_reading(tmp_path: Path) -> None:
+    path = tmp_path / "large.csv"
     with path.open("wb") as file:
         file.truncate(1 << 30)
     with pytest.raises(TrajectoryFileError, match="larger than 512 MiB"):
@@ -207,8 +207,8 @@ def test_invalid_motions_are_rejected() -> None:
     positions = np.zeros((4, 3))
     with pytest.raises(ValueError, match="has 3 poses"):
         RecordedMotion(times[:3], positions[:3], static[:3], 3.7)
-    half = Rotation.from_euler("z", np.array([[0.0], [0.0], [120.0], [120.0]]), degrees=True)
-    with pytest.raises(ValueError, match=r"turns by 120 deg after 1.000000 s \(pose 2\)"):
-        RecordedMotion(times, positions, half, 3.7)
+    large_turn = Rotation.from_euler("z", np.array([[0.0], [0.0], [120.0], [120.0]]), degrees=True)
+    with pytest.raises(ValueError, match=r"rotates by 120 deg after 1.000000 s \(pose 2\)"):
+        RecordedMotion(times, positions, large_turn, 3.7)
     with pytest.raises(ValueError, match="time 4 s is outside of the motion; allowed: 0 to 3 s"):
         RecordedMotion(times, positions, static, 3.7).state(4.0)

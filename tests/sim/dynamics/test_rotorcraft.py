@@ -20,12 +20,12 @@ from marsyard.sim.dynamics.rotorcraft import (
     RotorcraftParameters,
     TransitParameters,
     VibrationParameters,
-    landing_flight,
-    transit_flight,
+    simulate_landing,
+    simulate_transit,
 )
 
 GRAVITY, COURSE, HEADING = 9.8, 0.3, 1.0
-OVER, SITE = np.array([100.0, 50.0, 12.0]), np.array([103.0, 52.0])
+ABOVE_SITE, SITE = np.array([100.0, 50.0, 12.0]), np.array([103.0, 52.0])
 CRAFT, TRANSIT, GUIDANCE = RotorcraftParameters(), TransitParameters(), LandingGuidance()
 CALM: dict[str, Any] = {"east_m_s": 0.0, "north_m_s": 0.0, "gust_m_s": 0.0, "vertical_gust_m_s": 0.0}
 SMOOTH = RotorcraftParameters(vibration=VibrationParameters(acceleration_m_s2=0.0, angle_deg=0.0))
@@ -37,7 +37,7 @@ def _make_air(seed: int, **changes: float) -> Air:
 
 
 def _fly_transit(air: Air, craft: RotorcraftParameters = CRAFT) -> RotorcraftFlight:
-    return transit_flight(craft, TRANSIT, OVER, COURSE, HEADING, GRAVITY, air, np.random.default_rng(5))
+    return simulate_transit(craft, TRANSIT, ABOVE_SITE, COURSE, HEADING, GRAVITY, air, np.random.default_rng(5))
 
 
 def _fly_landing(
@@ -55,24 +55,24 @@ def _fly_landing(
     heights = 2.0 + slope * np.tile(0.5 * np.arange(101.0) - 25.0, (101, 1))
     ground = GroundPatch(SITE - 25.0, 0.5, heights)
     laser = LandingLaser(1.0, np.zeros(len(air.gusts_m_s)), stuck_m)
-    return landing_flight(flight, GUIDANCE, SITE, errors, air, ground, laser)
+    return simulate_landing(flight, GUIDANCE, SITE, errors, air, ground, laser)
 
 
-def test_too_short_air_is_rejected() -> None:
-    """The kernels would read beyond its end."""
+def test_air_shorter_than_the_flight_is_rejected() -> None:
+    """Otherwise the kernels would read beyond the end of the gust samples."""
     air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s, np.random.default_rng(0))
     with pytest.raises(ValueError, match="the flight may take"):
         _fly_transit(air)
 
 
-def _touchdown_error(flight: RotorcraftFlight) -> np.ndarray:
+def _touchdown_position(flight: RotorcraftFlight) -> np.ndarray:
     time = flight.first(Phase.ON_GROUND)
     assert time is not None
     return flight.path.state(time).position_m
 
 
 def test_velocity_rate_and_force_are_derivatives() -> None:
-    """Central differences over 1e-4 s: the truncation at the vibration's 22 Hz is (2 pi f h)^2 / 6 = 3e-5 of each."""
+    """Central differences over 1e-4 s: the relative truncation at the vibration's 22 Hz is (2 pi f h)^2 / 6 = 3e-5."""
     flight, step = _fly_landing(3).path, 1e-4
     assert isinstance(flight, Trajectory)
     first, last = flight.span_s
@@ -99,11 +99,11 @@ def test_specific_force_is_rotor_thrust_plus_drag() -> None:
 
 
 def test_pitch_balances_drag_and_wind() -> None:
-    """Steady flight: tan(tilt) is drag over weight, at 1 m/s minus the wind along the course."""
+    """In steady flight tan(pitch) is drag divided by weight; drag is proportional to the airspeed along the course."""
     for wind in (0.0, -3.0):
-        blowing = CALM | {"east_m_s": wind * np.cos(COURSE), "north_m_s": wind * np.sin(COURSE)}
-        flight = transit_flight(
-            SMOOTH, TRANSIT, OVER, COURSE, COURSE, GRAVITY, _make_air(0, **blowing), np.random.default_rng(0)
+        air = CALM | {"east_m_s": wind * np.cos(COURSE), "north_m_s": wind * np.sin(COURSE)}
+        flight = simulate_transit(
+            SMOOTH, TRANSIT, ABOVE_SITE, COURSE, COURSE, GRAVITY, _make_air(0, **air), np.random.default_rng(0)
         ).path
         attitude = flight.state(TRANSIT.pictures_s).attitude.as_euler("ZYX")
         speed = float(flight.state(TRANSIT.pictures_s).velocity_m_s[:2] @ [np.cos(COURSE), np.sin(COURSE)])
@@ -112,7 +112,7 @@ def test_pitch_balances_drag_and_wind() -> None:
         assert attitude[2] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_transit_keeps_height_and_course() -> None:
+def test_transit_has_constant_height_and_course() -> None:
     """Forty images in five seconds at 1 m/s: 5 m along the course at constant height except for gusts."""
     ends, heights, tilts = [], [], []
     for seed in range(20):
@@ -120,58 +120,58 @@ def test_transit_keeps_height_and_course() -> None:
         ends.append(motion.positions_m[-1] - motion.positions_m[0])
         heights.append(np.ptp(motion.positions_m[:, 2]))
         tilts.append(motion.attitudes.as_euler("ZYX", degrees=True).std(axis=0))
-    along = np.mean(ends, axis=0)
-    assert np.hypot(*along[:2]) == pytest.approx(5.0, abs=0.3)
-    assert np.arctan2(along[1], along[0]) == pytest.approx(COURSE, abs=0.1)
+    mean_path = np.mean(ends, axis=0)
+    assert np.hypot(*mean_path[:2]) == pytest.approx(5.0, abs=0.3)
+    assert np.arctan2(mean_path[1], mean_path[0]) == pytest.approx(COURSE, abs=0.1)
     assert max(heights) < 0.3
     # Gusts change the attitude by about a degree; the paper's limit for tracking is 10 deg.
     assert 0.2 < np.mean(tilts) < 2.0
 
 
 def test_vibration_has_the_specified_frequency() -> None:
-    shaken, smooth = (_fly_transit(_make_air(1), craft).path for craft in (CRAFT, SMOOTH))
+    vibrating, without_vibration = (_fly_transit(_make_air(1), craft).path for craft in (CRAFT, SMOOTH))
     times = np.arange(0.0, 5.0, 1e-3)
-    moving = [flight.motion(times) for flight in (shaken, smooth)]
-    specific_force = [motion.attitudes.apply(motion.specific_forces_m_s2) for motion in moving]
+    motions = [flight.motion(times) for flight in (vibrating, without_vibration)]
+    specific_force = [motion.attitudes.apply(motion.specific_forces_m_s2) for motion in motions]
     spectrum = np.abs(np.fft.rfft(specific_force[0] - specific_force[1], axis=0)) * 2.0 / times.size
     assert np.all(np.argmax(spectrum, axis=0) == 110)  # 5 s resolve 0.2 Hz
     np.testing.assert_allclose(spectrum[110], 1.5, rtol=1e-3)
-    rotated = moving[0].attitudes.as_euler("ZYX", degrees=True) - moving[1].attitudes.as_euler("ZYX", degrees=True)
-    np.testing.assert_allclose(rotated.std(axis=0), 0.03 / np.sqrt(2.0), rtol=1e-3)
+    angles_deg = motions[0].attitudes.as_euler("ZYX", degrees=True) - motions[1].attitudes.as_euler("ZYX", degrees=True)
+    np.testing.assert_allclose(angles_deg.std(axis=0), 0.03 / np.sqrt(2.0), rtol=1e-3)
 
 
 def test_calm_air_landing_error_equals_navigation_error() -> None:
-    exact = _touchdown_error(_fly_landing(**CALM))
+    exact = _touchdown_position(_fly_landing(**CALM))
     np.testing.assert_allclose(exact[:2], SITE, atol=0.02)
-    shifted = _touchdown_error(_fly_landing(east_error_m=0.7, **CALM))
-    np.testing.assert_allclose(shifted[:2], SITE - [0.7, 0.0], atol=0.02)
+    with_error = _touchdown_position(_fly_landing(east_error_m=0.7, **CALM))
+    np.testing.assert_allclose(with_error[:2], SITE - [0.7, 0.0], atol=0.02)
 
 
-def test_gusts_increase_touchdown_spread() -> None:
-    def spread(gust_m_s: float) -> float:
-        off = [_touchdown_error(_fly_landing(seed, gust_m_s=gust_m_s))[:2] - SITE for seed in range(25)]
-        return float(np.sqrt(np.mean(np.square(off))))
+def test_touchdown_error_is_proportional_to_gusts() -> None:
+    def rms_error(gust_m_s: float) -> float:
+        errors = [_touchdown_position(_fly_landing(seed, gust_m_s=gust_m_s))[:2] - SITE for seed in range(25)]
+        return float(np.sqrt(np.mean(np.square(errors))))
 
-    # Without saturation, doubled gusts double the errors; 50 values determine a spread to 10 %.
-    assert spread(0.8) / spread(0.4) == pytest.approx(2.0, rel=0.2)
+    # Without saturation, doubled gusts double the errors; 50 values determine an rms to 10 %.
+    assert rms_error(0.8) / rms_error(0.4) == pytest.approx(2.0, rel=0.2)
 
 
-def test_phases_start_at_the_papers_heights() -> None:
+def test_phases_start_at_the_heights_of_the_paper() -> None:
     flight = _fly_landing(slope=0.1, craft=SMOOTH, **CALM)
     state = {phase: flight.path.state(time) for phase in Phase if (time := flight.first(phase)) is not None}
     assert list(state) == list(Phase)
     assert state[Phase.APPROACH].time_s - TRANSIT.pictures_s == pytest.approx(GUIDANCE.wait_s, abs=0.05)
     # Commands use the state 0.1 s earlier: 0.2 m at 2 m/s, 0.07 m at the descent's 0.7 m/s.
     assert np.hypot(*(state[Phase.DESCENT].position_m[:2] - SITE)) == pytest.approx(2.0, abs=0.25)
-    flare = state[Phase.LANDING].position_m
-    assert flare[2] - 2.0 - 0.1 * (flare[0] - SITE[0]) == pytest.approx(1.5, abs=0.1)
-    down = state[Phase.ON_GROUND]
-    assert down.position_m[2] - 2.0 - 0.1 * (down.position_m[0] - SITE[0]) == pytest.approx(CRAFT.gear_m, abs=0.01)
-    assert down.velocity_m_s[2] == pytest.approx(-GUIDANCE.flare_m_s, abs=0.05)
-    rest = flight.path.state(flight.path.span_s[1])
-    np.testing.assert_allclose(rest.velocity_m_s, 0.0, atol=1e-9)
-    np.testing.assert_allclose(rest.attitude.as_matrix()[:, 2], [0.0, 0.0, 1.0], atol=1e-9)
-    assert rest.time_s - down.time_s == pytest.approx(GUIDANCE.rest_s, abs=0.05)
+    flare_start = state[Phase.LANDING].position_m
+    assert flare_start[2] - 2.0 - 0.1 * (flare_start[0] - SITE[0]) == pytest.approx(1.5, abs=0.1)
+    landed = state[Phase.ON_GROUND]
+    assert landed.position_m[2] - 2.0 - 0.1 * (landed.position_m[0] - SITE[0]) == pytest.approx(CRAFT.gear_m, abs=0.01)
+    assert landed.velocity_m_s[2] == pytest.approx(-GUIDANCE.flare_m_s, abs=0.05)
+    at_rest = flight.path.state(flight.path.span_s[1])
+    np.testing.assert_allclose(at_rest.velocity_m_s, 0.0, atol=1e-9)
+    np.testing.assert_allclose(at_rest.attitude.as_matrix()[:, 2], [0.0, 0.0, 1.0], atol=1e-9)
+    assert at_rest.time_s - landed.time_s == pytest.approx(GUIDANCE.rest_s, abs=0.05)
 
 
 def test_stuck_altimeter_prevents_deceleration() -> None:

@@ -9,18 +9,18 @@ from jaxtyping import Float64
 from pydantic import ValidationError
 
 from marsyard.sim.dynamics import MER, ROCKY_8, Ground, RockyGround, RoverParameters, settle
-from marsyard.sim.dynamics.rover import WHEELS, wheel_centres
+from marsyard.sim.dynamics.rover import WHEELS, compute_wheel_centres
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
 from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
 
 EAST, NORTH = 0.5 * np.pi, 0.0
 
 
-def test_wheels_rest_at_specified_positions() -> None:
+def test_wheel_centres_match_the_parameters() -> None:
     positions = dict(zip(WHEELS, MER.wheel_centres_m, strict=True))
     assert positions["left front"] == pytest.approx([0.705, 0.53, 0.125])
     assert positions["right rear"] == pytest.approx([-0.705, -0.53, 0.125])
-    assert wheel_centres(MER, 0.0, (0.0, 0.0)) == pytest.approx(MER.wheel_centres_m)
+    assert compute_wheel_centres(MER, 0.0, (0.0, 0.0)) == pytest.approx(MER.wheel_centres_m)
 
 
 @pytest.mark.parametrize("rover", [MER, ROCKY_8])
@@ -28,53 +28,53 @@ def test_wheels_rest_at_specified_positions() -> None:
 def test_body_is_parallel_to_a_plane(rover: RoverParameters, azimuth_deg: float) -> None:
     plane = Plane(0.3, -0.2, 5.0)
     stance = settle(rover, plane, 4.0, -3.0, np.radians(azimuth_deg))
-    turn = stance.world_from_rover.rotation.as_matrix()
+    rotation = stance.world_from_rover.rotation.as_matrix()
     normal = np.array([-0.3, 0.2, 1.0]) / np.linalg.norm([-0.3, 0.2, 1.0])
-    assert turn[:, 2] == pytest.approx(normal, abs=1e-9)
+    assert rotation[:, 2] == pytest.approx(normal, abs=1e-9)
     assert stance.world_from_rover.translation == pytest.approx([4.0, -3.0, 5.0 + 1.2 + 0.6], abs=1e-9)
-    heading = np.degrees(np.arctan2(turn[0, 0], turn[1, 0]))
+    heading = np.degrees(np.arctan2(rotation[0, 0], rotation[1, 0]))
     assert np.cos(np.radians(heading - azimuth_deg)) == pytest.approx(1.0)
-    assert stance.azimuth_rad == pytest.approx(np.arctan2(turn[0, 0], turn[1, 0]))
+    assert stance.azimuth_rad == pytest.approx(np.arctan2(rotation[0, 0], rotation[1, 0]))
     assert [stance.differential_rad, *stance.bogies_rad] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
 
 
-def test_slope_gives_pitch_uphill_and_roll_across() -> None:
+def test_slope_causes_pitch_uphill_and_roll_across() -> None:
     # Uphill the slope is the pitch. For a heading to the north on ground that rises to the east, the left side is low.
-    facing = settle(MER, uphill_east(12.0), 0.0, 0.0, EAST)
-    crossing = settle(MER, uphill_east(12.0), 0.0, 0.0, NORTH)
-    assert np.degrees([facing.pitch_rad, facing.roll_rad]) == pytest.approx([12.0, 0.0], abs=1e-6)
-    assert np.degrees([crossing.pitch_rad, crossing.roll_rad]) == pytest.approx([0.0, -12.0], abs=1e-6)
-    assert np.degrees(crossing.tilt_rad) == pytest.approx(12.0, abs=1e-6)
+    uphill = settle(MER, uphill_east(12.0), 0.0, 0.0, EAST)
+    across_slope = settle(MER, uphill_east(12.0), 0.0, 0.0, NORTH)
+    assert np.degrees([uphill.pitch_rad, uphill.roll_rad]) == pytest.approx([12.0, 0.0], abs=1e-6)
+    assert np.degrees([across_slope.pitch_rad, across_slope.roll_rad]) == pytest.approx([0.0, -12.0], abs=1e-6)
+    assert np.degrees(across_slope.tilt_rad) == pytest.approx(12.0, abs=1e-6)
 
 
 def test_body_pitches_by_the_mean_of_its_rockers() -> None:
     # The left front wheel is on a block of 10 cm: its rocker and bogie rotate, those of the other side rotate in the
     # opposite direction. For a heading to the east, the left front wheel is at (0.705, 0.53).
-    high = 0.10
-    stance = settle(MER, Steps(((0.705, 0.53, high),)), 0.0, 0.0, EAST)
-    assert np.abs(stance.gaps_m).max() < 1e-9
-    both = settle(MER, Steps(((0.705, 0.53, high), (0.705, -0.53, high))), 0.0, 0.0, EAST)
-    assert both.roll_rad == pytest.approx(0.0, abs=1e-9)
-    assert both.differential_rad == pytest.approx(0.0, abs=1e-9)
+    block_m = 0.10
+    one_block = settle(MER, Steps(((0.705, 0.53, block_m),)), 0.0, 0.0, EAST)
+    assert np.abs(one_block.gaps_m).max() < 1e-9
+    two_blocks = settle(MER, Steps(((0.705, 0.53, block_m), (0.705, -0.53, block_m))), 0.0, 0.0, EAST)
+    assert two_blocks.roll_rad == pytest.approx(0.0, abs=1e-9)
+    assert two_blocks.differential_rad == pytest.approx(0.0, abs=1e-9)
     # To first order one block causes half the pitch of two.
-    assert stance.pitch_rad == pytest.approx(0.5 * both.pitch_rad, rel=0.06)
-    assert -stance.differential_rad == pytest.approx(stance.pitch_rad, rel=0.06)
+    assert one_block.pitch_rad == pytest.approx(0.5 * two_blocks.pitch_rad, rel=0.06)
+    assert -one_block.differential_rad == pytest.approx(one_block.pitch_rad, rel=0.06)
     # The front wheel rises by h; the arm is from the bogie pivot to the front wheel.
-    assert both.pitch_rad == pytest.approx(high / (MER.front_m - MER.bogie_pivot_x_m), rel=0.06)
+    assert two_blocks.pitch_rad == pytest.approx(block_m / (MER.front_m - MER.bogie_pivot_x_m), rel=0.06)
 
 
-def test_bogie_absorbs_a_block_under_the_middle_wheel() -> None:
-    # The middle wheel rises by h: the bogie pivot rises by h times its distance from the rear wheel over the wheelbase.
-    high = 0.06
-    stance = settle(MER, Steps(((0.0, 0.61, high), (0.0, -0.61, high))), 0.0, 0.0, EAST)
-    lift = high * (MER.rear_m + MER.bogie_pivot_x_m) / MER.rear_m
-    nose_down = lift / (MER.front_m - MER.bogie_pivot_x_m)
+def test_block_under_the_middle_wheel_rotates_the_bogie() -> None:
+    # The middle wheel rises by h: the bogie pivot rises by h times its distance from the rear wheel / wheelbase.
+    block_m = 0.06
+    stance = settle(MER, Steps(((0.0, 0.61, block_m), (0.0, -0.61, block_m))), 0.0, 0.0, EAST)
+    pivot_rise_m = block_m * (MER.rear_m + MER.bogie_pivot_x_m) / MER.rear_m
+    nose_down = pivot_rise_m / (MER.front_m - MER.bogie_pivot_x_m)
     assert stance.pitch_rad == pytest.approx(-nose_down, rel=0.05)
     assert stance.bogies_rad[0] == pytest.approx(stance.bogies_rad[1])
-    assert stance.bogies_rad[0] == pytest.approx(-high / MER.rear_m - nose_down, rel=0.05)
+    assert stance.bogies_rad[0] == pytest.approx(-block_m / MER.rear_m - nose_down, rel=0.05)
 
 
-def test_all_wheels_stand_on_rough_ground() -> None:
+def test_all_wheels_touch_rough_ground() -> None:
     samples = np.zeros((256, 256, 2), dtype=np.float32)
     samples[..., 0] = 0.03 * np.random.default_rng(3).standard_normal((256, 256))
     surface = Surface.from_samples(samples, 0.1)
@@ -85,9 +85,9 @@ def test_all_wheels_stand_on_rough_ground() -> None:
         stance = settle(MER, surface, east, north, float(rng.uniform(-3.0, 3.0)))
         assert np.abs(stance.gaps_m).max() < 1e-6
         # No point below the wheel centre is deeper than the rim.
-        centres = stance.world_from_rover.apply(wheel_centres(MER, stance.differential_rad, stance.bogies_rad))
-        above = centres[:, 2] - surface.height(centres[:, 0], centres[:, 1])
-        assert np.all(above > 0.9 * MER.wheel_radius_m)
+        centres = stance.world_from_rover.apply(compute_wheel_centres(MER, stance.differential_rad, stance.bogies_rad))
+        clearance = centres[:, 2] - surface.height(centres[:, 0], centres[:, 1])
+        assert np.all(clearance > 0.9 * MER.wheel_radius_m)
 
 
 def _make_block(east: float, north: float, top: float) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -105,16 +105,16 @@ def test_bodies_raise_the_ground() -> None:
     assert RockyGround.of(slope, _make_block(1.0, 2.0, 0.05), (1.0, 2.0), 1.0).height(x, y) == pytest.approx(
         slope.height(x, y), abs=1e-9
     )
-    none = RockyGround.of(slope, np.empty((0, 3, 3)), (1.0, 2.0), 1.0)
-    assert none.height(x, y) == pytest.approx(slope.height(x, y))
+    without_bodies = RockyGround.of(slope, np.empty((0, 3, 3)), (1.0, 2.0), 1.0)
+    assert without_bodies.height(x, y) == pytest.approx(slope.height(x, y))
 
 
-def test_wheels_stand_on_bodies() -> None:
+def test_wheel_on_a_block_is_raised_as_on_a_mound() -> None:
     # Equal to a mound of the same height with a top wide enough for a wheel.
-    high = 0.10
-    ground = RockyGround.of(Plane(), _make_block(0.705, 0.53, high), (0.0, 0.0), 1.5)
+    height_m = 0.10
+    ground = RockyGround.of(Plane(), _make_block(0.705, 0.53, height_m), (0.0, 0.0), 1.5)
     stance = settle(MER, ground, 0.0, 0.0, EAST)
-    mound = settle(MER, Steps(((0.705, 0.53, high),)), 0.0, 0.0, EAST)
+    mound = settle(MER, Steps(((0.705, 0.53, height_m),)), 0.0, 0.0, EAST)
     assert np.abs(stance.gaps_m).max() < 1e-6
     assert stance.world_from_rover.as_matrix() == pytest.approx(mound.world_from_rover.as_matrix(), abs=1e-4)
 
@@ -135,9 +135,9 @@ def test_rock_of_a_field_lifts_the_wheel() -> None:
 
 def test_stance_does_not_depend_on_initial_guess() -> None:
     ground = Steps(((0.705, 0.53, 0.1), (-0.705, -0.53, 0.05)))
-    cold = settle(MER, ground, 0.0, 0.0, EAST)
-    warm = settle(MER, ground, 0.0, 0.0, EAST, near=settle(MER, uphill_east(5.0), 0.1, 0.0, EAST))
-    assert warm.world_from_rover.as_matrix() == pytest.approx(cold.world_from_rover.as_matrix(), abs=1e-8)
+    default = settle(MER, ground, 0.0, 0.0, EAST)
+    stance = settle(MER, ground, 0.0, 0.0, EAST, initial=settle(MER, uphill_east(5.0), 0.1, 0.0, EAST))
+    assert stance.world_from_rover.as_matrix() == pytest.approx(default.world_from_rover.as_matrix(), abs=1e-8)
 
 
 def test_pivots_must_lie_between_their_wheels() -> None:

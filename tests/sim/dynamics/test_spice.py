@@ -1,4 +1,4 @@
-"""Tests of flights from SPICE kernels, written by NAIF's library for a closed-form motion."""
+"""Tests of flights read from SPICE kernels. The kernels of a closed-form motion are written by NAIF's library."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SCLK_PARTITION_START_999 = ( 0.0 )
 SCLK_PARTITION_END_999   = ( 2.8147497671065E+14 )
 SCLK01_COEFFICIENTS_999  = ( 0.0 0.0 1.0 )
 """
-#: Site axes that are rotated relative to J2000, which reveals a missing rotation.
+#: The site axes are rotated relative to J2000, so that a missing rotation is detected.
 FRAMES = f"""KPL/FK
 \\begindata
 FRAME_SITE_ENU          = {SITE_FRAME}
@@ -59,7 +59,7 @@ FRAME_{CAMERA_FRAME}_CENTER   = {LANDER}
 CK_{CAMERA_FRAME}_SCLK        = {LANDER}
 CK_{CAMERA_FRAME}_SPK         = {LANDER}
 """
-STATED = f"""kernels = ["leap.tls", "lander.tsc", "site.tf", "lander.bsp", "lander.bc"]
+FLIGHT_FILE = f"""kernels = ["leap.tls", "lander.tsc", "site.tf", "lander.bsp", "lander.bc"]
 target = "{LANDER}"
 observer = "{MARS}"
 world = "SITE_ENU"
@@ -70,7 +70,7 @@ step_s = {STEP_S}
 """
 
 
-def fly(times_s: np.ndarray) -> tuple[np.ndarray, Rotation]:
+def closed_form_flight(times_s: np.ndarray) -> tuple[np.ndarray, Rotation]:
     """Return a descent in site axes, m, and the camera attitude in them."""
     east, north = 20.0 * times_s, -5.0 * times_s + 0.1 * times_s**2
     positions = np.stack([east, north, 2000.0 - 75.0 * times_s + 0.2 * times_s**2], axis=-1)
@@ -86,26 +86,26 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("kernels")
     for name, text in (("leap.tls", LEAPSECONDS), ("lander.tsc", CLOCK), ("site.tf", FRAMES)):
         (folder / name).write_text(text)
-    (folder / "flight.spice.toml").write_text(STATED)
+    (folder / "flight.spice.toml").write_text(FLIGHT_FILE)
     with spiceypy.KernelPool([str(folder / name) for name in ("leap.tls", "lander.tsc", "site.tf")]):
         begin = spiceypy.str2et(BEGIN)
         times = STEP_S * np.arange(-4, COUNT + 4)
-        positions, attitudes = fly(times)
-        turn = spiceypy.pxform("SITE_ENU", "J2000", begin)
+        positions, attitudes = closed_form_flight(times)
+        rotation = spiceypy.pxform("SITE_ENU", "J2000", begin)
         velocities = np.gradient(positions, times, axis=0)
-        states = 1e-3 * np.concatenate([positions @ turn.T, velocities @ turn.T], axis=1)
+        states = 1e-3 * np.concatenate([positions @ rotation.T, velocities @ rotation.T], axis=1)
         spk = spiceypy.spkopn(str(folder / "lander.bsp"), "descent", 0)
         span = (begin + times[0], begin + times[-1])
         spiceypy.spkw09(spk, LANDER, MARS, "J2000", *span, "descent", 7, len(times), states.tolist(), begin + times)
         spiceypy.spkcls(spk)
         ticks = [spiceypy.sce2c(LANDER, begin + time) for time in times]
         # C matrices transform vectors from J2000 to camera axes; SPICE quaternions have the scalar first.
-        turns = [spiceypy.m2q(np.ascontiguousarray((turn @ one.as_matrix()).T)) for one in attitudes]
+        quaternions = [spiceypy.m2q(np.ascontiguousarray((rotation @ a.as_matrix()).T)) for a in attitudes]
         ck = spiceypy.ckopn(str(folder / "lander.bc"), "descent", 0)
         rates = np.zeros((len(times), 3))
-        ends = (ticks[0], ticks[-1])
+        tick_span = (ticks[0], ticks[-1])
         spiceypy.ckw03(
-            ck, *ends, CAMERA_FRAME, "J2000", True, "descent", len(times), ticks, turns, rates, 1, [ticks[0]]
+            ck, *tick_span, CAMERA_FRAME, "J2000", True, "descent", len(times), ticks, quaternions, rates, 1, [ticks[0]]
         )
         spiceypy.ckcls(ck)
     return folder
@@ -115,48 +115,48 @@ def test_kernels_reproduce_the_flight(kernels: Path) -> None:
     poses = read_poses(kernels / "flight.spice.toml")
     assert poses.times_s.size == COUNT
     np.testing.assert_allclose(poses.times_s, STEP_S * np.arange(COUNT))
-    positions, attitudes = fly(poses.times_s)
+    positions, attitudes = closed_form_flight(poses.times_s)
     np.testing.assert_allclose(poses.positions_m, positions, atol=1e-6)
     assert (attitudes.inv() * Rotation.from_quat(poses.quaternions)).magnitude().max() < 1e-8
 
 
 def test_kernel_pool_is_restored(kernels: Path) -> None:
-    before = spiceypy.ktotal("ALL")
+    loaded_count = spiceypy.ktotal("ALL")
     read_poses(kernels / "flight.spice.toml")
-    assert spiceypy.ktotal("ALL") == before
+    assert spiceypy.ktotal("ALL") == loaded_count
 
 
 def test_hash_covers_all_kernels(kernels: Path, tmp_path: Path) -> None:
     copy = tmp_path / "kernels"
     shutil.copytree(kernels, copy)
     assert read_poses(copy / "flight.spice.toml").sha256 == read_poses(kernels / "flight.spice.toml").sha256
-    other = tmp_path / "others"
-    shutil.copytree(kernels, other)
-    with (other / "site.tf").open("a") as file:
+    changed = tmp_path / "others"
+    shutil.copytree(kernels, changed)
+    with (changed / "site.tf").open("a") as file:
         file.write("\\begintext\nanother remark\n")
-    assert read_poses(other / "flight.spice.toml").sha256 != read_poses(kernels / "flight.spice.toml").sha256
+    assert read_poses(changed / "flight.spice.toml").sha256 != read_poses(kernels / "flight.spice.toml").sha256
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
+    ("old", "new", "message"),
     [
-        ('"leap.tls", ', '"missing.tls", ', "the kernel .*missing.tls is not there"),
+        ('"leap.tls", ', '"missing.tls", ', "the kernel .*missing.tls does not exist"),
         ('"leap.tls", ', "", "SPICE: .*"),
         ('target = "-999"', 'target = "-998"', "SPICE: .*-998"),
         ('world = "SITE_ENU"', 'world = "SITE_NED"', "SPICE: .*SITE_NED"),
         ("00:00:40", "00:10:00", "SPICE: "),
-        ("00:00:40", "00:00:00", "make 1 poses; allowed: 2 to"),
+        ("00:00:40", "00:00:00", "result in 1 poses; allowed: 2 to"),
         ('begin = "2030-01-01T00:00:00"', 'begin = "yesterday"', "SPICE: .*UNPARSEDTIME"),
         ("step_s = 0.5", "step_s = -1.0", "step_s: .*greater than 0"),
         ('world = "SITE_ENU"', 'word = "SITE_ENU"', "world: Field required"),
         ('world = "SITE_ENU"', "world = SITE", "Invalid value"),
     ],
 )
-def test_kernel_errors_are_reported(kernels: Path, tmp_path: Path, before: str, after: str, message: str) -> None:
+def test_kernel_errors_are_reported(kernels: Path, tmp_path: Path, old: str, new: str, message: str) -> None:
     copy = tmp_path / "kernels"
     shutil.copytree(kernels, copy)
     path = copy / "flight.spice.toml"
-    path.write_text(STATED.replace(before, after))
+    path.write_text(FLIGHT_FILE.replace(old, new))
     with pytest.raises(TrajectoryFileError, match=f"flight.spice.toml: .*{message}") as caught:
         read_poses(path)
     assert "\n" not in str(caught.value)

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
 from marsyard.sim.dynamics import SwingDescent, SwingParameters
-from marsyard.sim.dynamics.kernels.swing import Chain, WindField, aerodynamic_force, derivatives
+from marsyard.sim.dynamics.kernels.swing import Chain, WindField, compute_aerodynamic_force, compute_derivatives
 from marsyard.sim.dynamics.swing import Modes, build_chain
 
 START = np.array([100.0, -50.0, 2100.0])
@@ -18,8 +18,9 @@ GROUND_M = 100.0
 GRAVITY = 3.72
 UP = np.array([0.0, 0.0, 1.0])
 FIVE_POINTS = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
-STILL = {"gust_intensity_m_s": 0.0, "cone_damping_ratio": 0.0, "nod_damping_ratio": 0.0}
-HANGING = STILL | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
+#: No gusts and no damping.
+UNDISTURBED = {"gust_intensity_m_s": 0.0, "cone_damping_ratio": 0.0, "nod_damping_ratio": 0.0}
+HANGING = UNDISTURBED | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
 WILD = {
     "wind_east_m_s": 20.0,
     "wind_north_m_s": -8.0,
@@ -63,9 +64,9 @@ def _body_states(y: np.ndarray, chain: Chain, p: SwingParameters) -> list[tuple[
 
 
 def _energy(y: np.ndarray, chain: Chain, p: SwingParameters) -> float:
-    moving = sum(0.5 * m * v @ v + m * GRAVITY * r[2] for m, r, v in _body_states(y, chain, p))
-    turning = chain.transverse_inertia * y[15:18] @ y[15:18] + chain.axial_inertia * y[21] ** 2
-    return float(moving + 0.5 * turning)
+    translational = sum(0.5 * m * v @ v + m * GRAVITY * r[2] for m, r, v in _body_states(y, chain, p))
+    rotational = chain.transverse_inertia * y[15:18] @ y[15:18] + chain.axial_inertia * y[21] ** 2
+    return float(translational + 0.5 * rotational)
 
 
 def _angular_momentum(y: np.ndarray, chain: Chain, p: SwingParameters) -> np.ndarray:
@@ -91,13 +92,11 @@ def _draw_state(rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
-    """The balances determine all unknown accelerations except one. Without air and friction all quantities are
-    conserved.
-    """
+    """The rates of energy, momentum and angular momentum equal the power, forces and torques of drag and friction."""
     p = SwingParameters(**(WILD | {"nod_damping_ratio": 0.1}))
     chain = build_chain(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
     y, wind = _draw_state(np.random.default_rng(seed)), _make_calm_wind()
-    rates, force = derivatives(y, chain, wind), aerodynamic_force(y, chain, wind)
+    rates, force = compute_derivatives(y, chain, wind), compute_aerodynamic_force(y, chain, wind)
     n, dn, e, de = y[6:18].reshape(4, 3)
     spinning = np.cross(e, de) + y[21] * e
     slip = spinning - (spinning @ n) * n - np.cross(n, dn)
@@ -105,9 +104,9 @@ def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
     power = (_energy(y + h * rates, chain, p) - _energy(y - h * rates, chain, p)) / (2.0 * h)
     # The energy of 1e7 J is rounded to 1e-9 J, over 2e-5 s.
     assert power == pytest.approx(force @ y[3:6] - chain.hinge_damping * slip @ slip, abs=1e-3)
-    turning = (_angular_momentum(y + h * rates, chain, p) - _angular_momentum(y - h * rates, chain, p)) / (2.0 * h)
+    torque = (_angular_momentum(y + h * rates, chain, p) - _angular_momentum(y - h * rates, chain, p)) / (2.0 * h)
     weights = sum(np.cross(r, -m * GRAVITY * UP) for m, r, _ in _body_states(y, chain, p))
-    np.testing.assert_allclose(turning, np.cross(y[:3], force) + weights, atol=1e-2)
+    np.testing.assert_allclose(torque, np.cross(y[:3], force) + weights, atol=1e-2)
     momentum_rate = sum(
         m * dv
         for (m, _, _), dv in zip(
@@ -129,15 +128,15 @@ def test_drag_and_friction_only_dissipate_energy() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         y = _draw_state(rng)
-        force = aerodynamic_force(y, chain, _make_calm_wind())
+        force = compute_aerodynamic_force(y, chain, _make_calm_wind())
         assert force @ y[3:6] < 0.0
 
 
-def _linearise(p: SwingParameters) -> tuple[Chain, Modes]:
-    """A chain with constant air density, which falls at a constant rate."""
-    thin = p.model_copy(update={"density_scale_height_m": 1e15})
-    modes = Modes.of(thin, GRAVITY)
-    return build_chain(thin, modes, GRAVITY, 2000.0), modes
+def _build_linear_chain(p: SwingParameters) -> tuple[Chain, Modes]:
+    """A chain that falls at a constant rate, because the air density is constant."""
+    constant_density = p.model_copy(update={"density_scale_height_m": 1e15})
+    modes = Modes.of(constant_density, GRAVITY)
+    return build_chain(constant_density, modes, GRAVITY, 2000.0), modes
 
 
 def _eigenvalues_by_matrices(p: SwingParameters, chain: Chain, modes: Modes) -> np.ndarray:
@@ -174,7 +173,7 @@ def _eigenvalues_by_differences(p: SwingParameters, chain: Chain) -> np.ndarray:
         for start, angle, rate in ((6, line, dline), (12, lander, dlander)):
             y[start : start + 6] = [np.sin(angle), 0, -np.cos(angle), rate * np.cos(angle), 0, rate * np.sin(angle)]
         y[18:21] = [0.0, 1.0, 0.0]
-        d = derivatives(y, chain, _make_calm_wind())
+        d = compute_derivatives(y, chain, _make_calm_wind())
         # n'' = (theta'' cos - theta'^2 sin, 0, theta'' sin + theta'^2 cos)
         rotated = [d[s] * np.cos(a) + d[s + 2] * np.sin(a) for s, a in ((9, line), (15, lander))]
         return np.array([dx, dline, dlander, d[3], *rotated])
@@ -187,7 +186,7 @@ def _eigenvalues_by_differences(p: SwingParameters, chain: Chain) -> np.ndarray:
 @pytest.mark.parametrize("ratio", [0.0, 0.03])
 def test_small_swings_match_the_double_pendulum(ratio: float) -> None:
     p = SwingParameters(cone_angle_deg=0.0, cone_damping_ratio=ratio, nod_damping_ratio=ratio)
-    chain, modes = _linearise(p)
+    chain, modes = _build_linear_chain(p)
     theory = _eigenvalues_by_matrices(p, chain, modes)
     result = _eigenvalues_by_differences(p, chain)
     np.testing.assert_allclose(np.sort_complex(result), np.sort_complex(theory), atol=1e-6)
@@ -195,7 +194,7 @@ def test_small_swings_match_the_double_pendulum(ratio: float) -> None:
 
 def test_mode_frequencies_and_damping_match_linear_theory() -> None:
     p = SwingParameters(cone_angle_deg=0.0, cone_damping_ratio=0.02, nod_damping_ratio=0.05)
-    chain, modes = _linearise(p)
+    chain, modes = _build_linear_chain(p)
     swings = _eigenvalues_by_matrices(p, chain, modes)
     cone, nod = sorted(swings[swings.imag > 0.0], key=abs)
     # The coning formula assumes a lander fixed to the line; canopy drag damps nods by another 0.003.
@@ -209,7 +208,7 @@ def test_mode_frequencies_and_damping_match_linear_theory() -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, {"cone_minor_fraction": 0.0, "cone_phase_deg": 90.0}, {"cone_angle_deg": 0.0}])
-def test_finite_differences_give_velocity_rate_and_specific_force(changes: dict[str, float]) -> None:
+def test_velocity_rate_and_force_match_finite_differences(changes: dict[str, float]) -> None:
     descent = _fly(**(WILD | changes))
     h, times = 1e-3, np.linspace(-9.9, descent.span_s[1] - 0.1, 400)
     stencil = [descent.motion(times + k * h) for k in range(-2, 3)]
@@ -218,13 +217,13 @@ def test_finite_differences_give_velocity_rate_and_specific_force(changes: dict[
     acceleration = np.tensordot(FIVE_POINTS, [m.velocities_m_s for m in stencil], 1) / h
     inverse = middle.attitudes.inv()
     rate = np.tensordot(FIVE_POINTS, [(inverse * m.attitudes).as_rotvec() for m in stencil], 1) / h
-    # The dense output follows the equations to some 1e-6.
+    # The dense output satisfies the equations to about 1e-6.
     np.testing.assert_allclose(velocity, middle.velocities_m_s, atol=1e-5)
     np.testing.assert_allclose(inverse.apply(acceleration + GRAVITY * UP), middle.specific_forces_m_s2, atol=1e-5)
     np.testing.assert_allclose(rate, middle.body_rates_rad_s, atol=1e-5)
 
 
-def test_motion_is_smooth_at_the_first_image() -> None:
+def test_motion_is_continuous_at_the_first_image() -> None:
     descent = _fly(**WILD)
     np.testing.assert_allclose(descent.state(0.0).position_m, START, atol=1e-9)
     around = descent.motion(np.array([-1e-9, 0.0]))
@@ -251,12 +250,12 @@ def test_fall_follows_terminal_velocity() -> None:
     def fall(_t: float, y: np.ndarray) -> list[float]:
         return [y[1], np.exp((START[2] - y[0]) / 10000.0) * braking * (y[1] / 75.0) ** 2 - GRAVITY]
 
-    alone = solve_ivp(fall, (0.0, 26.0), [START[2], -75.0], rtol=1e-10, atol=1e-10, dense_output=True).sol
-    assert alone is not None
+    reference = solve_ivp(fall, (0.0, 26.0), [START[2], -75.0], rtol=1e-10, atol=1e-10, dense_output=True).sol
+    assert reference is not None
     times = np.linspace(0.0, 26.0, 27)
     motion = descent.motion(times)
-    np.testing.assert_allclose(motion.positions_m[:, 2], alone(times)[0], atol=1e-5)
-    np.testing.assert_allclose(motion.velocities_m_s[:, 2], alone(times)[1], atol=1e-5)
+    np.testing.assert_allclose(motion.positions_m[:, 2], reference(times)[0], atol=1e-5)
+    np.testing.assert_allclose(motion.velocities_m_s[:, 2], reference(times)[1], atol=1e-5)
     # The velocity stays near the balance of weight and drag.
     balanced = 75.0 * np.exp((motion.positions_m[:, 2] - START[2]) / 20000.0)
     np.testing.assert_allclose(-motion.velocities_m_s[:, 2], balanced, rtol=5e-3)
@@ -272,8 +271,8 @@ def test_descent_drifts_with_the_mean_wind() -> None:
 
 
 @pytest.mark.parametrize("angle", [5.0, 30.0])
-def test_circular_cone_keeps_its_angle(angle: float) -> None:
-    descent = _fly(**(STILL | {"cone_angle_deg": angle, "cone_minor_fraction": 1.0, "nod_rate_deg_s": 0.0}))
+def test_circular_cone_has_a_constant_angle(angle: float) -> None:
+    descent = _fly(**(UNDISTURBED | {"cone_angle_deg": angle, "cone_minor_fraction": 1.0, "nod_rate_deg_s": 0.0}))
     assert _off_nadir_deg(descent, np.zeros(1))[0] == pytest.approx(angle, abs=1e-6)
     # Wide cones deviate from the lander tilt of linear theory, which causes nods of one degree.
     np.testing.assert_allclose(_off_nadir_deg(descent, np.linspace(-5.0, 7.5, 200)), angle, atol=0.04 * angle)
@@ -288,7 +287,7 @@ def test_circular_cone_keeps_its_angle(angle: float) -> None:
 @pytest.mark.parametrize("phase", [0.0, 60.0, 90.0, 200.0])
 def test_plane_swing_reaches_the_specified_angle(phase: float) -> None:
     swing = {"cone_angle_deg": 30.0, "cone_minor_fraction": 0.0, "cone_phase_deg": phase, "nod_rate_deg_s": 0.0}
-    descent = _fly(**(STILL | swing))
+    descent = _fly(**(UNDISTURBED | swing))
     angles = _off_nadir_deg(descent, np.linspace(-6.0, 16.0, 2000))
     assert angles.max() == pytest.approx(30.0, rel=0.03)
     assert angles.min() < 0.5
@@ -297,30 +296,30 @@ def test_plane_swing_reaches_the_specified_angle(phase: float) -> None:
 @pytest.mark.parametrize("fraction", [0.5, -0.5])
 def test_cone_starts_at_its_azimuth_with_its_sense_of_rotation(fraction: float) -> None:
     cone = {"cone_angle_deg": 20.0, "cone_minor_fraction": fraction, "cone_direction_deg": 90.0, "nod_rate_deg_s": 0.0}
-    descent = _fly(**(STILL | cone))
-    looking = -descent.motion(np.array([0.0, 1.0])).attitudes.as_matrix()[:, :, 2]
-    # The camera looks east of nadir; a positive value rotates clockwise from above, to the south.
-    np.testing.assert_allclose(looking[0], [np.sin(np.radians(20.0)), 0.0, -np.cos(np.radians(20.0))], atol=1e-9)
-    assert np.sign(looking[1, 1]) == -np.sign(fraction)
+    descent = _fly(**(UNDISTURBED | cone))
+    camera_axes = -descent.motion(np.array([0.0, 1.0])).attitudes.as_matrix()[:, :, 2]
+    # The camera points east of nadir; with a positive fraction it rotates clockwise seen from above, to the south.
+    np.testing.assert_allclose(camera_axes[0], [np.sin(np.radians(20.0)), 0.0, -np.cos(np.radians(20.0))], atol=1e-9)
+    assert np.sign(camera_axes[1, 1]) == -np.sign(fraction)
     # A quarter of a period later it is at the smaller semi-axis.
-    quarter = 0.5 * np.pi / Modes.of(descent.parameters, GRAVITY).cone_rad_s
-    min_angle = _off_nadir_deg(descent, np.linspace(quarter - 1.0, quarter + 1.0, 200)).min()
+    quarter_period_s = 0.5 * np.pi / Modes.of(descent.parameters, GRAVITY).cone_rad_s
+    min_angle = _off_nadir_deg(descent, np.linspace(quarter_period_s - 1.0, quarter_period_s + 1.0, 200)).min()
     assert min_angle == pytest.approx(10.0, abs=0.4)
 
 
 @pytest.mark.parametrize("phase", [0.0, 45.0, 250.0])
 def test_max_rate_equals_the_specified_rate(phase: float) -> None:
-    nodding = HANGING | {"nod_rate_deg_s": 60.0, "nod_phase_deg": phase}
-    descent = _fly(**nodding)
+    parameters = HANGING | {"nod_rate_deg_s": 60.0, "nod_phase_deg": phase}
+    descent = _fly(**parameters)
     period = 2.0 * np.pi / Modes.of(descent.parameters, GRAVITY).nod_rad_s
     motion = descent.motion(np.linspace(-0.5, 0.5, 400) * period)
     # Canopy drag reduces the rate by 2 % within a period.
-    greatest = np.degrees(np.linalg.norm(motion.body_rates_rad_s, axis=1)).max()
-    assert greatest == pytest.approx(60.0, rel=0.02)
+    max_rate = np.degrees(np.linalg.norm(motion.body_rates_rad_s, axis=1)).max()
+    assert max_rate == pytest.approx(60.0, rel=0.02)
     assert np.ptp(np.degrees(motion.body_rates_rad_s[:, 0])) == pytest.approx(120.0, rel=0.03)
 
 
-def test_heading_and_spin_turn_clockwise() -> None:
+def test_heading_and_spin_are_clockwise() -> None:
     descent = _fly(**HANGING, heading_deg=90.0, spin_rate_deg_s=5.0)
     matrices = descent.motion(np.array([0.0, 3.0])).attitudes.as_matrix()
     np.testing.assert_allclose(matrices[0, :, 1], [1.0, 0.0, 0.0], atol=1e-12)
@@ -330,11 +329,11 @@ def test_heading_and_spin_turn_clockwise() -> None:
 
 def test_gusts_depend_on_generator_and_swing_the_line() -> None:
     gusty = HANGING | {"gust_intensity_m_s": 3.0}
-    one, same, other = _fly(4, **gusty), _fly(4, **gusty), _fly(5, **gusty)
+    first, repeated, other_seed = _fly(4, **gusty), _fly(4, **gusty), _fly(5, **gusty)
     times = np.linspace(-5.0, 20.0, 50)
-    np.testing.assert_array_equal(one.motion(times).positions_m, same.motion(times).positions_m)
-    assert np.abs(one.motion(times).positions_m - other.motion(times).positions_m).max() > 1.0
-    assert 0.1 < _off_nadir_deg(one, times).max() < 15.0
+    np.testing.assert_array_equal(first.motion(times).positions_m, repeated.motion(times).positions_m)
+    assert np.abs(first.motion(times).positions_m - other_seed.motion(times).positions_m).max() > 1.0
+    assert 0.1 < _off_nadir_deg(first, times).max() < 15.0
 
 
 def test_thrusters_fire_at_their_height_before_the_end() -> None:
@@ -361,11 +360,11 @@ def test_horizontal_velocities_match_the_paper() -> None:
     assert 20.0 < max(speeds) < 32.0
 
 
-def test_errors_state_the_allowed_values() -> None:
+def test_error_messages_contain_the_allowed_values() -> None:
     descent = _fly(**HANGING)
     with pytest.raises(ValueError, match=r"time -11 s is outside of the motion; allowed: -10 to 27\.\d+ s"):
         descent.state(-11.0)
-    with pytest.raises(ValueError, match=r"altitude 5000 m is not flown through; allowed: .* to 27\d\d"):
+    with pytest.raises(ValueError, match=r"altitude 5000 m is not passed; allowed: .* to 27\d\d"):
         descent.time_of_altitude(5000.0)
     with pytest.raises(ValueError, match=r"nod_rate_deg_s is 110; allowed: below \d+"):
         _fly(nod_rate_deg_s=110.0, mass_centre_m=0.2, gyration_transverse_m=1.0)
@@ -374,7 +373,7 @@ def test_errors_state_the_allowed_values() -> None:
             SwingParameters(), np.array([0.0, 0.0, 150.0]), np.random.default_rng(0), ground_height_m=GROUND_M
         )
     with pytest.raises(
-        ValueError, match=r"gyration_transverse_m of 5 with mass_centre_m of 0\.1 .*; allowed: nods far"
+        ValueError, match=r"gyration_transverse_m of 5 with mass_centre_m of 0\.1 .*; allowed: nodding much"
     ):
         _fly(mass_centre_m=0.1, gyration_transverse_m=5.0, nod_rate_deg_s=0.0)
     with pytest.raises(ValueError, match="lead_s is 60; allowed: above 0, up to 30 s"):
@@ -389,7 +388,7 @@ def test_compiled_integrator_matches_scipy() -> None:
     state = descent.path.at(np.zeros(1))[0]
     for end_s in (-9.0, 12.0):
         expected = solve_ivp(
-            lambda _t, y: derivatives(y, descent.chain, descent.wind.field),
+            lambda _t, y: compute_derivatives(y, descent.chain, descent.wind.field),
             (0.0, end_s),
             state,
             method="DOP853",

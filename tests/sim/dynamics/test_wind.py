@@ -25,7 +25,7 @@ def test_mean_wind_is_logarithmic_in_layer_and_constant_above() -> None:
     np.testing.assert_array_equal(wind.velocities(np.array([GROUND_M - 10.0])), 0.0)
 
 
-def test_gust_bands_contain_all_but_the_mean() -> None:
+def test_wind_without_gusts_is_the_mean_wind() -> None:
     wind = _make_wind(wind_east_m_s=20.0, gust_intensity_m_s=2.0)
     heights = GROUND_M + np.linspace(600.0, 2000.0, 50)
     assert np.ptp(wind.velocities(heights)[:, 0]) > 1.0
@@ -40,9 +40,9 @@ def _structure_function(spectrum: str, lag_m: float, length_m: float) -> float:
         return 2.0 / (1.0 + x2) if spectrum == "longitudinal" else (1.0 + 3.0 * x2) / (1.0 + x2) ** 2
 
     first, last = 2.0 * np.pi / (LONGEST_WAVE_SCALES * length_m), 2.0 * np.pi / SHORTEST_WAVE_M
-    full, _ = quad(density, first, last, limit=400)
-    part, _ = quad(lambda k: density(k) * 2.0 * (1.0 - np.cos(k * lag_m)), first, last, limit=2000)
-    return part / full
+    variance, _ = quad(density, first, last, limit=400)
+    squared_difference, _ = quad(lambda k: density(k) * 2.0 * (1.0 - np.cos(k * lag_m)), first, last, limit=2000)
+    return squared_difference / variance
 
 
 @pytest.mark.parametrize("lag_m", [50.0, 300.0])
@@ -50,12 +50,12 @@ def test_gusts_have_dryden_spectra(lag_m: float) -> None:
     draws = 3000
     heights = GROUND_M + np.array([1000.0, 1000.0 + lag_m])
     rows = np.stack([_make_wind(seed, gust_intensity_m_s=2.0).velocities(heights) for seed in range(draws)])
-    # The variance of n normal draws has a spread of sqrt(2 / n) = 2.6 %; the tolerance is four times that.
+    # The variance of n normal draws has a relative deviation of sqrt(2 / n) = 2.6 %; the tolerance is four times that.
     band = 4.0 * np.sqrt(2.0 / draws)
     np.testing.assert_allclose(rows[:, 0].var(axis=0), 4.0, rtol=band)
-    squared = np.mean((rows[:, 1] - rows[:, 0]) ** 2, axis=0) / 4.0
-    np.testing.assert_allclose(squared[:2], _structure_function("transverse", lag_m, 533.0), rtol=band)
-    np.testing.assert_allclose(squared[2], _structure_function("longitudinal", lag_m, 533.0), rtol=band)
+    structure = np.mean((rows[:, 1] - rows[:, 0]) ** 2, axis=0) / 4.0
+    np.testing.assert_allclose(structure[:2], _structure_function("transverse", lag_m, 533.0), rtol=band)
+    np.testing.assert_allclose(structure[2], _structure_function("longitudinal", lag_m, 533.0), rtol=band)
 
 
 def test_components_are_independent() -> None:

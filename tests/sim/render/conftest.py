@@ -1,4 +1,4 @@
-"""Fixtures of rendering tests."""
+"""Fixtures of the rendering tests: the renderer, a rough terrain, and a factory of descent cameras."""
 
 from collections.abc import Callable
 

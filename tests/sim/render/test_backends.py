@@ -12,7 +12,7 @@ import trimesh
 
 from marsyard.sim.render.backend import DepthRenderer, RenderingError, default_backend
 
-DRAW = """
+SCRIPT = """
 import sys
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -42,24 +42,24 @@ np.savez(sys.argv[2], radiance=frame.radiance, distance=frame.range_m, depth=dep
 LIBRARIES = {"osmesa": "libOSMesa.so.8", "egl": "libEGL.so.1"}
 
 
-def _draw(backend: str, folder: Path) -> dict[str, np.ndarray]:
+def _render_in_process(backend: str, folder: Path) -> dict[str, np.ndarray]:
     try:
         ctypes.CDLL(LIBRARIES[backend])
     except OSError:
         pytest.skip(f"{LIBRARIES[backend]} is not installed: {backend} cannot be compared")
     path = folder / f"{backend}.npz"
     environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
-    subprocess.run([sys.executable, "-c", DRAW, backend, str(path)], check=True, env=environment, timeout=120)
+    subprocess.run([sys.executable, "-c", SCRIPT, backend, str(path)], check=True, env=environment, timeout=120)
     return dict(np.load(path))
 
 
 def test_osmesa_and_egl_render_equal_images(tmp_path: Path) -> None:
-    osmesa, egl = _draw("osmesa", tmp_path), _draw("egl", tmp_path)
+    osmesa, egl = _render_in_process("osmesa", tmp_path), _render_in_process("egl", tmp_path)
     # Where a ray grazes a crest, a rounding difference in depth can select either side.
     assert np.mean(np.abs(egl["distance"] / osmesa["distance"] - 1.0) < 1e-6) > 0.999
     assert np.mean(np.abs(egl["radiance"] / osmesa["radiance"] - 1.0) < 1e-4) > 0.999
-    # A depth sample off the pixel centre (EGL multisampling) would differ by a quarter of a pixel's slope: some tenths
-    # of a metre.
+    # A depth sample off the pixel centre (EGL multisampling) would differ by the slope times a quarter of a pixel:
+    # several tenths of a metre.
     assert np.abs(egl["depth"] - osmesa["depth"]).mean() < 1e-3
 
 
@@ -78,7 +78,8 @@ def test_default_backend_is_installed(monkeypatch: pytest.MonkeyPatch, installed
     assert backend.default_backend() == chosen
 
 
-def _render_depths(height_m: float) -> tuple[np.ndarray, float, float, float]:
+def _depth_view(height_m: float) -> tuple[np.ndarray, float, float, float]:
+    """Pose of a camera that looks straight down, its focal length in pixels, and the near and far distance."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = height_m
     return pose, 40.0, 1.0, 100.0
@@ -91,12 +92,12 @@ def test_load_replaces_the_previous_geometry() -> None:
     above = np.array([[[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]]])
     renderer = DepthRenderer(64, default_backend())
     with pytest.raises(RenderingError, match="no mesh"):
-        renderer.draw(*_render_depths(20.0))
-    nothing = (np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
-    for loaded, number in (((above, np.array([70000])), 70001), (nothing, 0), ((above, np.array([5])), 6)):
+        renderer.draw(*_depth_view(20.0))
+    no_triangles = (np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
+    for loaded, number in (((above, np.array([70000])), 70001), (no_triangles, 0), ((above, np.array([5])), 6)):
         renderer.load(ground, *loaded)
         for height in (20.0, 10.0):
-            depth, numbers = renderer.draw(*_render_depths(height))
+            depth, numbers = renderer.draw(*_depth_view(height))
             # 24 bits of a depth between 1 and 100 m.
             assert depth[32, 32] == pytest.approx(height - (4.0 if number else 0.0), abs=1e-3)
             assert depth[2, 2] == pytest.approx(height, abs=1e-3)
@@ -111,10 +112,10 @@ def test_second_backend_in_one_process_is_rejected() -> None:
         "try:\n    DepthRenderer(64, 'egl')\nexcept RenderingError as error:\n    print(error)\n"
     )
     environment = os.environ | {"PYOPENGL_PLATFORM": "osmesa"}
-    done = subprocess.run(
+    run = subprocess.run(
         [sys.executable, "-c", program], check=True, env=environment, capture_output=True, text=True, timeout=60
     )
-    assert "already uses OpenGL through osmesa" in done.stdout
+    assert "already uses OpenGL through osmesa" in run.stdout
 
 
 def test_python_without_assertions_is_rejected() -> None:
@@ -122,5 +123,5 @@ def test_python_without_assertions_is_rejected() -> None:
         "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"
         "try:\n    DepthRenderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"
     )
-    done = subprocess.run([sys.executable, "-O", "-c", program], check=True, capture_output=True, text=True, timeout=60)
-    assert "without -O" in done.stdout
+    run = subprocess.run([sys.executable, "-O", "-c", program], check=True, capture_output=True, text=True, timeout=60)
+    assert "without -O" in run.stdout

@@ -49,68 +49,69 @@ def test_cover_and_size_equal_the_parameters(cover: float) -> None:
     assert inside.sum() / entries * layers[0].cell_m == pytest.approx(900.0, rel=0.05)
 
 
-def test_clouds_dim_the_direct_sun_by_their_optical_depth(
+def test_direct_sunlight_is_attenuated_by_the_optical_depth(
     renderer: Renderer, descent_camera: Callable[..., Cahvor]
 ) -> None:
     layer = _make_layer(cover=0.4, optical_depth=1.0, edge_m=10.0)
     frame = _render_from_above(renderer, _make_scene(layer), descent_camera(128))
     elevation = np.radians(50.0)
     clear = ALBEDO * np.sin(elevation)
-    more = layer.parameters.sky_light(SUN) * ALBEDO
-    assert frame.radiance.max() == pytest.approx(clear + more, rel=1e-4)
-    assert frame.radiance.min() == pytest.approx(clear * np.exp(-1.0 / np.sin(elevation)) + more, rel=1e-3)
+    scattered = layer.parameters.sky_light(SUN) * ALBEDO
+    assert frame.radiance.max() == pytest.approx(clear + scattered, rel=1e-4)
+    assert frame.radiance.min() == pytest.approx(clear * np.exp(-1.0 / np.sin(elevation)) + scattered, rel=1e-3)
 
 
 def test_rendered_transmittance_equals_truth(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     scene = _make_scene(_make_layer(seed=3, asymmetry=0.0, optical_depth=100.0))
     frame = _render_from_above(renderer, scene, descent_camera(128), time_s=12.0)
     assert scene.clouds is not None
-    passed = scene.clouds.transmittance(frame.points_world(), SUN, 12.0)
-    more = scene.clouds.parameters.sky_light(SUN)
-    np.testing.assert_allclose(frame.radiance, ALBEDO * (SUN.direction[2] * passed + more), rtol=2e-5, atol=1e-6)
-    assert 0.1 < np.mean(passed < 0.5) < 0.9
+    transmittance = scene.clouds.transmittance(frame.points_world(), SUN, 12.0)
+    sky_light = scene.clouds.parameters.sky_light(SUN)
+    expected = ALBEDO * (SUN.direction[2] * transmittance + sky_light)
+    np.testing.assert_allclose(frame.radiance, expected, rtol=2e-5, atol=1e-6)
+    assert 0.1 < np.mean(transmittance < 0.5) < 0.9
 
 
 def test_shadows_move_with_the_wind(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     """From a camera that drifts with the wind, the shadows on uniform ground are static."""
     scene, camera = _make_scene(_make_layer(wind_east_m_s=9.0, wind_north_m_s=-4.0)), descent_camera(128)
     first = _render_from_above(renderer, scene, camera, 5.0)
-    later = _render_from_above(renderer, scene, camera, 8.75, at=(100.0 + 3.75 * 9.0, 300.0 - 3.75 * 4.0))
-    stayed = _render_from_above(renderer, scene, camera, 8.75)
+    moving_camera = _render_from_above(renderer, scene, camera, 8.75, at=(100.0 + 3.75 * 9.0, 300.0 - 3.75 * 4.0))
+    fixed_camera = _render_from_above(renderer, scene, camera, 8.75)
     assert np.ptp(first.radiance) > 0.1
     # A hundredth of a pixel of 13 m times the steepest gradient of a 40 m edge is 7e-4.
-    assert np.abs(later.radiance - first.radiance).max() < 1e-4
-    assert np.abs(stayed.radiance - first.radiance).max() > 0.05
+    assert np.abs(moving_camera.radiance - first.radiance).max() < 1e-4
+    assert np.abs(fixed_camera.radiance - first.radiance).max() > 0.05
 
 
-def test_zero_cover_equals_no_clouds_bit_for_bit(
+def test_zero_cover_is_bitwise_equal_to_no_clouds(
     renderer: Renderer, descent_camera: Callable[..., Cahvor], rough: Surface
 ) -> None:
     camera = PixelRays.of(descent_camera(128))
     pose = rigid(Rotation.identity(), np.array([380.0, 200.0, 900.0]))
-    bare = Scene(rough, (380.0, 200.0), SUN, Photometry())
-    clouded = replace(bare, clouds=_make_layer(cover=0.0))
+    clear = Scene(rough, (380.0, 200.0), SUN, Photometry())
+    zero_cover = replace(clear, clouds=_make_layer(cover=0.0))
     assert (
-        renderer.render(bare, camera, pose).radiance.tobytes()
-        == renderer.render(clouded, camera, pose, 40.0).radiance.tobytes()
+        renderer.render(clear, camera, pose).radiance.tobytes()
+        == renderer.render(zero_cover, camera, pose, 40.0).radiance.tobytes()
     )
 
 
 def test_scattered_light_does_not_exceed_the_removed_light() -> None:
     for depth in (0.0, 0.5, 5.0, 50.0):
-        inputs = CloudParameters(optical_depth=depth, cover=0.4)
-        stored = 0.4 * (1.0 - inputs.direct_transmittance(SUN)) * SUN.direction[2]
-        assert 0.0 <= inputs.sky_light(SUN) <= stored
+        parameters = CloudParameters(optical_depth=depth, cover=0.4)
+        removed = 0.4 * (1.0 - parameters.direct_transmittance(SUN)) * SUN.direction[2]
+        assert 0.0 <= parameters.sky_light(SUN) <= removed
     assert CloudParameters(optical_depth=0.0).sky_light(SUN) == 0.0
 
 
-def test_equal_generators_give_equal_clouds() -> None:
+def test_equal_generators_draw_equal_clouds() -> None:
     assert _make_layer(7).cover.tobytes() == _make_layer(7).cover.tobytes()
     assert _make_layer(7).cover.tobytes() != _make_layer(8).cover.tobytes()
 
 
 def test_transmittance_of_the_sky_is_nan() -> None:
     points = np.array([[np.nan, np.nan, np.nan], [3.0, 4.0, 5.0]])
-    passed = _make_layer().transmittance(points, SUN, 0.0)
-    assert np.isnan(passed[0])
-    assert 0.0 < passed[1] <= 1.0
+    transmittance = _make_layer().transmittance(points, SUN, 0.0)
+    assert np.isnan(transmittance[0])
+    assert 0.0 < transmittance[1] <= 1.0

@@ -8,11 +8,11 @@ from marsyard.sim.render.kernels.views import depth_in_metres
 def test_perspective_depths_convert_to_metres() -> None:
     """OpenGL stores ``f (z - n) / (z (f - n))`` for a depth z between n and f, lowest row first."""
     near, far = 3.0, 900.0
-    true = np.geomspace(4.0, 60.0, 15).reshape(5, 3)
-    stored = far * (true - near) / (true * (far - near))
+    depths_m = np.geomspace(4.0, 60.0, 15).reshape(5, 3)
+    stored = far * (depths_m - near) / (depths_m * (far - near))
     stored[1, 2] = 1.0
     result = depth_in_metres(stored[::-1].astype(np.float32), near, far)
     assert result[1, 2] == 0.0
-    true[1, 2] = 0.0
-    # Single precision of 1 - n / z: 6e-8 z / n of z.
-    np.testing.assert_allclose(result, true, rtol=3e-6)
+    depths_m[1, 2] = 0.0
+    # Rounding of 1 - n / z in single precision causes a relative error of 6e-8 z / n in z.
+    np.testing.assert_allclose(result, depths_m, rtol=3e-6)

@@ -60,7 +60,7 @@ def rocky() -> View:
 
 @pytest.fixture(scope="module")
 def reference(renderer: Renderer, rocky: View) -> np.ndarray:
-    """The rocks rendered with 256 rays per pixel; ground and texture have the smoothness of a pixel."""
+    """Radiance rendered with 256 rays per pixel; ground and texture are smoothed over a pixel."""
     single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
     return supersample(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
 
@@ -69,10 +69,10 @@ def test_subpixel_rays_are_evenly_distributed() -> None:
     camera = _make_camera((7, 5))
     rays = PixelRays.of(camera)
     pixels = np.array([0, 17, 34])
-    within = supersample_rays(rays, pixels, 3)
-    result, _ = camera.project(within.directions.astype(np.float64))
-    middles = np.stack([pixels % 7, pixels // 7], axis=-1)
-    positions = result.reshape(3, 9, 2) - middles[:, None]
+    subpixel_rays = supersample_rays(rays, pixels, 3)
+    result, _ = camera.project(subpixel_rays.directions.astype(np.float64))
+    centres = np.stack([pixels % 7, pixels // 7], axis=-1)
+    positions = result.reshape(3, 9, 2) - centres[:, None]
     assert np.abs(positions.mean(axis=1)).max() < 1e-3
     # No two of the nine rays share a row or column.
     for axis in range(2):
@@ -94,35 +94,36 @@ def test_nearest_triangle_equals_exhaustive_search(rocky: View) -> None:
 def test_outlines_match_256_rays_per_pixel(
     renderer: Renderer, rocky: View, reference: np.ndarray, side: int, fraction: float
 ) -> None:
-    single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
+    one_ray_view = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
     rays = rocky.rays(rocky.camera)
-    one = renderer.render(single.scene, rays, rocky.world_from_body)
+    single_ray = renderer.render(one_ray_view.scene, rays, rocky.world_from_body)
     antialiased = renderer.render(replace(rocky.scene, edge_rays=side), rays, rocky.world_from_body)
-    edges = edge_pixels(one.radiance, one.range_m, one.body)
-    assert 500 < edges.size < 0.2 * one.radiance.size
+    edges = edge_pixels(single_ray.radiance, single_ray.range_m, single_ray.body)
+    assert 500 < edges.size < 0.2 * single_ray.radiance.size
 
     def error(radiance: np.ndarray) -> float:
         return float(np.sqrt(np.mean((radiance - reference).ravel()[edges] ** 2)) / reference.mean())
 
-    assert error(antialiased.radiance) < fraction * error(one.radiance)
+    assert error(antialiased.radiance) < fraction * error(single_ray.radiance)
     # The mean brightness at outlines is unbiased.
     at_edges = (antialiased.radiance - reference).ravel()[edges].mean() / reference.mean()
-    assert abs(at_edges) < 0.1 * error(one.radiance)
+    assert abs(at_edges) < 0.1 * error(single_ray.radiance)
 
 
 def test_truth_is_at_pixel_centres(renderer: Renderer, rocky: View) -> None:
     rays = rocky.rays(rocky.camera)
-    one = renderer.render(replace(rocky.scene, edge_rays=1), rays, rocky.world_from_body)
+    single_ray = renderer.render(replace(rocky.scene, edge_rays=1), rays, rocky.world_from_body)
     antialiased = renderer.render(rocky.scene, rays, rocky.world_from_body)
     for layer in ("range_m", "body", "normal"):
-        assert getattr(one, layer).tobytes() == getattr(antialiased, layer).tobytes()
-    changed = np.flatnonzero(one.radiance.ravel() != antialiased.radiance.ravel())
-    assert np.isin(changed, edge_pixels(one.radiance, one.range_m, one.body)).all()
+        assert getattr(single_ray, layer).tobytes() == getattr(antialiased, layer).tobytes()
+    changed = np.flatnonzero(single_ray.radiance.ravel() != antialiased.radiance.ravel())
+    assert np.isin(changed, edge_pixels(single_ray.radiance, single_ray.range_m, single_ray.body)).all()
 
 
 def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
-    """A rolled camera over a plane: the ground fraction in each column is the part below the mesh border. The mesh
-    ends 200 m away, 5 mrad or 3.3 pixels below the horizon.
+    """Ground fraction per column for a rolled camera over a plane: the part of the column below the mesh border.
+
+    The mesh ends 200 m away, 5 mrad or 3.3 pixels below the horizon.
     """
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = 0.2

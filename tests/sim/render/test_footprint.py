@@ -1,4 +1,4 @@
-"""Tests of shadow footprints: all ground that objects may shade is included, and little other ground."""
+"""Tests of shadow footprints: they contain all ground that objects may shade, and little more."""
 
 from dataclasses import replace
 
@@ -22,14 +22,14 @@ def _is_inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray
     column = np.floor((x - west) * per_metre).astype(int)
     row = np.floor((y - south) * per_metre).astype(int)
     inside = (column >= 0) & (column < cells.shape[1]) & (row >= 0) & (row < cells.shape[0])
-    marked = np.zeros(x.shape, dtype=bool)
-    marked[inside] = cells[row[inside], column[inside]]
-    return marked
+    is_shaded = np.zeros(x.shape, dtype=bool)
+    is_shaded[inside] = cells[row[inside], column[inside]]
+    return is_shaded
 
 
 @pytest.mark.parametrize("elevation", [0.2, 0.7, 1.5])
 def test_footprint_contains_every_shaded_position(elevation: float) -> None:
-    """It contains all ground points whose ray to the sun intersects a sphere, at any height, and few others."""
+    """The footprint contains all ground points whose ray to the sun intersects a sphere, and few other points."""
     rng = np.random.default_rng(0)
     spheres = np.column_stack(
         [rng.uniform(-900.0, 900.0, (40, 2)), rng.uniform(-30.0, 30.0, 40), rng.uniform(0.5, 3.0, 40)]
@@ -50,9 +50,9 @@ def test_footprint_contains_every_shaded_position(elevation: float) -> None:
 
 
 def test_footprint_without_objects_or_sun_is_everywhere() -> None:
-    one = np.array([[0.0, 0.0, 0.0, 1.0]])
+    sphere = np.array([[0.0, 0.0, 0.0, 1.0]])
     assert shadow_footprint(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is EVERYWHERE
-    assert shadow_footprint(one, direction(0.0, -0.1), 0.0) is EVERYWHERE
+    assert shadow_footprint(sphere, direction(0.0, -0.1), 0.0) is EVERYWHERE
 
 
 def test_footprint_does_not_change_images() -> None:
@@ -71,7 +71,7 @@ def test_footprint_does_not_change_images() -> None:
 
 
 @pytest.mark.parametrize("elevation", [0.25, 1.0])
-def test_potentially_visible_objects_give_equal_images(elevation: float) -> None:
+def test_culling_does_not_change_images(elevation: float) -> None:
     """A mast subframe among rocks is bitwise equal with and without culling, for two sun elevations and azimuths."""
     terrain = ROCKY.model_copy(update={"spacing_m": 0.05, "rms_slope_deg": 5.0, "slope_baseline_m": 1.0})
     terrain = terrain.model_copy(update={"outer_scale_m": 10.0, "craters_per_km2": 0.0})
@@ -82,11 +82,12 @@ def test_potentially_visible_objects_give_equal_images(elevation: float) -> None
     for azimuth in (0.5, 3.0):
         eye = Eye(12.0, 11.0, 1.5, rays.pixel_rad, 0.5, 1.2, 25.0)
         scene = site_scene(ground, eye, Sun(direction(azimuth, elevation)))
-        near = scene.within([rays.cone(pose)])
-        assert 0 < len(near.objects) < 0.5 * len(scene.objects)
-        full, subset = (process_renderer(default_backend()).render(one, rays, pose) for one in (scene, near))
+        visible_scene = scene.within([rays.cone(pose)])
+        assert 0 < len(visible_scene.objects) < 0.5 * len(scene.objects)
+        renderer = process_renderer(default_backend())
+        full, subset = renderer.render(scene, rays, pose), renderer.render(visible_scene, rays, pose)
         np.testing.assert_array_equal(subset.radiance, full.radiance)
         np.testing.assert_array_equal(subset.range_m, full.range_m)
         # culling keeps the spheres of the remaining objects
-        repeated = Objects(**{name: getattr(near.objects, name) for name in Objects.__dataclass_fields__})
-        np.testing.assert_array_equal(near.objects.spheres, repeated.spheres)
+        repeated = Objects(**{name: getattr(visible_scene.objects, name) for name in Objects.__dataclass_fields__})
+        np.testing.assert_array_equal(visible_scene.objects.spheres, repeated.spheres)

@@ -21,13 +21,13 @@ from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
 #: Ground whose brightness equals its albedo from any direction.
-PAINT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
+ALBEDO_ONLY = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
 #: Tilted by 25 deg and rolled.
 TILTED = Rotation.from_euler("zxy", [30.0, 20.0, 15.0], degrees=True)
-STRONG = (0.01, -0.25, 0.08)
+STRONG_DISTORTION = (0.01, -0.25, 0.08)
 
 
-def _marked_plane(height_m: float) -> tuple[Surface, np.ndarray]:
+def _make_spotted_plane(height_m: float) -> tuple[Surface, np.ndarray]:
     """A plane with bright spots; returns the surface and the spot positions in the world, shape (n, 3). A spot is a
     Gaussian of 2.5 samples in the control values: the symmetric B-spline keeps its centre.
     """
@@ -45,9 +45,9 @@ def _marked_plane(height_m: float) -> tuple[Surface, np.ndarray]:
     return Surface.from_samples(samples, spacing), spots
 
 
-def _centroid(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
+def _centroid(radiance: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Centroid of brightness above the background within 8 pixels of a position."""
-    u0, v0 = np.rint(near).astype(int)
+    u0, v0 = np.rint(position).astype(int)
     patch = radiance[v0 - 8 : v0 + 9, u0 - 8 : u0 + 9].astype(np.float64)
     border = np.concatenate([patch[0], patch[-1], patch[:, 0], patch[:, -1]])
     weight = np.clip(patch - np.median(border), 0.0, None)
@@ -72,16 +72,16 @@ def _expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
 
 def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     """Requirement: 0.05 px rms through a strongly distorted CAHVOR camera, tilted and rolled."""
-    surface, spots = _marked_plane(height_m=7.0)
-    camera = descent_camera(r=STRONG)
+    surface, spots = _make_spotted_plane(height_m=7.0)
+    camera = descent_camera(r=STRONG_DISTORTION)
     pose = rigid(TILTED, np.array([300.0, 700.0, 1207.0]))
-    scene = Scene(surface, (300.0, 400.0), OVERHEAD, PAINT)
+    scene = Scene(surface, (300.0, 400.0), OVERHEAD, ALBEDO_ONLY)
     frame = renderer.render(scene, PixelRays.of(camera), pose)
     copies = np.arange(-2, 3) * surface.period_m
     everywhere = np.concatenate([spots + np.array([dx, dy, 0.0]) for dx in copies for dy in copies])
     pixels, visible = camera.transform(pose).project(everywhere)
     inside = visible & (np.abs(pixels - 511.5) < 495.0).all(axis=-1)
-    result = np.stack([_centroid(frame.radiance, near) for near in pixels[inside]])
+    result = np.stack([_centroid(frame.radiance, position) for position in pixels[inside]])
     expected = np.stack([_expected_centroid(camera.transform(pose), spot) for spot in everywhere[inside]])
     error = result - expected
     assert inside.sum() > 400
@@ -97,10 +97,10 @@ def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_ca
 def test_world_points_are_on_the_plane_and_on_rays(
     renderer: Renderer, descent_camera: Callable[..., Cahvor], height_m: float
 ) -> None:
-    surface, _ = _marked_plane(height_m=-3.0)
-    camera = descent_camera(r=STRONG)
+    surface, _ = _make_spotted_plane(height_m=-3.0)
+    camera = descent_camera(r=STRONG_DISTORTION)
     pose = rigid(TILTED, np.array([100.0, 50.0, height_m - 3.0]))
-    frame = renderer.render(Scene(surface, (100.0, 50.0), OVERHEAD, PAINT), PixelRays.of(camera), pose)
+    frame = renderer.render(Scene(surface, (100.0, 50.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(camera), pose)
     points = frame.points_world()
     assert np.isfinite(points).all()
     assert np.abs((points[..., 2] + 3.0) / frame.range_m).max() < 1e-5
@@ -111,8 +111,8 @@ def test_world_points_are_on_the_plane_and_on_rays(
     assert np.abs(pixels - camera.pixel_grid()).max() < 1e-3
 
 
-def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, reach: float) -> float:
-    """Distance to the ground by marching in steps of a fifth of a sample and bisection, with SciPy's B-spline."""
+def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, expected_m: float) -> float:
+    """Distance to the ground near the expected one: march in steps of a fifth of a sample, then bracket the root."""
     control = surface.levels[0][..., 0].astype(np.float64)
 
     def clearance(t: np.ndarray) -> np.ndarray:
@@ -122,7 +122,7 @@ def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, reach: floa
         )
         return np.asarray(z - ground)
 
-    t = np.arange(0.5 * reach, 1.5 * reach, 0.3)
+    t = np.arange(0.5 * expected_m, 1.5 * expected_m, 0.3)
     first = int(np.argmax(clearance(t) < 0.0))
     assert first > 0
     return float(brentq(lambda s: clearance(s).item(), t[first - 1], t[first], xtol=1e-9))
@@ -133,7 +133,7 @@ def test_rough_ground_ranges_match_independent_ray_cast(
 ) -> None:
     rays = PixelRays.of(descent_camera())
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
-    frame = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, PAINT), rays, pose)
+    frame = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
     rng = np.random.default_rng(8)
     pixels = rng.integers(0, frame.range_m.size, 300)
     directions = pose.rotation.apply(rays.directions[pixels].astype(np.float64))
@@ -144,7 +144,7 @@ def test_rough_ground_ranges_match_independent_ray_cast(
 
 
 @pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
-def test_grazing_rays_meet_the_first_occluding_crest(rough: Surface, bounded: bool) -> None:
+def test_grazing_rays_intersect_the_first_occluding_crest(rough: Surface, bounded: bool) -> None:
     """Rays that graze rough ground hundreds of samples away, against marching in steps of a thirtieth of a sample."""
     rng = np.random.default_rng(3)
     count, ground = 400, Ground(rough)
@@ -167,10 +167,8 @@ def test_grazing_rays_meet_the_first_occluding_crest(rough: Surface, bounded: bo
 
 
 @pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
-def test_search_finds_ground_only_up_to_its_end(rough: Surface, bounded: bool) -> None:
-    """Without ceilings the steps are longer than the remaining distance: a crest and the ground before it must be
-    found.
-    """
+def test_search_returns_infinity_beyond_its_end(rough: Surface, bounded: bool) -> None:
+    """Without ceilings a step is longer than the remaining distance; the search must still stop at its end."""
     rng = np.random.default_rng(4)
     ground = Ground(rough)
     level = GroundLevel(rough.levels[0], rough.ceilings[0] if bounded else NO_CEILING, 1.0 / rough.spacing_m)
@@ -178,12 +176,12 @@ def test_search_finds_ground_only_up_to_its_end(rough: Surface, bounded: bool) -
         origin = np.array([*rng.uniform(0.0, rough.period_m, 2), ground.highest + 80.0])
         ray = direction(azimuth, -elevation)
         t = float(ground.cast(origin[None], ray[None], 2000.0, 0.05)[0])
-        near = t - 4.0 * rough.spacing_m
-        assert intersect_ground(level, Ray(*origin, *ray), near, t + 1e-3) == pytest.approx(t, rel=1e-6)
-        assert intersect_ground(level, Ray(*origin, *ray), near, t - 1e-3) == np.inf
+        begin = t - 4.0 * rough.spacing_m
+        assert intersect_ground(level, Ray(*origin, *ray), begin, t + 1e-3) == pytest.approx(t, rel=1e-6)
+        assert intersect_ground(level, Ray(*origin, *ray), begin, t - 1e-3) == np.inf
 
 
-def test_entry_distance_is_where_a_ray_reaches_the_highest_ground() -> None:
+def test_entry_distance_is_at_the_height_of_the_highest_ground() -> None:
     extent = (-10.0, 10.0, -20.0, 20.0, 3.0)
     assert entry_distance(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, -0.1)) == pytest.approx(20.0)
     assert entry_distance(extent, Ray(0.0, 0.0, 3.0, 1.0, 0.0, -0.1)) == 0.0
@@ -214,28 +212,28 @@ def test_blocks_below_a_ray_are_skipped(rough: Surface) -> None:
 def test_mesh_resolution_does_not_change_the_image(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    """A mesh three times as coarse gives the same image: the terrain defines the geometry."""
+    """The mesh is only the start of the search on the terrain: a mesh three times as coarse has the same image."""
     rays = PixelRays.of(descent_camera(256))
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
-    fine = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, PAINT), rays, pose)
-    coarse = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, PAINT, mesh_finest_m=36.0), rays, pose)
-    same = np.abs(fine.range_m / coarse.range_m - 1.0) < 1e-6
-    assert same.mean() > 0.995
+    fine = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
+    coarse = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY, mesh_finest_m=36.0), rays, pose)
+    is_equal = np.abs(fine.range_m / coarse.range_m - 1.0) < 1e-6
+    assert is_equal.mean() > 0.995
 
 
-def test_pixels_above_the_horizon_see_the_sky(
+def test_pixels_above_the_horizon_show_the_sky(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     level = rigid(Rotation.from_euler("x", 90.0, degrees=True), np.array([0.0, 0.0, 500.0]))
-    frame = renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, PAINT), PixelRays.of(descent_camera(128)), level)
+    frame = renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(128)), level)
     upper, lower = frame.range_m[:60], frame.range_m[-40:]
     assert np.isinf(upper).all()
     assert np.isfinite(lower).all()
-    assert (frame.radiance[:60] == np.float32(PAINT.sky_radiance)).all()
+    assert (frame.radiance[:60] == np.float32(ALBEDO_ONLY.sky_radiance)).all()
     assert np.isnan(frame.points_world()[:60]).all()
 
 
-def test_objects_out_of_view_do_not_change_the_picture(
+def test_objects_out_of_view_do_not_change_the_image(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     """Without visible objects no triangle is drawn: the search must not read missing data."""
@@ -243,11 +241,11 @@ def test_objects_out_of_view_do_not_change_the_picture(
     corners = position + np.array([[0.0, 0.0, 100.0], [1.0, 0.0, 100.0], [0.0, 1.0, 100.0]])
     faces = np.array([[0, 1, 2]], dtype=np.int32)
     above = Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (3, 1)), faces, np.zeros(1, np.int32), albedo=0.1)
-    low_sun = Sun(direction(0.3, np.radians(5.0)))
+    sun = Sun(direction(0.3, np.radians(5.0)))
     rays = PixelRays.of(descent_camera(256))
     with_objects, without = (
         renderer.render(
-            Scene(rough, (100.0, 200.0), low_sun, PAINT, objects, among_objects=True), rays, rigid(TILTED, position)
+            Scene(rough, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True), rays, rigid(TILTED, position)
         )
         for objects in (above, Objects.none())
     )
@@ -261,7 +259,7 @@ def test_camera_below_the_ground_is_rejected(
 ) -> None:
     buried = rigid(Rotation.identity(), np.array([0.0, 0.0, -1000.0]))
     with pytest.raises(RenderingError, match="below the ground"):
-        renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, PAINT), PixelRays.of(descent_camera(64)), buried)
+        renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(64)), buried)
 
 
 def test_image_does_not_depend_on_earlier_images(
@@ -271,7 +269,7 @@ def test_image_does_not_depend_on_earlier_images(
     sun = Sun(direction(np.radians(100.0), np.radians(40.0)))
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
     first = renderer.render(Scene(rough, (380.0, 200.0), sun, Photometry()), rays, pose)
-    renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, PAINT), rays, rigid(TILTED, np.array([0.0, 0.0, 900.0])))
+    renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), rays, rigid(TILTED, np.array([0.0, 0.0, 900.0])))
     repeated = renderer.render(Scene(rough, (380.0, 200.0), sun, Photometry()), rays, pose)
     assert first.radiance.tobytes() == repeated.radiance.tobytes()
     assert first.range_m.tobytes() == repeated.range_m.tobytes()

@@ -1,10 +1,10 @@
-"""Test of the memory that is freed after rendering."""
+"""Test that freed memory stays allocated between images and is returned to the system on request."""
 
 import subprocess
 import sys
 
 SIZE = 20_000_000
-#: Frees the memory of several images, then prints the memory in use before and after it is returned.
+#: Frees a large block, then prints the bytes still in use before and after the memory is returned to the system.
 SCRIPT = f"""
 import os, sys
 from marsyard.sim.render.renderer import keep_freed_memory, return_freed_memory
@@ -16,21 +16,21 @@ def used():
 if sys.argv[1] == "keep":
     keep_freed_memory()
 before = used()
-pictures = b"1" * {SIZE}
-del pictures
+block = b"1" * {SIZE}
+del block
 freed = used()
 return_freed_memory()
 print(freed - before, used() - before)
 """
 
 
-def _measure_memory(word: str) -> tuple[int, int]:
-    done = subprocess.run([sys.executable, "-c", SCRIPT, word], capture_output=True, text=True, check=True)
-    freed, returned = map(int, done.stdout.split())
+def _measure_memory(mode: str) -> tuple[int, int]:
+    result = subprocess.run([sys.executable, "-c", SCRIPT, mode], capture_output=True, text=True, check=True)
+    freed, returned = map(int, result.stdout.split())
     return freed, returned
 
 
-def test_freed_memory_is_kept_until_it_is_returned() -> None:
+def test_freed_memory_stays_allocated_until_it_is_returned() -> None:
     freed, returned = _measure_memory("keep")
     assert freed > 0.9 * SIZE
     assert returned < 0.1 * SIZE

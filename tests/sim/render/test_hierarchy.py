@@ -13,7 +13,7 @@ EYE = np.array([0.3, -0.2, 1.1])
 
 
 @pytest.fixture(scope="module")
-def thicket() -> Objects:
+def objects() -> Objects:
     """Triangles of 0.1 m to 1 m in all directions."""
     rng = np.random.default_rng(6)
     middles = rng.uniform(-12.0, 12.0, (1500, 1, 3))
@@ -27,48 +27,48 @@ def _draw_rays(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def test_nearest_triangle_equals_exhaustive_search(thicket: Objects) -> None:
+def test_nearest_triangle_equals_exhaustive_search(objects: Objects) -> None:
     rays = _draw_rays(np.random.default_rng(7), 800)
-    expected = meet_triangles(thicket, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
-    result = np.array([nearest_hit(thicket.hierarchy, Ray(*EYE, *ray), np.inf).distance for ray in rays])
+    expected = meet_triangles(objects, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
+    result = np.array([nearest_hit(objects.hierarchy, Ray(*EYE, *ray), np.inf).distance for ray in rays])
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.9
     np.testing.assert_allclose(result, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("axis", [*_draw_rays(np.random.default_rng(8), 12), *np.eye(3), *-np.eye(3)], ids=str)
-@pytest.mark.parametrize("spread", [1e-3, 0.05, 0.5])
-def test_beam_lists_all_triangles_hit_by_its_rays(thicket: Objects, axis: np.ndarray, spread: float) -> None:
-    """Rays at all angles up to the half angle, up to a distance; few other triangles are listed."""
+@pytest.mark.parametrize("half_angle", [1e-3, 0.05, 0.5])
+def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.ndarray, half_angle: float) -> None:
+    """All triangles hit by random rays within the half angle and a maximum distance are listed, and few others."""
     farthest = 9.0
     rng = np.random.default_rng(9)
-    room = np.empty(1500, dtype=np.int64)
-    listed = set(room[: list_in_beam(thicket.hierarchy, Ray(*EYE, *axis), spread, farthest, room)].tolist())
-    across = np.cross(axis, _draw_rays(rng, 400))
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    angles = spread * rng.uniform(0.0, 1.0, (400, 1))
-    met: set[int] = set()
-    for ray in np.cos(angles) * axis + np.sin(angles) * across:
-        met |= _list_hits(thicket, ray, farthest)
-    assert met <= listed
+    buffer = np.empty(1500, dtype=np.int64)
+    listed = set(buffer[: list_in_beam(objects.hierarchy, Ray(*EYE, *axis), half_angle, farthest, buffer)].tolist())
+    perpendicular = np.cross(axis, _draw_rays(rng, 400))
+    perpendicular /= np.linalg.norm(perpendicular, axis=1, keepdims=True)
+    angles = half_angle * rng.uniform(0.0, 1.0, (400, 1))
+    hit: set[int] = set()
+    for ray in np.cos(angles) * axis + np.sin(angles) * perpendicular:
+        hit |= _list_hits(objects, ray, farthest)
+    assert hit <= listed
     # A wide beam has hits: the test is significant.
-    assert met or spread < 0.5
+    assert hit or half_angle < 0.5
     # The beam lists triangles in a square frustum, which is larger than the cone at its corners.
-    middles = thicket.triangles.mean(axis=1) - EYE
-    size = np.linalg.norm(thicket.triangles - thicket.triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
-    along = middles @ axis
-    adjacent = np.linalg.norm(middles - along[:, None] * axis, axis=1)
-    near = adjacent <= np.sqrt(2.0) * (np.tan(spread) * np.maximum(along, 0.0) + 2.0 * size)
-    assert listed <= set(np.flatnonzero(near).tolist())
+    centres = objects.triangles.mean(axis=1) - EYE
+    size = np.linalg.norm(objects.triangles - objects.triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+    axis_distance = centres @ axis
+    off_axis_distance = np.linalg.norm(centres - axis_distance[:, None] * axis, axis=1)
+    in_frustum = off_axis_distance <= np.sqrt(2.0) * (np.tan(half_angle) * np.maximum(axis_distance, 0.0) + 2.0 * size)
+    assert listed <= set(np.flatnonzero(in_frustum).tolist())
 
 
-def test_beam_reports_an_overflow_of_its_list(thicket: Objects) -> None:
-    ahead = direction(1.0, 0.2)
-    room = np.empty(1500, dtype=np.int64)
-    count = list_in_beam(thicket.hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room)
+def test_beam_reports_an_overflow_of_its_list(objects: Objects) -> None:
+    axis = direction(1.0, 0.2)
+    buffer = np.empty(1500, dtype=np.int64)
+    count = list_in_beam(objects.hierarchy, Ray(*EYE, *axis), 0.3, 9.0, buffer)
     assert count > 5
-    assert list_in_beam(thicket.hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room[:count].copy()) == count
-    assert list_in_beam(thicket.hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room[: count - 1].copy()) == -1
-    assert list_in_beam(Objects.none().hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room) == 0
+    assert list_in_beam(objects.hierarchy, Ray(*EYE, *axis), 0.3, 9.0, buffer[:count].copy()) == count
+    assert list_in_beam(objects.hierarchy, Ray(*EYE, *axis), 0.3, 9.0, buffer[: count - 1].copy()) == -1
+    assert list_in_beam(Objects.none().hierarchy, Ray(*EYE, *axis), 0.3, 9.0, buffer) == 0
 
 
 def _list_hits(objects: Objects, ray: np.ndarray, farthest: float) -> set[int]:

@@ -54,18 +54,16 @@ def test_lunar_lambert_matches_the_formula(renderer: Renderer, descent_camera: C
     np.testing.assert_allclose(_render(renderer, camera, FLAT, sun, law), expected, rtol=1e-4)
 
 
-def test_the_opposition_spot_is_at_the_antisolar_point(
-    renderer: Renderer, descent_camera: Callable[..., Cahvor]
-) -> None:
+def test_opposition_spot_is_at_the_antisolar_point(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     camera = descent_camera()
     sun = Sun(direction(np.radians(30.0), np.radians(80.0)))
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     radiance = _render(renderer, camera, FLAT, sun, law)
-    at, visible = camera.transform(NADIR).project(NADIR.translation - 500.0 * sun.direction)
+    expected, visible = camera.transform(NADIR).project(NADIR.translation - 500.0 * sun.direction)
     assert visible
     peak = np.unravel_index(radiance.argmax(), radiance.shape)
     # Within one pixel.
-    assert np.abs(np.array(peak[::-1]) - at).max() <= 0.51
+    assert np.abs(np.array(peak[::-1]) - expected).max() <= 0.51
 
 
 def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
@@ -81,16 +79,16 @@ def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: 
     assert frame.radiance[facing_east].min() > frame.radiance[facing_west].max()
 
 
-def test_ground_facing_away_is_lit_by_the_sky_only(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_ground_facing_away_receives_only_sky_light(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     x = np.arange(256) * 8.0
     heights = np.broadcast_to(40.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
     low = Sun(direction(np.radians(90.0), np.radians(5.0)))
-    dark = _render(
+    without_sky = _render(
         renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_share=0.0, surrounding_albedo=0.0)
     )
-    assert dark.min() == 0.0
-    lit = _render(renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_share=0.15))
-    assert lit.min() > 0.15 * 0.2 * 0.9
+    assert without_sky.min() == 0.0
+    with_sky = _render(renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_share=0.15))
+    assert with_sky.min() > 0.15 * 0.2 * 0.9
 
 
 def test_distant_ground_is_averaged(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:

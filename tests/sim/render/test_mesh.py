@@ -12,13 +12,13 @@ from marsyard.sim.terrain import Surface
 
 @given(finest=st.floats(0.5, 20.0), stretch=st.floats(1.01, 1000.0), count=st.integers(8, 200).map(lambda n: 2 * n + 1))
 def test_offsets_have_the_given_extent_and_spacing(finest: float, stretch: float, count: int) -> None:
-    reach = stretch * finest * (count - 1) / 2
-    offsets = graded_offsets(reach, finest, count)
+    half_width = stretch * finest * (count - 1) / 2
+    offsets = graded_offsets(half_width, finest, count)
     gaps = np.diff(offsets)
-    assert offsets[-1] == pytest.approx(reach, rel=1e-6)
-    np.testing.assert_allclose(offsets, -offsets[::-1], atol=1e-9 * reach)
+    assert offsets[-1] == pytest.approx(half_width, rel=1e-6)
+    np.testing.assert_allclose(offsets, -offsets[::-1], atol=1e-9 * half_width)
     assert gaps.min() == pytest.approx(finest, rel=1e-6)
-    assert (np.diff(gaps[count // 2 :]) > -1e-9 * reach).all()
+    assert (np.diff(gaps[count // 2 :]) > -1e-9 * half_width).all()
 
 
 def test_too_many_grid_lines_are_rejected() -> None:
@@ -33,13 +33,13 @@ def test_mesh_is_closed_faces_up_and_follows_the_ground(rough: Surface) -> None:
     assert (mesh.face_normals[:, 2] > 0.0).all()
     # No cracks: the only open edges are the border of the square.
     assert len(mesh.edges_unique) == 3 * 64 * 64 + 2 * 64
-    middle = np.abs(mesh.vertices[:, :2] - [120.0, -40.0]).max(axis=1) < 50.0
-    near = mesh.vertices[middle]
-    np.testing.assert_allclose(near[:, 2], rough.height(near[:, 0], near[:, 1], level=2), atol=1e-9)
+    is_inner = np.abs(mesh.vertices[:, :2] - [120.0, -40.0]).max(axis=1) < 50.0
+    inner = mesh.vertices[is_inner]
+    np.testing.assert_allclose(inner[:, 2], rough.height(inner[:, 0], inner[:, 1], level=2), atol=1e-9)
 
 
 @given(st.lists(st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0)), min_size=3, max_size=9), st.integers(0, 9))
-def test_cells_in_hull_cover_it_closely(corners: list[tuple[float, float]], seed: int) -> None:
+def test_cell_spans_cover_the_hull(corners: list[tuple[float, float]], seed: int) -> None:
     """Includes hulls that extend beyond the grid or lie between two grid lines."""
     positions = np.array(corners) + np.array([[0.0, 0.0], [0.3, 0.1], [0.1, 0.4], *[[0.0, 0.0]] * (len(corners) - 3)])
     assume(np.linalg.matrix_rank(positions - positions[0], tol=1e-3) == 2)
@@ -59,8 +59,8 @@ def test_cells_in_hull_cover_it_closely(corners: list[tuple[float, float]], seed
         assert lines[spans[strip, 1]] >= low[0]
 
 
-def test_partial_mesh_equals_the_whole_mesh(rough: Surface) -> None:
-    """The spans omit strips, overlap at a corner, and do not touch."""
+def test_partial_mesh_equals_the_cells_of_the_full_mesh(rough: Surface) -> None:
+    """The spans include empty strips, strips that share a corner, and separate strips."""
     lines = graded_offsets(300.0, 5.0, 17)
     spans = np.zeros((16, 2), dtype=int)
     spans[3:6] = [[2, 5], [7, 9], [0, 16]]

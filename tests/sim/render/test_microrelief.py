@@ -1,4 +1,4 @@
-"""Tests of relief finer than the terrain's samples: its spectrum, its shading, and what stays exact."""
+"""Tests of relief finer than the terrain's samples: spectrum, shading, and unchanged geometric truth."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.microrelief import octave_heights
 
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
-EVEN = np.ones((1, 1), dtype=np.float32)
+UNIFORM = np.ones((1, 1), dtype=np.float32)
 POSE = rigid(Rotation.identity(), np.array([30.0, 40.0, 20.0]))
 
 
 def _make_relief(coarsest_m: float, *heights_m: float) -> MicroRelief:
-    return MicroRelief(coarsest_m, np.array(heights_m), EVEN, EVEN, 0.0)
+    return MicroRelief(coarsest_m, np.array(heights_m), UNIFORM, UNIFORM, 0.0)
 
 
 def _sample_noise(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -49,7 +49,7 @@ def flat() -> Surface:
     return Surface(tuple(levels), 1.0)
 
 
-def test_noise_has_the_stated_variances_and_derivatives() -> None:
+def test_noise_has_the_specified_variances_and_derivatives() -> None:
     x, y = np.random.default_rng(3).uniform(-200.0, 200.0, (2, 40000))
     noise = _sample_noise(x, y)
     assert np.mean(noise[:, 0]) == pytest.approx(0.0, abs=0.005)
@@ -88,7 +88,7 @@ def test_octaves_continue_the_spectrum_of_the_terrain(hurst: float) -> None:
 
 
 @pytest.mark.parametrize("cell_px", [4.0, 2.0])
-def test_slopes_fade_as_by_the_mean_over_a_pixel(cell_px: float) -> None:
+def test_slopes_are_attenuated_as_by_averaging_over_a_pixel(cell_px: float) -> None:
     """Slopes averaged over pixels of 15 x 15 samples, against the attenuation of the footprint."""
     pixels, inside = 40, 15
     centre = np.arange(pixels) / cell_px
@@ -117,8 +117,8 @@ def test_unresolved_octaves_only_add_to_the_variance() -> None:
 def test_shadowing_equals_smiths_formula(elevation_deg: float, slope_deg: float) -> None:
     cosine, sigma = np.sin(np.radians(elevation_deg)), np.tan(np.radians(slope_deg))
     a = cosine / (np.sqrt(2.0) * sigma * np.sqrt(1.0 - cosine**2))
-    hidden = 0.5 * (np.exp(-(a**2)) / (a * np.sqrt(np.pi)) - special.erfc(a))
-    assert smith_shadowing(cosine, sigma**2) == pytest.approx(1.0 / (1.0 + hidden), abs=0.005)
+    smith_lambda = 0.5 * (np.exp(-(a**2)) / (a * np.sqrt(np.pi)) - special.erfc(a))
+    assert smith_shadowing(cosine, sigma**2) == pytest.approx(1.0 / (1.0 + smith_lambda), abs=0.005)
 
 
 def _shade_heights(heights: np.ndarray, step_m: float, sun: np.ndarray) -> np.ndarray:
@@ -135,10 +135,10 @@ def _shade_heights(heights: np.ndarray, step_m: float, sun: np.ndarray) -> np.nd
 
 
 @pytest.mark.parametrize("rms_slope_deg", [8.0, 15.0])
-def test_appearance_changes_with_the_sun_as_that_of_geometry(
+def test_shading_changes_with_the_sun_as_for_a_height_field(
     renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], rms_slope_deg: float
 ) -> None:
-    """Correlation of pictures under two suns 90 deg apart: equal, within 0.05, to that of a ray-cast height field."""
+    """Images under two suns 90 deg apart correlate as those of a ray-cast height field, within 0.05."""
     cell, pixels, inside = 0.8, 96, 6
     relief = _make_relief(cell, np.tan(np.radians(rms_slope_deg)) * cell / np.sqrt(SLOPE_VARIANCE))
     rays = PixelRays.of(descent_camera(pixels, (0.0, 0.0, 0.0)))
@@ -154,22 +154,22 @@ def test_appearance_changes_with_the_sun_as_that_of_geometry(
     heights = relief.heights[0] * _sample_noise(x / cell, y / cell)[:, 0].reshape(x.shape)
     shaded = []
     for sun in suns:
-        picture = _shade_heights(heights, step, sun)
-        side = [n // inside * inside for n in picture.shape]
-        picture = picture[: side[0], : side[1]].reshape(side[0] // inside, inside, side[1] // inside, inside)
-        shaded.append(picture.mean(axis=(1, 3)).ravel())
+        image = _shade_heights(heights, step, sun)
+        side = [n // inside * inside for n in image.shape]
+        image = image[: side[0], : side[1]].reshape(side[0] // inside, inside, side[1] // inside, inside)
+        shaded.append(image.mean(axis=(1, 3)).ravel())
     assert rendered == pytest.approx(np.corrcoef(*shaded)[0, 1], abs=0.05)
     for frame in frames:
         assert frame.radiance.std() > 0.03 * frame.radiance.mean()
 
 
-def test_geometric_truth_and_mean_brightness_are_kept(
+def test_relief_does_not_change_geometric_truth_and_mean_brightness(
     renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     rays = PixelRays.of(descent_camera(128))
-    bare = Scene(flat, (30.0, 40.0), Sun(direction(2.0, np.radians(50.0))), LAMBERT)
-    rough = replace(bare, relief=_make_relief(1.2, *0.02 * 0.5 ** np.arange(8.0)))
-    first, second = (renderer.render(scene, rays, POSE) for scene in (bare, rough))
+    without_relief = Scene(flat, (30.0, 40.0), Sun(direction(2.0, np.radians(50.0))), LAMBERT)
+    with_relief = replace(without_relief, relief=_make_relief(1.2, *0.02 * 0.5 ** np.arange(8.0)))
+    first, second = (renderer.render(scene, rays, POSE) for scene in (without_relief, with_relief))
     np.testing.assert_array_equal(first.range_m, second.range_m)
     np.testing.assert_array_equal(first.normal, second.normal)
     assert second.radiance.std() > 2.0 * first.radiance.std()

@@ -1,4 +1,4 @@
-"""Tests that rendered images move like their camera: short versions of the measurements of `make validate`."""
+"""Tests of image motion between renderings, against the camera model: short versions of those in `make validate`."""
 
 from collections.abc import Callable
 
@@ -16,23 +16,23 @@ from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
 #: Limit of the means over all patches in the full measurement of at least 200 patches.
-BAR_PX = 0.02
+MAX_MEAN_ERROR_PX = 0.02
 
 
-def test_estimator_finds_a_known_shift() -> None:
+def test_known_shift_is_estimated() -> None:
     """Bumps of several pixels at exact positions; the second image is darker by a gain."""
     rng = np.random.default_rng(2)
     positions, sizes, heights = rng.uniform(0, 160, (900, 2)), rng.uniform(2.0, 5.0, 900), rng.uniform(-1, 1, 900)
     v, u = np.mgrid[:160, :160].astype(np.float64)
 
-    def picture(shift: np.ndarray) -> np.ndarray:
-        samples = np.zeros((160, 160))
+    def render_bumps(shift: np.ndarray) -> np.ndarray:
+        image = np.zeros((160, 160))
         for (x, y), size, height in zip(positions + shift, sizes, heights, strict=True):
-            samples += height * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * size**2))
-        return samples
+            image += height * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * size**2))
+        return image
 
     shift = np.array([0.37, -0.22])
-    first, second = SmoothPicture(picture(np.zeros(2))), SmoothPicture(0.8 * picture(shift) + 0.1)
+    first, second = SmoothPicture(render_bumps(np.zeros(2))), SmoothPicture(0.8 * render_bumps(shift) + 0.1)
     shifts = symmetric_shifts(first, second, patch_grid((160, 160)))
     np.testing.assert_allclose(shifts.found, np.broadcast_to(shift, shifts.found.shape), atol=2e-3)
     # With equal motion of all pixels in a patch, the estimator expects that motion.
@@ -50,7 +50,7 @@ def test_descent_image_motion_matches_the_camera(
     for motion in measure(renderer, View(scene, camera, pose), np.array([0.3, 0.75])):
         assert len(motion.error) >= 200
         # Ten times better than the limit: without rocks the image has no edges.
-        assert np.abs(motion.error.mean(axis=0)).max() < 0.1 * BAR_PX
+        assert np.abs(motion.error.mean(axis=0)).max() < 0.1 * MAX_MEAN_ERROR_PX
 
 
 @pytest.mark.parametrize("distance_m", [5.0, 2.0])
@@ -89,4 +89,4 @@ def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer, distance_
     for motion in measure(renderer, view, np.array([0.3, 0.75])):
         on_rock = motion.error[motion.body >= 0]
         assert len(on_rock) > 60
-        assert np.abs(on_rock.mean(axis=0)).max() < BAR_PX
+        assert np.abs(on_rock.mean(axis=0)).max() < MAX_MEAN_ERROR_PX

@@ -1,4 +1,4 @@
-"""Tests of bodies of triangles: bounding spheres and selections."""
+"""Tests of `Objects`, triangle meshes of several bodies: bounding spheres, and selection by body and by cone."""
 
 import numpy as np
 
@@ -28,14 +28,14 @@ def test_spheres_enclose_their_bodies_tightly() -> None:
 
 def test_only_selects_bodies() -> None:
     objects = _make_bodies()
-    stored = np.array([True, False, False, True])
-    subset = objects.only(stored)
-    expected = stored[objects.body_of_triangle]
-    np.testing.assert_array_equal(subset.triangles, objects.triangles[expected])
-    np.testing.assert_array_equal(subset.normals, objects.normals[expected])
+    is_selected = np.array([True, False, False, True])
+    subset = objects.only(is_selected)
+    is_expected = is_selected[objects.body_of_triangle]
+    np.testing.assert_array_equal(subset.triangles, objects.triangles[is_expected])
+    np.testing.assert_array_equal(subset.normals, objects.normals[is_expected])
     assert subset.first_triangle.tolist() == [0, 5, 8]
     assert subset.names.tolist() == [7, 3]
-    np.testing.assert_array_equal(subset.spheres, objects.spheres[stored])
+    np.testing.assert_array_equal(subset.spheres, objects.spheres[is_selected])
     assert len(objects.only(np.zeros(4, dtype=bool))) == 0
 
 
@@ -45,9 +45,9 @@ def test_cone_selects_facing_triangles_of_bodies_within_it() -> None:
     eye = objects.spheres[2, :3] + np.array([0.0, 0.0, 200.0])
     result = objects.in_cone(eye, np.array([0.0, 0.0, -1.0]), 1e-3)
     first, second, third = objects.triangles.transpose(1, 0, 2)
-    facing = np.einsum("ij,ij->i", np.cross(second - first, third - first), eye - first) > 0.0
-    meant = objects.body_of_triangle == 2
-    assert 20 < np.count_nonzero(facing & meant) < 60
-    assert set(np.flatnonzero(facing & meant)) <= set(result)
-    assert facing[result].all()
+    is_facing = np.einsum("ij,ij->i", np.cross(second - first, third - first), eye - first) > 0.0
+    in_cone = objects.body_of_triangle == 2
+    assert 20 < np.count_nonzero(is_facing & in_cone) < 60
+    assert set(np.flatnonzero(is_facing & in_cone)) <= set(result)
+    assert is_facing[result].all()
     assert (np.diff(result) > 0).all()

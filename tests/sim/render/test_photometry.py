@@ -19,7 +19,7 @@ LAWS = {
     "Mars": Photometry(),
     "narrow surge": Photometry(lunar_fraction=1.0, surge_amplitude=1.5, surge_width=0.01),
 }
-each_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+with_each_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
 
 
 @pytest.fixture(scope="module")
@@ -43,23 +43,23 @@ def _brightness(renderer: Renderer, flat: Surface, law: Photometry, to_sun: np.n
     return float(renderer.render(scene, PixelRays.of(camera), pose).radiance[4, 4])
 
 
-@each_law
+@with_each_law
 def test_reflectance_law_is_reciprocal(renderer: Renderer, flat: Surface, law: Photometry) -> None:
     rng = np.random.default_rng(9)
     for _ in range(3):
         azimuths, heights = rng.uniform(0.0, 2.0 * np.pi, 2), np.arcsin(rng.uniform(0.15, 1.0, 2))
         sun, eye = (direction(float(a), float(h)) for a, h in zip(azimuths, heights, strict=True))
         forward, backward = _brightness(renderer, flat, law, sun, eye), _brightness(renderer, flat, law, eye, sun)
-        # I/F over the cosine of incidence is pi times the bidirectional reflectance.
+        # I/F divided by the cosine of incidence is pi times the bidirectional reflectance.
         assert forward / sun[2] == pytest.approx(backward / eye[2], rel=1e-5)
 
 
-@each_law
+@with_each_law
 def test_albedo_is_the_reflected_fraction_of_light(law: Photometry) -> None:
-    """Sun and eye are drawn in proportion to their cosines: the mean of I/F over cos i is the spherical albedo."""
-    one, two, turn = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(17).T
-    cos_i, cos_e = np.sqrt(1.0 - one), np.sqrt(1.0 - two)
-    g = np.arccos(np.clip(cos_i * cos_e + np.sqrt(one * two) * np.cos(2.0 * np.pi * turn), -1.0, 1.0))
+    """For sun and eye directions drawn with a cosine density, the mean of (I/F) / cos i is the spherical albedo."""
+    sin2_i, sin2_e, azimuth_turns = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(17).T
+    cos_i, cos_e = np.sqrt(1.0 - sin2_i), np.sqrt(1.0 - sin2_e)
+    g = np.arccos(np.clip(cos_i * cos_e + np.sqrt(sin2_i * sin2_e) * np.cos(2.0 * np.pi * azimuth_turns), -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
     disc = 2.0 * law.lunar_fraction * cos_i / (cos_i + cos_e) + (1.0 - law.lunar_fraction) * cos_i
     assert law.normalisation() * np.mean(surge * disc / cos_i) == pytest.approx(1.0, rel=0.01)
@@ -77,19 +77,19 @@ def _hazcam() -> Cahvore:
     return Cahvore.from_cahv(pinhole, r=np.array([0.0, -0.02, 0.002]), e=np.full(3, 0.006), linearity=-0.1)
 
 
-@pytest.mark.parametrize("wide", [False, True])
-def test_the_opposition_peak_is_opposite_the_sun(
-    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], wide: float
+@pytest.mark.parametrize("is_fisheye", [False, True])
+def test_opposition_peak_is_at_the_antisolar_point(
+    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], is_fisheye: float
 ) -> None:
     """The centre of the peak in the image is within half a pixel."""
-    camera = _hazcam() if wide else descent_camera(512)
+    camera = _hazcam() if is_fisheye else descent_camera(512)
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
-    for opposite in np.array([[150.3, 201.8], [330.6, 255.1]]):
-        _, ray = camera.transform(pose).rays(opposite)
+    for antisolar in np.array([[150.3, 201.8], [330.6, 255.1]]):
+        _, ray = camera.transform(pose).rays(antisolar)
         frame = renderer.render(Scene(flat, (0.0, 0.0), Sun(-ray), law), PixelRays.of(camera), pose)
         radiance = frame.radiance.astype(np.float64)
         weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)
         v, u = np.mgrid[:512, :512]
         peak = np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
-        assert np.linalg.norm(peak - opposite) < 0.5
+        assert np.linalg.norm(peak - antisolar) < 0.5

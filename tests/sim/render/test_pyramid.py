@@ -8,15 +8,15 @@ from marsyard.sim.terrain import Surface
 
 
 @pytest.mark.parametrize("side", [16, 128])
-def test_kernels_get_the_same_number_of_levels(side: int) -> None:
+def test_kernels_receive_a_constant_number_of_levels(side: int) -> None:
     surface = Surface.from_samples(np.zeros((side, side, 2), dtype=np.float32), 1.0)
     ground = ground_struct(surface, (0.0, 1.0, 0.0, 1.0, 2.0), ceilings=True)
     levels, coarsest = ground.levels, ground.top_level
     assert len(levels) == len(ground.ceilings) == LEVELS
     assert levels[coarsest].shape[0] == 16
-    assert all(one is other for one, other in zip(levels, surface.levels, strict=False))
+    assert all(level is expected for level, expected in zip(levels, surface.levels, strict=False))
     # Kernels are compiled for one type of all levels.
-    assert {(one.dtype.str, one.flags.writeable, one.flags.c_contiguous) for one in levels} == {("<f4", False, True)}
-    assert all(one is other for one, other in zip(ground.ceilings, surface.ceilings, strict=False))
+    assert {(a.dtype.str, a.flags.writeable, a.flags.c_contiguous) for a in levels} == {("<f4", False, True)}
+    assert all(ceiling is expected for ceiling, expected in zip(ground.ceilings, surface.ceilings, strict=False))
     without = ground_struct(surface, ground.extent, ceilings=False)
-    assert all(one is NO_CEILING for one in without.ceilings)
+    assert all(ceiling is NO_CEILING for ceiling in without.ceilings)

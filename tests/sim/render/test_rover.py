@@ -59,8 +59,8 @@ def test_wheels_follow_the_suspension() -> None:
     stance = settle(MER, Steps(((0.705, 0.53, 0.1),)), 0.0, 0.0, EAST)
     corners = rover_objects(MER, stance, MER_MAST, 0.0, 0.0).triangles.reshape(-1, 3)
     for x, y, height in ((0.705, 0.53, 0.1), (0.705, -0.53, 0.0), (-0.705, 0.53, 0.0)):
-        under = corners[np.hypot(corners[:, 0] - x, corners[:, 1] - y) < 0.15]
-        assert under[:, 2].min() == pytest.approx(height, abs=0.01)
+        near_wheel = corners[np.hypot(corners[:, 0] - x, corners[:, 1] - y) < 0.15]
+        assert near_wheel[:, 2].min() == pytest.approx(height, abs=0.01)
 
 
 @pytest.mark.parametrize("elevation_deg", [10.0, 0.0, -20.0, -35.0])
@@ -75,9 +75,9 @@ def test_head_does_not_occlude_its_cameras(azimuth_deg: float, elevation_deg: fl
         # The central part of the image, which shows the targets.
         u, v = np.meshgrid(np.linspace(430.0, 590.0, 9), np.linspace(430.0, 590.0, 9))
         origins, directions = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))
-        met = meet_triangles(objects, origins, directions, nearest=1e-3)
+        hit_distances = meet_triangles(objects, origins, directions, nearest=1e-3)
         # Views to the side and down show the deck 0.9 m below, views ahead do not.
-        assert met.min() > (0.9 if azimuth_deg else 100.0)
+        assert hit_distances.min() > (0.9 if azimuth_deg else 100.0)
 
 
 def test_rover_tilts_with_the_ground() -> None:
@@ -89,7 +89,7 @@ def test_rover_tilts_with_the_ground() -> None:
     )
 
 
-def test_mast_shadow_lies_opposite_the_sun(renderer: Renderer) -> None:
+def test_mast_shadow_is_opposite_the_sun(renderer: Renderer) -> None:
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = 0.2
     surface = Surface.from_samples(samples, 1.0)
@@ -100,45 +100,45 @@ def test_mast_shadow_lies_opposite_the_sun(renderer: Renderer) -> None:
     scene = Scene(surface, (32.0, 32.0), sun, LAMBERT, objects, mesh_finest_m=0.2, mesh_reach_m=60.0, edge_rays=1)
     # High on the mast, outside the deck's shadow: the shadow is in the west at height / tan(elevation).
     mast = stance.world_from_rover.apply(np.array([*MER_MAST.base_m[:2], 0.0]))
-    high = 1.28
-    shade = mast + np.array([-high / np.tan(elevation), 0.0, 0.0])
+    height_m = 1.28
+    expected = mast + np.array([-height_m / np.tan(elevation), 0.0, 0.0])
     camera = Cahv.from_field_of_view(
         horizontal_rad=0.1, size=(101, 101), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
     )
-    pose = rigid(Rotation.identity(), shade + np.array([0.0, 0.0, 6.0]))
+    pose = rigid(Rotation.identity(), expected + np.array([0.0, 0.0, 6.0]))
     frame = renderer.render(scene, PixelRays.of(camera), pose)
     points = frame.points_world()
-    dark = frame.radiance < 0.1 * frame.radiance.max()
-    assert 0.1 < np.mean(dark) < 0.5
-    # The shadow is a band to the east, as wide as the mast.
-    band = points[dark & (np.abs(points[..., 0] - shade[0]) < 0.1)]
-    assert band[:, 1].mean() == pytest.approx(shade[1], abs=0.01)
+    is_shaded = frame.radiance < 0.1 * frame.radiance.max()
+    assert 0.1 < np.mean(is_shaded) < 0.5
+    # The shadow is a band along the east-west direction, as wide as the mast.
+    band = points[is_shaded & (np.abs(points[..., 0] - expected[0]) < 0.1)]
+    assert band[:, 1].mean() == pytest.approx(expected[1], abs=0.01)
     assert np.ptp(band[:, 1]) == pytest.approx(2 * 0.05, abs=0.02)
 
 
 @pytest.mark.parametrize(("rover", "mast"), [(MER, MER_MAST), (ROCKY_8, RESEARCH_MAST)])
 def test_sphere_contains_the_rover_in_any_stance(rover: RoverParameters, mast: MastGeometry) -> None:
     rng = np.random.default_rng(2)
-    farthest = []
+    relative_radii = []
     for _ in range(20):
         blocks = Steps(tuple((float(x), float(y), 0.25) for x, y in rng.uniform(-0.8, 0.8, (3, 2))))
         stance = settle(rover, blocks, 0.0, 0.0, float(rng.uniform(0.0, 6.0)))
         corners = rover_objects(rover, stance, mast, *rng.uniform(-1.5, 1.5, 2)).triangles.reshape(-1, 3)
         *centre, radius = rover_sphere(rover, stance, mast)[0]
-        farthest.append(np.linalg.norm(corners - centre, axis=1).max() / radius)
-    # The radius is close to the necessary radius.
-    assert 0.7 < max(farthest) <= 1.0
+        relative_radii.append(np.linalg.norm(corners - centre, axis=1).max() / radius)
+    # The sphere is not much larger than necessary.
+    assert 0.7 < max(relative_radii) <= 1.0
 
 
-def test_rover_shadow_reach() -> None:
+def test_rover_casts_shadows_only_away_from_the_sun() -> None:
     objects = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
-    low = direction(EAST, np.radians(20.0))
+    sun_direction = direction(EAST, np.radians(20.0))
     # The mast top at 1.6 m has a shadow 4.4 m to the west and none to the east.
     corners = objects.triangles.reshape(-1, 3)
-    shadow = corners - corners[:, 2:] / low[2] * low
+    shadow = corners - corners[:, 2:] / sun_direction[2] * sun_direction
     for position in shadow[:: len(shadow) // 50]:
-        assert may_cast_shadow(objects.spheres, low, position, 0.0)
-    assert not may_cast_shadow(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 0.3)
-    assert may_cast_shadow(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 2.0)
-    assert not may_cast_shadow(objects.spheres, low, np.array([-8.0, 0.0, 0.0]), 0.3)
-    assert not may_cast_shadow(objects.spheres, low, np.array([-2.0, 4.0, 0.0]), 0.3)
+        assert may_cast_shadow(objects.spheres, sun_direction, position, 0.0)
+    assert not may_cast_shadow(objects.spheres, sun_direction, np.array([2.5, 0.0, 0.0]), 0.3)
+    assert may_cast_shadow(objects.spheres, sun_direction, np.array([2.5, 0.0, 0.0]), 2.0)
+    assert not may_cast_shadow(objects.spheres, sun_direction, np.array([-8.0, 0.0, 0.0]), 0.3)
+    assert not may_cast_shadow(objects.spheres, sun_direction, np.array([-2.0, 4.0, 0.0]), 0.3)

@@ -37,18 +37,18 @@ def _with_uniform_albedo(surface: Surface) -> Surface:
     return Surface.from_samples(samples, surface.spacing_m)
 
 
-def _agreement(frame: Frame, scene: Scene, count: int, step: float) -> tuple[float, float]:
+def _compare_with_ray_cast(frame: Frame, scene: Scene, count: int, step: float) -> tuple[float, float]:
     """Fraction of random pixels where image and ray cast agree, and the fraction in cast shadow."""
     pixels = np.random.default_rng(6).integers(0, frame.radiance.size, count)
     points = frame.points_world().reshape(-1, 3)[pixels]
-    towards = scene.sun.direction
-    facing = frame.normal.reshape(-1, 3)[pixels].astype(np.float64) @ towards
+    to_sun = scene.sun.direction
+    facing = frame.normal.reshape(-1, 3)[pixels].astype(np.float64) @ to_sun
     fraction = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(facing, 1e-6))
-    hidden = Ground(scene.surface).hides(points, towards, step)
-    rays = np.broadcast_to(towards, points.shape)
-    hidden |= np.isfinite(meet_triangles(scene.objects, points, rays, nearest=2e-3))
-    actual, expected = (facing > 0.0) & (fraction > 0.5), (facing > 0.0) & ~hidden
-    return float(np.mean(actual == expected)), float(np.mean((facing > 0.0) & hidden))
+    is_shaded = Ground(scene.surface).hides(points, to_sun, step)
+    rays = np.broadcast_to(to_sun, points.shape)
+    is_shaded |= np.isfinite(meet_triangles(scene.objects, points, rays, nearest=2e-3))
+    actual, expected = (facing > 0.0) & (fraction > 0.5), (facing > 0.0) & ~is_shaded
+    return float(np.mean(actual == expected)), float(np.mean((facing > 0.0) & is_shaded))
 
 
 @pytest.mark.parametrize("azimuth_deg", [110.0, 200.0])
@@ -59,7 +59,7 @@ def test_low_sun_shadows_of_rough_ground_match_ray_cast(
     scene = Scene(_with_uniform_albedo(rough), (380.0, 200.0), sun, LAMBERT, edge_rays=1)
     pose = rigid(Rotation.from_euler("zxy", [30.0, 12.0, 5.0], degrees=True), np.array([380.0, 200.0, 1500.0]))
     frame = renderer.render(scene, PixelRays.of(descent_camera(512)), pose)
-    agree, in_shadow = _agreement(frame, scene, 4000, 0.3)
+    agree, in_shadow = _compare_with_ray_cast(frame, scene, 4000, 0.3)
     assert in_shadow > 0.02
     assert agree >= MIN_AGREEMENT
 
@@ -83,7 +83,7 @@ def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
     scene = Scene(surface, (10.0, 10.0), sun, LAMBERT, rocks, mesh_finest_m=0.1, mesh_reach_m=100.0, edge_rays=1)
     eye = np.array([10.0, 10.0, float(surface.height(10.0, 10.0)) + 8.0])
     frame = renderer.render(scene, PixelRays.of(camera), rigid(Rotation.from_euler("x", 15.0, degrees=True), eye))
-    agree, in_shadow = _agreement(frame, scene, 3000, 0.02)
+    agree, in_shadow = _compare_with_ray_cast(frame, scene, 3000, 0.02)
     assert in_shadow > 0.02
     assert agree >= MIN_AGREEMENT
 
@@ -105,18 +105,18 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
     x_m = frame.points_world()[..., 0].ravel()
     offset = np.clip((elevation - np.interp(x_m, ground, skyline)) / sun.angular_radius_rad, -1.0, 1.0)
     expected = 0.5 + (offset * np.sqrt(1.0 - offset**2) + np.arcsin(offset)) / np.pi
-    lit = frame.radiance.ravel() / (ALBEDO * np.sin(elevation))
+    sun_fraction = frame.radiance.ravel() / (ALBEDO * np.sin(elevation))
     # the penumbra is 1 m wide; a pixel covers 3 cm
     assert 0.1 < np.mean((expected > 0.0) & (expected < 1.0)) < 0.3
-    np.testing.assert_allclose(lit, expected, atol=0.01)
+    np.testing.assert_allclose(sun_fraction, expected, atol=0.01)
 
 
 @pytest.mark.parametrize("elevation", [-0.2, 0.15, 1.0, np.pi / 2])
-def test_hidden_positions_agree_with_all_triangles(elevation: float) -> None:
-    """Triangles of all sizes and shapes, some of them upright, in overlapping bodies."""
+def test_shaded_positions_equal_an_exhaustive_search(elevation: float) -> None:
+    """Random triangles of many sizes and orientations in overlapping bodies."""
     rng = np.random.default_rng(8)
-    middles = rng.uniform(-5.0, 5.0, (60, 1, 1, 3))
-    triangles = (middles + 10.0 ** rng.uniform(-1.5, 0.3, (60, 1, 1, 1)) * rng.normal(size=(60, 7, 3, 3))).reshape(
+    centres = rng.uniform(-5.0, 5.0, (60, 1, 1, 3))
+    triangles = (centres + 10.0 ** rng.uniform(-1.5, 0.3, (60, 1, 1, 1)) * rng.normal(size=(60, 7, 3, 3))).reshape(
         -1, 3
     )
     faces = np.arange(len(triangles), dtype=np.int32).reshape(-1, 3)
@@ -140,13 +140,13 @@ def test_shadow_sweep_of_an_area_equals_the_full_sweep(rough: Surface, azimuth_d
     heights = height_range(rough.levels[0])
     area_m = (-40.0, 60.0, 700.0, 760.0)
     full_shadow, area_shadow = ground_shadow(rough, sun, heights), ground_shadow(rough, sun, heights, area_m)
-    full, part, spacing = full_shadow.height, area_shadow.height, full_shadow.spacing
+    full, area, spacing = full_shadow.height, area_shadow.height, full_shadow.spacing
     assert full_shadow[2:] == area_shadow[2:]
-    assert len(part) < len(full)
+    assert len(area) < len(full)
     x, y = (np.arange(int(a / spacing) - 1, int(b / spacing) + 3) for a, b in (area_m[:2], area_m[2:]))
     rows, columns = (x, y) if full_shadow.along_x else (y, x)
     full_values, part_values = (
-        grid[np.ix_(rows & (len(grid) - 1), columns & (len(grid) - 1))] for grid in (full, part)
+        grid[np.ix_(rows & (len(grid) - 1), columns & (len(grid) - 1))] for grid in (full, area)
     )
     np.testing.assert_array_equal(part_values, full_values)
 
@@ -156,19 +156,21 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_de
     def sun_at(elevation_rad: float) -> Sun:
         return Sun(direction(np.radians(azimuth_deg), elevation_rad))
 
-    high = sun_at(np.radians(80.0))
-    steepest = slope_bounds(rough, high)
+    high_sun = sun_at(np.radians(80.0))
+    max_slopes = slope_bounds(rough, high_sun)
     rng = np.random.default_rng(4)
     x, y = rng.uniform(0.0, rough.period_m, (2, 20000))
     slopes = np.abs(rough.gradient(x, y))
-    assert np.all(slopes <= steepest)
-    assert np.all(slopes.max(axis=0) > 0.6 * np.array(steepest))
-    east, north = np.abs(high.direction[:2]) / np.hypot(*high.direction[:2])
-    max_slope_angle = np.arctan(steepest[0] * east + steepest[1] * north)
-    just_above, just_below = (sun_at(max_slope_angle + high.angular_radius_rad + off) for off in (1e-4, -1e-4))
-    assert sun_over_slopes(just_above, steepest)
-    assert slope_bounds(rough, just_above) == steepest
-    assert not sun_over_slopes(just_below, steepest)
+    assert np.all(slopes <= max_slopes)
+    assert np.all(slopes.max(axis=0) > 0.6 * np.array(max_slopes))
+    east, north = np.abs(high_sun.direction[:2]) / np.hypot(*high_sun.direction[:2])
+    max_slope_angle = np.arctan(max_slopes[0] * east + max_slopes[1] * north)
+    just_above, just_below = (
+        sun_at(max_slope_angle + high_sun.angular_radius_rad + offset) for offset in (1e-4, -1e-4)
+    )
+    assert sun_over_slopes(just_above, max_slopes)
+    assert slope_bounds(rough, just_above) == max_slopes
+    assert not sun_over_slopes(just_below, max_slopes)
     assert slope_bounds(rough, just_below) == (np.inf, np.inf)
     # The sweep finds no shadow except for rounding.
     shadow = ground_shadow(rough, just_above, height_range(rough.levels[0]))
@@ -179,7 +181,7 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_de
     assert scene.in_light(just_below, Photometry()).shadow is not NO_SHADOW
 
 
-def test_ground_in_cones_bounds_all_positions_in_them() -> None:
+def test_bounds_contain_all_ground_in_a_cone() -> None:
     rng = np.random.default_rng(2)
     tip, half = np.array([3.0, -2.0, 1.5]), 0.12
     axis = direction(2.0, -0.3)

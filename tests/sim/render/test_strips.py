@@ -1,4 +1,4 @@
-"""Test of vectorised spline evaluation: equal to single positions."""
+"""Test that the vectorised spline evaluation of the shading kernels equals the evaluation of single positions."""
 
 import numpy as np
 
@@ -17,11 +17,11 @@ def test_vectorised_spline_equals_single_evaluation() -> None:
     x, y = rng.uniform(-40.0, 40.0, (2, ROW))
     x[:4], y[:4] = [0.0, -0.25, 31.75, 32.0], [31.9, 0.0, -0.1, 16.0]
     level_of = rng.integers(0, len(SURFACE.levels), STRIP)
-    which = np.sort(rng.permutation(STRIP)[:100])
-    near = no_cells()
-    fetch_levels(SURFACE.levels, 1.0 / SPACING_M, level_of, which, which.size, x, y, near)
-    for k in which:
+    indices = np.sort(rng.permutation(STRIP)[:100])
+    cells = no_cells()
+    fetch_levels(SURFACE.levels, 1.0 / SPACING_M, level_of, indices, indices.size, x, y, cells)
+    for k in indices:
         scale = 1.0 / SPACING_M / 2.0 ** level_of[k]
-        height, slope_x, slope_y, albedo = spline(near[0], near[1], int(k))
+        height, slope_x, slope_y, albedo = spline(cells[0], cells[1], int(k))
         expected = sample(SURFACE.levels[level_of[k]], scale, x[k], y[k])
         np.testing.assert_allclose((height, slope_x * scale, slope_y * scale, albedo), expected, rtol=0.0, atol=1e-14)

@@ -1,4 +1,4 @@
-"""Tests of texture that fades octave by octave: it keeps the mean and does not alias."""
+"""Tests of albedo texture: octaves finer than the pixel footprint are attenuated, and the mean albedo is unchanged."""
 
 import numpy as np
 import pytest
@@ -8,20 +8,20 @@ from marsyard.sim.render.kernels.photometry import MIN_CELLS, NOISE_VARIANCE, ad
 from marsyard.sim.terrain import sites
 
 ONES = np.ones(60000)
-PLACES = np.random.default_rng(5).uniform(-500.0, 500.0, (60000, 3))
+POSITIONS = np.random.default_rng(5).uniform(-500.0, 500.0, (60000, 3))
 
 
 def test_noise_has_unit_variance() -> None:
-    noise = np.array([gradient_noise(x, y, z, 1) for x, y, z in PLACES])
+    noise = np.array([gradient_noise(x, y, z, 1) for x, y, z in POSITIONS])
     assert np.mean(noise**2) == pytest.approx(NOISE_VARIANCE, rel=0.02)
 
 
 @pytest.mark.parametrize("footprint_m", [1e-4, 3e-3, 0.1])
-def test_mean_albedo_is_kept_at_any_distance(footprint_m: float) -> None:
-    strongest = max((site.ground_texture for site in sites().values()), key=lambda one: max(one.amplitudes))
+def test_mean_albedo_is_unchanged_at_any_distance(footprint_m: float) -> None:
+    strongest = max((site.ground_texture for site in sites().values()), key=lambda texture: max(texture.amplitudes))
     octaves = np.array(strongest.amplitudes)
-    log = np.zeros(len(PLACES))
-    add_texture(*PLACES.T.copy(), np.full(len(PLACES), footprint_m), strongest.coarsest_m, octaves, ONES, log)
+    log = np.zeros(len(POSITIONS))
+    add_texture(*POSITIONS.T.copy(), np.full(len(POSITIONS), footprint_m), strongest.coarsest_m, octaves, ONES, log)
     assert np.mean(np.exp(log)) == pytest.approx(1.0, abs=0.005)
 
 
@@ -36,16 +36,16 @@ def test_detail_finer_than_a_footprint_is_removed() -> None:
 
 
 @pytest.mark.parametrize("cell_px", [4, 3, 2])
-def test_octave_fades_as_by_the_mean_over_a_pixel(cell_px: float) -> None:
+def test_octave_is_attenuated_as_by_averaging_over_a_pixel(cell_px: float) -> None:
     """A plane through the noise with ten samples per pixel, averaged, against the attenuation of the footprint."""
     fine, side = 10, 400
     rng = np.random.default_rng(7)
     rotated = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     y, x = np.mgrid[:side, :side].reshape(2, -1) / fine / cell_px
     positions = 50.0 + x[:, None] * rotated[0] + y[:, None] * rotated[1]
-    sharp, observed, strength = np.zeros(len(positions)), np.zeros(len(positions)), np.ones(len(positions))
+    sharp, attenuated, strength = np.zeros(len(positions)), np.zeros(len(positions)), np.ones(len(positions))
     add_texture(*positions.T.copy(), np.full(len(positions), 1e-6), 1.0, np.array([0.1]), strength, sharp)
-    add_texture(*positions.T.copy(), np.full(len(positions), 1.0 / cell_px), 1.0, np.array([0.1]), strength, observed)
-    # the median wave represents all waves
+    add_texture(*positions.T.copy(), np.full(len(positions), 1.0 / cell_px), 1.0, np.array([0.1]), strength, attenuated)
+    # The attenuation is that of the median wavelength of the octave.
     mean = ndimage.uniform_filter(sharp.reshape(side, side), fine, mode="nearest")
-    assert np.std(observed) / np.std(sharp) == pytest.approx(np.std(mean) / np.std(sharp), abs=0.03)
+    assert np.std(attenuated) / np.std(sharp) == pytest.approx(np.std(mean) / np.std(sharp), abs=0.03)

@@ -1,4 +1,4 @@
-"""Tests of the division of pixels among threads: each pixel once, and bitwise equal images."""
+"""Tests of the division of pixels among threads: each pixel is computed once, and images are bitwise equal."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 def test_every_pixel_belongs_to_one_part(pixels: int, count: int) -> None:
     visits = np.zeros(pixels, dtype=np.int64)
 
-    def visit(part: slice) -> None:
-        visits[part] += 1
+    def visit(pixels_of_part: slice) -> None:
+        visits[pixels_of_part] += 1
 
     run_in_parts(visit, pixels, count)
     np.testing.assert_array_equal(visits, 1)
 
 
 def test_exception_in_a_thread_is_raised() -> None:
-    def fail(part: slice) -> None:
-        if part.start > 0:
+    def fail(pixels_of_part: slice) -> None:
+        if pixels_of_part.start > 0:
             raise ValueError("the second half")
 
     with pytest.raises(ValueError, match="the second half"):
@@ -57,9 +57,9 @@ def test_images_do_not_depend_on_threads(
     rays = PixelRays.of(descent_camera().crop(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
     monkeypatch.setattr("marsyard.sim.render.renderer.run_in_parts", partial(run_in_parts, threads=1))
-    alone = renderer.render(scene, rays, pose)
-    assert np.any(alone.body >= 0)
+    one_thread = renderer.render(scene, rays, pose)
+    assert np.any(one_thread.body >= 0)
     monkeypatch.setattr("marsyard.sim.render.renderer.run_in_parts", partial(run_in_parts, threads=3))
-    shared = renderer.render(scene, rays, pose)
+    three_threads = renderer.render(scene, rays, pose)
     for name in ("radiance", "range_m", "body", "normal"):
-        np.testing.assert_array_equal(getattr(alone, name), getattr(shared, name))
+        np.testing.assert_array_equal(getattr(one_thread, name), getattr(three_threads, name))

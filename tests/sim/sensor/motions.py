@@ -1,4 +1,4 @@
-"""Closed-form motions for tests of instruments."""
+"""Closed-form motions for the tests of instruments: a swaying body, and uniform motion of an image."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ GRAVITY = 3.71
 
 
 def uniform_motion(rows_s: float, columns_s: float) -> ImageMotion:
+    """Image motion with equal velocities of all pixels, pixels per second."""
     return ImageMotion(np.tile(np.array([rows_s, columns_s]), (2, 2, 1)))
 
 
 @dataclass(frozen=True)
 class Swaying:
-    """Rotates about the vertical, pitches about its own x axis, moves on a parabola and oscillates to the east."""
+    """Motion of a body that spins about the vertical, nods about its x axis, falls on a parabola and sways east."""
 
     spin_rad_s: float = 0.0
     nod_rad: float = 0.0
@@ -49,11 +50,11 @@ class Swaying:
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         t = times_s[:, None]
-        east, up, first = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
-        nod = Rotation.from_rotvec(self.nod_rad * np.sin(self.nod_rad_s * t) * first)
+        east, up, x_axis = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+        nod = Rotation.from_rotvec(self.nod_rad * np.sin(self.nod_rad_s * t) * x_axis)
         attitudes = self.tilt * Rotation.from_rotvec(self.spin_rad_s * t * up) * nod
         rates = nod.inv().apply(np.broadcast_to(self.spin_rad_s * up, (times_s.size, 3)).copy())
-        rates = rates + self.nod_rad * self.nod_rad_s * np.cos(self.nod_rad_s * t) * first
+        rates = rates + self.nod_rad * self.nod_rad_s * np.cos(self.nod_rad_s * t) * x_axis
         v, a, k = np.array(self.velocity_m_s), np.array(self.acceleration_m_s2), self.sway_rad_s
         accelerations = a - self.sway_m * k**2 * np.sin(k * t) * east
         return Motion(

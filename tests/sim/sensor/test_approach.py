@@ -1,4 +1,4 @@
-"""Tests of inertial errors during the approach against a propagation at the full rate."""
+"""Tests of inertial errors during the approach, against a propagation at the full rate of the inertial unit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from marsyard.sim.dynamics import Motion, State
 from marsyard.sim.sensor import Approach, ApproachParameters, Imu, ImuIncrements, ImuParameters, InertialSolution
 from marsyard.sim.sensor.imu import true_increments
-from tests.sim.sensor.test_imu import perfect
+from tests.sim.sensor.test_imu import perfect_unit
 
 #: A short profile that can be measured at the full rate.
 SHORT = ApproachParameters(
@@ -30,11 +30,9 @@ class ProfileMotion:
         return self.motion(np.array([time_s])).state(0)
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
-        nothing = np.zeros((times_s.size, 3))
+        zeros = np.zeros((times_s.size, 3))
         a = self.approach
-        return Motion(
-            times_s, nothing, nothing, a.attitudes(times_s), a.body_rates(times_s), a.specific_forces(times_s)
-        )
+        return Motion(times_s, zeros, zeros, a.attitudes(times_s), a.body_rates(times_s), a.specific_forces(times_s))
 
 
 def _propagate_at_full_rate(imu: Imu, approach: Approach, seeds: range) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -43,7 +41,7 @@ def _propagate_at_full_rate(imu: Imu, approach: Approach, seeds: range) -> list[
     boundaries = imu.boundaries(approach.start_s, approach.end_s)
     angles, velocities = true_increments(ProfileMotion(approach), boundaries)
     exact = ImuIncrements(boundaries, 1.0 / imu.parameters.rate_hz, angles, velocities)
-    true = InertialSolution.propagate(exact, start, np.zeros(3), 0.0)
+    exact_solution = InertialSolution.propagate(exact, start, np.zeros(3), 0.0)
     errors = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
@@ -53,8 +51,8 @@ def _propagate_at_full_rate(imu: Imu, approach: Approach, seeds: range) -> list[
             delta_velocities_m_s=imu.accelerometer.measure(velocities, boundaries, rng),
         )
         estimate = InertialSolution.propagate(measured, start, np.zeros(3), 0.0)
-        attitude = (estimate.attitudes[-1] * true.attitudes[-1].inv()).as_rotvec()
-        errors.append((attitude, estimate.velocities_m_s[-1] - true.velocities_m_s[-1]))
+        attitude = (estimate.attitudes[-1] * exact_solution.attitudes[-1].inv()).as_rotvec()
+        errors.append((attitude, estimate.velocities_m_s[-1] - exact_solution.velocities_m_s[-1]))
     return errors
 
 
@@ -75,19 +73,19 @@ def test_profile_has_specified_deceleration_and_ends_upright() -> None:
     approach = Approach(p, 0.0)
     times = np.linspace(approach.start_s, 0.0, 200001)
     forces = approach.specific_forces(times)
-    carried = p.gravity_m_s2 * p.parachute_s
-    lost = np.trapezoid(forces[:, 2], times)
-    assert lost == pytest.approx(p.entry_delta_v_m_s + p.parachute_delta_v_m_s + carried, rel=1e-3)
+    gravity_delta_v = p.gravity_m_s2 * p.parachute_s
+    total_delta_v = np.trapezoid(forces[:, 2], times)
+    assert total_delta_v == pytest.approx(p.entry_delta_v_m_s + p.parachute_delta_v_m_s + gravity_delta_v, rel=1e-3)
     assert approach.attitudes(np.array([0.0]))[0].apply([0.0, 0.0, -1.0])[2] == pytest.approx(-1.0)
-    # Initially towards the heading and 12 deg below the horizon.
-    first = approach.attitudes(np.array([approach.start_s]))[0].apply([0.0, 0.0, -1.0])
-    assert np.degrees(np.arctan2(first[0], first[1])) == pytest.approx(p.heading_deg)
-    assert np.degrees(np.arccos(-first[2])) == pytest.approx(p.entry_off_nadir_deg)
+    # At the start the body -z axis points to the heading, 12 deg below the horizon.
+    start_axis = approach.attitudes(np.array([approach.start_s]))[0].apply([0.0, 0.0, -1.0])
+    assert np.degrees(np.arctan2(start_axis[0], start_axis[1])) == pytest.approx(p.heading_deg)
+    assert np.degrees(np.arccos(-start_axis[2])) == pytest.approx(p.entry_off_nadir_deg)
     assert 4.0 < forces[:, 2].max() / 9.81 < 7.0
 
 
-def test_constant_errors_grow_as_in_a_full_rate_propagation() -> None:
-    constant = perfect(
+def test_constant_errors_match_a_full_rate_propagation() -> None:
+    constant = perfect_unit(
         gyro_bias_deg_h=30.0,
         gyro_wander_deg_h=10.0,
         gyro_scale_ppm=300.0,
@@ -107,8 +105,8 @@ def test_constant_errors_grow_as_in_a_full_rate_propagation() -> None:
         np.testing.assert_allclose(fast.velocity_m_s, velocity, atol=0.01 * float(np.linalg.norm(velocity)))
 
 
-def test_noise_grows_as_in_a_full_rate_propagation() -> None:
-    noisy = perfect(rate_hz=20.0, angular_random_walk_deg_sqrt_h=1.0, velocity_random_walk_ug_sqrt_hz=3000.0)
+def test_noise_matches_a_full_rate_propagation() -> None:
+    noisy = perfect_unit(rate_hz=20.0, angular_random_walk_deg_sqrt_h=1.0, velocity_random_walk_ug_sqrt_hz=3000.0)
     approach = Approach(SHORT, -2.0)
     imu = Imu.draw(noisy, (approach.start_s, 0.0), np.random.default_rng(0))
     fast = [approach.errors(imu, np.random.default_rng(seed)) for seed in range(400)]
@@ -127,13 +125,13 @@ def test_noise_grows_as_in_a_full_rate_propagation() -> None:
 def test_scale_error_rotates_attitude_about_spin_axis() -> None:
     p = SHORT.model_copy(update={"cruise_s": 900.0, "spin_scale_ppm": 20.0})
     approach = Approach(p, 0.0)
-    imu = Imu.draw(perfect(gyro_scale_ppm=1e4), (approach.start_s, 0.0), np.random.default_rng(0))
+    imu = Imu.draw(perfect_unit(gyro_scale_ppm=1e4), (approach.start_s, 0.0), np.random.default_rng(0))
     calibrated = approach.calibrate(imu, np.random.default_rng(1))
-    flat = Approach(p.model_copy(update={"entry_off_nadir_deg": 0.0, "deploy_off_nadir_deg": 0.0}), 0.0)
-    error = flat.errors(calibrated, np.random.default_rng(0)).attitude_rad
-    rotated = 2.0 * np.pi / 30.0 * 940.0
+    level_approach = Approach(p.model_copy(update={"entry_off_nadir_deg": 0.0, "deploy_off_nadir_deg": 0.0}), 0.0)
+    error = level_approach.errors(calibrated, np.random.default_rng(0)).attitude_rad
+    rotation_rad = 2.0 * np.pi / 30.0 * 940.0
     assert abs(calibrated.gyro.scale[2]) < 1e-4
-    assert error[2] == pytest.approx(calibrated.gyro.scale[2] * rotated, rel=1e-9)
+    assert error[2] == pytest.approx(calibrated.gyro.scale[2] * rotation_rad, rel=1e-9)
     np.testing.assert_array_equal(calibrated.gyro.scale[:2], imu.gyro.scale[:2])
 
 
@@ -144,8 +142,8 @@ def test_spin_scale_error_dominates_the_descent_attitude_error() -> None:
         rng = np.random.default_rng(seed)
         imu = approach.calibrate(Imu.draw(ImuParameters(), (approach.start_s, 0.0), rng), rng)
         errors.append(approach.errors(imu, rng).attitude_rad)
-    spread = np.degrees(np.std(errors, axis=0))
-    # 1 deg/h for 1140 s along the spin axis and 100 ppm of 38 turns give 0.32 and 1.37 deg about the entry direction.
-    # Across the axis the bias averages out until the parachute opens.
-    assert 1.2 < spread[0] < 1.6
-    assert spread[1:].max() < 0.45
+    deviations_deg = np.degrees(np.std(errors, axis=0))
+    # About the spin axis (the entry direction): 1 deg/h for 1140 s is 0.32 deg, and 100 ppm of 38 turns are 1.37 deg.
+    # About the other axes the bias averages out until the parachute opens.
+    assert 1.2 < deviations_deg[0] < 1.6
+    assert deviations_deg[1:].max() < 0.45

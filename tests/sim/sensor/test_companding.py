@@ -13,7 +13,7 @@ def test_companding_round_trip_is_within_half_a_step(full_scale: int) -> None:
     counts = np.arange(full_scale + 1, dtype=np.uint16)[None]
     error = np.abs(expand(compand(counts, full_scale), full_scale).astype(int) - counts)
     step = np.gradient(expansion_table(full_scale).astype(float))[compression_table(full_scale)]
-    # The last code has only half a step.
+    # The last codes are excluded because the last step has half the width.
     assert (error <= 0.5 * step + 1.0)[counts < expansion_table(full_scale)[253]].all()
     # Twelve bits in eight: the widest step is 32 counts, the first steps are single counts.
     assert error.max() <= full_scale / 255 * 1.1

@@ -1,4 +1,4 @@
-"""Tests of lossy compression: size, error that grows with the compression, and lossless limit."""
+"""Tests of lossy image compression: error for a given size in bits per pixel, mean, position and range of counts."""
 
 from itertools import pairwise
 
@@ -12,14 +12,14 @@ SCENE = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(256, 384)), (0, 0
 COUNTS = np.clip(2000.0 + 4000.0 * SCENE, 0.0, 4095.0).astype(np.uint16)
 
 
-def test_error_grows_with_the_compression() -> None:
+def test_error_increases_with_compression() -> None:
     errors = [float(np.std(compress(COUNTS, bits, 4095).astype(float) - COUNTS)) for bits in (16.0, 4.0, 2.0, 1.0, 0.5)]
     assert errors[0] == 0.0
     assert all(coarse > fine for fine, coarse in pairwise(errors))
     assert 0.5 < errors[3] < 200.0
 
 
-def test_compression_neither_shifts_nor_dims_the_image() -> None:
+def test_compression_preserves_mean_and_position_of_the_image() -> None:
     lossy = compress(COUNTS, 1.0, 4095).astype(float)
     assert lossy.mean() == pytest.approx(COUNTS.mean(), rel=1e-3)
     shift, _ = cv2.phaseCorrelate(COUNTS.astype(float), lossy)

@@ -1,4 +1,4 @@
-"""Tests of custom cameras in campaigns: mounting keeps the field of view, and files are read once."""
+"""Tests of custom cameras in campaigns: mounting keeps all angles, and a stored camera replaces its file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marsyard.sim.camera import Cahvor, mount_looking_down, read_camera
 from marsyard.sim.sensor import CustomCamera, CustomCameraChoice, NamedOrCustomCamera
 
 CHOICE: TypeAdapter[CustomCamera] = TypeAdapter(CustomCameraChoice)
-EITHER: TypeAdapter[str | CustomCamera] = TypeAdapter(NamedOrCustomCamera)
+NAMED_OR_CUSTOM: TypeAdapter[str | CustomCamera] = TypeAdapter(NamedOrCustomCamera)
 #: EuRoC's first camera (sensor.yaml), with the fields that are read.
 EUROC = """resolution: [752, 480]
 camera_model: pinhole
@@ -30,13 +30,13 @@ def euroc(tmp_path: Path) -> Path:
     return path
 
 
-def test_mounting_keeps_all_angles(euroc: Path) -> None:
-    read, custom = read_camera(euroc), CHOICE.validate_python({"file": str(euroc)})
+def test_mounting_preserves_all_angles(euroc: Path) -> None:
+    unmounted, custom = read_camera(euroc), CHOICE.validate_python({"file": str(euroc)})
     mounted = custom.camera()
     assert np.array_equal(mounted.a, [0.0, 0.0, -1.0])
     assert np.array_equal(mounted.c, np.zeros(3))
     pixels = np.array([[0.0, 0.0], [751.0, 10.0], [400.0, 479.0], [100.0, 200.0]])
-    actual, expected = (camera.rays(pixels)[1] for camera in (mounted, read))
+    actual, expected = (camera.rays(pixels)[1] for camera in (mounted, unmounted))
     assert np.allclose(actual @ actual.T, expected @ expected.T, rtol=0, atol=1e-12)
     # Columns along +x, upper image edge along +y, viewing direction -z: OpenCV's y and z inverted.
     point = np.array([0.1, -0.2, 1.0])
@@ -56,10 +56,10 @@ def test_opportunity_labels_can_be_mounted(shared_data: Path) -> None:
     custom = CHOICE.validate_python(str(label))
     assert custom.model == "CAHVOR"
     assert custom.size == (1024, 1024)
-    read = read_camera(label)
-    assert isinstance(read, Cahvor)
+    unmounted = read_camera(label)
+    assert isinstance(unmounted, Cahvor)
     pixels = np.array([[0.0, 0.0], [1023.0, 10.0], [400.0, 900.0]])
-    actual, expected = (camera.rays(pixels)[1] for camera in (custom.camera(), read))
+    actual, expected = (camera.rays(pixels)[1] for camera in (custom.camera(), unmounted))
     # The label rounds A to six digits.
     assert np.allclose(actual @ actual.T, expected @ expected.T, rtol=0, atol=1e-6)
 
@@ -73,10 +73,10 @@ def test_stored_camera_replaces_the_file(euroc: Path) -> None:
     assert hash(CHOICE.validate_python(stored)) == hash(custom)
 
 
-def test_preset_names_are_kept(euroc: Path) -> None:
-    assert EITHER.validate_python("xc-55") == "xc-55"
-    assert isinstance(EITHER.validate_python(str(euroc)), CustomCamera)
-    assert isinstance(EITHER.validate_python({"file": str(euroc)}), CustomCamera)
+def test_preset_names_are_accepted(euroc: Path) -> None:
+    assert NAMED_OR_CUSTOM.validate_python("xc-55") == "xc-55"
+    assert isinstance(NAMED_OR_CUSTOM.validate_python(str(euroc)), CustomCamera)
+    assert isinstance(NAMED_OR_CUSTOM.validate_python({"file": str(euroc)}), CustomCamera)
 
 
 def test_mirrored_images_are_rejected(euroc: Path) -> None:

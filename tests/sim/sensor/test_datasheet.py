@@ -56,13 +56,13 @@ def test_responsivity_counts_solar_photons(tmp_path: Path) -> None:
     """ASTM E490 gives 475 W/m2 between 420 and 680 nm; the mean photon energy is that of 550 nm."""
     p = read_datasheet(write_sheet(tmp_path, "sun_au = 1.0\n" + SHEET)).parameters()
     photons = 475.0 / (6.62607015e-34 * 2.99792458e8 / 550e-9)
-    by_hand = 0.65 * 0.9 * (3.45e-6) ** 2 * photons / (4.0 * 4.0**2)
+    expected = 0.65 * 0.9 * (3.45e-6) ** 2 * photons / (4.0 * 4.0**2)
     # The sun is modelled as a black body, which is up to 9 % fainter in the green.
-    assert p.responsivity_e_s == pytest.approx(by_hand, rel=0.1)
-    # The detector states its sun.
+    assert p.responsivity_e_s == pytest.approx(expected, rel=0.1)
+    # `sunlight` is the solar irradiance at `sun_au`, relative to 1 au.
     assert p.sunlight == 1.0
-    elsewhere = read_datasheet(write_sheet(tmp_path, "sun_au = 3.0\n" + SHEET)).parameters()
-    assert elsewhere.responsivity_e_s / elsewhere.sunlight == pytest.approx(p.responsivity_e_s)
+    far_from_sun = read_datasheet(write_sheet(tmp_path, "sun_au = 3.0\n" + SHEET)).parameters()
+    assert far_from_sun.responsivity_e_s / far_from_sun.sunlight == pytest.approx(p.responsivity_e_s)
 
 
 def test_flat_curve_equals_the_mean(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_flat_curve_equals_the_mean(tmp_path: Path) -> None:
 
 def test_mer_ccd_from_datasheet_matches_the_preset(tmp_path: Path) -> None:
     """The preset's detector calculated from Maki et al. 2003 and the assumed quantum efficiency curve."""
-    points = [15, 22, 28, 33, 38, 42, 43, 40, 34, 27, 19, 11, 5, 2, 0]
+    efficiency_percent = [15, 22, 28, 33, 38, 42, 43, 40, 34, 27, 19, 11, 5, 2, 0]
     text = f"""pixel_pitch_um = 12.0
 full_well_e = 170000
 read_noise_e = 25
@@ -91,7 +91,7 @@ rows = 1024
 readout_s = 5.4272
 [quantum_efficiency]
 wavelength_nm = {[400.0 + 50.0 * k for k in range(15)]}
-efficiency = {[one / 100 for one in points]}
+efficiency = {[percent / 100 for percent in efficiency_percent]}
 [lens]
 f_number = 12.0
 band_nm = [600.0, 800.0]
@@ -105,15 +105,15 @@ band_nm = [600.0, 800.0]
 
 def test_campaign_stores_the_datasheet(tmp_path: Path) -> None:
     path = write_sheet(tmp_path)
-    plain = CHOICE.validate_python(str(path))
-    assert plain == read_datasheet(path).parameters().model_copy(update={"file": str(path)})
+    parameters = CHOICE.validate_python(str(path))
+    assert parameters == read_datasheet(path).parameters().model_copy(update={"file": str(path)})
     # The stored datasheet of the campaign folder is not read again.
     path.write_text("")
-    assert CHOICE.validate_python(plain.model_dump(mode="json")) == plain
+    assert CHOICE.validate_python(parameters.model_dump(mode="json")) == parameters
     path.write_text(SHEET)
     changed = CHOICE.validate_python({"file": str(path), "temperature_c": -10.0, "optics": {"dust_discs": 3}})
     assert (changed.temperature_c, changed.optics.dust_discs) == (-10.0, 3)
-    assert changed.full_well_e == plain.full_well_e
+    assert changed.full_well_e == parameters.full_well_e
     # The stored values replace the file.
     stored = changed.model_dump(mode="json")
     path.unlink()

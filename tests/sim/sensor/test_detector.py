@@ -10,33 +10,33 @@ from marsyard.sim.sensor.detector import BurstParameters, DefectParameters, dark
 from marsyard.sim.sensor.optics import OpticsParameters
 from tests.sim.sensor.motions import uniform_motion
 
-EVEN = np.ones((64, 48), dtype=np.float32)
+UNIFORM = np.ones((64, 48), dtype=np.float32)
 SHARP = OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)
 PERFECT = {"response_spread": 0.0, "calibration_error": 0.0, "read_noise_e": 0.0, "optics": SHARP}
-DARK = np.zeros_like(EVEN)
+DARK = np.zeros_like(UNIFORM)
 
 
-def _make_detector(shape: tuple[int, int] = EVEN.shape, **changes: object) -> Detector:
+def _make_detector(shape: tuple[int, int] = UNIFORM.shape, **changes: object) -> Detector:
     parameters = DetectorParameters.model_validate(PERFECT | changes)
     return Detector.draw(np.ones(shape, dtype=np.float32), parameters, np.random.default_rng(0))
 
 
-def test_photon_transfer_gives_gain() -> None:
-    """Variance over mean of uniform images is the gain: 2 % is four standard errors of 100 images."""
+def test_signal_divided_by_variance_equals_the_gain() -> None:
+    """Signal / variance of uniform images, both in counts, is the gain; 2 % is four standard errors of 100 images."""
     detector = _make_detector(transfer_row_s=0.0, clear_row_s=0.0, responsivity_e_s=5e7)
-    pictures = np.stack(
-        [detector.expose(0.2 * EVEN, np.random.default_rng(seed)).astype(np.float64) for seed in range(100)]
+    images = np.stack(
+        [detector.expose(0.2 * UNIFORM, np.random.default_rng(seed)).astype(np.float64) for seed in range(100)]
     )
-    signal_dn = pictures.mean() - detector.parameters.offset_dn
+    signal_dn = images.mean() - detector.parameters.offset_dn
     # Rounding adds one twelfth of a count to the variance.
-    variance = pictures.var(axis=0, ddof=1).mean() - 1.0 / 12.0
+    variance = images.var(axis=0, ddof=1).mean() - 1.0 / 12.0
     assert signal_dn / variance == pytest.approx(detector.parameters.gain_e_dn, rel=0.02)
 
 
 def test_smear_of_a_bright_row_matches_transfer_times() -> None:
     """A packet of row r passes the previous rows during readout and the following rows during clearing."""
     detector = _make_detector(rows_summed=1, transfer_row_s=1e-5, clear_row_s=2e-6)
-    scene = np.zeros_like(EVEN)
+    scene = np.zeros_like(UNIFORM)
     scene[20] = 1.0
     charge = detector.charge(scene)
     rate = detector.parameters.responsivity_e_s
@@ -45,42 +45,42 @@ def test_smear_of_a_bright_row_matches_transfer_times() -> None:
     np.testing.assert_allclose(charge[20], rate * detector.parameters.exposure_s, rtol=1e-5)
 
 
-def test_only_rows_are_summed() -> None:
-    counts = _make_detector(rows_summed=4).expose(EVEN, np.random.default_rng(0))
+def test_rows_are_summed_and_columns_are_not() -> None:
+    counts = _make_detector(rows_summed=4).expose(UNIFORM, np.random.default_rng(0))
     assert counts.shape == (16, 48)
     assert counts.dtype == np.uint16
 
 
 def test_signal_saturates_at_full_well_and_full_scale() -> None:
-    counts = _make_detector().expose(1e3 * EVEN, np.random.default_rng(0))
+    counts = _make_detector().expose(1e3 * UNIFORM, np.random.default_rng(0))
     p = DetectorParameters()
     assert (counts == min(4095, round(p.full_well_e / p.gain_e_dn + p.offset_dn))).all()
-    assert (_make_detector(gain_e_dn=1.0).expose(1e3 * EVEN, np.random.default_rng(0)) == 4095).all()
+    assert (_make_detector(gain_e_dn=1.0).expose(1e3 * UNIFORM, np.random.default_rng(0)) == 4095).all()
 
 
-def test_equal_streams_give_equal_images() -> None:
+def test_equal_random_streams_produce_equal_images() -> None:
     detector = _make_detector()
-    first = detector.expose(0.1 * EVEN, np.random.default_rng(1))
-    assert (first == detector.expose(0.1 * EVEN, np.random.default_rng(1))).all()
-    assert (first != detector.expose(0.1 * EVEN, np.random.default_rng(2))).any()
+    first = detector.expose(0.1 * UNIFORM, np.random.default_rng(1))
+    assert (first == detector.expose(0.1 * UNIFORM, np.random.default_rng(1))).all()
+    assert (first != detector.expose(0.1 * UNIFORM, np.random.default_rng(2))).any()
 
 
 def test_calibration_response_has_the_specified_error() -> None:
     detector = Detector.draw(
-        EVEN, DetectorParameters(response_spread=0.02, calibration_error=0.005), np.random.default_rng(3)
+        UNIFORM, DetectorParameters(response_spread=0.02, calibration_error=0.005), np.random.default_rng(3)
     )
-    true = detector.response.reshape(16, 4, 48).mean(axis=1)
-    # 768 pixels determine the spread to 2.6 %.
-    assert (detector.calibration.flat_field / true).std() == pytest.approx(0.005, rel=0.1)
-    assert true.std() == pytest.approx(0.02 / 2, rel=0.1)
+    true_response = detector.response.reshape(16, 4, 48).mean(axis=1)
+    # 768 pixels determine the standard deviation to 2.6 %.
+    assert (detector.calibration.flat_field / true_response).std() == pytest.approx(0.005, rel=0.1)
+    assert true_response.std() == pytest.approx(0.02 / 2, rel=0.1)
 
 
 def test_indivisible_rows_are_rejected() -> None:
     with pytest.raises(ValueError, match="cannot be summed"):
-        Detector.draw(EVEN[:63], DetectorParameters(), np.random.default_rng(0))
+        Detector.draw(UNIFORM[:63], DetectorParameters(), np.random.default_rng(0))
 
 
-def test_dimes_removes_the_smear() -> None:
+def test_dimes_correction_removes_the_smear() -> None:
     """A static image of the complete detector with light down to one third and texture between pixels."""
     rng = np.random.default_rng(5)
     large = gaussian_filter(rng.standard_normal((1024, 32)), 60.0, mode="wrap")
@@ -89,11 +89,11 @@ def test_dimes_removes_the_smear() -> None:
     detector = _make_detector(scene.shape)
     p = detector.parameters
 
-    def delivered(charge: np.ndarray) -> np.ndarray:
+    def sum_rows(charge: np.ndarray) -> np.ndarray:
         return np.asarray(charge.reshape(256, 4, 32).sum(axis=1) / p.gain_e_dn)
 
-    smeared = delivered(detector.charge(scene))
-    exposed = delivered(scene * np.float32(p.responsivity_e_s * p.exposure_s))
+    smeared = sum_rows(detector.charge(scene))
+    exposed = sum_rows(scene * np.float32(p.responsivity_e_s * p.exposure_s))
     assert np.abs(smeared - exposed).max() > 0.2 * p.full_scale_dn
     assert smeared.max() < p.full_scale_dn
     error = remove_frame_transfer(smeared, detector.calibration, 4) - exposed
@@ -101,7 +101,7 @@ def test_dimes_removes_the_smear() -> None:
     assert np.abs(error).max() < 0.002 * p.full_scale_dn
 
 
-def test_dark_current_doubles_every_six_degrees_and_grows_in_readout() -> None:
+def test_dark_current_doubles_every_six_degrees() -> None:
     cold, warm = (_make_detector(temperature_c=t).dark_charge() for t in (-34.0, -28.0))
     np.testing.assert_allclose(warm, 2.0 * cold, rtol=1e-6)
     detector = _make_detector(temperature_c=0.0)
@@ -114,12 +114,12 @@ def test_dark_current_doubles_every_six_degrees_and_grows_in_readout() -> None:
 
 def test_dark_current_adds_signal_and_shot_noise() -> None:
     detector = _make_detector(temperature_c=40.0, gain_e_dn=1.0, bits=16, offset_dn=0.0)
-    picture = detector.expose(DARK, np.random.default_rng(1)).astype(np.float64)
-    expected = np.broadcast_to(detector.dark_charge(), picture.shape)
+    image = detector.expose(DARK, np.random.default_rng(1)).astype(np.float64)
+    expected = np.broadcast_to(detector.dark_charge(), image.shape)
     assert (expected > 50.0).all()
     # 768 pixels, each with a standard error of the square root of its charge.
-    assert ((picture - expected) / np.sqrt(expected)).mean() == pytest.approx(0.0, abs=4.0 / np.sqrt(768))
-    assert ((picture - expected) / np.sqrt(expected)).std() == pytest.approx(1.0, abs=0.1)
+    assert ((image - expected) / np.sqrt(expected)).mean() == pytest.approx(0.0, abs=4.0 / np.sqrt(768))
+    assert ((image - expected) / np.sqrt(expected)).std() == pytest.approx(1.0, abs=0.1)
 
 
 def test_hot_and_dead_pixels_have_specified_rates() -> None:
@@ -139,12 +139,12 @@ def test_hot_and_dead_pixels_have_specified_rates() -> None:
 
 def test_bursts_disturb_runs_along_the_rows() -> None:
     scene = 0.1 * np.ones((256, 64), dtype=np.float32)
-    quiet = _make_detector(scene.shape, rows_summed=1)
+    undisturbed = _make_detector(scene.shape, rows_summed=1)
     disturbed = _make_detector(
         scene.shape, rows_summed=1, bursts=BurstParameters(bursts=3.0, length_px=200.0, amplitude_dn=500.0)
     )
     pairs = [
-        (quiet.expose(scene, np.random.default_rng(n)), disturbed.expose(scene, np.random.default_rng(n)))
+        (undisturbed.expose(scene, np.random.default_rng(n)), disturbed.expose(scene, np.random.default_rng(n)))
         for n in range(60)
     ]
     changed = np.stack([(a != b).reshape(-1) for a, b in pairs])
@@ -157,27 +157,27 @@ def test_bursts_disturb_runs_along_the_rows() -> None:
 
 def test_companding_noise_is_below_shot_noise() -> None:
     scene = np.tile(np.linspace(0.02, 0.25, 48, dtype=np.float32), (64, 1))
-    plain, companded = (
+    uncompanded, companded = (
         _make_detector(companded=value).expose(scene, np.random.default_rng(3)).astype(np.float64)
         for value in (False, True)
     )
-    assert len(np.unique(companded)) < len(np.unique(plain))
-    signal = plain - 20.0
-    assert (np.abs(companded - plain) <= np.sqrt(signal * 41.5) / 41.5 * 2.0 + 1.0).all()
+    assert len(np.unique(companded)) < len(np.unique(uncompanded))
+    signal = uncompanded - 20.0
+    assert (np.abs(companded - uncompanded) <= np.sqrt(signal * 41.5) / 41.5 * 2.0 + 1.0).all()
 
 
 def test_motion_blur_is_reproducible() -> None:
-    scene = np.random.default_rng(2).random(EVEN.shape, dtype=np.float32) * np.float32(0.2)
+    scene = np.random.default_rng(2).random(UNIFORM.shape, dtype=np.float32) * np.float32(0.2)
     detector = _make_detector()
-    moving = uniform_motion(900.0, -700.0)
-    first = detector.expose(scene, np.random.default_rng(1), moving)
-    np.testing.assert_array_equal(first, detector.expose(scene, np.random.default_rng(1), moving))
+    motion = uniform_motion(900.0, -700.0)
+    first = detector.expose(scene, np.random.default_rng(1), motion)
+    np.testing.assert_array_equal(first, detector.expose(scene, np.random.default_rng(1), motion))
     static = detector.expose(scene, np.random.default_rng(1))
     assert (first != static).mean() > 0.5
     np.testing.assert_array_equal(static, detector.expose(scene, np.random.default_rng(1), uniform_motion(0.0, 0.0)))
 
 
-def test_exposure_is_set_and_reported() -> None:
+def test_exposure_time_is_set_in_parameters_and_calibration() -> None:
     detector = _make_detector().with_exposure(0.002)
     assert detector.parameters.exposure_s == detector.calibration.exposure_s == 0.002
     with pytest.raises(ValueError, match="exposure_s"):
@@ -188,12 +188,12 @@ def test_subframe_has_the_pixels_of_the_full_frame() -> None:
     parameters = DetectorParameters(
         transfer_row_s=0.0, clear_row_s=0.0, optics=SHARP, defects=DefectParameters(hot_fraction=0.02)
     )
-    full = Detector.draw(EVEN, parameters, np.random.default_rng(6))
-    part = full.window(8, 16, (24, 32))
-    scene = np.random.default_rng(2).random(EVEN.shape, dtype=np.float32)
-    np.testing.assert_array_equal(part.charge(scene[16:48, 8:32]), full.charge(scene)[16:48, 8:32])
-    np.testing.assert_array_equal(part.calibration.flat_field, full.calibration.flat_field[4:12, 8:32])
-    assert part.expose(scene[16:48, 8:32], np.random.default_rng(0)).shape == (8, 24)
+    full_frame = Detector.draw(UNIFORM, parameters, np.random.default_rng(6))
+    subframe = full_frame.window(8, 16, (24, 32))
+    scene = np.random.default_rng(2).random(UNIFORM.shape, dtype=np.float32)
+    np.testing.assert_array_equal(subframe.charge(scene[16:48, 8:32]), full_frame.charge(scene)[16:48, 8:32])
+    np.testing.assert_array_equal(subframe.calibration.flat_field, full_frame.calibration.flat_field[4:12, 8:32])
+    assert subframe.expose(scene[16:48, 8:32], np.random.default_rng(0)).shape == (8, 24)
     for invalid in ((0, 2, (8, 8)), (0, 0, (8, 6)), (44, 0, (8, 8)), (0, -4, (8, 8)), (0, 0, (0, 8))):
         with pytest.raises(ValueError, match="a subframe of"):
-            full.window(*invalid)
+            full_frame.window(*invalid)

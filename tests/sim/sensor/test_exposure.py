@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from marsyard.sim.sensor import AutoExposureParameters, Detector, DetectorParameters, auto_expose
 
 GROUND = (0.1 + 0.02 * np.random.default_rng(0).random((128, 96))).astype(np.float32)
-ASKED = AutoExposureParameters()
+OPTIONS = AutoExposureParameters()
 
 
 def _make_detector(exposure_s: float) -> Detector:
@@ -17,11 +17,11 @@ def _make_detector(exposure_s: float) -> Detector:
 
 @pytest.mark.parametrize("start_s", [0.0005, 0.02, 0.5])
 def test_auto_exposure_converges_from_dark_and_bright(start_s: float) -> None:
-    result = auto_expose(_make_detector(start_s), GROUND, ASKED, np.random.default_rng(2))
+    result = auto_expose(_make_detector(start_s), GROUND, OPTIONS, np.random.default_rng(2))
     assert result.converged
     assert len(result.exposures_s) <= 5
-    picture = result.detector.expose(GROUND, np.random.default_rng(3))
-    assert np.percentile(picture, 98.0) == pytest.approx(0.75 * 4095, rel=ASKED.tolerance + 0.01)
+    image = result.detector.expose(GROUND, np.random.default_rng(3))
+    assert np.percentile(image, 98.0) == pytest.approx(0.75 * 4095, rel=OPTIONS.tolerance + 0.01)
     assert result.detector.calibration.exposure_s == result.exposures_s[-1]
 
 
@@ -29,27 +29,27 @@ def test_exposure_can_use_a_part_of_the_image() -> None:
     """Under a bright sky the ground is dark unless exposure uses the ground only."""
     scene = GROUND.copy()
     scene[:40] = 0.6
-    full = auto_expose(_make_detector(0.01), scene, ASKED, np.random.default_rng(2))
-    part = auto_expose(
-        _make_detector(0.01), scene, ASKED, np.random.default_rng(2), region=(slice(60, 110), slice(20, 70))
+    full_image = auto_expose(_make_detector(0.01), scene, OPTIONS, np.random.default_rng(2))
+    ground_region = auto_expose(
+        _make_detector(0.01), scene, OPTIONS, np.random.default_rng(2), region=(slice(60, 110), slice(20, 70))
     )
-    assert full.converged
-    assert part.converged
-    assert part.exposures_s[-1] / full.exposures_s[-1] == pytest.approx(0.6 / 0.12, rel=0.12)
+    assert full_image.converged
+    assert ground_region.converged
+    assert ground_region.exposures_s[-1] / full_image.exposures_s[-1] == pytest.approx(0.6 / 0.12, rel=0.12)
 
 
 def test_unreachable_exposure_is_reported() -> None:
-    short = AutoExposureParameters(max_exposure_s=0.001)
-    result = auto_expose(_make_detector(0.001), GROUND, short, np.random.default_rng(2))
+    limited = AutoExposureParameters(max_exposure_s=0.001)
+    result = auto_expose(_make_detector(0.001), GROUND, limited, np.random.default_rng(2))
     assert not result.converged
     assert result.exposures_s == (0.001,)
-    hurried = auto_expose(_make_detector(0.5), GROUND, AutoExposureParameters(pictures=1), np.random.default_rng(2))
-    assert not hurried.converged
-    assert hurried.detector.parameters.exposure_s < 0.5
+    one_image = auto_expose(_make_detector(0.5), GROUND, AutoExposureParameters(pictures=1), np.random.default_rng(2))
+    assert not one_image.converged
+    assert one_image.detector.parameters.exposure_s < 0.5
 
 
 def test_invalid_parameters_are_rejected() -> None:
     with pytest.raises(ValidationError, match="is greater than max_exposure_s"):
         AutoExposureParameters(min_exposure_s=0.1, max_exposure_s=0.01)
     with pytest.raises(ValueError, match="region is empty"):
-        auto_expose(_make_detector(0.01), GROUND, ASKED, np.random.default_rng(0), region=(slice(0, 0), slice(0, 0)))
+        auto_expose(_make_detector(0.01), GROUND, OPTIONS, np.random.default_rng(0), region=(slice(0, 0), slice(0, 0)))

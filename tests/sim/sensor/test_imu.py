@@ -18,15 +18,15 @@ PERFECT = {name: 0.0 for name in ImuParameters.model_fields if name.startswith((
     "velocity_random_walk_ug_sqrt_hz": 0.0,
     "clock": {},
 }
-STILL = Swaying()
+AT_REST = Swaying()
 
 
-def perfect(**errors: object) -> ImuParameters:
+def perfect_unit(**errors: object) -> ImuParameters:
     return ImuParameters.model_validate(PERFECT | errors)
 
 
 def _allan_deviation(rates: Float64[np.ndarray, "n channels"], samples: int) -> float:
-    """Allan deviation of means over this number of samples, all channels together (IEEE Std 952, annex C)."""
+    """Allan deviation for averages over this number of samples, over all channels (IEEE Std 952, annex C)."""
     count = len(rates) // samples
     means = rates[: count * samples].reshape(count, samples, -1).mean(axis=1)
     return float(np.sqrt(0.5 * np.mean(np.diff(means, axis=0) ** 2)))
@@ -34,13 +34,13 @@ def _allan_deviation(rates: Float64[np.ndarray, "n channels"], samples: int) -> 
 
 def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
     walk, wander, correlation, rate = 0.07, 1.0, 100.0, 4.0
-    parameters = perfect(
+    parameters = perfect_unit(
         rate_hz=rate, angular_random_walk_deg_sqrt_h=walk, gyro_wander_deg_h=wander, gyro_wander_s=correlation
     )
     rng = np.random.default_rng(0)
     hours = 12.0 * 3600.0
     imu = Imu.draw(parameters, (0.0, hours), rng)
-    rates = imu.increments(STILL, 0.0, hours, rng).delta_angles_rad * rate
+    rates = imu.increments(AT_REST, 0.0, hours, rng).delta_angles_rad * rate
 
     def expected(tau: float) -> float:
         x = tau / correlation
@@ -57,21 +57,21 @@ def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
 
 
 def test_static_ideal_unit_measures_gravity() -> None:
-    imu = Imu.draw(perfect(), (0.0, 1.0), np.random.default_rng(0))
-    increments = imu.increments(STILL, 0.0, 1.0, np.random.default_rng(1))
+    imu = Imu.draw(perfect_unit(), (0.0, 1.0), np.random.default_rng(0))
+    increments = imu.increments(AT_REST, 0.0, 1.0, np.random.default_rng(1))
     assert increments.times_s.size == 401
     np.testing.assert_array_equal(increments.delta_angles_rad, 0.0)
     np.testing.assert_allclose(increments.delta_velocities_m_s, [[0.0, 0.0, GRAVITY / 400.0]] * 400, atol=1e-15)
 
 
 def test_scale_and_misalignment_apply_to_true_increments() -> None:
-    parameters = perfect(
+    parameters = perfect_unit(
         gyro_scale_ppm=1000.0, gyro_misalignment_mrad=5.0, accelerometer_scale_ppm=2000.0, accelerometer_bias_mg=1.0
     )
     imu = Imu.draw(parameters, (0.0, 1.0), np.random.default_rng(3))
     increments = imu.increments(Swaying(spin_rad_s=1.0), 0.0, 1.0, np.random.default_rng(1))
-    turn = np.array([imu.gyro.misalignment[0, 2], imu.gyro.misalignment[1, 2], 1.0 + imu.gyro.scale[2]])
-    np.testing.assert_allclose(increments.delta_angles_rad.sum(axis=0), turn, atol=1e-12)
+    rotation_vector = np.array([imu.gyro.misalignment[0, 2], imu.gyro.misalignment[1, 2], 1.0 + imu.gyro.scale[2]])
+    np.testing.assert_allclose(increments.delta_angles_rad.sum(axis=0), rotation_vector, atol=1e-12)
     specific_force = imu.accelerometer.bias + np.array([0.0, 0.0, GRAVITY * (1.0 + imu.accelerometer.scale[2])])
     np.testing.assert_allclose(increments.delta_velocities_m_s.sum(axis=0), specific_force, atol=1e-12)
     assert 0.0 < np.abs(imu.gyro.misalignment).max() < 0.02
@@ -79,28 +79,28 @@ def test_scale_and_misalignment_apply_to_true_increments() -> None:
 
 
 def test_rounding_errors_do_not_accumulate() -> None:
-    parameters = perfect(gyro_count_rad=1e-3, gyro_bias_deg_h=1.0 / DEG_H)
+    parameters = perfect_unit(gyro_count_rad=1e-3, gyro_bias_deg_h=1.0 / DEG_H)
     imu = Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(0))
-    measured = imu.increments(STILL, 0.0, 10.0, np.random.default_rng(0)).delta_angles_rad
+    measured = imu.increments(AT_REST, 0.0, 10.0, np.random.default_rng(0)).delta_angles_rad
     np.testing.assert_allclose(measured / 1e-3, np.rint(measured / 1e-3), atol=1e-9)
-    true = imu.gyro.bias * (np.arange(1, 4001)[:, None] / 400.0)
-    assert np.abs(np.cumsum(measured, axis=0) - true).max() <= 0.5e-3 + 1e-12
+    true_angles = imu.gyro.bias * (np.arange(1, 4001)[:, None] / 400.0)
+    assert np.abs(np.cumsum(measured, axis=0) - true_angles).max() <= 0.5e-3 + 1e-12
 
 
 def test_bias_follows_temperature() -> None:
     warm_up = WarmUp(start_s=10.0, change_k=20.0, time_constant_s=100.0)
-    imu = Imu.draw(perfect(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (0.0, 2000.0), np.random.default_rng(0))
+    imu = Imu.draw(perfect_unit(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (0.0, 2000.0), np.random.default_rng(0))
     bias = imu.gyro.bias_at(np.array([0.0, 10.0, 110.0, 2000.0]))
     np.testing.assert_array_equal(bias[:2], 0.0)
     np.testing.assert_allclose(bias[2], imu.gyro.bias_per_k * 20.0 * (1.0 - np.exp(-1.0)), rtol=1e-12)
     np.testing.assert_allclose(bias[3], imu.gyro.bias_per_k * 20.0, rtol=1e-8)
 
 
-def test_drawn_errors_have_the_specified_spreads() -> None:
+def test_drawn_errors_have_the_specified_deviations() -> None:
     parameters = ImuParameters()
     units = [Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(seed)) for seed in range(400)]
     milli_g = 1e-3 * STANDARD_GRAVITY_M_S2
-    # 1,200 values each determine the spread to 2 %; the tolerance is four times that.
+    # 1,200 values each determine the standard deviation to 2 %; the tolerance is four times that.
     for samples, sd in (
         ([unit.gyro.bias for unit in units], 1.0 * DEG_H),
         ([unit.gyro.scale for unit in units], 100e-6),
@@ -114,6 +114,6 @@ def test_drawn_errors_have_the_specified_spreads() -> None:
 
 
 def test_span_without_samples_is_rejected() -> None:
-    imu = Imu.draw(perfect(), (0.0, 1.0), np.random.default_rng(0))
+    imu = Imu.draw(perfect_unit(), (0.0, 1.0), np.random.default_rng(0))
     with pytest.raises(ValueError, match="no sample"):
         imu.boundaries(0.0, 0.001)

@@ -1,4 +1,4 @@
-"""Tests of inertial navigation with errors of the unit and of time tags."""
+"""Tests of inertial navigation with errors of the inertial unit and of time tags."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from marsyard.sim.sensor import Imu, ImuIncrements, ImuParameters, InertialSolut
 from marsyard.sim.sensor.imu import DEG_H
 from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from tests.sim.sensor.motions import GRAVITY, Swaying
-from tests.sim.sensor.test_imu import perfect
+from tests.sim.sensor.test_imu import perfect_unit
 
 #: Nods with 60 deg/s, rotates, oscillates and falls like a descent.
-BUSY = Swaying(
+DESCENT = Swaying(
     spin_rad_s=0.3,
     nod_rad=0.2,
     nod_rad_s=5.2,
@@ -38,29 +38,29 @@ def _navigate(
 
 
 def test_error_free_navigation_reproduces_the_motion() -> None:
-    _, solution = _navigate(BUSY, perfect())
+    _, solution = _navigate(DESCENT, perfect_unit())
     # Includes times between samples.
     times = np.linspace(-2.0, 18.0, 137)
-    true = BUSY.motion(times)
-    assert (solution.attitude(times) * true.attitudes.inv()).magnitude().max() < 1e-5
-    np.testing.assert_allclose(solution.velocity(times), true.velocities_m_s, atol=2e-5)
-    on_sample = np.array([0.0, 3.75, 7.5, 18.0])
-    true = BUSY.motion(on_sample)
-    assert (solution.attitude(on_sample) * true.attitudes.inv()).magnitude().max() < 1e-10
-    np.testing.assert_allclose(solution.velocity(on_sample), true.velocities_m_s, atol=1e-6)
-    means = np.diff(true.positions_m, axis=0) / np.diff(on_sample)[:, None]
-    np.testing.assert_allclose(solution.mean_velocities(on_sample), means, atol=1e-5)
+    truth = DESCENT.motion(times)
+    assert (solution.attitude(times) * truth.attitudes.inv()).magnitude().max() < 1e-5
+    np.testing.assert_allclose(solution.velocity(times), truth.velocities_m_s, atol=2e-5)
+    sample_times = np.array([0.0, 3.75, 7.5, 18.0])
+    truth = DESCENT.motion(sample_times)
+    assert (solution.attitude(sample_times) * truth.attitudes.inv()).magnitude().max() < 1e-10
+    np.testing.assert_allclose(solution.velocity(sample_times), truth.velocities_m_s, atol=1e-6)
+    means = np.diff(truth.positions_m, axis=0) / np.diff(sample_times)[:, None]
+    np.testing.assert_allclose(solution.mean_velocities(sample_times), means, atol=1e-5)
 
 
-def test_gyro_bias_rotates_the_attitude_at_its_rate() -> None:
-    imu, solution = _navigate(Swaying(), perfect(gyro_bias_deg_h=100.0))
+def test_gyro_bias_rotates_the_attitude() -> None:
+    imu, solution = _navigate(Swaying(), perfect_unit(gyro_bias_deg_h=100.0))
     error = solution.attitude(np.array([18.0]))[0].as_rotvec()
     np.testing.assert_allclose(error, imu.gyro.bias * 20.0, rtol=1e-9)
 
 
 def test_only_bias_along_the_spin_axis_accumulates() -> None:
     spin = 2.0 * np.pi / 4.0
-    imu, solution = _navigate(Swaying(spin_rad_s=spin), perfect(gyro_bias_deg_h=100.0))
+    imu, solution = _navigate(Swaying(spin_rad_s=spin), perfect_unit(gyro_bias_deg_h=100.0))
     truth = Swaying(spin_rad_s=spin).state(18.0).attitude
     error = (solution.attitude(np.array([18.0]))[0] * truth.inv()).as_rotvec()
     # Five complete turns; second-order errors are 1e-5 of the first order.
@@ -69,50 +69,50 @@ def test_only_bias_along_the_spin_axis_accumulates() -> None:
 
 
 def test_accelerometer_bias_and_tilt_cause_velocity_errors() -> None:
-    imu, solution = _navigate(Swaying(), perfect(accelerometer_bias_mg=1.0))
+    imu, solution = _navigate(Swaying(), perfect_unit(accelerometer_bias_mg=1.0))
     np.testing.assert_allclose(solution.velocity(np.array([18.0]))[0], imu.accelerometer.bias * 20.0, rtol=1e-9)
     tilt = np.array([1e-3, -2e-3, 5e-3])
-    _, solution = _navigate(Swaying(), perfect(), NavigationErrors(tilt, np.array([3.0, 0.0, 0.0])))
+    _, solution = _navigate(Swaying(), perfect_unit(), NavigationErrors(tilt, np.array([3.0, 0.0, 0.0])))
     expected = np.array([3.0, 0.0, 0.0]) + 20.0 * np.cross(tilt, [0.0, 0.0, GRAVITY])
     np.testing.assert_allclose(solution.velocity(np.array([18.0]))[0], expected, atol=20.0 * GRAVITY * 2e-5)
 
 
-def test_attitude_and_velocity_random_walk_have_specified_spread() -> None:
+def test_random_walks_have_the_specified_deviation() -> None:
     attitude, velocity = [], []
     for seed in range(150):
-        noisy = perfect(rate_hz=50.0, angular_random_walk_deg_sqrt_h=0.07, velocity_random_walk_ug_sqrt_hz=50.0)
+        noisy = perfect_unit(rate_hz=50.0, angular_random_walk_deg_sqrt_h=0.07, velocity_random_walk_ug_sqrt_hz=50.0)
         _, solution = _navigate(Swaying(), noisy, seed=seed)
         attitude.append(np.degrees(solution.attitude(np.array([18.0]))[0].as_rotvec()))
         velocity.append(solution.velocity(np.array([18.0]))[0, 2])
-    # 450 and 150 values determine spreads to 3.3 % and 5.8 %; the tolerance is three times that. Tilt does not affect
-    # the z velocity.
+    # 450 and 150 values determine the standard deviation to 3.3 % and 5.8 %; the tolerance is three times that. Tilt
+    # does not affect the z velocity.
     assert np.std(attitude) == pytest.approx(0.07 * np.sqrt(20.0 / 3600.0), rel=0.1)
     assert np.std(velocity) == pytest.approx(50e-6 * 9.80665 * np.sqrt(20.0), rel=0.18)
 
 
-def test_ten_millisecond_tag_error_shifts_ground_by_21_metres() -> None:
+def test_tag_error_of_10_ms_shifts_ground_by_21_m() -> None:
     # Example: 60 deg/s at 2000 m, 10 ms.
-    turning = Swaying(spin_rad_s=np.radians(60.0), tilt=Rotation.from_euler("x", 90.0, degrees=True))
-    _, solution = _navigate(turning, perfect())
+    motion = Swaying(spin_rad_s=np.radians(60.0), tilt=Rotation.from_euler("x", 90.0, degrees=True))
+    _, solution = _navigate(motion, perfect_unit())
     clock = Clock(ClockParameters(), offset_s=0.01)
     tag = clock.tags(np.array([3.75]), np.random.default_rng(0))
-    rotated = (solution.attitude(tag)[0] * turning.state(3.75).attitude.inv()).magnitude()
-    assert 2000.0 * np.tan(rotated) == pytest.approx(20.9, abs=0.1)
+    angle_error = (solution.attitude(tag)[0] * motion.state(3.75).attitude.inv()).magnitude()
+    assert 2000.0 * np.tan(angle_error) == pytest.approx(20.9, abs=0.1)
     # A clock offset shared with the unit has no effect.
-    imu = Imu.draw(perfect(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
-    increments = imu.increments(turning, *SPAN, np.random.default_rng(0))
-    shared = InertialSolution.propagate(increments, turning.state(SPAN[0]).attitude, np.zeros(3), GRAVITY)
-    assert (shared.attitude(tag)[0] * turning.state(3.75).attitude.inv()).magnitude() < 1e-9
+    imu = Imu.draw(perfect_unit(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
+    increments = imu.increments(motion, *SPAN, np.random.default_rng(0))
+    shared = InertialSolution.propagate(increments, motion.state(SPAN[0]).attitude, np.zeros(3), GRAVITY)
+    assert (shared.attitude(tag)[0] * motion.state(3.75).attitude.inv()).magnitude() < 1e-9
 
 
-def test_large_jitter_keeps_times_increasing() -> None:
-    imu = Imu.draw(perfect(clock=ClockParameters(jitter_sd_s=0.01)), SPAN, np.random.default_rng(0))
-    increments = imu.increments(BUSY, *SPAN, np.random.default_rng(0))
+def test_time_tags_increase_despite_large_jitter() -> None:
+    imu = Imu.draw(perfect_unit(clock=ClockParameters(jitter_sd_s=0.01)), SPAN, np.random.default_rng(0))
+    increments = imu.increments(DESCENT, *SPAN, np.random.default_rng(0))
     assert np.all(np.diff(increments.times_s) >= 0.0)
-    start = BUSY.state(SPAN[0])
+    start = DESCENT.state(SPAN[0])
     solution = InertialSolution.propagate(increments, start.attitude, start.velocity_m_s, GRAVITY)
     times = np.concatenate([increments.times_s[:1], np.linspace(-1.9, 17.9, 1000), increments.times_s[-1:]])
-    error = (solution.attitude(times) * BUSY.motion(times).attitudes.inv()).magnitude()
+    error = (solution.attitude(times) * DESCENT.motion(times).attitudes.inv()).magnitude()
     # At most 1.35 rad/s, and jitter of up to four standard deviations.
     assert error.max() < 1.35 * 0.05
 
@@ -124,9 +124,9 @@ def test_navigation_is_defined_only_within_its_samples() -> None:
         solution.velocity(np.array([1.5]))
 
 
-def test_gyro_bias_is_small_between_images() -> None:
+def test_gyro_bias_rotates_attitude_by_less_than_0_1_deg() -> None:
     # 1 deg/h over 20 s is 0.006 deg: the attitude error accumulates before the images.
-    imu, solution = _navigate(BUSY, ImuParameters())
-    error = (solution.attitude(np.array([17.9]))[0] * BUSY.state(17.9).attitude.inv()).magnitude()
+    imu, solution = _navigate(DESCENT, ImuParameters())
+    error = (solution.attitude(np.array([17.9]))[0] * DESCENT.state(17.9).attitude.inv()).magnitude()
     assert np.degrees(error) < 0.1
     assert np.abs(imu.gyro.bias).max() < 5.0 * DEG_H

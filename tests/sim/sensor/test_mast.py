@@ -1,4 +1,4 @@
-"""Tests of mast pointing errors and of range errors from stereo calibration."""
+"""Tests of the mast: pointing errors, and range errors caused by errors of the stereo calibration."""
 
 from __future__ import annotations
 
@@ -23,61 +23,61 @@ PERFECT = StereoCalibrationParameters(
 )
 
 
-def _rng(seed: int = 1) -> np.random.Generator:
+def _make_rng(seed: int = 1) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
 def _move_mast(mast: Mast, azimuths_deg: list[float]) -> list[MastState]:
-    states, rng = [mast.rest], _rng()
+    states, rng = [mast.rest], _make_rng()
     for azimuth in azimuths_deg:
         states.append(mast.point(states[-1], float(np.radians(azimuth)), 0.0, rng))
     return states[1:]
 
 
 def test_error_free_mast_points_as_commanded() -> None:
-    mast = Mast.draw(EXACT, MER_MAST, _rng())
-    state = mast.point(mast.rest, 0.4, -0.3, _rng())
+    mast = Mast.draw(EXACT, MER_MAST, _make_rng())
+    state = mast.point(mast.rest, 0.4, -0.3, _make_rng())
     assert state.true_rad == state.readings_rad == (0.4, -0.3)
     expected = MER_MAST.rover_from_head(0.4, -0.3)
     assert mast.rover_from_head(state).as_matrix() == pytest.approx(expected.as_matrix())
 
 
 def test_backlash_lags_by_half_and_absorbs_short_reversals() -> None:
-    mast = Mast.draw(EXACT.model_copy(update={"backlash_deg": 0.2}), MER_MAST, _rng())
-    up, repeated, back_a_little, back, far = (
+    mast = Mast.draw(EXACT.model_copy(update={"backlash_deg": 0.2}), MER_MAST, _make_rng())
+    forward, repeated, short_reverse, reverse, long_reverse = (
         np.degrees(state.true_rad[0]) for state in _move_mast(mast, [10.0, 10.0, 9.9, 9.5, -20.0])
     )
     # The axis stops 0.1 short from below and 0.1 beyond from above; a reversal by 0.1 is within the backlash of 0.2.
-    assert [up, repeated, back_a_little, back, far] == pytest.approx([9.9, 9.9, 9.9, 9.6, -19.9])
+    assert [forward, repeated, short_reverse, reverse, long_reverse] == pytest.approx([9.9, 9.9, 9.9, 9.6, -19.9])
     # The encoder is before the gears and does not measure it.
     assert np.degrees([state.readings_rad[0] for state in _move_mast(mast, [10.0, 9.9])]) == pytest.approx([10.0, 9.9])
 
 
 def test_zero_error_is_constant_in_a_run() -> None:
     parameters = EXACT.model_copy(update={"zero_deg": 0.3})
-    zeros = np.degrees([Mast.draw(parameters, MER_MAST, _rng(n)).zeros_rad for n in range(400)])
+    zeros_deg = np.degrees([Mast.draw(parameters, MER_MAST, _make_rng(n)).zeros_rad for n in range(400)])
     # 800 draws: 0.3 within four standard errors.
-    assert np.std(zeros) == pytest.approx(0.3, abs=4.0 * 0.3 / np.sqrt(1600.0))
-    mast = Mast.draw(parameters, MER_MAST, _rng())
+    assert np.std(zeros_deg) == pytest.approx(0.3, abs=4.0 * 0.3 / np.sqrt(1600.0))
+    mast = Mast.draw(parameters, MER_MAST, _make_rng())
     for state in _move_mast(mast, [10.0, -40.0, 5.0]):
         assert np.subtract(state.readings_rad, state.true_rad) == pytest.approx(mast.zeros_rad)
 
 
-def test_encoders_and_motors_are_quantised() -> None:
-    mast = Mast.draw(EXACT.model_copy(update={"count_deg": 0.05, "settling_deg": 0.2}), MER_MAST, _rng())
+def test_encoder_rounding_and_settling_error_have_the_specified_size() -> None:
+    mast = Mast.draw(EXACT.model_copy(update={"count_deg": 0.05, "settling_deg": 0.2}), MER_MAST, _make_rng())
     states = _move_mast(mast, list(np.linspace(-30.0, 30.0, 400)))
     counts = np.degrees([state.readings_rad[0] for state in states]) / 0.05
     assert counts == pytest.approx(np.rint(counts), abs=1e-9)
-    rounded = np.degrees([state.readings_rad[0] - state.true_rad[0] for state in states])
-    assert np.abs(rounded).max() <= 0.025 + 1e-9
-    assert np.std(rounded) == pytest.approx(0.05 / np.sqrt(12.0), rel=0.15)
-    missed = np.degrees([state.true_rad[0] for state in states]) - np.linspace(-30.0, 30.0, 400)
-    assert np.std(missed) == pytest.approx(0.2, rel=0.15)
+    rounding_deg = np.degrees([state.readings_rad[0] - state.true_rad[0] for state in states])
+    assert np.abs(rounding_deg).max() <= 0.025 + 1e-9
+    assert np.std(rounding_deg) == pytest.approx(0.05 / np.sqrt(12.0), rel=0.15)
+    settling_error_deg = np.degrees([state.true_rad[0] for state in states]) - np.linspace(-30.0, 30.0, 400)
+    assert np.std(settling_error_deg) == pytest.approx(0.2, rel=0.15)
 
 
-def test_mast_stops_at_its_limits_and_reports_it() -> None:
-    mast = Mast.draw(EXACT, MER_MAST, _rng())
-    state = mast.point(mast.rest, 0.0, -2.0, _rng())
+def test_mast_stops_at_its_elevation_limit() -> None:
+    mast = Mast.draw(EXACT, MER_MAST, _make_rng())
+    state = mast.point(mast.rest, 0.0, -2.0, _make_rng())
     assert np.degrees(state.readings_rad[1]) == pytest.approx(-87.0)
 
 
@@ -96,60 +96,60 @@ def test_mer_navcam_position_matches_opportunity_labels() -> None:
 @pytest.mark.parametrize("name", MASTS)
 def test_ideal_calibration_equals_the_design(name: str) -> None:
     design = stereo_mast(name)
-    head = StereoHead.draw(design, PERFECT, _rng())
-    for calibrated, true in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
+    head = StereoHead.draw(design, PERFECT, _make_rng())
+    for calibrated, ideal in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
         for vector in ("c", "a", "h", "v"):
-            assert getattr(calibrated, vector) == pytest.approx(getattr(true, vector), abs=1e-9)
+            assert getattr(calibrated, vector) == pytest.approx(getattr(ideal, vector), abs=1e-9)
     assert head.disparity_error_px(5.0) == pytest.approx(0.0, abs=1e-8)
 
 
-def _triangulated_m(left: CameraModel, right: CameraModel, pixels: list[np.ndarray]) -> float:
+def _triangulate_range_m(left_camera: CameraModel, right_camera: CameraModel, pixels: list[np.ndarray]) -> float:
     """Range at the closest approach of the lines of sight of two pixels."""
-    sights = [camera.rays(pixel) for camera, pixel in zip((left, right), pixels, strict=True)]
-    across = np.stack([sights[0][1], -sights[1][1]], axis=1)
-    along = np.linalg.lstsq(across, sights[1][0] - sights[0][0], rcond=None)[0]
-    return float(along[0])
+    sights = [camera.rays(pixel) for camera, pixel in zip((left_camera, right_camera), pixels, strict=True)]
+    directions = np.stack([sights[0][1], -sights[1][1]], axis=1)
+    distances = np.linalg.lstsq(directions, sights[1][0] - sights[0][0], rcond=None)[0]
+    return float(distances[0])
 
 
 @pytest.mark.parametrize("name", ["mer-navcam", "research-navcam"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_disparity_error_causes_range_error_of_eq_1(name: str, seed: int) -> None:
     design = stereo_mast(name)
-    head = StereoHead.draw(design, PERFECT.model_copy(update={"disparity_error_px": 0.5}), _rng(seed))
+    head = StereoHead.draw(design, PERFECT.model_copy(update={"disparity_error_px": 0.5}), _make_rng(seed))
     error, range_m = head.disparity_error_px(10.0), 10.0
     assert 0.0 < abs(error) <= 0.5
     assert head.disparity_error_px(2.0) == pytest.approx(error, rel=0.02)
     point = np.array([range_m, 0.0, 0.0])
     pixels = [camera.project(point)[0] for camera in (design.left, design.right)]
-    measured = _triangulated_m(head.calibrated.left, head.calibrated.right, pixels)
+    measured = _triangulate_range_m(head.calibrated.left, head.calibrated.right, pixels)
     baseline = float(np.linalg.norm(design.left.c - design.right.c))
     expected = range_m**2 / (design.left.focal_lengths[0] * baseline) * error
-    # Eq. 1 is the first order in error over disparity (25 px at 10 m for the navcam).
+    # Eq. 1 is first order in the ratio of error and disparity (25 px at 10 m for the navcam).
     assert measured - np.hypot(range_m, 0.5 * baseline) == pytest.approx(expected, rel=0.03)
 
 
 def test_disparity_errors_are_uniform_within_their_bound() -> None:
     design = stereo_mast("research-navcam")
     parameters = PERFECT.model_copy(update={"disparity_error_px": 0.5})
-    errors = np.array([StereoHead.draw(design, parameters, _rng(n)).disparity_error_px(1e4) for n in range(150)])
+    errors = np.array([StereoHead.draw(design, parameters, _make_rng(n)).disparity_error_px(1e4) for n in range(150)])
     assert np.abs(errors).max() <= 0.5 + 1e-6
     assert np.std(errors) == pytest.approx(0.5 / np.sqrt(3.0), rel=0.15)
 
 
 def test_row_errors_and_common_rotations_shift_images() -> None:
     design, point = stereo_mast("research-navcam"), np.array([50.0, 0.0, 0.0])
-    across = StereoHead.draw(design, PERFECT.model_copy(update={"epipolar_error_px": 1.0}), _rng(5)).calibrated
-    rows = [camera.project(point)[0][1] for camera in (across.left, across.right)]
-    columns = [camera.project(point)[0][0] for camera in (across.left, across.right)]
+    misaligned = StereoHead.draw(design, PERFECT.model_copy(update={"epipolar_error_px": 1.0}), _make_rng(5)).calibrated
+    rows = [camera.project(point)[0][1] for camera in (misaligned.left, misaligned.right)]
+    columns = [camera.project(point)[0][0] for camera in (misaligned.left, misaligned.right)]
     expected = [camera.project(point)[0][0] for camera in (design.left, design.right)]
     assert columns == pytest.approx(expected, abs=1e-3)
-    draw = _rng(5)
-    draw.uniform()
-    assert abs(rows[0] - rows[1]) == pytest.approx(abs(draw.standard_normal()), rel=1e-3)
-    rotated = StereoHead.draw(design, PERFECT.model_copy(update={"alignment_deg": 1.0}), _rng(5))
+    rng = _make_rng(5)
+    rng.uniform()
+    assert abs(rows[0] - rows[1]) == pytest.approx(abs(rng.standard_normal()), rel=1e-3)
+    rotated = StereoHead.draw(design, PERFECT.model_copy(update={"alignment_deg": 1.0}), _make_rng(5))
     shifts = [
-        one.project(point)[0] - other.project(point)[0]
-        for one, other in ((rotated.calibrated.left, design.left), (rotated.calibrated.right, design.right))
+        calibrated.project(point)[0] - ideal.project(point)[0]
+        for calibrated, ideal in ((rotated.calibrated.left, design.left), (rotated.calibrated.right, design.right))
     ]
     assert np.linalg.norm(shifts[0]) > 5.0
     assert shifts[0] == pytest.approx(shifts[1], abs=0.5)
@@ -158,12 +158,12 @@ def test_row_errors_and_common_rotations_shift_images() -> None:
 
 def test_focal_length_errors_scale_the_image() -> None:
     design = stereo_mast("research-navcam")
-    head = StereoHead.draw(design, PERFECT.model_copy(update={"focal_error": 0.01}), _rng(3))
+    head = StereoHead.draw(design, PERFECT.model_copy(update={"focal_error": 0.01}), _make_rng(3))
     point = np.array([10.0, 2.0, 1.0])
-    for calibrated, true in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
-        centre = np.array(true.image_centre)
-        ratio = (calibrated.project(point)[0] - centre) / (true.project(point)[0] - centre)
-        scale = calibrated.focal_lengths[0] / true.focal_lengths[0]
+    for calibrated, ideal in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
+        centre = np.array(ideal.image_centre)
+        ratio = (calibrated.project(point)[0] - centre) / (ideal.project(point)[0] - centre)
+        scale = calibrated.focal_lengths[0] / ideal.focal_lengths[0]
         assert ratio == pytest.approx([scale, scale])
         assert scale != pytest.approx(1.0, abs=1e-6)
 

@@ -1,4 +1,4 @@
-"""Tests of moving exposures against brute force: sums of many sharp images at their own times."""
+"""Tests of motion blur and smear: `moving_exposure` against sums of many sharp images at successive times."""
 
 from collections.abc import Callable
 
@@ -14,28 +14,28 @@ from marsyard.sim.render import Photometry, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.rays import PixelRays
 from marsyard.sim.sensor import ImageMotion, natural_fall_off
-from marsyard.sim.sensor.kernels import path_kernel
+from marsyard.sim.sensor.kernels import write_path_kernel
 from marsyard.sim.sensor.optics import moving_exposure
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from tests.sim.sensor.motions import uniform_motion
 
-Picture = NDArray[np.float64]
+Image = NDArray[np.float64]
 EXPOSURE_S = 4e-3
 
 
-def _brute_force(
-    seen: Callable[[float], Picture], shape: tuple[int, int], transfer_row_s: float, clear_row_s: float, rows: int
-) -> Picture:
+def _sum_sharp_images(
+    image_at: Callable[[float], Image], shape: tuple[int, int], transfer_row_s: float, clear_row_s: float, rows: int
+) -> Image:
     """Radiance x seconds collected by packets from images at any time; `rows` transfer steps at once."""
-    total = sum((seen(((n + 0.5) / 24 - 0.5) * EXPOSURE_S) for n in range(24)), np.zeros(shape)) * EXPOSURE_S / 24
+    total = sum((image_at(((n + 0.5) / 24 - 0.5) * EXPOSURE_S) for n in range(24)), np.zeros(shape)) * EXPOSURE_S / 24
     for first in range(1, shape[0], rows):
         lags = range(first, min(first + rows, shape[0]))
         middle = float(np.mean(lags)) - 0.5
-        after = seen(0.5 * EXPOSURE_S + middle * transfer_row_s) * transfer_row_s
-        before = seen(-0.5 * EXPOSURE_S - middle * clear_row_s) * clear_row_s
+        readout = image_at(0.5 * EXPOSURE_S + middle * transfer_row_s) * transfer_row_s
+        clearing = image_at(-0.5 * EXPOSURE_S - middle * clear_row_s) * clear_row_s
         for lag in lags:
-            total[lag:] += after[:-lag]
-            total[:-lag] += before[lag:]
+            total[lag:] += readout[:-lag]
+            total[:-lag] += clearing[lag:]
     return total
 
 
@@ -57,7 +57,7 @@ def test_rotating_camera_matches_many_renderings() -> None:
     position = np.array([50.0, 80.0, 1400.0])
     response = natural_fall_off(camera)
 
-    def seen(time_s: float) -> Picture:
+    def render_at(time_s: float) -> Image:
         rotated = Rotation.from_rotvec(rate * time_s) * attitude
         return np.asarray(
             renderer.render(scene, rays, rigid(rotated, position + velocity * time_s)).radiance * response
@@ -67,7 +67,7 @@ def test_rotating_camera_matches_many_renderings() -> None:
     motion = ImageMotion.from_camera(camera, frame.range_m, frame.world_from_body, velocity, rate)
     assert motion.max_px_s == pytest.approx(np.radians(60.0) * 14.67e-3 / 12e-6, rel=0.1)
     result = moving_exposure(frame.radiance, response, motion, EXPOSURE_S, transfer_row_s, clear_row_s)
-    expected = _brute_force(seen, (size, size), transfer_row_s, clear_row_s, rows=6)
+    expected = _sum_sharp_images(render_at, (size, size), transfer_row_s, clear_row_s, rows=6)
     # Pixels outside the frame have no radiance: a border as wide as the image motion is excluded.
     inside = np.s_[13:-13, 13:-13]
     error = (result - expected)[inside] / expected.mean()
@@ -77,19 +77,19 @@ def test_rotating_camera_matches_many_renderings() -> None:
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 1400.0), (1400.0, 0.0), (-1000.0, 800.0), (6.0, -4.0)])
-def test_smear_and_blur_of_drifting_image_match_brute_force(velocity: tuple[float, float]) -> None:
+def test_smear_and_blur_of_drifting_image_match_sum_of_sharp_images(velocity: tuple[float, float]) -> None:
     rng = np.random.default_rng(0)
     scene = (1.0 + 0.5 * gaussian_filter(rng.standard_normal((128, 96)), 1.5)).astype(np.float32)
     response = np.linspace(1.0, 0.8, 128)[:, None] * (1.0 + 0.01 * rng.standard_normal((128, 96)))
     response = response.astype(np.float32)
     rows, columns = np.indices(scene.shape).astype(np.float64)
 
-    def seen(time_s: float) -> Picture:
+    def render_at(time_s: float) -> Image:
         where = [rows - velocity[0] * time_s, columns - velocity[1] * time_s]
         return map_coordinates(scene.astype(np.float64), where, order=3, mode="nearest") * response
 
     result = moving_exposure(scene, response, uniform_motion(*velocity), EXPOSURE_S, 4e-5, 8e-6)
-    expected = _brute_force(seen, scene.shape, 4e-5, 8e-6, rows=1)
+    expected = _sum_sharp_images(render_at, scene.shape, 4e-5, 8e-6, rows=1)
     assert np.sqrt(((result - expected) ** 2).mean()) < 0.0015 * expected.mean()
 
 
@@ -97,24 +97,24 @@ def test_smear_and_blur_of_drifting_image_match_brute_force(velocity: tuple[floa
 def test_moving_dot_is_at_its_mid_exposure_position(velocity: tuple[float, float]) -> None:
     rows, columns = np.indices((64, 64))
     dot = np.exp(-0.5 * ((rows - 31.3) ** 2 + (columns - 30.6) ** 2) / 1.5**2).astype(np.float32)
-    picture = moving_exposure(dot, np.ones_like(dot), uniform_motion(*velocity), EXPOSURE_S, 0.0, 0.0)
-    total = picture.sum(dtype=np.float64)
+    image = moving_exposure(dot, np.ones_like(dot), uniform_motion(*velocity), EXPOSURE_S, 0.0, 0.0)
+    total = image.sum(dtype=np.float64)
     assert total == pytest.approx(dot.sum(dtype=np.float64) * EXPOSURE_S, rel=1e-4)
-    assert (picture * rows).sum() / total == pytest.approx(31.3, abs=0.005)
-    assert (picture * columns).sum() / total == pytest.approx(30.6, abs=0.005)
-    # Its length along the motion is that of the path: variance L^2 / 12.
-    along = ((rows - 31.3) * velocity[0] + (columns - 30.6) * velocity[1]) / np.hypot(*velocity)
+    assert (image * rows).sum() / total == pytest.approx(31.3, abs=0.005)
+    assert (image * columns).sum() / total == pytest.approx(30.6, abs=0.005)
+    # Along the motion, the blur over a path of length L adds a variance of L^2 / 12.
+    position_along_motion = ((rows - 31.3) * velocity[0] + (columns - 30.6) * velocity[1]) / np.hypot(*velocity)
     path = np.hypot(*velocity) * EXPOSURE_S
-    assert (picture * along**2).sum() / total == pytest.approx(1.5**2 + path**2 / 12.0, rel=0.02)
+    assert (image * position_along_motion**2).sum() / total == pytest.approx(1.5**2 + path**2 / 12.0, rel=0.02)
 
 
 def test_smear_trail_of_a_moving_dot_is_inclined() -> None:
     """During readout a packet d rows below the dot passes it d row times after the exposure."""
     rows, columns = np.indices((96, 96))
     dot = np.exp(-0.5 * ((rows - 20.0) ** 2 + (columns - 40.0) ** 2) / 1.5**2).astype(np.float32)
-    picture = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 5e-5, 0.0)
+    image = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 5e-5, 0.0)
     for row in (40, 60, 90):
-        centre = (picture[row] * columns[row]).sum() / picture[row].sum()
+        centre = (image[row] * columns[row]).sum() / image[row].sum()
         assert centre == pytest.approx(40.0 + 1000.0 * (0.5 * EXPOSURE_S + (row - 20 - 0.5) * 5e-5), abs=0.05)
     # Before the exposure the packets above passed it; higher packets passed earlier.
     cleared = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 0.0, 5e-5)
@@ -122,7 +122,7 @@ def test_smear_trail_of_a_moving_dot_is_inclined() -> None:
     assert centre == pytest.approx(40.0 - 1000.0 * (0.5 * EXPOSURE_S + 14.5 * 5e-5), abs=0.05)
 
 
-def test_slow_motion_converges_to_static_image() -> None:
+def test_slow_motion_equals_static_exposure() -> None:
     rng = np.random.default_rng(3)
     scene, response = (1.0 + 0.1 * rng.standard_normal((2, 96, 64))).astype(np.float32)
     result = moving_exposure(scene, response, uniform_motion(1e-6, 1e-6), EXPOSURE_S, 5e-6, 1e-6)
@@ -155,23 +155,23 @@ def test_image_velocity_matches_finite_differences() -> None:
     np.testing.assert_allclose(motion.velocity_px_s[:16, :16, ::-1], expected, atol=1e-3)
 
 
-def test_infinite_range_moves_with_rotation_only() -> None:
+def test_image_at_infinite_range_moves_only_by_rotation() -> None:
     camera = Cahv.from_focal_length(
         6e-3, 12e-6, (128, 96), axis=np.array([1.0, 0.0, 0.0]), right=np.array([0.0, -1.0, 0.0])
     )
     pose = rigid(Rotation.identity(), np.zeros(3))
     sky = np.full((96, 128), np.inf)
     assert ImageMotion.from_camera(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).max_px_s < 1e-3
-    turning = ImageMotion.from_camera(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
+    rotation_only = ImageMotion.from_camera(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
     # A left turn moves the image to the right by 500 px/rad.
-    assert turning.velocity_px_s[1, 2, 1] == pytest.approx(50.0, rel=0.01)
+    assert rotation_only.velocity_px_s[1, 2, 1] == pytest.approx(50.0, rel=0.01)
 
 
-def test_path_kernel_is_a_centred_mean() -> None:
+def test_path_kernel_has_unit_sum_and_zero_mean() -> None:
     kernel = np.empty((15, 15))
     offsets = np.arange(-7, 8)
     for path in ((0.0, 0.0), (3.3, -7.1), (0.0, 9.0)):
-        path_kernel(*path, 7, kernel)
+        write_path_kernel(*path, 7, kernel)
         assert kernel.sum() == pytest.approx(1.0)
         assert (kernel.sum(axis=1) * offsets).sum() == pytest.approx(0.0, abs=1e-12)
         assert (kernel.sum(axis=0) * offsets).sum() == pytest.approx(0.0, abs=1e-12)
@@ -179,8 +179,9 @@ def test_path_kernel_is_a_centred_mean() -> None:
 
 @pytest.mark.parametrize("velocity", [(1222.0, 0.0), (0.0, -1222.0), (864.0, 864.0)])
 def test_border_of_moving_image_approximates_wider_image(velocity: tuple[float, float]) -> None:
-    """60 deg/s through the descent camera (1222 px/s): the scene extrapolated at the border against the true scene.
-    Rows and columns outside the frame have zero response. The ground has 10 % contrast in waves of about 8 pixels.
+    """The scene extrapolated at the border, against a wider image with zero response outside the frame.
+
+    Motion of 60 deg/s through the descent camera (1222 px/s); ground with 10 % contrast in waves of about 8 pixels.
     """
     margin = 12
     rng = np.random.default_rng(2)
@@ -191,10 +192,10 @@ def test_border_of_moving_image_approximates_wider_image(velocity: tuple[float, 
     response = np.zeros_like(wide)
     response[inside] = 1.0
     motion = uniform_motion(*velocity)
-    held = moving_exposure(frame, np.ones_like(frame), motion, EXPOSURE_S, 5e-6, 1e-6)
-    true = moving_exposure(wide, response, motion, EXPOSURE_S, 5e-6, 1e-6)[inside]
-    error = (held - true) / true.mean()
-    rows, columns = (np.asarray(one) for one in np.indices(frame.shape))
+    from_frame = moving_exposure(frame, np.ones_like(frame), motion, EXPOSURE_S, 5e-6, 1e-6)
+    from_wider_image = moving_exposure(wide, response, motion, EXPOSURE_S, 5e-6, 1e-6)[inside]
+    error = (from_frame - from_wider_image) / from_wider_image.mean()
+    rows, columns = (np.asarray(indices) for indices in np.indices(frame.shape))
     depth: np.ndarray = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])
     rms = [float(np.sqrt(np.mean(error[depth == ring] ** 2))) for ring in range(20)]
     # The noise is 1 %.

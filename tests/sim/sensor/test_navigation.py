@@ -16,7 +16,7 @@ from marsyard.sim.dynamics.rotorcraft import (
     FlownPath,
     RotorcraftParameters,
     TransitParameters,
-    transit_flight,
+    simulate_transit,
 )
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
@@ -34,7 +34,7 @@ def _make_path(seed: int) -> FlownPath:
     rng = np.random.default_rng(seed)
     air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S, rng)
     over, heading = np.array([100.0, 50.0, 10.0]), rng.uniform(0.0, 2.0 * np.pi)
-    return transit_flight(CRAFT, TRANSIT, over, 0.3, heading, GRAVITY, air, rng).path
+    return simulate_transit(CRAFT, TRANSIT, over, 0.3, heading, GRAVITY, air, rng).path
 
 
 def _run_filter(
@@ -57,18 +57,18 @@ def _run_filter(
     return path, imu, navigation.run(start, increments, solutions, readings, np.array(covariance_times_s))
 
 
-def _errors(path: FlownPath, imu: Imu, solution: NavigationSolution, at: np.ndarray) -> np.ndarray:
+def _state_errors(path: FlownPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray) -> np.ndarray:
     """True minus estimated state, fifteen columns; the effect of gravity on scale and misalignment counts as bias."""
-    times = imu.boundaries(*path.span_s)[at]
-    true = path.motion(times)
+    times = imu.boundaries(*path.span_s)[indices]
+    truth = path.motion(times)
     gravity_scale_error = imu.accelerometer.sensitivity_error[:, 2] * GRAVITY
     return np.concatenate(
         [
-            true.positions_m - solution.positions_m[at],
-            true.velocities_m_s - solution.velocities_m_s[at],
-            (true.attitudes * solution.attitudes[at].inv()).as_rotvec(),
-            imu.gyro.bias_at(times) - solution.gyro_biases_rad_s[at],
-            imu.accelerometer.bias_at(times) + gravity_scale_error - solution.accelerometer_biases_m_s2[at],
+            truth.positions_m - solution.positions_m[indices],
+            truth.velocities_m_s - solution.velocities_m_s[indices],
+            (truth.attitudes * solution.attitudes[indices].inv()).as_rotvec(),
+            imu.gyro.bias_at(times) - solution.gyro_biases_rad_s[indices],
+            imu.accelerometer.bias_at(times) + gravity_scale_error - solution.accelerometer_biases_m_s2[indices],
         ],
         axis=1,
     )
@@ -82,7 +82,7 @@ def test_errors_are_consistent_with_the_covariance() -> None:
     squares = []
     for seed in range(FLIGHTS):
         path, imu, solution = _run_filter(seed, rtk_parameters=floating, covariance_times_s=(-3.0, 0.0, 2.5, 5.0))
-        errors = _errors(path, imu, solution, solution.covariance_indices)
+        errors = _state_errors(path, imu, solution, solution.covariance_indices)
         covariances = solution.covariances
         squares.append([float(e @ np.linalg.solve(p, e)) for e, p in zip(errors, covariances, strict=True)])
     low, high = (float(chi2.ppf(p, 15 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
@@ -103,21 +103,21 @@ def test_innovations_are_white() -> None:
                 normalised[kind].extend(values)
                 products[kind].extend(values[1:] * values[:-1])
     for kind in normalised:
-        # 7,600 values determine a variance to 1.6 % and a correlation to 0.011; unmodelled bias adds to both.
+        # 7,600 values determine a variance to 1.6 % and a correlation to 0.011; unmodelled bias increases both.
         assert np.var(normalised[kind]) == pytest.approx(1.0, abs=0.1)
         assert abs(np.mean(products[kind])) < 0.12
 
 
-def test_better_instruments_make_smaller_errors() -> None:
+def test_better_instruments_reduce_the_errors() -> None:
     """Ideal inertial unit; the receiver has white noise of 2 mm and 5 mm/s, averaged over about 1 s by the filter."""
-    none = {name: 0.0 for name, value in SMALL_UNIT.model_dump().items() if isinstance(value, float)}
+    no_errors = {name: 0.0 for name, value in SMALL_UNIT.model_dump().items() if isinstance(value, float)}
     times = {"rate_hz": 100.0, "gyro_wander_s": 100.0, "accelerometer_wander_s": 60.0}
-    ideal = ImuParameters.model_validate(none | times | {"clock": {}})
+    ideal = ImuParameters.model_validate(no_errors | times | {"clock": {}})
     static = {"wander_m": (0.0,) * 3, "noise_m": (2e-3,) * 3, "correlation_s": 1.0}
     white = {"velocity_noise_m_s": (5e-3,) * 3, "velocity_wander_m_s": (0.0,) * 3, "clock": {}}
-    exact = RtkParameters.model_validate({"fixed": static, "floating": static} | white)
-    path, imu, solution = _run_filter(0, ideal, exact)
-    errors = _errors(path, imu, solution, np.arange(1000, 1550))
+    accurate_receiver = RtkParameters.model_validate({"fixed": static, "floating": static} | white)
+    path, imu, solution = _run_filter(0, ideal, accurate_receiver)
+    errors = _state_errors(path, imu, solution, np.arange(1000, 1550))
     assert np.abs(errors[:, :3]).max() < 6e-3
     assert np.abs(errors[:, 3:6]).max() < 0.015
 
@@ -128,7 +128,7 @@ def test_outage_errors_are_consistent_with_the_covariance() -> None:
     squares, sizes = [], []
     for seed in range(FLIGHTS):
         path, imu, solution = _run_filter(seed, rtk_parameters=with_outage, covariance_times_s=(5.0,))
-        error = _errors(path, imu, solution, solution.covariance_indices)[0]
+        error = _state_errors(path, imu, solution, solution.covariance_indices)[0]
         squares.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
         sizes.append(np.hypot(*error[:2]))
     assert 0.2 < np.sqrt(np.mean(np.square(sizes))) < 3.0
@@ -141,13 +141,13 @@ def test_stuck_instruments_are_ignored() -> None:
     stuck = TiltCompassParameters(heading_stuck_s=-8.0, tilt_stuck_s=-8.0)
     tilts: dict[str, list[np.ndarray]] = {name: [] for name in ("free", "stuck")}
     for seed in range(20):
-        for name, unit in (("free", COMPASS), ("stuck", stuck)):
-            path, imu, solution = _run_filter(seed, compass_parameters=unit)
-            error = _errors(path, imu, solution, np.array([1500]))[0]
+        for name, compass_parameters in (("free", COMPASS), ("stuck", stuck)):
+            path, imu, solution = _run_filter(seed, compass_parameters=compass_parameters)
+            error = _state_errors(path, imu, solution, np.array([1500]))[0]
             tilts[name].append(np.degrees(error[6:9]))
             if name == "stuck":
-                late = solution.innovations.kinds[solution.innovations.times_s > -7.0]
-                assert set(late) == {POSITION_FIX, VELOCITY_FIX}
+                late_kinds = solution.innovations.kinds[solution.innovations.times_s > -7.0]
+                assert set(late_kinds) == {POSITION_FIX, VELOCITY_FIX}
     rms_free, rms_stuck = (np.sqrt(np.mean(np.square(tilts[name]), axis=0)) for name in ("free", "stuck"))
     # The receiver's velocities determine the tilt with or without inclinometers.
     assert np.all(rms_stuck[:2] < 1.5 * rms_free[:2] + 0.05)
@@ -168,9 +168,9 @@ def test_filter_resets_after_persistent_rejection() -> None:
     solution = navigation.run(wrong_start, imu.increments(path, *span, rng), solutions, readings)
     innovations = solution.innovations
     assert not innovations.used[(innovations.kinds == POSITION_FIX) & (innovations.axes == 0)][0]
-    off = np.abs(solution.positions_m - path.motion(imu.boundaries(*span)).positions_m)
-    assert off[80, 0] > 15.0
-    assert off[200:].max() < 0.1
+    position_errors_m = np.abs(solution.positions_m - path.motion(imu.boundaries(*span)).positions_m)
+    assert position_errors_m[80, 0] > 15.0
+    assert position_errors_m[200:].max() < 0.1
 
 
 def test_pose_is_defined_only_within_the_flight() -> None:
@@ -179,5 +179,5 @@ def test_pose_is_defined_only_within_the_flight() -> None:
         solution.pose(path.span_s[1] + 1.0)
     # 5 ms after a boundary the position has moved by 5 ms of its velocity.
     tags = solution.increments.times_s
-    moved = solution.pose(tags[700] + 0.005).translation - solution.positions_m[700]
-    np.testing.assert_allclose(moved, 0.005 * solution.velocities_m_s[700], atol=1e-9)
+    displacement_m = solution.pose(tags[700] + 0.005).translation - solution.positions_m[700]
+    np.testing.assert_allclose(displacement_m, 0.005 * solution.velocities_m_s[700], atol=1e-9)

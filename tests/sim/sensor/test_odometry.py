@@ -30,9 +30,9 @@ def _drive(ground: Ground, commands: tuple[DriveCommand, ...], slip: SlipParamet
     return drives
 
 
-def _error_rad(estimate: PoseEstimate, true: RigidTransform) -> np.ndarray:
+def _attitude_error_rad(estimate: PoseEstimate, true_pose: RigidTransform) -> np.ndarray:
     """Rotation vector in world axes from the true to the estimated attitude."""
-    return np.asarray((estimate.world_from_rover.rotation * true.rotation.inv()).as_rotvec())
+    return np.asarray((estimate.world_from_rover.rotation * true_pose.rotation.inv()).as_rotvec())
 
 
 def _estimate_poses(
@@ -57,62 +57,64 @@ def test_visual_odometry_detects_slip_and_wheels_do_not() -> None:
     # 15 deg uphill: about half of the distance is lost, but the wheels count it.
     slip = SlipParameters(step_spread=0.0, wander_deg_m=0.0)
     drives = _drive(uphill_east(15.0), (STRAIGHT,) * 3, slip)
-    true = drives[-1].end.world_from_rover
-    _, counted = _estimate_poses(drives, EXACT, 0)
-    _, seen = _estimate_poses(drives, EXACT, 0, visual=True)
-    lost = slip.slip_fraction(np.radians(15.0)) * 3 * STRAIGHT.forward_m
-    uphill = np.array([np.cos(np.radians(15.0)), 0.0, np.sin(np.radians(15.0))])
-    assert counted.error_m(true) == pytest.approx(lost * uphill, abs=1e-7)
-    assert seen.error_m(true) == pytest.approx(np.zeros(3), abs=1e-7)
+    true_pose = drives[-1].end.world_from_rover
+    _, wheels = _estimate_poses(drives, EXACT, 0)
+    _, visual = _estimate_poses(drives, EXACT, 0, visual=True)
+    slipped_m = slip.slip_fraction(np.radians(15.0)) * 3 * STRAIGHT.forward_m
+    direction = np.array([np.cos(np.radians(15.0)), 0.0, np.sin(np.radians(15.0))])
+    assert wheels.error_m(true_pose) == pytest.approx(slipped_m * direction, abs=1e-7)
+    assert visual.error_m(true_pose) == pytest.approx(np.zeros(3), abs=1e-7)
 
 
-def test_gyros_measure_turns_lost_by_wheels() -> None:
+def test_gyros_measure_turns_reduced_by_wheel_slip() -> None:
     slip = SlipParameters(turn=0.2, step_spread=0.0, wander_deg_m=0.0)
     drives = _drive(Plane(), (DriveCommand(turn_left_rad=1.0), STRAIGHT), slip)
     _, estimate = _estimate_poses(drives, EXACT, 0)
-    assert _error_rad(estimate, drives[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
+    assert _attitude_error_rad(estimate, drives[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
 
 
-def test_misalignment_appears_when_the_rover_turns() -> None:
+def test_gyro_misalignment_causes_attitude_errors_in_turns() -> None:
     parameters = EXACT.model_copy(update={"misalignment_deg": 1.0})
     ground = Plane(0.1, 0.05)
     straight = _drive(ground, (STRAIGHT, STRAIGHT))
     odometer, estimate = _estimate_poses(straight, parameters, 3)
     assert odometer.initial_estimate.world_from_rover is straight[0].start.world_from_rover
-    assert _error_rad(estimate, straight[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
-    about = _drive(ground, (DriveCommand(turn_left_rad=np.pi),))
-    odometer, estimate = _estimate_poses(about, parameters, 3)
-    wrong = np.linalg.norm(_error_rad(estimate, about[-1].end.world_from_rover))
+    assert _attitude_error_rad(estimate, straight[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
+    half_turn = _drive(ground, (DriveCommand(turn_left_rad=np.pi),))
+    odometer, estimate = _estimate_poses(half_turn, parameters, 3)
+    error_rad = np.linalg.norm(_attitude_error_rad(estimate, half_turn[-1].end.world_from_rover))
     # After half a turn the misalignment appears twice.
-    assert wrong == pytest.approx(2.0 * odometer.misalignment.magnitude(), rel=0.01)
+    assert error_rad == pytest.approx(2.0 * odometer.misalignment.magnitude(), rel=0.01)
 
 
-def test_visual_odometry_error_is_two_percent_of_eight_metres() -> None:
+def test_visual_odometry_error_is_two_percent_of_the_distance() -> None:
     drives = _drive(Plane(), (DriveCommand(forward_m=2.0),) * 4)
-    true = drives[-1].end.world_from_rover
+    end = drives[-1].end.world_from_rover
     errors = [
-        np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n, visual=True)[1].error_m(true))
+        np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n, visual=True)[1].error_m(end))
         for n in range(100)
     ]
     # The rms of 100 vectors with one to three degrees of freedom has a standard deviation of up to 7 %.
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.02 * 8.0, rel=0.2)
-    counted = [np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n)[1].error_m(true)) for n in range(100)]
-    assert np.sqrt(np.mean(np.square(counted))) == pytest.approx(0.011 * 8.0, rel=0.2)
+    wheel_errors = [
+        np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n)[1].error_m(end)) for n in range(100)
+    ]
+    assert np.sqrt(np.mean(np.square(wheel_errors))) == pytest.approx(0.011 * 8.0, rel=0.2)
 
 
 def test_scale_errors_are_constant_and_random_walks_are_not() -> None:
     drives = _drive(Plane(), (STRAIGHT,) * 8)
     half, full = drives[3].end.world_from_rover, drives[7].end.world_from_rover
 
-    def along(parameters: OdometryParameters) -> tuple[np.ndarray, np.ndarray]:
+    def forward_errors(parameters: OdometryParameters) -> tuple[np.ndarray, np.ndarray]:
         middle = [_estimate_poses(drives[:4], parameters, n)[1].error_m(half)[0] for n in range(80)]
         end = [_estimate_poses(drives, parameters, n)[1].error_m(full)[0] for n in range(80)]
         return np.array(middle), np.array(end)
 
-    middle, end = along(EXACT.model_copy(update={"scale_error": 0.01}))
+    middle, end = forward_errors(EXACT.model_copy(update={"scale_error": 0.01}))
     assert end == pytest.approx(2.0 * middle)
     assert np.std(end) == pytest.approx(0.01 * 6.4, rel=0.25)
-    middle, end = along(EXACT.model_copy(update={"walk_m": 0.01}))
+    middle, end = forward_errors(EXACT.model_copy(update={"walk_m": 0.01}))
     assert np.std(end) == pytest.approx(0.01 * np.sqrt(6.4), rel=0.25)
     # Half the variance of a walk exists at half the distance: the correlation is the root of one half.
     assert np.corrcoef(middle, end)[0, 1] == pytest.approx(np.sqrt(0.5), abs=0.22)
@@ -120,18 +122,18 @@ def test_scale_errors_are_constant_and_random_walks_are_not() -> None:
 
 def test_heading_errors_grow_and_shift_the_position() -> None:
     drives = _drive(Plane(), (STRAIGHT,) * 5)
-    true = drives[-1].end.world_from_rover
+    true_pose = drives[-1].end.world_from_rover
     drift = EXACT.model_copy(update={"heading_drift_deg_m": 0.5})
     odometer, estimate = _estimate_poses(drives, drift, 2)
     assert estimate.heading_error_rad == pytest.approx(4.0 * odometer.heading_drift_rad_m)
-    assert _error_rad(estimate, true) == pytest.approx([0.0, 0.0, estimate.heading_error_rad], abs=1e-9)
+    assert _attitude_error_rad(estimate, true_pose) == pytest.approx([0.0, 0.0, estimate.heading_error_rad], abs=1e-9)
     # The initial heading error of each of five drives shifts it sideways: (0 + 1 + 2 + 3 + 4) steps of 0.8 m each.
-    assert estimate.error_m(true)[1] == pytest.approx(odometer.heading_drift_rad_m * 0.8 * 0.8 * 10.0, rel=1e-3)
+    assert estimate.error_m(true_pose)[1] == pytest.approx(odometer.heading_drift_rad_m * 0.8 * 0.8 * 10.0, rel=1e-3)
     walk = EXACT.model_copy(update={"heading_walk_deg": 0.2})
     errors = [np.degrees(_estimate_poses(drives, walk, n)[1].heading_error_rad) for n in range(100)]
     assert np.std(errors) == pytest.approx(0.2 * 2.0, rel=0.22)
-    turn = _drive(Plane(), (DriveCommand(turn_left_rad=2.0),))
-    odometer, estimate = _estimate_poses(turn, EXACT.model_copy(update={"heading_scale_error": 0.01}), 4)
+    turn_drives = _drive(Plane(), (DriveCommand(turn_left_rad=2.0),))
+    odometer, estimate = _estimate_poses(turn_drives, EXACT.model_copy(update={"heading_scale_error": 0.01}), 4)
     assert estimate.heading_error_rad == pytest.approx(2.0 * odometer.heading_scale)
 
 
@@ -139,8 +141,8 @@ def test_wheel_odometry_replaces_failed_visual_odometry() -> None:
     slip = SlipParameters(step_spread=0.0, wander_deg_m=0.0)
     drives = _drive(uphill_east(15.0), (STRAIGHT,), slip)
     failing = EXACT.model_copy(update={"visual": VisualOdometryParameters(failure_fraction=1.0)})
-    _, failed = _estimate_poses(drives, failing, 0, visual=True)
-    _, counted = _estimate_poses(drives, EXACT, 0)
-    assert failed.visual_failed
-    assert not counted.visual_failed
-    assert failed.world_from_rover.as_matrix() == pytest.approx(counted.world_from_rover.as_matrix())
+    _, visual = _estimate_poses(drives, failing, 0, visual=True)
+    _, wheels = _estimate_poses(drives, EXACT, 0)
+    assert visual.visual_failed
+    assert not wheels.visual_failed
+    assert visual.world_from_rover.as_matrix() == pytest.approx(wheels.world_from_rover.as_matrix())

@@ -1,4 +1,4 @@
-"""Tests of optics: point spread, fall-off and dust."""
+"""Tests of the optics model: point spread, defocus, stray light, fall-off and dust."""
 
 from typing import Any
 
@@ -14,18 +14,18 @@ FORWARD: dict[str, Any] = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array
 
 
 @pytest.mark.parametrize("parameters", [MER, OpticsParameters(pixel_aperture=True), OpticsParameters(diffusion_px=1.0)])
-def test_point_spread_keeps_total_light_and_position(parameters: OpticsParameters) -> None:
+def test_point_spread_preserves_total_light_and_position(parameters: OpticsParameters) -> None:
     scene = np.zeros((41, 41), dtype=np.float32)
     scene[20, 17] = 1.0
-    picture = apply_point_spread(scene, parameters).astype(np.float64)
-    assert picture.sum() == pytest.approx(1.0, abs=1e-6)
-    assert picture[20, 17] < 0.8
-    rows, columns = np.indices(picture.shape)
-    assert (picture * rows).sum() / picture.sum() == pytest.approx(20.0, abs=1e-3)
-    assert (picture * columns).sum() / picture.sum() == pytest.approx(17.0, abs=1e-3)
+    image = apply_point_spread(scene, parameters).astype(np.float64)
+    assert image.sum() == pytest.approx(1.0, abs=1e-6)
+    assert image[20, 17] < 0.8
+    rows, columns = np.indices(image.shape)
+    assert (image * rows).sum() / image.sum() == pytest.approx(20.0, abs=1e-3)
+    assert (image * columns).sum() / image.sum() == pytest.approx(17.0, abs=1e-3)
 
 
-def test_light_is_kept_at_the_border() -> None:
+def test_total_light_is_conserved_at_the_border() -> None:
     scene = np.random.default_rng(0).random((30, 25), dtype=np.float32)
     assert apply_point_spread(scene, MER).sum(dtype=np.float64) == pytest.approx(scene.sum(dtype=np.float64), rel=1e-6)
 
@@ -41,7 +41,7 @@ def test_point_spread_has_the_specified_modulation_transfer() -> None:
     assert result == pytest.approx(diffraction * diffusion, rel=0.02)
 
 
-def test_without_spread_the_scene_is_untouched() -> None:
+def test_zero_spread_returns_the_scene() -> None:
     scene = np.random.default_rng(0).random((8, 8), dtype=np.float32)
     assert apply_point_spread(scene, OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)) is scene
 
@@ -64,7 +64,7 @@ def test_equidistant_fisheye_fall_off_matches_formula() -> None:
     np.testing.assert_allclose(natural_fall_off(camera)[20:-20, 20:-20], expected[20:-20, 20:-20], rtol=5e-3)
 
 
-def test_dust_attenuates_and_is_not_calibrated() -> None:
+def test_dust_attenuates_light_and_is_absent_from_the_flat_field() -> None:
     dusty = OpticsParameters(dust_discs=4, dust_depth=0.4, dust_radius_px=12.0)
     transmission = dust_transmission((128, 128), dusty, np.random.default_rng(4))
     assert transmission.max() == 1.0
@@ -72,10 +72,12 @@ def test_dust_attenuates_and_is_not_calibrated() -> None:
     # Four shadows of 12 px in an image of 128 px cover about 11 %.
     assert 0.03 < (transmission < 0.99).mean() < 0.4
     assert np.abs(np.diff(transmission, axis=1)).max() < 0.4 * 1.5 / 8.0
-    even = np.ones((128, 128), dtype=np.float32)
-    clean, soiled = (Detector.draw(even, DetectorParameters(optics=o), np.random.default_rng(1)) for o in (MER, dusty))
-    assert soiled.response.sum() < clean.response.sum()
-    np.testing.assert_array_equal(soiled.calibration.flat_field, clean.calibration.flat_field)
+    flat = np.ones((128, 128), dtype=np.float32)
+    clean, with_dust = (
+        Detector.draw(flat, DetectorParameters(optics=o), np.random.default_rng(1)) for o in (MER, dusty)
+    )
+    assert with_dust.response.sum() < clean.response.sum()
+    np.testing.assert_array_equal(with_dust.calibration.flat_field, clean.calibration.flat_field)
 
 
 @pytest.mark.parametrize("diameter", [1.0, 2.5])
@@ -92,9 +94,9 @@ def test_defocus_has_the_transfer_of_a_uniform_disc(diameter: float) -> None:
     np.testing.assert_allclose(measured, 2.0 * bessel / x, atol=0.02)
 
 
-def test_stray_light_reduces_contrast_and_keeps_the_mean() -> None:
+def test_stray_light_reduces_contrast_but_not_the_mean() -> None:
     scene = np.random.default_rng(0).uniform(0.1, 0.3, (32, 48)).astype(np.float32)
-    nothing = OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)
-    veiled = apply_point_spread(scene, nothing.model_copy(update={"stray_light": 0.2}))
-    assert veiled.mean() == pytest.approx(scene.mean(), rel=1e-5)
-    assert veiled.std() == pytest.approx(0.8 * scene.std(), rel=1e-5)
+    no_spread = OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)
+    with_stray_light = apply_point_spread(scene, no_spread.model_copy(update={"stray_light": 0.2}))
+    assert with_stray_light.mean() == pytest.approx(scene.mean(), rel=1e-5)
+    assert with_stray_light.std() == pytest.approx(0.8 * scene.std(), rel=1e-5)

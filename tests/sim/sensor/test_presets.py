@@ -12,31 +12,31 @@ class _Campaign(BaseModel):
     detector: DetectorChoice = DetectorParameters()
 
 
-def _fields_deg(name: str) -> tuple[float, float]:
+def _fields_of_view_deg(name: str) -> tuple[float, float]:
     """Angles between the centres of opposite edges."""
     camera = preset(name).cameras()[0]
     columns, rows = camera.size
     u, v = (columns - 1) / 2, (rows - 1) / 2
     _origins, d = camera.rays(np.array([[-0.5, v], [columns - 0.5, v], [u, -0.5], [u, rows - 0.5]]))
-    across, down = np.degrees(np.arccos([d[0] @ d[1], d[2] @ d[3]]))
-    return float(across), float(down)
+    horizontal, vertical = np.degrees(np.arccos([d[0] @ d[1], d[2] @ d[3]]))
+    return float(horizontal), float(vertical)
 
 
 @pytest.mark.parametrize(
-    ("name", "across", "down", "tolerance"),
+    ("name", "h_deg", "v_deg", "tolerance"),
     [
         ("mer-descent-flown", 45.0, 45.0, 1.0),
         ("mer-descent-field", 45.0, 45.0, 1.0),
         ("mer-navcam", 45.0, 45.0, 1.0),
         # 1024 pixels of 12 um behind 5.58 mm are 126 deg for an equidistant lens.
         ("mer-hazcam", 124.0, 124.0, 3.0),
-        # The tracking paper states the fields for 4.8 mm x 3.6 mm; the preset has pixels of 4.65 um.
+        # The fields of view of the tracking paper are those of 4.8 mm x 3.6 mm; the preset has pixels of 4.65 um.
         ("research-navcam", 49.0, 37.0, 6.0),
         ("research-pancam", 17.0, 13.0, 0.5),
     ],
 )
-def test_presets_have_the_specified_fields_of_view(name: str, across: float, down: float, tolerance: float) -> None:
-    assert _fields_deg(name) == pytest.approx((across, down), abs=tolerance)
+def test_presets_have_the_specified_fields_of_view(name: str, h_deg: float, v_deg: float, tolerance: float) -> None:
+    assert _fields_of_view_deg(name) == pytest.approx((h_deg, v_deg), abs=tolerance)
 
 
 def test_helicopter_camera_has_lens_distortion() -> None:
@@ -48,9 +48,9 @@ def test_helicopter_camera_has_lens_distortion() -> None:
     )
     corner = np.array([[639.5, 479.5]]) - 0.5
     point = 10.0 * ideal.rays(corner)[1]
-    (samples,), _ = camera.project(point)
-    towards_middle = np.linalg.norm(corner[0] - [319.5, 239.5]) - np.linalg.norm(samples - [319.5, 239.5])
-    assert towards_middle == pytest.approx(0.018 * 400.0, abs=0.3)
+    (distorted,), _ = camera.project(point)
+    distortion_px = np.linalg.norm(corner[0] - [319.5, 239.5]) - np.linalg.norm(distorted - [319.5, 239.5])
+    assert distortion_px == pytest.approx(0.018 * 400.0, abs=0.3)
 
 
 @pytest.mark.parametrize(
@@ -65,16 +65,16 @@ def test_stereo_presets_have_the_specified_baseline(name: str, baseline_m: float
         # Up and forward have the expected signs.
         assert camera.a[0] > 0.99
         np.testing.assert_allclose(camera.down, [0.0, 0.0, -1.0], atol=1e-12)
-    # Points ahead are farther right in the left camera.
-    ahead = np.array([2.0, 0.0, 0.0])
-    assert left.project(ahead)[0][0] > right.project(ahead)[0][0]
+    # A point in front of the cameras is farther right in the left image.
+    point = np.array([2.0, 0.0, 0.0])
+    assert left.project(point)[0][0] > right.project(point)[0][0]
 
 
 def test_pancam_has_toe_in() -> None:
     """2 deg between the cameras are 120 of the 516 px of disparity at 2 m."""
     left, right = preset("research-pancam").cameras()
-    ahead = np.array([2.0, 0.0, 0.0])
-    disparity = left.project(ahead)[0][0] - right.project(ahead)[0][0]
+    point = np.array([2.0, 0.0, 0.0])
+    disparity = left.project(point)[0][0] - right.project(point)[0][0]
     assert disparity == pytest.approx(516.1 - 120.1, abs=1.0)
 
 
@@ -84,7 +84,7 @@ def test_hazcam_is_a_fisheye() -> None:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_each_preset_exposes_an_image(name: str) -> None:
-    """Ground of radiance factor 0.3 fills about 60 % of the full well on axis, and less for the descent camera."""
+    """Ground of radiance factor 0.3 fills about 60 % of full scale on axis; for the descent camera 5 to 10 %."""
     camera = preset(name)
     fall_off = natural_fall_off(camera.cameras()[0])[::8, ::8]
     p = camera.detector.model_copy(update={"rows_summed": 1, "transfer_row_s": 0.0, "clear_row_s": 0.0})
@@ -96,10 +96,10 @@ def test_each_preset_exposes_an_image(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_responsivity_matches_the_stated_sunlight(name: str) -> None:
+def test_responsivity_is_proportional_to_the_sunlight(name: str) -> None:
     camera = preset(name)
-    of_earth = camera.light.responsivity_e_s(1.0)
-    assert camera.detector.responsivity_e_s == pytest.approx(camera.detector.sunlight * of_earth, rel=1e-12)
+    at_1_au = camera.light.responsivity_e_s(1.0)
+    assert camera.detector.responsivity_e_s == pytest.approx(camera.detector.sunlight * at_1_au, rel=1e-12)
     # MER's cameras are on Mars, except for the descent camera, which was flown over deserts.
     assert camera.detector.sunlight == pytest.approx(
         0.444 if name in ("mer-descent-flown", "mer-navcam", "mer-hazcam") else 1.0, abs=1e-3

@@ -30,39 +30,39 @@ def test_total_sunlight_equals_the_solar_constant() -> None:
 def test_neutral_density_filters_match_the_paper() -> None:
     """Section III.B.2: optical density 0.67 and 22 %, 0.97 and 11 %."""
     for camera, fraction in ((FLOWN, 0.22), (FIELD, 0.11)):
-        bare = replace(camera.light, neutral_density=None)
-        passed = camera.light.responsivity_e_s(1.5) / bare.responsivity_e_s(1.5)
-        assert passed == pytest.approx(fraction, abs=0.005)
+        without_filter = replace(camera.light, neutral_density=None)
+        transmission = camera.light.responsivity_e_s(1.5) / without_filter.responsivity_e_s(1.5)
+        assert transmission == pytest.approx(fraction, abs=0.005)
 
 
 @pytest.mark.parametrize(
     ("temperature_c", "ratio", "dark_fraction"), [(-34.0, 102.0, None), (0.0, 100.0, 0.02), (23.0, 87.0, 0.15)]
 )
-def test_paper_signal_to_noise_and_dark_current_fractions(
+def test_signal_to_noise_and_dark_current_match_the_paper(
     temperature_c: float, ratio: float, dark_fraction: float | None
 ) -> None:
     """Section III.B.3 with one set of constants: the ratio within 2, fractions within a factor of 1.2."""
     for camera in (FLOWN, FIELD):
         p = camera.detector.model_copy(update={"temperature_c": temperature_c})
         assert _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) == pytest.approx(ratio, abs=2.0)
-        without = _signal_to_noise(p.model_copy(update={"dark_e_s": 0.0}), DARKEST_RADIANCE_FACTOR)
-        result = 1.0 - _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) / without
+        without_dark = _signal_to_noise(p.model_copy(update={"dark_e_s": 0.0}), DARKEST_RADIANCE_FACTOR)
+        actual = 1.0 - _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) / without_dark
         if dark_fraction is None:
-            assert result < 0.001
+            assert actual < 0.001
         else:
-            assert dark_fraction / 1.2 < result < dark_fraction * 1.2
+            assert dark_fraction / 1.2 < actual < dark_fraction * 1.2
 
 
 def test_field_test_and_flight_collect_similar_charge() -> None:
     flight, field = FLOWN.detector, FIELD.detector
     electrons = flight.responsivity_e_s * flight.exposure_s
     assert field.responsivity_e_s * field.exposure_s == pytest.approx(electrons)
-    # 44 % of the sunlight through a 22 % filter is slightly less than all of it through 11 %.
+    # On Mars the sunlight is 44 % and the filter transmits 22 %; on Earth 100 % and 11 %.
     assert flight.responsivity_e_s / field.responsivity_e_s == pytest.approx(0.44 * 0.22 / 0.11, rel=0.03)
     assert 0.003 < field.exposure_s < flight.exposure_s < 0.005
 
 
-def test_default_detector_is_the_flown_descent_camera() -> None:
+def test_default_detector_equals_the_flown_descent_camera() -> None:
     p = DetectorParameters()
     flight = FLOWN.detector.model_dump()
     assert p.responsivity_e_s == pytest.approx(flight.pop("responsivity_e_s"), rel=2e-3)
@@ -71,7 +71,7 @@ def test_default_detector_is_the_flown_descent_camera() -> None:
     assert p.dark_e_s == DARK_E_S
 
 
-def test_responsivity_follows_the_lens_the_pixel_and_the_sun() -> None:
+def test_responsivity_depends_on_aperture_pixel_area_band_and_distance() -> None:
     light = LightPath(12.0, 12.0, (400.0, 1100.0))
     rate = light.responsivity_e_s(1.0)
     assert light.responsivity_e_s(2.0) == pytest.approx(rate / 4.0)

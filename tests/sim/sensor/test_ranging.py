@@ -1,4 +1,4 @@
-"""Tests of radar, laser and satellite receiver: common properties and the geometry of each."""
+"""Tests of radar altimeter, laser altimeter and satellite receiver: errors, time tags and measured ranges."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _make_rough_surface(seed: int) -> Surface:
     return _make_surface(30.0 * heights / heights.std(), 2.0)
 
 
-def _axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray, "3"]:
+def _beam_axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray, "3"]:
     tilt, azimuth = np.radians([tilt_deg, azimuth_deg])
     return np.array([np.sin(tilt) * np.sin(azimuth), np.sin(tilt) * np.cos(azimuth), -np.cos(tilt)])
 
@@ -80,22 +80,22 @@ PERFECT: dict[Callable[..., Instrument], dict[str, object]] = {
         ("horizontal_noise_m", "vertical_noise_m", "horizontal_wander_m", "vertical_wander_m"), 0.0
     ),
 }
-each = pytest.mark.parametrize("make", PERFECT, ids=["radar", "gps"])
+with_each_instrument = pytest.mark.parametrize("make", PERFECT, ids=["radar", "gps"])
 
 
-@each
+@with_each_instrument
 def test_error_free_readings_equal_the_truth(make: Callable[..., Instrument]) -> None:
     instrument = make(np.random.default_rng(0), **PERFECT[make])
     times = instrument.sampling.within(0.0, 10.0)
     readings = instrument.measure(DESCENT, times, np.random.default_rng(1))
-    true = DESCENT.motion(times).positions_m
+    truth = DESCENT.motion(times).positions_m
     # Flat ground at height 0.
-    np.testing.assert_allclose(readings.values, true if readings.values.ndim == 2 else true[:, 2], atol=1e-6)
+    np.testing.assert_allclose(readings.values, truth if readings.values.ndim == 2 else truth[:, 2], atol=1e-6)
     np.testing.assert_array_equal(readings.times_s, times)
 
 
-@each
-def test_readings_belong_to_the_true_time(make: Callable[..., Instrument]) -> None:
+@with_each_instrument
+def test_readings_are_measured_at_the_true_time(make: Callable[..., Instrument]) -> None:
     clock = {"offset_s": 0.02, "jitter_sd_s": 0.001}
     instrument = make(np.random.default_rng(0), **PERFECT[make] | {"clock": clock})
     times = np.arange(400) * 0.02
@@ -103,13 +103,13 @@ def test_readings_belong_to_the_true_time(make: Callable[..., Instrument]) -> No
     heights = readings.values[:, 2] if readings.values.ndim == 2 else readings.values
     np.testing.assert_allclose(heights, 2000.0 - 75.0 * times, atol=1e-6)
     error = readings.times_s - times
-    # 400 values determine mean and spread to 5e-5 s and 3.5 %.
+    # 400 values determine mean and standard deviation to 5e-5 s and 3.5 %.
     assert error.mean() == pytest.approx(0.02, abs=2e-4)
     assert error.std() == pytest.approx(0.001, rel=0.15)
 
 
-@each
-def test_equal_streams_give_equal_readings(make: Callable[..., Instrument]) -> None:
+@with_each_instrument
+def test_equal_random_streams_produce_equal_readings(make: Callable[..., Instrument]) -> None:
     def read() -> Readings:
         return make(np.random.default_rng(5)).measure(DESCENT, np.array([0.0, 1.0]), np.random.default_rng(6))
 
@@ -136,7 +136,7 @@ def test_radar_scale_is_common_and_noise_is_independent() -> None:
         first, second = radar.measure(static, np.array([0.0, 1.0]), rng).values
         common.append(0.5 * (first + second) - 1000.0)
         noise.append((first - second) / np.sqrt(2.0))
-    # 300 values determine the spread to 4 %; the tolerance is three times that.
+    # 300 values determine the standard deviation to 4 %; the tolerance is three times that.
     assert np.std(common) == pytest.approx(10.0, rel=0.12)
     assert np.std(noise) == pytest.approx(1.0, rel=0.12)
 
@@ -158,17 +158,17 @@ def test_radar_is_quantised_and_limited_in_range() -> None:
 
 
 @pytest.mark.parametrize("slope_deg", [0.0, 5.0, 12.0])
-def test_radar_over_a_slope_measures_the_perpendicular(slope_deg: float) -> None:
+def test_radar_over_a_slope_measures_the_perpendicular_distance(slope_deg: float) -> None:
     surface = _make_plane(np.tan(np.radians(slope_deg)))
     position = np.array([MIDDLE, MIDDLE, 1000.0])
-    result = first_return(surface, position, _axis(0.0), np.radians(30.0), 5000.0)
+    result = first_return(surface, position, _beam_axis(0.0), np.radians(30.0), 5000.0)
     assert result == pytest.approx(1000.0 * np.cos(np.radians(slope_deg)), abs=0.1)
 
 
-def test_narrow_beam_measures_a_slope_at_its_edge() -> None:
+def test_narrow_beam_measures_the_range_at_its_uphill_edge() -> None:
     surface = _make_plane(np.tan(np.radians(20.0)))
     position = np.array([MIDDLE, MIDDLE, 1000.0])
-    result = first_return(surface, position, _axis(0.0), np.radians(5.0), 5000.0)
+    result = first_return(surface, position, _beam_axis(0.0), np.radians(5.0), 5000.0)
     # The ray 5 deg uphill of nadir: r cos 5 = 1000 - r sin 5 tan 20.
     expected = 1000.0 / (np.cos(np.radians(5.0)) + np.sin(np.radians(5.0)) * np.tan(np.radians(20.0)))
     assert result == pytest.approx(expected, rel=5e-4)
@@ -177,52 +177,54 @@ def test_narrow_beam_measures_a_slope_at_its_edge() -> None:
 @pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 30.0, 40.0, 60.0])
 def test_tilt_beyond_half_beam_width_increases_the_range(tilt_deg: float) -> None:
     position = np.array([0.0, 0.0, 1500.0])
-    result = first_return(FLAT, position, _axis(tilt_deg, 33.0), np.radians(30.0), 5000.0)
-    beyond = max(np.radians(tilt_deg - 30.0), 0.0)
-    assert result == pytest.approx(1500.0 / np.cos(beyond), rel=5e-4)
+    result = first_return(FLAT, position, _beam_axis(tilt_deg, 33.0), np.radians(30.0), 5000.0)
+    off_nadir = max(np.radians(tilt_deg - 30.0), 0.0)
+    assert result == pytest.approx(1500.0 / np.cos(off_nadir), rel=5e-4)
 
 
-def test_radar_near_a_cliff_measures_its_edge() -> None:
+def test_radar_near_a_cliff_measures_the_range_to_its_edge() -> None:
     heights = np.zeros((SIDE, SIDE))
     edge = SIDE // 2 + 60
     heights[:, edge:] = 200.0
     position = np.array([MIDDLE, MIDDLE, 1500.0])
-    result = first_return(_make_surface(heights), position, _axis(0.0), np.radians(30.0), 5000.0)
+    result = first_return(_make_surface(heights), position, _beam_axis(0.0), np.radians(30.0), 5000.0)
     # The spline makes a ramp of the step; its top is one cell beyond the edge.
     assert result == pytest.approx(np.hypot(61 * SPACING, 1300.0), abs=0.1)
-    # Its top is 13 deg from nadir, outside a beam of 10 deg to each side.
-    assert first_return(_make_surface(heights), position, _axis(0.0), np.radians(10.0), 5000.0) == pytest.approx(1500.0)
+    # The edge is 13 deg from nadir, outside a beam with a half angle of 10 deg.
+    assert first_return(_make_surface(heights), position, _beam_axis(0.0), np.radians(10.0), 5000.0) == pytest.approx(
+        1500.0
+    )
 
 
 @pytest.mark.parametrize(("height", "tilt_deg"), [(2000.0, 0.0), (1400.0, 25.0), (2000.0, 38.0)])
 def test_first_return_matches_a_dense_scan(height: float, tilt_deg: float) -> None:
     surface = _make_rough_surface(int(height + tilt_deg))
-    position, axis = np.array([300.0, 700.0, height]), _axis(tilt_deg, 200.0)
+    position, axis = np.array([300.0, 700.0, height]), _beam_axis(tilt_deg, 200.0)
     line = np.arange(-1500.0, 1500.0, 2.0)
     x, y = np.meshgrid(line, line)
-    down = height - surface.height(300.0 + x, 700.0 + y)
-    ranges = np.sqrt(x**2 + y**2 + down**2)
-    observed = x * axis[0] + y * axis[1] - down * axis[2] >= ranges * np.cos(np.radians(30.0))
+    depth = height - surface.height(300.0 + x, 700.0 + y)
+    ranges = np.sqrt(x**2 + y**2 + depth**2)
+    in_beam = x * axis[0] + y * axis[1] - depth * axis[2] >= ranges * np.cos(np.radians(30.0))
     result = first_return(surface, position, axis, np.radians(30.0), 5000.0)
     # Requirement: 0.05 % of the altitude.
-    assert result == pytest.approx(ranges[observed].min(), abs=5e-4 * height)
+    assert result == pytest.approx(ranges[in_beam].min(), abs=5e-4 * height)
 
 
 def test_radar_above_the_horizon_has_no_return() -> None:
     for height in (1000.0, 1.0):
-        assert first_return(FLAT, np.array([0.0, 0.0, height]), _axis(150.0), np.radians(30.0), 5000.0) == np.inf
+        assert first_return(FLAT, np.array([0.0, 0.0, height]), _beam_axis(150.0), np.radians(30.0), 5000.0) == np.inf
 
 
-def test_radar_on_a_ledge_finds_the_ground_below() -> None:
+def test_radar_on_a_ledge_measures_the_ground_below() -> None:
     heights = np.zeros((SIDE, SIDE))
     edge = SIDE // 2
     heights[:, :edge] = 400.0
     # 1 m above the ledge, 20 m from its edge, with a narrow beam 60 deg down to the east.
     position = np.array([edge * SPACING - 20.0, MIDDLE, 401.0])
-    result = first_return(_make_surface(heights), position, _axis(60.0), np.radians(2.0), 5000.0)
+    result = first_return(_make_surface(heights), position, _beam_axis(60.0), np.radians(2.0), 5000.0)
     assert result < 10.0
     position = np.array([edge * SPACING + 15.0, MIDDLE, 401.0])
-    result = first_return(_make_surface(heights), position, _axis(60.0), np.radians(2.0), 5000.0)
+    result = first_return(_make_surface(heights), position, _beam_axis(60.0), np.radians(2.0), 5000.0)
     assert result == pytest.approx(401.0 / np.cos(np.radians(58.0)), rel=5e-3)
 
 
@@ -243,19 +245,19 @@ def test_laser_unit_adds_its_errors() -> None:
     np.testing.assert_array_equal(readings.values, [10.0, np.nan, np.nan])
 
 
-def test_boresight_error_has_the_specified_spread() -> None:
+def test_boresight_error_has_the_specified_deviation() -> None:
     parameters = LaserParameters(boresight_deg=0.5)
     axes = np.array([RangingUnit.draw(parameters, np.random.default_rng(seed)).axis for seed in range(400)])
-    # 400 values determine a spread to 3.5 %; the tolerance is three times that
+    # 400 values determine the standard deviation to 3.5 %; the tolerance is three times that
     np.testing.assert_allclose(np.degrees(axes[:, :2].std(axis=0)), 0.5, rtol=0.11)
     np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0)
 
 
-def test_side_lobes_see_the_ground_below_a_tilted_beam() -> None:
+def test_side_lobes_receive_the_ground_at_nadir() -> None:
     """Tilted by 50 deg, the beam of 60 deg ends 20 deg from nadir; the side lobes reach the nadir."""
     tilted = Swaying(position_m=(160.0, 160.0, 1000.0), tilt=Rotation.from_rotvec([0.0, np.radians(50.0), 0.0]))
     times = np.arange(100) * 0.1
-    beam, lobes = (
+    main_lobe, with_side_lobes = (
         RadarAltimeter.draw(
             RadarParameters(scale_error=0.0, noise=0.0, count_m=0.0, sidelobe_fraction=fraction),
             FLAT,
@@ -265,10 +267,10 @@ def test_side_lobes_see_the_ground_below_a_tilted_beam() -> None:
         .values
         for fraction in (0.0, 0.3)
     )
-    np.testing.assert_allclose(beam, 1000.0 / np.cos(np.radians(20.0)), rtol=1e-3)
-    near = np.isclose(lobes, 1000.0, rtol=1e-3)
-    assert np.all(near | np.isclose(lobes, beam, rtol=1e-6))
-    assert 0.15 < near.mean() < 0.45
+    np.testing.assert_allclose(main_lobe, 1000.0 / np.cos(np.radians(20.0)), rtol=1e-3)
+    is_nadir_range = np.isclose(with_side_lobes, 1000.0, rtol=1e-3)
+    assert np.all(is_nadir_range | np.isclose(with_side_lobes, main_lobe, rtol=1e-6))
+    assert 0.15 < is_nadir_range.mean() < 0.45
 
 
 def test_true_altitude_is_vertical_height_above_ground() -> None:
@@ -276,13 +278,13 @@ def test_true_altitude_is_vertical_height_above_ground() -> None:
     np.testing.assert_allclose(height_above_ground(_make_plane(0.2), positions), [480.0, 510.0], atol=1e-3)
 
 
-def test_receiver_errors_have_the_specified_spreads() -> None:
+def test_receiver_errors_have_the_specified_deviations() -> None:
     errors, time = [], np.array([2.0])
-    true = DESCENT.motion(time).positions_m[0]
+    true_position = DESCENT.motion(time).positions_m[0]
     for seed in range(200):
         rng = np.random.default_rng(seed)
         gps = Gps.draw(RTK, (0.0, 10.0), rng)
-        errors.append(gps.measure(DESCENT, time, rng).values[0] - true)
-    # 400 and 200 values determine spreads to 3.5 % and 5 %; the tolerance is three times that.
+        errors.append(gps.measure(DESCENT, time, rng).values[0] - true_position)
+    # 400 and 200 values determine the standard deviation to 3.5 % and 5 %; the tolerance is three times that.
     assert np.std(np.array(errors)[:, :2]) == pytest.approx(np.hypot(0.01, 0.01), rel=0.11)
     assert np.std(np.array(errors)[:, 2]) == pytest.approx(np.hypot(0.015, 0.02), rel=0.15)

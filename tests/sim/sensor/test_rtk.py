@@ -22,29 +22,29 @@ def _measure(seed: int, times: np.ndarray, **changes: object) -> tuple[RtkReceiv
 def test_errors_match_specified_and_reported_deviation(kind: str) -> None:
     fraction = 1.0 if kind == "floating" else 0.0
     times = np.array([5.0])
-    true = MOTION.motion(times)
+    truth = MOTION.motion(times)
     samples = [_measure(seed, times, float_fraction=fraction) for seed in range(400)]
-    off = np.array([(s.positions_m - true.positions_m)[0] for _, s in samples])
-    # 400 values determine the spread to 3.5 %; the tolerance is three times that.
-    np.testing.assert_allclose(off.std(axis=0), getattr(RtkParameters(), kind).total_m, rtol=0.11)
+    position_errors = np.array([(s.positions_m - truth.positions_m)[0] for _, s in samples])
+    # 400 values determine the standard deviation to 3.5 %; the tolerance is three times that.
+    np.testing.assert_allclose(position_errors.std(axis=0), getattr(RtkParameters(), kind).total_m, rtol=0.11)
     reported = np.array([s.reported_m[0] for _, s in samples])
     factors = np.log(reported / getattr(RtkParameters(), kind).total_m)
     assert np.std(factors[:, 0]) == pytest.approx(0.1, rel=0.11)
-    faster = np.array([(s.velocities_m_s - true.velocities_m_s)[0] for _, s in samples])
-    np.testing.assert_allclose(faster.std(axis=0), np.hypot([0.03, 0.03, 0.05], [0.01, 0.01, 0.02]), rtol=0.11)
+    velocity_errors = np.array([(s.velocities_m_s - truth.velocities_m_s)[0] for _, s in samples])
+    np.testing.assert_allclose(velocity_errors.std(axis=0), np.hypot([0.03, 0.03, 0.05], [0.01, 0.01, 0.02]), rtol=0.11)
     assert all(s.fixed[0] == (kind == "fixed") for _, s in samples)
 
 
 def test_slow_error_has_the_specified_correlation_time() -> None:
     """A Gauss-Markov error has a correlation of exp(-1) after one correlation time."""
     times = np.array([0.0, 1.0, 120.0])
-    off = np.array(
+    errors = np.array(
         [
             (_measure(seed, times, float_fraction=1.0)[1].positions_m - MOTION.motion(times).positions_m)[:, :2] / 0.5
             for seed in range(400)
         ]
     )
-    correlation = np.corrcoef(np.moveaxis(off, 1, 0).reshape(3, -1))
+    correlation = np.corrcoef(np.moveaxis(errors, 1, 0).reshape(3, -1))
     assert correlation[0, 1] == pytest.approx(np.exp(-1.0 / 120.0), abs=0.01)
     # 800 values: three standard deviations of (1 - r^2) / sqrt(800).
     assert correlation[0, 2] == pytest.approx(np.exp(-1.0), abs=0.09)
@@ -65,11 +65,11 @@ def test_solution_types_have_specified_fraction_and_duration() -> None:
 def test_outage_has_no_solutions() -> None:
     times = np.arange(0.0, 10.0, 0.1)
     _, solutions = _measure(0, times, outages=(Outage(start_s=3.0, duration_s=2.0),))
-    silent = np.isnan(solutions.positions_m).all(axis=1)
-    np.testing.assert_array_equal(silent, (times >= 3.0) & (times < 5.0))
-    assert np.isfinite(solutions.velocities_m_s[~silent]).all()
+    is_missing = np.isnan(solutions.positions_m).all(axis=1)
+    np.testing.assert_array_equal(is_missing, (times >= 3.0) & (times < 5.0))
+    assert np.isfinite(solutions.velocities_m_s[~is_missing]).all()
 
 
-def test_zero_fraction_is_rejected() -> None:
+def test_too_short_fixed_solutions_are_rejected() -> None:
     with pytest.raises(ValueError, match="float_fraction"):
         RtkParameters(float_fraction=0.999, float_s=1.0)

@@ -1,4 +1,4 @@
-"""Tests of exponentially correlated random processes."""
+"""Tests of the Gauss-Markov process: variance, correlation and span."""
 
 import numpy as np
 import pytest
@@ -10,12 +10,12 @@ def test_process_is_stationary_from_the_start() -> None:
     rng = np.random.default_rng(0)
     process = GaussMarkov.draw(np.repeat([2.0, 5.0], 2000), 100.0, (-50.0, 250.0), rng)
     early, later = process.at(np.array([-50.0])), process.at(np.array([50.0]))
-    # 2,000 channels determine a spread to 1.6 % and a correlation to 2 %; tolerances are four times that.
-    for part, sd in ((slice(0, 2000), 2.0), (slice(2000, 4000), 5.0)):
-        assert np.std(early[0, part]) == pytest.approx(sd, rel=0.065)
-        assert np.std(later[0, part]) == pytest.approx(sd, rel=0.065)
-        # One correlation time apart.
-        assert np.corrcoef(early[0, part], later[0, part])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.08)
+    # 2,000 channels determine the standard deviation to 1.6 % and a correlation to 2 %; tolerances are four times that.
+    for channels, sd in ((slice(0, 2000), 2.0), (slice(2000, 4000), 5.0)):
+        assert np.std(early[0, channels]) == pytest.approx(sd, rel=0.065)
+        assert np.std(later[0, channels]) == pytest.approx(sd, rel=0.065)
+        # The two times differ by one correlation time.
+        assert np.corrcoef(early[0, channels], later[0, channels])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.08)
 
 
 def test_process_is_defined_only_within_its_samples() -> None:

@@ -37,9 +37,10 @@ def test_static_readings_equal_the_attitude() -> None:
 
 
 def test_acceleration_tilts_vertical_and_rotates_heading() -> None:
-    """Eastward acceleration a tilts the vertical by atan(a / g) and rotates a part of the dip into the horizontal
-    plane. Field (0, cos d, -sin d); horizontal axes north' = north and east' = (g, 0, -a) / |.|. The heading of the
-    body x axis (east) is 90 deg minus atan(east' field / north' field).
+    """An eastward acceleration a tilts the measured vertical by atan(a / g).
+
+    The magnetic field is (0, cos d, -sin d) with the dip d. The measured horizontal axes are north and
+    east' = (g, 0, -a) / sqrt(g^2 + a^2). The body x axis is east: its heading is 90 deg - atan(B_east' / B_north).
     """
     motion, dip = Swaying(acceleration_m_s2=(0.5, 0.0, 0.0)), np.radians(59.0)
     readings = _read(motion, np.array([0.0]))
@@ -53,35 +54,35 @@ def test_acceleration_tilts_vertical_and_rotates_heading() -> None:
 
 
 def test_inclinometers_lag_as_a_first_order_system() -> None:
-    """An oscillation of 1 rad/s with a lag of 0.2 s: amplitude over sqrt(1 + w^2 t^2), phase delay atan(w t)."""
+    """Sway with w = 1 rad/s and a lag t = 0.2 s: the gain is 1 / sqrt(1 + w^2 t^2), and the phase lag is atan(w t)."""
     motion, times = Swaying(sway_m=0.1, sway_rad_s=1.0), np.arange(10.0, 20.0, 0.05)
-    leaned = _read(motion, times).up_body[:, 0]
+    up_x = _read(motion, times).up_body[:, 0]
     expected = -0.1 / GRAVITY / np.hypot(1.0, 0.2) * np.sin(times - np.arctan(0.2))
-    np.testing.assert_allclose(leaned, expected, atol=2e-5)
+    np.testing.assert_allclose(up_x, expected, atol=2e-5)
 
 
 def test_lag_does_not_depend_on_requested_times() -> None:
     motion, times = Swaying(sway_m=0.1, sway_rad_s=3.0), np.arange(0.0, 6.0, 0.25)
-    together = _read(motion, times).up_body
-    np.testing.assert_allclose(_read(motion, times[12:]).up_body, together[12:], atol=1e-5)
+    all_readings = _read(motion, times).up_body
+    np.testing.assert_allclose(_read(motion, times[12:]).up_body, all_readings[12:], atol=1e-5)
 
 
 def test_iron_causes_one_and_two_cycle_heading_errors() -> None:
     parameters = TiltCompassParameters.model_validate(
         PERFECT | {"heading_bias_deg": 0.8, "hard_iron_deg": 0.5, "soft_iron_deg": 0.25}
     )
-    around = np.radians(np.arange(0.0, 360.0, 45.0))
-    off = []
+    azimuths = np.radians(np.arange(0.0, 360.0, 45.0))
+    deviations_deg = []
     for seed in range(300):
         unit = TiltCompass.draw(parameters, np.random.default_rng(seed))
-        expected = unit.deviation_rad(around)
-        rotated = [Swaying(tilt=Rotation.from_euler("z", 0.5 * np.pi - azimuth)) for azimuth in around]
-        one = np.random.default_rng(0)
+        expected = unit.deviation_rad(azimuths)
+        rotated = [Swaying(tilt=Rotation.from_euler("z", 0.5 * np.pi - azimuth)) for azimuth in azimuths]
+        reading_rng = np.random.default_rng(0)
         if seed < 3:
-            read = [unit.measure(motion, np.array([0.0]), one).headings_rad[0] for motion in rotated]
-            np.testing.assert_allclose(np.angle(np.exp(1j * (read - around - expected))), 0.0, atol=1e-9)
-        off.append(np.degrees(expected))
-    modes = np.fft.rfft(np.array(off), axis=1) / around.size
+            read = [unit.measure(motion, np.array([0.0]), reading_rng).headings_rad[0] for motion in rotated]
+            np.testing.assert_allclose(np.angle(np.exp(1j * (read - azimuths - expected))), 0.0, atol=1e-9)
+        deviations_deg.append(np.degrees(expected))
+    modes = np.fft.rfft(np.array(deviations_deg), axis=1) / azimuths.size
     # Constant, then each component of one and two cycles: 300 or 600 values.
     assert modes[:, 0].real.std() == pytest.approx(0.8, rel=0.12)
     assert np.sqrt(2.0 * np.mean(np.abs(modes[:, 1]) ** 2)) == pytest.approx(0.5, rel=0.09)
@@ -89,11 +90,11 @@ def test_iron_causes_one_and_two_cycle_heading_errors() -> None:
     np.testing.assert_allclose(np.abs(modes[:, 3]), 0.0, atol=1e-9)
 
 
-def test_noise_and_bias_have_the_specified_size() -> None:
+def test_noise_and_bias_have_the_specified_deviation() -> None:
     static, times = Swaying(), np.arange(0.0, 40.0, 0.1)
-    up = _read(static, times, tilt_noise_deg=0.15, heading_noise_deg=0.3)
-    assert np.degrees(up.up_body[:, :2]).std() == pytest.approx(0.15, rel=0.08)  # 800 values
-    assert np.degrees(up.headings_rad).std() == pytest.approx(0.3, rel=0.11)
+    readings = _read(static, times, tilt_noise_deg=0.15, heading_noise_deg=0.3)
+    assert np.degrees(readings.up_body[:, :2]).std() == pytest.approx(0.15, rel=0.08)  # 800 values
+    assert np.degrees(readings.headings_rad).std() == pytest.approx(0.3, rel=0.11)
     biases = [np.degrees(_read(static, times[:1], seed, tilt_bias_deg=0.2).up_body[0, :2]) for seed in range(300)]
     assert np.std(biases) == pytest.approx(0.2, rel=0.09)
 

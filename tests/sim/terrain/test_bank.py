@@ -58,7 +58,7 @@ def test_damaged_file_is_rebuilt(cache: Path, damage: bytes | None) -> None:
 
 
 def test_zeroed_cache_file_is_rebuilt(cache: Path) -> None:
-    """Holds for a process that verified the file before, with an updated time of use."""
+    """The process has verified the file before; writing zeros changes its modification time."""
     bank = TerrainBank(SMALL, seed=1)
     built = _terrain_bytes(bank, 0)
     assert _terrain_bytes(bank, 0) == built
@@ -74,16 +74,16 @@ def test_file_is_verified_once_per_process(cache: Path, monkeypatch: pytest.Monk
     bank = TerrainBank(SMALL, seed=1)
     built = _terrain_bytes(bank, 0)
     monkeypatch.setattr("marsyard.sim.cache._VERIFIED", {})
-    summed: list[int] = []
-    checksum = cache_module._checksum
+    checked_sizes: list[int] = []
+    checksum = cache_module._compute_checksum
 
-    def count(array: np.ndarray) -> object:
-        summed.append(array.size)
+    def count_and_compute(array: np.ndarray) -> object:
+        checked_sizes.append(array.size)
         return checksum(array)
 
-    monkeypatch.setattr("marsyard.sim.cache._checksum", count)
+    monkeypatch.setattr("marsyard.sim.cache._compute_checksum", count_and_compute)
     assert [_terrain_bytes(bank, 0), _terrain_bytes(bank, 0)] == [built, built]
-    assert len(summed) == 1
+    assert len(checked_sizes) == 1
 
 
 def test_terrain_is_synced_before_rename(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,15 +104,15 @@ def test_terrain_is_synced_before_rename(cache: Path, monkeypatch: pytest.Monkey
     assert [Path(step).suffix or Path(step).name for step in steps] == [".part", "named", "terrain"]
 
 
-def test_unwritable_cache_still_gives_terrains(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_terrains_are_built_without_a_writable_cache(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bank = TerrainBank(SMALL, seed=1)
     built = _terrain_bytes(bank, 0)
     next(cache.iterdir()).unlink()
 
-    def full(_: int) -> None:
+    def raise_disk_full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("os.fsync", full)
+    monkeypatch.setattr("os.fsync", raise_disk_full)
     with pytest.warns(CacheWarning, match="No space left"):
         assert _terrain_bytes(bank, 0) == built
     assert not list(cache.iterdir())
@@ -121,10 +121,10 @@ def test_unwritable_cache_still_gives_terrains(cache: Path, monkeypatch: pytest.
 def test_terrain_larger_than_the_limit_is_built(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE_GB", "0.00001")
     bank = TerrainBank(SMALL, seed=1)
-    held = bank.terrain(0)
-    other = bank.terrain(1)
-    assert held.levels[0].tobytes() == TerrainBank(SMALL, seed=1).terrain(0).levels[0].tobytes()
-    assert np.isfinite(other.levels[0]).all()
+    first = bank.terrain(0)
+    second = bank.terrain(1)
+    assert first.levels[0].tobytes() == TerrainBank(SMALL, seed=1).terrain(0).levels[0].tobytes()
+    assert np.isfinite(second.levels[0]).all()
 
 
 def test_terrains_are_read_only(cache: Path) -> None:
@@ -135,7 +135,7 @@ def test_terrains_are_read_only(cache: Path) -> None:
 
 def test_unused_terrain_is_evicted_for_the_next(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bank = TerrainBank(SMALL, seed=1)
-    held = bank.terrain(0)
+    terrain_in_use = bank.terrain(0)
     size = next(cache.iterdir()).stat().st_size
     monkeypatch.setenv("MARSYARD_CACHE_GB", f"{2.5 * size / 1e9:.12f}")
     first = set(cache.iterdir())
@@ -143,25 +143,25 @@ def test_unused_terrain_is_evicted_for_the_next(cache: Path, monkeypatch: pytest
     second = set(cache.iterdir()) - first
     bank.terrain(2)
     assert len(list(cache.iterdir())) == 2
-    assert first <= set(cache.iterdir()), "held by this process"
+    assert first <= set(cache.iterdir()), "in use by this process"
     assert not second & set(cache.iterdir())
     assert _terrain_bytes(bank, 1) == built
-    assert np.isfinite(held.levels[0]).all()
+    assert np.isfinite(terrain_in_use.levels[0]).all()
 
 
-def test_terrain_removed_by_another_process_stays_readable(cache: Path) -> None:
+def test_terrain_stays_readable_after_its_file_is_removed(cache: Path) -> None:
     surface = TerrainBank(SMALL, seed=1).terrain(0)
-    before = surface.levels[0].tobytes()
+    content = surface.levels[0].tobytes()
     next(cache.iterdir()).unlink()
-    assert surface.levels[0].tobytes() == before
+    assert surface.levels[0].tobytes() == content
 
 
 def test_concurrent_builds_in_a_small_cache_are_complete(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each process gets complete terrains while others evict files; no partial file remains."""
     monkeypatch.setenv("MARSYARD_CACHE_GB", "0.0002")
     with ProcessPoolExecutor(3, mp_context=multiprocessing.get_context("spawn")) as pool:
-        observed = list(pool.map(_hash_terrains, range(3)))
-    assert observed[0] == observed[1] == observed[2]
+        hashes = list(pool.map(_hash_terrains, range(3)))
+    assert hashes[0] == hashes[1] == hashes[2]
     assert not list(cache.glob("*.part"))
     assert sum(path.stat().st_size for path in cache.iterdir()) <= 5 * 45_000 + 3 * 45_000
 

@@ -1,4 +1,4 @@
-"""Tests of imported terrain: heights at the posts, filled holes, and blending into a periodic surround."""
+"""Tests of imported terrain: heights at the posts, filled holes, brightness, and the border to synthetic terrain."""
 
 import sys
 from pathlib import Path
@@ -13,21 +13,21 @@ from marsyard.sim.terrain.surface import terrain_statistics
 ROWS, COLUMNS = 90, 110
 
 
-def dem() -> np.ndarray:
+def make_dem() -> np.ndarray:
     y, x = np.mgrid[:ROWS, :COLUMNS]
     return np.asarray(100.0 + 3.0 * np.sin(x / 9.0) + 2.0 * np.cos(y / 7.0) + 0.05 * x)
 
 
 @pytest.fixture
 def npz(tmp_path: Path) -> Path:
-    """Row 0 in the north; a hole of six posts; an image with twice the density, brighter to the east."""
-    heights = dem().astype(np.float32)
+    """File with row 0 in the north, a hole of six posts, and an image at half the spacing, brighter to the east."""
+    heights = make_dem().astype(np.float32)
     heights[40:42, 50:53] = np.nan
-    picture = np.broadcast_to(np.linspace(80, 160, 2 * COLUMNS), (2 * ROWS, 2 * COLUMNS)).astype(np.uint8).copy()
-    valid = np.ones(picture.shape, dtype=bool)
+    image = np.broadcast_to(np.linspace(80, 160, 2 * COLUMNS), (2 * ROWS, 2 * COLUMNS)).astype(np.uint8).copy()
+    valid = np.ones(image.shape, dtype=bool)
     valid[:4] = False
     path = tmp_path / "tile.npz"
-    np.savez(path, dem=heights, dem_gsd=1.0, ortho=picture, ortho_gsd=0.5, ortho_valid=valid)
+    np.savez(path, dem=heights, dem_gsd=1.0, ortho=image, ortho_gsd=0.5, ortho_valid=valid)
     return path
 
 
@@ -47,7 +47,7 @@ def build_surface(parameters: TerrainParameters) -> Surface:
     return synthesise(parameters, np.random.default_rng(1))
 
 
-def test_the_surface_passes_through_the_posts(npz: Path) -> None:
+def test_surface_interpolates_the_posts(npz: Path) -> None:
     source = RealTerrain(dtm=npz, border_m=10.0, roughen=False)
     extent = embed(source, 256, 1.0).extent
     assert (extent.holes, extent.ortho_holes) == (6, 8 * COLUMNS)
@@ -57,11 +57,11 @@ def test_the_surface_passes_through_the_posts(npz: Path) -> None:
     expected = full[11:-11, 11:-11] - full.mean()
     np.testing.assert_allclose(surface.height(x, y), expected, atol=1e-4)
     # The first row of the file is the northernmost row.
-    np.testing.assert_allclose(full[-1], dem()[0], atol=1e-4)
+    np.testing.assert_allclose(full[-1], make_dem()[0], atol=1e-4)
 
 
 @pytest.mark.parametrize("spacing_m", [0.5, 1.5])
-def test_resampling_keeps_the_heights(npz: Path, spacing_m: float) -> None:
+def test_resampling_preserves_the_heights(npz: Path, spacing_m: float) -> None:
     source = RealTerrain(dtm=npz, border_m=10.0, roughen=False)
     surface = build_surface(make_surround(source, samples=512 if spacing_m < 1 else 128, spacing_m=spacing_m))
     extent = embed(source, surface.levels[0].shape[0], spacing_m).extent
@@ -72,7 +72,7 @@ def test_resampling_keeps_the_heights(npz: Path, spacing_m: float) -> None:
     np.testing.assert_allclose(actual - actual.mean(), expected - expected.mean(), atol=0.02)
 
 
-def test_the_seam_has_no_step(npz: Path) -> None:
+def test_border_of_the_imported_terrain_has_no_step(npz: Path) -> None:
     source = RealTerrain(dtm=npz, border_m=15.0)
     surface = build_surface(make_surround(source, rms_slope_deg=3.0))
     x, y = np.meshgrid(np.arange(256.0), np.arange(256.0))
@@ -81,7 +81,7 @@ def test_the_seam_has_no_step(npz: Path) -> None:
     assert slope.max() < 42.0
 
 
-def test_detail_below_the_post_spacing_is_optional(npz: Path) -> None:
+def test_roughness_finer_than_the_posts_is_optional(npz: Path) -> None:
     smooth, rough = (
         build_surface(make_surround(RealTerrain(dtm=npz, roughen=r), samples=1024, spacing_m=0.25, rms_slope_deg=4.0))
         for r in (False, True)
@@ -89,32 +89,32 @@ def test_detail_below_the_post_spacing_is_optional(npz: Path) -> None:
     middle = np.s_[480:560, 480:560, 0]
     added = rough.levels[0][middle] - smooth.levels[0][middle]
     assert 0.003 < added.std() < 0.3
-    assert abs(added.mean()) < 0.2 * added.std(), "nothing above the posting"
+    assert abs(added.mean()) < 0.2 * added.std(), "the roughness does not change the mean height"
 
 
 def test_brightness_uses_the_image_offset(npz: Path) -> None:
     source = RealTerrain(dtm=npz, border_m=5.0, roughen=False)
     surface = build_surface(make_surround(source, albedo=0.2, albedo_contrast=0.0))
     extent = embed(source, 256, 1.0).extent
-    along = surface.albedo(extent.west_m + np.arange(10.0, 100.0), np.full(90, extent.south_m + 40.0))
-    assert along[-1] / along[0] == pytest.approx((80 + 80 * 99.5 / 110) / (80 + 80 * 9.5 / 110), rel=0.02)
-    moved = build_surface(
+    row = surface.albedo(extent.west_m + np.arange(10.0, 100.0), np.full(90, extent.south_m + 40.0))
+    assert row[-1] / row[0] == pytest.approx((80 + 80 * 99.5 / 110) / (80 + 80 * 9.5 / 110), rel=0.02)
+    offset_surface = build_surface(
         make_surround(source.model_copy(update={"ortho_east_m": 8.0}), albedo=0.2, albedo_contrast=0.0)
     )
-    shifted = moved.albedo(extent.west_m + np.arange(10.0, 90.0), np.full(80, extent.south_m + 40.0))
-    np.testing.assert_allclose(shifted, along[8:88], rtol=0.02)
+    offset_row = offset_surface.albedo(extent.west_m + np.arange(10.0, 90.0), np.full(80, extent.south_m + 40.0))
+    np.testing.assert_allclose(offset_row, row[8:88], rtol=0.02)
 
 
-def test_changed_file_gives_another_terrain(npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changed_file_produces_another_terrain(npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path / "cache"))
     bank = TerrainBank(make_surround(RealTerrain(dtm=npz)), seed=1)
-    before = bank.terrain(0).levels[0].tobytes()
-    np.savez(npz, dem=dem() * 2.0, dem_gsd=1.0)
-    assert bank.terrain(0).levels[0].tobytes() != before
+    original = bank.terrain(0).levels[0].tobytes()
+    np.savez(npz, dem=make_dem() * 2.0, dem_gsd=1.0)
+    assert bank.terrain(0).levels[0].tobytes() != original
 
 
 def test_hirise_tile_is_imported(shared_data: Path) -> None:
-    """Its orthoimage is about 2 m east and 1 m south of its heights."""
+    """The orthoimage of the tile is about 2 m east and 1 m south of its heights."""
     source = RealTerrain(
         dtm=shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz", ortho_east_m=2.0, ortho_north_m=-1.0
     )
@@ -159,7 +159,7 @@ def test_missing_geotiff_reader_is_reported(tmp_path: Path, monkeypatch: pytest.
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
 def test_geotiff_units_and_holes_are_read(tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio")
-    heights = dem().astype(np.float32)
+    heights = make_dem().astype(np.float32)
     heights[3, 4] = -9999.0
     path = tmp_path / "dtm.tif"
     profile = {
@@ -194,11 +194,11 @@ def test_statistics_use_only_valid_posts(tmp_path: Path) -> None:
     path = tmp_path / "half.npz"
     np.savez(path, dem=heights, dem_gsd=1.0)
     source = RealTerrain(dtm=path, border_m=2.0, roughen=False, max_hole_fraction=0.6)
-    real = embed(source, 256, 1.0)
-    assert real.extent.hole_fraction == pytest.approx(0.5)
-    assert real.real_samples(256).sum() == np.isfinite(heights).sum()
-    assert real.filled_samples(256).sum() == np.isnan(heights).sum()
-    measured = terrain_statistics(build_surface(make_surround(source)), real.real_samples(256))
+    embedded = embed(source, 256, 1.0)
+    assert embedded.extent.hole_fraction == pytest.approx(0.5)
+    assert embedded.real_samples(256).sum() == np.isfinite(heights).sum()
+    assert embedded.filled_samples(256).sum() == np.isnan(heights).sum()
+    measured = terrain_statistics(build_surface(make_surround(source)), embedded.real_samples(256))
     full = heights[:, :80]
     rises = (full[30:] - full[:-30], full[:, 30:] - full[:, :-30])
     expected = np.mean([np.degrees(np.arctan(np.abs(rise) / 30.0)).mean() for rise in rises])
@@ -208,7 +208,7 @@ def test_statistics_use_only_valid_posts(tmp_path: Path) -> None:
 
 
 def test_many_holes_are_rejected_unless_allowed(tmp_path: Path) -> None:
-    heights = dem()
+    heights = make_dem()
     heights[:, :9] = np.nan  # 8.2 % of 110 columns
     path = tmp_path / "holes.npz"
     np.savez(path, dem=heights, dem_gsd=1.0)

@@ -1,4 +1,4 @@
-"""Tests of landforms: each has its specified shape and is independent of the others."""
+"""Tests of landforms: their specified shapes, and independence of each other."""
 
 import os
 import subprocess
@@ -27,7 +27,7 @@ def synthesize_heights(parameters: TerrainParameters, seed: int = 1) -> np.ndarr
     return synthesise(parameters, np.random.default_rng(seed)).levels[0][..., 0].astype(np.float64)
 
 
-ALL = {
+LANDFORMS = {
     "dunes": Dunes(),
     "ripples": Dunes(wavelength_m=20.0, height_m=0.8),
     "lava": Lava(),
@@ -39,10 +39,10 @@ ALL = {
 }
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_equal_seeds_give_equal_bytes(name: str) -> None:
-    parameters = make_parameters(**{name: ALL[name]})
-    first, repeated, other = (
+@pytest.mark.parametrize("name", LANDFORMS)
+def test_equal_seeds_produce_equal_bytes(name: str) -> None:
+    parameters = make_parameters(**{name: LANDFORMS[name]})
+    first, repeated, other_seed = (
         synthesize_heights(parameters),
         synthesize_heights(parameters),
         synthesize_heights(parameters, seed=2),
@@ -50,15 +50,15 @@ def test_equal_seeds_give_equal_bytes(name: str) -> None:
     assert first.tobytes() == repeated.tobytes()
     assert np.isfinite(first).all()
     assert np.ptp(first) > 0.0
-    assert (name == "ramp") == np.array_equal(first, other)
+    assert (name == "ramp") == np.array_equal(first, other_seed)
 
 
 @pytest.mark.parametrize("name", ["dunes", "lava", "swell", "ramp", "gullies", "playa"])
 def test_added_landform_does_not_change_others(name: str) -> None:
     """Heights are additive: the contribution of a landform does not depend on the other landforms."""
-    rough = make_parameters(rms_slope_deg=2.0, ripples=ALL["ripples"])
-    contribution = synthesize_heights(make_parameters(**{name: ALL[name]}))
-    difference = synthesize_heights(rough.model_copy(update={name: ALL[name]})) - synthesize_heights(rough)
+    rough = make_parameters(rms_slope_deg=2.0, ripples=LANDFORMS["ripples"])
+    contribution = synthesize_heights(make_parameters(**{name: LANDFORMS[name]}))
+    difference = synthesize_heights(rough.model_copy(update={name: LANDFORMS[name]})) - synthesize_heights(rough)
     np.testing.assert_allclose(difference, contribution, atol=1e-3)
 
 
@@ -74,10 +74,10 @@ def test_bytes_do_not_depend_on_the_number_of_threads() -> None:
     for threads in ("1", "4"):
         names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
         environment = {**os.environ, **dict.fromkeys(names, threads)}
-        ended = subprocess.run(
+        run = subprocess.run(
             [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
         )
-        hashes.add(ended.stdout.strip())
+        hashes.add(run.stdout.strip())
     assert len(hashes) == 1
 
 
@@ -92,8 +92,8 @@ def test_dunes_have_specified_wavelength_height_and_slip_faces() -> None:
     slope = surface.gradient(x, y)[..., 0]
     steepest = np.degrees(np.arctan(-np.quantile(slope, 0.01)))
     assert 30.0 <= steepest <= 34.0
-    assert np.degrees(np.arctan(slope.max())) < 20.0, "the stoss is gentle"
-    assert np.mean(slope > 0) > 0.7, "the stoss takes most of the wavelength"
+    assert np.degrees(np.arctan(slope.max())) < 20.0, "the stoss slope is gentle"
+    assert np.mean(slope > 0) > 0.7, "the stoss slope is longer than the lee slope"
 
 
 def test_dunes_end_in_defects_without_steps() -> None:
@@ -111,11 +111,11 @@ def test_wind_direction_rotates_the_crests() -> None:
     crests_north = synthesize_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=270.0)))
     crests_east = synthesize_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=180.0)))
 
-    def rough_along(z: np.ndarray, axis: int) -> float:
+    def mean_change(z: np.ndarray, axis: int) -> float:
         return float(np.abs(np.roll(z, -20, axis=axis) - z).mean())
 
-    assert rough_along(crests_north, 1) > 2 * rough_along(crests_north, 0)
-    assert rough_along(crests_east, 0) > 2 * rough_along(crests_east, 1)
+    assert mean_change(crests_north, 1) > 2 * mean_change(crests_north, 0)
+    assert mean_change(crests_east, 0) > 2 * mean_change(crests_east, 1)
 
 
 def test_lava_is_rough_at_metres_and_smooth_at_larger_scales() -> None:
@@ -126,17 +126,17 @@ def test_lava_is_rough_at_metres_and_smooth_at_larger_scales() -> None:
 
 @pytest.mark.parametrize("slope_deg", [8.0, 17.5, 25.0])
 @pytest.mark.parametrize("uphill", ["east", "north"])
-def test_ramp_has_its_slope_in_the_stated_direction(slope_deg: float, uphill: Literal["east", "north"]) -> None:
+def test_ramp_has_its_slope_in_the_specified_direction(slope_deg: float, uphill: Literal["east", "north"]) -> None:
     ramp = Ramp(slope_deg=slope_deg, length_m=20.0, uphill=uphill)
     surface = synthesise(make_parameters(spacing_m=0.2, ramp=ramp), np.random.default_rng(0))
     period = surface.period_m
-    along = np.linspace(0.25 * period - 8.5, 0.25 * period + 8.5, 50)
-    across = np.linspace(0.0, period, 50)
-    position = (along, across) if uphill == "east" else (across, along)
+    uphill_m = np.linspace(0.25 * period - 8.5, 0.25 * period + 8.5, 50)
+    cross_m = np.linspace(0.0, period, 50)
+    position = (uphill_m, cross_m) if uphill == "east" else (cross_m, uphill_m)
     gradient = surface.gradient(*position)
-    forward, sideways = (0, 1) if uphill == "east" else (1, 0)
-    np.testing.assert_allclose(np.degrees(np.arctan(gradient[:, forward])), slope_deg, atol=0.05)
-    np.testing.assert_allclose(gradient[:, sideways], 0.0, atol=1e-4)
+    uphill_axis, cross_axis = (0, 1) if uphill == "east" else (1, 0)
+    np.testing.assert_allclose(np.degrees(np.arctan(gradient[:, uphill_axis])), slope_deg, atol=0.05)
+    np.testing.assert_allclose(gradient[:, cross_axis], 0.0, atol=1e-4)
     level = surface.gradient(*((0.0, 5.0) if uphill == "east" else (5.0, 0.0)))
     np.testing.assert_allclose(level, 0.0, atol=1e-4)
 
@@ -164,11 +164,11 @@ def test_gullies_have_steep_walls() -> None:
     slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
     assert 25.0 < np.quantile(slope, 0.995) < 45.0
     z = surface.levels[0][..., 0]
-    assert np.mean(z > -0.01) > 0.4, "between them the ground is untouched"
+    assert np.mean(z > -0.01) > 0.4, "the ground between gullies is unchanged"
     assert z.min() < -1.0
 
 
-def test_refinement_keeps_the_surface_exactly() -> None:
+def test_refined_control_values_define_the_same_surface() -> None:
     rng = np.random.default_rng(0)
     coarse = rng.normal(size=(16, 16)).astype(np.float32)
     fine = refine(coarse, 64)
@@ -186,12 +186,12 @@ def test_smooth_fields_have_unit_power() -> None:
     assert np.mean(powers) == pytest.approx(1.0, abs=0.05)
 
 
-def test_landforms_on_a_coarser_grid_keep_their_position() -> None:
+def test_landforms_on_a_coarser_grid_have_the_same_position() -> None:
     ground = Ground(np.zeros((64, 64), np.float32), np.zeros((64, 64), np.float32), 1.0)
-    part = ground.coarser(4.0)
-    assert (part.side, part.spacing_m, part.period_m) == (16, 4.0, 64.0)
-    part.height[4, 8] = 1.0
-    ground.add(part)
+    coarse = ground.coarser(4.0)
+    assert (coarse.side, coarse.spacing_m, coarse.period_m) == (16, 4.0, 64.0)
+    coarse.height[4, 8] = 1.0
+    ground.add(coarse)
     assert tuple(map(int, np.unravel_index(ground.height.argmax(), (64, 64)))) == (16, 32)
 
 
@@ -226,39 +226,39 @@ def test_dune_kernel_matches_scipy() -> None:
     add_dunes(height, tone, spacing, modulation, Bedforms(wave[0], wave[1], crest, steepest, 0.3))
     rows, columns = np.mgrid[:side, :side]
     real, imaginary = (
-        map_coordinates(part.astype(np.float64), [rows / 4, columns / 4], order=3, mode="grid-wrap", prefilter=False)
-        for part in np.moveaxis(modulation, -1, 0)
+        map_coordinates(c.astype(np.float64), [rows / 4, columns / 4], order=3, mode="grid-wrap", prefilter=False)
+        for c in np.moveaxis(modulation, -1, 0)
     )
     strength = np.hypot(real, imaginary)
     phase = spacing * (wave[0] * columns + wave[1] * rows) + np.arctan2(imaginary, real)
     u = np.mod(phase / (2.0 * np.pi), 1.0)
-    high = crest * np.minimum(strength, 1.6)
-    slip = np.clip(4.0 / 3.0 * high * np.linalg.norm(wave) / (2.0 * np.pi * steepest), 0.01, 0.5)
+    crest_height = crest * np.minimum(strength, 1.6)
+    slip = np.clip(4.0 / 3.0 * crest_height * np.linalg.norm(wave) / (2.0 * np.pi * steepest), 0.01, 0.5)
     stoss, face = u / (1.0 - slip), (1.0 - u) / slip
     shape = np.where(
         u < 1.0 - slip,
         0.25 * stoss + 0.75 * stoss**2 * (3.0 - 2.0 * stoss),
         np.where(face > 0.5, 4.0 / 3.0 * face - 1.0 / 3.0, 4.0 / 3.0 * face**2),
     )
-    np.testing.assert_allclose(height, high * shape, atol=1e-5)
+    np.testing.assert_allclose(height, crest_height * shape, atol=1e-5)
     np.testing.assert_allclose(tone, 0.3 * (shape - 0.5) * np.minimum(strength, 1.0), atol=1e-5)
 
 
-def test_ejecta_lie_in_seven_and_twelve_rays() -> None:
-    """Outside a round crater the ejecta blanket falls with the cube of distance, and its rays vary with azimuth."""
-    side, spacing, radius, rim, reach, phase = 128, 1.0, 12.0, 0.8, 4.0, 0.7
+def test_ejecta_have_seven_and_twelve_rays() -> None:
+    """Outside the rim the ejecta height decreases with the cube of the distance and is modulated by rays in azimuth."""
+    side, spacing, radius, rim, max_radius, phase = 128, 1.0, 12.0, 0.8, 4.0, 0.7
     height, tone = np.zeros((2, side, side), dtype=np.float32)
     crater = np.array([[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phase]])
-    stamp_craters(height, tone, spacing, crater, reach)
+    stamp_craters(height, tone, spacing, crater, max_radius)
     y, x = np.mgrid[:side, :side] - 64.0
     r, azimuth = np.hypot(x, y) / radius, np.arctan2(y, x)
-    outside = (r > 1.1) & (r < reach)
-    fade = (reach - r) / (reach - 1.0)
+    outside = (r > 1.1) & (r < max_radius)
+    fade = (max_radius - r) / (max_radius - 1.0)
     rays = np.cos(7.0 * azimuth + phase) + np.cos(12.0 * azimuth + 2.3 * phase)
     blanket = rim / np.maximum(r, 0.6) ** 3 * fade * (1.0 + 0.25 * rays * np.minimum(2.0 * (r - 1.0), 1.0))
     np.testing.assert_allclose(height[outside], blanket[outside], atol=1e-6)
-    light = np.maximum(fade**2 * (1.0 + 0.5 * rays), 0.0)
-    np.testing.assert_allclose(tone[outside], 0.2 * light[outside], atol=1e-6)
+    ray_tone = np.maximum(fade**2 * (1.0 + 0.5 * rays), 0.0)
+    np.testing.assert_allclose(tone[outside], 0.2 * ray_tone[outside], atol=1e-6)
 
 
 def test_cracks_follow_periodic_voronoi_borders() -> None:
@@ -270,11 +270,11 @@ def test_cracks_follow_periodic_voronoi_borders() -> None:
     row, column = np.mgrid[:count, :count]
     positions = (points + np.stack([column, row], axis=-1)).reshape(-1, 2)
     y, x = np.mgrid[:side, :side] * spacing / cell
-    distance, number = map(
+    distance, nearest = map(
         np.asarray, cKDTree(positions, boxsize=np.full(2, float(count))).query(np.stack([x, y], axis=-1), k=2)
     )
-    between = (positions[number[..., 1]] - positions[number[..., 0]] + count / 2) % count - count / 2
-    border = 0.5 * (distance[..., 1] ** 2 - distance[..., 0] ** 2) / np.linalg.norm(between, axis=-1) * cell
+    separation = (positions[nearest[..., 1]] - positions[nearest[..., 0]] + count / 2) % count - count / 2
+    border = 0.5 * (distance[..., 1] ** 2 - distance[..., 0] ** 2) / np.linalg.norm(separation, axis=-1) * cell
     fraction = np.clip(1.0 - border / width, 0.0, None)
     # The two nearest points are within one cell on each side, except for wide cells.
     assert np.mean(np.isclose(height, -0.2 * fraction, atol=1e-6)) > 0.999
@@ -282,7 +282,7 @@ def test_cracks_follow_periodic_voronoi_borders() -> None:
 
 
 def test_dunes_finer_than_the_grid_are_sampled_directly() -> None:
-    """Features and modulation too fine for the grid are sampled directly."""
+    """Dunes and their modulation are finer than the grid spacing."""
     tiny = Dunes(wavelength_m=1.0, height_m=0.05, regularity=0.3, crest_length=0.5)
     z = synthesize_heights(make_parameters(samples=64, spacing_m=3.0, ripples=tiny))
     assert 0.0 < np.ptp(z) < 0.1

@@ -33,9 +33,9 @@ TARGET = PlacedRock(name="target", east_m=3.0, north_m=60.0, diameter_m=1.5, sha
 def ground() -> Surface:
     """A bumpy ground of 64 m with slopes up to 20 deg."""
     side, spacing = 256, 0.25
-    turn = 2 * np.pi * np.arange(side) / side
+    phase = 2 * np.pi * np.arange(side) / side
     samples = np.full((side, side, 2), 0.2, dtype=np.float32)
-    samples[..., 0] = np.sin(3 * turn)[None, :] * 0.9 + np.cos(2 * turn)[:, None] * 0.8
+    samples[..., 0] = np.sin(3 * phase)[None, :] * 0.9 + np.cos(2 * phase)[:, None] * 0.8
     return Surface.from_samples(samples, spacing)
 
 
@@ -45,7 +45,7 @@ def make_field(ground: Surface, seed: int = 1, **changes: object) -> RockField:
     return RockField.on(ground, parameters, np.random.default_rng(seed))
 
 
-def mesh_of(shapes: ShapeSet, number: int) -> trimesh.Trimesh:
+def make_mesh(shapes: ShapeSet, number: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(shapes.vertices[number], shapes.faces, process=False, validate=False)
 
 
@@ -60,7 +60,7 @@ def field(ground: Surface) -> RockField:
 def test_shapes_are_closed_and_of_unit_size(detail: int, triangles: int) -> None:
     shapes = rock_shapes(detail)
     for number in range(SHAPES):
-        mesh = mesh_of(shapes, number)
+        mesh = make_mesh(shapes, number)
         assert len(mesh.faces) == triangles
         assert mesh.is_watertight
         assert mesh.volume > 0.0
@@ -75,30 +75,30 @@ def test_finest_shapes_have_specified_height_diameter_and_normals() -> None:
     for number in range(SHAPES):
         vertices = shapes.vertices[number]
         assert vertices[:, 2].max() == pytest.approx(UNIT_HEIGHT)
-        observed = vertices[vertices[:, 2] >= 0.0, :2]
-        across = np.ptp(observed @ np.stack([np.cos(azimuth), np.sin(azimuth)]), axis=0)
-        assert (across.max() + across.min()) / 2 == pytest.approx(1.0, abs=0.005 if number < SHAPES_OF_FORM else 0.01)
+        above_ground = vertices[vertices[:, 2] >= 0.0, :2]
+        widths = np.ptp(above_ground @ np.stack([np.cos(azimuth), np.sin(azimuth)]), axis=0)
+        assert (widths.max() + widths.min()) / 2 == pytest.approx(1.0, abs=0.005 if number < SHAPES_OF_FORM else 0.01)
         # Triangles cut corners: their mean normals agree except at edges.
-        agreement = np.sum(mesh_of(shapes, number).vertex_normals * shapes.normals[number], axis=1)
+        agreement = np.sum(make_mesh(shapes, number).vertex_normals * shapes.normals[number], axis=1)
         assert np.median(agreement) > (0.999 if number < SHAPES_OF_FORM else 0.96)
 
 
 def test_shapes_are_different() -> None:
     vertices = rock_shapes(MEDIUM).vertices
-    for one in range(SHAPES):
-        for other in range(one):
-            assert np.abs(vertices[one] - vertices[other]).max() > 0.05
+    for first in range(SHAPES):
+        for second in range(first):
+            assert np.abs(vertices[first] - vertices[second]).max() > 0.05
 
 
 def _rocks_per_m2(abundance: float, smallest_m: float, largest_m: float) -> float:
-    """Number of rocks between two diameters: the covered fraction's density over the rock area, integrated."""
+    """Number of rocks between two diameters: integral of the density of covered area divided by the rock area."""
     q = decay_per_m(abundance)
     return float(quad(lambda d: abundance * q * np.exp(-q * d) / (0.25 * np.pi * d * d), smallest_m, largest_m)[0])
 
 
 @pytest.mark.parametrize("abundance", [0.02, 0.1, 0.4])
 def test_rock_sizes_follow_golombek(abundance: float) -> None:
-    """The area of rocks above each diameter matches the model within 10 %, where the number of rocks is sufficient."""
+    """The area of rocks above each diameter matches the model within 10 % or three standard deviations."""
     parameters = RockParameters(abundance=abundance, smallest_m=0.05, largest_m=10.0)
     area = 1.5e4 if abundance > 0.02 else 1.0e5
     diameters = draw_diameters(parameters, area, np.random.default_rng(3))
@@ -110,20 +110,20 @@ def test_rock_sizes_follow_golombek(abundance: float) -> None:
         expected = abundance * np.exp(-decay_per_m(abundance) * min_diameter)
         assert fraction == pytest.approx(expected, abs=max(0.1 * expected, 3 * sigma))
         if min_diameter < 0.2:
-            assert 3 * sigma < 0.1 * expected, "enough rocks for the bar of 10 %"
+            assert 3 * sigma < 0.1 * expected, "enough rocks for a tolerance of 10 %"
         number = area * _rocks_per_m2(abundance, min_diameter, 10.0)
         assert above.size == pytest.approx(number, abs=max(0.02 * number, 4 * np.sqrt(number)))
 
 
 def test_no_two_rocks_overlap(field: RockField) -> None:
-    """All neighbouring pairs, including across the border; rocks do not overlap in plan view."""
-    reach = rock_shapes(COARSE).reach[field.shape] * field.diameter_m
+    """Rocks do not overlap in plan view; neighbours across the periodic border are included."""
+    radius_m = rock_shapes(COARSE).reach[field.shape] * field.diameter_m
     tree = cKDTree(field.position_m[:, :2], boxsize=np.full(2, field.period_m))
-    pairs = tree.query_pairs(2 * reach.max(), output_type="ndarray")
-    apart = np.abs(field.position_m[pairs[:, 0], :2] - field.position_m[pairs[:, 1], :2])
-    apart = np.minimum(apart, field.period_m - apart)
+    pairs = tree.query_pairs(2 * radius_m.max(), output_type="ndarray")
+    offsets_m = np.abs(field.position_m[pairs[:, 0], :2] - field.position_m[pairs[:, 1], :2])
+    offsets_m = np.minimum(offsets_m, field.period_m - offsets_m)
     assert len(pairs) > 1000
-    assert np.all(np.hypot(*apart.T) >= reach[pairs].sum(axis=1))
+    assert np.all(np.hypot(*offsets_m.T) >= radius_m[pairs].sum(axis=1))
 
 
 def test_max_rock_density_is_reached(ground: Surface) -> None:
@@ -132,11 +132,11 @@ def test_max_rock_density_is_reached(ground: Surface) -> None:
     assert covered == pytest.approx(0.4 * np.exp(-0.06 * decay_per_m(0.4)), rel=0.1)
 
 
-def test_equal_seeds_give_equal_rocks(ground: Surface, field: RockField) -> None:
-    repeated, other = make_field(ground), make_field(ground, seed=2)
+def test_equal_seeds_produce_equal_rocks(ground: Surface, field: RockField) -> None:
+    repeated, other_seed = make_field(ground), make_field(ground, seed=2)
     for name in ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up"):
         assert getattr(field, name).tobytes() == getattr(repeated, name).tobytes()
-    assert len(other) != len(field) or not np.array_equal(other.position_m, field.position_m)
+    assert len(other_seed) != len(field) or not np.array_equal(other_seed.position_m, field.position_m)
 
 
 def test_rocks_stand_on_the_ground_along_its_normal(ground: Surface, field: RockField) -> None:
@@ -159,26 +159,26 @@ def test_placed_rock_has_its_name_and_position(ground: Surface, field: RockField
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert body.is_watertight
     # Along its vertical it rises half its diameter above the ground point.
-    along = (mesh.vertices - field.position_m[number]) @ field.up[number]
-    assert along.max() == pytest.approx(0.75)
-    assert along.min() < -0.1
+    heights_m = (mesh.vertices - field.position_m[number]) @ field.up[number]
+    assert heights_m.max() == pytest.approx(0.75)
+    assert heights_m.min() < -0.1
     with pytest.raises(KeyError, match="named rocks: target"):
         field.by_name("adirondack")
 
 
 def test_near_returns_rocks_around_a_position_in_any_period(field: RockField) -> None:
-    home = field.near(2.0, 1.0, 9.0, detail=COARSE)
-    assert set(np.unique(home.rock_of_face)) == {
+    original = field.near(2.0, 1.0, 9.0, detail=COARSE)
+    assert set(np.unique(original.rock_of_face)) == {
         n
         for n, (x, y) in enumerate(field.position_m[:, :2])
         if np.hypot((x - 2 + 32) % 64 - 32, (y - 1 + 32) % 64 - 32) <= 9.0
     }
-    away = field.near(2.0 - 64.0, 1.0 + 128.0, 9.0, detail=COARSE)
-    np.testing.assert_array_equal(away.rock_of_face, home.rock_of_face)
-    np.testing.assert_allclose(away.vertices - [-64.0, 128.0, 0.0], home.vertices, atol=1e-9)
-    assert home.faces.max() == len(home.vertices) - 1
-    assert len(home.rock_of_face) == len(home.faces)
-    np.testing.assert_allclose(np.linalg.norm(home.vertex_normals, axis=1), 1.0, atol=1e-12)
+    shifted = field.near(2.0 - 64.0, 1.0 + 128.0, 9.0, detail=COARSE)
+    np.testing.assert_array_equal(shifted.rock_of_face, original.rock_of_face)
+    np.testing.assert_allclose(shifted.vertices - [-64.0, 128.0, 0.0], original.vertices, atol=1e-9)
+    assert original.faces.max() == len(original.vertices) - 1
+    assert len(original.rock_of_face) == len(original.faces)
+    np.testing.assert_allclose(np.linalg.norm(original.vertex_normals, axis=1), 1.0, atol=1e-12)
 
 
 def test_detail_follows_apparent_size_and_small_rocks_are_omitted(field: RockField) -> None:
@@ -187,12 +187,12 @@ def test_detail_follows_apparent_size_and_small_rocks_are_omitted(field: RockFie
     assert field.diameter_m[rocks].min() >= 0.3
     assert triangles[rocks == field.by_name("target")] == 5120
     assert triangles.min() == 80
-    nothing = field.near(3.0, 58.0, 20.0, smallest_m=90.0)
-    assert nothing.faces.shape == (0, 3)
-    assert nothing.vertices.shape == (0, 3)
+    empty = field.near(3.0, 58.0, 20.0, smallest_m=90.0)
+    assert empty.faces.shape == (0, 3)
+    assert empty.vertices.shape == (0, 3)
 
 
-def test_clinker_is_rougher_than_blocks_and_has_separate_shapes(ground: Surface) -> None:
+def test_clinker_has_rougher_shapes_than_blocks(ground: Surface) -> None:
     """Angles between neighbouring triangles: the faces of a block are flat."""
     shapes = rock_shapes(FINEST)
     meshes = [trimesh.Trimesh(vertices, shapes.faces, process=False) for vertices in shapes.vertices]
@@ -212,12 +212,12 @@ def test_small_terrain_repeats_in_the_view(field: RockField) -> None:
     bodies, first, triangles = np.unique(mesh.body_of_face, return_index=True, return_counts=True)
     assert len(bodies) > 2 * len(rocks)
     assert np.all(triangles == 80)
-    for one, start in zip(bodies, first, strict=True):
-        own = mesh.faces[mesh.body_of_face == one]
+    for body, start in zip(bodies, first, strict=True):
+        faces = mesh.faces[mesh.body_of_face == body]
         number = int(mesh.rock_of_face[start])
-        away = mesh.vertices[own].mean(axis=(0, 1))[:2] - field.position_m[number, :2]
-        np.testing.assert_allclose(away - 64.0 * np.round(away / 64.0), 0.0, atol=0.3 * field.diameter_m[number])
-        assert np.all(mesh.rock_of_face[mesh.body_of_face == one] == number)
+        offset = mesh.vertices[faces].mean(axis=(0, 1))[:2] - field.position_m[number, :2]
+        np.testing.assert_allclose(offset - 64.0 * np.round(offset / 64.0), 0.0, atol=0.3 * field.diameter_m[number])
+        assert np.all(mesh.rock_of_face[mesh.body_of_face == body] == number)
 
 
 def test_faces_point_outwards(field: RockField) -> None:
@@ -244,22 +244,22 @@ def test_invalid_rocks_are_rejected(invalid: dict[str, object], message: str) ->
 def test_too_many_rocks_and_unknown_shapes_are_rejected(ground: Surface) -> None:
     with pytest.raises(ValueError, match=r"choose a larger rocks\.smallest_m"):
         draw_diameters(RockParameters(abundance=0.4, smallest_m=0.01), 1.0e6, np.random.default_rng(0))
-    strange = PlacedRock(name="strange", east_m=0.0, north_m=0.0, diameter_m=1.0, shape=99)
+    unknown = PlacedRock(name="strange", east_m=0.0, north_m=0.0, diameter_m=1.0, shape=99)
     with pytest.raises(ValueError, match="'strange' has shape 99"):
-        make_field(ground, placed=(strange,))
+        make_field(ground, placed=(unknown,))
 
 
 @pytest.mark.parametrize("number", [0, 9, 15, 16, 27, 32, 47, 50, 63, 70])
 @pytest.mark.parametrize("detail", [COARSEST, COARSE, MEDIUM, FINE])
 def test_coarse_rock_matches_the_finest_within_subpixels(number: int, detail: int) -> None:
     """Requirement: 0.25 px rms above the ground, from the plane of the nearest coarse triangle."""
-    coarse = mesh_of(rock_shapes(detail), number)
+    coarse = make_mesh(rock_shapes(detail), number)
     samples, triangles = trimesh.sample.sample_surface(coarse, 200_000, seed=1)
-    finest = trimesh.sample.sample_surface(mesh_of(rock_shapes(FINEST), number), 4_000, seed=2)[0]
+    finest = trimesh.sample.sample_surface(make_mesh(rock_shapes(FINEST), number), 4_000, seed=2)[0]
     finest = finest[finest[:, 2] > 0.0]
     nearest = cKDTree(samples).query(finest)[1]
-    away = np.sum((finest - samples[nearest]) * coarse.face_normals[triangles[nearest]], axis=1)
-    assert 0.15 < np.sqrt(np.mean(away**2)) * max_pixels()[number, detail] < 0.3
+    distances = np.sum((finest - samples[nearest]) * coarse.face_normals[triangles[nearest]], axis=1)
+    assert 0.15 < np.sqrt(np.mean(distances**2)) * max_pixels()[number, detail] < 0.3
 
 
 def test_rock_detail_follows_camera_resolution(field: RockField) -> None:
@@ -268,21 +268,21 @@ def test_rock_detail_follows_camera_resolution(field: RockField) -> None:
         mesh = field.near(32.0, 32.0, 25.0, smallest_m=0.3, above_m=1.5, pixel_rad=pixel_rad)
         for rock, count in zip(*np.unique(mesh.rock_of_face, return_counts=True), strict=True):
             detail = faces.index(int(count))
-            away = np.hypot(np.hypot(*(field.position_m[rock, :2] - 32.0)), 1.5)
-            across_px = field.diameter_m[rock] / (away - 0.5 * field.diameter_m[rock]) / pixel_rad
-            held = np.concatenate([[0.0], max_pixels()[field.shape[rock]], [np.inf]])
-            assert held[detail] < across_px <= held[detail + 1]
+            distance = np.hypot(np.hypot(*(field.position_m[rock, :2] - 32.0)), 1.5)
+            diameter_px = field.diameter_m[rock] / (distance - 0.5 * field.diameter_m[rock]) / pixel_rad
+            thresholds = np.concatenate([[0.0], max_pixels()[field.shape[rock]], [np.inf]])
+            assert thresholds[detail] < diameter_px <= thresholds[detail + 1]
 
 
 def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
-    clear = [function.cache_clear for function in (rock_shapes, max_pixels, shapes._vertices, shapes._reach)]
+    cache_clears = [function.cache_clear for function in (rock_shapes, max_pixels, shapes._vertices, shapes._reach)]
     results = []
     for _ in range(2):
-        for clear_one in clear:
-            clear_one()
-        one = rock_shapes(COARSE)
-        results.append([one.vertices, one.normals, one.reach, max_pixels()])
+        for clear_cache in cache_clears:
+            clear_cache()
+        coarse = rock_shapes(COARSE)
+        results.append([coarse.vertices, coarse.normals, coarse.reach, max_pixels()])
         files = sorted((tmp_path / "terrain").glob("rocks-*.npy"))
     # Vertices of five levels, normals of two, sizes in pixels.
     assert len(files) == 8

@@ -1,4 +1,4 @@
-"""Tests of sites: statistics against the field test paper (section III.A), as by `marsyard terrain stats`."""
+"""Tests of sites: terrain statistics against the field test paper (section III.A), environment and parameters."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +17,7 @@ NAMES = (*FIELD, *MARS, "mars-yard", "heli-benign", "heli-hazardous")
 
 
 @pytest.fixture(scope="module")
-def measured() -> dict[str, TerrainStatistics]:
+def site_statistics() -> dict[str, TerrainStatistics]:
     """Statistics of the full extent of 6 km at half the post density, which reduces run time."""
     result = {}
     for name in (*FIELD, *MARS):
@@ -36,8 +36,8 @@ def test_all_sites_exist() -> None:
 
 
 @pytest.mark.parametrize("name", FIELD + MARS)
-def test_albedo_and_slopes_match_the_paper(name: str, measured: dict[str, TerrainStatistics]) -> None:
-    paper, figures = PAPER[name], measured[name]
+def test_albedo_and_slopes_match_the_paper(name: str, site_statistics: dict[str, TerrainStatistics]) -> None:
+    paper, figures = PAPER[name], site_statistics[name]
     assert paper.albedo[0] - 1e-6 <= figures.albedo <= paper.albedo[1] + 1e-6
     min_value, max_value = paper.mean_slope_deg
     assert min_value <= figures.mean_slope_30_m_deg <= max_value
@@ -46,7 +46,7 @@ def test_albedo_and_slopes_match_the_paper(name: str, measured: dict[str, Terrai
 
 @pytest.mark.parametrize("name", ["pisgah", "gusev", "meridiani"])
 def test_small_bank_terrains_match_the_paper(name: str) -> None:
-    """2048 samples 2 m apart, 44 MB on disk instead of 178 MB: for banks of hundreds of terrains."""
+    """2048 samples with 2 m spacing need 44 MB on disk instead of 178 MB, for banks of hundreds of terrains."""
     figures = terrain_statistics(
         synthesise(site(name).terrain("descent", {"samples": 2048, "spacing_m": 2.0}), np.random.default_rng(2))
     )
@@ -55,11 +55,11 @@ def test_small_bank_terrains_match_the_paper(name: str) -> None:
     assert min_value <= figures.mean_slope_90_m_deg <= max_value
 
 
-def test_kelso_rises_over_200_m_and_ivanpah_is_the_flattest(measured: dict[str, TerrainStatistics]) -> None:
-    assert measured["kelso"].relief_m > 200.0
-    for other in ("pisgah", "kelso"):
-        assert measured["ivanpah"].mean_slope_30_m_deg < measured[other].mean_slope_30_m_deg
-        assert measured["ivanpah"].mean_slope_90_m_deg < measured[other].mean_slope_90_m_deg
+def test_kelso_rises_over_200_m_and_ivanpah_is_the_flattest(site_statistics: dict[str, TerrainStatistics]) -> None:
+    assert site_statistics["kelso"].relief_m > 200.0
+    for other_site in ("pisgah", "kelso"):
+        assert site_statistics["ivanpah"].mean_slope_30_m_deg < site_statistics[other_site].mean_slope_30_m_deg
+        assert site_statistics["ivanpah"].mean_slope_90_m_deg < site_statistics[other_site].mean_slope_90_m_deg
 
 
 def _median_contrast(name: str) -> float:
@@ -70,8 +70,8 @@ def _median_contrast(name: str) -> float:
     )
 
 
-def test_contrast_at_pisgah_is_at_most_that_at_the_mars_sites() -> None:
-    """'Similar to contrast measured on descent images synthesized' from MOC, which is a lower limit: half to all."""
+def test_contrast_of_pisgah_is_below_that_of_the_mars_sites() -> None:
+    """The paper: "similar to contrast measured on descent images synthesized" from MOC, which is a lower limit."""
     pisgah = _median_contrast("pisgah")
     assert pisgah < 0.1
     for name in MARS:
@@ -79,12 +79,12 @@ def test_contrast_at_pisgah_is_at_most_that_at_the_mars_sites() -> None:
 
 
 def test_sites_have_complete_parameters() -> None:
-    for one in sites().values():
-        assert one.descent is not None or one.ground is not None
-        assert one.ground_texture.amplitudes
-        assert one.rock_texture.amplitudes
-        finest = one.ground_texture.coarsest_m / 2 ** (len(one.ground_texture.amplitudes) - 1)
-        assert finest < 0.002, "texture reaches a millimetre"
+    for parameters in sites().values():
+        assert parameters.descent is not None or parameters.ground is not None
+        assert parameters.ground_texture.amplitudes
+        assert parameters.rock_texture.amplitudes
+        finest_m = parameters.ground_texture.coarsest_m / 2 ** (len(parameters.ground_texture.amplitudes) - 1)
+        assert finest_m < 0.002, "texture has details of a millimetre"
     for name in FIELD + MARS:
         assert site(name).terrain().spacing_m == 1.5
         assert site(name).terrain("ground").spacing_m == 0.025
@@ -96,7 +96,7 @@ def test_sites_have_complete_parameters() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_site_grounds_can_be_built_with_rocks(name: str) -> None:
-    """A sixteenth of the extent in each direction keeps the posts and rocks."""
+    """A smaller extent with the same rocks reduces the run time."""
     parameters = site(name).terrain("ground")
     scale = {"samples": 512} if name != "kelso" else {"samples": 1024, "spacing_m": 0.1}
     surface = synthesise(parameters.model_copy(update=scale), np.random.default_rng(1))
@@ -106,20 +106,20 @@ def test_site_grounds_can_be_built_with_rocks(name: str) -> None:
         assert len(field) > 0
 
 
-def test_mean_slope_of_a_plane_wave_and_of_a_part() -> None:
+def test_mean_slope_of_a_sine_wave_and_of_a_part_of_it() -> None:
     side, spacing = 256, 2.0
     samples = np.full((side, side, 2), 0.2, dtype=np.float32)
-    turn = 2 * np.pi * np.arange(side) / side
-    samples[..., 0] = 10.0 * np.sin(2 * turn)[None, :]
+    phase = 2 * np.pi * np.arange(side) / side
+    samples[..., 0] = 10.0 * np.sin(2 * phase)[None, :]
     surface = Surface.from_samples(samples, spacing)
-    # The mean absolute slope of a sine is 2 / pi of its maximum, and zero across it.
+    # The mean absolute slope of a sine is 2 / pi of its maximum; along its crests the slope is zero.
     steepest = 10.0 * 2 * 2 * np.pi / 512
     assert mean_slope_deg(surface, 16.0) == pytest.approx(np.degrees(steepest * 2 / np.pi) / 2, rel=0.02)
     # Near the crossing at x = 256 m the slope is maximal along the complete line.
-    part_of = np.zeros((side, side), dtype=np.bool_)
-    part_of[:251, 123:134] = True
-    part = mean_slope_deg(surface, 4.0, part_of)
-    assert part == pytest.approx(np.degrees(np.arctan(steepest)) / 2, rel=0.02)
+    is_included = np.zeros((side, side), dtype=np.bool_)
+    is_included[:251, 123:134] = True
+    part_slope_deg = mean_slope_deg(surface, 4.0, is_included)
+    assert part_slope_deg == pytest.approx(np.degrees(np.arctan(steepest)) / 2, rel=0.02)
     assert np.isnan(mean_slope_deg(surface, 300.0))
 
 
@@ -130,18 +130,18 @@ def test_contrast_of_checkered_level_ground_equals_albedo_contrast() -> None:
     assert image_contrast(Surface.from_samples(samples, 6.5), 6.5) == pytest.approx(1 / 3, rel=1e-6)
 
 
-def test_light_of_the_sky_grows_with_dust() -> None:
+def test_sky_light_increases_with_dust() -> None:
     high = np.radians(45.0)
-    shares = [Environment(optical_depth=tau).sky_share(high) for tau in (0.0, 0.2, 0.5, 0.9)]
-    assert shares[0] == 0.0
-    assert all(a < b for a, b in pairwise(shares))
+    fractions = [Environment(optical_depth=tau).sky_share(high) for tau in (0.0, 0.2, 0.5, 0.9)]
+    assert fractions[0] == 0.0
+    assert all(a < b for a, b in pairwise(fractions))
     assert Environment(optical_depth=0.0).direct_share(high) == 1.0
     # Without absorption and with isotropic scattering Eddington's approximation has a closed form. Over black ground
     # the transmitted fraction is (2 + 3 mu + (2 - 3 mu) exp(-tau / mu)) / (4 + 3 tau) (Shettle & Weinman 1970).
-    clear = Environment(optical_depth=1.0, single_scattering_albedo=0.9999999, asymmetry=0.0)
+    conservative = Environment(optical_depth=1.0, single_scattering_albedo=0.9999999, asymmetry=0.0)
     for mu in (1.0, 0.5):
         sun = np.arcsin(mu)
-        total = clear.direct_share(sun) * (mu + clear.sky_share(sun)) / mu
+        total = conservative.direct_share(sun) * (mu + conservative.sky_share(sun)) / mu
         expected = (2 + 3 * mu + (2 - 3 * mu) * np.exp(-1.0 / mu)) / (4 + 3)
         assert total == pytest.approx(expected, abs=1e-4)
 
@@ -160,16 +160,16 @@ def test_terrain_with_landforms_is_read_from_a_file() -> None:
 
 
 def test_site_terrain_can_be_partly_changed() -> None:
-    before = site("gusev").terrain("ground")
-    after = site("gusev").terrain("ground", {"samples": 512, "rocks": {"abundance": 0.2}, "ripples": None})
-    assert before.rocks is not None
-    assert after.rocks is not None
-    assert (after.samples, after.rocks.abundance, after.ripples) == (512, 0.2, None)
-    assert after.rocks.model_copy(update={"abundance": before.rocks.abundance}) == before.rocks
-    assert after.albedo == before.albedo
-    made = site("gusev").terrain("descent", {"dunes": {"wavelength_m": 40.0}})
-    assert made.dunes is not None
-    assert made.dunes.wavelength_m == 40.0
+    default = site("gusev").terrain("ground")
+    changed = site("gusev").terrain("ground", {"samples": 512, "rocks": {"abundance": 0.2}, "ripples": None})
+    assert default.rocks is not None
+    assert changed.rocks is not None
+    assert (changed.samples, changed.rocks.abundance, changed.ripples) == (512, 0.2, None)
+    assert changed.rocks.model_copy(update={"abundance": default.rocks.abundance}) == default.rocks
+    assert changed.albedo == default.albedo
+    with_dunes = site("gusev").terrain("descent", {"dunes": {"wavelength_m": 40.0}})
+    assert with_dunes.dunes is not None
+    assert with_dunes.dunes.wavelength_m == 40.0
     assert site("gusev").terrain("descent", {}) == site("gusev").descent
 
 
@@ -189,7 +189,7 @@ def test_change_errors_are_reported(changes: dict[str, object], message: str) ->
         site("gusev").terrain("descent", changes)
 
 
-def test_imported_terrain_lies_in_a_site_surround(shared_data: Path) -> None:
+def test_imported_terrain_replaces_the_relief_of_a_site(shared_data: Path) -> None:
     """The HiRISE tile can replace a preset: heights of the file, rocks and roughness of the site."""
     tile = shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz"
     changes = {"samples": 512, "spacing_m": 1.0, "source": {"dtm": tile, "ortho_east_m": 2.0, "ortho_north_m": -1.0}}
@@ -202,13 +202,13 @@ def test_imported_terrain_lies_in_a_site_surround(shared_data: Path) -> None:
     assert len(RockField.on(surface, parameters.rocks, np.random.default_rng(1))) > 0
 
 
-def test_the_suns_disc_shrinks_with_distance() -> None:
-    # 0.0093 rad across at 1 AU, 0.35 deg at the mean distance of Mars.
+def test_solar_disc_is_smaller_at_mars() -> None:
+    # Diameter: 0.0093 rad at 1 au, 0.35 deg at the mean distance of Mars.
     assert site("kelso").environment.sun_radius_rad == pytest.approx(0.00465)
     assert np.degrees(2.0 * site("gusev").environment.sun_radius_rad) == pytest.approx(0.35, abs=0.01)
 
 
-def test_relief_is_measured_on_the_surface() -> None:
+def test_relief_is_that_of_the_spline_surface() -> None:
     """A chequerboard of control values of +1 and -1 m is +1/9 and -1/9 m at the knots: (4 - 2)**2 / 36."""
     samples = np.full((32, 32, 2), 0.2, dtype=np.float32)
     rows, columns = np.indices((32, 32))

@@ -1,4 +1,4 @@
-"""Tests of terrain surfaces against SciPy's cubic B-spline."""
+"""Tests of terrain surfaces: height, gradient and levels against SciPy's cubic B-spline, and bounds of the height."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def surface() -> Surface:
 
 
 @pytest.fixture(scope="module")
-def places() -> tuple[np.ndarray, np.ndarray]:
+def positions() -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(6)
     # Several periods to each side: the ground is periodic.
     return rng.uniform(-500.0, 500.0, 400), rng.uniform(-500.0, 500.0, 400)
@@ -23,9 +23,9 @@ def places() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_height_matches_scipy_cubic_b_spline(
-    surface: Surface, places: tuple[np.ndarray, np.ndarray], level: int
+    surface: Surface, positions: tuple[np.ndarray, np.ndarray], level: int
 ) -> None:
-    x, y = places
+    x, y = positions
     spacing = surface.spacing_m * 2**level
     for channel, actual in ((0, surface.height(x, y, level)), (1, surface.albedo(x, y, level))):
         control = surface.levels[level][..., channel].astype(np.float64)
@@ -33,8 +33,8 @@ def test_height_matches_scipy_cubic_b_spline(
         np.testing.assert_allclose(actual, expected, atol=1e-12)
 
 
-def test_gradient_is_the_derivative_of_height(surface: Surface, places: tuple[np.ndarray, np.ndarray]) -> None:
-    x, y = places
+def test_gradient_is_the_derivative_of_height(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
+    x, y = positions
     # Central differences of a piecewise cubic: the error is h^2/6 times a third derivative of order 1.
     step = 1e-4
     along_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
@@ -44,22 +44,23 @@ def test_gradient_is_the_derivative_of_height(surface: Surface, places: tuple[np
 
 @pytest.mark.parametrize("level", [0, 2])
 def test_ceilings_bound_the_height(surface: Surface, level: int) -> None:
-    """At most the maximum control value around a block, and at most the global maximum."""
+    """The ceiling of a block is the maximum control value around it; no height in the block exceeds it."""
     ceiling, spacing = surface.ceilings[level], surface.spacing_m * 2.0**level
     block = CEILING_BLOCK * spacing
     x, y = np.random.default_rng(7).uniform(-surface.period_m, 2.0 * surface.period_m, (2, 40000))
-    a, b = (np.floor(each / block).astype(int) % len(ceiling) for each in (y, x))
+    a, b = (np.floor(coordinate / block).astype(int) % len(ceiling) for coordinate in (y, x))
     assert np.all(surface.height(x, y, level) <= ceiling[a, b])
     samples = surface.levels[level][..., 0]
     for row, column in ((0, 0), (3, 1), (len(ceiling) - 1, 2)):
-        around = [
-            np.arange(CEILING_BLOCK * one - 1, CEILING_BLOCK * (one + 1) + 2) % len(samples) for one in (row, column)
+        indices = [
+            np.arange(CEILING_BLOCK * index - 1, CEILING_BLOCK * (index + 1) + 2) % len(samples)
+            for index in (row, column)
         ]
-        assert ceiling[row, column] == samples[np.ix_(*around)].max()
+        assert ceiling[row, column] == samples[np.ix_(*indices)].max()
 
 
-def test_surface_is_periodic(surface: Surface, places: tuple[np.ndarray, np.ndarray]) -> None:
-    x, y = places
+def test_surface_is_periodic(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
+    x, y = positions
     np.testing.assert_allclose(
         surface.height(x + surface.period_m, y - 2 * surface.period_m), surface.height(x, y), atol=1e-11
     )

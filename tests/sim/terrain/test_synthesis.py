@@ -10,17 +10,17 @@ from marsyard.sim.terrain.landforms.kernels import stamp_craters
 from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
 
 
-def test_equal_streams_give_equal_bytes() -> None:
+def test_equal_seeds_produce_equal_bytes() -> None:
     parameters = TerrainParameters(samples=128)
     first = synthesise(parameters, np.random.default_rng(3))
     repeated = synthesise(parameters, np.random.default_rng(3))
-    other = synthesise(parameters, np.random.default_rng(4))
+    other_seed = synthesise(parameters, np.random.default_rng(4))
     for a, b in zip(first.levels, repeated.levels, strict=True):
         assert a.tobytes() == b.tobytes()
-    assert first.levels[0].tobytes() != other.levels[0].tobytes()
+    assert first.levels[0].tobytes() != other_seed.levels[0].tobytes()
 
 
-def test_mean_variance_matches_expectation() -> None:
+def test_mean_variance_of_random_fields_is_the_specified_one() -> None:
     # 200 draws of about ten independent large-scale modes each determine the mean variance to about 3 %.
     spectrum = Spectrum.power_law(128, 1.0, 0.5, 60.0)
     variances = [spectrum.field(np.random.default_rng(seed), 2.0).var() for seed in range(200)]
@@ -67,11 +67,11 @@ def test_crater_sizes_follow_the_power_law() -> None:
     assert diameters.max() <= parameters.crater_diameter_max_m
 
 
-def test_crater_depths_run_from_degraded_to_fresh() -> None:
+def test_crater_depths_range_from_degraded_to_fresh() -> None:
     craters = draw_craters(TerrainParameters(craters_per_km2=100.0), np.random.default_rng(3))
-    from_rim_to_floor = (craters[:, 3] + craters[:, 4]) / (2.0 * craters[:, 2])
-    assert from_rim_to_floor.min() == pytest.approx(DEGRADED_DEPTH, rel=0.02)
-    assert from_rim_to_floor.max() == pytest.approx(FRESH_DEPTH, rel=0.02)
+    depth_ratio = (craters[:, 3] + craters[:, 4]) / (2.0 * craters[:, 2])
+    assert depth_ratio.min() == pytest.approx(DEGRADED_DEPTH, rel=0.02)
+    assert depth_ratio.max() == pytest.approx(FRESH_DEPTH, rel=0.02)
 
 
 def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:

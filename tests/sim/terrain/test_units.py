@@ -39,7 +39,7 @@ def _make_parameters(**changes: Any) -> TerrainParameters:
     return TerrainParameters.model_validate({**settings, **changes})
 
 
-def test_areas_factors_and_tones_are_as_stated() -> None:
+def test_units_have_the_specified_areas_factors_and_tones() -> None:
     """With sharp boundaries and fixed areas, each unit has its area, its factors and its albedo."""
     ground, cover = _apply(_make_units(concentration=1e6))
     for kind in KINDS:
@@ -65,19 +65,19 @@ def test_patches_are_longer_along_the_wind() -> None:
     assert along_x > 1.2 * along_y
 
 
-def test_ground_with_units_is_textured_unevenly() -> None:
+def test_units_make_the_texture_patchy() -> None:
     def patchiness(parameters: TerrainParameters) -> float:
         tone = np.log(synthesise(parameters, np.random.default_rng(3)).levels[0][..., 1].astype(float))
         blocks = tone.reshape(32, 16, 32, 16).std(axis=(1, 3))
         return float(np.percentile(blocks, 90) / np.percentile(blocks, 10))
 
-    even = patchiness(_make_parameters())
-    uneven = patchiness(_make_parameters(units=_make_units(boundary=0.2)))
-    assert even < 2.3
-    assert uneven > 1.5 * even
+    without_units = patchiness(_make_parameters())
+    with_units = patchiness(_make_parameters(units=_make_units(boundary=0.2)))
+    assert without_units < 2.3
+    assert with_units > 1.5 * without_units
 
 
-def test_split_field_is_the_same_field() -> None:
+def test_sum_of_split_field_equals_the_field() -> None:
     spectrum = Spectrum.power_law(128, 1.0, 0.4, 60.0)
     coarse, fine = spectrum.split_field(np.random.default_rng(2), 1.5, 20.0)
     np.testing.assert_allclose(coarse + fine, spectrum.field(np.random.default_rng(2), 1.5), atol=1e-5)
@@ -112,7 +112,7 @@ def test_crater_floor_has_its_tone() -> None:
     assert not tone[np.hypot(*(np.mgrid[:128, :128] - 64.0)) > 34.0].any()
 
 
-def test_craters_smooth_their_floor_and_roughen_their_ejecta() -> None:
+def test_crater_floors_are_smoother_and_ejecta_rougher() -> None:
     factors = np.ones((64, 64), dtype=np.float32)
     stamp_cover(factors, 1.0, np.array([[32.0, 32.0, 10.0, 0.4, 1.8]]), 2.0)
     assert factors[32, 32] == pytest.approx(0.4)
@@ -137,29 +137,29 @@ def test_dust_devil_tracks_are_darker() -> None:
     assert 0.02 < np.mean(ground.tone < -0.02) < 0.9
 
 
-def test_rocks_follow_their_density_and_keep_the_abundance() -> None:
+def test_rocks_follow_the_density_of_units_with_the_same_total() -> None:
     surface = synthesise(_make_parameters(samples=256, spacing_m=0.5, units=_make_units()), np.random.default_rng(4))
     parameters = RockParameters(abundance=0.005, smallest_m=0.02)  # so few that they rarely overlap
     rocks = RockField.on(surface, parameters, np.random.default_rng(2))
-    bare = RockField.on(Surface(surface.levels, surface.spacing_m), parameters, np.random.default_rng(2))
-    assert len(rocks) == len(bare)
+    uniform_rocks = RockField.on(Surface(surface.levels, surface.spacing_m), parameters, np.random.default_rng(2))
+    assert len(rocks) == len(uniform_rocks)
     side = len(surface.cover)
     cell = (rocks.position_m[:, :2] / surface.period_m * side).astype(int) % side
     density = surface.cover[..., ROCKS]
-    dense = density[cell[:, 1], cell[:, 0]] > 1.0
+    is_dense = density[cell[:, 1], cell[:, 0]] > 1.0
     expected = float(density[density > 1.0].sum() / density.sum())
-    assert dense.mean() == pytest.approx(expected, abs=4.0 * np.sqrt(expected * (1.0 - expected) / len(rocks)))
+    assert is_dense.mean() == pytest.approx(expected, abs=4.0 * np.sqrt(expected * (1.0 - expected) / len(rocks)))
 
 
-def test_forms_are_mixed_as_stated_and_albedo_keeps_its_mean() -> None:
+def test_rock_forms_have_the_specified_fractions() -> None:
     surface = synthesise(_make_parameters(samples=128, spacing_m=0.5), np.random.default_rng(4))
     parameters = RockParameters(abundance=0.1, smallest_m=0.05, forms=RockForms(block=3.0, slab=1.0), albedo_spread=0.3)
     rocks = RockField.on(surface, parameters, np.random.default_rng(2))
-    slab = rocks.shape // 16 == 3
+    is_slab = rocks.shape // 16 == 3
     assert set(np.unique(rocks.shape // 16)) == {0, 3}
-    assert slab.mean() == pytest.approx(0.25, abs=0.02)
+    assert is_slab.mean() == pytest.approx(0.25, abs=0.02)
     ratio = rocks.height_m / rocks.diameter_m
-    assert ratio[slab].mean() == pytest.approx(0.35 * ratio[~slab].mean(), rel=0.05)
+    assert ratio[is_slab].mean() == pytest.approx(0.35 * ratio[~is_slab].mean(), rel=0.05)
     assert rocks.albedo.mean() == pytest.approx(1.0, abs=0.02)
     assert np.log(rocks.albedo).std() == pytest.approx(0.3, rel=0.05)
 
