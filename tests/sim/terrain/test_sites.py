@@ -70,7 +70,7 @@ def _median_contrast(name: str) -> float:
     )
 
 
-def test_contrast_at_pisgah_is_at_most_that_at_the_mars_sites() -> None:
+def test_contrast_at_pisgah_does_not_exceed_that_at_the_mars_sites() -> None:
     """'Similar to contrast measured on descent images synthesized' from MOC, which is a lower limit: half to all."""
     pisgah = _median_contrast("pisgah")
     assert pisgah < 0.1
