@@ -308,5 +308,6 @@ def _import_site(source: RealTerrain, _changed_ns: int) -> Site:
         "description": f"terrain model {source.dtm} with the light of {LIGHT_PRESET}",
         "descent": terrain,
         "ground": terrain,
+        "hills": (),
     }
     return site(LIGHT_PRESET).model_copy(update=changes)

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.scenarios.horizon import hill_objects
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
 from marsyard.sim.render.kernels.structs import MicroRelief
@@ -133,12 +134,16 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
     horizon = float(np.sqrt(2.0 * _MARS_RADIUS_M * eye.height_m))
     reach = max(_MESH_REACH_HEIGHTS * eye.height_m, _MESH_REACH_M, min(horizon, eye.reach_m))
     half = int(np.ceil(np.arcsinh(reach / finest * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
+    objects = select_rocks(ground, eye, reach)
+    if ground.site.hills and np.isinf(eye.reach_m) and eye.height_m < _LOW_M:
+        mean_m = float(ground.surface.levels[-1][..., 0].mean())
+        objects = Objects.join([objects, hill_objects(ground.site.hills, mean_m, ground.terrain.albedo)])
     return Scene(
         ground.surface,
         (eye.east_m, eye.north_m),
         sun,
         ground.photometry(sun),
-        objects=select_rocks(ground, eye, reach),
+        objects=objects,
         relief=micro_relief(ground),
         ground_texture=Texture(ground.site.ground_texture.coarsest_m, ground.site.ground_texture.amplitudes),
         object_texture=Texture(ground.site.rock_texture.coarsest_m, ground.site.rock_texture.amplitudes),
@@ -228,20 +233,24 @@ def _pixel_of_detail_rad(field: RockField, eye: Eye) -> float:
 
 @dataclass(frozen=True)
 class Stance:
-    """Typical terrain scale, height above the ground, and elevation of the optical axis of a camera."""
+    """Typical terrain scale, height above the ground, and elevation of the optical axis of a camera.
+
+    `on_rover_m` is the position of a camera that is fixed to a rover's body, in the rover's frame; None for others.
+    """
 
     scale: Scale
     height_m: float
     elevation_deg: float
+    on_rover_m: tuple[float, float, float] | None = None
 
 
 #: Typical stances of the cameras of `marsyard.sim.sensor.PRESETS`: first image of a descent, masts of 1.5 m, MER's
-#: hazcams 0.53 m above the ground (Maki et al. 2003), a helicopter at 10 m.
+#: hazcams 0.53 m above the ground (Maki et al. 2003) at the front of the body, a helicopter at 10 m.
 STANCES: Mapping[str, Stance] = {
     "mer-descent-flown": Stance("descent", 2000.0, -90.0),
     "mer-descent-field": Stance("descent", 2000.0, -90.0),
     "mer-navcam": Stance("ground", 1.5, -18.0),
-    "mer-hazcam": Stance("ground", 0.53, -40.0),
+    "mer-hazcam": Stance("ground", 0.53, -40.0, (0.55, 0.0, 0.53)),
     "research-navcam": Stance("ground", 1.5, -13.0),
     "research-pancam": Stance("ground", 1.5, -5.0),
     "xc-55": Stance("ground", 10.0, -90.0),

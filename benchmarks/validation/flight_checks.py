@@ -10,7 +10,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+import marsyard
 from benchmarks.validation.records import Check, Measure
+from marsyard.algorithms.dimes.details import TRACK_COLUMNS
 from marsyard.cli.pictures import ImageRequest, render_images
 from marsyard.sim.image_statistics import ImageStatistics, compute_image_statistics
 
@@ -64,7 +66,36 @@ def run_mast(quick: bool) -> Iterator[Measure]:
         yield Measure(f"{claim}, upper bound", contrast, "", 0.075, how)
 
 
+#: Extremes over the four DIMES templates of Spirit's descent images: peak width, px, and second peak over first peak.
+FLOWN_WIDTHS_PX, FLOWN_SECOND_PEAKS = (3.3, 15.6), (0.40, 0.82)
+#: 95 % interval of the fraction of refused templates by Clopper and Pearson: one of four was refused.
+FLOWN_REFUSED = (0.006, 0.806)
+
+
+def run_templates(quick: bool) -> Iterator[Measure]:
+    """Compare the correlation peaks of DIMES' templates in `dimes-gusev` with those of the four flown templates."""
+    campaign = marsyard.load_campaign("dimes-gusev", {"location.bank": 8})
+    products = [marsyard.run_case(campaign, case).products for case in range(1, 4 if quick else 41)]
+    tracks = np.concatenate([product["tracks"] for product in products if "tracks" in product])
+    width, second, valid = (
+        tracks[:, TRACK_COLUMNS.index(name)] for name in ("peak_width", "second_peak_ratio", "valid")
+    )
+    how = f"{len(tracks)} templates of {len(products)} cases of dimes-gusev; Spirit: four templates"
+    for name, values, (low, high) in (
+        ("width of the correlation peak, px", width, FLOWN_WIDTHS_PX),
+        ("second peak over first peak", second, FLOWN_SECOND_PEAKS),
+    ):
+        low_5, middle, high_95 = np.percentile(values, (5.0, 50.0, 95.0))
+        text = f"{how}; median {middle:.2g}, 5 to 95 % {low_5:.2g} to {high_95:.2g}"
+        yield Measure(f"{name}: smallest", float(values.min()), "", low, text)
+        yield Measure(f"{name}: largest", float(values.max()), "", high, text, "at least")
+    refused = float(np.mean(valid == 0.0))
+    yield Measure("refused templates", refused, "", FLOWN_REFUSED[1], f"{how}, one refused")
+    yield Measure("refused templates, lower bound", refused, "", FLOWN_REFUSED[0], f"{how}, one refused", "at least")
+
+
 CHECKS = (
     Check("flight", "The world against pictures from Mars: descents", run_descent),
+    Check("flight-templates", "The world against pictures from Mars: templates of DIMES", run_templates),
     Check("flight-mast", "The world against pictures from Mars: masts", run_mast),
 )

@@ -28,8 +28,8 @@ from marsyard.sim.terrain import Surface
 EQUAL = 0.01
 #: Pixels about a shadow's edge that are left out of the comparison of radiance.
 EDGE_PX = 1
-#: Samples of the terrain per vertex of the mesh.
-FINER = 5
+#: Vertices of the mesh per sample of the terrain: at 5, its linear normals alone differ by 1 % under a sun at 10 deg.
+FINER = 9
 
 
 def ground_mesh(

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from marsyard.cli.pictures import ImageRequest, render_images
 from marsyard.reports.campaign import page_environment
-from marsyard.sim.terrain import sites
+from marsyard.scenarios.terrain_files import SUFFIXES, is_terrain_file, load_site
 
 Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]
 
@@ -49,6 +49,8 @@ VIEWS: Sequence[tuple[str, str, dict[str, Any]]] = (
     ("heli-hazardous", "xc-55", {"sun_azimuth_deg": 140.0, "sun_elevation_deg": 45.0}),
     ("heli-hazardous", "xc-55", {"altitude_m": 30.0, "sun_azimuth_deg": 140.0, "sun_elevation_deg": 30.0}),
 )
+#: Camera and altitude of the images of DTM files.
+TERRAIN_CAMERA, TERRAIN_ALTITUDE_M = "mer-descent-flown", 500.0
 
 
 @dataclass(frozen=True)
@@ -70,8 +72,13 @@ class GalleryImage:
         )
 
 
-def render_gallery(folder: Path, overwrite: bool) -> Path:
-    """Render all views and write the gallery; return the path of the page. Raises ValueError."""
+def render_gallery(folder: Path, overwrite: bool, terrain_files: Sequence[Path] = ()) -> Path:
+    """Render all views, and DTM files; write the gallery and return the path of the page. Raises ValueError."""
+    requests = [ImageRequest.from_defaults(site, camera, **settings) for site, camera, settings in VIEWS]
+    for file in terrain_files:
+        if not is_terrain_file(str(file)):
+            raise ValueError(f"--terrain {file} is not a DTM file; allowed: {', '.join(SUFFIXES)}")
+        requests.append(ImageRequest.from_defaults(str(file), TERRAIN_CAMERA, altitude_m=TERRAIN_ALTITUDE_M))
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {folder} is a file; a folder is needed")
     existing = [folder / name for name in (PAGE, SHEET) if (folder / name).exists()]
@@ -81,9 +88,9 @@ def render_gallery(folder: Path, overwrite: bool) -> Path:
     if not os.access(parent, os.W_OK):
         raise ValueError(f"--out {folder}: the folder {parent} is not writable")
     images = []
-    for number, (site, camera, settings) in enumerate(VIEWS, start=1):
-        typer.echo(f"{number} of {len(VIEWS)}: {site}, {camera}", err=True)
-        images.append(render_gallery_image(number, ImageRequest.from_defaults(site, camera, **settings)))
+    for number, request in enumerate(requests, start=1):
+        typer.echo(f"{number} of {len(requests)}: {request.site}, {request.camera}", err=True)
+        images.append(render_gallery_image(number, request))
     return write_gallery(images, folder)
 
 
@@ -94,7 +101,7 @@ def render_gallery_image(number: int, request: ImageRequest) -> GalleryImage:
         raise ValueError("an image without detector counts cannot be displayed")
     signal = np.clip(image.counts - image.auto_exposure.detector.parameters.offset_dn, 0.0, None)
     grey = map_to_grey(signal, np.isfinite(image.frame.range_m))
-    return GalleryImage(request, grey, f"{number:02d}-{request.site}-{request.camera}.jpg")
+    return GalleryImage(request, grey, f"{number:02d}-{Path(request.site).name}-{request.camera}.jpg")
 
 
 def map_to_grey(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarray, "rows columns"]) -> Grey:
@@ -126,13 +133,13 @@ def write_gallery(images: Sequence[GalleryImage], folder: Path) -> Path:
             f"marsyard render {s.site} --camera {s.camera} --scale {s.scale} --altitude {s.altitude_m:g} "
             f"--east {s.east_m:g} --north {s.north_m:g} "
             f"--azimuth {s.azimuth_deg:g} --elevation {s.elevation_deg:g} --sun-azimuth {s.sun_azimuth_deg:g} "
-            f"--sun-elevation {s.sun_elevation_deg:g} --out {s.site}"
+            f"--sun-elevation {s.sun_elevation_deg:g} --out {Path(s.site).stem}"
         )
         values = {"file": image.file, "columns": columns, "rows": rows, "caption": image.caption, "command": command}
         source = f"data:image/jpeg;base64,{base64.b64encode(inline).decode()}"
         groups.setdefault(s.site, []).append({"source": source, **values})
     (folder / SHEET).write_bytes(draw_contact_sheet(images))
-    site_images = [(sites()[name], entries) for name, entries in groups.items()]
+    site_images = [(load_site(name), entries) for name, entries in groups.items()]
     page = page_environment().get_template("gallery.html.j2").render(groups=site_images, version=version("marsyard"))
     (folder / PAGE).write_text(page, encoding="utf-8")
     return folder / PAGE
@@ -152,7 +159,7 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
         first = (height - cropped_height) // 3  # crop more rows at the bottom: the horizon is in the upper part
         cell = cv2.resize(image.grey[first : first + cropped_height], CELL_PX, interpolation=cv2.INTER_AREA)
         sheet[top : top + cell_height, left : left + cell_width] = cell
-        label = f"{image.request.site}  {image.request.camera}  {image.request.altitude_m:g} m"
+        label = f"{Path(image.request.site).name}  {image.request.camera}  {image.request.altitude_m:g} m"
         position = (left + 1, top + cell_height + LABEL_PX - 8)
         cv2.putText(sheet, label, position, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 235, 1, cv2.LINE_AA)
     encoded = b""

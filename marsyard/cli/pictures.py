@@ -17,14 +17,18 @@ import numpy as np
 from jaxtyping import Bool, UInt16
 
 from marsyard.scenarios.exposure import add_haze
+from marsyard.scenarios.horizon import add_unresolved_rocks
 from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, load_site
-from marsyard.scenarios.views import STANCES, Eye, SiteGround, camera_pose, site_scene
+from marsyard.scenarios.views import STANCES, Eye, SiteGround, camera_pose, mast_pose, site_scene, smallest_rock_rad
 from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
-from marsyard.sim.frames import direction
-from marsyard.sim.render import Frame, PixelRays, Scene, Sun, process_renderer
+from marsyard.sim.dynamics.rover import RoverParameters
+from marsyard.sim.dynamics.rover import Stance as RoverStance
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Frame, Objects, PixelRays, Scene, Sun, process_renderer, rover_objects
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.sensor.compression import compress
+from marsyard.sim.sensor.mast import MER_MAST
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Site, sites
 from marsyard.sim.terrain.imported import embed
@@ -140,15 +144,30 @@ def render_images(request: ImageRequest, *, detector: bool = True, both: bool = 
     selected = cameras if both else cameras[:1]
     rays = [PixelRays.of(camera) for camera in selected]
     # The baseline of a pair is so short that one scene serves both cameras.
-    scene = site_scene(ground, Eye.of(rays[0], pose, ground.surface), sun)
+    eye = Eye.of(rays[0], pose, ground.surface)
+    scene = _add_rover(site_scene(ground, eye, sun), request, ground)
+    smallest_rad = smallest_rock_rad(ground.rocks, eye) if ground.rocks is not None else 0.0
+    rms_slope = math.tan(math.radians(ground.terrain.rms_slope_deg))
     images = []
     for number, camera in enumerate(selected):
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
+        frame = add_unresolved_rocks(frame, scene, ground.rocks, smallest_rad, rms_slope)
         exposure, counts = _expose(request, ground, camera, number, frame, sun) if detector else (None, None)
         suffix = "" if len(cameras) == 1 else ("-left", "-right")[number]
         filled = _mark_filled(ground, frame)
         images.append(RenderedImage(suffix, camera.transform(pose), camera, frame, scene, exposure, counts, filled))
     return images
+
+
+def _add_rover(scene: Scene, request: ImageRequest, ground: SiteGround) -> Scene:
+    """Add the rover that carries the camera, standing level with the camera at its place on the rover's body."""
+    mount = STANCES[request.camera].on_rover_m
+    if mount is None:
+        return scene
+    level = mast_pose(ground.surface, request.east_m, request.north_m, request.altitude_m, request.azimuth_deg, 0.0)
+    stance = RoverStance(rigid(level.rotation, level.apply(-np.array(mount))), 0.0, (0.0, 0.0), np.zeros(6))
+    rover = rover_objects(RoverParameters(), stance, MER_MAST, 0.0, 0.0)
+    return scene.with_objects(Objects.join([scene.objects, rover]))
 
 
 def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:

@@ -264,10 +264,14 @@ def report_image_errors(out: Path) -> Iterator[None]:
 
 def gallery(
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the page and images.")] = Path("gallery"),
+    terrain: Annotated[
+        list[Path] | None,
+        Option("--terrain", metavar="FILE", help="Also show this DTM, seen by a descent camera. Can be repeated."),
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Render each site with suitable cameras; write one page and a contact sheet. Takes about a minute."""
     from marsyard.cli.gallery import render_gallery
 
     with report_image_errors(out):
-        typer.echo(render_gallery(out, overwrite))
+        typer.echo(render_gallery(out, overwrite, terrain or ()))

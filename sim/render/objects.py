@@ -149,8 +149,8 @@ def spheres_in_cone(
 
 #: Albedo of everything: bright metal and glass under dust. Assumed.
 ALBEDO = 0.25
-#: Number of the rover's body; rocks have numbers from 0.
-ROVER_NAME = -1
+#: Name of the rover's body: rocks have numbers from 0, and truth layers use -1 for ground and -2 for sky.
+ROVER_NAME = -3
 #: Sizes that matter to shadows only, assumed: widths of legs and mast, thickness of the deck, m, and the body's
 #: fraction of the deck's length and width.
 _LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)

@@ -103,6 +103,16 @@ class SiteTexture(Parameters):
     amplitudes: Annotated[tuple[float, ...], Field(description="amplitude of each octave")]
 
 
+class Hill(Parameters):
+    """A hill on the horizon of a site; the direction is that from the origin of the site's terrain."""
+
+    azimuth_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth of its middle, clockwise from north")]
+    distance_m: Annotated[Positive, Field(description="distance of its middle, m")]
+    width_m: Annotated[Positive, Field(description="width across the line of sight, m")]
+    depth_m: Annotated[Positive, Field(description="extent along the line of sight, m")]
+    height_m: Annotated[Positive, Field(description="height above the plain, m")]
+
+
 class Site(Parameters):
     """A site with its environment, photometry and terrain.
 
@@ -118,6 +128,7 @@ class Site(Parameters):
     rock_texture: SiteTexture
     descent: TerrainParameters | None = None
     ground: TerrainParameters | None = None
+    hills: tuple[Hill, ...] = ()
 
     def with_dust(self, optical_depth: float | None) -> Site:
         """Return the site with another optical depth of its air; None keeps it."""

@@ -127,3 +127,24 @@ def test_existing_gallery_is_kept(
     assert raised.value.code == 2
     assert f"{tmp_path / name}: the file exists" in capfd.readouterr().err
     assert (tmp_path / name).read_text() == "mine"
+
+
+def test_gallery_shows_a_terrain_model(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tile = shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz"
+    monkeypatch.setattr(gallery_command, "VIEWS", ())
+    page = gallery_command.render_gallery(tmp_path / "gallery", overwrite=False, terrain_files=[tile])
+    text = page.read_text()
+    assert f"terrain model {tile}" in text
+    image = cv2.imread(str(page.parent / f"01-{tile.name}-mer-descent-flown.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    assert image.std() > 5.0
+
+
+def test_gallery_rejects_a_file_that_is_no_terrain_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path), "--terrain", "relief.txt"])
+    with pytest.raises(SystemExit) as raised:
+        cli.main()
+    assert raised.value.code == 2
+    assert "--terrain relief.txt is not a DTM file; allowed: .npz, .tif, .tiff" in capfd.readouterr().err

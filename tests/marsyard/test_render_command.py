@@ -58,8 +58,8 @@ def _check_picture(prefix: Path, size: tuple[int, int], multiple: int) -> None:
         assert ((truth["object"] == -2) == ~is_surface).all()
         assert (truth["object"] >= 0).any()
         assert 0.0 < truth["shadow"][is_surface].mean() < 0.5
-        # surfaces that face away from the sun are in shadow
-        assert truth["shadow"][is_surface][truth["normal"][is_surface] @ to_sun < -1e-3].all()
+        # surfaces that face away from the sun are in shadow; micro-relief, which normals omit, tilts by a few degrees
+        assert truth["shadow"][is_surface][truth["normal"][is_surface] @ to_sun < -0.05].all()
         np.testing.assert_allclose(truth["world_from_body"], metadata["world_from_body"])
 
 

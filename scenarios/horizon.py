@@ -1,0 +1,87 @@
+"""What a camera sees near the horizon: hills beyond the terrain, and rocks too small to be drawn one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from marsyard.sim.render import Frame, Objects, Scene
+from marsyard.sim.terrain import RockField
+from marsyard.sim.terrain.sites import Hill
+
+#: Name of the hills' bodies (`Objects.names`): no rock has it.
+HILL_NAME = -4
+#: Lines of the hills' mesh in azimuth and in distance, and azimuth lines per body.
+_AZIMUTHS, _DISTANCES, _LINES_PER_BODY = 1440, 64, 60
+#: Sizes of the ridges in lines of the mesh, and their RMS height relative to the hill's; assumed.
+_RIDGE_SIZES, _RIDGES = (12.0, 6.0, 3.0), 0.25
+#: Minimum height of a face above the plain, metres, and albedo relative to the plain's; assumed.
+_BASE_M, _HILL_ALBEDO = 1.0, 0.85
+_MARS_RADIUS_M = 3.39e6
+#: Mean width of a rock's silhouette divided by its diameter and height: between an ellipse (pi/4) and a rectangle.
+_SILHOUETTE = 0.85
+
+
+def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objects:
+    """Build the hills around the origin of a site's terrain, without the part that the planet's curvature hides.
+
+    The hills are Gaussian domes with ridges of three sizes, on a mesh of lines of azimuth and distance; `ground_m` is
+    the mean height of the terrain, `albedo` that of the plain.
+    """
+    azimuth = np.linspace(-np.pi, np.pi, _AZIMUTHS, endpoint=False)
+    nearest, farthest = (min(h.distance_m - h.depth_m for h in hills), max(h.distance_m + h.depth_m for h in hills))
+    distance = np.geomspace(max(nearest, 1.0), farthest, _DISTANCES)[:, None]
+    height = np.zeros((_DISTANCES, _AZIMUTHS))
+    for hill in hills:
+        angle = azimuth - np.radians(hill.azimuth_deg)
+        along, across = distance * np.cos(angle) - hill.distance_m, distance * np.sin(angle)
+        dome = np.exp(-2.0 * ((2.0 * along / hill.depth_m) ** 2 + (2.0 * across / hill.width_m) ** 2))
+        height += hill.height_m * np.where(np.cos(angle) > 0.0, dome, 0.0)
+    rng = np.random.default_rng(0)
+    for size in _RIDGE_SIZES:
+        noise = gaussian_filter(rng.standard_normal(height.shape), (size / 3.0, size), mode=("nearest", "wrap"))
+        height *= np.maximum(1.0 + _RIDGES * size / _RIDGE_SIZES[0] * noise / noise.std(), 0.0)
+    x, y = distance * np.sin(azimuth), distance * np.cos(azimuth)
+    above_plain = height - distance**2 / (2.0 * _MARS_RADIUS_M)
+    vertices = np.stack([x, y, ground_m + above_plain], axis=-1)
+    by_azimuth = np.roll(vertices, -1, axis=1) - np.roll(vertices, 1, axis=1)
+    normals = np.cross(by_azimuth, np.gradient(vertices, axis=0))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    corner = np.arange(height.size, dtype=np.int32).reshape(height.shape)
+    right = np.roll(corner, -1, axis=1)
+    quads = np.stack([corner[:-1], right[:-1], right[1:], corner[1:]], axis=-1)
+    # parts as low as the terrain's own relief would intersect it; bodies are sectors of azimuth
+    row, column = np.nonzero(np.all(above_plain.reshape(-1)[quads] > _BASE_M, axis=-1))
+    order = np.argsort(column // _LINES_PER_BODY, kind="stable")
+    quad, body = quads[row, column][order], (column // _LINES_PER_BODY)[order]
+    faces = np.stack([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
+    bodies = np.repeat(body, 2).astype(np.int32)
+    names = np.full(bodies.size, HILL_NAME, dtype=np.int32)
+    return Objects.of_mesh(vertices.reshape(-1, 3), normals.reshape(-1, 3), faces, names, _HILL_ALBEDO * albedo, bodies)
+
+
+def add_unresolved_rocks(
+    frame: Frame, scene: Scene, rocks: RockField | None, smallest_rad: float, rms_slope: float
+) -> Frame:
+    """Blend the mean radiance of the drawn rocks into ground whose smaller rocks are not drawn.
+
+    Rocks below ``smallest_rad x range`` are not drawn. At grazing view they hide the ground: with frontal areas a per
+    square metre, the visible fraction of the ground is ``exp(-sum a / t)`` with ``t**2 = tan(e)**2 + rms_slope**2``,
+    where e is the angle between the line of sight and level ground. Range and normals are not changed.
+    """
+    is_rock = np.append(scene.objects.names, [-2, -1])[frame.body] >= 0
+    if rocks is None or len(rocks) == 0 or not np.any(is_rock):
+        return frame
+    order = np.argsort(rocks.diameter_m)
+    areas = _SILHOUETTE * (rocks.diameter_m * rocks.height_m)[order] / rocks.period_m**2
+    area_below = np.concatenate([[0.0], np.cumsum(areas)])
+    smaller = np.searchsorted(rocks.diameter_m[order], smallest_rad * np.where(frame.body == -1, frame.range_m, 0.0))
+    up = frame.rays.directions.reshape(*frame.range_m.shape, 3) @ frame.world_from_body.rotation.as_matrix()[2]
+    tangent = np.maximum(-up, 1e-4) / np.sqrt(np.maximum(1.0 - up**2, 1e-8))
+    hidden = -np.expm1(-area_below[smaller] / np.hypot(tangent, rms_slope)).astype(np.float32)
+    rock = frame.radiance[is_rock].mean()
+    blended = frame.radiance + hidden * (rock - frame.radiance)
+    return replace(frame, radiance=np.where(frame.body == -1, blended, frame.radiance))
