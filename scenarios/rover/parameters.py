@@ -18,7 +18,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import MastCalibration
-from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.render import CloudParameters, Sun
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
@@ -226,6 +226,7 @@ class CameraParameters(Parameters):
     defocus_px: Annotated[NonNegative, Field(le=10.0, description="diameter of a point's defocused image, px")] = 0.0
     stray_light: Annotated[float, bounded_field(0.0, 0.5, "fraction of the light spread over the image")] = 0.0
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on each lens")] = 0
+    dust_depth: Annotated[Fraction, Field(description="fraction of the light absorbed by a speck")] = 0.3
 
     @field_validator("preset")
     @classmethod
@@ -257,7 +258,7 @@ class CameraParameters(Parameters):
     def settings(self) -> DetectorParameters:
         """Return the parameters of both detectors."""
         detector = preset(self.preset).detector if self.detector is None else self.detector
-        errors = {name: getattr(self, name) for name in ("defocus_px", "stray_light", "dust_discs")}
+        errors = {name: getattr(self, name) for name in ("defocus_px", "stray_light", "dust_discs", "dust_depth")}
         changes = {name: value for name, value in errors.items() if value}
         return detector.model_copy(update={"optics": detector.optics.model_copy(update=changes)})
 
