@@ -1,4 +1,7 @@
-"""Validation of an algorithm's answers against the interface: types, shapes, finite numbers, consistent outcomes."""
+"""Validation of an algorithm's answers against the interface: types, shapes, finite numbers, consistent outcomes.
+
+Used for algorithms in this process and in external programs (`marsyard.algorithms.exchange`).
+"""
 
 from __future__ import annotations
 
@@ -34,10 +37,7 @@ def describe_error(error: BaseException | None) -> str:
 
 
 class AlgorithmError(Exception):
-    """Error for an algorithm under test that returned no usable answer.
-
-    `stderr` is the end of its standard error output, if known.
-    """
+    """An algorithm under test returned no usable answer: the reason (`fault`) and the end of its standard error."""
 
     def __init__(self, fault: Fault, message: str, stderr: str = "") -> None:
         super().__init__(message)
@@ -53,14 +53,14 @@ def bad_answer(message: str) -> AlgorithmError:
     return AlgorithmError(Fault.BAD_ANSWER, message)
 
 
-#: Largest asymmetry of a covariance, as a fraction of its largest entry.
-_ROUNDING = 1e-9
+#: Largest asymmetry of a covariance due to rounding, as a fraction of its largest entry.
+_MAX_ASYMMETRY = 1e-9
 
 
 def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> VelocityEstimate:
     """Validate a `VelocityEstimate`; return a copy with plain float64 arrays and Python numbers.
 
-    `tags_s` are the time tags of the images; the span must lie between the first and the last. None if unknown. Raises
+    `tags_s` are the images' time tags, None if unknown; `span_s` must lie between the first and the last tag. Raises
     AlgorithmError (BAD_ANSWER) with the reason.
     """
     _check_type("the answer", answer, VelocityEstimate)
@@ -75,7 +75,7 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
     covariance = _check_numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
     if covariance is not None:
         scale = float(np.abs(covariance).max())
-        if not np.allclose(covariance, covariance.T, rtol=0.0, atol=_ROUNDING * scale):
+        if not np.allclose(covariance, covariance.T, rtol=0.0, atol=_MAX_ASYMMETRY * scale):
             raise bad_answer(f"covariance_m2_s2 is not symmetric: {covariance.tolist()}")
         if scale == 0.0 or float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
             raise bad_answer(f"covariance_m2_s2 is not positive definite: {covariance.tolist()}")
@@ -144,12 +144,12 @@ def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.
     if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
         kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {_type_name(value)}"
         raise bad_answer(f"{name} is {kind}; allowed: a NumPy array of floats, shape {shape}")
-    plain = np.array(value, dtype=np.float64, subok=False)
-    if plain.shape != shape:
-        raise bad_answer(f"{name} has the shape {plain.shape}; allowed: {shape}")
-    if not np.all(np.isfinite(plain)):
-        raise bad_answer(f"{name} is not finite: {plain.tolist()}")
-    return plain
+    numbers = np.array(value, dtype=np.float64, subok=False)
+    if numbers.shape != shape:
+        raise bad_answer(f"{name} has the shape {numbers.shape}; allowed: {shape}")
+    if not np.all(np.isfinite(numbers)):
+        raise bad_answer(f"{name} is not finite: {numbers.tolist()}")
+    return numbers
 
 
 def _check_type(name: str, value: Any, kind: type) -> None:
@@ -167,20 +167,20 @@ STREAM_METHODS = ("start", "picture", "finish")
 
 @dataclass(frozen=True)
 class StreamedEstimator:
-    """`VelocityEstimator` that passes any number of images one by one to a stream."""
+    """`VelocityEstimator` that passes the images of a descent one by one to a `VelocityStream`."""
 
     stream: VelocityStream
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """Return the final estimate with the intermediate estimates; raises AlgorithmError for an invalid answer."""
+        """Return the final estimate, with the answers after each image; raises AlgorithmError for an invalid answer."""
         tags = measurements.tags_s
         self.stream.start()
-        earlier: list[VelocityEstimate | None] = []
+        answers: list[VelocityEstimate | None] = []
         for number, frame in enumerate(measurements.frames(), start=1):
             answer = self.stream.picture(frame)
-            earlier.append(None if answer is None else _check_answer(answer, tags[:number]))
+            answers.append(None if answer is None else _check_answer(answer, tags[:number]))
         final = _check_answer(self.stream.finish(), tags)
-        return replace(final, after_pictures=tuple(earlier))
+        return replace(final, after_pictures=tuple(answers))
 
 
 def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:

@@ -1,4 +1,4 @@
-"""Common array types: vectors, lists of points and images."""
+"""Array types used by all algorithms in type annotations: vectors, lists of points, and images."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ Vector3 = Float[np.ndarray, "3"]
 Points2 = Float[np.ndarray, "n 2"]
 Points3 = Float[np.ndarray, "n 3"]
 Vector = Float[np.ndarray, "n"]
+#: One boolean per point, track or match.
 Flags = Bool[np.ndarray, "n"]
 #: Image, or map with one value per cell.
 Raster = Float[np.ndarray, "rows columns"]

@@ -1,4 +1,4 @@
-"""Run all benchmarks, print and store the figures: ``python -m benchmarks``."""
+"""Run all benchmarks, print and store the measurements: ``python -m benchmarks``."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import descent, engine, estimators, hda, pictures, renderers, reporting, starting, vtt
+from benchmarks import descent, engine, estimators, hda, images, renderers, reporting, starting, vtt
 from benchmarks.page import PAGE, write_page
-from benchmarks.timing import Figure
+from benchmarks.timing import Measurement
 from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
@@ -24,45 +24,45 @@ PACKAGES = ("marsyard", "numpy", "numba", "pyrender2", "opencv-python-headless")
 
 
 def main() -> None:
-    """Run all benchmarks, print and store the figures."""
+"""Run all benchmarks, print and store the measurements."""
     argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__).parse_args()
     cv2.setNumThreads(1)
-    figures = [
+measurements = [
         # first, because other benchmarks increase the memory of the process
-        *pictures.memory(500),
-        *descent.frame(15),
-        *descent.case(7),
+        *images.measure_memory(500),
+        *descent.measure_frame(15),
+        *descent.measure_case(7),
         *estimators.compare_estimators(8),
-        *renderers.figures(5),
-        *pictures.rover_pictures(3),
-        *descent.new_terrains(2),
-        *vtt.figures(9),
-        *hda.figures(9),
-        *engine.figures(),
-        *starting.figures(5),
-        *reporting.figures(),
+        *renderers.measure(5),
+        *images.measure_rover_images(3),
+        *descent.measure_new_terrains(2),
+        *vtt.measure(9),
+        *hda.measure(9),
+        *engine.measure(),
+        *starting.measure(5),
+        *reporting.measure(),
     ]
-    print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'limit':<8}")
-    for figure in figures:
-        mark = "" if figure.met else "  MISSED"
-        low, high = min(figure.values), max(figure.values)
-        print(f"{figure.name:<52}{figure.median:8.3f}{low:8.3f}{high:8.3f}  {figure.asked:<8}{mark}")
-    keep(figures)
+    print(f"{'core-seconds, unless stated otherwise':<52}{'median':>8}{'min':>8}{'max':>8}  {'limit':<8}")
+for row in measurements:
+        mark = "" if row.is_within_limit else "  MISSED"
+        low, high = min(row.values), max(row.values)
+        print(f"{row.name:<52}{row.median:8.3f}{low:8.3f}{high:8.3f}  {row.limit_text:<8}{mark}")
+store(measurements)
 
 
-def keep(figures: list[Figure]) -> None:
-    """Store the figures with machine and versions."""
+def store(measurements: list[Measurement]) -> None:
+"""Store the measurements with the machine and the versions, and write the page."""
     record = {
         "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
         "machine": {"platform": platform.platform(), "processor": processor_features(), "cores": os.cpu_count()},
         "versions": {name: version(name) for name in PACKAGES},
         "gl": process_renderer(default_backend()).description(),
-        "figures": {figure.name: {"median": figure.median, "asked": figure.asked} for figure in figures},
+        "figures": {row.name: {"median": row.median, "asked": row.limit_text} for row in measurements},
     }
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps(record, indent=2) + "\n")
     write_page(record)
-    print(f"kept in {RESULTS}, shown in {PAGE}")
+    print(f"stored in {RESULTS}, page written to {PAGE}")
 
 
 if __name__ == "__main__":

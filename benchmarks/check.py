@@ -1,8 +1,8 @@
 """Detect hot paths that are slower than their stored ratios: ``python -m benchmarks.check [--keep]``.
 
-Each path alternates with a reference workload of the same kinds of operations (matrix products, filters, sorting,
+Runs of each path alternate with runs of a reference workload of the same kinds of operations (matrix products, filters, sorting,
 copies), so that a slow or busy machine affects both. Welch's test compares the logarithms of their ratios with the
-stored ones. A path is slower if its mean ratio has grown by more than `ALLOWED`, with a false alarm rate of
+stored ones. A path is slower if its mean ratio has grown by more than the factor `ALLOWED_GROWTH`. The false alarm rate is
 `FALSE_ALARMS` for all paths together. Ratios are valid for one type of processor.
 """
 
@@ -22,10 +22,10 @@ import numpy as np
 from scipy import stats
 
 from benchmarks import hda
-from benchmarks.engine import table_seconds
+from benchmarks.engine import measure_table_s
 from benchmarks.estimators import record_descents
-from benchmarks.pictures import descent_exposure
-from benchmarks.vtt import seeded_update
+from benchmarks.images import prepare_descent_exposure
+from benchmarks.vtt import prepare_update
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, hazard_maps
 from marsyard.sim.kernel_cache import processor_features
@@ -33,67 +33,67 @@ from marsyard.sim.kernel_cache import processor_features
 RATIOS = Path(__file__).parent / "results" / "ratios.json"
 #: Pairs of runs of a path and the reference workload.
 PAIRS = 15
-#: Growth of a ratio that is accepted, because memory and caches are shared with other programs.
-ALLOWED = 1.15
-#: Probability that any path of an unchanged program is reported.
+#: Accepted factor of growth of a ratio, because memory and caches are shared with other programs.
+ALLOWED_GROWTH = 1.15
+#: Probability that at least one path of an unchanged program is reported.
 FALSE_ALARMS = 0.01
 
 
-def _dimes() -> Callable[[], object]:
+def _prepare_dimes() -> Callable[[], object]:
     measurements, estimator = record_descents("dimes-smoke", 1)[0].measurements, DimesEstimator()
     return lambda: estimator.estimate(measurements)
 
 
-def _dense_map() -> Callable[[], object]:
-    given, estimator = hda.measurements(), HdaEstimator(hda.DENSE)
-    return lambda: estimator.estimate(given)
+def _prepare_dense_map() -> Callable[[], object]:
+measurements, estimator = hda.make_measurements(), HdaEstimator(hda.DENSE)
+    return lambda: estimator.estimate(measurements)
 
 
-def _hazards() -> Callable[[], object]:
-    rough = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
-    ground = ElevationMap(rough, np.zeros(2), 0.1)
+def _prepare_hazard_maps() -> Callable[[], object]:
+elevation_m = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
+ground = ElevationMap(elevation_m, np.zeros(2), 0.1)
     return lambda: hazard_maps(ground, HdaOptions())
 
 
-#: Functions that prepare each path for repeated runs, by name.
+#: Path: function that prepares it and returns a function for repeated runs.
 PATHS: Mapping[str, Callable[[], Callable[[], object]]] = {
-    "descent picture with detector": descent_exposure,
-    "DIMES, a triple": _dimes,
-    "target tracking, an update": seeded_update,
-    "HDA, 160 x 120 points": _dense_map,
-    "hazard maps of 256 x 256": _hazards,
-    "table of 20,000 rows": lambda: lambda: table_seconds(20_000),
+"descent image with detector": prepare_descent_exposure,
+"DIMES, a triple": _prepare_dimes,
+"target tracking, an update": prepare_update,
+"HDA, 160 x 120 points": _prepare_dense_map,
+"hazard maps of 256 x 256": _prepare_hazard_maps,
+    "table of 20,000 rows": lambda: lambda: measure_table_s(20_000),
 }
 
 
 def reference_workload() -> Callable[[], object]:
-    """Return a workload of about 30 ms."""
+"""Return a function that takes about 30 ms."""
     rng = np.random.default_rng(0)
     matrix = rng.standard_normal((300, 300))
-    picture = rng.standard_normal((1024, 1024)).astype(np.float32)
+    image = rng.standard_normal((1024, 1024)).astype(np.float32)
     values = rng.standard_normal(200_000)
 
     def work() -> None:
         matrix @ matrix
-        cv2.GaussianBlur(picture, (0, 0), 2.0)
+        cv2.GaussianBlur(image, (0, 0), 2.0)
         np.sort(values)
-        picture.copy()
+        image.copy()
 
     return work
 
 
 def log_ratios(path: Callable[[], object], reference: Callable[[], object], pairs: int) -> list[float]:
-    """Logarithm of the path's processor time over the mean reference time before and after it, for each pair."""
+"""Measure, for each pair, the logarithm of the path's processor time divided by the mean of the two reference times."""
     path()
-    found, before = [], _seconds(reference)
+ratios, before = [], _processor_seconds(reference)
     for _ in range(pairs):
-        taken, after = _seconds(path), _seconds(reference)
-        found.append(float(np.log(taken / (0.5 * (before + after)))))
+elapsed, after = _processor_seconds(path), _processor_seconds(reference)
+ratios.append(float(np.log(elapsed / (0.5 * (before + after)))))
         before = after
-    return found
+return ratios
 
 
-def _seconds(work: Callable[[], object]) -> float:
+def _processor_seconds(work: Callable[[], object]) -> float:
     start = time.process_time()
     work()
     return time.process_time() - start
@@ -101,39 +101,39 @@ def _seconds(work: Callable[[], object]) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A path compared with its stored ratio: the factor of its growth, and the p-value without growth."""
+"""Comparison of a path with its stored ratio: factor of growth, and p-value of the hypothesis of no slow-down."""
 
     name: str
-    times: float
+growth: float
     p_value: float
 
 
-def compare(now: Mapping[str, Sequence[float]], kept: Mapping[str, Sequence[float]]) -> list[Comparison]:
+def compare(now: Mapping[str, Sequence[float]], stored: Mapping[str, Sequence[float]]) -> list[Comparison]:
     """Compare every path that both records contain."""
-    regressions = []
-    for name in now.keys() & kept.keys():
-        ours, before = np.asarray(now[name]), np.asarray(kept[name])
-        test = stats.ttest_ind(ours - np.log(ALLOWED), before, equal_var=False, alternative="greater")
-        regressions.append(Comparison(name, float(np.exp(ours.mean() - before.mean())), float(test.pvalue)))
-    return sorted(regressions, key=lambda one: one.name)
+comparisons = []
+    for name in now.keys() & stored.keys():
+current, before = np.asarray(now[name]), np.asarray(stored[name])
+        test = stats.ttest_ind(current - np.log(ALLOWED_GROWTH), before, equal_var=False, alternative="greater")
+comparisons.append(Comparison(name, float(np.exp(current.mean() - before.mean())), float(test.pvalue)))
+return sorted(comparisons, key=lambda comparison: comparison.name)
 
 
-def select_slower(found: Sequence[Comparison]) -> list[Comparison]:
+def select_slower(comparisons: Sequence[Comparison]) -> list[Comparison]:
     """Select paths that exceed the accepted growth, with Bonferroni's correction."""
-    return [one for one in found if one.p_value < FALSE_ALARMS / len(found)]
+return [comparison for comparison in comparisons if comparison.p_value < FALSE_ALARMS / len(comparisons)]
 
 
 def main() -> int:
-    """Measure, then store or compare. Returns 1 if a path is slower, 2 without stored ratios."""
+"""Measure, then store or compare. Returns 1 if a path is slower, 2 without stored ratios of this processor."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.check", description=__doc__)
     parser.add_argument("--keep", action="store_true", help="store these ratios for later comparisons")
     keep = parser.parse_args().keep
-    kept = json.loads(RATIOS.read_text()) if RATIOS.exists() else None
-    if not keep and (kept is None or kept["processor"] != processor_features()):
+stored = json.loads(RATIOS.read_text()) if RATIOS.exists() else None
+    if not keep and (stored is None or stored["processor"] != processor_features()):
         reason = (
             "no ratios are stored"
-            if kept is None
-            else f"the stored ratios are of another processor, {kept['processor']}"
+if stored is None
+            else f"the stored ratios are of another processor, {stored['processor']}"
         )
         print(f"{reason}: run 'python -m benchmarks.check --keep' on the version to compare with", file=sys.stderr)
         return 2
@@ -147,19 +147,19 @@ def main() -> int:
             "log_ratios": now,
         }
         RATIOS.write_text(json.dumps(record, indent=2) + "\n")
-        print(f"kept in {RATIOS}")
+print(f"stored in {RATIOS}")
         return 0
-    assert kept is not None, "without kept ratios nothing is compared"
-    return _print_comparison(compare(now, kept["log_ratios"]), kept["measured"])
+assert stored is not None, "the program ends earlier without stored ratios"
+    return _print_comparison(compare(now, stored["log_ratios"]), stored["measured"])
 
 
-def _print_comparison(found: Sequence[Comparison], measured: str) -> int:
+def _print_comparison(comparisons: Sequence[Comparison], measured: str) -> int:
     """Print the comparison. Returns 1 if a path is slower."""
-    bad = select_slower(found)
-    print(f"{'factor to the ratio of ' + measured[:10]:<40}{'times':>8}{'p':>10}")
-    for one in found:
-        print(f"{one.name:<40}{one.times:8.2f}{one.p_value:10.2g}{'  SLOWER' if one in bad else ''}")
-    return 1 if bad else 0
+slower = select_slower(comparisons)
+    print(f"{'ratio divided by that of ' + measured[:10]:<40}{'factor':>8}{'p':>10}")
+for comparison in comparisons:
+print(f"{comparison.name:<40}{comparison.growth:8.2f}{comparison.p_value:10.2g}{'  SLOWER' if comparison in slower else ''}")
+return 1 if slower else 0
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.bounds import bounds
 from benchmarks.pictures import descent_pose, descent_scene
 from benchmarks.stages import measure_stages
-from benchmarks.timing import Figure, core_seconds
+from benchmarks.timing import Measurement, core_seconds
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
@@ -20,14 +20,14 @@ from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.sites import sites
 
 
-def frame(repeats: int) -> list[Figure]:
+def frame(repeats: int) -> list[Measurement]:
     """A frame of the descent scene with prepared terrain, mesh and shadows."""
     scene, surface = descent_scene()
     optics = camera_optics(CameraParameters())
     renderer = process_renderer(default_backend())
     pose = descent_pose(surface)
     return [
-        Figure(
+        Measurement(
             "descent frame, 1024 x 1024",
             core_seconds(lambda: renderer.render(scene, optics.rays, pose), repeats),
             limit=0.2,
@@ -35,7 +35,7 @@ def frame(repeats: int) -> list[Figure]:
     ]
 
 
-def case(repeats: int) -> list[Figure]:
+def case(repeats: int) -> list[Measurement]:
     """Complete `dimes-gusev` cases over one prepared terrain, their stages and lower bounds."""
     campaign = load_campaign("dimes-gusev")
     numbers = itertools.count()
@@ -46,19 +46,19 @@ def case(repeats: int) -> list[Figure]:
         campaign.scenario.run(parameters, campaign.streams(number))
 
     return [
-        Figure("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=1.0),
+        Measurement("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=1.0),
         *measure_stages(run_next, repeats),
         *bounds(run_next, repeats),
     ]
 
 
-def new_terrains(repeats: int) -> list[Figure]:
+def new_terrains(repeats: int) -> list[Measurement]:
     """A new descent terrain of 4096 x 4096 samples, by default parameters and for every site."""
     kinds = {"plain": TerrainParameters()} | {
         name: site.descent for name, site in sites().items() if site.descent is not None
     }
     return [
-        Figure(
+        Measurement(
             f"new descent terrain, {name}",
             core_seconds(partial(synthesise, kind, np.random.default_rng(0)), repeats),
             limit=2.0,

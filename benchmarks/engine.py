@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from joblib import Parallel, delayed
 from pydantic import BaseModel, ConfigDict
 
-from benchmarks.timing import Figure
+from benchmarks.timing import Measurement
 from marsyard.algorithms.processes import resident_bytes
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
@@ -85,26 +85,26 @@ class Span:
     grown_mb: float
 
 
-def figures(repeats: int = 3) -> list[Figure]:
+def measure(repeats: int = 3) -> list[Measurement]:
     """Overhead of the engine. Fractions of wall-clock time, so that load of other programs affects both sides."""
     empty = [span(0.0, 2_000, 12_000) for _ in range(repeats)]
     busy = [span(0.05, 20, 140) for _ in range(repeats)]
     long = span(0.0, 10_000, 100_000)
     return [
-        Figure("engine: overhead of an empty case (ms)", [1e3 * (one.case_s - one.own_s) for one in empty], limit=2.0),
-        Figure(
+        Measurement("engine: overhead of an empty case (ms)", [1e3 * (one.case_s - one.own_s) for one in empty], limit=2.0),
+        Measurement(
             "engine: overhead of a case of 50 ms (%)",
             [100.0 * (one.case_s / one.own_s - 1.0) for one in busy],
             limit=3.0,
         ),
-        Figure("engine: growth of the parent, 10,000 to 100,000 cases (MB)", [long.grown_mb], limit=10.0),
+        Measurement("engine: growth of the parent, 10,000 to 100,000 cases (MB)", [long.grown_mb], limit=10.0),
         *_a_hundred_thousand(),
-        Figure("engine: speed-up by two workers, rendered cases", [gain() for _ in range(repeats)], minimum=1.85),
-        Figure(f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [table_seconds(1_000_000)], limit=30.0),
+        Measurement("engine: speed-up by two workers, rendered cases", [gain() for _ in range(repeats)], minimum=1.85),
+        Measurement(f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [table_seconds(1_000_000)], limit=30.0),
     ]
 
 
-def _a_hundred_thousand(cases: int = 100_000) -> list[Figure]:
+def _a_hundred_thousand(cases: int = 100_000) -> list[Measurement]:
     """A complete campaign of empty cases on two workers, and a loop of joblib over the same cases."""
     configuration = CampaignConfiguration(
         name="empty", scenario="benchmarks.engine:BusyScenario", cases=cases, retain=Retain(showcase="none")
@@ -118,8 +118,8 @@ def _a_hundred_thousand(cases: int = 100_000) -> list[Figure]:
     Parallel(2)(delayed(_one)(campaign, case) for case in range(cases))
     loop = time.perf_counter() - began
     return [
-        Figure(f"engine: {cases:,} empty cases, two workers (wall s)", [ours], limit=60.0),
-        Figure("the same in a loop of joblib without storage (wall s)", [loop]),
+        Measurement(f"engine: {cases:,} empty cases, two workers (wall s)", [ours], limit=60.0),
+        Measurement("the same in a loop of joblib without storage (wall s)", [loop]),
     ]
 
 
@@ -181,5 +181,5 @@ def table_seconds(rows: int) -> float:
 
 
 if __name__ == "__main__":
-    for figure in figures():
-        print(f"{figure.name:<60}{figure.median:9.3f}  {figure.asked:<8}{'' if figure.met else '  MISSED'}")
+    for row in measure():
+        print(f"{row.name:<60}{row.median:9.3f}  {row.limit_text:<8}{'' if row.is_within_limit else '  MISSED'}")

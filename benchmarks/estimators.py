@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from benchmarks.timing import Figure
+from benchmarks.timing import Measurement
 from marsyard.algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
@@ -88,11 +88,11 @@ def run_estimator(estimator: VelocityEstimator, descents: list[Descent]) -> Esti
     return EstimatorResult(np.array(errors), np.array(seconds))
 
 
-def compare_estimators(cases: int) -> list[Figure]:
+def compare_estimators(cases: int) -> list[Measurement]:
     """Core-seconds of each estimator on the same triples, binned to 256 x 256."""
     descents = record_descents("dimes-smoke", cases)
     limits_s = {"DIMES": 0.015}
     return [
-        Figure(f"a triple: {name}", run_estimator(estimator, descents).seconds.tolist(), limit=limits_s.get(name))
+        Measurement(f"a triple: {name}", run_estimator(estimator, descents).seconds.tolist(), limit=limits_s.get(name))
         for name, estimator in ESTIMATORS.items()
     ]

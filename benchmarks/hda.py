@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from benchmarks.timing import Figure, core_seconds
+from benchmarks.timing import Measurement, core_seconds
 from marsyard.algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
 from marsyard.algorithms.hda.baselines import SemiGlobalEstimator
 from marsyard.algorithms.hda.estimator import expected_pixels, map_ground, match_structure, motion_from_tracks
@@ -60,13 +60,13 @@ def _picture(texture: np.ndarray, pose: RigidTransform) -> np.ndarray:
     return np.rint(np.clip(cv2.remap(texture, places, None, cv2.INTER_LINEAR), 0, 255)).astype(np.uint16)
 
 
-def figures(repeats: int) -> list[Figure]:
+def measure(repeats: int) -> list[Measurement]:
     """Stages and total with the paper's parameters, dense estimation, hazard maps of a large map, a campaign case."""
     given = measurements()
     return [*table_one(given, repeats), *_whole(given, repeats), _large_map(repeats), case(repeats)]
 
 
-def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
+def table_one(given: LandingMeasurements, repeats: int) -> list[Measurement]:
     """The four stages of Table I; the scale is part of structure from motion."""
     seen = build_scene(given)
     details = HdaEstimator(PAPER).estimate(given).details
@@ -89,47 +89,47 @@ def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
 
     rows, columns = ground.elevation.elevation_m.shape
     return [
-        Figure("HDA features, 11 x 11 in 81 x 81 (paper: 0.21 s)", core_seconds(track, repeats)),
-        Figure(f"HDA motion, {tracks.accepted.sum()} tracks (paper: 59, 0.10 s)", core_seconds(move, repeats)),
-        Figure(
+        Measurement("HDA features, 11 x 11 in 81 x 81 (paper: 0.21 s)", core_seconds(track, repeats)),
+        Measurement(f"HDA motion, {tracks.accepted.sum()} tracks (paper: 59, 0.10 s)", core_seconds(move, repeats)),
+        Measurement(
             f"HDA structure, {len(matches.points)} points (paper: 600, 0.41 s)",
             core_seconds(lambda: match_structure(seen, motion, PAPER), repeats),
         ),
-        Figure(
+        Measurement(
             f"HDA map and hazards, {rows} x {columns} (paper: 0.05 s)",
             core_seconds(lambda: map_ground(seen, matches.points, resolution, PAPER), repeats),
         ),
     ]
 
 
-def _whole(given: LandingMeasurements, repeats: int) -> list[Figure]:
+def _whole(given: LandingMeasurements, repeats: int) -> list[Measurement]:
     return [
-        Figure(
+        Measurement(
             "HDA, the paper's parameters (paper: 0.77 s)",
             core_seconds(lambda: HdaEstimator(PAPER).estimate(given), repeats),
             limit=0.03,
         ),
-        Figure(
+        Measurement(
             "HDA, 160 x 120 points of 640 x 480",
             core_seconds(lambda: HdaEstimator(DENSE).estimate(given), repeats),
             limit=0.2,
         ),
-        Figure(
+        Measurement(
             "the same by semi-global matching",
             core_seconds(lambda: SemiGlobalEstimator(DENSE).estimate(given), repeats),
         ),
     ]
 
 
-def _large_map(repeats: int) -> Figure:
+def _large_map(repeats: int) -> Measurement:
     rough = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
     ground = ElevationMap(rough, np.zeros(2), 0.1)
-    return Figure(
+    return Measurement(
         "HDA hazard maps of 256 x 256", core_seconds(lambda: hazard_maps(ground, HdaOptions()), repeats), limit=0.05
     )
 
 
-def case(cases: int) -> Figure:
+def case(cases: int) -> Measurement:
     """Complete cases of `hda-hazardous` with prepared terrain."""
     campaign = load_campaign("hda-hazardous")
 
@@ -137,4 +137,4 @@ def case(cases: int) -> Figure:
         campaign.scenario.run(campaign.parameters(number), campaign.streams(number))
 
     times = [time for number in range(cases) for time in core_seconds(partial(fly, number), 1)]
-    return Figure("hda-hazardous case: flight, 2 frames, map, landing, truth", times, limit=1.5)
+    return Measurement("hda-hazardous case: flight, 2 frames, map, landing, truth", times, limit=1.5)

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.pictures import SUN, descent_exposure, descent_pose, descent_scene, on_all_cores
-from benchmarks.timing import Figure, core_seconds
+from benchmarks.timing import Measurement, core_seconds
 from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
 from marsyard.sim.render.rays import VIEW_SIDE_PX
@@ -36,7 +36,7 @@ NEAR_M, FAR_M = 100.0, 40_000.0
 BLENDER = "MARSYARD_BLENDER"
 
 
-def figures(repeats: int) -> list[Figure]:
+def measure(repeats: int) -> list[Measurement]:
     """A sensor-realistic descent frame against other renderers' shaded frames of the same ground.
 
     This renderer resolves the terrain's samples, 1.5 m apart, independently of its mesh. The others resolve their mesh:
@@ -47,19 +47,19 @@ def figures(repeats: int) -> list[Figure]:
     theirs = _pyrender_shaded(given)
     paired = [(core_seconds(ours, 1)[0], core_seconds(theirs, 1)[0]) for _ in range(repeats)]
     timings = [
-        Figure("descent frame with shadows and detector", [mine for mine, _ in paired], limit=0.2),
+        Measurement("descent frame with shadows and detector", [mine for mine, _ in paired], limit=0.2),
         *on_all_cores(repeats),
-        Figure("pyrender's shaded frame of a mesh as fine, with shadows", [other for _, other in paired]),
-        Figure("how many times slower that is", [other / mine for mine, other in paired], minimum=3.0),
+        Measurement("pyrender's shaded frame of a mesh as fine, with shadows", [other for _, other in paired]),
+        Measurement("how many times slower that is", [other / mine for mine, other in paired], minimum=3.0),
     ]
     if importlib.util.find_spec("pyvista") is not None:
         command = [sys.executable, "-m", "benchmarks.renderers"]
         timings.append(
-            Figure("PyVista's (VTK's) frame of that mesh, with shadows", _elsewhere(command, given, repeats))
+            Measurement("PyVista's (VTK's) frame of that mesh, with shadows", _elsewhere(command, given, repeats))
         )
     if BLENDER in os.environ:
         command = [os.environ[BLENDER], str(Path(__file__).with_name("blender_frame.py"))]
-        timings.append(Figure("Blender Cycles' frame of that mesh, 16 samples a pixel", _elsewhere(command, given, 2)))
+        timings.append(Measurement("Blender Cycles' frame of that mesh, 16 samples a pixel", _elsewhere(command, given, 2)))
     return timings
 
 

@@ -6,7 +6,7 @@ import cProfile
 import time
 from collections.abc import Callable, Mapping
 
-from benchmarks.timing import Figure
+from benchmarks.timing import Measurement
 
 #: Functions of each stage, as end of the file name and function name; callees are included.
 Stages = Mapping[str, tuple[tuple[str, str], ...]]
@@ -32,13 +32,13 @@ STAGES: Stages = {
 REMAINDER = "other"
 
 
-def measure_stages(run: Callable[[], object], repeats: int) -> list[Figure]:
+def measure_stages(run: Callable[[], object], repeats: int) -> list[Measurement]:
     """Core-seconds of every stage and of the remainder, per run, after a warm-up run.
 
     Python's profiler slows stages with many small calls (flight, instruments) by up to a half.
     """
     timings = profile_stages(run, repeats, STAGES)
-    return [Figure(f"  of a case, profiled: {name}", values) for name, values in timings.items()]
+    return [Measurement(f"  of a case, profiled: {name}", values) for name, values in timings.items()]
 
 
 def profile_stages(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:

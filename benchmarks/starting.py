@@ -10,19 +10,19 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from benchmarks.timing import Figure
+from benchmarks.timing import Measurement
 
 
-def figures(repeats: int) -> list[Figure]:
+def measure(repeats: int) -> list[Measurement]:
     """Wall-clock times of starting the command, of compiling kernels and of the first run."""
     return [
-        Figure("marsyard --help (wall s)", [_wall_s("--help") for _ in range(repeats)], limit=0.3),
-        Figure("marsyard list (wall s)", [_wall_s("list") for _ in range(repeats)], limit=0.6),
+        Measurement("marsyard --help (wall s)", [_wall_s("--help") for _ in range(repeats)], limit=0.3),
+        Measurement("marsyard list (wall s)", [_wall_s("list") for _ in range(repeats)], limit=0.6),
         *_first_use(),
     ]
 
 
-def _first_use() -> list[Figure]:
+def _first_use() -> list[Measurement]:
     """Time to compile kernels, and additional time of the first campaigns compared with a repetition.
 
     The very first campaign also builds its terrains.
@@ -41,9 +41,9 @@ def _first_use() -> list[Figure]:
         with_terrains = run(built, "with terrains")
         again = min(run(built, f"again {number}") for number in range(2))
     return [
-        Figure("marsyard compile on a fresh installation, part of its set-up (wall s)", [ahead]),
-        Figure("additional time of the first run for kernels (wall s)", [with_terrains - again], limit=3.0),
-        Figure("the same with the eight terrains that it builds (wall s)", [first - again]),
+        Measurement("marsyard compile on a fresh installation, part of its set-up (wall s)", [ahead]),
+        Measurement("additional time of the first run for kernels (wall s)", [with_terrains - again], limit=3.0),
+        Measurement("the same with the eight terrains that it builds (wall s)", [first - again]),
     ]
 
 

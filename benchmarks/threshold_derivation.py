@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.dimes.binning import View, ground_from_pixels
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.overlap import best_candidates, search_geometry, template_candidates
-from marsyard.algorithms.dimes.validity import combinations
+from marsyard.algorithms.dimes.validity import rank_combinations
 from marsyard.sim.camera import Cahv, CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorCalibration
@@ -247,7 +247,7 @@ def harm(
         spoilt[rng.integers(2), rng.integers(tracks.shape[1])] += rng.uniform(*wrong_by_m_s) * _direction(rng)
         change = np.zeros((2, 3))
         change[1, :2] = imu_sd_m_s * rng.standard_normal(2)
-        best = combinations(list(enumerate(spoilt[0])), list(enumerate(spoilt[1])), change)[0]
+        best = rank_combinations(list(enumerate(spoilt[0])), list(enumerate(spoilt[1])), change)[0]
         if not best.discrepancy_m_s < threshold_m_s:
             outcomes[1] += 1
         else:

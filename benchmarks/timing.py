@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Figure:
+class Measurement:
     """Measurements of one quantity in core-seconds, unless its name states another unit, and bounds of their median."""
 
     name: str
@@ -23,14 +23,14 @@ class Figure:
         return statistics.median(self.values)
 
     @property
-    def asked(self) -> str:
+    def limit_text(self) -> str:
         """The bound as text."""
         if self.limit is not None:
             return f"<= {self.limit:g}"
         return f">= {self.minimum:g}" if self.minimum is not None else ""
 
     @property
-    def met(self) -> bool:
+    def is_within_limit(self) -> bool:
         """Whether the median is within the bounds."""
         return (self.limit is None or self.median <= self.limit) and (
             self.minimum is None or self.median >= self.minimum

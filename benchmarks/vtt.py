@@ -9,7 +9,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from benchmarks.timing import Figure, core_seconds
+from benchmarks.timing import Measurement, core_seconds
 from marsyard.algorithms.image.correlation import coarse_to_fine_peak, normalized_correlation
 from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from marsyard.algorithms.vtt.matching import extract_patch, search_window
@@ -57,14 +57,14 @@ def _update_ms(tracker: VisualTargetTracker, repeats: int) -> list[float]:
     return [1e3 * seconds / BATCH for seconds in batches]
 
 
-def updates(repeats: int) -> list[Figure]:
+def updates(repeats: int) -> list[Measurement]:
     """One update: scale, roll, 21 x 21 in 161 x 161, refinement, point stereo, criteria."""
     options = VttOptions()
     brute = replace(options, coarse_levels=0)
     return [
-        Figure("target tracking update, ms", _update_ms(VisualTargetTracker(options), repeats), limit=2.0),
-        Figure("the same by the full search, ms", _update_ms(VisualTargetTracker(brute), repeats)),
-        Figure("the same by OpenCV's Lucas-Kanade, ms", _update_ms(lucas_kanade_tracker(), repeats)),
+        Measurement("target tracking update, ms", _update_ms(VisualTargetTracker(options), repeats), limit=2.0),
+        Measurement("the same by the full search, ms", _update_ms(VisualTargetTracker(brute), repeats)),
+        Measurement("the same by OpenCV's Lucas-Kanade, ms", _update_ms(lucas_kanade_tracker(), repeats)),
     ]
 
 
@@ -73,7 +73,7 @@ def _repeat(search: Callable[[], object]) -> None:
         search()
 
 
-def searches(repeats: int) -> list[Figure]:
+def searches(repeats: int) -> list[Measurement]:
     """Template search: coarse to fine, at every position, and OpenCV's matchTemplate."""
     figures = []
     for side in (161, 600):
@@ -92,11 +92,11 @@ def searches(repeats: int) -> list[Figure]:
         }
         for name, search in timed.items():
             batch = [1e3 * s / BATCH for s in core_seconds(partial(_repeat, search), repeats)]
-            figures.append(Figure(f"21 x 21 in {side} x {side} {name}, ms", batch))
+            figures.append(Measurement(f"21 x 21 in {side} x {side} {name}, ms", batch))
     return figures
 
 
-def runs(repeats: int) -> list[Figure]:
+def runs(repeats: int) -> list[Measurement]:
     """Closed loop from 10 m to 2 m in steps of 10 %, with 17 stereo pairs of rendered subframes among rocks."""
     of_run = {
         "camera": {"preset": "research-navcam"},
@@ -106,9 +106,9 @@ def runs(repeats: int) -> list[Figure]:
     }
     parameters = RoverScenarioParameters.model_validate(of_run)
     elapsed_s = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
-    return [Figure("a rover's run from 10 m to 2 m, rendered", elapsed_s, limit=1.5)]
+    return [Measurement("a rover's run from 10 m to 2 m, rendered", elapsed_s, limit=1.5)]
 
 
-def figures(repeats: int) -> list[Figure]:
+def measure(repeats: int) -> list[Measurement]:
     """All figures of target tracking."""
     return [*updates(repeats), *searches(repeats), *runs(min(repeats, 3))]

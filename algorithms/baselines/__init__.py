@@ -1,4 +1,4 @@
-"""Baselines for DIMES: image registration with OpenCV, with the same interface."""
+"""Baseline velocity estimators to compare with DIMES: image registration with OpenCV, with the same interface."""
 
 from marsyard.algorithms.baselines.homography import HomographyEstimator, HomographyOptions
 from marsyard.algorithms.baselines.pairs import (

@@ -1,4 +1,4 @@
-"""Baseline for DIMES: homography between rectified images from OpenCV's ORB features."""
+"""Baseline velocity estimator: homography between rectified images from OpenCV's ORB features."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class HomographyOptions:
     - fast_threshold: FAST threshold, grey levels after the stretch to 8 bits
     - max_ratio: Largest ratio of the descriptor distances of the best and the second-best match (Lowe's ratio test)
     - reprojection_px: Largest reprojection error of an inlier, rectified pixels
-    - min_inliers: Minimum number of inliers. Images of different ground gave up to 6 inliers by chance; shifted images
-      with the flight camera's noise gave at least 190.
+    - min_inliers: Minimum number of inliers. In tests, image pairs of different ground had up to 6 inliers by chance;
+      shifted images with the flight camera's noise had at least 190.
     - max_distortion: Largest relative length change by the homography at the centroid of the inliers. Attitude and
       altitude errors within specification cause up to 0.02.
-    - confidence, iterations: Parameters of the robust estimation
+    - confidence, iterations: Confidence level and maximum number of iterations of MAGSAC++
     """
 
     common: CommonOptions = DEFAULT_COMMON_OPTIONS
@@ -50,10 +50,10 @@ class HomographyOptions:
 
 @final
 class HomographyEstimator:
-    """Horizontal velocity from a homography of ORB features between rectified images, by MAGSAC++.
+    """Baseline velocity estimator: homography of ORB features between rectified images, by MAGSAC++.
 
-    With exact attitude and altitude the homography is a shift; its other parameters absorb their errors. The shift is
-    evaluated at the centroid of the inliers, where it is most accurate.
+    With exact attitude and altitude the homography is a pure shift. Attitude and altitude errors change its other
+    parameters. The shift is evaluated at the centroid of the inliers, where it is most accurate.
     """
 
     def __init__(self, options: HomographyOptions | None = None) -> None:
@@ -80,11 +80,12 @@ class HomographyEstimator:
             return None
         mapped_point = homogeneous[:2] / depth
         count = int(inlier.sum())
-        valid = count >= opts.min_inliers and distortion(homography, depth, mapped_point) <= opts.max_distortion
+        distortion = max_length_change(homography, depth, mapped_point)
+        valid = count >= opts.min_inliers and distortion <= opts.max_distortion
         return PairMatch(np.asarray(mapped_point - centroid), float(count), valid)
 
 
-def distortion(homography: Float[np.ndarray, "3 3"], depth: float | np.floating, mapped_point: Vector2) -> float:
+def max_length_change(homography: Float[np.ndarray, "3 3"], depth: float | np.floating, mapped_point: Vector2) -> float:
     """Largest relative length change near the point mapped to `mapped_point`, with homogeneous component `depth`."""
     jacobian = (homography[:2, :2] - np.outer(mapped_point, homography[2, :2])) / depth
     return float(np.abs(np.linalg.svd(jacobian, compute_uv=False) - 1.0).max())
@@ -98,17 +99,17 @@ def stretch_to_8_bits(patch: Raster) -> UInt8[np.ndarray, "rows columns"]:
 
 
 def match_features(patches: PairPatches, options: HomographyOptions) -> tuple[Points2, Points2] | None:
-    """Positions (column, row) of matching features in both images; None if too few for a homography."""
+    """Match ORB features; return their positions (column, row) in both images, or None if fewer than four match."""
     orb = cv2.ORB.create(nfeatures=options.features, fastThreshold=options.fast_threshold)
     images = (stretch_to_8_bits(patch) for patch in (patches.first, patches.second))
-    (first, first_bits), (second, second_bits) = (orb.detectAndCompute(image, None) for image in images)
-    if first_bits is None or second_bits is None or len(second) < 2:
+    (keypoints_1, descriptors_1), (keypoints_2, descriptors_2) = (orb.detectAndCompute(image, None) for image in images)
+    if descriptors_1 is None or descriptors_2 is None or len(keypoints_2) < 2:
         return None
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(first_bits, second_bits, k=2)
-    good = [best for best, next_best in pairs if best.distance < options.max_ratio * next_best.distance]
-    if len(good) < 4:
+    neighbours = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(descriptors_1, descriptors_2, k=2)
+    matches = [best for best, second_best in neighbours if best.distance < options.max_ratio * second_best.distance]
+    if len(matches) < 4:
         return None
     return (
-        np.array([first[match.queryIdx].pt for match in good], dtype=np.float32),
-        np.array([second[match.trainIdx].pt for match in good], dtype=np.float32),
+        np.array([keypoints_1[match.queryIdx].pt for match in matches], dtype=np.float32),
+        np.array([keypoints_2[match.trainIdx].pt for match in matches], dtype=np.float32),
     )

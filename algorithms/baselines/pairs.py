@@ -1,8 +1,8 @@
-"""Image pairs rectified to a common camera that looks straight down, and the phase correlation of such pairs.
+"""Rectification of image pairs for the baseline velocity estimators, and the estimator by phase correlation.
 
-The baselines use the same corrected images as DIMES, in the same geometry (`dimes.binning.rectify_patch`). They match
-the whole overlap of two images instead of templates. The change between the two velocities is checked against the IMU
-as in DIMES, with the same threshold. Only the measurement of the shift differs.
+Both images of a pair are rectified to one virtual camera that looks straight down (`dimes.binning.rectify_patch`) and
+corrected as in DIMES. The baselines match one large square of the overlap region instead of templates. The IMU check of
+the two velocities is that of DIMES, with the same threshold. Only the measurement of the shift differs.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from jaxtyping import Float
 from marsyard.algorithms.arrays import Vector2
 from marsyard.algorithms.dimes import binning
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.validity import combinations
+from marsyard.algorithms.dimes.validity import rank_combinations
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 
-#: Spacing of the lattice on which the common ground is searched, rectified pixels.
+#: Spacing of the lattice for the search of the overlap region, rectified pixels.
 COARSE_STEP_PX = 8
 
 
 @dataclass(frozen=True)
 class CommonOptions:
-    """Options of both baselines; the defaults of the geometry are those of `DimesOptions`.
+    """Options of both baselines; options without a description here, and their defaults, are those of `DimesOptions`.
 
-    - min_side_px: Minimum side of the common square, rectified pixels: twice the search range, so that half of the
-      square stays in view
-    - max_side_px: Maximum side of the common square
+    - min_side_px: Minimum side of the common square, rectified pixels: twice the search range, so that at least half of
+      the square is visible in the second image
+    - max_side_px: Maximum side of the common square, rectified pixels
     """
 
     binned_size: tuple[int, int] = DimesOptions.binned_size
@@ -49,10 +49,10 @@ DEFAULT_COMMON_OPTIONS = CommonOptions()
 
 @dataclass(frozen=True)
 class PairPatches:
-    """The same square of ground, assuming no motion, in both images of a pair.
+    """Patches of both images of a pair that show the same square of ground if the camera does not move.
 
     - first, second: Corrected and rectified patches, counts, north up
-    - gsd_m: Ground sample distance
+    - gsd_m: Ground sample distance, metres per rectified pixel
     """
 
     first: Float[np.ndarray, "side side"]
@@ -65,7 +65,7 @@ class PairMatch:
     """Shift between the two images of a pair.
 
     - shift_px: Shift of the second patch's content: (columns, rows), rectified pixels
-    - score: Validity measure of the match; larger is better
+    - score: Validity measure of the match (number of inliers, or phase correlation response); larger is better
     - valid: Whether the match is accepted
     """
 
@@ -76,7 +76,7 @@ class PairMatch:
 
 @dataclass(frozen=True)
 class BaselineDetails:
-    """Patches of each pair (None without common ground), and its match (None if there is none)."""
+    """Intermediate products of a baseline: for each pair the patches (None without overlap) and the match, or None."""
 
     patches: tuple[PairPatches | None, ...]
     matches: tuple[PairMatch | None, ...]
@@ -88,26 +88,26 @@ Matcher = Callable[[PairPatches], PairMatch | None]
 def find_common_square(
     first: binning.View, second: binning.View, options: CommonOptions
 ) -> tuple[Vector2, int, float] | None:
-    """Find the largest square of ground in both views at zero motion.
+    """Find the largest square of ground inside both views at zero motion.
 
-    Returns its centre (east, north), side (pixels) and ground sample distance; None if smaller than `min_side_px`.
+    Returns its centre (east, north), side (rectified pixels) and ground sample distance (m); None if it is too small.
     """
     gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
     max_offset_m = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
-    per_side = 2 * int(np.ceil(max_offset_m / (COARSE_STEP_PX * gsd))) + 1
-    lattice = binning.ground_lattice(np.zeros(2), per_side, COARSE_STEP_PX * gsd)
+    points_per_side = 2 * int(np.ceil(max_offset_m / (COARSE_STEP_PX * gsd))) + 1
+    lattice = binning.ground_lattice(np.zeros(2), points_per_side, COARSE_STEP_PX * gsd)
     visible = np.ones(lattice.shape[:2], dtype=bool)
     for view in (first, second):
         visible &= binning.inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
-    # chessboard distance to the nearest invisible point: half sides of squares
-    steps = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
-    row, column = np.unravel_index(int(np.argmax(steps)), steps.shape)
-    side = min(2 * (int(steps[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
+    # half sides of the squares around each point: chessboard distance to the nearest invisible point, lattice steps
+    half_sides = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
+    row, column = np.unravel_index(int(np.argmax(half_sides)), half_sides.shape)
+    side = min(2 * (int(half_sides[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
     return (lattice[row, column], side, gsd) if side >= options.min_side_px else None
 
 
 def rectify_pair(first: binning.View, second: binning.View, options: CommonOptions) -> PairPatches | None:
-    """Rectify both images of a pair over their common ground; None if it is too small."""
+    """Rectify both images of a pair over their largest common square; None if the square is too small."""
     square = find_common_square(first, second, options)
     return square and PairPatches(
         binning.rectify_patch(first, *square), binning.rectify_patch(second, *square), square[2]
@@ -115,8 +115,8 @@ def rectify_pair(first: binning.View, second: binning.View, options: CommonOptio
 
 
 def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:
-    """Estimate the velocity over the second pair, if both pairs match and their difference agrees with the IMU."""
-    views = binning.usable_views(measurements, options.binned_size)
+    """Estimate the second pair's velocity, if both pairs match and their velocity change agrees with the IMU."""
+    views = binning.build_views(measurements, options.binned_size)
     if views is None:
         return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, BaselineDetails((), ()))
     view_pairs = ((views[0], views[1]), (views[1], views[2]))
@@ -134,8 +134,9 @@ def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, optio
         velocities.append(shift_m / (second.time_s - first.time_s))
     if max(np.hypot(*velocity) for velocity in velocities) > options.max_speed_m_s + options.imu_threshold_m_s:
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None, details)
-    (agreement,) = combinations([(0, velocities[0])], [(0, velocities[1])], measurements.interval_velocities_m_s)
-    if not agreement.discrepancy_m_s < options.imu_threshold_m_s:
+    tracks = ([(0, velocities[0])], [(0, velocities[1])])
+    (combination,) = rank_combinations(*tracks, measurements.interval_velocities_m_s)
+    if not combination.discrepancy_m_s < options.imu_threshold_m_s:
         return VelocityEstimate(VelocityOutcome.IMU_MISMATCH, None, details)
     return VelocityEstimate(VelocityOutcome.VALID, velocities[1], details)
 
@@ -145,8 +146,8 @@ class PhaseCorrelationOptions:
     """Options of the phase correlation.
 
     - common: Geometry and IMU check
-    - min_response: Minimum response: the peak's energy, 1 for equal images. Images of different ground gave up to 0.12;
-      shifted images with the flight camera's noise gave at least 0.79.
+    - min_response: Minimum response of `cv2.phaseCorrelate`: energy of the peak, 1 for equal images. Image pairs
+      of different ground had up to 0.12; shifted images with the flight camera's noise had at least 0.79.
     """
 
     common: CommonOptions = DEFAULT_COMMON_OPTIONS
@@ -155,7 +156,7 @@ class PhaseCorrelationOptions:
 
 @final
 class PhaseCorrelationEstimator:
-    """Horizontal velocity from the shift between rectified images, by `cv2.phaseCorrelate` with a Hann window."""
+    """Baseline velocity estimator: shift between rectified images by `cv2.phaseCorrelate` with a Hann window."""
 
     def __init__(self, options: PhaseCorrelationOptions | None = None) -> None:
         self.options = PhaseCorrelationOptions() if options is None else options

@@ -1,4 +1,4 @@
-"""Binned images above their ground planes, and their rectified and corrected patches (section II.A).
+"""Binning, rectification and correction of descent images for DIMES and its baselines (section II.A).
 
 The virtual camera looks straight down. Its pixels are squares of ground, `gsd_m` on a side, in the plane at the
 measured altitude; rows run south and columns east. Both views of a pair are rectified to the same virtual camera,
@@ -8,8 +8,8 @@ between pixels by a cubic spline.
 
 Dark current is not corrected, as in the paper. It is a ramp along the columns. Over the 31 rows of a template it is
 0.05 counts at -34 deg C (flight) and 2.5 counts at 0 deg C (field test). Both are below a pixel's noise of 6 counts and
-do not affect velocities, even over terrain of 2 % contrast. At +23 deg C it is 36 counts. Then few tracks are valid
-over terrain of 2 % contrast and no velocity is reported; over terrain of 15 % contrast errors double to 0.07 m/s.
+do not affect velocities, even over terrain of 2 % contrast. At +23 deg C the ramp is 36 counts: over terrain of 2 %
+contrast few tracks are valid and no velocity is reported; over terrain of 15 % contrast errors double to 0.07 m/s.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration, DetectorImage
 
-#: Range of usable heights: from the size of the airbags to above the atmosphere.
+#: Range of usable camera heights above the ground: from the size of the airbags to above the atmosphere.
 HEIGHT_RANGE_M = (1.0, 1e6)
 _IMAGE_COUNT = 3
 
 
 @dataclass(frozen=True)
 class View:
-    """One binned image above its ground plane.
+    """One binned image, and its camera's position above the ground plane.
 
     - signal: Counts above the offset, averaged over the pixels binned by software; not corrected
     - flat_field: Relative response, binned in the same way
@@ -74,13 +74,13 @@ def bin_factors(shape: tuple[int, int], binned_size: tuple[int, int]) -> tuple[i
 
 
 def bin_mean(image: Raster, columns: int, rows: int) -> Float[np.ndarray, "binned_rows binned_columns"]:
-    """Average blocks of `columns` x `rows` pixels, which must divide the image."""
+    """Average blocks of `columns` x `rows` pixels; the image size must be a multiple of the block size."""
     size = (image.shape[1] // columns, image.shape[0] // rows)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def place_camera(camera: CameraModel, world_from_body: Rotation, altitude_m: float) -> tuple[CameraModel, Vector3]:
-    """Transform a body's camera to a view's ground frame; return it and its position.
+    """Transform a camera from the body frame to a view's ground frame; return it and its position.
 
     The altitude is that of the body's origin; the camera's height follows from its lever arm.
     """
@@ -96,7 +96,7 @@ def build_view(
     binned_size: tuple[int, int],
     previous: View | None = None,
 ) -> View:
-    """Bin an image and place its camera above the ground; for an equal calibration use the flat field of `previous`."""
+    """Bin an image and place its camera above the ground; with the calibration of `previous`, reuse its flat field."""
     columns, rows = bin_factors(image.counts.shape, binned_size)
     detector = image.calibration
     camera, centre = place_camera(image.camera.bin(columns, rows), world_from_body, altitude_m)
@@ -113,10 +113,10 @@ def build_view(
 
 
 def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, "images"]:
-    """Propagate measured altitudes from their own time tags to those of the images, metres.
+    """Propagate measured altitudes (metres) from their own time tags to the images' time tags.
 
-    The vertical velocity is inertial. The first and the last image use the first and the last interval; an image
-    between them uses the mean of both adjacent intervals.
+    The vertical velocity is that of the IMU: for the first and the last image, of the first and the last interval; for
+    an image between them, the mean of both adjacent intervals.
     """
     vertical = measurements.interval_velocities_m_s[:, 2]
     rates = np.concatenate([vertical[:1], 0.5 * (vertical[:-1] + vertical[1:]), vertical[-1:]])
@@ -124,7 +124,7 @@ def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, 
     return np.asarray(np.array([a.altitude_m for a in measurements.altitudes], dtype=np.float64) + rates * delays_s)
 
 
-def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]) -> tuple[View, View, View] | None:
+def build_views(measurements: DescentMeasurements, binned_size: tuple[int, int]) -> tuple[View, View, View] | None:
     """Build the views of the three images, each above its own ground plane.
 
     None if altitudes or times are not finite, times do not increase, or a height is outside `HEIGHT_RANGE_M`. Raises
@@ -163,7 +163,7 @@ def ground_from_pixels(view: View, pixels: Points2, max_off_nadir_rad: float) ->
 def pixels_from_ground(
     view: View, ground: Float[np.ndarray, "*shape 2"]
 ) -> tuple[Float[np.ndarray, "*shape 2"], Bool[np.ndarray, "*shape"]]:
-    """Pixels (u, v) of ground points (east, north), and whether the optics can image them (in frame or not)."""
+    """Project ground points (east, north) to pixels (u, v), also outside the frame; False where projection fails."""
     points = np.zeros((*ground.shape[:-1], 3))
     points[..., :2] = ground
     pixels, visible = view.camera.project(points)
@@ -187,7 +187,7 @@ def pixel_angle_rad(view: View) -> float:
     return float(np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1).mean())
 
 
-def square(half_m: float, per_side: int) -> Points2:
+def square_lattice(half_m: float, per_side: int) -> Points2:
     """Lattice of `per_side` x `per_side` points (east, north) over a square of half side `half_m`."""
     steps = np.linspace(-half_m, half_m, per_side)
     east, north = np.meshgrid(steps, steps)
@@ -195,8 +195,8 @@ def square(half_m: float, per_side: int) -> Points2:
 
 
 def square_outline(half_m: float, per_side: int) -> Points2:
-    """Points of `square` on its outline."""
-    points = square(half_m, per_side)
+    """Points of `square_lattice` on the outline of the square."""
+    points = square_lattice(half_m, per_side)
     return np.asarray(points[np.abs(points).max(axis=1) == half_m])
 
 
@@ -210,7 +210,7 @@ def correct_patch(view: View, rows: slice, columns: slice) -> Float[np.ndarray, 
     return np.asarray(exposure_signal[rows] / np.maximum(view.flat_field[rows, columns], MIN_RESPONSE))
 
 
-#: Margin around the spline's pixels; pixels outside it change the result by 1e-6.
+#: Margin of the spline around a patch, pixels; pixels outside it change the result by 1e-6 of their value.
 SPLINE_MARGIN = 10
 
 
@@ -224,7 +224,7 @@ def ground_lattice(centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndar
 
 
 def _pixel_range(smallest: float, largest: float, size: int) -> slice:
-    """Range of whole pixels from `smallest` to `largest` with the spline's margin, clipped to 0 .. size."""
+    """Slice of whole pixels from `smallest` to `largest` with the spline's margin, clipped to 0 .. size."""
     low, high = max(int(smallest - SPLINE_MARGIN), 0), min(int(largest + SPLINE_MARGIN + 1), size)
     return slice(min(low, size - 1), max(high, 1))
 
@@ -232,8 +232,8 @@ def _pixel_range(smallest: float, largest: float, size: int) -> slice:
 def rectify_patch(view: View, centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndarray, "side side"]:
     """Rectify and correct a patch of `side_px` pixels around the ground point `centre` (east, north), counts.
 
-    Points outside the image get its border value, invisible points that of the upper left corner; template candidates
-    exclude both.
+    Points outside the image get the value at its border. Points that the optics cannot image get the value of its upper
+    left pixel. Template candidates have neither.
     """
     pixels, visible = pixels_from_ground(view, ground_lattice(centre, side_px, gsd_m))
     columns, rows = view.size

@@ -1,4 +1,4 @@
-"""Intermediate products of DIMES, shown in the paper's Figs. 7-9."""
+"""Intermediate products of DIMES (paper: Figs. 7-9), and their conversion to plain arrays for storage and figures."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ class Track:
     - template, window: Rectified and corrected patches, counts, north up
     - match: Row and column in `window` of the matched template's centre
     - surface: Correlation at every shift; its centre is zero motion
+    - failed: Validity checks that the track failed
     - velocity_m_s: Mean velocity of the camera over the pair (east, north), also of invalid tracks
     """
 
@@ -50,11 +51,12 @@ class Track:
 class PairDetails:
     """Products of one pair of images.
 
-    - overlap_polygon: Footprint of the later image at zero horizontal motion: outline (u, v) in the earlier image
+    - overlap_polygon: Outline (u, v) in the earlier image of the later image's footprint at zero horizontal motion
     - zero_phase_pixels: Centre of the zero-phase spot (u, v) in both images; NaN if invisible
     - gsd_m: Ground sample distance of rectified pixels
     - candidates: Number of feasible template positions on the coarse grid
     - tracks: All tracks, valid or not
+    - views: Earlier and later binned image
     """
 
     overlap_polygon: Float[np.ndarray, "n 2"]
@@ -89,7 +91,7 @@ TRACK_COLUMNS = (
     "second_peak_ratio", "valid", "velocity_east_m_s", "velocity_north_m_s", "ground_east_m", "ground_north_m",
     *(f"failed_{check.name.lower()}" for check in ValidityCheck),
 )  # fmt: skip
-#: Points along a side of the lattice for rectified figures: sufficient for the perspective of a horizon.
+#: Points along a side of the lattice for rectified figures: enough to draw a perspective image up to the horizon.
 LATTICE_POINTS = 49
 #: Off-nadir limit of figures: slightly more than DIMES uses.
 FIGURE_OFF_NADIR_RAD = float(np.deg2rad(60.0))

@@ -1,4 +1,4 @@
-"""The DIMES estimator: templates tracked in two image pairs give a horizontal velocity or a failure (section II)."""
+"""The DIMES estimator: horizontal velocity from templates tracked in two image pairs (section II)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from jaxtyping import Float
 
 from marsyard.algorithms.arrays import Patch, Vector2, Vector3
 from marsyard.algorithms.dimes import overlap
-from marsyard.algorithms.dimes.binning import View, pixels_from_ground, rectify_patch, usable_views
+from marsyard.algorithms.dimes.binning import View, build_views, pixels_from_ground, rectify_patch
 from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.validity import combinations, failed_checks, track_metrics
+from marsyard.algorithms.dimes.validity import failed_checks, rank_combinations, track_metrics
 from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, highest_peak, pseudo_normalized_correlation
 from marsyard.algorithms.image.registration import refine_shift
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
@@ -26,7 +26,7 @@ def match_corner(
     peak: Peak,
     options: DimesOptions,
 ) -> Vector2:
-    """Row and column in the window of the matched template's upper left pixel, refined according to the options."""
+    """Position (row, column) in the window of the matched template's upper left pixel, refined as in the options."""
     integer_peak = np.array([peak.row, peak.column], dtype=np.float64)
     if not options.subpixel:
         return integer_peak
@@ -38,9 +38,9 @@ def match_corner(
 def camera_displacement(corner: Vector2, geometry: overlap.SearchGeometry) -> Vector2:
     """Horizontal displacement (east, north) of the camera between the images, metres.
 
-    A ground point at r1 from the first nadir point and at r2 from the second gives a displacement of r1 - r2. The
-    centres of template and window have the same offset r1. Therefore r2 - r1 is the shift from the window's centre
-    times the ground sample distance, with rows running south.
+    Let r1 and r2 be a ground point's offsets from the first and the second nadir point. The displacement is r1 - r2.
+    Template and search window are centred at the same offset r1. Therefore r2 - r1 is the match's shift from the
+    window's centre times the ground sample distance, with rows running south.
     """
     shift = corner - geometry.search_px
     return np.asarray(geometry.gsd_m * np.array([-shift[1], shift[0]]))
@@ -89,12 +89,13 @@ def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, opt
 
 @final
 class DimesEstimator:
-    """The Descent Image Motion Estimation System of the Mars Exploration Rovers.
+    """Horizontal velocity estimator: the Descent Image Motion Estimation System (DIMES) of the Mars Exploration Rovers.
 
-    Two templates are tracked in each pair of consecutive images. The combination of tracks whose velocity change agrees
-    best with the IMU is selected; its second-pair track gives the velocity if the discrepancy is below the threshold.
-    The ground is modelled as a level plane at each image's altitude. From the inertial velocity only its changes are
-    used, and its vertical component to propagate altitudes to the images.
+    Two templates are tracked in each pair of consecutive images. Each track defines a mean velocity over its pair. The
+    estimator selects the combination of a first-pair and a second-pair track whose velocity change agrees best with the
+    IMU. It reports the velocity of the second track if the discrepancy is below `DimesOptions.imu_threshold_m_s`. The
+    ground is modelled as a level plane at each image's altitude. The IMU is used for velocity changes, and to propagate
+    altitudes to the images.
     """
 
     def __init__(self, options: DimesOptions | None = None) -> None:
@@ -103,10 +104,10 @@ class DimesEstimator:
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """Estimate the velocity, with `DimesDetails`.
 
-        Raises ValueError if the images cannot be binned to the size in the options, or for an impossible calibration;
-        never because of image content or measured values.
+        Raises ValueError if the images cannot be binned to the size in the options, or if the exposure is too short to
+        correct frame transfer; never because of image content or measured values.
         """
-        views = usable_views(measurements, self.options.binned_size)
+        views = build_views(measurements, self.options.binned_size)
         if views is None:
             return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, DimesDetails((), (), None))
         first, second, third = views
@@ -118,9 +119,9 @@ class DimesEstimator:
 def combine_pairs(
     pairs: tuple[PairDetails, PairDetails], interval_velocities_m_s: Float[np.ndarray, "2 3"], imu_threshold_m_s: float
 ) -> VelocityEstimate:
-    """Select the combination of tracks that agrees best with the IMU, and report its velocity or a failure."""
+    """Select the combination of tracks that agrees best with the IMU; return its velocity or a failure outcome."""
     first, second = ([(track.index, track.velocity_m_s) for track in pair.tracks if track.valid] for pair in pairs)
-    candidates = combinations(first, second, interval_velocities_m_s)
+    candidates = rank_combinations(first, second, interval_velocities_m_s)
     if candidates and candidates[0].discrepancy_m_s < imu_threshold_m_s:
         velocity = pairs[1].tracks[candidates[0].second].velocity_m_s
         return VelocityEstimate(VelocityOutcome.VALID, velocity, DimesDetails(pairs, candidates, candidates[0]))

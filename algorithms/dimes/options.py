@@ -12,13 +12,13 @@ class DimesOptions:
     """Options of the DIMES estimator (paper: section II of 'Field Testing of the MER DIMES').
 
     - binned_size: Columns and rows of the binned image (paper: 256 x 256)
-    - max_speed_m_s: Largest horizontal speed expected (paper: 30 m/s); multiplied by the time between images it gives
-      the search range
-    - search_margin_px: Additional search range on each side: attitude and altitude errors shift the match too (0.3 deg
-      between two images is 9 m, 1.6 px, at 1700 m), and a peak must not lie on the border
+    - max_speed_m_s: Largest horizontal speed expected (paper: 30 m/s). The search range is this speed times the time
+      between the images.
+    - search_margin_px: Additional search range on each side, rectified pixels. Attitude and altitude errors also shift
+      the match (0.3 deg between two images is 9 m, 1.6 px, at 1700 m), and a peak must not lie on the border.
     - template_px: Side of the rectified template, odd. 31 px is 172 m at 1700 m.
-    - max_off_nadir_rad: Largest off-nadir angle of used ground. At 55 deg a pixel covers three times as much ground
-      along the line of sight as at the nadir, and an altitude error shifts the ground by 1.4 times the error.
+    - max_off_nadir_rad: Ground at larger off-nadir angles is not used. At 55 deg a pixel covers three times as much
+      ground along the line of sight as at the nadir, and an altitude error shifts the ground by 1.4 times the error.
     - border_px: Distance of templates and windows from the image border, binned pixels, for spline interpolation and
       the lens distortion of a window's sides.
     - zero_phase_radius_rad: Angle from the anti-solar point within which the ground is masked. The opposition surge of
@@ -27,16 +27,16 @@ class DimesOptions:
     - grid_step_px: Spacing of the coarse grid of candidate templates, binned pixels of the first image: a quarter of a
       template
     - templates_per_pair: Templates selected in each pair of images (paper: 2)
-    - exclusion_px: Minimum distance (in column or row, binned pixels) between template centres: the templates do not
-      overlap and fail independently.
+    - exclusion_px: Minimum distance (in column or row, binned pixels) between template centres, so that the templates
+      do not overlap and fail independently.
     - subpixel: Whether the correlation peak is refined to sub-pixel accuracy (not specified for DIMES in the paper)
-    - align: Whether Gauss-Newton alignment follows; it removes the biquadratic fit's bias towards whole pixels
-    - min_contrast: Minimum Harris interest of a template divided by its mean signal, per binned pixel. Noise alone, at
-      the flight camera's signal-to-noise ratio of 102, gives 0.0022 to 0.0029.
-    - min_peak: Minimum correlation at the peak, from random terrains of 0.2 to 15 % contrast with that noise. On
+    - align: Whether the peak fit is refined by Gauss-Newton alignment, which removes its bias towards whole pixels
+    - min_contrast: Minimum Harris interest of a template divided by its mean signal, per binned pixel. Images of noise
+      only, at the flight camera's signal-to-noise ratio of 102, have 0.0022 to 0.0029.
+    - min_peak: Minimum correlation at the peak, derived on random terrains of 0.2 to 15 % contrast with that noise. On
       terrain with detail, wrong matches had peaks below 0.28. On terrain without detail they had up to 0.64; the
-      second-peak check rejects those (0.83 or more). Correct matches of at least 0.45 are accurate to about 0.5 m/s rms
-      (3 m/s on terrain without detail).
+      second-peak check rejects them (ratios of 0.83 or more). Correct matches of at least 0.45 have velocity errors of
+      about 0.5 m/s rms (3 m/s on terrain without detail).
     - max_peak_width_px: Largest full width of the peak at three quarters of its height, rectified pixels. At the lowest
       accepted peak, tracks of this width have errors of about 2.5 m/s rms, half of the requirement. Single straight
       edges have wider peaks.

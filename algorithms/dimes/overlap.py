@@ -15,7 +15,7 @@ from marsyard.algorithms.image.interest import harris_interest, local_mean, stru
 
 @dataclass(frozen=True)
 class SearchGeometry:
-    """Sizes of template and search window of a pair in the virtual nadir camera.
+    """Sizes of template and search window in the virtual camera of a pair.
 
     - gsd_m: Ground sample distance: one binned pixel of the second view at its nadir
     - template_px: Side of the template
@@ -43,7 +43,7 @@ class SearchGeometry:
 
 
 def search_geometry(first: binning.View, second: binning.View, options: DimesOptions) -> SearchGeometry:
-    """Compute the sizes from the second view's height and pixel angle, the image interval and the largest speed."""
+    """Compute the sizes of template and search window from the second view, the image interval and the options."""
     gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
     max_displacement_m = options.max_speed_m_s * (second.time_s - first.time_s)
     return SearchGeometry(gsd, options.template_px, int(np.ceil(max_displacement_m / gsd)) + options.search_margin_px)
@@ -60,7 +60,7 @@ def border_pixels(size: tuple[int, int], per_side: int = 8) -> Points2:
 def overlap_polygon(first: binning.View, second: binning.View, options: DimesOptions) -> Points2:
     """Project the second view's border into the first view at zero horizontal motion.
 
-    Returns pixels (u, v) in order; invisible ones are omitted.
+    Returns pixels (u, v) in order along the border, without invisible points.
     """
     ground, _ = binning.ground_from_pixels(second, border_pixels(second.size), options.max_off_nadir_rad)
     pixels, visible = binning.pixels_from_ground(first, ground)
@@ -98,10 +98,11 @@ def outside_zero_phase(
 
 @dataclass(frozen=True)
 class Candidates:
-    """Feasible template positions: pixels (u, v) of the first view, ground points, and preference.
+    """Feasible template positions: the template fits the first view, and its search window fits the second view.
 
-    The template fits the first view and its search window the second. At zero motion the template does not overlap the
-    zero-phase spot. The whole search window of a preferred candidate does not overlap the spot.
+    - pixels, ground: Template centres: pixels (u, v) of the first view, and ground points (east, north)
+    - preferred: Whether the complete search window is outside the zero-phase spot. The template itself is always
+      outside the spot at zero motion.
     """
 
     pixels: Points2
@@ -123,7 +124,7 @@ def template_candidates(
         pixels, ground = pixels[feasible], ground[feasible]
 
     def is_outside_spot(view: binning.View, half_m: float, per_side: int) -> Flags:
-        points = ground[:, None] + binning.square(half_m, per_side)
+        points = ground[:, None] + binning.square_lattice(half_m, per_side)
         outside = outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
 
@@ -136,10 +137,10 @@ def template_candidates(
 DARK_FRACTION = 0.01
 
 
-def contrasts(view: binning.View, pixels: Points2, support: int) -> Vector:
+def template_contrasts(view: binning.View, pixels: Points2, support: int) -> Vector:
     """Harris interest over squares of `support` pixels around whole pixels (u, v), divided by their mean signal.
 
-    Computed from the uncorrected image: the frame-transfer ramp is smooth along columns; its effect is negligible.
+    The image is not corrected: the frame-transfer ramp is smooth along columns and its effect is negligible.
     """
     columns, rows = np.rint(pixels).astype(int).T
     uu, vv, uv = (part[rows, columns] for part in structure_tensor(view.signal, support))
@@ -148,7 +149,7 @@ def contrasts(view: binning.View, pixels: Points2, support: int) -> Vector:
 
 
 def best_candidates(contrasts: Vector, pixels: Points2, preferred: Flags, count: int, exclusion_px: float) -> list[int]:
-    """Indices of up to `count` candidates by decreasing contrast, preferred ones first.
+    """Indices of up to `count` candidates by decreasing contrast; preferred candidates precede all others.
 
     Each selected candidate excludes those closer than `exclusion_px` in both column and row.
     """
@@ -166,6 +167,6 @@ def select_templates(
     view: binning.View, candidates: Candidates, options: DimesOptions
 ) -> tuple[list[int], Float[np.ndarray, "k"]]:
     """Indices of the selected candidates, best first, and their contrasts."""
-    values, pixels = contrasts(view, candidates.pixels, options.template_px), candidates.pixels
-    indices = best_candidates(values, pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px)
-    return indices, values[indices]
+    contrasts, pixels = template_contrasts(view, candidates.pixels, options.template_px), candidates.pixels
+    indices = best_candidates(contrasts, pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px)
+    return indices, contrasts[indices]

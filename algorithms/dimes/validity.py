@@ -16,7 +16,7 @@ from marsyard.algorithms.image.correlation import Peak, peak_width, second_peak
 
 
 class ValidityCheck(Enum):
-    """Validity checks of a track."""
+    """Validity checks of a track; each value describes the failure."""
 
     CONTRAST = "too little contrast in the template"
     PEAK_HEIGHT = "correlation peak too low"
@@ -31,7 +31,7 @@ class TrackMetrics:
 
     - contrast: Harris interest of the template divided by its mean signal, per binned pixel
     - peak: Height of the correlation peak, at most 1
-    - peak_width_px: Full width at three quarters of its height along its longest direction, rectified pixels
+    - peak_width_px: Full width of the peak at three quarters of its height, in its longest direction, rectified pixels
     - second_peak_ratio: Second-highest local maximum divided by the peak; 1 without a positive peak
     - on_border: Whether the highest correlation lies on the border of the search range
     """
@@ -67,14 +67,11 @@ def failed_checks(metrics: TrackMetrics, options: DimesOptions) -> tuple[Validit
     return tuple(check for check, failed in failures.items() if failed)
 
 
-Horizontal = Vector2
-
-
 @dataclass(frozen=True)
 class Combination:
-    """Indices of a first-pair and a second-pair track, and their discrepancy from the IMU.
+    """One track of the first pair and one of the second pair (indices), and their discrepancy from the IMU.
 
-    The discrepancy is the length of the horizontal velocity change minus the change measured by the IMU.
+    The discrepancy is the length of the difference between the tracks' and the IMU's horizontal velocity change.
     """
 
     first: int
@@ -82,23 +79,26 @@ class Combination:
     discrepancy_m_s: float
 
 
-def combinations(
-    first: Sequence[tuple[int, Horizontal]],
-    second: Sequence[tuple[int, Horizontal]],
+def rank_combinations(
+    first: Sequence[tuple[int, Vector2]],
+    second: Sequence[tuple[int, Vector2]],
     interval_velocities_m_s: Float[np.ndarray, "2 3"],
 ) -> tuple[Combination, ...]:
-    """All combinations of valid tracks (index, velocity) of both pairs, best agreement first."""
+    """Combine all valid tracks (index, velocity) of the first and the second pair; best agreement with the IMU first.
+
+    `interval_velocities_m_s` are the IMU's mean velocities over both pairs.
+    """
     change = (interval_velocities_m_s[1] - interval_velocities_m_s[0])[:2]
     candidates = [Combination(i, j, float(np.hypot(*(b - a - change)))) for (i, a), (j, b) in product(first, second)]
     return tuple(sorted(candidates, key=lambda c: c.discrepancy_m_s))
 
 
 def propagate_velocity(
-    velocity_m_s: Horizontal, inertial_then_m_s: Horizontal, inertial_now_m_s: Horizontal
+    velocity_m_s: Vector2, inertial_at_estimate_m_s: Vector2, inertial_at_end_m_s: Vector2
 ) -> Vector2:
-    """Propagate a velocity by the IMU, for example to thruster firing near 100 m (section I), m/s.
+    """Propagate a horizontal velocity by the IMU, for example to thruster firing near 100 m (section I), m/s.
 
-    `inertial_then_m_s` is the mean inertial velocity over the second pair's interval, `inertial_now_m_s` the present
-    one. An unknown error common to both cancels.
+    `inertial_at_estimate_m_s` is the mean inertial velocity over the interval of the estimate (second pair),
+    `inertial_at_end_m_s` the inertial velocity at the end of the propagation. Their common error cancels.
     """
-    return np.asarray(velocity_m_s + (inertial_now_m_s - inertial_then_m_s))
+    return np.asarray(velocity_m_s + (inertial_at_end_m_s - inertial_at_estimate_m_s))

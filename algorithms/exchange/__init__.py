@@ -1,4 +1,4 @@
-"""External executables as algorithms: cases as files, answers as JSON (docs/custom-algorithms.md)."""
+"""External programs as algorithms under test: cases as files, answers as JSON (docs/custom-algorithms.md)."""
 
 from marsyard.algorithms.exchange.executable import (
     ExecutableSiteEstimator,

@@ -1,4 +1,7 @@
-"""External executables as algorithms: measurements are written to files, answers are read as JSON."""
+"""Adapters from external programs to the algorithm protocols: measurements are written to files, answers read as JSON.
+
+The decoding functions (`_read_...`) raise AlgorithmError (BAD_ANSWER) for an answer of the wrong form.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,10 @@ from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command,
 from marsyard.algorithms.exchange.serving import (
     ProgramDetails,
     Session,
-    ask_case,
     check_keys,
     read_member,
     read_numbers,
+    run_case,
 )
 from marsyard.sim.measurements import (
     DescentFrame,
@@ -39,13 +42,13 @@ class ExecutableVelocityEstimator:
 
     def estimate(self, measurements: DescentMeasurements) -> interface.VelocityEstimate:
         """Write the measurements, run the program and return its estimate."""
-        return ask_case(self.command, self.limits, measurements, _read_velocity)
+        return run_case(self.command, self.limits, measurements, _read_velocity)
 
 
 class ExecutableVelocityStream:
     """Velocity stream that runs an external program, one JSON line per call (docs/custom-algorithms.md).
 
-    Methods raise AlgorithmError if the program fails. A `serve-stream:` program may have processed earlier descents.
+    Methods raise AlgorithmError if the program fails. One process of a `serve-stream:` program processes many descents.
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
@@ -55,16 +58,18 @@ class ExecutableVelocityStream:
     def start(self) -> None:
         """Start a new descent."""
         self._details = ProgramDetails("", 0.0)
-        if self._session.ask("start", {}, self._read_answer) is not None:
+        if self._session.send_request("start", {}, self._read_answer) is not None:
             raise bad_answer("the answer to 'start' has an outcome; before the first image it must be null")
 
     def picture(self, frame: DescentFrame) -> interface.VelocityEstimate | None:
         """Send the next image and return the program's estimate, or None."""
-        return self._session.ask("picture", {}, self._read_answer, {"frame": lambda folder: write_frame(folder, frame)})
+        return self._session.send_request(
+            "picture", {}, self._read_answer, {"frame": lambda folder: write_frame(folder, frame)}
+        )
 
     def finish(self) -> interface.VelocityEstimate:
         """Return the program's final estimate; its details contain the output and the time of the whole descent."""
-        answer = self._session.ask("finish", {}, self._read_answer)
+        answer = self._session.send_request("finish", {}, self._read_answer)
         if answer is None:
             allowed = ", ".join(interface.VelocityOutcome.__members__)
             raise bad_answer(f"the answer to 'finish' has the outcome null; allowed: {allowed}")
@@ -89,14 +94,14 @@ class ExecutableSiteEstimator:
 
     def estimate(self, measurements: LandingMeasurements) -> interface.SiteEstimate:
         """Write the measurements, run the program and return its estimate."""
-        return ask_case(self.command, self.limits, measurements, _read_site)
+        return run_case(self.command, self.limits, measurements, _read_site)
 
 
 class ExecutableTargetTracker:
     """Target tracker that runs an external program (docs/custom-algorithms.md).
 
-    Methods raise AlgorithmError if the program fails. An `exec:` program ends with this tracker. A `serve:` program may
-    have tracked earlier targets; a designation resets it.
+    Methods raise AlgorithmError if the program fails. An `exec:` program ends with this tracker. A `serve:` program can
+    be used by several trackers, one after another; a designation resets it.
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
@@ -114,27 +119,27 @@ class ExecutableTargetTracker:
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
         """Send the target and the rover's pose."""
         values = {"target": encode_target(target), "world_from_rover": encode_pose(world_from_rover)}
-        self._state = self._session.ask("designate", values, _read_state)
+        self._state = self._session.send_request("designate", values, _read_state)
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> interface.MastAim | None:
         """Request the mast angles and the image regions of interest."""
         values = {"world_from_rover": encode_pose(world_from_rover), "mast": self._write_mast(mast)}
-        return self._session.ask("aim", values, lambda answer, _: check_aim(_read_aim(answer), mast))
+        return self._session.send_request("aim", values, lambda answer, _: check_aim(_read_aim(answer), mast))
 
     def update(self, measurements: RoverMeasurements) -> interface.TargetUpdate:
         """Send the images of a rover stop and return the program's answer."""
         values = {"mast": self._write_mast(measurements.mast)}
         files = {"stop": lambda folder: write_stop(folder, measurements)}
-        update = self._session.ask("update", values, _read_update, files)
+        update = self._session.send_request("update", values, _read_update, files)
         self._state = update.state
         return update
 
     def clear(self) -> None:
         """Clear the target."""
-        self._state = self._session.ask("clear", {}, _read_state)
+        self._state = self._session.send_request("clear", {}, _read_state)
 
     def _write_mast(self, mast: MastCalibration) -> str:
-        """Write the mast's files if the mast changed; return their folder."""
+        """Write the mast's files if the mast changed since the last call; return their folder."""
         if mast is not self._mast:
             self._mast, self._mast_count = mast, self._mast_count + 1
             self._folder = self._session.folder / f"mast_{self._mast_count}"

@@ -1,7 +1,7 @@
-"""Cases, frames and rover stops as files: images as 16-bit PGM or PNG, cameras as `.cahvor`, all other data as JSON.
+"""Exchange files: cases, frames and rover stops with images as 16-bit PGM or PNG, cameras as `.cahvor`, and JSON.
 
-Reading restores counts, flat fields and numbers exactly (JSON stores the shortest text of the same float64), and
-attitudes except for rounding of the quaternion's norm.
+Written for external programs. Reading restores counts, flat fields and numbers exactly (JSON stores the shortest text
+of the same float64), and attitudes except for rounding of the quaternion's norm.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from marsyard.sim.measurements import (
 
 #: Version of the exchange file format.
 FORMAT_VERSION = 1
-#: Supported versions of answers and request lines; from version 2 each request has an `id`, repeated in its answer.
+#: Supported versions of request lines and answers. From version 2 a request has an `id`, and its answer the same `id`.
 ANSWER_VERSIONS = (1, 2)
 
 CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 
-#: Calibration fields of a detector, without its flat field.
+#: Fields of `DetectorCalibration` except the flat field.
 _CALIBRATION_KEYS = tuple(field.name for field in fields(DetectorCalibration) if field.name != "flat_field")
 
 #: Image file format.
@@ -103,9 +103,9 @@ def read_frame(folder: Path) -> DescentFrame:
             image=_read_image(folder, content["image"]),
             attitude=_read_attitude(content["attitude"]),
             altitude=_read_altitude(content["altitude"]),
-            sun_direction=_vector(content["sun_direction"]),
-            inertial_velocity_m_s=_vector(content["inertial_velocity_m_s"]),
-            interval_velocity_m_s=_vector(content["interval_velocity_m_s"]),
+            sun_direction=_read_vector(content["sun_direction"]),
+            inertial_velocity_m_s=_read_vector(content["inertial_velocity_m_s"]),
+            interval_velocity_m_s=_read_vector(content["interval_velocity_m_s"]),
         )
 
 
@@ -119,17 +119,17 @@ def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
                 images=tuple(images),
                 attitudes=tuple(_read_attitude(record) for record in content["attitudes"]),
                 altitudes=tuple(_read_altitude(record) for record in content["altitudes"]),
-                interval_velocities_m_s=_vector(content["interval_velocities_m_s"]).reshape(-1, 3),
-                sun_direction=_vector(content["sun_direction"]),
-                inertial_velocities_m_s=_vector(content.get("inertial_velocities_m_s")),
+                interval_velocities_m_s=_read_vector(content["interval_velocities_m_s"]).reshape(-1, 3),
+                sun_direction=_read_vector(content["sun_direction"]),
+                inertial_velocities_m_s=_read_vector(content.get("inertial_velocities_m_s")),
             )
         poses = [PoseMeasurement(read_pose(record, "body"), record["time_s"]) for record in content["poses"]]
         return LandingMeasurements(
             images=(images[0], images[1]),
             poses=(poses[0], poses[1]),
             slant_range_m=_read_length(content["slant_range_m"]),
-            up_body=_vector(content["up_body"]),
-            apriori_site_world=_vector(content["apriori_site_world"]),
+            up_body=_read_vector(content["up_body"]),
+            apriori_site_world=_read_vector(content["apriori_site_world"]),
         )
 
 
@@ -180,26 +180,26 @@ def _encode_vector(value: Float[np.ndarray, "..."] | None) -> list[Any] | None:
     return None if value is None else value.tolist()
 
 
-def _vector(content: Any) -> Any:
+def _read_vector(content: Any) -> Any:
     return None if content is None else np.array(content, dtype=np.float64)
 
 
 def _write_images(folder: Path, images: Sequence[DetectorImage], image_format: ImageFormat) -> list[dict[str, Any]]:
-    """Write images, cameras and flat fields; a shared flat field is written once."""
+    """Write images, cameras and flat fields; equal flat fields are written once. Returns one JSON record per image."""
     records: list[dict[str, Any]] = []
     flat_fields: dict[str, Float[np.ndarray, "rows columns"]] = {}
     for number, image in enumerate(images, start=1):
         names = {"file": f"image_{number}.{image_format}", "camera": f"camera_{number}.cahvor"}
         detector = image.calibration
-        write_picture(folder / names["file"], image.counts)
+        write_counts(folder / names["file"], image.counts)
         write_cahvor(image.camera, folder / names["camera"], frame=BODY_FRAME)
-        flat_name = next((n for n, field in flat_fields.items() if np.array_equal(field, detector.flat_field)), None)
-        if flat_name is None:
-            flat_name = f"flat_field_{len(flat_fields) + 1}.f64"
-            flat_fields[flat_name] = detector.flat_field
-            detector.flat_field.astype("<f8").tofile(folder / flat_name)
+        flat_file = next((n for n, field in flat_fields.items() if np.array_equal(field, detector.flat_field)), None)
+        if flat_file is None:
+            flat_file = f"flat_field_{len(flat_fields) + 1}.f64"
+            flat_fields[flat_file] = detector.flat_field
+            detector.flat_field.astype("<f8").tofile(folder / flat_file)
         rows, columns = image.counts.shape
-        calibration = {"flat_field": flat_name, **{name: getattr(detector, name) for name in _CALIBRATION_KEYS}}
+        calibration = {"flat_field": flat_file, **{name: getattr(detector, name) for name in _CALIBRATION_KEYS}}
         size = {"columns": columns, "rows": rows}
         records.append({**names, "time_s": image.time_s, **size, "calibration": calibration})
     return records
@@ -209,15 +209,15 @@ def _read_image(folder: Path, content: Mapping[str, Any]) -> DetectorImage:
     calibration, shape = content["calibration"], (content["rows"], content["columns"])
     flat_field = np.fromfile(folder / calibration["flat_field"], dtype="<f8").reshape(shape).astype(np.float64)
     return DetectorImage(
-        counts=read_picture(folder / content["file"]),
+        counts=read_counts(folder / content["file"]),
         time_s=content["time_s"],
         camera=read_cahvor(folder / content["camera"]),
         calibration=DetectorCalibration(flat_field, **{name: calibration[name] for name in _CALIBRATION_KEYS}),
     )
 
 
-def write_picture(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> None:
-    """Write counts as `.pgm` (P5, two bytes per pixel, big-endian) or `.png` (16 bits)."""
+def write_counts(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> None:
+    """Write image counts as `.pgm` (P5, two bytes per pixel, big-endian) or `.png` (16 bits)."""
     if path.suffix == ".pgm":
         rows, columns = counts.shape
         path.write_bytes(b"P5\n%d %d\n65535\n" % (columns, rows) + counts.astype(">u2").tobytes())
@@ -225,8 +225,8 @@ def write_picture(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> Non
         raise OSError(f"{path} cannot be written")
 
 
-def read_picture(path: Path) -> UInt16[np.ndarray, "rows columns"]:
-    """Read the counts that `write_picture` wrote. Raises ValueError unless it is a single-channel 16-bit image."""
+def read_counts(path: Path) -> UInt16[np.ndarray, "rows columns"]:
+    """Read the image counts that `write_counts` wrote; raises ValueError unless the image is single-channel, 16-bit."""
     counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if counts is None or counts.dtype != np.uint16 or counts.ndim != 2:
         raise ValueError(f"{path} is not a single-channel 16-bit image")
@@ -250,27 +250,27 @@ def read_mast(folder: Path) -> MastCalibration:
     """Read the mast that `write_mast` wrote. Raises ValueError if it is missing."""
     with open_json(folder / MAST_FILE, "mast") as content:
         left, right = (read_cahvor(folder / content[name]["camera"]) for name in ("left", "right"))
-        base, elbow, head = (_vector(content[name]) for name in _OFFSETS)
+        base, elbow, head = (_read_vector(content[name]) for name in _OFFSETS)
         azimuths, elevations = ((content[name][0], content[name][1]) for name in _LIMITS)
         return MastCalibration(MastGeometry(base, elbow, head, azimuths, elevations), left, right)
 
 
 def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
-    """Write the images and angles measured at one rover stop (imaging position), without the mast."""
+    """Write the images and mast angles measured at one rover stop (imaging position), without the mast calibration."""
     content: dict[str, Any] = {name: getattr(measurements, name) for name in ("azimuth_rad", "elevation_rad")}
     content["world_from_rover"] = encode_pose(measurements.world_from_rover)
     for name, image in (("left", measurements.left), ("right", measurements.right)):
-        write_picture(folder / f"{name}.pgm", image.counts)
+        write_counts(folder / f"{name}.pgm", image.counts)
         rows, columns = image.counts.shape
         content[name] = {"file": f"{name}.pgm", "corner": list(image.corner), "columns": columns, "rows": rows}
     write_json(folder / STOP_FILE, content)
 
 
 def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
-    """Read the stop that `write_stop` wrote. Raises ValueError if it is missing."""
+    """Read the stop that `write_stop` wrote; `mast` completes it. Raises ValueError if it is missing."""
     with open_json(folder / STOP_FILE, "stop") as content:
         left, right = (
-            MastImage(read_picture(folder / record["file"]), (int(record["corner"][0]), int(record["corner"][1])))
+            MastImage(read_counts(folder / record["file"]), (int(record["corner"][0]), int(record["corner"][1])))
             for record in (content["left"], content["right"])
         )
         azimuth, elevation = float(content["azimuth_rad"]), float(content["elevation_rad"])
@@ -284,8 +284,8 @@ def encode_pose(pose: RigidTransform, body: str = "rover") -> dict[str, Any]:
 
 
 def read_pose(content: Mapping[str, Any], body: str = "rover") -> RigidTransform:
-    """Decode a pose of `encode_pose`."""
-    return rigid(Rotation.from_quat(content[f"world_from_{body}_xyzw"]), _vector(content["position_world_m"]))
+    """Decode a pose that `encode_pose` encoded."""
+    return rigid(Rotation.from_quat(content[f"world_from_{body}_xyzw"]), _read_vector(content["position_world_m"]))
 
 
 def encode_target(target: TargetDesignation) -> dict[str, Any]:
@@ -294,9 +294,9 @@ def encode_target(target: TargetDesignation) -> dict[str, Any]:
 
 
 def read_target(content: Mapping[str, Any]) -> TargetDesignation:
-    """Decode a target designation of `encode_target`."""
+    """Decode a target designation that `encode_target` encoded."""
     if "pixel" in content:
-        return PixelTarget(_vector(content["pixel"]), content["azimuth_rad"], content["elevation_rad"])
+        return PixelTarget(_read_vector(content["pixel"]), content["azimuth_rad"], content["elevation_rad"])
     if "position_rover" in content:
-        return RoverTarget(_vector(content["position_rover"]))
-    return SiteTarget(_vector(content["position_site"]))
+        return RoverTarget(_read_vector(content["position_rover"]))
+    return SiteTarget(_read_vector(content["position_site"]))

@@ -1,6 +1,7 @@
-"""Programs under test: their commands, and their execution within limits on time, memory and output.
+"""External programs under test: parsing of their commands, and execution within limits on time, memory and output.
 
-Each program has its own process group, so that its children can be killed with it. It ends with its parent process.
+Each program has its own process group, so that its child processes can be killed with it. On Linux it is killed when
+its parent process ends.
 """
 
 from __future__ import annotations
@@ -24,19 +25,20 @@ from pydantic import BaseModel, ConfigDict, Field
 from marsyard.algorithms.answers import AlgorithmError, Fault
 from marsyard.algorithms.processes import descendants, resident_bytes
 
-#: Interval of the memory checks, seconds.
+#: Interval of the limit checks, seconds.
 _POLL_S = 0.02
-#: Maximum length of the stored end of standard error, characters.
+#: Number of characters stored from the end of standard error.
 MAX_STDERR_CHARACTERS = 4000
 #: Time for a persistent program to exit after its input is closed, seconds.
 _EXIT_GRACE_S = 0.5
 
+#: Linux's `prctl` option for the signal that a process receives when its parent ends.
 _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None)
 
 
 class ExecutableLimits(BaseModel):
-    """Limits of a program under test for one case."""
+    """Limits of an external program under test, for one case or request."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -47,10 +49,10 @@ class ExecutableLimits(BaseModel):
 
 @dataclass(frozen=True)
 class Command:
-    """Command line of a program under test.
+    """Command line of an external program under test.
 
     - words: The program and its arguments
-    - persistent: Whether one process answers many cases
+    - persistent: Whether one process of the program answers many cases
     - stream: Whether the program receives a descent's images one by one
     """
 
@@ -69,7 +71,7 @@ PREFIXES: Mapping[str, tuple[bool, bool]] = {
 
 
 def parse_command(text: str) -> Command | None:
-    """Parse a command (for example `exec:./program --flag`); None for a text without one of the prefixes.
+    """Parse a command (for example `exec:./program --flag`); None for a text without one of `PREFIXES`.
 
     Raises ValueError if the program does not exist or a quote is not closed.
     """
@@ -91,7 +93,7 @@ def parse_command(text: str) -> Command | None:
 
 @dataclass(frozen=True)
 class Output:
-    """Output of a program for one case, and its wall-clock time."""
+    """Output of a program for one case or request, and its wall-clock time."""
 
     stdout: bytes
     stderr: str
@@ -99,14 +101,14 @@ class Output:
 
 
 class RunningProgram:
-    """A running program under test.
+    """A running external program under test.
 
-    Methods end the program and raise AlgorithmError if it exceeds a limit, ends early or cannot be started.
+    If the program exceeds a limit, ends early or cannot be started, methods end it and raise AlgorithmError.
     """
 
     def __init__(self, words: tuple[str, ...], limits: ExecutableLimits) -> None:
         self.limits = limits
-        self._output, self._stderr = bytearray(), bytearray()
+        self._stdout, self._stderr = bytearray(), bytearray()
         try:
             self._process = subprocess.Popen(  # noqa: S603 (running the user's program is the purpose)
                 words,
@@ -132,7 +134,7 @@ class RunningProgram:
         self._close_input()
         self._read(lambda: False)
         self._wait()
-        output = self._collect_output(bytes(self._output), start_s)
+        output = self._collect_output(bytes(self._stdout), start_s)
         self._kill()
         return output
 
@@ -142,7 +144,7 @@ class RunningProgram:
         Output before the request is a fault (BAD_ANSWER): it could be a second line for the previous case.
         """
         start_s = time.perf_counter()
-        self._output.clear()
+        self._stdout.clear()
         self._stderr.clear()
         self._deadline_s = time.monotonic() + self.limits.time_s
         if request is not None:
@@ -157,11 +159,11 @@ class RunningProgram:
             except BrokenPipeError:
                 self._wait()
                 raise self._end_with_fault(Fault.CRASHED, "it closed its input") from None
-        self._read(lambda: b"\n" in self._output)
-        if b"\n" not in self._output:
+        self._read(lambda: b"\n" in self._stdout)
+        if b"\n" not in self._stdout:
             self._wait()
             raise self._end_with_fault(Fault.CRASHED, "its output ended without an answer")
-        first_line, _, extra_output = bytes(self._output).partition(b"\n")
+        first_line, _, extra_output = bytes(self._stdout).partition(b"\n")
         if extra_output:
             raise self._end_with_fault(Fault.BAD_ANSWER, "it wrote more than one line")
         return self._collect_output(first_line, start_s)
@@ -181,7 +183,7 @@ class RunningProgram:
     def _read(self, is_complete: Callable[[], bool]) -> None:
         """Read both streams until they end or `is_complete()` is true, within the limits on time, memory and size."""
         with selectors.DefaultSelector() as selector:
-            for stream, buffer in ((self._process.stdout, self._output), (self._process.stderr, self._stderr)):
+            for stream, buffer in ((self._process.stdout, self._stdout), (self._process.stderr, self._stderr)):
                 if stream is not None:
                     selector.register(stream, selectors.EVENT_READ, buffer)
             while selector.get_map() and not is_complete():
@@ -195,12 +197,13 @@ class RunningProgram:
     def _check_limits(self) -> None:
         if time.monotonic() > self._deadline_s:
             raise self._end_with_fault(Fault.TIMED_OUT, f"no answer within {self.limits.time_s:g} s")
-        if len(self._output) + len(self._stderr) > self.limits.output_mb * 1e6:
+        if len(self._stdout) + len(self._stderr) > self.limits.output_mb * 1e6:
             raise self._end_with_fault(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")
         if resident_bytes([self._process.pid, *descendants(self._process.pid)]) > self.limits.memory_gb * 1e9:
             raise self._end_with_fault(Fault.OUT_OF_MEMORY, f"it used more than {self.limits.memory_gb:g} GB of memory")
 
     def _wait(self) -> None:
+        """Wait until the program exits; raise AlgorithmError unless its exit status is 0."""
         while True:
             self._check_limits()
             with suppress(subprocess.TimeoutExpired):
@@ -213,10 +216,12 @@ class RunningProgram:
             raise self._end_with_fault(Fault.CRASHED, f"it ended with status {status}")
 
     def _end_with_fault(self, fault: Fault, message: str) -> AlgorithmError:
+        """Kill the program; return the error to raise."""
         self._kill()
         return AlgorithmError(fault, message, _decode_tail(self._stderr))
 
     def _kill(self) -> None:
+        """Kill the program's process group and close its pipes."""
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -233,7 +238,7 @@ class RunningProgram:
 
 
 def _end_with_parent() -> None:
-    """Between fork and exec, ask Linux to kill the program when its parent thread ends."""
+    """Configure Linux to kill the program when its parent thread ends; called between fork and exec."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 

@@ -1,8 +1,8 @@
-"""Requests to programs and their answers: one JSON object per line, with the version of the exchange format.
+"""Requests to external programs and their answers: one JSON object per line, with the version of the exchange format.
 
-A persistent program (`serve:`) is started once per process, answers many cases, and ends with the process. An `exec:`
-program processes a single target, stream or case. For one case it writes no greeting line: its last argument is the
-case's folder, and its complete output is the answer.
+A persistent program (`serve:`) is started once per worker process, answers many cases, and ends with the worker. An
+`exec:` program is started for each target, stream or case. For a case it writes no greeting line: its last argument is
+the case's folder, and its complete output is the answer.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class ProgramDetails:
     time_s: float
 
 
-#: Function that decodes an answer of the program from its table and the details to attach.
+#: Function that decodes an answer from its JSON object; the details become part of the decoded answer.
 AnswerReader = Callable[[Mapping[str, Any], ProgramDetails], Answer]
 
 
-def parse_table(output: Output) -> Mapping[str, Any]:
+def parse_object(output: Output) -> Mapping[str, Any]:
     """Parse the JSON object of an output; raises AlgorithmError (BAD_ANSWER). Keys are not checked."""
     message = f"its output is not one JSON object: {shorten(output.stdout)}"
     try:
@@ -64,7 +64,7 @@ def check_keys(answer: Mapping[str, Any], allowed: set[str]) -> None:
 
 
 def read_member(label: str, name: object, kinds: type[Member]) -> Member:
-    """Look up the member of an enumeration by name; raises AlgorithmError (BAD_ANSWER)."""
+    """Look up a member of the enumeration `kinds` by name; raises AlgorithmError (BAD_ANSWER). `label` is the key."""
     if not isinstance(name, str) or name not in kinds.__members__:
         raise bad_answer(f"{label} is {name!r}; allowed: {', '.join(kinds.__members__)}")
     return kinds[name]
@@ -75,21 +75,21 @@ def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -
     value = answer.get(name)
     if value is None:
         return None
-    if not _is_nested(value, shape):
+    if not _has_shape(value, shape):
         value_text = shorten(json.dumps(value).encode())
         raise bad_answer(f"{name} is {value_text}; allowed: numbers in the shape {list(shape)}")
     return np.array(value, dtype=np.float64)
 
 
-def _is_nested(value: Any, shape: tuple[int, ...]) -> bool:
-    """Whether a value is a nested list of numbers of this shape."""
+def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
+    """Whether a value is a number (empty shape) or a nested list of numbers of this shape."""
     if not shape:
         return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-    return isinstance(value, list) and len(value) == shape[0] and all(_is_nested(item, shape[1:]) for item in value)
+    return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(item, shape[1:]) for item in value)
 
 
 def read_answer(answer: Mapping[str, Any], output: Output, read: AnswerReader[Answer]) -> Answer:
-    """Decode an answer of a program; the program's standard error is added to an AlgorithmError."""
+    """Decode an answer of a program; an AlgorithmError is raised again with the program's standard error."""
     try:
         return read(answer, ProgramDetails(output.stderr, output.time_s))
     except AlgorithmError as error:
@@ -98,27 +98,27 @@ def read_answer(answer: Mapping[str, Any], output: Output, read: AnswerReader[An
 
 @dataclass
 class Server:
-    """Running program that has written its greeting.
+    """Running program that has written its greeting line.
 
     - version: Version of the exchange format in the greeting, one of `ANSWER_VERSIONS`
-    - request_count: Number of requests sent: the `id` of the last one
+    - request_count: Number of requests sent, which is the `id` of the last request
     """
 
     child: RunningProgram
     version: int
     request_count: int = 0
 
-    def ask(self, request: Mapping[str, Any]) -> tuple[Mapping[str, Any], Output]:
+    def send_request(self, request: Mapping[str, Any]) -> tuple[Mapping[str, Any], Output]:
         """Send one request; return the program's answer without its `id`, and its raw output.
 
-        Ends the program and raises AlgorithmError if it fails, its answer is not one JSON object, or the answer belongs
-        to another request.
+        If the program fails, its answer is not one JSON object, or the answer belongs to another request, the program
+        is ended and AlgorithmError raised.
         """
         self.request_count += 1
         identity = {"id": self.request_count} if self.version > 1 else {}
         output = self.child.read_line(json.dumps({"exchange": self.version, **identity, **request}, allow_nan=False))
         try:
-            answer = parse_table(output)
+            answer = parse_object(output)
             for key, expected in {"exchange": self.version, **identity}.items():
                 if type(answer.get(key)) is not int or answer[key] != expected:
                     message = f"the answer's {key} is {answer.get(key)!r}; allowed: {expected}, as in the request"
@@ -133,14 +133,17 @@ class Server:
 _idle: dict[tuple[Command, ExecutableLimits], Server] = {}
 
 
-def acquire(command: Command, limits: ExecutableLimits) -> Server:
-    """Take an idle persistent program, or start a new one and check its greeting; the caller owns it."""
+def acquire_server(command: Command, limits: ExecutableLimits) -> Server:
+    """Return an idle persistent program, or start a new program and check its greeting line.
+
+    The caller must pass it to `release_server` afterwards.
+    """
     if command.persistent and (command, limits) in _idle:
         return _idle.pop((command, limits))
     child = RunningProgram(command.words, limits)
     output = child.read_line()
     try:
-        greeting = dict(parse_table(output))
+        greeting = dict(parse_object(output))
         version = greeting.get("exchange")
         is_ready = greeting == {"exchange": version, "ready": True}
         if type(version) is not int or version not in ANSWER_VERSIONS or not is_ready:
@@ -153,8 +156,8 @@ def acquire(command: Command, limits: ExecutableLimits) -> Server:
     return Server(child, version)
 
 
-def release(command: Command, limits: ExecutableLimits, server: Server) -> None:
-    """Keep a persistent program for the next case; end any other."""
+def release_server(command: Command, limits: ExecutableLimits, server: Server) -> None:
+    """Store a persistent program for the next case; end a program that is not persistent or already stored."""
     if command.persistent and (command, limits) not in _idle:
         _idle[command, limits] = server
     else:
@@ -167,8 +170,8 @@ def idle_processes() -> set[int]:
 
 
 @atexit.register
-def end_persistent() -> None:
-    """End the persistent programs of this process."""
+def end_idle_programs() -> None:
+    """End the idle persistent programs of this process; also called when the process exits."""
     while _idle:
         _idle.popitem()[1].child.stop()
 
@@ -186,7 +189,7 @@ class Session:
         self.folder = Path(tempfile.mkdtemp(prefix="marsyard-talk-"))
         weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
 
-    def ask(
+    def send_request(
         self,
         action: str,
         values: Mapping[str, Any],
@@ -195,12 +198,13 @@ class Session:
     ) -> Answer:
         """Send the request `action` with `values` and return the program's answer, decoded by `parse`.
 
-        `files` maps request keys to functions that write a folder; the folders are removed after the answer.
+        `files` maps request keys to functions that write the files of a folder; the request contains the folder's path.
+        The folders are removed after the answer.
         """
         request = {"do": action, **values}
         if self._server is None:
-            self._server = acquire(self._command, self._limits)
-            self._release = weakref.finalize(self, release, self._command, self._limits, self._server)
+            self._server = acquire_server(self._command, self._limits)
+            self._release = weakref.finalize(self, release_server, self._command, self._limits, self._server)
         with tempfile.TemporaryDirectory(prefix=f"{action}-", dir=self.folder) as request_folder:
             for key, write in (files or {}).items():
                 folder = Path(request_folder) / key
@@ -208,7 +212,7 @@ class Session:
                 write(folder)
                 request[key] = str(folder)
             try:
-                answer, output = self._server.ask(request)
+                answer, output = self._server.send_request(request)
             except AlgorithmError:
                 # the program has ended: do not return it to the idle programs
                 if self._release is not None:
@@ -217,23 +221,23 @@ class Session:
         return read_answer(answer, output, parse)
 
 
-def ask_case(
+def run_case(
     command: Command,
     limits: ExecutableLimits,
     measurements: DescentMeasurements | LandingMeasurements,
     read: AnswerReader[Answer],
 ) -> Answer:
-    """Run a program on one case and return its answer.
+    """Run a program on one case and return its answer, decoded by `read`.
 
     A persistent program that fails is ended; the next case starts it again.
     """
     with tempfile.TemporaryDirectory(prefix="marsyard-case-") as folder:
         write_case(Path(folder), measurements)
         if command.persistent:
-            server = acquire(command, limits)
-            answer, output = server.ask({"case": folder})
-            release(command, limits, server)
+            server = acquire_server(command, limits)
+            answer, output = server.send_request({"case": folder})
+            release_server(command, limits, server)
         else:
             output = RunningProgram((*command.words, folder), limits).read_all()
-            answer = parse_table(output)
+            answer = parse_object(output)
     return read_answer(answer, output, read)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.exchange.files import write_picture
+from marsyard.algorithms.exchange.files import write_counts
 from marsyard.scenarios.descent.parameters import binned_size_for
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.layout import (
@@ -253,7 +253,7 @@ class _FolderReader:
         return store.StoredImage(
             source=row.texts["file"],
             size=camera.size,
-            counts=store.write_file(self.target, "pictures", f"{name}.png", lambda path: write_picture(path, counts)),
+            counts=store.write_file(self.target, "pictures", f"{name}.png", lambda path: write_counts(path, counts)),
             camera=self.cameras[camera],
             flat_field=flat_field,
             time_s=image.time_s,

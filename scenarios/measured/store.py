@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.exchange.files import read_picture
+from marsyard.algorithms.exchange.files import read_counts
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.scenarios.user_files import UserFile
 from marsyard.sim.camera import BODY_FRAME, CameraModel, read_cahvor, write_cahvor
@@ -187,7 +187,7 @@ def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]
     """Load the images of a case with their cameras in the body frame. Raises ValueError if a file has changed."""
     folder, images = Path(cases.file).parent, []
     for image in case.pictures:
-        counts = read_picture(_check_unchanged(folder, image.counts))
+        counts = read_counts(_check_unchanged(folder, image.counts))
         flat = image.flat_field
         calibration = DetectorCalibration(
             flat_field=np.ones(counts.shape)

@@ -102,7 +102,7 @@ class StereoCamera:
 
         pairs = zip(cameras, boxes, strict=True)
         pixel_rays = [PixelRays.of(camera.crop(*box.corner, box.size)) for camera, box in pairs]
-        local_scene = add_rover(scene.within([rays.cone(world_from_head) for rays in pixel_rays]))
+        local_scene = add_rover(scene.restrict_to_cones([rays.cone(world_from_head) for rays in pixel_rays]))
         radiances, exposure_s = [render(local_scene, rays) for rays in pixel_rays], 0.0
         if p.camera.detector_noise:
             windows = [unit.window(*box.corner, box.size) for unit, box in zip(self.detectors, boxes, strict=True)]

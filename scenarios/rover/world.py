@@ -116,7 +116,7 @@ class RunWorld:
         interval = int(time_s // self.sun.held_s)
         if self._cached_scene is None or self._cached_scene[0] != interval:
             sun = self.sun.sun_in_interval(interval, self.ground.site.environment.sun_radius_rad)
-            self._cached_scene = (interval, self.base.in_light(sun, self.ground.photometry(sun)))
+            self._cached_scene = (interval, self.base.with_light(sun, self.ground.photometry(sun)))
         return self._cached_scene[1]
 
     def brightness(self, time_s: float) -> float:

@@ -35,7 +35,7 @@ class Sun:
 
 @dataclass(frozen=True)
 class DustySky:
-    """A sky that is brighter towards the sun and the horizon, with the sun's disc, for pixels that show the sky.
+    """Brightness of a dusty sky: brighter towards the sun and the horizon, with the disc of the sun.
 
     Radiance by single scattering in a plane layer of air (Chandrasekhar 1960, section 7), relative to direct sunlight
     at the ground::
@@ -202,7 +202,7 @@ class CloudLayer:
     """One realisation of the clouds: a thin, periodic layer of constant shape that drifts with the wind.
 
     A cloud between a point and the sun attenuates direct sunlight. Skylight increases by the light that all clouds
-    scatter down. The clouds are not visible in pictures from above the layer or of the sky. The layer has no thickness,
+    scatter down. The clouds are not visible in images from above the layer or of the sky. The layer has no thickness,
     so the cover does not depend on the sun's elevation.
 
     - height_m: height of the layer above z = 0
@@ -238,11 +238,13 @@ class CloudLayer:
             variance * (scale * length) ** 2 * np.exp(-wave * (scale * length) ** 2) for scale, variance in OCTAVES
         )
         field = np.fft.irfft2(noise * np.sqrt(power), s=(CELLS, CELLS))
-        above = field - np.quantile(field, 1.0 - parameters.cover)
+        excess = field - np.quantile(field, 1.0 - parameters.cover)
         # cloud fraction of a cell at an outline, by linear interpolation
-        slope = np.hypot(*(0.5 * (np.roll(above, -1, k) - np.roll(above, 1, k)) for k in (0, 1)))
-        inside = np.clip(0.5 + above / np.maximum(slope, 1e-12), 0.0, 1.0)
-        smoothed = np.fft.irfft2(np.fft.rfft2(inside) * np.exp(-0.5 * wave * parameters.edge_m**2), s=inside.shape)
+        slope = np.hypot(*(0.5 * (np.roll(excess, -1, k) - np.roll(excess, 1, k)) for k in (0, 1)))
+        cloud_fraction = np.clip(0.5 + excess / np.maximum(slope, 1e-12), 0.0, 1.0)
+        smoothed = np.fft.irfft2(
+            np.fft.rfft2(cloud_fraction) * np.exp(-0.5 * wave * parameters.edge_m**2), s=(CELLS, CELLS)
+        )
         return cls(parameters, ground_m + parameters.base_m, _read_only(np.clip(smoothed, 0.0, 1.0)))
 
     @property
@@ -261,7 +263,7 @@ class CloudLayer:
     ) -> Float64[np.ndarray, "*batch"]:
         """Fraction of direct sunlight that reaches world points (metres) through the layer; NaN for NaN points.
 
-        Ground truth of a picture: ``clouds.transmittance(frame.points_world(), scene.sun, time_s)``.
+        Ground truth of an image: ``clouds.transmittance(frame.points_world(), scene.sun, time_s)``.
         """
         _cells, height, east, north, opacity = self.coefficients(sun, time_s)
         direction = np.asarray(sun.direction, dtype=np.float64)
@@ -275,7 +277,7 @@ class CloudLayer:
 
 
 def no_cover() -> Float32[np.ndarray, "one one"]:
-    """Cover of a scene without clouds, with the same numba type as that of a cloud layer."""
+    """Return the cloud cover of a scene without clouds, with the same numba type as that of a cloud layer."""
     return _read_only(np.zeros((1, 1)))
 
 

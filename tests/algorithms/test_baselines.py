@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.baselines import BaselineDetails, HomographyEstimator, PairPatches, PhaseCorrelationEstimator
-from marsyard.algorithms.baselines.homography import distortion
+from marsyard.algorithms.baselines.homography import max_length_change
 from marsyard.algorithms.baselines.pairs import DEFAULT_COMMON_OPTIONS, find_common_square, rectify_pair
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
-from marsyard.algorithms.dimes.binning import inside_frame, square, usable_views
+from marsyard.algorithms.dimes.binning import build_views, inside_frame, square_lattice
 from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 from tests.algorithms.synthetic_descent import (
@@ -127,7 +127,7 @@ def test_distortion_is_the_largest_relative_length_change() -> None:
         - 1.0
         for a in angles
     ]
-    result = distortion(homography, float((homography @ np.array([*middle, 1.0]))[2]), apply_homography(middle))
+    result = max_length_change(homography, float((homography @ np.array([*middle, 1.0]))[2]), apply_homography(middle))
     assert result == pytest.approx(np.abs(changes).max(), abs=1e-4)
 
 
@@ -149,12 +149,12 @@ def test_estimates_are_deterministic_and_contain_matches(name: str, measurements
 
 
 def test_common_square_is_the_largest_visible_in_both_images() -> None:
-    triple = usable_views(render(steady_flight((0.0, 0.0), ATTITUDES)), DimesOptions().binned_size)
+    triple = build_views(render(steady_flight((0.0, 0.0), ATTITUDES)), DimesOptions().binned_size)
     assert triple is not None
     result = find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, max_side_px=1000))
     assert result is not None
     middle, side, gsd = result
-    ground = middle + square(0.5 * side * gsd, 9)
+    ground = middle + square_lattice(0.5 * side * gsd, 9)
     for view in triple[:2]:
         assert inside_frame(view, ground, 0.0, DEFAULT_COMMON_OPTIONS.max_off_nadir_rad).all()
     # The second image has 256 pixels per side, rotated by 120 deg and tilted: a north-up square in it is smaller.

@@ -17,9 +17,9 @@ from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import (
     TrackMetrics,
     ValidityCheck,
-    combinations,
     failed_checks,
     propagate_velocity,
+    rank_combinations,
     track_metrics,
 )
 from marsyard.algorithms.image.correlation import Peak
@@ -61,7 +61,7 @@ def combine_tracks(
 def test_combinations_are_sorted_by_consistency() -> None:
     velocities = np.array([[40.0, 0.0, -75.0], [41.0, 2.0, -75.0]])
     first = [(0, np.array([5.0, 5.0])), (1, np.array([9.0, 5.0]))]
-    result = combinations(first, [(1, np.array([6.0, 7.0]))], velocities)
+    result = rank_combinations(first, [(1, np.array([6.0, 7.0]))], velocities)
     assert [(c.first, c.second) for c in result] == [(0, 1), (1, 1)]
     assert [c.discrepancy_m_s for c in result] == pytest.approx([0.0, 4.0])
 

@@ -16,7 +16,7 @@ from marsyard.algorithms.dimes.binning import (
     pixel_angle_rad,
     pixels_from_ground,
     rectify_patch,
-    square,
+    square_lattice,
     square_outline,
 )
 from marsyard.algorithms.dimes.options import DimesOptions
@@ -24,12 +24,12 @@ from marsyard.algorithms.dimes.overlap import (
     Candidates,
     best_candidates,
     border_pixels,
-    contrasts,
     grid_pixels,
     overlap_polygon,
     search_geometry,
     select_templates,
     template_candidates,
+    template_contrasts,
     zero_phase_pixel,
 )
 from marsyard.sim.frames import direction
@@ -114,7 +114,7 @@ def test_pixel_angle_and_search_geometry_match_the_paper() -> None:
 
 
 def test_square_and_outline_have_the_expected_points() -> None:
-    assert square(3.0, 4).shape == (16, 2)
+    assert square_lattice(3.0, 4).shape == (16, 2)
     outline = square_outline(3.0, 4)
     assert outline.shape == (12, 2)
     assert np.all(np.abs(outline).max(axis=1) == 3.0)
@@ -187,7 +187,7 @@ def test_templates_and_windows_avoid_zero_phase_spot() -> None:
         for view in (first, second):
             for ground, preferred in zip(selectable.ground, selectable.preferred, strict=True):
                 half = geometry.window_half_m if preferred and view is second else geometry.template_half_m
-                points = np.column_stack([ground + square(half, 25), np.zeros(625)]) - view.centre
+                points = np.column_stack([ground + square_lattice(half, 25), np.zeros(625)]) - view.centre
                 cosines = points @ -sun / np.linalg.norm(points, axis=1)
                 # Between lattice points the spot may extend into the window by a fraction of a degree.
                 assert np.degrees(np.arccos(cosines.max())) > np.degrees(radius) - 0.6
@@ -226,7 +226,7 @@ def test_only_textured_area_is_selected() -> None:
     np.testing.assert_allclose(pixels[chosen[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
     assert contrasts_of_chosen[0] > 0.02
     assert contrasts_of_chosen[1] < 0.001
-    assert contrasts(view, pixels, OPTIONS.template_px)[chosen[0]] == contrasts_of_chosen[0]
+    assert template_contrasts(view, pixels, OPTIONS.template_px)[chosen[0]] == contrasts_of_chosen[0]
 
 
 def make_wave_texture() -> Texture:

@@ -22,7 +22,7 @@ from marsyard.algorithms.exchange import (
     read_case,
     write_case,
 )
-from marsyard.algorithms.exchange.serving import end_persistent
+from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, PoseMeasurement
 from tests.algorithms.synthetic_descent import Flight, render, tilt_body
@@ -211,7 +211,7 @@ def test_persistent_program_restarts_after_a_crash(measurements: DescentMeasurem
     repeated = run_program(spec, measurements).velocity_m_s
     assert repeated is not None
     assert repeated[0] == 0.0
-    end_persistent()
+    end_idle_programs()
 
 
 #: A program that answers each case twice: `{pause_s}` after the request, and again after the same time.
@@ -248,7 +248,7 @@ def test_late_second_answer_is_not_used_for_the_next_case(
     repeated = run_program(spec, measurements).velocity_m_s
     assert repeated is not None
     assert repeated[0] == 0.0
-    end_persistent()
+    end_idle_programs()
 
 
 def test_answer_to_another_request_is_rejected(measurements: DescentMeasurements, tmp_path: Path) -> None:
@@ -258,7 +258,7 @@ def test_answer_to_another_request_is_rejected(measurements: DescentMeasurements
     with pytest.raises(AlgorithmError, match="the answer's id is 1; allowed: 2") as caught:
         run_program(spec, measurements)
     assert caught.value.fault is Fault.BAD_ANSWER
-    end_persistent()
+    end_idle_programs()
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,7 @@ def test_c_example_estimates_velocity(measurements: DescentMeasurements, tmp_pat
         assert np.hypot(*(result.velocity_m_s - TRUE)) < 1.0
         assert isinstance(result.details, ProgramDetails)
         assert "templates found" in result.details.stderr
-    end_persistent()
+    end_idle_programs()
     images = tuple(dataclasses.replace(image, counts=np.full_like(image.counts, 4095)) for image in measurements.images)
     saturated = dataclasses.replace(measurements, images=images)
     assert run_program(f"exec:{executable}", saturated).outcome is VelocityOutcome.NO_VALID_TRACK

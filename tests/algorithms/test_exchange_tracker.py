@@ -21,7 +21,7 @@ from marsyard.algorithms.exchange import (
     read_target,
 )
 from marsyard.algorithms.exchange.files import encode_target, write_mast, write_stop
-from marsyard.algorithms.exchange.serving import end_persistent
+from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
 from marsyard.scenarios.conformance import trackers
@@ -106,7 +106,7 @@ def test_program_matches_python_tracker(tmp_path: Path) -> None:
     assert lost.losses == expected.losses
     program.clear()
     assert cast(TargetTracker, program).state is TrackingState.NO_TARGET
-    end_persistent()
+    end_idle_programs()
 
 
 @pytest.mark.usefixtures("import_path")
@@ -121,7 +121,7 @@ def test_persistent_process_serves_many_runs(tmp_path: Path) -> None:
             gc.collect()
         assert all(len(process_ids) == 1 for process_ids in processes)
         assert (processes[0] == processes[1]) is shared
-    end_persistent()
+    end_idle_programs()
     still_running = [number for process_ids in processes for number in process_ids if Path(f"/proc/{number}").exists()]
     assert still_running == []
 

@@ -21,7 +21,7 @@ from marsyard.algorithms.exchange import (
     write_case,
     write_frame,
 )
-from marsyard.algorithms.exchange.serving import end_persistent
+from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
@@ -194,7 +194,7 @@ def test_example_returns_equal_estimates_in_python_and_as_program(monkeypatch: p
         assert [estimate is None for estimate in actual.after_pictures] == [True, False, False, False, False]
         assert isinstance(actual.details, ProgramDetails)
         assert actual.details.time_s > 0.0
-    end_persistent()
+    end_idle_programs()
 
 
 def format_server(answers: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Kernels of relief finer than the terrain's samples: band-limited height noise that enters shading by its slopes."""
+"""Kernels of micro-relief: band-limited height noise finer than the terrain samples, which changes surface normals."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from numba import njit
 from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.terrain.kernels import Array
 
-#: As `marsyard.sim.render.kernels.photometry.FADING`, for noise of 0.61 waves a cell.
+#: As `marsyard.sim.render.kernels.photometry.FADING`, for slopes with a median frequency of 0.61 cycles per cell.
 FADING = 0.306
 MIN_CELLS = math.sqrt(FADING)
-#: Mean squares of `relief_noise` and of its derivative along one axis, and its waves per cell in the median of power.
+#: Mean squares of `relief_noise` and of its derivative along one axis.
 HEIGHT_VARIANCE, SLOPE_VARIANCE = 0.0464, 0.3886
 #: Gradients of the noise: eight unit vectors, evenly spaced.
 _LONG, _SHORT = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
@@ -21,7 +21,7 @@ _LONG, _SHORT = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
 
 @njit(cache=True, inline="always")
 def _lattice_gradient(i: int, j: int, seed: int) -> tuple[float, float]:
-    """One of eight gradients by a hash of a lattice point (finaliser of MurmurHash3)."""
+    """Select one of eight gradients by a hash of the lattice point (finaliser of MurmurHash3)."""
     h = np.uint32(i) * np.uint32(0x8DA6B343)
     h ^= np.uint32(j) * np.uint32(0xD8163841)
     h ^= np.uint32(seed) * np.uint32(0x9E3779B1)
@@ -48,12 +48,12 @@ def relief_noise(x: float, y: float, seed: int) -> tuple[float, float, float]:
     cx, cy = _lattice_gradient(i, j + 1, seed)
     dx, dy = _lattice_gradient(i + 1, j + 1, seed)
     a = ax * x + ay * y
-    along_x = bx * (x - 1.0) + by * y - a
-    along_y = cx * x + cy * (y - 1.0) - a
-    twist = dx * (x - 1.0) + dy * (y - 1.0) - a - along_x - along_y
-    value = a + u * along_x + v * along_y + u * v * twist
-    by_x = ax + u * (bx - ax) + v * (cx - ax) + u * v * (ax - bx - cx + dx) + du * (along_x + v * twist)
-    by_y = ay + u * (by - ay) + v * (cy - ay) + u * v * (ay - by - cy + dy) + dv * (along_y + u * twist)
+    difference_x = bx * (x - 1.0) + by * y - a
+    difference_y = cx * x + cy * (y - 1.0) - a
+    twist = dx * (x - 1.0) + dy * (y - 1.0) - a - difference_x - difference_y
+    value = a + u * difference_x + v * difference_y + u * v * twist
+    by_x = ax + u * (bx - ax) + v * (cx - ax) + u * v * (ax - bx - cx + dx) + du * (difference_x + v * twist)
+    by_y = ay + u * (by - ay) + v * (cy - ay) + u * v * (ay - by - cy + dy) + dv * (difference_y + u * twist)
     return value, by_x, by_y
 
 
@@ -68,10 +68,11 @@ def add_relief_slopes(
     resolved: Array,
     unresolved: Array,
 ) -> None:
-    """Compute the slopes of the octaves that pixels resolve, for a roughness of 1.
+    """Compute the slopes of the octaves that are resolved by the pixels, for a roughness of 1.
 
-    An octave fades with its pixels' footprint as texture does (`FADING`). `resolved` and `unresolved` are the
-    variances of slope along one axis that pixels resolve and do not. A footprint is infinite where there is no ground.
+    An octave fades with the footprint of the pixel (`FADING`). `resolved` and `unresolved` are the variances of the
+    slope along one axis, of the part that a pixel resolves and of the remainder. Pixels without ground have an infinite
+    footprint.
     """
     finest = math.inf
     for k in range(footprint.size):
@@ -80,10 +81,10 @@ def add_relief_slopes(
     cell = relief.coarsest
     for octave in range(relief.heights.size):
         gain = relief.heights[octave] / cell
-        full = gain * gain * SLOPE_VARIANCE
+        variance = gain * gain * SLOPE_VARIANCE
         if cell <= MIN_CELLS * finest:
             for k in range(footprint.size):
-                unresolved[k] += full
+                unresolved[k] += variance
         else:
             for k in range(footprint.size):
                 ratio = footprint[k] / cell
@@ -92,17 +93,17 @@ def add_relief_slopes(
                 _value, by_x, by_y = relief_noise(x[k] / cell, y[k] / cell, octave)
                 slope_x[k] += gain * fade * by_x
                 slope_y[k] += gain * fade * by_y
-                resolved[k] += full * fade * fade
-                unresolved[k] += full * (1.0 - fade * fade)
+                resolved[k] += variance * fade * fade
+                unresolved[k] += variance * (1.0 - fade * fade)
         cell *= 0.5
 
 
 @njit(cache=True, inline="always", error_model="numpy")
 def smith_shadowing(cosine: float, variance: float) -> float:
-    """Fraction of facets in the light that roughness does not shade, for an incidence and a variance of slope.
+    """Fraction of illuminated facets that the roughness does not shade (Smith 1967, Gaussian slopes).
 
-    Smith (1967) for Gaussian slopes, in the rational approximation of Walter et al. (2007, section 5.2); above 0.996
-    of the exact value.
+    `cosine` is that of the incidence angle, `variance` that of the slope along one axis. The rational approximation of
+    Walter et al. (2007, section 5.2) is at least 0.996 of the exact value.
     """
     if variance <= 0.0 or cosine >= 1.0:
         return 1.0

@@ -22,8 +22,8 @@ def single_scattering(cos_zenith: float, cos_sun_zenith: float, cos_g: float, de
     mu = max(cos_zenith, HORIZON)
     mu0 = max(cos_sun_zenith, HORIZON)
     # exact also where both elevations are equal
-    apart = depth / mu - depth / mu0
-    path = 1.0 - 0.5 * apart if abs(apart) < 1e-6 else -math.expm1(-apart) / apart
+    difference = depth / mu - depth / mu0
+    path = 1.0 - 0.5 * difference if abs(difference) < 1e-6 else -math.expm1(-difference) / difference
     phase = (1.0 - asymmetry * asymmetry) / (1.0 + asymmetry * asymmetry - 2.0 * asymmetry * cos_g) ** 1.5
     brightness: float = phase * path * depth / mu
     return brightness
@@ -31,9 +31,9 @@ def single_scattering(cos_zenith: float, cos_sun_zenith: float, cos_g: float, de
 
 @njit(cache=True)
 def sky_brightness(sky: Array, sun_z: float, sun_radius: float, dz: float, cos_g: float, pixel: float) -> float:
-    """Radiance factor of the sky in a direction, with the sun's disc where a dusty sky is given.
+    """Radiance factor of the sky in a direction; a dusty sky includes the disc of the sun.
 
-    - sky: even radiance factor, factor of single scattering (0 for an even sky), its optical depth, asymmetry
+    - sky: uniform radiance factor, factor of single scattering (0 for a uniform sky), its optical depth, asymmetry
     - sun_z, sun_radius: sine of the sun's elevation, and its angular radius
     - dz, cos_g: sine of the direction's elevation, and cosine of its angle from the sun
     - pixel: angle that the pixel subtends: the width of the disc's edge
@@ -51,28 +51,29 @@ def sky_brightness(sky: Array, sun_z: float, sun_radius: float, dz: float, cos_g
 
 @njit(cache=True)
 def scattered_irradiance(sun_z: float, depth: float, asymmetry: float) -> float:
-    """Irradiance of level ground over pi under a sky of `single_scattering`: ``1 / pi int L mu dOmega``.
+    """Irradiance of level ground divided by pi, under the sky of `single_scattering`: ``1 / pi int L mu dOmega``.
 
-    Midpoints of 256 equal steps in the squared sine of elevation, by which irradiance is weighted, and of 256 steps of
-    azimuth over one half, as the other is the same.
+    Midpoint rule with 256 steps in the squared sine of elevation and 256 steps in azimuth over 180 deg (the other half
+    is symmetric).
     """
     steps = 256
-    sun_across = math.sqrt(max(1.0 - sun_z * sun_z, 0.0))
+    sun_cos_elevation = math.sqrt(max(1.0 - sun_z * sun_z, 0.0))
     total = 0.0
     for i in range(steps):
         mu = math.sqrt((i + 0.5) / steps)
-        across = math.sqrt(1.0 - mu * mu)
+        cos_elevation = math.sqrt(1.0 - mu * mu)
         for k in range(steps):
-            cos_g = mu * sun_z + across * sun_across * math.cos(math.pi * (k + 0.5) / steps)
+            cos_g = mu * sun_z + cos_elevation * sun_cos_elevation * math.cos(math.pi * (k + 0.5) / steps)
             total += single_scattering(mu, sun_z, cos_g, depth, asymmetry)
     return total / (steps * steps)
 
 
 #: Mean square of `gradient_noise` over space.
 NOISE_VARIANCE = 0.0732
-#: A pixel averages over its area: waves of f cycles a footprint keep sinc(f) of their amplitude; the detector applies
-#: the blur of the optics. Noise of cells of c footprints has 0.53 waves a cell in the median, and
-#: ``(1 - FADING / c^2)^2`` is its sinc to 0.02 down to Nyquist's frequency; waves beyond it alias as in a real camera.
+#: A pixel averages over its area: a wave of f cycles per footprint keeps the fraction sinc(f) of its amplitude. (The
+#: detector model applies the blur of the optics.) Noise with cells of c footprints has a median frequency of 0.53
+#: cycles per cell; ``(1 - FADING / c^2)^2`` approximates its sinc to 0.02 down to the Nyquist frequency. Waves
+#: above the Nyquist frequency alias, as in a real camera.
 FADING = 0.231
 #: Cell size, in footprints, at which an octave vanishes.
 MIN_CELLS = math.sqrt(FADING)
@@ -107,28 +108,28 @@ def _gradient_product(h: np.uint32, x: float, y: float, z: float) -> float:
 
 @njit(cache=True, inline="always")
 def gradient_noise(x: float, y: float, z: float, seed: int) -> float:
-    """Perlin's improved noise (2002): smooth, of mean zero, with waves of about one to two units."""
+    """Perlin's improved noise (2002): smooth, of mean zero, with wavelengths of about one to two units."""
     fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
     i, j, k = int(fx), int(fy), int(fz)
     x, y, z = x - fx, y - fy, z - fz
     u = x * x * x * (x * (x * 6.0 - 15.0) + 10.0)
     v = y * y * y * (y * (y * 6.0 - 15.0) + 10.0)
     w = z * z * z * (z * (z * 6.0 - 15.0) + 10.0)
-    near = (1.0 - v) * (
+    below = (1.0 - v) * (
         (1.0 - u) * _gradient_product(_hash_point(i, j, k, seed), x, y, z)
         + u * _gradient_product(_hash_point(i + 1, j, k, seed), x - 1.0, y, z)
     ) + v * (
         (1.0 - u) * _gradient_product(_hash_point(i, j + 1, k, seed), x, y - 1.0, z)
         + u * _gradient_product(_hash_point(i + 1, j + 1, k, seed), x - 1.0, y - 1.0, z)
     )
-    far = (1.0 - v) * (
+    above = (1.0 - v) * (
         (1.0 - u) * _gradient_product(_hash_point(i, j, k + 1, seed), x, y, z - 1.0)
         + u * _gradient_product(_hash_point(i + 1, j, k + 1, seed), x - 1.0, y, z - 1.0)
     ) + v * (
         (1.0 - u) * _gradient_product(_hash_point(i, j + 1, k + 1, seed), x, y - 1.0, z - 1.0)
         + u * _gradient_product(_hash_point(i + 1, j + 1, k + 1, seed), x - 1.0, y - 1.0, z - 1.0)
     )
-    noise: float = (1.0 - w) * near + w * far
+    noise: float = (1.0 - w) * below + w * above
     return noise
 
 
@@ -143,7 +144,7 @@ def _add_octave(
     strength: Array,
     change: Array,
 ) -> None:
-    """Add one octave of `add_texture`, given by its number and amplitude."""
+    """Add one octave of `add_texture`; `octave` contains its number and amplitude."""
     number, amplitude = octave
     for k in range(x.size):
         ratio = footprint[k] / cell
@@ -157,12 +158,12 @@ def _add_octave(
 def add_texture(
     x: Array, y: Array, z: Array, footprint: Array, coarsest: float, amplitudes: Array, strength: Array, change: Array
 ) -> None:
-    """Add the logarithm of the albedo's relative change at positions, averaged over pixels' footprints, to `change`.
+    """Add the logarithm of the relative albedo, averaged over the pixels' footprints, to `change`.
 
-    Octave n has lattice cells of ``coarsest / 2**n``. It fades as optics and pixels blur it (`FADING`), as slowly as
-    detail appears when a real camera nears a surface; faster, trackers see the texture change from picture to picture.
-    Half of each octave's variance is subtracted, so that albedo keeps its mean for any visible octaves. `strength` is a
-    factor of the amplitudes. A footprint is infinite where no texture is wanted.
+    Octave n has lattice cells of ``coarsest / 2**n``. It fades by the average over the pixel (`FADING`), so that detail
+    appears as slowly as in a real camera that approaches a surface. Half of each octave's variance is subtracted, so
+    the mean albedo does not depend on the number of visible octaves. `strength` is a factor of the amplitudes. Pixels
+    with an infinite footprint have no texture.
     """
     finest = math.inf
     for k in range(footprint.size):

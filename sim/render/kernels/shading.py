@@ -51,18 +51,19 @@ from marsyard.sim.render.kernels.sun import (
 )
 from marsyard.sim.terrain.kernels import Array, Level, sample
 
-#: Footprint, in samples, up to which the finest level is used: the B-spline itself holds nothing finer.
+#: Maximum footprint, in samples, for which the finest level is used; the B-spline contains no finer detail.
 SHARP_UNTIL = 1.2
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
-#: Rows of a strip's buffer: position and direction of the line of sight, footprint (infinite without ground), terrain
-#: there, normal, log change of albedo by texture, cosines of incidence, emission and phase, visible sun fraction.
+#: Rows of a strip's buffer: position, direction of the line of sight, footprint (infinite without ground), height,
+#: slopes and albedo of the terrain, normal, logarithm of the texture's relative albedo, cosines of incidence, emission
+#: and phase angles, visible fraction of the sun.
 X, Y, Z, DX, DY, DZ, FOOTPRINT, HEIGHT, SLOPE_X, SLOPE_Y, ALBEDO, NX, NY, NZ, CHANGE, COS_I, COS_E, COS_G, LIT = (
     ROW * n for n in range(19)
 )
-#: Rows of the ground's level: samples per metre, weight of the next coarser level, and the terrain there.
+#: Rows of the ground's level: samples per metre, weight of the next coarser level, and terrain of the coarser level.
 SCALE, BLEND, COARSE_HEIGHT, COARSE_SLOPE_X, COARSE_SLOPE_Y, COARSE_ALBEDO = (ROW * n for n in range(19, 25))
-#: Rows of objects alone: positions, footprints and changes of albedo.
+#: Rows of the pixels with objects: position, footprint and logarithm of the relative albedo.
 OBJECT_X, OBJECT_Y, OBJECT_Z, OBJECT_FOOTPRINT, OBJECT_CHANGE = (ROW * n for n in range(25, 30))
 #: Rows of the micro-relief: slopes, resolved and unresolved variance of slope, and strength of texture.
 FINE_X, FINE_Y, RESOLVED, UNRESOLVED, STRENGTH = (ROW * n for n in range(30, 35))
@@ -78,8 +79,12 @@ class Occluders(NamedTuple):
 
 
 class _Strip(NamedTuple):
-    """Buffers of a strip: rows of `work`, the ground's level of each pixel, numbers of the pixels on the
-    ground, of those with blended levels, and of others, and which positions are hidden from the sun.
+    """Buffers of a strip of pixels.
+
+    - work: rows of values (see `X` and the following constants)
+    - level: terrain level of each pixel
+    - ground, blended, other: indices of pixels with ground, with two blended levels, and without ground
+    - hidden: whether objects hide the sun
     """
 
     work: Array
@@ -92,7 +97,7 @@ class _Strip(NamedTuple):
 
 @njit(cache=True, inline="always")
 def _in_footprint(footprint: Footprint, x: float, y: float) -> bool:
-    """Whether an object may hide the sun from the ground at a position."""
+    """Return whether an object may hide the sun from the ground at a position."""
     if footprint.per_metre == 0.0:
         return True
     cells = footprint.cells
@@ -115,7 +120,7 @@ def _locate_pixels(
     width: int,
     work: Array,
 ) -> None:
-    """Positions of the pixels of a strip, and footprints as on the ground; the sky is placed at the camera."""
+    """Compute positions and footprints (as on level ground) of a strip; sky pixels get the position of the camera."""
     for k in range(min(width, STRIP)):
         dx, dy, dz = rotate(rotation, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
         x, y, z = rotate(rotation, origins[3 * k], origins[3 * k + 1], origins[3 * k + 2])
@@ -131,44 +136,44 @@ def _locate_pixels(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _evaluate_splines(fetched: FetchedCells, width: int, out: Array) -> None:
-    """Height, slopes by sample and albedo of the terrain at the positions of a strip, a row of `out` each."""
+    """Evaluate height, slopes per sample and albedo of the terrain for a strip; each is a row of `out`."""
     for k in range(min(width, STRIP)):
         out[k], out[ROW + k], out[2 * ROW + k], out[3 * ROW + k] = spline(fetched[0], fetched[1], k)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _blend_levels(width: int, work: Array) -> None:
-    """Blend the terrain of the next coarser level into that of the finer."""
+    """Blend slopes and albedo of two terrain levels; convert slopes to metres per metre."""
     for k in range(min(width, STRIP)):
         blend, scale = work[BLEND + k], work[SCALE + k]
         slope_x, slope_y, albedo = work[SLOPE_X + k] * scale, work[SLOPE_Y + k] * scale, work[ALBEDO + k]
-        to_x = 0.5 * scale * work[COARSE_SLOPE_X + k] - slope_x
-        to_y = 0.5 * scale * work[COARSE_SLOPE_Y + k] - slope_y
-        to_albedo = work[COARSE_ALBEDO + k] - albedo
-        mixed = blend > 0.0
-        work[SLOPE_X + k] = slope_x + blend * to_x if mixed else slope_x
-        work[SLOPE_Y + k] = slope_y + blend * to_y if mixed else slope_y
-        work[ALBEDO + k] = albedo + blend * to_albedo if mixed else albedo
+        change_x = 0.5 * scale * work[COARSE_SLOPE_X + k] - slope_x
+        change_y = 0.5 * scale * work[COARSE_SLOPE_Y + k] - slope_y
+        change_albedo = work[COARSE_ALBEDO + k] - albedo
+        is_blended = blend > 0.0
+        work[SLOPE_X + k] = slope_x + blend * change_x if is_blended else slope_x
+        work[SLOPE_Y + k] = slope_y + blend * change_y if is_blended else slope_y
+        work[ALBEDO + k] = albedo + blend * change_albedo if is_blended else albedo
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _interpolate_normal(normals: Array, triangle: int, second: float, third: float, k: int, work: Array) -> None:
     """Interpolate a triangle's normal by the weights of its second and third corner."""
-    rest = 1.0 - second - third
-    nx = rest * normals[triangle, 0, 0] + second * normals[triangle, 1, 0] + third * normals[triangle, 2, 0]
-    ny = rest * normals[triangle, 0, 1] + second * normals[triangle, 1, 1] + third * normals[triangle, 2, 1]
-    nz = rest * normals[triangle, 0, 2] + second * normals[triangle, 1, 2] + third * normals[triangle, 2, 2]
+    first = 1.0 - second - third
+    nx = first * normals[triangle, 0, 0] + second * normals[triangle, 1, 0] + third * normals[triangle, 2, 0]
+    ny = first * normals[triangle, 0, 1] + second * normals[triangle, 1, 1] + third * normals[triangle, 2, 1]
+    nz = first * normals[triangle, 0, 2] + second * normals[triangle, 1, 2] + third * normals[triangle, 2, 2]
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     work[NX + k], work[NY + k], work[NZ + k] = nx / length, ny / length, nz / length
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _select_levels(spacing: float, top_level: int, hits: Hits, strip: _Strip) -> tuple[int, int, int]:
-    """Select the ground's level for each pixel by its footprint, blended between the two nearest.
+    """Select the terrain level of each pixel by its footprint, with blending of the two nearest levels.
 
-    Returns how many pixels see the ground, how many of them blend levels, and how many do not see the ground.
+    Returns the numbers of pixels with ground, of those with blended levels, and of pixels without ground.
     """
-    work, level_of, of_ground, blended, other, _hidden = strip
+    work, level_of_pixel, ground, blended, other, _hidden = strip
     distance, triangle, level = hits.distance, hits.triangle, hits.level
     n_ground, n_blended, n_other = 0, 0, 0
     for k in range(distance.size):
@@ -179,16 +184,16 @@ def _select_levels(spacing: float, top_level: int, hits: Hits, strip: _Strip) ->
             continue
         lower = 0
         if level[k] > 0 or work[FOOTPRINT + k] > SHARP_UNTIL * spacing:
-            suited = math.log2(max(work[FOOTPRINT + k] / (SHARP_UNTIL * spacing), 1.0))
-            fractional = max(suited, float(level[k]))
+            footprint_level = math.log2(max(work[FOOTPRINT + k] / (SHARP_UNTIL * spacing), 1.0))
+            fractional = max(footprint_level, float(level[k]))
             lower = min(int(fractional), top_level)
             if lower < top_level and fractional > lower:
                 work[BLEND + k] = min(fractional - lower, 1.0)
                 blended[n_blended] = k
                 n_blended += 1
-        level_of[k] = lower
+        level_of_pixel[k] = lower
         work[SCALE + k] = 1.0 / spacing / (1 << lower)
-        of_ground[n_ground] = k
+        ground[n_ground] = k
         n_ground += 1
     return n_ground, n_blended, n_other
 
@@ -203,7 +208,7 @@ def _sample_ground(
     strip: _Strip,
     fetched: FetchedCells,
 ) -> None:
-    """Slopes, albedo and normals of the ground in the pixels of a strip."""
+    """Sample slopes, albedo and normals of the ground for a strip of pixels."""
     work = strip.work
     if n_ground > 0:
         x, y = work[X : X + ROW], work[Y : Y + ROW]
@@ -225,9 +230,9 @@ def _sample_ground(
 def _sample_objects(
     materials: Materials, hits: Hits, pixel_angles: Array32, n_other: int, strip: _Strip, body: Ints
 ) -> int:
-    """Normals, albedo and footprints of the objects in the pixels of a strip; marks the sky.
+    """Sample normals, albedo and footprints of objects for a strip of pixels, and mark sky pixels.
 
-    Returns how many pixels see objects; their numbers become the first of `strip.other`.
+    Returns the number of pixels with objects; their indices are moved to the start of `strip.other`.
     """
     work, other = strip.work, strip.other
     distance, triangles, weights = hits.distance, hits.triangle, hits.weights
@@ -255,9 +260,9 @@ def _sample_objects(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
-    """Tilt the ground's normals by its micro-relief, and set the strength of its texture.
+    """Tilt the normals of the ground by the micro-relief, and set the strength of the texture.
 
-    The reflectance law is that of ground with all its roughness: a slope that a pixel resolves may not darken the mean.
+    The reflectance law already includes the mean effect of all roughness; `_shade_roughness` restores this mean.
     """
     work = strip.work
     for k in range(width):
@@ -284,15 +289,15 @@ def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _shade_roughness(width: int, work: Array) -> None:
-    """Restore the mean of tilted normals, and darken by the shadows of relief that pixels do not resolve."""
+    """Restore the mean radiance after the normals were tilted, and darken by shadows of unresolved relief."""
     for k in range(width):
         if work[COS_I + k] > 0.0 and work[UNRESOLVED + k] + work[RESOLVED + k] > 0.0:
             work[LIT + k] *= (1.0 + work[RESOLVED + k]) * smith_shadowing(work[COS_I + k], work[UNRESOLVED + k])
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _apply_texture(materials: Materials, width: int, seen: int, strip: _Strip) -> None:
-    """Change the albedo of ground and objects by their textures."""
+def _apply_texture(materials: Materials, width: int, n_objects: int, strip: _Strip) -> None:
+    """Multiply the albedo of ground and objects by their textures."""
     work = strip.work
     coarsest, amplitudes = materials.ground_texture
     x, y, z = work[X : X + width], work[Y : Y + width], work[Z : Z + width]
@@ -300,13 +305,20 @@ def _apply_texture(materials: Materials, width: int, seen: int, strip: _Strip) -
     add_texture(
         x, y, z, work[FOOTPRINT : FOOTPRINT + width], coarsest, amplitudes, strength, work[CHANGE : CHANGE + width]
     )
-    if seen > 0:
+    if n_objects > 0:
         coarsest, amplitudes = materials.object_texture
-        x, y, z = work[OBJECT_X : OBJECT_X + seen], work[OBJECT_Y : OBJECT_Y + seen], work[OBJECT_Z : OBJECT_Z + seen]
-        footprint, change = work[OBJECT_FOOTPRINT : OBJECT_FOOTPRINT + seen], work[OBJECT_CHANGE : OBJECT_CHANGE + seen]
-        work[FINE_X : FINE_X + seen] = 1.0
-        add_texture(x, y, z, footprint, coarsest, amplitudes, work[FINE_X : FINE_X + seen], change)
-        for m in range(seen):
+        x, y, z = (
+            work[OBJECT_X : OBJECT_X + n_objects],
+            work[OBJECT_Y : OBJECT_Y + n_objects],
+            work[OBJECT_Z : OBJECT_Z + n_objects],
+        )
+        footprint, change = (
+            work[OBJECT_FOOTPRINT : OBJECT_FOOTPRINT + n_objects],
+            work[OBJECT_CHANGE : OBJECT_CHANGE + n_objects],
+        )
+        work[FINE_X : FINE_X + n_objects] = 1.0
+        add_texture(x, y, z, footprint, coarsest, amplitudes, work[FINE_X : FINE_X + n_objects], change)
+        for m in range(n_objects):
             work[CHANGE + strip.other[m]] = work[OBJECT_CHANGE + m]
     for k in range(width):
         if work[CHANGE + k] != 0.0:
@@ -324,54 +336,54 @@ def _cast_shadows(
     body: Ints,
     strip: _Strip,
 ) -> None:
-    """Fraction of the sun that each pixel's position sees past the ground and objects.
+    """Compute the fraction of the sun's disc that ground and objects leave visible, for each pixel.
 
-    `terrain` is the level on which the ground's shadow was swept.
+    `terrain` is the level on whose grid the ground's shadow was computed.
     """
     sun, radius = light.sun, light.law[7]
     distance, triangle, level = hits.distance, hits.triangle, hits.level
     work, other, hidden = strip.work, strip.other, strip.hidden
     shadow, casters, footprint = occluders
-    shadowed = shadow.height.shape[0] > 1
-    objects = casters[0].shape[0] > 0
-    unsure = COARSE_GRID_MARGIN * shadow.spacing
-    queried = 0
+    has_shadow = shadow.height.shape[0] > 1
+    has_objects = casters[0].shape[0] > 0
+    margin = COARSE_GRID_MARGIN * shadow.spacing
+    n_tested = 0
     for k in range(distance.size):
         if work[COS_I + k] <= 0.0 or body[k] == SKY:
             continue
         x, y, z = work[X + k], work[Y + k], work[Z + k]
         on_object = triangle[k] >= 0
-        met = level[k] == 0
+        on_finest_level = level[k] == 0
         lit = 1.0
-        if shadowed:
-            if not on_object and not met:
-                # where the pixel sees a smoothed level, the finest level's bumps must not shade it
+        if has_shadow:
+            if not on_object and not on_finest_level:
+                # a pixel on a smoothed level must not be shaded by bumps of the finest level
                 height, _slope_x, _slope_y, _albedo = sample(terrain, 1.0 / shadow.spacing, x, y)
                 z = max(z, height)
                 work[Z + k] = z
-            clear, rows = shadow_clearance(shadow, x, y, z)
-            soft = penumbra(shadow, radius, 0.0, rows)
-            if on_object or not met:
-                lit = disc_above(clear / soft)
-            elif clear <= -unsure - soft:
+            clearance, rows = shadow_clearance(shadow, x, y, z)
+            half_penumbra = penumbra(shadow, radius, 0.0, rows)
+            if on_object or not on_finest_level:
+                lit = disc_above(clearance / half_penumbra)
+            elif clearance <= -margin - half_penumbra:
                 lit = 0.0
-            elif clear < unsure + soft:
-                # at the shadow's edge the swept grid is too coarse: search towards the sun from here
+            elif clearance < margin + half_penumbra:
+                # at the edge of the shadow the grid is too coarse: march towards the sun
                 lit = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
         work[LIT + k] = lit
-        if lit > 0.0 and objects and (on_object or _in_footprint(footprint, x, y)):
-            # lifted off its own facet, so that it and its neighbours do not shade it by rounding
-            lift = 1e-4 + (0.05 * distance[k] * pixel_angles[k] if on_object else 0.0)
-            work[OBJECT_X + queried] = x + lift * work[NX + k]
-            work[OBJECT_Y + queried] = y + lift * work[NY + k]
-            work[OBJECT_Z + queried] = z + lift * work[NZ + k]
-            other[queried] = k
-            queried += 1
-    if queried > 0:
-        xs, ys = work[OBJECT_X : OBJECT_X + queried], work[OBJECT_Y : OBJECT_Y + queried]
-        zs = work[OBJECT_Z : OBJECT_Z + queried]
+        if lit > 0.0 and has_objects and (on_object or _in_footprint(footprint, x, y)):
+            # an offset along the normal prevents shading by the facet itself because of rounding
+            offset = 1e-4 + (0.05 * distance[k] * pixel_angles[k] if on_object else 0.0)
+            work[OBJECT_X + n_tested] = x + offset * work[NX + k]
+            work[OBJECT_Y + n_tested] = y + offset * work[NY + k]
+            work[OBJECT_Z + n_tested] = z + offset * work[NZ + k]
+            other[n_tested] = k
+            n_tested += 1
+    if n_tested > 0:
+        xs, ys = work[OBJECT_X : OBJECT_X + n_tested], work[OBJECT_Y : OBJECT_Y + n_tested]
+        zs = work[OBJECT_Z : OBJECT_Z + n_tested]
         sun_hidden(casters, xs, ys, zs, hidden)
-        for m in range(queried):
+        for m in range(n_tested):
             work[LIT + other[m]] *= 0.0 if hidden[m] else 1.0
 
 
@@ -388,7 +400,7 @@ def photometric_angles(sun: tuple[float, float, float], width: int, work: Array)
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def reflect(law: tuple[float, float, float, float, float, float], width: int, work: Array, radiance: Array32) -> None:
-    """Radiance factor of ground under sun and sky: Lunar-Lambert with an opposition surge."""
+    """Compute the radiance factor under sun and sky: Lunar-Lambert law with an opposition surge."""
     lunar, amplitude, surge_width, normalisation, sky_fraction, bounced = law
     for k in range(min(width, STRIP)):
         nz, cos_i, cos_g = work[NZ + k], work[COS_I + k], work[COS_G + k]
@@ -402,7 +414,7 @@ def reflect(law: tuple[float, float, float, float, float, float], width: int, wo
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def dim_sun(light: Light, distance: Array, work: Array) -> None:
-    """Dim the sun by the shadow of a round body at the camera, and by clouds."""
+    """Reduce the visible fraction of the sun by a round body at the camera, and by clouds."""
     sun, law, drift, cover = light.sun, light.law, light.drift, light.cover
     for k in range(distance.size):
         if work[COS_I + k] <= 0.0:
@@ -411,14 +423,14 @@ def dim_sun(light: Light, distance: Array, work: Array) -> None:
         if law[6] > 0.0 and cos_g > 0.9:
             work[LIT + k] *= 1.0 - disc_overlap(0.5 * law[6] / distance[k], law[7], math.acos(cos_g))
         if drift[4] > 0.0:
-            up = max(drift[1] - work[Z + k], 0.0) / sun[2]
-            x, y = work[X + k] + up * sun[0] - drift[2], work[Y + k] + up * sun[1] - drift[3]
+            path = max(drift[1] - work[Z + k], 0.0) / sun[2]
+            x, y = work[X + k] + path * sun[0] - drift[2], work[Y + k] + path * sun[1] - drift[3]
             work[LIT + k] *= 1.0 - drift[4] * interpolate_bilinear(cover, drift[0], x, y)[0]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def draw_sky(light: Light, pixel_angles: Array32, body: Ints, work: Array, radiance: Array32) -> None:
-    """Radiance factor of the pixels that see the sky."""
+def shade_sky(light: Light, pixel_angles: Array32, body: Ints, work: Array, radiance: Array32) -> None:
+    """Compute the radiance factor of the sky pixels."""
     sun, sky, radius = light.sun, light.sky, light.law[7]
     for k in range(body.size):
         if body[k] == SKY:
@@ -438,7 +450,7 @@ def shade(
     picture: Picture,
 ) -> None:
     """Compute radiance factor, body and normal of every pixel: geometry, texture, illumination, then photometry."""
-    towards = (light.sun[0], light.sun[1], light.sun[2])
+    sun = (light.sun[0], light.sun[1], light.sun[2])
     rotation = unpack_matrix(pose.rotation)
     centre = (pose.position[0], pose.position[1], pose.position[2])
     law = light.law
@@ -456,25 +468,27 @@ def shade(
         last = min(first + STRIP, count)
         width = last - first
         angles, body, radiance = rays.pixel_angles[first:last], picture.body[first:last], picture.radiance[first:last]
-        met = Hits(
+        strip_hits = Hits(
             hits.distance[first:last], hits.triangle[first:last], hits.weights[first:last], hits.level[first:last]
         )
         body[:] = GROUND
-        here, there = 3 * first, 3 * last
-        _locate_pixels(rotation, centre, origins[here:there], directions[here:there], angles, met.distance, width, work)
-        n_ground, n_blended, n_other = _select_levels(spacing, ground.top_level, met, strip)
+        start, end = 3 * first, 3 * last
+        _locate_pixels(
+            rotation, centre, origins[start:end], directions[start:end], angles, strip_hits.distance, width, work
+        )
+        n_ground, n_blended, n_other = _select_levels(spacing, ground.top_level, strip_hits, strip)
         _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, fetched)
-        n_objects = _sample_objects(materials, met, angles, n_other, strip, body)
+        n_objects = _sample_objects(materials, strip_hits, angles, n_other, strip, body)
         for k in range(width):
-            n = here + 3 * k
+            n = start + 3 * k
             normals[n], normals[n + 1], normals[n + 2] = work[NX + k], work[NY + k], work[NZ + k]
         _roughen_ground(materials.relief, width, strip)
-        photometric_angles(towards, width, work)
+        photometric_angles(sun, width, work)
         _apply_texture(materials, width, n_objects, strip)
-        _cast_shadows(finest, terrain, met, angles, light, occluders, body, strip)
+        _cast_shadows(finest, terrain, strip_hits, angles, light, occluders, body, strip)
         if law[6] > 0.0 or light.drift[4] > 0.0:
-            dim_sun(light, met.distance, work)
+            dim_sun(light, strip_hits.distance, work)
         if materials.relief.heights.size > 0:
             _shade_roughness(width, work)
         reflect(reflectance, width, work, radiance)
-        draw_sky(light, angles, body, work, radiance)
+        shade_sky(light, angles, body, work, radiance)

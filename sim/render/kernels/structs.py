@@ -1,7 +1,7 @@
-"""Structs of arrays that kernels take and return.
+"""Named tuples of arrays: inputs and outputs of the rendering kernels.
 
-A loop over pixels takes the arrays out of their structs before it begins, and passes only arrays to inlined functions:
-each copy of a struct counts a reference to every array in it, which takes longer than a pixel does.
+A loop over pixels unpacks the tuples before it begins, and passes only arrays to inlined functions. Copying a tuple
+increments the reference count of each of its arrays, which takes longer than shading a pixel.
 """
 
 from __future__ import annotations
@@ -19,15 +19,18 @@ Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int32]
 Longs = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-#: Bounds of x, then of y, metres.
+#: Minimum and maximum x, then y, metres.
 Bounds = tuple[float, float, float, float]
-#: Bounds of the visible ground in x, then in y, and its greatest z.
+#: Minimum and maximum x, then y, of the visible ground, and its maximum z, metres.
 Extent = tuple[float, float, float, float, float]
 
 
 class Ground(NamedTuple):
-    """The surface's pyramid (`marsyard.sim.render.renderer.pyramid`): levels, ceilings, number of the coarsest level,
-    spacing of level 0, metres, and extent of the ground.
+    """The pyramid of a terrain surface (`marsyard.sim.render.renderer.pyramid`).
+
+    - levels, ceilings: samples of each level, and upper bounds of its height by block
+    - top_level: number of the coarsest level
+    - spacing: distance between samples of level 0, metres
     """
 
     levels: tuple[Level, ...]
@@ -38,7 +41,7 @@ class Ground(NamedTuple):
 
 
 class GroundLevel(NamedTuple):
-    """One level of the ground: control values, upper bounds of its height by block, samples per metre."""
+    """One level of the ground: control values, upper bounds of the height by block, samples per metre."""
 
     field: Level
     ceiling: Array32
@@ -53,7 +56,7 @@ class Pose(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """Rays in body axes, relative to a camera's centre: origins, unit directions, angles of pixels, radians."""
+    """Rays in body axes: origins relative to the camera's centre, unit directions, and pixel angles in radians."""
 
     origins: Array32
     directions: Array32
@@ -72,11 +75,11 @@ class Ray(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """Hits of rays.
+    """Intersections of rays with ground and objects.
 
-    - distance: along the ray, metres, infinite for the sky
-    - triangle, weights: number of the object's triangle, -1 for none, and weights of its second and third corner
-    - level: that of the terrain on which the ray meets the ground, -1 where the mesh's distance stands
+    - distance: along the ray, metres; infinite for the sky
+    - triangle, weights: index of the object's triangle (-1: none), and weights of its second and third corner
+    - level: terrain level of the intersection with the ground; -1 if the distance is that of the rendered mesh
     """
 
     distance: Array
@@ -86,12 +89,12 @@ class Hits(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Pinhole views from a camera's position.
+    """Pinhole images rendered by OpenGL from a camera's position.
 
-    - depth: along the axis, metres
-    - numbers: those of triangles plus one, 0 for ground, empty where no triangles were drawn
-    - focal: in samples
-    - view_from_body: rotates body axes to a view's (x right, y down, z forward)
+    - depth: along the optical axis, metres
+    - numbers: triangle index plus one, 0 for ground; empty if no triangles were rendered
+    - focal: focal length of each view, pixels
+    - view_from_body: rotation from body axes to view axes (x right, y down, z forward)
     """
 
     depth: Array32
@@ -102,28 +105,29 @@ class Views(NamedTuple):
 
 
 class GroundShadow(NamedTuple):
-    """The ground's shadow on the grid of a level of the surface; one side is 1 where there is none.
+    """Shadow of the ground on the grid of one terrain level; a grid of one sample means no shadow.
 
-    - height: height below which the ground hides the centre of the sun
-    - reach: distance of the shadow's caster (`marsyard.sim.render.kernels.sun.sweep_shadow`)
-    - along_x: whether rows run along x
-    - row_m: distance along the sun's direction from one row to the next
-    - across: horizontal component of the sun's direction
-    - highest: upper bound of the ground's height
+    - height: height below which the ground hides the centre of the sun, metres
+    - caster_distance: distance of the ground that casts the shadow (`marsyard.sim.render.kernels.sun.sweep_shadow`)
+    - along_x: whether rows are parallel to x
+    - spacing, level: distance between samples, metres, and number of the terrain level
+    - row_m: horizontal distance towards the sun from one row to the next, metres
+    - cos_elevation: horizontal component of the unit vector to the sun
+    - max_height: upper bound of the ground's height, metres
     """
 
     height: Array32
-    reach: Bytes
+    caster_distance: Bytes
     along_x: bool
     spacing: float
     level: int
     row_m: float
-    across: float
-    highest: float
+    cos_elevation: float
+    max_height: float
 
 
 class Footprint(NamedTuple):
-    """Region of ground that objects may shade: a grid, its west and south border, cells per metre; 0: everywhere."""
+    """Region of ground that objects may shade: a grid, its west and south border, cells per metre (0: all ground)."""
 
     cells: Flags
     west: float
@@ -132,13 +136,15 @@ class Footprint(NamedTuple):
 
 
 class Light(NamedTuple):
-    """The light at one time.
+    """Illumination at one time.
 
-    - sun: unit vector towards it
-    - law: lunar share, surge amplitude, surge width, normalisation, sky share, light from the surrounding ground,
-      diameter of a round body at the camera that casts a shadow, angular radius of the sun
-    - sky: see `sky_brightness`
-    - drift: of the clouds: cells per metre, height, drift to east and north, opacity, 0 without clouds
+    - sun: unit vector to the sun
+    - law: coefficients of the reflectance law: lunar fraction, surge amplitude, surge width, normalisation, irradiance
+      of the sky, light from the surrounding ground; then the diameter of a round body at the camera that casts a
+      shadow, metres, and the angular radius of the sun, radians
+    - sky: coefficients of `sky_brightness`
+    - cover, drift: cloud cover on a periodic grid; its cells per metre, height, displacement to east and north, metres,
+      and opacity (0: no clouds)
     """
 
     sun: Array
@@ -149,10 +155,10 @@ class Light(NamedTuple):
 
 
 class MicroRelief(NamedTuple):
-    """Octaves of height noise on the ground, and maps of their strength; no octaves where there are no heights.
+    """Octaves of height noise on the ground, and maps of their strength. Without octaves `heights` is empty.
 
-    - coarsest: size of the coarsest octave's lattice cells, metres; each further octave is half as large
-    - heights: amplitude of each octave's heights, metres, coarsest first
+    - coarsest: cell size of the coarsest octave, metres; the cell size is halved with each octave
+    - heights: height amplitude of each octave, metres, coarsest first
     - roughness, texture: factors of these heights, and of the ground's albedo texture, on a periodic grid
     - per_metre: samples of that grid per metre
     """
@@ -165,7 +171,7 @@ class MicroRelief(NamedTuple):
 
 
 class Materials(NamedTuple):
-    """Relief and textures (coarsest cell, amplitudes of octaves), normals at triangles' corners, albedo of bodies."""
+    """Micro-relief, textures (coarsest cell size, octave amplitudes), normals at triangle corners, albedo of bodies."""
 
     relief: MicroRelief
     ground_texture: tuple[float, Array]
@@ -176,7 +182,7 @@ class Materials(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """Radiance factor, body number (or ground, sky), and unit normal in world axes of every pixel."""
+    """Output of shading for each pixel: radiance factor, body number (or ground, sky), unit normal in world axes."""
 
     radiance: Array32
     body: Ints
@@ -185,7 +191,7 @@ class Picture(NamedTuple):
 
 @njit(cache=True, inline="always")
 def world_ray(pose: Pose, rays: Rays, n: int) -> Ray:
-    """Return the n-th of some rays in world axes."""
+    """Transform ray n to world axes."""
     x, y, z = _rotate(pose.rotation, rays.origins, n)
     dx, dy, dz = _rotate(pose.rotation, rays.directions, n)
     return Ray(pose.position[0] + x, pose.position[1] + y, pose.position[2] + z, dx, dy, dz)

@@ -103,7 +103,7 @@ def shadow_clearance(shadow: GroundShadow, x: float, y: float, z: float) -> tupl
     """Height of a position above the ground's shadow, metres, and distance of the shadow's caster in rows."""
     column, row = (y, x) if shadow.along_x else (x, y)
     edge, (i0, i1), (j0, j1) = interpolate_bilinear(shadow.height, 1.0 / shadow.spacing, column, row)
-    distance = shadow.reach
+    distance = shadow.caster_distance
     farthest = max(max(distance[i0, j0], distance[i0, j1]), max(distance[i1, j0], distance[i1, j1]))
     return z - edge, float(farthest * REACH_ROWS)
 
@@ -111,7 +111,7 @@ def shadow_clearance(shadow: GroundShadow, x: float, y: float, z: float) -> tupl
 @njit(cache=True, inline="always")
 def penumbra(shadow: GroundShadow, radius: float, distance: float, rows: float) -> float:
     """Half the depth of the penumbra, metres, for an occluder at `distance` plus `rows` grid rows."""
-    return radius * (distance + rows * shadow.row_m) / shadow.across
+    return radius * (distance + rows * shadow.row_m) / shadow.cos_elevation
 
 
 @njit(cache=True, inline="always")
@@ -184,12 +184,12 @@ def visible_sun_fraction(
     _height, slope_x, slope_y, _albedo = sample(field, per_metre, x, y)
     if sun[2] - slope_x * sun[0] - slope_y * sun[1] <= 0.0:
         return 0.0
-    cos_elevation = shadow.across
+    cos_elevation = shadow.cos_elevation
     min_angle = radius
     nearest = 0.0
     t = 0.25 * spacing
     steps = 0
-    farthest = (shadow.highest - z) / max(sun[2] - radius, 1e-3)
+    farthest = (shadow.max_height - z) / max(sun[2] - radius, 1e-3)
     while t < farthest:
         px, py, pz = x + t * sun[0], y + t * sun[1], z + t * sun[2]
         height, _slope_x, _slope_y, _albedo = sample(field, per_metre, px, py)

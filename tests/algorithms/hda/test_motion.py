@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.hda import HdaOptions, Motion
-from marsyard.algorithms.hda.estimator import motion_failure
+from marsyard.algorithms.hda.estimator import check_motion
 from marsyard.algorithms.hda.kernels import motion as kernels
 from marsyard.algorithms.hda.motion import estimate_motion, plane_depths
 from marsyard.algorithms.interface import SiteOutcome
@@ -147,7 +147,7 @@ def test_pure_rotation_has_no_baseline(rotation_vector: tuple[float, float, floa
     second = project_points(points, depths, true_motion) + rng.normal(0.0, noise_px / FOCAL_PX, points.shape)
     result = solve_motion(points, second)
     assert result.parallax_px < 5.0 * noise_px + 1e-6
-    assert motion_failure(result, OPTIONS) is SiteOutcome.NO_BASELINE
+    assert check_motion(result, OPTIONS) is SiteOutcome.NO_BASELINE
 
 
 def test_tracks_without_rigid_motion_are_rejected() -> None:
@@ -155,8 +155,8 @@ def test_tracks_without_rigid_motion_are_rejected() -> None:
     for _ in range(5):
         points, _ = make_tracks(rng, 0.05)
         result = solve_motion(points, points + rng.normal(0.0, 60.0 / FOCAL_PX, points.shape))
-        assert motion_failure(result, OPTIONS) in (SiteOutcome.NO_MOTION, SiteOutcome.NO_BASELINE)
-    assert motion_failure(None, OPTIONS) is SiteOutcome.NO_MOTION
+        assert check_motion(result, OPTIONS) in (SiteOutcome.NO_MOTION, SiteOutcome.NO_BASELINE)
+    assert check_motion(None, OPTIONS) is SiteOutcome.NO_MOTION
 
 
 def test_residuals_are_reprojection_errors_in_pixels() -> None:

@@ -10,7 +10,7 @@ from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.kernels.structs import Footprint
-from marsyard.sim.render.scene import EVERYWHERE, shadow_footprint
+from marsyard.sim.render.scene import ALL_GROUND, shadow_footprint
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import RockParameters, TerrainParameters, site
 
@@ -51,8 +51,8 @@ def test_footprint_contains_every_shaded_position(elevation: float) -> None:
 
 def test_footprint_without_objects_or_sun_is_everywhere() -> None:
     sphere = np.array([[0.0, 0.0, 0.0, 1.0]])
-    assert shadow_footprint(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is EVERYWHERE
-    assert shadow_footprint(sphere, direction(0.0, -0.1), 0.0) is EVERYWHERE
+    assert shadow_footprint(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is ALL_GROUND
+    assert shadow_footprint(sphere, direction(0.0, -0.1), 0.0) is ALL_GROUND
 
 
 def test_footprint_does_not_change_images() -> None:
@@ -64,7 +64,7 @@ def test_footprint_does_not_change_images() -> None:
     assert len(scene.objects) > 50
     limited = process_renderer(default_backend()).render(scene, rays, pose)
     unlimited = replace(scene)
-    unlimited.__dict__["footprint"] = EVERYWHERE
+    unlimited.__dict__["footprint"] = ALL_GROUND
     full = process_renderer(default_backend()).render(unlimited, rays, pose)
     np.testing.assert_array_equal(limited.radiance, full.radiance)
     assert not scene.footprint.cells.all()
@@ -82,7 +82,7 @@ def test_culling_does_not_change_images(elevation: float) -> None:
     for azimuth in (0.5, 3.0):
         eye = Eye(12.0, 11.0, 1.5, rays.pixel_rad, 0.5, 1.2, 25.0)
         scene = site_scene(ground, eye, Sun(direction(azimuth, elevation)))
-        visible_scene = scene.within([rays.cone(pose)])
+        visible_scene = scene.restrict_to_cones([rays.cone(pose)])
         assert 0 < len(visible_scene.objects) < 0.5 * len(scene.objects)
         renderer = process_renderer(default_backend())
         full, subset = renderer.render(scene, rays, pose), renderer.render(visible_scene, rays, pose)

@@ -17,8 +17,8 @@ from marsyard.sim.render.scene import (
     casters_towards,
     ground_in_cones,
     ground_shadow,
+    is_sun_above_slopes,
     slope_bounds,
-    sun_over_slopes,
 )
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
@@ -168,9 +168,9 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_de
     just_above, just_below = (
         sun_at(max_slope_angle + high_sun.angular_radius_rad + offset) for offset in (1e-4, -1e-4)
     )
-    assert sun_over_slopes(just_above, max_slopes)
+    assert is_sun_above_slopes(just_above, max_slopes)
     assert slope_bounds(rough, just_above) == max_slopes
-    assert not sun_over_slopes(just_below, max_slopes)
+    assert not is_sun_above_slopes(just_below, max_slopes)
     assert slope_bounds(rough, just_below) == (np.inf, np.inf)
     # The sweep finds no shadow except for rounding.
     shadow = ground_shadow(rough, just_above, height_range(rough.levels[0]))
@@ -178,7 +178,7 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_de
     assert np.all(shadow.height < heights + 1e-3)
     scene = Scene(rough, (0.0, 0.0), just_above, Photometry())
     assert scene.shadow is NO_SHADOW
-    assert scene.in_light(just_below, Photometry()).shadow is not NO_SHADOW
+    assert scene.with_light(just_below, Photometry()).shadow is not NO_SHADOW
 
 
 def test_bounds_contain_all_ground_in_a_cone() -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from benchmarks.timing import Figure, core_seconds
+from benchmarks.timing import Measurement, core_seconds
 from marsyard.algorithms.processes import used_memory
 from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.flight import create_flight
@@ -54,7 +54,7 @@ def descent_pose(surface: Surface) -> RigidTransform:
     return flown.motion.state(1.0).world_from_body
 
 
-def rover_pictures(repeats: int) -> list[Figure]:
+def rover_pictures(repeats: int) -> list[Measurement]:
     """A navcam frame over rocks, and a stereo pair of subframes of 161 x 161."""
     parameters = TerrainParameters(
         samples=2048, spacing_m=0.05, rms_slope_deg=4.0, slope_baseline_m=1.0, outer_scale_m=20.0, craters_per_km2=0.0
@@ -94,8 +94,8 @@ def rover_pictures(repeats: int) -> list[Figure]:
         renderer.render(scene, small, right)
 
     return [
-        Figure("navcam frame over rocks", core_seconds(lambda: renderer.render(scene, full, left), repeats)),
-        Figure("stereo pair of subframes, 161 x 161", core_seconds(pair, 3 * repeats), limit=0.06),
+        Measurement("navcam frame over rocks", core_seconds(lambda: renderer.render(scene, full, left), repeats)),
+        Measurement("stereo pair of subframes, 161 x 161", core_seconds(pair, 3 * repeats), limit=0.06),
     ]
 
 
@@ -103,7 +103,7 @@ def rover_pictures(repeats: int) -> list[Figure]:
 PICTURES_OF_A_SCENE, ROCKY_OF = 5, 4
 
 
-def memory(frames: int) -> list[Figure]:
+def memory(frames: int) -> list[Measurement]:
     """Memory of this process after half of the frames and after all; every fifth frame loads a new scene.
 
     One scene in four has rocks, so that bodies are loaded and released, and the renderer switches between drawing
@@ -128,9 +128,9 @@ def memory(frames: int) -> list[Figure]:
     # medians, because the memory of scenes with rocks varies
     growth = float(np.median(sizes[-quarter:]) - np.median(sizes[quarter : 2 * quarter]))
     return [
-        Figure(f"own memory, most over {len(sizes)} frames of {scenes} scenes, GB", [max(sizes)], limit=1.2),
-        Figure("its growth from the second quarter of these frames to the last, GB", [growth], limit=0.02),
-        Figure(
+        Measurement(f"own memory, most over {len(sizes)} frames of {scenes} scenes, GB", [max(sizes)], limit=1.2),
+        Measurement("its growth from the second quarter of these frames to the last, GB", [growth], limit=0.02),
+        Measurement(
             "greatest resident memory, terrain files included, GB",
             [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20],
             limit=1.2,
@@ -138,7 +138,7 @@ def memory(frames: int) -> list[Figure]:
     ]
 
 
-def on_all_cores(repeats: int) -> list[Figure]:
+def on_all_cores(repeats: int) -> list[Measurement]:
     """Wall-clock time of a descent frame with detector in a separate process with all cores."""
     limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "LP_NUM_THREADS")
     free = os.environ | dict.fromkeys(limits, str(os.cpu_count()))
@@ -149,7 +149,7 @@ def on_all_cores(repeats: int) -> list[Figure]:
         text=True,
         check=True,
     )
-    return [Figure("the same on all cores (wall s)", json.loads(done.stdout), limit=0.12)]
+    return [Measurement("the same on all cores (wall s)", json.loads(done.stdout), limit=0.12)]
 
 
 def _wall_seconds(repeats: int) -> list[float]:
