@@ -42,12 +42,12 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     craters = draw_craters(p, substream(rng, "craters"))
     cover = UNIFORM
     if p.units is None:
-        height = relief.field(substream(rng, "relief"), relief_m)
-        tone = albedo.field(substream(rng, "albedo"), contrast)
+        height = relief.draw_field(substream(rng, "relief"), relief_m)
+        tone = albedo.draw_field(substream(rng, "albedo"), contrast)
         ground = Ground(height, tone, p.spacing_m)
     else:
-        height, rough = relief.split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
-        tone, fine = albedo.split_field(substream(rng, "albedo"), contrast, p.fine_below_m)
+        height, rough = relief.draw_split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
+        tone, fine = albedo.draw_split_field(substream(rng, "albedo"), contrast, p.fine_below_m)
         ground = Ground(height, tone, p.spacing_m)
         cover = p.units.apply(ground, craters, substream(rng, "units"))
         height += rough * refine(np.ascontiguousarray(cover[..., ROUGHNESS]), ground.side)

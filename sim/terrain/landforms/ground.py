@@ -1,4 +1,4 @@
-"""Work grids of a terrain that is being synthesised, named random substreams, and random fields on periodic grids."""
+"""Grids of height and albedo for terrain synthesis, named random substreams, and random fields on periodic grids."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.random import Generator
 from marsyard.sim.streams import hash_words
 from marsyard.sim.terrain.landforms.kernels import add_refined
 
-SMALLEST_SIDE = 16  #: Smallest side of a grid on which a landform is made.
+SMALLEST_SIDE = 16  #: Minimum side of the grid of a landform, samples.
 Grid = Float32[np.ndarray, "side side"]
 
 
 @dataclass(frozen=True)
 class Ground:
-    """Heights and tones of a terrain, which landforms change in place.
+    """Height and albedo of a terrain during synthesis; landforms change them in place.
 
-    - height: control values, metres
-    - tone: natural logarithm of albedo over its mean
+    - height: control values of the spline, metres
+    - tone: natural logarithm of albedo divided by its mean
     """
 
     height: Grid
@@ -35,13 +35,13 @@ class Ground:
 
     @property
     def period_m(self) -> float:
-        """Distance after which the ground repeats."""
+        """Period of the ground along x and y, metres."""
         return float(self.side * self.spacing_m)
 
     def coarser(self, feature_m: float) -> Ground:
-        """Return an empty ground of the same extent with samples at most `feature_m` apart, but not denser than these.
+        """Return an empty grid of the same extent with a spacing of at most `feature_m`, but not finer than this grid.
 
-        A landform without finer detail costs less there; `add` brings it back.
+        A landform without finer detail is computed faster on such a grid, and then added by `add`.
         """
         side = self.side
         while side > SMALLEST_SIDE and self.period_m / (side // 2) <= feature_m:
@@ -50,7 +50,7 @@ class Ground:
         return Ground(height, tone, self.period_m / side)
 
     def add(self, part: Ground, *, tone: bool = True) -> None:
-        """Add a ground made on a coarser grid; the sum of the surfaces is exact, as refining a B-spline is."""
+        """Add a part computed on a coarser grid. The refinement of a B-spline is exact, and so is the sum."""
         for total, grid in ((self.height, part.height), (self.tone, part.tone))[: 1 + tone]:
             if grid.shape == total.shape:
                 total += grid
@@ -59,7 +59,7 @@ class Ground:
 
 
 def refine(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[np.ndarray, "side side"]:
-    """Return control values of the same surface on a grid of this side: the coarse one's times a power of two."""
+    """Refine the control values of a surface to a grid with `side` samples: the coarse side times a power of two."""
     while coarse.shape[0] < side:
         doubled = np.zeros((2 * coarse.shape[0], 2 * coarse.shape[0]), dtype=np.float32)
         add_refined(doubled, np.ascontiguousarray(coarse))
@@ -68,7 +68,7 @@ def refine(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[n
 
 
 def resample(field: Float32[np.ndarray, "own own"], side: int) -> Float32[np.ndarray, "side side"]:
-    """Return a smooth field on a grid of this side: refined, or decimated."""
+    """Refine or decimate a smooth field to a grid with `side` samples along each side."""
     step = max(field.shape[0] // side, 1)
     return refine(np.ascontiguousarray(field[::step, ::step]), side)
 
@@ -76,7 +76,7 @@ def resample(field: Float32[np.ndarray, "own own"], side: int) -> Float32[np.nda
 def draw_smooth_fields(
     period_m: float, length_across_m: float, length_along_m: float, azimuth_rad: float, rng: Generator
 ) -> Float32[np.ndarray, "side side 2"]:
-    """Draw two independent smooth random fields whose squares sum to a unit mean: control values on their own grid.
+    """Draw two independent smooth random fields; the mean of the sum of their squares is 1.
 
     The spectrum is Gaussian with correlation lengths (1/e of the amplitude spectrum at wavenumber sqrt(2)/length)
     across and along a direction (azimuth of "along", counter-clockwise from x).
@@ -96,14 +96,14 @@ def draw_smooth_fields(
 
 
 def substream(rng: Generator, name: str) -> Generator:
-    """Derive the generator of this name from the seed of `rng`.
+    """Derive a random generator from the seed of `rng` and a name.
 
-    It depends on that seed and the name alone, not on draws or spawns from `rng`, which stays unchanged. Raises
-    TypeError for a generator that was not made from a `SeedSequence`.
+    It does not depend on earlier draws or spawns from `rng`, and does not change `rng`. Raises TypeError if `rng` was
+    not created from a `SeedSequence`.
     """
     seed = rng.bit_generator.seed_seq
     if not isinstance(seed, np.random.SeedSequence):
-        raise TypeError(f"a generator seeded by a SeedSequence is needed, not by {type(seed).__name__}")
+        raise TypeError(f"the generator is seeded by {type(seed).__name__}; a SeedSequence is needed")
     key = (*seed.spawn_key, *hash_words(name))
     child = np.random.SeedSequence(seed.entropy, spawn_key=key, pool_size=seed.pool_size)
     return Generator(np.random.PCG64(child))
@@ -111,10 +111,10 @@ def substream(rng: Generator, name: str) -> Generator:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """A power-law spectrum on a periodic grid, from which random fields of unit expected variance are drawn.
+    """Power-law spectrum on a periodic grid, for random fields.
 
-    `amplitude` holds the modes of the half spectrum; `column_power` is the sum of their squares along y for each
-    wavenumber along x, conjugate modes included.
+    - amplitude: modes of the half spectrum
+    - column_power: sum of the squared modes along y for each wavenumber along x, including conjugate modes
     """
 
     amplitude: Float32[np.ndarray, "samples half"]
@@ -146,23 +146,23 @@ class Spectrum:
         amplitude[0, 0] = 0.0
         return cls(amplitude, spacing_m, _column_power(amplitude))
 
-    def low_passed(self, wavelength_m: float) -> Spectrum:
-        """Return this spectrum without waves shorter than about this length: a Gaussian filter."""
+    def apply_low_pass(self, wavelength_m: float) -> Spectrum:
+        """Return the spectrum after a Gaussian low-pass filter that attenuates waves shorter than `wavelength_m`."""
         amplitude = self.amplitude * _low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m)
         return Spectrum(amplitude, self.spacing_m, _column_power(amplitude))
 
-    def field(self, rng: Generator, scale: float) -> Float32[np.ndarray, "samples samples"]:
-        """Draw a Gaussian field of expected variance ``scale**2``: white noise shaped in the frequency domain.
+    def draw_field(self, rng: Generator, scale: float) -> Float32[np.ndarray, "samples samples"]:
+        """Draw a Gaussian random field with the expected variance ``scale**2``, by filtered white noise.
 
-        The variance is normalised by its expectation, so it varies from draw to draw. One thread, so the bytes do not
-        depend on the number of threads.
+        The variance of a single field differs from its expectation. The transform uses one thread, so that the result
+        does not depend on the number of threads.
         """
         return self._transform(self._modes(rng), scale)
 
-    def split_field(
+    def draw_split_field(
         self, rng: Generator, scale: float, wavelength_m: float
     ) -> tuple[Float32[np.ndarray, "samples samples"], Float32[np.ndarray, "samples samples"]]:
-        """Draw the same field as `field`, as the sum of a coarse and a fine part, divided at a wavelength."""
+        """Draw the field of `draw_field` as the sum of a coarse and a fine part, separated at a wavelength."""
         modes = self._modes(rng)
         coarse = self._transform(modes * _low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m), scale)
         fine = self._transform(modes, scale)
@@ -173,7 +173,7 @@ class Spectrum:
         samples, half = self.amplitude.shape
         noise = rng.standard_normal((samples, half, 2), dtype=np.float32).view(np.complex64)[..., 0]
         noise *= self.amplitude
-        # irfft2 keeps the real part only of these two columns: half the power of their modes
+        # irfft2 uses only the real part of these two columns, which contains half of their power
         noise[:, 0] *= np.float32(np.sqrt(2.0))
         noise[:, -1] *= np.float32(np.sqrt(2.0))
         return noise
@@ -188,25 +188,25 @@ class Spectrum:
         return np.asarray(field)
 
     def line_slope_rms(self, baseline_m: float) -> float:
-        """Expected RMS slope over a baseline along a line of a unit-variance field.
+        """Compute the expected RMS slope of a field with unit variance along a line, over a baseline.
 
         ``E[(z(x + L) - z(x))**2] = 2 sum P (1 - cos k L) / sum P``.
         """
         k = 2.0 * np.pi * scipy.fft.rfftfreq(self.amplitude.shape[0], self.spacing_m)
-        # 1 - cos without cancellation
+        # 1 - cos(x) = 2 sin(x / 2)**2, without cancellation
         square = np.sum(self.column_power * 4.0 * np.sin(0.5 * k * baseline_m) ** 2) / self.column_power.sum()
         return float(np.sqrt(square) / baseline_m)
 
 
 def _column_power(amplitude: Float32[np.ndarray, "samples half"]) -> Float64[np.ndarray, "half"]:
     power = np.einsum("ij,ij->j", amplitude, amplitude, dtype=np.float64)
-    # a mode of the half spectrum counts for itself and its conjugate, except in the first and the last column
+    # each mode of the half spectrum represents two conjugate modes, except in the first and last column
     power[1:-1] *= 2.0
     return np.asarray(power)
 
 
 def _low_pass(samples: int, spacing_m: float, wavelength_m: float) -> Float32[np.ndarray, "samples half"]:
-    """Gaussian filter that keeps exp(-1/2) of the amplitude at a wavelength."""
+    """Compute a Gaussian filter with the gain exp(-1/2) at a wavelength."""
     along_y = scipy.fft.fftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)
     along_x = scipy.fft.rfftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)
     exponent = np.float32(-0.5) * (along_y[:, None] ** 2 + along_x[None, :] ** 2)

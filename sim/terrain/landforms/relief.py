@@ -162,12 +162,12 @@ class Swell(Parameters):
 
 
 class Ramp(Parameters):
-    """An even slope for driving tests, as part of a ridge, because the ground repeats.
+    """Slope of constant angle for driving tests, as one side of a ridge, because the ground is periodic.
 
-    Along the direction of `uphill` the ground is level, climbs at the stated slope over `length_m`, is level on top and
-    descends at the same slope; across it nothing changes. The climb is centred a quarter of the period from the
-    terrain's edge (east_m or north_m = 0.25 period), the descent at three quarters. Bends are rounded over a
-    tenth of the slope's length.
+    Along the direction `uphill` the ground is level, climbs with the slope `slope_deg` over `length_m`, is level again
+    and descends with the same slope. Perpendicular to it the profile is constant. The centre of the climb is at a
+    quarter of the period (east_m or north_m = 0.25 period), that of the descent at three quarters. Bends are rounded
+    over a tenth of the length of the slope.
     """
 
     slope_deg: Annotated[float, Field(gt=0.0, le=40.0, description="slope of the ramp")] = 8.0
@@ -183,8 +183,8 @@ class Ramp(Parameters):
         position = np.arange(ground.side) * ground.spacing_m
         bend = 0.1 * self.length_m
         climb, fall = (
-            np.clip((0.5 * self.length_m + bend / 2.0 - np.abs(position - at * period)) / bend, 0.0, 1.0)
-            for at in (0.25, 0.75)
+            np.clip((0.5 * self.length_m + bend / 2.0 - np.abs(position - centre * period)) / bend, 0.0, 1.0)
+            for centre in (0.25, 0.75)
         )
         rise = climb - fall
         profile = (np.cumsum(rise) - 0.5 * rise) * ground.spacing_m * np.tan(np.radians(self.slope_deg))
@@ -193,61 +193,63 @@ class Ramp(Parameters):
 
 
 def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 16"]:
-    """Draw impact craters, the largest first, as rows of `kernels.stamp_craters`.
+    """Draw impact craters in order of decreasing size, as rows of `kernels.stamp_craters`.
 
-    Their number is Poisson. The cumulative size-frequency distribution falls as ``D**-crater_exponent`` up to
-    `crater_knee_m`, where craters are saturated (Hartmann 1984: -1.83), and as ``D**-crater_steep_exponent`` beyond, as
-    they are produced (Hartmann 2005). Freshness is ``u**2``, u uniform: a crater is degraded for most of its life.
-    Outlines are out of round by a few per cent.
+    Their number has a Poisson distribution. The cumulative size-frequency distribution is ``D**-crater_exponent`` up to
+    `crater_knee_m` (saturation, Hartmann 1984: -1.83) and ``D**-crater_steep_exponent`` above it (production function,
+    Hartmann 2005). Freshness is ``u**2`` with a uniform u: most craters are degraded. Outlines deviate from circles by
+    a few per cent.
     """
     p = parameters
-    smallest, largest = p.crater_diameter_min_m, p.crater_diameter_max_m
-    if largest <= smallest:
-        limit = f"crater_diameter_min_m, {smallest:g}"
-        raise ValueError(f"crater_diameter_max_m is {largest:g}; it must be larger than {limit}")
+    min_m, max_m = p.crater_diameter_min_m, p.crater_diameter_max_m
+    if max_m <= min_m:
+        limit = f"crater_diameter_min_m, {min_m:g}"
+        raise ValueError(f"crater_diameter_max_m is {max_m:g}; it must be larger than {limit}")
     period = p.samples * p.spacing_m
     count = int(rng.poisson(p.craters_per_km2 * (period / 1000.0) ** 2))
-    knee = min(max(p.crater_knee_m, smallest), largest)
-    at_knee = (knee / smallest) ** -p.crater_exponent
-    above = rng.uniform(at_knee * (largest / knee) ** -p.crater_steep_exponent, 1.0, count)
-    saturated = smallest * above ** (-1.0 / p.crater_exponent)
-    produced = knee * (above / at_knee) ** (-1.0 / p.crater_steep_exponent)
-    diameter = np.sort(np.where(above > at_knee, saturated, produced))[::-1]
-    fresh = rng.uniform(0.0, 1.0, count) ** 2
+    knee = min(max(p.crater_knee_m, min_m), max_m)
+    knee_fraction = (knee / min_m) ** -p.crater_exponent  # of the craters that are larger than the knee
+    fraction = rng.uniform(knee_fraction * (max_m / knee) ** -p.crater_steep_exponent, 1.0, count)
+    below_knee = min_m * fraction ** (-1.0 / p.crater_exponent)
+    above_knee = knee * (fraction / knee_fraction) ** (-1.0 / p.crater_steep_exponent)
+    diameter = np.sort(np.where(fraction > knee_fraction, below_knee, above_knee))[::-1]
+    freshness = rng.uniform(0.0, 1.0, count) ** 2
     position = rng.uniform(0.0, period, (count, 2))
-    rim = diameter * (DEGRADED_RIM + (FRESH_RIM - DEGRADED_RIM) * fresh)
-    depth = diameter * (DEGRADED_DEPTH + (FRESH_DEPTH - DEGRADED_DEPTH) * fresh) - rim
-    rounding = depth * (ROUNDEST_RIM + (SHARPEST_RIM - ROUNDEST_RIM) * fresh)
-    fill = DEEPEST_FILL * (1.0 - fresh)
-    bright = p.crater_ejecta_contrast * np.maximum(fresh - BRIGHT_ABOVE, 0.0) / (1.0 - BRIGHT_ABOVE)
-    bright *= rng.choice([-1.0, 1.0], count)
-    floor = p.crater_floor_contrast * rng.standard_normal(count)
+    rim = diameter * (DEGRADED_RIM + (FRESH_RIM - DEGRADED_RIM) * freshness)
+    depth = diameter * (DEGRADED_DEPTH + (FRESH_DEPTH - DEGRADED_DEPTH) * freshness) - rim
+    rounding = depth * (ROUNDEST_RIM + (SHARPEST_RIM - ROUNDEST_RIM) * freshness)
+    fill = DEEPEST_FILL * (1.0 - freshness)
+    ejecta_tone = p.crater_ejecta_contrast * np.maximum(freshness - BRIGHT_ABOVE, 0.0) / (1.0 - BRIGHT_ABOVE)
+    ejecta_tone *= rng.choice([-1.0, 1.0], count)
+    floor_tone = p.crater_floor_contrast * rng.standard_normal(count)
     outline = rng.standard_normal((count, 6)) * np.repeat([0.025, 0.02, 0.012], 2)
     phase = rng.uniform(0.0, 2.0 * np.pi, count)
-    return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, bright, floor, outline, phase])
+    return np.column_stack(
+        [position, diameter / 2.0, depth, rim, rounding, fill, ejecta_tone, floor_tone, outline, phase]
+    )
 
 
 def draw_channels(
     start: Points, heading: Channels, length: Channels, width: Channels, depth: Channels, wander: float, rng: Generator
 ) -> Float64[np.ndarray, "discs 4"]:
-    """Draw winding channels as rows of discs (x, y, half width, depth), a quarter of their width apart.
+    """Draw winding channels as rows of discs (x, y, half width, depth) with a spacing of a quarter of their width.
 
-    Each swings about its heading (radians, counter-clockwise from x): the deviation is a first-order Gauss-Markov
-    process of RMS `wander` per width travelled, correlated over about eight widths. Channels begin and end narrow and
-    shallow.
+    The direction of a channel deviates from its heading (radians, counter-clockwise from x) by a first-order
+    Gauss-Markov process with an RMS of `wander` per width and a correlation length of about eight widths. Both ends of
+    a channel are narrow and shallow.
     """
     parts = [np.empty((0, 4))]
-    for origin, mean_heading, reach, wide, deep in zip(start, heading, length, width, depth, strict=True):
-        step = 0.25 * wide
-        count = max(int(reach / step), 2)
-        correlation = np.exp(-step / (8.0 * wide))
-        noise = 2.0 * wander * np.sqrt(step / wide) * rng.standard_normal(count)
-        swing = np.asarray(lfilter([1.0], [1.0, -correlation], noise))
-        steps = np.column_stack([np.cos(mean_heading + swing), np.sin(mean_heading + swing)]) * step
-        along = (np.arange(count) + 0.5) / count
-        taper = np.sqrt(np.minimum(1.0, 8.0 * along) * np.minimum(1.0, 5.0 * (1.0 - along)))
+    for origin, mean_heading, length_m, width_m, depth_m in zip(start, heading, length, width, depth, strict=True):
+        step = 0.25 * width_m
+        count = max(int(length_m / step), 2)
+        correlation = np.exp(-step / (8.0 * width_m))
+        noise = 2.0 * wander * np.sqrt(step / width_m) * rng.standard_normal(count)
+        deviation = np.asarray(lfilter([1.0], [1.0, -correlation], noise))
+        steps = np.column_stack([np.cos(mean_heading + deviation), np.sin(mean_heading + deviation)]) * step
+        fraction = (np.arange(count) + 0.5) / count
+        taper = np.sqrt(np.minimum(1.0, 8.0 * fraction) * np.minimum(1.0, 5.0 * (1.0 - fraction)))
         position = origin + np.cumsum(steps, axis=0)
-        parts.append(np.column_stack([position, 0.5 * wide * np.maximum(taper, 0.3), deep * taper]))
+        parts.append(np.column_stack([position, 0.5 * width_m * np.maximum(taper, 0.3), depth_m * taper]))
     return np.concatenate(parts)
 
 
@@ -302,11 +304,11 @@ class Playa(Parameters):
     contrast: Annotated[float, Field(ge=-2.0, le=2.0, description="log albedo of fissures over the plates'")] = -0.12
 
     def apply(self, ground: Ground, rng: Generator) -> None:
-        """Add the fissures, everywhere."""
+        """Add fissures to all of the ground."""
         ground.add(self.fissures(ground, rng))
 
     def fissures(self, ground: Ground, rng: Generator) -> Ground:
-        """Return the fissures alone."""
+        """Compute the fissures on a separate grid."""
         part = ground.coarser(self.fissure_m)
         for scale in (1.0, 0.4):
             cells = max(round(ground.period_m / (scale * self.polygon_m)), 3)
@@ -323,8 +325,8 @@ class Fans(Parameters):
 
     One divide lies along y = 0, so fans face north and south and the playa lies around y = period / 2; further divides
     are spaced evenly. Radial profiles flatten towards the toe; slopes of 1-5 deg are usual (Blair & McPherson 1994).
-    Washes spread from the apexes. The fans keep the relief from before; the playa keeps `playa_relief` of it, and may
-    have polygons.
+    Washes spread from the apexes. Existing relief is unchanged on the fans, and multiplied by `playa_relief` on the
+    playa, which can have polygons.
     """
 
     slope_deg: Annotated[float, Field(gt=0.0, le=15.0, description="slope at the apex")] = 4.5
@@ -356,13 +358,13 @@ class Fans(Parameters):
         raise_cones(broad.height, broad.tone, broad.spacing_m, apexes, slope, self.concavity, rounding)
         if self.polygons is not None:
             fissures = self.polygons.fissures(ground, rng)
-            bare = np.float32(1.0) - resample(broad.tone, fissures.side)
-            np.multiply(fissures.height, bare, out=fissures.height)
-            np.multiply(fissures.tone, bare, out=fissures.tone)
+            playa_fraction = np.float32(1.0) - resample(broad.tone, fissures.side)
+            np.multiply(fissures.height, playa_fraction, out=fissures.height)
+            np.multiply(fissures.tone, playa_fraction, out=fissures.tone)
         relief = np.float32(self.playa_relief) + np.float32(1.0 - self.playa_relief) * broad.tone
-        kept = refine(relief, ground.side)
-        np.multiply(ground.height, kept, out=ground.height)
-        np.multiply(ground.tone, kept, out=ground.tone)
+        relief = refine(relief, ground.side)
+        np.multiply(ground.height, relief, out=ground.height)
+        np.multiply(ground.tone, relief, out=ground.tone)
         broad.tone[...] *= np.float32(self.fan_contrast)
         ground.add(broad)
         if self.polygons is not None:
@@ -374,7 +376,7 @@ class Fans(Parameters):
         part = ground.coarser(self.wash_width_m / 3.0)
         count = self.washes_per_fan
         for apex in apexes:
-            # half of them to either side of the divide, within 30 deg of straight down
+            # on both sides of the divide, within 30 deg of the steepest descent
             heading = rng.choice([-1.0, 1.0], count) * np.pi / 2.0 + rng.uniform(-0.52, 0.52, count)
             begin = apex[2] * rng.uniform(0.02, 0.5, count)
             width = self.wash_width_m * np.exp(0.5 * rng.standard_normal(count))

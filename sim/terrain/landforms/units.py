@@ -31,16 +31,16 @@ _FIT_STEPS, _FIT_SIDE = 40, 128
 class SurfaceUnit(Parameters):
     """One kind of ground. Factors are relative to the terrain's own values; a factor of 1 leaves them unchanged."""
 
-    name: Annotated[str, Field(min_length=1, description="what it is")]
+    name: Annotated[str, Field(min_length=1, description="name of the unit")]
     fraction: Annotated[Fraction, Field(description="expected fraction of the terrain's area")]
-    tone: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of albedo over the terrain's mean")] = 0.0
+    tone: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of albedo divided by the terrain's mean")] = 0.0
     roughness: Annotated[NonNegative, Field(description="factor of fine relief")] = 1.0
     texture: Annotated[NonNegative, Field(description="factor of fine albedo contrast")] = 1.0
     rocks: Annotated[NonNegative, Field(description="factor of rock density")] = 1.0
 
 
 class SurfaceUnits(Parameters):
-    """A map of surface units: each is where its random field exceeds the others'.
+    """A map of surface units. The ground belongs to the unit with the largest random field.
 
     The areas vary from terrain to terrain by a Dirichlet distribution around the expected fractions.
     """
@@ -49,17 +49,19 @@ class SurfaceUnits(Parameters):
     largest_m: Annotated[Positive, Field(description="size of the largest patches, m")] = 500.0
     smallest_m: Annotated[Positive, Field(description="size of the smallest patches, m")] = 10.0
     boundary: Annotated[Positive, Field(description="softness of boundaries, standard deviations of the field")] = 0.15
-    elongation: Annotated[float, Field(ge=1.0, le=10.0, description="length of patches along the wind over width")] = (
-        2.0
-    )
-    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="mean azimuth the wind comes from")] = 0.0
-    wind_spread_deg: Annotated[NonNegative, Field(description="standard deviation of it from terrain to terrain")] = (
-        20.0
-    )
-    concentration: Annotated[Positive, Field(description="of the Dirichlet distribution: larger varies less")] = 8.0
+    elongation: Annotated[
+        float, Field(ge=1.0, le=10.0, description="length of patches along the wind divided by width")
+    ] = 2.0
+    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="mean azimuth from which the wind blows")] = 0.0
+    wind_spread_deg: Annotated[NonNegative, Field(description="its standard deviation between terrains")] = 20.0
+    concentration: Annotated[
+        Positive, Field(description="of the Dirichlet distribution: areas vary less if larger")
+    ] = 8.0
 
     tracks_per_km2: Annotated[NonNegative, Field(description="tracks of dust devils per km2")] = 0.0
-    track_tone: Annotated[float, bounded_field(-1.0, 0.0, "logarithm of albedo of a track over the ground's")] = -0.12
+    track_tone: Annotated[
+        float, bounded_field(-1.0, 0.0, "logarithm of a track's albedo divided by the ground's")
+    ] = -0.12
     track_width_m: Annotated[Positive, Field(description="median width of a track, m")] = 25.0
     track_length_m: Annotated[Positive, Field(description="mean length of a track, m")] = 900.0
     streak_fraction: Annotated[Fraction, Field(description="fraction of craters with a wind tail")] = 0.0
@@ -69,7 +71,7 @@ class SurfaceUnits(Parameters):
     def apply(
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], rng: Generator
     ) -> Float32[np.ndarray, "cover cover 3"]:
-        """Add the units' tones, the tracks of dust devils and the craters' wind tails; return the cover."""
+        """Add the tones of the units, dust devil tracks and wind tails of craters; return the cover (see `Surface`)."""
         kinds = self.kinds
         expected = np.array([kind.fraction for kind in kinds])
         areas = rng.dirichlet(self.concentration * expected / expected.sum())
@@ -77,8 +79,8 @@ class SurfaceUnits(Parameters):
         spacing = ground.period_m / side
         downwind = np.radians(270.0 - self.wind_from_deg - self.wind_spread_deg * rng.standard_normal())
         spectrum = Spectrum.power_law(side, spacing, OUTLINE_HURST, self.largest_m, self.elongation, downwind)
-        spectrum = spectrum.low_passed(self.smallest_m)
-        fields = np.stack([spectrum.field(rng, 1.0) for _ in kinds], axis=-1)
+        spectrum = spectrum.apply_low_pass(self.smallest_m)
+        fields = np.stack([spectrum.draw_field(rng, 1.0) for _ in kinds], axis=-1)
         membership = self._membership(fields, areas)
         values = np.array([(kind.roughness, kind.texture, kind.rocks) for kind in kinds])
         factors = np.exp(membership @ np.log(np.maximum(values, 1e-3)).astype(np.float32))
@@ -93,7 +95,7 @@ class SurfaceUnits(Parameters):
             rough = np.ascontiguousarray(factors[..., ROUGHNESS])
             stamp_cover(rough, spacing, rows, 2.0)
             factors[..., ROUGHNESS] = rough
-        # the stated abundance of rocks is that of the whole terrain
+        # the parameter `abundance` refers to the whole terrain
         factors[..., ROCKS] /= factors[..., ROCKS].mean(dtype=np.float64)
         return np.asarray(factors)
 
@@ -114,18 +116,18 @@ class SurfaceUnits(Parameters):
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator
     ) -> None:
         large = craters[craters[:, 2] > 0.5 * self.streak_min_m]
-        chosen = large[rng.uniform(size=len(large)) < self.streak_fraction]
-        radius, count = chosen[:, 2], len(chosen)
+        sources = large[rng.uniform(size=len(large)) < self.streak_fraction]
+        radius, count = sources[:, 2], len(sources)
         heading = downwind + 0.12 * rng.standard_normal(count)
         length = 2.0 * radius * rng.uniform(2.0, 7.0, count)
         tone = self.streak_tone * rng.standard_normal(count)
-        rows = np.column_stack([chosen[:, :2], radius, length, np.cos(heading), np.sin(heading), tone])
+        rows = np.column_stack([sources[:, :2], radius, length, np.cos(heading), np.sin(heading), tone])
         stamp_streaks(ground.tone, ground.spacing_m, rows)
 
     def _membership(
         self, fields: Float32[np.ndarray, "side side kinds"], areas: Float[np.ndarray, "kinds"]
     ) -> Float32[np.ndarray, "side side kinds"]:
-        """Soft membership of each unit: a softmax of the fields, shifted until the areas are as drawn."""
+        """Compute the soft membership of each unit: a softmax of the fields, shifted until the areas match."""
         shift = np.zeros(areas.size)
         step = max(fields.shape[0] // _FIT_SIDE, 1)
         for _ in range(_FIT_STEPS):

@@ -1,4 +1,4 @@
-"""The rocks of a terrain: parameters, size-frequency distribution, positions, and triangles around a position."""
+"""Rocks of a terrain: parameters, size-frequency distribution, positions, and triangles near a position."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from marsyard.sim.terrain.rocks.kernels import Placements, assemble, place_discs
 from marsyard.sim.terrain.rocks.shapes import FINEST, SHAPES_OF_FORM, max_pixels, rock_shapes
 from marsyard.sim.terrain.surface import ROCKS, Surface
 
-MAX_ROCKS = 2_000_000  #: Largest number of rocks on one terrain; more are an error of the configuration.
-CELL_OVER_DIAMETER = 3.0  #: Side of the cells in which placement searches for neighbours, over the mean diameter.
-MAX_TRIES = 20000  #: Random positions tried for a rock; even at k = 0.4 a handful suffices.
+MAX_ROCKS = 2_000_000  #: Maximum number of rocks on one terrain.
+CELL_OVER_DIAMETER = 3.0  #: Side of the cells of the neighbour search, divided by the mean diameter.
+MAX_TRIES = 20000  #: Maximum number of random positions that are tried for a rock.
 #: Arrays of a `RockField` with one row per rock.
 ROCK_ARRAYS = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up", "albedo")
-Positions = Float64[np.ndarray, "found 3"]
+Positions = Float64[np.ndarray, "selected 3"]
 Sizes = Float64[np.ndarray, "rocks"]
-Numbers = Int64[np.ndarray, "found"]
+Numbers = Int64[np.ndarray, "selected"]
 
 
 Form = Literal["block", "clinker", "vesicular", "slab", "ventifact"]
 
 
 class PlacedRock(Parameters):
-    """A rock at a stated position: a rover's target, a landing hazard."""
+    """A rock at a given position, such as a rover's target or a landing hazard."""
 
-    name: Annotated[str, Field(min_length=1, description="what scenarios call it; unique on its terrain")]
+    name: Annotated[str, Field(min_length=1, description="name in scenarios; unique on its terrain")]
     east_m: Annotated[float, Field(description="x of its centre, m, on the periodic terrain")]
     north_m: Annotated[float, Field(description="y of its centre, m, on the periodic terrain")]
     diameter_m: Annotated[float, Field(gt=0.0, le=50.0, description="mean of longest and shortest diameter, m")]
     height_m: Annotated[Positive | None, Field(description="above the ground, m; default: half the diameter")] = None
     shape: Annotated[int | None, Field(ge=0, description="0-15 blocks, then 16 of each further form")] = None
-    yaw_deg: Annotated[float | None, Field(description="turn about its vertical, deg; drawn where not given")] = None
+    yaw_deg: Annotated[float | None, Field(description="rotation about the vertical, deg; random if omitted")] = None
 
 
 class RockForms(Parameters):
@@ -58,33 +58,40 @@ class RockForms(Parameters):
     @model_validator(mode="after")
     def _check_sum(self) -> RockForms:
         if sum(self.weights()) == 0.0:
-            raise ValueError("all forms have the number 0; at least one must be above 0")
+            raise ValueError("all forms have the number 0; at least one must be greater than 0")
         return self
 
     def weights(self) -> tuple[float, ...]:
-        """The numbers, in the order of `marsyard.sim.terrain.rocks.shapes.FORMS`."""
+        """Return the numbers in the order of `marsyard.sim.terrain.rocks.shapes.FORMS`."""
         return self.block, self.clinker, self.vesicular, self.slab, self.ventifact
 
 
 class RockParameters(Parameters):
-    """Rocks of a terrain: the size-frequency distribution of Golombek & Rapp (1997), and rocks at stated positions.
+    """Rocks of a terrain: the size-frequency distribution of Golombek & Rapp (1997), and rocks at given positions.
 
-    The fraction of the ground covered by rocks of at least diameter D is ``F_k(D) = k exp(-q D)``,
+    The fraction of the ground that is covered by rocks with a diameter of at least D is ``F_k(D) = k exp(-q D)``,
     ``q = 1.79 + 0.152 / k`` (D in metres), fitted to the Viking landing sites.
     The number of rocks per area and diameter follows: ``n(D) = -dF/dD / (pi D**2 / 4)``.
     """
 
-    abundance: Annotated[float, Field(ge=0.0, le=0.4, description="k, fraction of the ground under rocks")] = 0.05
-    smallest_m: Annotated[Positive, Field(description="diameter of the smallest rocks that are made, m")] = 0.05
-    largest_m: Annotated[Positive, Field(description="diameter of the largest, m")] = 3.0
+    abundance: Annotated[float, Field(ge=0.0, le=0.4, description="k, fraction of the ground covered by rocks")] = 0.05
+    smallest_m: Annotated[Positive, Field(description="minimum diameter of rocks, m")] = 0.05
+    largest_m: Annotated[Positive, Field(description="maximum diameter of rocks, m")] = 3.0
     height_ratio: Annotated[float, Field(gt=0.0, le=1.0, description="mean height/diameter (Golombek & Rapp)")] = 0.5
-    height_spread: Annotated[float, Field(ge=0.0, lt=1.0, description="half width of its uniform spread over it")] = 0.3
-    form: Annotated[Form, Field(description="form of all rocks, unless `forms` mixes several")] = "block"
-    forms: Annotated[RockForms | None, Field(description="a mixture of forms instead")] = None
+    height_spread: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="half width of the uniform distribution of height/diameter, relative to its mean",
+        ),
+    ] = 0.3
+    form: Annotated[Form, Field(description="form of all rocks, if `forms` is omitted")] = "block"
+    forms: Annotated[RockForms | None, Field(description="relative numbers of several forms")] = None
     albedo_spread: Annotated[NonNegative, Field(description="standard deviation of the logarithm of rocks' albedo")] = (
         0.0
     )
-    placed: Annotated[tuple[PlacedRock, ...], Field(description="rocks at stated positions")] = ()
+    placed: Annotated[tuple[PlacedRock, ...], Field(description="rocks at given positions")] = ()
 
     @model_validator(mode="after")
     def _check_consistency(self) -> RockParameters:
@@ -97,14 +104,14 @@ class RockParameters(Parameters):
 
 
 def decay_per_m(abundance: float) -> float:
-    """q(k) of Golombek & Rapp (1997), 1/m."""
+    """Compute q(k) of Golombek & Rapp (1997), 1/m."""
     return 1.79 + 0.152 / abundance
 
 
 def draw_diameters(parameters: RockParameters, area_m2: float, rng: Generator) -> Float64[np.ndarray, "n"]:
-    """Draw the diameters of the rocks on an area, metres, the largest first; their number is Poisson.
+    """Draw the diameters of the rocks on an area, metres, in decreasing order; their number has a Poisson distribution.
 
-    Raises ValueError where there would be more than `MAX_ROCKS`.
+    Raises ValueError if the expected number exceeds `MAX_ROCKS`.
     """
     p, q = parameters, decay_per_m(parameters.abundance or 1.0)
 
@@ -120,7 +127,7 @@ def draw_diameters(parameters: RockParameters, area_m2: float, rng: Generator) -
     if expected > MAX_ROCKS:
         raise ValueError(
             f"{expected:.3g} rocks of at least {p.smallest_m:g} m on {area_m2:.3g} m2; at most "
-            f"{MAX_ROCKS:g} can be made: choose a larger rocks.smallest_m"
+            f"{MAX_ROCKS:g} are allowed: choose a larger rocks.smallest_m"
         )
     quantile = rng.random(int(rng.poisson(expected)))
     drawn = np.exp(np.interp(quantile * number[-1], number, np.log(diameter)))
@@ -135,8 +142,8 @@ class RockMesh:
     - vertex_normals: outward unit normals of the smooth shapes, to be interpolated over a triangle
     - faces: vertex numbers of each triangle, counter-clockwise seen from outside
     - rock_of_face: number of each triangle's rock in its field
-    - body_of_face: number of each triangle's body in this mesh, from 0: where the mesh is wider than the terrain's
-      period, a rock appears as often as it repeats
+    - body_of_face: number of each triangle's body in this mesh, from 0. If the mesh is wider than the period of the
+      terrain, each copy of a rock is a separate body
     """
 
     vertices: Float64[np.ndarray, "vertices 3"]
@@ -148,15 +155,15 @@ class RockMesh:
 
 @dataclass(frozen=True)
 class RockField:
-    """Rocks on a periodic terrain. Rock n is row n of every array; placed rocks come first, then the largest.
+    """Rocks on a periodic terrain. Rock n is row n of each array: placed rocks first, then rocks by decreasing size.
 
-    - shape: number of each rock's shape, see `marsyard.sim.terrain.rocks.shapes`
+    - shape: shape number of each rock, see `marsyard.sim.terrain.rocks.shapes`
     - position_m: world position of each rock's centre on the ground, x and y within one period
-    - diameter_m: mean of the longest and the shortest diameter seen from above
+    - diameter_m: mean of the longest and the shortest horizontal diameter
     - height_m: height of the top above the ground
     - yaw_rad: rotation about the rock's own vertical
     - up: unit vector of the rock's own vertical: the ground's normal
-    - albedo: each rock's albedo over that of the site's rocks
+    - albedo: albedo of each rock divided by the site's rock albedo
     - names: number of each named rock
     """
 
@@ -172,9 +179,9 @@ class RockField:
 
     @classmethod
     def on(cls, surface: Surface, parameters: RockParameters, rng: Generator) -> RockField:
-        """Draw rocks on this ground that do not overlap, seen along their verticals; denser where its cover says so.
+        """Draw rocks that do not overlap on a surface, with the relative density of the surface's cover.
 
-        Raises ValueError where a rock finds no free position, or a placed rock has no such shape.
+        Raises ValueError if there is no free position for a rock, or if the shape of a placed rock does not exist.
         """
         placed = parameters.placed
         drawn = draw_diameters(parameters, surface.period_m**2, substream(rng, "rock sizes"))
@@ -186,30 +193,33 @@ class RockField:
             if rock.shape is not None and rock.shape >= shapes.SHAPES:
                 allowed = f"0 to {shapes.SHAPES - 1}"
                 raise ValueError(f"rock '{rock.name}' has shape {rock.shape}; allowed: {allowed}")
-            kind, turn = first + int(draws.integers(0, SHAPES_OF_FORM)), float(draws.uniform(-np.pi, np.pi))
-            placed_shape.append(kind if rock.shape is None else rock.shape)
-            placed_yaw.append(turn if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
+            random_shape, random_yaw_rad = (
+                first + int(draws.integers(0, SHAPES_OF_FORM)),
+                float(draws.uniform(-np.pi, np.pi)),
+            )
+            placed_shape.append(random_shape if rock.shape is None else rock.shape)
+            placed_yaw.append(random_yaw_rad if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
         diameter = np.concatenate([[rock.diameter_m for rock in placed], drawn])
-        kinds = first + appearance.integers(0, SHAPES_OF_FORM, drawn.size)
+        drawn_shape = first + appearance.integers(0, SHAPES_OF_FORM, drawn.size)
         if parameters.forms is not None:
             weights = np.array(parameters.forms.weights())
-            mixed = substream(rng, "rock forms").choice(weights.size, drawn.size, p=weights / weights.sum())
-            kinds = mixed * SHAPES_OF_FORM + kinds % SHAPES_OF_FORM
-            ratio *= np.array([form.flatness for form in shapes.FORMS.values()])[mixed]
+            form = substream(rng, "rock forms").choice(weights.size, drawn.size, p=weights / weights.sum())
+            drawn_shape = form * SHAPES_OF_FORM + drawn_shape % SHAPES_OF_FORM
+            ratio *= np.array([definition.flatness for definition in shapes.FORMS.values()])[form]
         height = np.concatenate([[rock.height_m or 0.5 * rock.diameter_m for rock in placed], ratio * drawn])
-        tone = parameters.albedo_spread * substream(rng, "rock albedo").standard_normal(drawn.size)
-        albedo = np.concatenate([np.ones(len(placed)), np.exp(tone - 0.5 * parameters.albedo_spread**2)])
-        shape = np.concatenate([placed_shape, kinds]).astype(np.int32)
+        log_albedo = parameters.albedo_spread * substream(rng, "rock albedo").standard_normal(drawn.size)
+        albedo = np.concatenate([np.ones(len(placed)), np.exp(log_albedo - 0.5 * parameters.albedo_spread**2)])
+        shape = np.concatenate([placed_shape, drawn_shape]).astype(np.int32)
         yaw = np.concatenate([placed_yaw, appearance.uniform(-np.pi, np.pi, drawn.size)])
         radius = rock_shapes(shapes.COARSEST).reach[shape] * diameter
         xy = _draw_positions(parameters, radius, diameter, surface, substream(rng, "rock places"))
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
-        # the ground's slope over about the rock's own size
+        # slope of the ground over about the size of the rock
         level = np.clip(np.log2(np.maximum(diameter / surface.spacing_m, 1.0)).astype(int), 0, len(surface.levels) - 1)
         up = np.ones((diameter.size, 3))
-        for one in np.unique(level):
-            rows = level == one
-            up[rows, :2] = -surface.gradient(xy[rows, 0], xy[rows, 1], int(one))
+        for number in np.unique(level):
+            rows = level == number
+            up[rows, :2] = -surface.gradient(xy[rows, 0], xy[rows, 1], int(number))
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         for array in (shape, position, diameter, height, yaw, up, albedo):
             array.setflags(write=False)
@@ -220,7 +230,7 @@ class RockField:
         return int(self.diameter_m.size)
 
     def by_name(self, name: str) -> int:
-        """Return the number of a named rock. Raises KeyError, naming the existing ones."""
+        """Return the number of a named rock. Raises KeyError with the existing names."""
         if name not in self.names:
             raise KeyError(f"no rock is called '{name}'; named rocks: {', '.join(self.names) or 'none'}")
         return self.names[name]
@@ -238,18 +248,18 @@ class RockField:
     ) -> RockMesh:
         """Return the triangles of the rocks whose centres lie within a horizontal radius of a position.
 
-        - x, y: world position in any period; beyond half a period a rock appears as often as it repeats
-        - smallest_m: smallest diameter of interest
-        - above_m, pixel_rad: height of the eye above the ground there, and angle that a pixel subtends
-        - detail: level of detail of all rocks, 0 (20 triangles) to 4 (5120); by default each rock's is the coarsest
-          that deviates too little from the finest to be seen (`DEVIATION_PX`)
+        - x, y: world position in any period; within more than half a period a rock can occur several times
+        - smallest_m: minimum diameter
+        - above_m, pixel_rad: height of the camera above the ground at this position, and angle of a pixel
+        - detail: level of detail of all rocks, 0 (20 triangles) to 4 (5120); by default the coarsest level of each rock
+          whose deviation from the finest is not visible (`DEVIATION_PX`)
         """
         large = np.flatnonzero(self.diameter_m >= smallest_m)
-        reach = int(np.ceil(radius_m / self.period_m))
-        home = np.floor(np.array([x, y]) / self.period_m)
+        periods = int(np.ceil(radius_m / self.period_m))
+        cell = np.floor(np.array([x, y]) / self.period_m)
         numbers, positions = [], []
-        for i, j in product(range(-reach, reach + 1), repeat=2):
-            offset = (home + np.array([j, i])) * self.period_m
+        for i, j in product(range(-periods, periods + 1), repeat=2):
+            offset = (cell + np.array([j, i])) * self.period_m
             dx = self.position_m[large, 0] + (offset[0] - x)
             dy = self.position_m[large, 1] + (offset[1] - y)
             numbers.append(large[dx * dx + dy * dy <= radius_m * radius_m])
@@ -257,16 +267,16 @@ class RockField:
         number, position = np.concatenate(numbers), np.concatenate(positions)
         if detail is None:
             distance = np.sqrt((position[:, 0] - x) ** 2 + (position[:, 1] - y) ** 2 + above_m**2)
-            # the shortest possible distance from the eye to any of its surface
+            # minimum distance from the camera to the surface of the rock
             nearest = np.maximum(distance - 0.5 * self.diameter_m[number], 0.1 * self.diameter_m[number])
-            across_px = self.diameter_m[number] / (nearest * pixel_rad)
-            details = np.sum(across_px[:, None] > max_pixels()[self.shape[number]], axis=1)
+            size_px = self.diameter_m[number] / (nearest * pixel_rad)
+            details = np.sum(size_px[:, None] > max_pixels()[self.shape[number]], axis=1)
         else:
             details = np.full(number.size, detail)
         return self._assemble(number, position, details)
 
     def rock(self, number: int, detail: int = FINEST) -> RockMesh:
-        """Return the triangles of one rock, within the first period."""
+        """Return the triangles of one rock in the first period."""
         numbers = np.array([number])
         return self._assemble(numbers, self.position_m[numbers], np.array([detail]))
 
@@ -278,9 +288,11 @@ class RockField:
         vertices, normals = [np.empty((0, 3))], [np.empty((0, 3))]
         faces, counts, start = [np.empty((0, 3), dtype=np.int32)], [np.empty(0, dtype=np.int64)], 0
         for level in np.unique(detail):
-            one, unit = detail == level, rock_shapes(int(level))
-            rocks = number[one]
-            placements = Placements(self.shape[rocks], position[one], scale[one], self.yaw_rad[rocks], self.up[rocks])
+            selected, unit = detail == level, rock_shapes(int(level))
+            rocks = number[selected]
+            placements = Placements(
+                self.shape[rocks], position[selected], scale[selected], self.yaw_rad[rocks], self.up[rocks]
+            )
             level_vertices, level_normals = assemble(placements, unit.vertices, unit.normals)
             stop = start + len(level_vertices)
             first = np.arange(start, stop, unit.vertices.shape[1], dtype=np.int32)
@@ -297,7 +309,7 @@ class RockField:
 def _draw_positions(
     parameters: RockParameters, radius: Sizes, diameter: Sizes, surface: Surface, rng: Generator
 ) -> Float64[np.ndarray, "rocks 2"]:
-    """Positions of the placed rocks as stated, and of the others where they do not overlap, the largest first."""
+    """Return the positions of placed rocks, and draw positions without overlap for the others by decreasing size."""
     period_m, density = surface.period_m, np.ascontiguousarray(surface.cover[..., ROCKS])
     placed = np.array([(rock.east_m, rock.north_m) for rock in parameters.placed], dtype=np.float64).reshape(-1, 2)
     placed %= period_m
@@ -307,7 +319,7 @@ def _draw_positions(
     occupied = np.column_stack([placed, radius[:count]])
     cell = max(CELL_OVER_DIAMETER * float(diameter[count:].mean()), period_m / 4096)
     drawn = place_discs(radius[count:], occupied, density, period_m, cell, MAX_TRIES, rng)
-    crowded = int(np.count_nonzero(np.isnan(drawn[:, 0])))
-    if crowded:
-        raise ValueError(f"{crowded} of {len(drawn)} rocks find no free position; a smaller rocks.abundance is needed")
+    unplaced = int(np.count_nonzero(np.isnan(drawn[:, 0])))
+    if unplaced:
+        raise ValueError(f"{unplaced} of {len(drawn)} rocks have no free position; a smaller rocks.abundance is needed")
     return np.concatenate([placed, drawn])

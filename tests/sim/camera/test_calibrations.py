@@ -306,7 +306,7 @@ def test_fisheye_pose_is_applied() -> None:
 FAULTS = [
     (OPENCV, "image_width: 640\n", "", "image_width, image_height or resolution.*allowed: two positive integers"),
     (OPENCV, "image_width: 640", "image_width: -640", "allowed: two positive integers"),
-    (OPENCV, "5.3765976500165073e+002", ".nan", "camera_matrix: .* no list of finite numbers"),
+    (OPENCV, "5.3765976500165073e+002", ".nan", "camera_matrix: .* not a list of finite numbers"),
     (OPENCV, "5.3765976500165073e+002, 0.,", "5.3765976500165073e+002,", "camera_matrix: has 8 numbers"),
     (OPENCV, "camera_matrix: !!", "matrix: !!", "camera_matrix: missing"),
     (OPENCV, "5.3765976500165073e+002", "-537.6", "fx and fy positive"),

@@ -135,7 +135,7 @@ def test_invalid_changes_are_rejected(navcam: Cahvor) -> None:
         with pytest.raises(ValueError, match="cannot bin"):
             navcam.bin(columns, rows)
     for factor in (0.0, -1.0, math.nan, math.inf):
-        with pytest.raises(ValueError, match="positive, finite"):
+        with pytest.raises(ValueError, match="positive and finite"):
             navcam.scale(factor)
     with pytest.raises(ValueError, match="size"):
         navcam.scale(1e-6)

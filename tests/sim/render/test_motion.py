@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validation.estimators import PATCH, SmoothPicture, symmetric_shifts
+from benchmarks.validation.estimators import PATCH, SmoothImage, symmetric_shifts
 from benchmarks.validation.motion import View, measure, patch_grid
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import direction, rigid
@@ -32,12 +32,12 @@ def test_known_shift_is_estimated() -> None:
         return image
 
     shift = np.array([0.37, -0.22])
-    first, second = SmoothPicture(render_bumps(np.zeros(2))), SmoothPicture(0.8 * render_bumps(shift) + 0.1)
+    first, second = SmoothImage(render_bumps(np.zeros(2))), SmoothImage(0.8 * render_bumps(shift) + 0.1)
     shifts = symmetric_shifts(first, second, patch_grid((160, 160)))
-    np.testing.assert_allclose(shifts.found, np.broadcast_to(shift, shifts.found.shape), atol=2e-3)
+    np.testing.assert_allclose(shifts.motion_px, np.broadcast_to(shift, shifts.motion_px.shape), atol=2e-3)
     # With equal motion of all pixels in a patch, the estimator expects that motion.
-    everywhere = np.broadcast_to(shift, (len(shifts.found), PATCH, PATCH, 2))
-    np.testing.assert_allclose(shifts.expected(everywhere), np.broadcast_to(shift, shifts.found.shape), atol=1e-9)
+    everywhere = np.broadcast_to(shift, (len(shifts.motion_px), PATCH, PATCH, 2))
+    np.testing.assert_allclose(shifts.expected(everywhere), np.broadcast_to(shift, shifts.motion_px.shape), atol=1e-9)
 
 
 def test_descent_image_motion_matches_the_camera(

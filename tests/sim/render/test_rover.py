@@ -21,6 +21,7 @@ from marsyard.sim.render import (
     rover_objects,
     rover_sphere,
 )
+from marsyard.sim.render.objects import ROVER_NAME
 from marsyard.sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
 from marsyard.sim.terrain import Surface
 from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
@@ -41,7 +42,7 @@ def test_rover_stands_on_the_ground_with_specified_size(rover: RoverParameters, 
         (20.0 - 0.5 * rover.body_width_m, 20.0 + 0.5 * rover.body_width_m), abs=0.2
     )
     assert len(objects) == 1
-    assert objects.names[0] == -1
+    assert objects.names[0] == ROVER_NAME
 
 
 def test_normals_point_outwards() -> None:

@@ -23,7 +23,7 @@ def test_equal_seeds_produce_equal_bytes() -> None:
 def test_mean_variance_of_random_fields_is_the_specified_one() -> None:
     # 200 draws of about ten independent large-scale modes each determine the mean variance to about 3 %.
     spectrum = Spectrum.power_law(128, 1.0, 0.5, 60.0)
-    variances = [spectrum.field(np.random.default_rng(seed), 2.0).var() for seed in range(200)]
+    variances = [spectrum.draw_field(np.random.default_rng(seed), 2.0).var() for seed in range(200)]
     assert np.mean(variances) == pytest.approx(4.0, rel=0.04)
 
 

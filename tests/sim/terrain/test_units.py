@@ -79,8 +79,8 @@ def test_units_make_the_texture_patchy() -> None:
 
 def test_sum_of_split_field_equals_the_field() -> None:
     spectrum = Spectrum.power_law(128, 1.0, 0.4, 60.0)
-    coarse, fine = spectrum.split_field(np.random.default_rng(2), 1.5, 20.0)
-    np.testing.assert_allclose(coarse + fine, spectrum.field(np.random.default_rng(2), 1.5), atol=1e-5)
+    coarse, fine = spectrum.draw_split_field(np.random.default_rng(2), 1.5, 20.0)
+    np.testing.assert_allclose(coarse + fine, spectrum.draw_field(np.random.default_rng(2), 1.5), atol=1e-5)
     waves = np.abs(np.fft.rfft2(coarse)).sum(axis=0)
     assert waves[40:].max() < 1e-3 * waves[:5].max()
 
