@@ -10,8 +10,7 @@ Vector3 = Float[np.ndarray, "3"]
 Points2 = Float[np.ndarray, "n 2"]
 Points3 = Float[np.ndarray, "n 3"]
 Vector = Float[np.ndarray, "n"]
-#: One boolean per point, track or match.
-Flags = Bool[np.ndarray, "n"]
+Flags = Bool[np.ndarray, "n"]  #: one value per point, track or match
 #: Image, or map with one value per cell.
 Raster = Float[np.ndarray, "rows columns"]
 Mask = Bool[np.ndarray, "rows columns"]

@@ -1,4 +1,4 @@
-"""Protocols that algorithms under test implement, and the types of their answers."""
+"""Protocols that algorithms under test implement (velocity, target tracking, landing site), and their answer types."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from marsyard.sim.measurements import (
 
 
 class VelocityOutcome(Enum):
-    """Result of a velocity estimation. All members except VALID are expected failures: no velocity is reported."""
+    """Outcome of a velocity estimate. All members except VALID are expected failures: no velocity is reported."""
 
     VALID = "a velocity is reported"
     NO_TEMPLATE_AREA = "an image pair has no feasible overlap for a template and its search window"
@@ -31,13 +31,13 @@ class VelocityOutcome(Enum):
 
 @dataclass(frozen=True)
 class VelocityEstimate:
-    """Horizontal velocity of the lander over the ground.
+    """Answer of a velocity estimator: horizontal velocity of the lander over the ground, or a failure.
 
     - outcome: Result of the estimation
     - velocity_m_s: Mean horizontal velocity of the camera (east, north) over `span_s`; None unless the outcome is VALID
     - details: Intermediate products for figures and diagnosis, or None
-    - covariance_m2_s2: Covariance of the velocity error (east, north) estimated by the algorithm, or None. If given,
-      errors are tested against it as well.
+    - covariance_m2_s2: Covariance of the velocity error (east, north) estimated by the algorithm, or None. The
+      evaluation also tests whether the errors agree with this covariance.
     - span_s: Start and end of the averaging interval, within the time tags of the images. Equal values mean the
       velocity at that instant. None: the last interval, from the second to the third of three images.
     - after_pictures: Answers of a stream (`VelocityStream`) after each image, None for no answer; set by the caller.
@@ -53,7 +53,7 @@ class VelocityEstimate:
 
 
 class VelocityEstimator(Protocol):
-    """Estimates horizontal velocity from three descent images and their measurements."""
+    """Protocol: estimate the horizontal velocity from descent images (three for DIMES) and their measurements."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """Estimate the velocity; never raises for an image, attitude or altitude that an instrument can deliver."""
@@ -61,7 +61,7 @@ class VelocityEstimator(Protocol):
 
 @runtime_checkable
 class VelocityStream(Protocol):
-    """Estimates horizontal velocity from any number of descent images, received one by one.
+    """Protocol: estimate the horizontal velocity from any number of descent images, received one by one.
 
     `marsyard.algorithms.answers.StreamedEstimator` converts it to a `VelocityEstimator`.
     """
@@ -70,7 +70,7 @@ class VelocityStream(Protocol):
         """Reset the state for a new descent."""
 
     def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
-        """Process the next image; return an estimate or None. Never raises, as `VelocityEstimator.estimate`."""
+        """Process the next image; return an estimate, or None. Like `VelocityEstimator.estimate`, never raises."""
 
     def finish(self) -> VelocityEstimate:
         """Return the final estimate of the descent; a failure outcome if there were too few images."""
@@ -86,7 +86,7 @@ class TrackingState(Enum):
 
 
 class TargetLoss(Enum):
-    """Reason for the loss of the target in an update. Each is an expected failure."""
+    """Reason for the loss of the target in an update; all are expected failures."""
 
     LOW_MATCH_SCORE = "the match score of the template is too low"
     LOW_STEREO_SCORE = "the stereo match score in the right image is too low"
@@ -98,7 +98,7 @@ class TargetLoss(Enum):
 
 @dataclass(frozen=True)
 class PixelBox:
-    """Region of a full frame: upper left pixel (column, row) and size (columns, rows)."""
+    """Rectangular region of a full image frame: upper left pixel (column, row) and size (columns, rows)."""
 
     corner: tuple[int, int]
     size: tuple[int, int]
@@ -106,7 +106,7 @@ class PixelBox:
 
 @dataclass(frozen=True)
 class MastAim:
-    """Requested mast angles and image regions.
+    """Mast angles and image regions that a target tracker requests for its next images.
 
     - azimuth_rad, elevation_rad: Mast angles to command (see `marsyard.sim.measurements.MastGeometry`)
     - left, right: Regions of the full frames to deliver; the exposure should be controlled for these regions
@@ -120,8 +120,9 @@ class MastAim:
 
 @dataclass(frozen=True)
 class TargetUpdate:
-    """Result of one tracking update.
+    """Answer of a target tracker to the images of one rover stop.
 
+    - state: State of the tracker after the update
     - losses: Reasons of the loss, in the order of `TargetLoss`; empty after a match or without a search (states
       NO_TARGET and FAILURE)
     - position_rover: The target in the rover frame of this stop, metres: triangulated, or propagated by the pose
@@ -141,9 +142,10 @@ class TargetUpdate:
 
 
 class TargetTracker(Protocol):
-    """Tracks one designated target over the stops of a rover.
+    """Protocol: track one designated target over the stops of a rover.
 
-    At each stop: `aim`, point the mast, take images, `update`. The first update after `designate` sets the template.
+    At each stop the caller calls `aim`, points the mast, takes images and calls `update`. The first update after
+    `designate` sets the template.
     """
 
     @property
@@ -151,31 +153,31 @@ class TargetTracker(Protocol):
         """State of the tracker."""
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
-        """Set the target, with the rover's estimated pose; replaces the previous target."""
+        """Set the target, which replaces the previous target; `world_from_rover` is the rover's estimated pose."""
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
-        """Compute the mast aim from this pose; None if the mast cannot point at the target.
+        """Compute the mast aim for this rover pose; None if the mast cannot point at the target.
 
-        An update with images taken at other angles can lose the target.
+        Images taken at different angles may not show the target, which is then lost in the update.
         """
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
-        """Match the target; never raises for images, angles or poses that the rover can deliver."""
+        """Find the target in new images; never raises for images, angles or poses that the rover can deliver."""
 
     def clear(self) -> None:
         """Clear the target."""
 
 
 class SiteOutcome(Enum):
-    """Result of the search for a landing site.
+    """Outcome of the search for a landing site.
 
-    SAFE_SITE reports a site. NO_SAFE_SITE reports none: the ground was mapped and no part of it is safe. All other
-    members mean that the algorithm did not converge: the a-priori site is reported without a check.
+    SAFE_SITE: a site is reported. NO_SAFE_SITE: no site is reported, because no part of the mapped ground is safe. All
+    other members mean that the algorithm did not converge: the a-priori site is reported, although it was not checked.
     """
 
     SAFE_SITE = "a safe site is reported"
     NO_SAFE_SITE = "the mapped ground has no safe site"
-    NO_RANGE = "the altimeter gave no range"
+    NO_RANGE = "the altimeter measured no range"
     NO_FEATURES = "the first image has too few features"
     NO_TRACKS = "too few features were tracked to the second image"
     NO_MOTION = "no rigid motion explains the tracks"
@@ -190,11 +192,11 @@ class SiteOutcome(Enum):
 
 @dataclass(frozen=True)
 class SiteEstimate:
-    """Landing site.
+    """Answer of a landing site estimator.
 
     - outcome: Result of the search
-    - site_world: Site in the world frame of the on-board poses, metres; the a-priori site without convergence, None
-      without a safe site
+    - site_world: Site in the world frame of the on-board poses, metres; the a-priori site if the algorithm did not
+      converge, None if there is no safe site
     - details: Intermediate products for figures and diagnosis, or None
     """
 
@@ -204,7 +206,7 @@ class SiteEstimate:
 
 
 class SiteEstimator(Protocol):
-    """Selects a safe landing site from two images and their measurements."""
+    """Protocol: select a safe landing site from two images and their measurements."""
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """Select the site; never raises for images, poses or a range that instruments can deliver."""

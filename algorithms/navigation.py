@@ -1,16 +1,17 @@
-"""Local path planner similar to Autonav: arcs to a goal around obstacles, over mapped ground.
+"""Local path planner similar to Autonav (GESTALT): arcs to a goal around obstacles, over mapped ground.
 
-This is flight software: its inputs are estimated poses and sensed rocks, never the truth. It is not under test. It
-closes the loop of the tracking paper's sections 6 and 7 (GESTALT: Maimone, Leger & Biesiadecki 2007):
+The planner drives the simulated rover while a target tracker is tested (tracking paper, sections 6 and 7; GESTALT:
+Maimone, Leger & Biesiadecki 2007). It is not under test. As flight software it uses estimated poses and sensed rocks,
+never the ground truth:
 
-- It drives only over ground that wedges of stereo images have mapped. A single navcam wedge, 45 deg wide, is too narrow
+- It plans only over ground that stereo images have mapped (wedges). A single navcam wedge, 45 deg wide, is too narrow
   to pass a near obstacle; two wedges are enough (section 6). The ground directly in front of the cameras is not imaged:
   the rover drives the first metres of a map over unmapped ground (section 7.3).
 - Rocks that wheels can climb are not obstacles. A large rock with the target on it is excluded by name (section 6).
 
-Each step searches all paths again: an optional turn in place, an arc, and a second arc to the goal. The rover follows
-the path of minimum cost that is clear and mapped up to the lookahead distance, for one step. The swept area is that of
-a disc: the footprint of a rover at any heading.
+Each step searches new paths: an optional turn in place, an arc, and a second arc to the goal. The rover follows the
+path of minimum cost that is clear and mapped up to the lookahead distance, for one step. The swept area is that of a
+disc, which contains the rover's footprint at any heading.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.measurements import DriveCommand
 
-#: Points of a footprint of unit radius at which the map is sampled: centre and rim.
+#: Points at which the map is tested for a disc of unit radius: its centre and 12 points of its circle.
 _FOOTPRINT_POINTS = np.concatenate(
     [np.zeros((1, 2)), [(np.cos(a), np.sin(a)) for a in np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)]]
 )
-#: Distance below which the goal counts as reached, metres.
+#: Distance to the goal below which it is reached, metres.
 AT_GOAL_M = 0.02
-#: Largest angle between the heading at the start of the second arc and the goal: a wider arc turns back.
+#: Largest angle between the heading at the start of the second arc and the direction to the goal.
 _MAX_HEADING_RAD = np.radians(75.0)
-#: Initial turns in place, in addition to the turn towards the goal.
+#: Candidate turns in place, deg, in addition to the turn towards the goal.
 _TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0, 80.0, -80.0, 100.0, -100.0)
 
 
@@ -42,7 +43,7 @@ class Wedge:
     """Ground mapped by one stereo pair, in the estimated world frame.
 
     - apex_m: Position of the cameras, east and north
-    - azimuth_rad: Centre direction, clockwise from north
+    - azimuth_rad: Direction of the wedge's centre line, clockwise from north
     - nearest_m, farthest_m: Limits of the stereo range
     """
 
@@ -63,7 +64,7 @@ class Wedge:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Sensed rock: identifying name, centre (east, north) in the estimated world frame, and size."""
+    """Sensed rock: unique name, centre (east, north) in the estimated world frame, radius and height."""
 
     name: str
     position_m: Float[np.ndarray, "2"]
@@ -79,12 +80,12 @@ class TerrainMap:
     obstacles: tuple[Obstacle, ...] = ()
 
     def add_wedge(self, wedge: Wedge, rocks: Iterable[Obstacle]) -> TerrainMap:
-        """Return the map with a wedge added, and with every rock that the wedge covers at least in part.
+        """Return the map with a new wedge, and with the rocks that the wedge covers at least in part.
 
-        Occlusion is neglected. The latest measurement of a rock replaces earlier ones.
+        Occlusion is neglected. The latest measurement of a rock replaces its earlier measurements.
         """
-        rims = ((rock, rock.position_m + rock.radius_m * _FOOTPRINT_POINTS) for rock in rocks)
-        visible_rocks = {rock.name: rock for rock, rim in rims if wedge.covers(rim).any()}
+        rock_points = ((rock, rock.position_m + rock.radius_m * _FOOTPRINT_POINTS) for rock in rocks)
+        visible_rocks = {rock.name: rock for rock, points in rock_points if wedge.covers(points).any()}
         remaining_rocks = tuple(rock for rock in self.obstacles if rock.name not in visible_rocks)
         return TerrainMap((*self.wedges, wedge), remaining_rocks + tuple(visible_rocks.values()))
 
@@ -98,7 +99,7 @@ class TerrainMap:
 
 @dataclass(frozen=True)
 class NavigationOptions:
-    """Parameters of the planner; all except those of the wheels are assumed.
+    """Parameters of the planner; all except those of the wheels (`half_width_m`, `climb_m`) are assumed.
 
     - half_width_m: Radius of the swept disc: a MER's outer wheels are 0.69 m from its centre line
     - margin_m: Clearance between disc and obstacle
@@ -136,9 +137,9 @@ class NavigationOutcome(Enum):
 
 @dataclass(frozen=True)
 class NavigationPlan:
-    """The next step to drive.
+    """Result of `navigate`: the next step to drive.
 
-    - commands: One step along the path, in order; empty unless the outcome is PATH
+    - commands: Drive commands of one step along the path, in order; empty unless the outcome is PATH
     - path_m: The complete path (east, north) in the estimated world frame; empty without a path
     """
 
@@ -172,7 +173,7 @@ def navigate(
     if not bool(terrain.contains(position + options.half_width_m * _FOOTPRINT_POINTS).all()):
         return NavigationPlan(NavigationOutcome.NOT_MAPPED, (), no_path)
     obstacles = [rock for rock in terrain.obstacles if rock.name != target and rock.height_m > options.climb_m]
-    for path in _candidates(goal, options):
+    for path in _generate_paths(goal, options):
         lookahead = position + path.points(np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)) @ heading.T
         footprint_points = lookahead[:, None] + options.half_width_m * _FOOTPRINT_POINTS
         if _is_clear(lookahead, obstacles, options) and bool(terrain.contains(footprint_points).all()):
@@ -215,7 +216,7 @@ class _Path:
 
 
 def _arc(curvature_m: float, distances_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-    """Positions at distances along an arc that starts at the origin along x."""
+    """Positions at distances along an arc that starts at the origin in the direction of x."""
     half = 0.5 * curvature_m * distances_m
     chord = distances_m * np.sinc(half / np.pi)
     return np.stack([chord * np.cos(half), chord * np.sin(half)], axis=-1)
@@ -226,8 +227,11 @@ def _rotation_matrix(angle_rad: float) -> Float[np.ndarray, "2 2"]:
     return np.array([[cosine, -sine], [sine, cosine]])
 
 
-def _candidates(goal: Float[np.ndarray, "2"], options: NavigationOptions) -> Iterator[_Path]:
-    """Paths to the goal by increasing cost: an optional turn, an optional arc, and the arc to the goal."""
+def _generate_paths(goal: Float[np.ndarray, "2"], options: NavigationOptions) -> Iterator[_Path]:
+    """Generate paths to the goal by increasing cost: an optional turn, an optional arc, and the arc to the goal.
+
+    `goal` is in the axes of the rover: x forward, y to the left, metres.
+    """
     goal_direction = float(np.arctan2(goal[1], goal[0]))
     turns = np.concatenate([np.radians(_TURNS_DEG), [goal_direction]])
     curvatures = options.curvature_m * np.linspace(-1.0, 1.0, 9)
@@ -237,8 +241,8 @@ def _candidates(goal: Float[np.ndarray, "2"], options: NavigationOptions) -> Ite
     half = 0.5 * curvature_1 * length_1
     chord = length_1 * np.sinc(half / np.pi)
     heading = turn + 2.0 * half
-    east, north = goal[0] - chord * np.cos(turn + half), goal[1] - chord * np.sin(turn + half)
-    range_m, angle = np.hypot(east, north), np.arctan2(north, east) - heading
+    to_goal_x, to_goal_y = goal[0] - chord * np.cos(turn + half), goal[1] - chord * np.sin(turn + half)
+    range_m, angle = np.hypot(to_goal_x, to_goal_y), np.arctan2(to_goal_y, to_goal_x) - heading
     angle = (angle + np.pi) % (2.0 * np.pi) - np.pi
     curvature_2 = 2.0 * np.sin(angle) / np.maximum(range_m, AT_GOAL_M)
     length_2 = range_m / np.sinc(angle / np.pi)
@@ -247,13 +251,13 @@ def _candidates(goal: Float[np.ndarray, "2"], options: NavigationOptions) -> Ite
     bending = curvature_1**2 * length_1 + curvature_2**2 * length_2
     cost = length_1 + length_2 + options.turn_cost_m * np.abs(turn) + options.bend_cost_m2 * bending
     cost = np.where(feasible, cost, np.inf)
-    for best in np.argsort(cost, kind="stable")[: np.count_nonzero(feasible)]:
-        arcs = (float(curvature_1[best]), float(curvature_2[best])), (float(length_1[best]), float(length_2[best]))
-        yield _Path(float(turn[best]), *arcs)
+    for k in np.argsort(cost, kind="stable")[: np.count_nonzero(feasible)]:
+        curvatures_m = (float(curvature_1[k]), float(curvature_2[k]))
+        yield _Path(float(turn[k]), curvatures_m, (float(length_1[k]), float(length_2[k])))
 
 
 def _is_clear(positions_m: Float[np.ndarray, "n 2"], rocks: Iterable[Obstacle], options: NavigationOptions) -> bool:
-    """Whether the disc avoids all rocks; a rock that it overlaps at the start is allowed if the distance grows."""
+    """Whether the swept disc avoids all rocks; it may overlap a rock at the start if the distance then increases."""
     for rock in rocks:
         distances = np.hypot(*(positions_m - rock.position_m).T)
         clearance = options.half_width_m + options.margin_m + rock.radius_m

@@ -1,4 +1,4 @@
-"""Child processes and memory use, read from Linux's /proc; empty or zero on other systems."""
+"""Child processes and memory use, read from Linux's /proc to enforce memory limits; empty or zero on other systems."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def descendants(process: int) -> list[int]:
 
 
 def used_memory(processes: Sequence[int], exact_above: float = 0.0) -> float:
-    """Bytes of private and shared anonymous memory of the processes of one tree; 0 for ended ones.
+    """Bytes of private and shared anonymous memory of the processes of one tree; 0 for ended processes.
 
-    Mapped files do not count: workers share those of a terrain, and Linux reclaims them. Pages shared by forked
-    processes count once; this count is slow. Therefore a fast upper bound (shared pages counted in each process) is
-    returned if it is at most `exact_above`.
+    Mapped files are not counted: workers share the files of a terrain, and Linux reclaims their memory. Pages shared by
+    forked processes are counted once, which is slow. Therefore a fast upper bound, with shared pages counted in each
+    process, is returned if it is at most `exact_above`.
     """
     upper_bound = sum(_read_kilobytes(process, "status", r"Rss(?:Anon|Shmem)") for process in processes) * 1024.0
     if len(processes) < 2 or upper_bound <= exact_above:

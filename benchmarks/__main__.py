@@ -24,10 +24,10 @@ PACKAGES = ("marsyard", "numpy", "numba", "pyrender2", "opencv-python-headless")
 
 
 def main() -> None:
-"""Run all benchmarks, print and store the measurements."""
+    """Run all benchmarks, print and store the measurements."""
     argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__).parse_args()
     cv2.setNumThreads(1)
-measurements = [
+    measurements = [
         # first, because other benchmarks increase the memory of the process
         *images.measure_memory(500),
         *descent.measure_frame(15),
@@ -43,15 +43,15 @@ measurements = [
         *reporting.measure(),
     ]
     print(f"{'core-seconds, unless stated otherwise':<52}{'median':>8}{'min':>8}{'max':>8}  {'limit':<8}")
-for row in measurements:
+    for row in measurements:
         mark = "" if row.is_within_limit else "  MISSED"
         low, high = min(row.values), max(row.values)
         print(f"{row.name:<52}{row.median:8.3f}{low:8.3f}{high:8.3f}  {row.limit_text:<8}{mark}")
-store(measurements)
+    store(measurements)
 
 
 def store(measurements: list[Measurement]) -> None:
-"""Store the measurements with the machine and the versions, and write the page."""
+    """Store the measurements with the machine and the versions, and write the page."""
     record = {
         "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
         "machine": {"platform": platform.platform(), "processor": processor_features(), "cores": os.cpu_count()},

@@ -1,9 +1,9 @@
 """Detect hot paths that are slower than their stored ratios: ``python -m benchmarks.check [--keep]``.
 
-Runs of each path alternate with runs of a reference workload of the same kinds of operations (matrix products, filters, sorting,
-copies), so that a slow or busy machine affects both. Welch's test compares the logarithms of their ratios with the
-stored ones. A path is slower if its mean ratio has grown by more than the factor `ALLOWED_GROWTH`. The false alarm rate is
-`FALSE_ALARMS` for all paths together. Ratios are valid for one type of processor.
+Runs of each path alternate with runs of a reference workload (matrix products, filters, sorting, copies), so that a
+slow or busy machine affects both. Welch's test compares the logarithms of the ratios of their processor times with the
+stored logarithms. A path is slower if its mean ratio has grown by more than the factor `ALLOWED_GROWTH`. The false
+alarm rate is `FALSE_ALARMS` for all paths together. Ratios are valid for one type of processor.
 """
 
 from __future__ import annotations
@@ -45,29 +45,29 @@ def _prepare_dimes() -> Callable[[], object]:
 
 
 def _prepare_dense_map() -> Callable[[], object]:
-measurements, estimator = hda.make_measurements(), HdaEstimator(hda.DENSE)
+    measurements, estimator = hda.make_measurements(), HdaEstimator(hda.DENSE)
     return lambda: estimator.estimate(measurements)
 
 
 def _prepare_hazard_maps() -> Callable[[], object]:
-elevation_m = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
-ground = ElevationMap(elevation_m, np.zeros(2), 0.1)
+    elevation_m = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
+    ground = ElevationMap(elevation_m, np.zeros(2), 0.1)
     return lambda: hazard_maps(ground, HdaOptions())
 
 
 #: Path: function that prepares it and returns a function for repeated runs.
 PATHS: Mapping[str, Callable[[], Callable[[], object]]] = {
-"descent image with detector": prepare_descent_exposure,
-"DIMES, a triple": _prepare_dimes,
-"target tracking, an update": prepare_update,
-"HDA, 160 x 120 points": _prepare_dense_map,
-"hazard maps of 256 x 256": _prepare_hazard_maps,
+    "descent image with detector": prepare_descent_exposure,
+    "DIMES, three images": _prepare_dimes,
+    "target tracking, an update": prepare_update,
+    "HDA, 160 x 120 points": _prepare_dense_map,
+    "hazard maps of 256 x 256": _prepare_hazard_maps,
     "table of 20,000 rows": lambda: lambda: measure_table_s(20_000),
 }
 
 
 def reference_workload() -> Callable[[], object]:
-"""Return a function that takes about 30 ms."""
+    """Return a function that takes about 30 ms."""
     rng = np.random.default_rng(0)
     matrix = rng.standard_normal((300, 300))
     image = rng.standard_normal((1024, 1024)).astype(np.float32)
@@ -83,14 +83,14 @@ def reference_workload() -> Callable[[], object]:
 
 
 def log_ratios(path: Callable[[], object], reference: Callable[[], object], pairs: int) -> list[float]:
-"""Measure, for each pair, the logarithm of the path's processor time divided by the mean of the two reference times."""
+    """For each pair, the logarithm of the path's time divided by the mean reference time before and after it."""
     path()
-ratios, before = [], _processor_seconds(reference)
+    ratios, before = [], _processor_seconds(reference)
     for _ in range(pairs):
-elapsed, after = _processor_seconds(path), _processor_seconds(reference)
-ratios.append(float(np.log(elapsed / (0.5 * (before + after)))))
+        elapsed, after = _processor_seconds(path), _processor_seconds(reference)
+        ratios.append(float(np.log(elapsed / (0.5 * (before + after)))))
         before = after
-return ratios
+    return ratios
 
 
 def _processor_seconds(work: Callable[[], object]) -> float:
@@ -101,38 +101,38 @@ def _processor_seconds(work: Callable[[], object]) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-"""Comparison of a path with its stored ratio: factor of growth, and p-value of the hypothesis of no slow-down."""
+    """Comparison of a path with its stored ratio: factor of growth, and p-value of the hypothesis of no slow-down."""
 
     name: str
-growth: float
+    growth: float
     p_value: float
 
 
 def compare(now: Mapping[str, Sequence[float]], stored: Mapping[str, Sequence[float]]) -> list[Comparison]:
     """Compare every path that both records contain."""
-comparisons = []
+    comparisons = []
     for name in now.keys() & stored.keys():
-current, before = np.asarray(now[name]), np.asarray(stored[name])
+        current, before = np.asarray(now[name]), np.asarray(stored[name])
         test = stats.ttest_ind(current - np.log(ALLOWED_GROWTH), before, equal_var=False, alternative="greater")
-comparisons.append(Comparison(name, float(np.exp(current.mean() - before.mean())), float(test.pvalue)))
-return sorted(comparisons, key=lambda comparison: comparison.name)
+        comparisons.append(Comparison(name, float(np.exp(current.mean() - before.mean())), float(test.pvalue)))
+    return sorted(comparisons, key=lambda comparison: comparison.name)
 
 
 def select_slower(comparisons: Sequence[Comparison]) -> list[Comparison]:
     """Select paths that exceed the accepted growth, with Bonferroni's correction."""
-return [comparison for comparison in comparisons if comparison.p_value < FALSE_ALARMS / len(comparisons)]
+    return [comparison for comparison in comparisons if comparison.p_value < FALSE_ALARMS / len(comparisons)]
 
 
 def main() -> int:
-"""Measure, then store or compare. Returns 1 if a path is slower, 2 without stored ratios of this processor."""
+    """Measure, then store or compare. Returns 1 if a path is slower, 2 without stored ratios of this processor."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.check", description=__doc__)
     parser.add_argument("--keep", action="store_true", help="store these ratios for later comparisons")
     keep = parser.parse_args().keep
-stored = json.loads(RATIOS.read_text()) if RATIOS.exists() else None
+    stored = json.loads(RATIOS.read_text()) if RATIOS.exists() else None
     if not keep and (stored is None or stored["processor"] != processor_features()):
         reason = (
             "no ratios are stored"
-if stored is None
+            if stored is None
             else f"the stored ratios are of another processor, {stored['processor']}"
         )
         print(f"{reason}: run 'python -m benchmarks.check --keep' on the version to compare with", file=sys.stderr)
@@ -147,19 +147,20 @@ if stored is None
             "log_ratios": now,
         }
         RATIOS.write_text(json.dumps(record, indent=2) + "\n")
-print(f"stored in {RATIOS}")
+        print(f"stored in {RATIOS}")
         return 0
-assert stored is not None, "the program ends earlier without stored ratios"
+    assert stored is not None, "the program ends earlier without stored ratios"
     return _print_comparison(compare(now, stored["log_ratios"]), stored["measured"])
 
 
 def _print_comparison(comparisons: Sequence[Comparison], measured: str) -> int:
     """Print the comparison. Returns 1 if a path is slower."""
-slower = select_slower(comparisons)
+    slower = select_slower(comparisons)
     print(f"{'ratio divided by that of ' + measured[:10]:<40}{'factor':>8}{'p':>10}")
-for comparison in comparisons:
-print(f"{comparison.name:<40}{comparison.growth:8.2f}{comparison.p_value:10.2g}{'  SLOWER' if comparison in slower else ''}")
-return 1 if slower else 0
+    for comparison in comparisons:
+        mark = "  SLOWER" if comparison in slower else ""
+        print(f"{comparison.name:<40}{comparison.growth:8.2f}{comparison.p_value:10.2g}{mark}")
+    return 1 if slower else 0
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Run times of a descent picture, a new terrain, DIMES and a complete case."""
+"""Run times of a descent image, a new terrain and a complete case of the descent scenario."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.bounds import bounds
-from benchmarks.pictures import descent_pose, descent_scene
+from benchmarks.images import descent_pose, descent_scene
+from benchmarks.minimum_costs import measure_minimum_costs
 from benchmarks.stages import measure_stages
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.campaigns.definition.loading import load_campaign
@@ -20,8 +20,8 @@ from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.sites import sites
 
 
-def frame(repeats: int) -> list[Measurement]:
-    """A frame of the descent scene with prepared terrain, mesh and shadows."""
+def measure_frame(repeats: int) -> list[Measurement]:
+    """Measure a frame of the descent scene with prepared terrain, mesh and shadows."""
     scene, surface = descent_scene()
     optics = camera_optics(CameraParameters())
     renderer = process_renderer(default_backend())
@@ -35,33 +35,35 @@ def frame(repeats: int) -> list[Measurement]:
     ]
 
 
-def case(repeats: int) -> list[Measurement]:
-    """Complete `dimes-gusev` cases over one prepared terrain, their stages and lower bounds."""
+def measure_case(repeats: int) -> list[Measurement]:
+    """Measure complete `dimes-gusev` cases over one prepared terrain, their stages and their minimum costs."""
     campaign = load_campaign("dimes-gusev")
-    numbers = itertools.count()
+    case_numbers = itertools.count()
 
     def run_next() -> None:
-        number = next(numbers)
-        parameters = campaign.with_values({**campaign.draws(number), "location.terrain": 0})
-        campaign.scenario.run(parameters, campaign.streams(number))
+        case = next(case_numbers)
+        parameters = campaign.with_values({**campaign.draws(case), "location.terrain": 0})
+        campaign.scenario.run(parameters, campaign.streams(case))
 
     return [
-        Measurement("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=1.0),
+        Measurement(
+            "dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=1.0
+        ),
         *measure_stages(run_next, repeats),
-        *bounds(run_next, repeats),
+        *measure_minimum_costs(run_next, repeats),
     ]
 
 
-def new_terrains(repeats: int) -> list[Measurement]:
-    """A new descent terrain of 4096 x 4096 samples, by default parameters and for every site."""
-    kinds = {"plain": TerrainParameters()} | {
+def measure_new_terrains(repeats: int) -> list[Measurement]:
+    """Measure the synthesis of a descent terrain of 4096 x 4096 samples, with default parameters and for every site."""
+    parameters = {"default parameters": TerrainParameters()} | {
         name: site.descent for name, site in sites().items() if site.descent is not None
     }
     return [
         Measurement(
             f"new descent terrain, {name}",
-            core_seconds(partial(synthesise, kind, np.random.default_rng(0)), repeats),
+            core_seconds(partial(synthesise, site_parameters, np.random.default_rng(0)), repeats),
             limit=2.0,
         )
-        for name, kind in kinds.items()
+        for name, site_parameters in parameters.items()
     ]

@@ -1,6 +1,6 @@
 """Derive and store the threshold of DIMES' IMU check: ``python -m benchmarks.dimes_threshold``.
 
-Writes `algorithms/dimes/imu_threshold.json`; a test compares the option's default with it. Takes about two minutes.
+Writes `algorithms/dimes/imu_threshold.json`; a test compares it with the option's default. Takes about two minutes.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.reports.statistics.samples import quantile_bounds
 
 STORED = Path(options.__file__).with_name("imu_threshold.json")
-#: Increased if the derivation changes without a change of its inputs.
+#: Version of the derivation; increase it if the result changes for the same inputs.
 VERSION = 1
 QUANTILES = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
-#: Range of the velocity error of the wrong track, m/s: minimum error, and errors up to the search range.
+#: Minimum and maximum velocity error of the wrong track, m/s: always the smallest error, and up to the search range.
 WRONG_BY_M_S = ((10.0, 10.0), (10.0, 60.0))
 
 
 def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
-    """Threshold, distribution of discrepancies, and effect of the check on one wrong track."""
+    """Derive the threshold, the distribution of discrepancies, and the effect of the check on one wrong track."""
     rng = np.random.default_rng(inputs.seed)
     errors = derivation.right_track_errors(inputs, rng)
     results = derivation.discrepancies(errors, inputs.imu_sd_m_s, rng)
     threshold = derivation.threshold_m_s(results.single, inputs.kept, inputs.step_m_s)
-    harms = [
+    wrong_track_effects = [
         {
             "tracks_per_pair": tracks,
-            "wrong_by_m_s": bounds,
-            **asdict(derivation.harm(errors[:, :, :tracks], bounds, threshold, inputs.imu_sd_m_s, rng)),
+            "wrong_by_m_s": error_range_m_s,
+            **asdict(derivation.harm(errors[:, :, :tracks], error_range_m_s, threshold, inputs.imu_sd_m_s, rng)),
         }
         for tracks in (1, 2)
-        for bounds in WRONG_BY_M_S
+        for error_range_m_s in WRONG_BY_M_S
     ]
     return {
         "derivation": "benchmarks.threshold_derivation",
@@ -58,7 +58,7 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
         "kept_quantile_m_s": float(np.quantile(results.single, inputs.kept)),
         "kept_quantile_90_percent_bounds_m_s": quantile_bounds(results.single, inputs.kept, 0.95),
         "threshold_m_s": threshold,
-        "one_wrong_track": harms,
+        "one_wrong_track": wrong_track_effects,
     }
 
 
@@ -70,7 +70,7 @@ def main() -> None:
     record = derive_threshold(derivation.ThresholdInputs())
     STORED.write_text(json.dumps(record, indent=1) + "\n")
     print(json.dumps(record, indent=1))
-    print(f"kept in {STORED}; the option's default is {DimesOptions().imu_threshold_m_s} m/s")
+    print(f"stored in {STORED}; the option's default is {DimesOptions().imu_threshold_m_s} m/s")
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ class BusyParameters(BaseModel):
 
 
 class BusyScenario:
-    """Occupy a processor for a given time, without a score."""
+    """Scenario that occupies the processor for `busy_s` and computes nothing."""
 
     name = "busy"
     parameters_type = BusyParameters
@@ -56,20 +56,20 @@ class BusyScenario:
 
 
 class Stopwatch:
-    """Progress display that records time and memory of the parent at given numbers of cases."""
+    """Progress display that records time and memory of the parent process at given numbers of finished cases."""
 
-    def __init__(self, marks: tuple[int, ...]) -> None:
+    def __init__(self, case_counts: tuple[int, ...]) -> None:
         self.at: dict[int, tuple[float, float]] = {}
-        self._marks = marks
+        self._case_counts = case_counts
         self._done = 0
-        self._counts = False
+        self._is_counting = False
 
     def begin(self, stage: str, total: int) -> None:
-        self._counts = stage == "cases"
+        self._is_counting = stage == "cases"
 
     def step(self) -> None:
-        self._done += self._counts
-        if self._counts and self._done in self._marks:
+        self._done += self._is_counting
+        if self._is_counting and self._done in self._case_counts:
             self.at[self._done] = (time.perf_counter(), resident_bytes([os.getpid()]) / 1e6)
 
     def note(self, text: str) -> None:
@@ -77,35 +77,45 @@ class Stopwatch:
 
 
 @dataclass(frozen=True)
-class Span:
-    """Wall-clock time per case between two marks, the part spent in cases, and growth of memory."""
+class CaseCost:
+    """Wall-clock time per case, its part inside the scenario, and growth of the parent's memory."""
 
-    case_s: float
-    own_s: float
-    grown_mb: float
+    wall_s: float
+    inside_case_s: float
+    memory_growth_mb: float
 
 
 def measure(repeats: int = 3) -> list[Measurement]:
-    """Overhead of the engine. Fractions of wall-clock time, so that load of other programs affects both sides."""
-    empty = [span(0.0, 2_000, 12_000) for _ in range(repeats)]
-    busy = [span(0.05, 20, 140) for _ in range(repeats)]
-    long = span(0.0, 10_000, 100_000)
+    """Measure the overhead of the engine. Ratios use wall-clock time, so that load of other programs cancels."""
+    empty = [measure_case_cost(0.0, 2_000, 12_000) for _ in range(repeats)]
+    busy = [measure_case_cost(0.05, 20, 140) for _ in range(repeats)]
+    long = measure_case_cost(0.0, 10_000, 100_000)
     return [
-        Measurement("engine: overhead of an empty case (ms)", [1e3 * (one.case_s - one.own_s) for one in empty], limit=2.0),
+        Measurement(
+            "engine: overhead of an empty case (ms)",
+            [1e3 * (cost.wall_s - cost.inside_case_s) for cost in empty],
+            limit=2.0,
+        ),
         Measurement(
             "engine: overhead of a case of 50 ms (%)",
-            [100.0 * (one.case_s / one.own_s - 1.0) for one in busy],
+            [100.0 * (cost.wall_s / cost.inside_case_s - 1.0) for cost in busy],
             limit=3.0,
         ),
-        Measurement("engine: growth of the parent, 10,000 to 100,000 cases (MB)", [long.grown_mb], limit=10.0),
-        *_a_hundred_thousand(),
-        Measurement("engine: speed-up by two workers, rendered cases", [gain() for _ in range(repeats)], minimum=1.85),
-        Measurement(f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [table_seconds(1_000_000)], limit=30.0),
+        Measurement("engine: growth of the parent, 10,000 to 100,000 cases (MB)", [long.memory_growth_mb], limit=10.0),
+        *_measure_empty_campaign(),
+        Measurement(
+            "engine: speed-up by two workers, rendered cases",
+            [measure_speed_up() for _ in range(repeats)],
+            minimum=1.85,
+        ),
+        Measurement(
+            f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [measure_table_s(1_000_000)], limit=30.0
+        ),
     ]
 
 
-def _a_hundred_thousand(cases: int = 100_000) -> list[Measurement]:
-    """A complete campaign of empty cases on two workers, and a loop of joblib over the same cases."""
+def _measure_empty_campaign(cases: int = 100_000) -> list[Measurement]:
+    """Measure a campaign of empty cases on two workers, and a joblib loop over the same cases without storage."""
     configuration = CampaignConfiguration(
         name="empty", scenario="benchmarks.engine:BusyScenario", cases=cases, retain=Retain(showcase="none")
     )
@@ -113,26 +123,26 @@ def _a_hundred_thousand(cases: int = 100_000) -> list[Measurement]:
     with TemporaryDirectory() as folder:
         began = time.perf_counter()
         run_campaign(campaign, Path(folder, "run"), ExecutorConfig(2), Stopwatch(()))
-        ours = time.perf_counter() - began
+        campaign_s = time.perf_counter() - began
     began = time.perf_counter()
-    Parallel(2)(delayed(_one)(campaign, case) for case in range(cases))
-    loop = time.perf_counter() - began
+    Parallel(2)(delayed(_run_case)(campaign, case) for case in range(cases))
+    loop_s = time.perf_counter() - began
     return [
-        Measurement(f"engine: {cases:,} empty cases, two workers (wall s)", [ours], limit=60.0),
-        Measurement("the same in a loop of joblib without storage (wall s)", [loop]),
+        Measurement(f"engine: {cases:,} empty cases, two workers (wall s)", [campaign_s], limit=60.0),
+        Measurement(f"joblib loop without storage: {cases:,} empty cases, two workers (wall s)", [loop_s]),
     ]
 
 
-def _one(campaign: Campaign, case: int) -> CaseResult:
+def _run_case(campaign: Campaign, case: int) -> CaseResult:
     return campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
 
 
-def span(busy_s: float, first: int, last: int) -> Span:
-    """Run a campaign on one worker and measure between the marks, so that start-up is excluded."""
+def measure_case_cost(busy_s: float, first: int, last: int) -> CaseCost:
+    """Run a campaign on one worker; measure from case `first` to case `last`, so that start-up is excluded."""
     configuration = CampaignConfiguration(
         name="busy",
         scenario="benchmarks.engine:BusyScenario",
-        # workers run small batches after the last mark
+        # additional cases, because workers run small batches at the end
         cases=last + (last - first) // 10,
         parameters={"busy_s": busy_s},
         retain=Retain(showcase="none"),
@@ -140,16 +150,16 @@ def span(busy_s: float, first: int, last: int) -> Span:
     watch = Stopwatch((first, last))
     with TemporaryDirectory() as folder:
         run_campaign(Campaign(configuration, BusyScenario()), Path(folder, "run"), ExecutorConfig(1), watch)
-        own = pq.read_table(Path(folder, "run", "cases.parquet"), columns=["wall_time_s"])["wall_time_s"]
-        own_s = pc.mean(own.slice(first, last - first)).as_py()
+        seconds = pq.read_table(Path(folder, "run", "cases.parquet"), columns=["wall_time_s"])["wall_time_s"]
+        inside_case_s = pc.mean(seconds.slice(first, last - first)).as_py()
     (began, before), (ended, after) = watch.at[first], watch.at[last]
-    return Span((ended - began) / (last - first), own_s, after - before)
+    return CaseCost((ended - began) / (last - first), inside_case_s, after - before)
 
 
-def gain(campaign: str = "dimes-smoke", cases: int = 120) -> float:
-    """Speed-up of two workers with rendered cases; meaningful on idle cores only.
+def measure_speed_up(campaign: str = "dimes-smoke", cases: int = 120) -> float:
+    """Measure the speed-up of two workers with rendered cases; needs idle cores.
 
-    Measured between the start-up of all workers and the last batches.
+    The measurement excludes the start-up of the workers and the last batches.
     """
     first, last = 24, cases - 8
     times = []
@@ -162,8 +172,8 @@ def gain(campaign: str = "dimes-smoke", cases: int = 120) -> float:
     return times[0] / times[1]
 
 
-def table_seconds(rows: int) -> float:
-    """Processor time to write a table with full-precision numbers."""
+def measure_table_s(rows: int) -> float:
+    """Measure the processor time to write a table with full-precision numbers."""
     head: dict[str, Scalar] = {"outcome": "VALID", "answered": True}
     tail: dict[str, Scalar] = {"wall_time_s": 0.1, "cpu_time_s": 0.1, "error": "", "traceback": ""}
     with TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Velocity estimators on the same rendered descents: DIMES and baselines."""
+"""Run times of velocity estimators on the same rendered descents: DIMES and baselines."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ESTIMATORS: Mapping[str, VelocityEstimator] = {
     "OpenCV's phase correlation": PhaseCorrelationEstimator(),
     "OpenCV's ORB and homography": HomographyEstimator(),
 }
-#: Runs of each estimate; the fastest counts, because other programs only add time.
+#: Runs of each estimate. The fastest run is used, because other programs only add time.
 REPEATS = 3
 
 
@@ -41,7 +41,7 @@ class Recorder:
 
 @dataclass(frozen=True)
 class Descent:
-    """Measurements of a descent, true mean velocity over the second pair, and whether the overlap is feasible."""
+    """Measurements of a descent, true mean velocity over the second image pair, and whether the overlap is feasible."""
 
     measurements: DescentMeasurements
     velocity_m_s: np.ndarray
@@ -49,7 +49,7 @@ class Descent:
 
 
 def record_descents(campaign_name: str, cases: int) -> list[Descent]:
-    """Record the first cases of a descent campaign."""
+    """Run the first cases of a descent campaign and record their measurements."""
     campaign = load_campaign(campaign_name, ["parameters.algorithm=benchmarks.estimators:Recorder"])
     descents = []
     for case in range(cases):
@@ -89,10 +89,14 @@ def run_estimator(estimator: VelocityEstimator, descents: list[Descent]) -> Esti
 
 
 def compare_estimators(cases: int) -> list[Measurement]:
-    """Core-seconds of each estimator on the same triples, binned to 256 x 256."""
+    """Measure the core-seconds of each estimator on the same descents of three images, binned to 256 x 256."""
     descents = record_descents("dimes-smoke", cases)
     limits_s = {"DIMES": 0.015}
     return [
-        Measurement(f"a triple: {name}", run_estimator(estimator, descents).seconds.tolist(), limit=limits_s.get(name))
+        Measurement(
+            f"velocity from three images: {name}",
+            run_estimator(estimator, descents).seconds.tolist(),
+            limit=limits_s.get(name),
+        )
         for name, estimator in ESTIMATORS.items()
     ]

@@ -1,4 +1,4 @@
-"""Run times of hazard detection next to those of the paper (Table I, 400 MHz R12000), and of dense maps."""
+"""Run times of hazard detection: the stages of Table I of the paper (400 MHz R12000), dense maps and complete cases."""
 
 from __future__ import annotations
 
@@ -22,27 +22,29 @@ from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
 
-#: XC-55 camera. Blocks of 73 px give about 59 tracks and a grid of 20 px gives 600 points, as in the paper.
+#: XC-55 camera.
 CAMERA = Cahv.from_focal_length(0.006, 7.4e-6, (640, 480), axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0))
+#: As in the paper: blocks of 73 px give about 59 tracks, a grid of 20 px gives 600 points.
 PAPER = HdaOptions(block_px=73, grid_px=20)
-#: 160 x 120 structure pixels.
+#: Grid of 160 x 120 structure points.
 DENSE = HdaOptions(grid_px=4)
+#: Size of a texture sample on the ground, metres.
 TEXEL_M = 0.005
 
 
-def measurements() -> LandingMeasurements:
-    """Two images of textured level ground from a height of 10 m with a baseline of 0.36 m."""
+def make_measurements() -> LandingMeasurements:
+    """Make two images of textured level ground from a height of 10 m with a baseline of 0.36 m."""
     values = np.random.default_rng(1).standard_normal((2400, 2400)).astype(np.float32)
     texture = sum(
         sigma * ndimage.gaussian_filter(values, sigma, mode="wrap", truncate=3.0) * sigma**0.5 for sigma in (4, 12, 36)
     )
     texture = np.asarray(128.0 + 40.0 * texture / np.std(texture), dtype=np.float32)
-    known = DetectorCalibration(np.ones((480, 640)), 0.001, 0.0, 0.0, 1, 0.0, 255)
+    calibration = DetectorCalibration(np.ones((480, 640)), 0.001, 0.0, 0.0, 1, 0.0, 255)
     poses = (
         rigid(Rotation.identity(), np.array([0.0, 0.0, 10.0])),
         rigid(Rotation.from_euler("zyx", [0.3, 0.2, -0.2], degrees=True), np.array([0.1, -0.35, 10.02])),
     )
-    images = [DetectorImage(_picture(texture, pose), float(k), CAMERA, known) for k, pose in enumerate(poses)]
+    images = [DetectorImage(_draw_image(texture, pose), float(k), CAMERA, calibration) for k, pose in enumerate(poses)]
     return LandingMeasurements(
         (images[0], images[1]),
         (PoseMeasurement(poses[0], 0.0), PoseMeasurement(poses[1], 1.0)),
@@ -52,89 +54,92 @@ def measurements() -> LandingMeasurements:
     )
 
 
-def _picture(texture: np.ndarray, pose: RigidTransform) -> np.ndarray:
+def _draw_image(texture: np.ndarray, pose: RigidTransform) -> np.ndarray:
     camera = CAMERA.transform(pose)
     rays = camera.rays(camera.pixel_grid())[1]
     ground = camera.c[:2] - camera.c[2] * rays[..., :2] / rays[..., 2:]
-    places = (ground / TEXEL_M + 1200.0).astype(np.float32)
-    return np.rint(np.clip(cv2.remap(texture, places, None, cv2.INTER_LINEAR), 0, 255)).astype(np.uint16)
+    texels = (ground / TEXEL_M + 1200.0).astype(np.float32)
+    return np.rint(np.clip(cv2.remap(texture, texels, None, cv2.INTER_LINEAR), 0, 255)).astype(np.uint16)
 
 
 def measure(repeats: int) -> list[Measurement]:
-    """Stages and total with the paper's parameters, dense estimation, hazard maps of a large map, a campaign case."""
-    given = measurements()
-    return [*table_one(given, repeats), *_whole(given, repeats), _large_map(repeats), case(repeats)]
+    """Measure stages and total with the paper's parameters, dense estimation, a large hazard map, and a case."""
+    measurements = make_measurements()
+    estimators = _measure_estimators(measurements, repeats)
+    return [*measure_stages(measurements, repeats), *estimators, _measure_large_map(repeats), measure_cases(repeats)]
 
 
-def table_one(given: LandingMeasurements, repeats: int) -> list[Measurement]:
-    """The four stages of Table I; the scale is part of structure from motion."""
-    seen = build_scene(given)
-    details = HdaEstimator(PAPER).estimate(given).details
+def measure_stages(measurements: LandingMeasurements, repeats: int) -> list[Measurement]:
+    """Measure the four stages of Table I; the scale is part of structure from motion."""
+    scene = build_scene(measurements)
+    details = HdaEstimator(PAPER).estimate(measurements).details
     assert isinstance(details, HdaDetails)
     tracks, motion, matches, ground = details.tracks, details.motion, details.matches, details.ground
     assert tracks is not None
     assert motion is not None
     assert matches is not None
     assert ground is not None
-    first, second = (view.counts for view in seen.views)
-    places = undistort(seen.views[0].camera, tracks.first[tracks.accepted])
-    resolution = map_resolution(motion, seen.views[0].focal_px, PAPER)
+    first, second = (view.counts for view in scene.views)
+    points = undistort(scene.views[0].camera, tracks.first[tracks.accepted])
+    resolution = map_resolution(motion, scene.views[0].focal_px, PAPER)
 
     def track() -> None:
         features = select_features(first, PAPER)
-        track_features(first, second, features, expected_pixels(seen, features, PAPER), PAPER)
+        track_features(first, second, features, expected_pixels(scene, features, PAPER), PAPER)
 
-    def move() -> None:
-        scale_factor(seen.views, motion_from_tracks(seen, tracks, PAPER), places, seen.range_m, PAPER)
+    def estimate_motion() -> None:
+        scale_factor(scene.views, motion_from_tracks(scene, tracks, PAPER), points, scene.range_m, PAPER)
 
     rows, columns = ground.elevation.elevation_m.shape
     return [
         Measurement("HDA features, 11 x 11 in 81 x 81 (paper: 0.21 s)", core_seconds(track, repeats)),
-        Measurement(f"HDA motion, {tracks.accepted.sum()} tracks (paper: 59, 0.10 s)", core_seconds(move, repeats)),
+        Measurement(
+            f"HDA motion, {tracks.accepted.sum()} tracks (paper: 59, 0.10 s)", core_seconds(estimate_motion, repeats)
+        ),
         Measurement(
             f"HDA structure, {len(matches.points)} points (paper: 600, 0.41 s)",
-            core_seconds(lambda: match_structure(seen, motion, PAPER), repeats),
+            core_seconds(lambda: match_structure(scene, motion, PAPER), repeats),
         ),
         Measurement(
             f"HDA map and hazards, {rows} x {columns} (paper: 0.05 s)",
-            core_seconds(lambda: map_ground(seen, matches.points, resolution, PAPER), repeats),
+            core_seconds(lambda: map_ground(scene, matches.points, resolution, PAPER), repeats),
         ),
     ]
 
 
-def _whole(given: LandingMeasurements, repeats: int) -> list[Measurement]:
+def _measure_estimators(measurements: LandingMeasurements, repeats: int) -> list[Measurement]:
     return [
         Measurement(
             "HDA, the paper's parameters (paper: 0.77 s)",
-            core_seconds(lambda: HdaEstimator(PAPER).estimate(given), repeats),
+            core_seconds(lambda: HdaEstimator(PAPER).estimate(measurements), repeats),
             limit=0.03,
         ),
         Measurement(
             "HDA, 160 x 120 points of 640 x 480",
-            core_seconds(lambda: HdaEstimator(DENSE).estimate(given), repeats),
+            core_seconds(lambda: HdaEstimator(DENSE).estimate(measurements), repeats),
             limit=0.2,
         ),
         Measurement(
-            "the same by semi-global matching",
-            core_seconds(lambda: SemiGlobalEstimator(DENSE).estimate(given), repeats),
+            "HDA by semi-global matching, 160 x 120 points of 640 x 480",
+            core_seconds(lambda: SemiGlobalEstimator(DENSE).estimate(measurements), repeats),
         ),
     ]
 
 
-def _large_map(repeats: int) -> Measurement:
-    rough = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
-    ground = ElevationMap(rough, np.zeros(2), 0.1)
+def _measure_large_map(repeats: int) -> Measurement:
+    elevation_m = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
+    ground = ElevationMap(elevation_m, np.zeros(2), 0.1)
     return Measurement(
         "HDA hazard maps of 256 x 256", core_seconds(lambda: hazard_maps(ground, HdaOptions()), repeats), limit=0.05
     )
 
 
-def case(cases: int) -> Measurement:
-    """Complete cases of `hda-hazardous` with prepared terrain."""
+def measure_cases(cases: int) -> Measurement:
+    """Measure complete cases of `hda-hazardous` with prepared terrain."""
     campaign = load_campaign("hda-hazardous")
 
-    def fly(number: int) -> None:
+    def run_case(number: int) -> None:
         campaign.scenario.run(campaign.parameters(number), campaign.streams(number))
 
-    times = [time for number in range(cases) for time in core_seconds(partial(fly, number), 1)]
+    times = [time for number in range(cases) for time in core_seconds(partial(run_case, number), 1)]
     return Measurement("hda-hazardous case: flight, 2 frames, map, landing, truth", times, limit=1.5)

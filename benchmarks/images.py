@@ -1,4 +1,4 @@
-"""Run times of rendered pictures, and memory of a worker."""
+"""Run times of rendered images, and memory of a process that renders."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ SUN = Sun(direction(4.0, 0.7))
 
 
 def descent_scene() -> tuple[Scene, Surface]:
-    """The descent scene of the smoke campaign."""
+    """Return the scene and the terrain of the smoke campaign of descents."""
     surface = TerrainBank(TerrainParameters(), 1).terrain(0)
     return Scene(surface, (0.0, 0.0), SUN, Photometry()), surface
 
 
-def descent_exposure() -> Callable[[], object]:
+def prepare_descent_exposure() -> Callable[[], object]:
     """Return a function that renders and exposes the descent scene with prepared terrain and shadows."""
     scene, surface = descent_scene()
     optics = camera_optics(CameraParameters())
@@ -49,13 +49,13 @@ def descent_exposure() -> Callable[[], object]:
 
 
 def descent_pose(surface: Surface) -> RigidTransform:
-    """Pose of the lander one second after its first picture."""
-    flown = create_flight(DescentScenarioParameters(), surface, Streams(1, "bench", 0))
-    return flown.motion.state(1.0).world_from_body
+    """Return the pose of the lander one second after its first image."""
+    flight = create_flight(DescentScenarioParameters(), surface, Streams(1, "bench", 0))
+    return flight.motion.state(1.0).world_from_body
 
 
-def rover_pictures(repeats: int) -> list[Measurement]:
-    """A navcam frame over rocks, and a stereo pair of subframes of 161 x 161."""
+def measure_rover_images(repeats: int) -> list[Measurement]:
+    """Measure a navcam frame over rocks, and a stereo pair of subframes of 161 x 161."""
     parameters = TerrainParameters(
         samples=2048, spacing_m=0.05, rms_slope_deg=4.0, slope_baseline_m=1.0, outer_scale_m=20.0, craters_per_km2=0.0
     )
@@ -83,77 +83,86 @@ def rover_pictures(repeats: int) -> list[Measurement]:
         right=np.array([1.0, 0.0, 0.0]),
     )
     navcam = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
-    full, small = PixelRays.of(navcam), PixelRays.of(navcam.crop(430, 560, (161, 161)))
+    full_frame, subframe = PixelRays.of(navcam), PixelRays.of(navcam.crop(430, 560, (161, 161)))
     eye = np.array([50.0, 50.0, float(surface.height(50.0, 50.0)) + 1.5])
-    looking = Rotation.from_euler("x", -18.0, degrees=True)
-    left, right = rigid(looking, eye), rigid(looking, eye + np.array([0.2, 0.0, 0.0]))
+    attitude = Rotation.from_euler("x", -18.0, degrees=True)
+    left, right = rigid(attitude, eye), rigid(attitude, eye + np.array([0.2, 0.0, 0.0]))
     renderer = process_renderer(default_backend())
 
-    def pair() -> None:
-        renderer.render(scene, small, left)
-        renderer.render(scene, small, right)
+    def render_pair() -> None:
+        renderer.render(scene, subframe, left)
+        renderer.render(scene, subframe, right)
 
     return [
-        Measurement("navcam frame over rocks", core_seconds(lambda: renderer.render(scene, full, left), repeats)),
-        Measurement("stereo pair of subframes, 161 x 161", core_seconds(pair, 3 * repeats), limit=0.06),
+        Measurement("navcam frame over rocks", core_seconds(lambda: renderer.render(scene, full_frame, left), repeats)),
+        Measurement("stereo pair of subframes, 161 x 161", core_seconds(render_pair, 3 * repeats), limit=0.06),
     ]
 
 
-#: Images per scene in the measurement of memory; one of `ROCKY_OF` scenes has rocks.
-PICTURES_OF_A_SCENE, ROCKY_OF = 5, 4
+#: Images per scene in the measurement of memory; every fourth scene has rocks.
+IMAGES_PER_SCENE, ROCKS_EVERY = 5, 4
 
 
-def memory(frames: int) -> list[Measurement]:
-    """Memory of this process after half of the frames and after all; every fifth frame loads a new scene.
+def measure_memory(frames: int) -> list[Measurement]:
+    """Measure maximum and growth of the memory of this process while it renders many scenes.
 
-    One scene in four has rocks, so that bodies are loaded and released, and the renderer switches between drawing
-    ground only and drawing triangle numbers.
+    Scenes with and without rocks alternate, so that bodies are loaded and released, and the renderer switches between
+    drawing only the ground and drawing triangle numbers.
     """
     renderer = process_renderer(default_backend())
     _, surface = descent_scene()
     optics = camera_optics(CameraParameters())
-    rocky = SiteGround.of(site("pisgah"), "descent")
-    sizes = []
-    scenes = frames // PICTURES_OF_A_SCENE
+    rocks = SiteGround.of(site("pisgah"), "descent")
+    memory_gb = []
+    scenes = frames // IMAGES_PER_SCENE
     for number in range(scenes):
         east = 40.0 * number
-        if number % ROCKY_OF == ROCKY_OF - 1:
-            scene, ground = site_scene(rocky, Eye(east, 0.0, 1200.0, optics.rays.pixel_rad), SUN), rocky.surface
+        if number % ROCKS_EVERY == ROCKS_EVERY - 1:
+            eye = Eye(east, 0.0, 1200.0, optics.rays.pixel_rad)
+            scene, ground = site_scene(rocks, eye, SUN), rocks.surface
         else:
             scene, ground = Scene(surface, (east, 0.0), SUN, Photometry()), surface
-        for picture in range(PICTURES_OF_A_SCENE):
-            renderer.render(scene, optics.rays, nadir_pose(ground, east, 0.0, 2000.0 - 150.0 * picture))
-            sizes.append(used_memory([os.getpid()]) / 1e9)
-    quarter = len(sizes) // 4
+        for image in range(IMAGES_PER_SCENE):
+            renderer.render(scene, optics.rays, nadir_pose(ground, east, 0.0, 2000.0 - 150.0 * image))
+            memory_gb.append(used_memory([os.getpid()]) / 1e9)
+    quarter = len(memory_gb) // 4
     # medians, because the memory of scenes with rocks varies
-    growth = float(np.median(sizes[-quarter:]) - np.median(sizes[quarter : 2 * quarter]))
+    growth_gb = float(np.median(memory_gb[-quarter:]) - np.median(memory_gb[quarter : 2 * quarter]))
     return [
-        Measurement(f"own memory, most over {len(sizes)} frames of {scenes} scenes, GB", [max(sizes)], limit=1.2),
-        Measurement("its growth from the second quarter of these frames to the last, GB", [growth], limit=0.02),
         Measurement(
-            "greatest resident memory, terrain files included, GB",
+            f"maximum memory without terrain files, {len(memory_gb)} frames of {scenes} scenes (GB)",
+            [max(memory_gb)],
+            limit=1.2,
+        ),
+        Measurement("growth of this memory, second to last quarter of the frames (GB)", [growth_gb], limit=0.02),
+        Measurement(
+            "maximum resident memory with terrain files (GB)",
             [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20],
             limit=1.2,
         ),
     ]
 
 
-def on_all_cores(repeats: int) -> list[Measurement]:
-    """Wall-clock time of a descent frame with detector in a separate process with all cores."""
-    limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "LP_NUM_THREADS")
-    free = os.environ | dict.fromkeys(limits, str(os.cpu_count()))
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.pictures", str(repeats)],
-        env=free,
+def measure_all_cores(repeats: int) -> list[Measurement]:
+    """Measure the wall-clock time of a descent frame with detector in a separate process that uses all cores."""
+    thread_variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "LP_NUM_THREADS")
+    environment = os.environ | dict.fromkeys(thread_variables, str(os.cpu_count()))
+    result = subprocess.run(
+        [sys.executable, "-m", "benchmarks.images", str(repeats)],
+        env=environment,
         capture_output=True,
         text=True,
         check=True,
     )
-    return [Measurement("the same on all cores (wall s)", json.loads(done.stdout), limit=0.12)]
+    return [
+        Measurement(
+            "descent frame with shadows and detector, all cores (wall s)", json.loads(result.stdout), limit=0.12
+        )
+    ]
 
 
 def _wall_seconds(repeats: int) -> list[float]:
-    expose = descent_exposure()
+    expose = prepare_descent_exposure()
     expose()
     times = []
     for _ in range(repeats):

@@ -1,4 +1,4 @@
-"""Write the measured figures as `docs/performance.md`."""
+"""Write `docs/performance.md` from the template `performance.md` and the stored measurements."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
 
 
 def write_page(record: Mapping[str, Any]) -> None:
-    """Write the page from the record in `benchmarks.json`."""
-    rows = ["| quantity | bound | median |", "|---|---|---|"]
-    rows += [f"| {name} | {kept['asked']} | {kept['median']:.3g} |" for name, kept in record["figures"].items()]
+    """Write the page; `record` is the content of `benchmarks.json`."""
+    rows = ["| quantity | limit | median |", "|---|---|---|"]
+    rows += [f"| {name} | {row['asked']} | {row['median']:.3g} |" for name, row in record["figures"].items()]
     machine = record["machine"]
-    where = f"{record['measured'][:10]}, {machine['cores']} cores of {machine['processor']}, {record['gl']}"
-    text = TEMPLATE.read_text(encoding="utf-8").replace("{figures}", "\n".join(rows)).replace("{machine}", where)
+    conditions = f"{record['measured'][:10]}, {machine['cores']} cores of {machine['processor']}, {record['gl']}"
+    text = (
+        TEMPLATE.read_text(encoding="utf-8").replace("{measurements}", "\n".join(rows)).replace("{machine}", conditions)
+    )
     PAGE.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Run times of other renderers for the terrain of a descent frame.
+"""Run times of other renderers (pyrender, VTK, Blender Cycles) for the terrain of a descent frame.
 
 pyrender is a dependency. VTK (through PyVista) is measured if it is installed (``pip install .[bench]``). Blender
 Cycles is measured if the variable `MARSYARD_BLENDER` names a Python with ``bpy`` (from PyPI, in a separate environment
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.pictures import SUN, descent_exposure, descent_pose, descent_scene, on_all_cores
+from benchmarks.images import SUN, descent_pose, descent_scene, measure_all_cores, prepare_descent_exposure
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
@@ -37,34 +37,38 @@ BLENDER = "MARSYARD_BLENDER"
 
 
 def measure(repeats: int) -> list[Measurement]:
-    """A sensor-realistic descent frame against other renderers' shaded frames of the same ground.
+    """Measure a descent frame with detector, and shaded frames of the same ground by other renderers.
 
-    This renderer resolves the terrain's samples, 1.5 m apart, independently of its mesh. The others resolve their mesh:
-    lines 3 m apart in the centre, twice as coarse as the terrain. All cast shadows.
+    Marsyard's renderer resolves the terrain's samples, 1.5 m apart, independently of its mesh. The other renderers
+    resolve their mesh: lines 3 m apart in the centre, twice as coarse as the terrain. All renderers draw shadows.
     """
-    ours = descent_exposure()
-    given = _descent_mesh()
-    theirs = _pyrender_shaded(given)
-    paired = [(core_seconds(ours, 1)[0], core_seconds(theirs, 1)[0]) for _ in range(repeats)]
-    timings = [
-        Measurement("descent frame with shadows and detector", [mine for mine, _ in paired], limit=0.2),
-        *on_all_cores(repeats),
-        Measurement("pyrender's shaded frame of a mesh as fine, with shadows", [other for _, other in paired]),
-        Measurement("how many times slower that is", [other / mine for mine, other in paired], minimum=3.0),
+    render_marsyard = prepare_descent_exposure()
+    inputs = _make_descent_mesh()
+    render_pyrender = _prepare_pyrender(inputs)
+    paired_s = [(core_seconds(render_marsyard, 1)[0], core_seconds(render_pyrender, 1)[0]) for _ in range(repeats)]
+    measurements = [
+        Measurement("descent frame with shadows and detector", [marsyard_s for marsyard_s, _ in paired_s], limit=0.2),
+        *measure_all_cores(repeats),
+        Measurement("pyrender: frame of the terrain mesh with shadows", [pyrender_s for _, pyrender_s in paired_s]),
+        Measurement(
+            "pyrender: time divided by that of the descent frame with shadows and detector",
+            [pyrender_s / marsyard_s for marsyard_s, pyrender_s in paired_s],
+            minimum=3.0,
+        ),
     ]
     if importlib.util.find_spec("pyvista") is not None:
         command = [sys.executable, "-m", "benchmarks.renderers"]
-        timings.append(
-            Measurement("PyVista's (VTK's) frame of that mesh, with shadows", _elsewhere(command, given, repeats))
-        )
+        times_s = _run_renderer(command, inputs, repeats)
+        measurements.append(Measurement("PyVista (VTK): frame of the same mesh with shadows", times_s))
     if BLENDER in os.environ:
         command = [os.environ[BLENDER], str(Path(__file__).with_name("blender_frame.py"))]
-        timings.append(Measurement("Blender Cycles' frame of that mesh, 16 samples a pixel", _elsewhere(command, given, 2)))
-    return timings
+        times_s = _run_renderer(command, inputs, 2)
+        measurements.append(Measurement("Blender Cycles: frame of the same mesh, 16 samples per pixel", times_s))
+    return measurements
 
 
-def _descent_mesh() -> dict[str, Any]:
-    """Terrain triangles, camera pose (OpenGL axes, equal to the body axes), focal length and sun direction."""
+def _make_descent_mesh() -> dict[str, Any]:
+    """Return terrain triangles, camera pose (OpenGL axes, equal to the body axes), focal length and sun direction."""
     scene, surface = descent_scene()
     offsets = graded_offsets(scene.mesh_reach_m, 3.0, 1025)
     mesh = ground_mesh(scene.surface, scene.centre_m[0] + offsets, scene.centre_m[1] + offsets)
@@ -76,21 +80,21 @@ def _descent_mesh() -> dict[str, Any]:
     }
 
 
-def _pyrender_shaded(given: Mapping[str, Any]) -> Callable[[], None]:
+def _prepare_pyrender(inputs: Mapping[str, Any]) -> Callable[[], None]:
     import pyrender
 
-    theirs = pyrender.Scene(ambient_light=(0.1, 0.1, 0.1))
-    theirs.add(pyrender.Mesh.from_trimesh(given["mesh"], smooth=True))
+    scene = pyrender.Scene(ambient_light=(0.1, 0.1, 0.1))
+    scene.add(pyrender.Mesh.from_trimesh(inputs["mesh"], smooth=True))
     light = np.eye(4)
-    light[:3, :3] = Rotation.align_vectors(given["sun"][None], np.array([[0.0, 0.0, 1.0]]))[0].as_matrix()
-    theirs.add(pyrender.DirectionalLight(intensity=3.0), pose=light)
+    light[:3, :3] = Rotation.align_vectors(inputs["sun"][None], np.array([[0.0, 0.0, 1.0]]))[0].as_matrix()
+    scene.add(pyrender.DirectionalLight(intensity=3.0), pose=light)
     middle = VIEW_SIDE_PX / 2.0
-    camera = pyrender.IntrinsicsCamera(given["focal_px"], given["focal_px"], middle, middle, znear=NEAR_M, zfar=FAR_M)
-    theirs.add(camera, pose=given["pose"])
+    camera = pyrender.IntrinsicsCamera(inputs["focal_px"], inputs["focal_px"], middle, middle, znear=NEAR_M, zfar=FAR_M)
+    scene.add(camera, pose=inputs["pose"])
     renderer = pyrender.OffscreenRenderer(VIEW_SIDE_PX, VIEW_SIDE_PX)
     _compile_shaders_once(renderer._renderer)
     flags = pyrender.RenderFlags.SHADOWS_DIRECTIONAL
-    return lambda: renderer.render(theirs, flags=flags)
+    return lambda: renderer.render(scene, flags=flags)
 
 
 def _compile_shaders_once(renderer: Any) -> None:
@@ -117,32 +121,32 @@ def _compile_shaders_once(renderer: Any) -> None:
     programs.get_program = get_program
 
 
-def _elsewhere(command: list[str], given: Mapping[str, Any], repeats: int) -> list[float]:
-    """Core-seconds of each frame that another process renders from a file."""
+def _run_renderer(command: list[str], inputs: Mapping[str, Any], repeats: int) -> list[float]:
+    """Run a renderer in another process on a file of these inputs; return the core-seconds of each frame."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "ground.npz"
-        mesh = given["mesh"]
-        arrays = {name: given[name] for name in ("pose", "focal_px", "sun")} | {"range_m": np.array([NEAR_M, FAR_M])}
+        mesh = inputs["mesh"]
+        arrays = {name: inputs[name] for name in ("pose", "focal_px", "sun")} | {"range_m": np.array([NEAR_M, FAR_M])}
         np.savez(file, vertices=mesh.vertices.astype(np.float32), faces=mesh.faces.astype(np.int32), **arrays)
-        drawn = subprocess.run([*command, str(file), str(repeats)], check=True, capture_output=True, text=True)
-    # the last line has the result; other lines are messages of the renderer
-    return [float(value) for value in json.loads(drawn.stdout.splitlines()[-1])]
+        result = subprocess.run([*command, str(file), str(repeats)], check=True, capture_output=True, text=True)
+    # the last line contains the result; other lines are messages of the renderer
+    return [float(value) for value in json.loads(result.stdout.splitlines()[-1])]
 
 
-def _vtk(given: Mapping[str, Any]) -> Callable[[], object]:
+def _prepare_vtk(inputs: Mapping[str, Any]) -> Callable[[], object]:
     import pyvista
 
     plotter = pyvista.Plotter(off_screen=True, window_size=(SIDE_PX, SIDE_PX), lighting=None)
-    plotter.add_mesh(pyvista.PolyData.from_regular_faces(given["vertices"], given["faces"]), smooth_shading=True)
-    light = pyvista.Light(light_type="scene light", position=tuple(FAR_M * given["sun"]), focal_point=(0.0, 0.0, 0.0))
+    plotter.add_mesh(pyvista.PolyData.from_regular_faces(inputs["vertices"], inputs["faces"]), smooth_shading=True)
+    light = pyvista.Light(light_type="scene light", position=tuple(FAR_M * inputs["sun"]), focal_point=(0.0, 0.0, 0.0))
     light.positional = False
     plotter.add_light(light)
     plotter.enable_shadows()
-    pose = given["pose"]
+    pose = inputs["pose"]
     plotter.camera.position = pose[:3, 3]
     plotter.camera.focal_point = pose[:3, 3] - pose[:3, 2] * 1000.0
     plotter.camera.up = pose[:3, 1]
-    plotter.camera.view_angle = float(np.degrees(2.0 * np.arctan(0.5 * SIDE_PX / float(given["focal_px"]))))
+    plotter.camera.view_angle = float(np.degrees(2.0 * np.arctan(0.5 * SIDE_PX / float(inputs["focal_px"]))))
     plotter.camera.clipping_range = (NEAR_M, FAR_M)
 
     def draw() -> object:
@@ -155,7 +159,7 @@ def _vtk(given: Mapping[str, Any]) -> Callable[[], object]:
 def _measure_vtk(file: Path, repeats: int) -> None:
     """Render frames with VTK and print the core-seconds of each, summed over all threads."""
     with np.load(file) as stored:
-        draw = _vtk({name: stored[name] for name in stored.files})
+        draw = _prepare_vtk({name: stored[name] for name in stored.files})
     print(json.dumps(core_seconds(draw, repeats)))
 
 

@@ -24,10 +24,10 @@ from benchmarks.timing import Measurement
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.store.record import SCHEMA
 
-#: Additional columns of numbers; a row of `dimes-gusev` has 99 columns.
-FURTHER = 82
-#: Cases that are generated together.
-_BLOCK = 50_000
+#: Number of additional numeric columns, because a row of `dimes-gusev` has 99 columns.
+ADDITIONAL_COLUMNS = 82
+#: Number of cases that are generated at a time.
+_BLOCK_CASES = 50_000
 
 
 @dataclass(frozen=True)
@@ -40,26 +40,26 @@ class Cost:
 
 
 def measure(cases: int = 1_000_000, campaigns: int = 1_000) -> list[Measurement]:
-    """Figures of reports and dashboard in core-seconds, which do not depend on other programs."""
+    """Measure reports and dashboards, in core-seconds where possible, because these do not depend on other programs."""
     with TemporaryDirectory() as folder:
         large, small = (synthetic_campaign(Path(folder, f"of-{count}"), count) for count in (cases, 24))
-        of_large, of_small = (marsyard("report", str(run)) for run in (large, small))
+        large_cost, small_cost = (marsyard("report", str(run)) for run in (large, small))
         page = large / "report.html"
-        site = _many(Path(folder, "many"), small, campaigns)
-        fresh = marsyard("dashboard", str(site.parent / "runs"), "--out", str(site))
-        again = marsyard("dashboard", str(site.parent / "runs"), "--out", str(site))
+        site = _copy_campaigns(Path(folder, "many"), small, campaigns)
+        first_cost = marsyard("dashboard", str(site.parent / "runs"), "--out", str(site))
+        second_cost = marsyard("dashboard", str(site.parent / "runs"), "--out", str(site))
         index = site / "index.html"
-        shown, filtered = time_page(page, hover_a_case), time_page(index, filter_campaigns)
+        tooltip_s, filter_s = time_page(page, hover_over_case), time_page(index, filter_campaigns)
         return [
-            Measurement(f"report of {cases:,} cases", [of_large.core_s], limit=30.0),
-            Measurement(f"report of {cases:,} cases: memory (GB)", [of_large.memory_gb], limit=2.0),
+            Measurement(f"report of {cases:,} cases", [large_cost.core_s], limit=30.0),
+            Measurement(f"report of {cases:,} cases: memory (GB)", [large_cost.memory_gb], limit=2.0),
             Measurement(f"report of {cases:,} cases: page (MB)", [page.stat().st_size / 1e6], limit=10.0),
-            Measurement("the same, from opening until a tooltip appears (wall s)", shown, limit=3.0),
-            Measurement("report of 24 cases", [of_small.core_s], limit=8.0),
-            Measurement(f"dashboard of {campaigns:,} campaigns", [fresh.core_s]),
-            Measurement("the same, written again without changes", [again.core_s]),
-            Measurement("the same: index (MB)", [index.stat().st_size / 1e6], limit=10.0),
-            Measurement("the same, from opening until filtered (wall s)", filtered, limit=3.0),
+            Measurement(f"report of {cases:,} cases: opening and first tooltip (wall s)", tooltip_s, limit=3.0),
+            Measurement("report of 24 cases", [small_cost.core_s], limit=8.0),
+            Measurement(f"dashboard of {campaigns:,} campaigns", [first_cost.core_s]),
+            Measurement(f"dashboard of {campaigns:,} campaigns: again without changes", [second_cost.core_s]),
+            Measurement(f"dashboard of {campaigns:,} campaigns: index (MB)", [index.stat().st_size / 1e6], limit=10.0),
+            Measurement(f"dashboard of {campaigns:,} campaigns: opening and filtering (wall s)", filter_s, limit=3.0),
         ]
 
 
@@ -68,8 +68,8 @@ def synthetic_campaign(directory: Path, cases: int, seed: int = 1, site: str = "
     rng = np.random.default_rng(seed)
     directory.mkdir(parents=True)
     writer: pq.ParquetWriter | None = None
-    for start in range(0, cases, _BLOCK):
-        block = _rows(rng, start, min(_BLOCK, cases - start))
+    for start in range(0, cases, _BLOCK_CASES):
+        block = _rows(rng, start, min(_BLOCK_CASES, cases - start))
         writer = writer or pq.ParquetWriter(directory / "cases.parquet", block.schema)
         writer.write_table(block)
     if writer is not None:
@@ -96,7 +96,7 @@ def _rows(rng: np.random.Generator, start: int, count: int) -> pa.Table:
         "sun_elevation_deg": rng.uniform(20.0, 60.0, count),
         "horizontal_speed_m_s": rng.uniform(0.0, 30.0, count),
         "off_nadir_max_deg": off_nadir_deg,
-        **{f"dispersion_{number}": rng.normal(size=count) for number in range(FURTHER)},
+        **{f"dispersion_{number}": rng.normal(size=count) for number in range(ADDITIONAL_COLUMNS)},
         "image_hash": [f"{case:064x}" for case in range(start, start + count)],
         "wall_time_s": rng.uniform(1.0, 2.0, count),
         "cpu_time_s": rng.uniform(1.0, 2.0, count),
@@ -107,7 +107,7 @@ def _rows(rng: np.random.Generator, start: int, count: int) -> pa.Table:
 
 
 def _record(cases: int, seed: int, site: str) -> dict[str, Any]:
-    asked = [shipped_requirements()[name].model_dump(mode="json") for name in ("DIMES-VEL", "DIMES-HARM")]
+    requirements = [shipped_requirements()[name].model_dump(mode="json") for name in ("DIMES-VEL", "DIMES-HARM")]
     configuration = {"name": f"dimes-{site}", "scenario": "descent", "cases": cases, "seed": seed}
     return {
         "schema": SCHEMA,
@@ -117,72 +117,79 @@ def _record(cases: int, seed: int, site: str) -> dict[str, Any]:
         "finished_utc": "2026-12-31T00:00:00Z",
         "cases": cases,
         "seed": seed,
-        "requirements": asked,
-        "configuration": {**configuration, "parameters": {"site": site}, "requirements": asked},
+        "requirements": requirements,
+        "configuration": {**configuration, "parameters": {"site": site}, "requirements": requirements},
         "git_commit": f"{seed % 7:040x}",
     }
 
 
-def _many(folder: Path, pattern: Path, campaigns: int) -> Path:
-    """Copy a reported campaign several times with separate records. Returns the site folder."""
+def _copy_campaigns(folder: Path, original: Path, campaigns: int) -> Path:
+    """Copy a campaign and its report several times with different records. Returns the folder for the dashboard."""
     for number in range(campaigns):
         run = folder / "runs" / f"run-{number:04}"
-        shutil.copytree(pattern, run, copy_function=os.link)
+        shutil.copytree(original, run, copy_function=os.link)
         site = ("gusev", "meridiani", "isidis")[number % 3]
-        for name, changed in (("campaign.json", _record(24, number, site)), ("report.json", _twin(pattern, site))):
+        for name, content in (
+            ("campaign.json", _record(24, number, site)),
+            ("report.json", _renamed_report(original, site)),
+        ):
             (run / name).unlink()
-            (run / name).write_text(json.dumps(changed), encoding="utf-8")
+            (run / name).write_text(json.dumps(content), encoding="utf-8")
     return folder / "site"
 
 
-def _twin(pattern: Path, site: str) -> dict[str, Any]:
-    twin: dict[str, Any] = json.loads((pattern / "report.json").read_text(encoding="utf-8"))
-    return {**twin, "campaign": f"dimes-{site}"}
+def _renamed_report(original: Path, site: str) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((original / "report.json").read_text(encoding="utf-8"))
+    return {**report, "campaign": f"dimes-{site}"}
 
 
 def marsyard(*arguments: str) -> Cost:
-    """Cost of a `marsyard` command in a separate process.
+    """Run a `marsyard` command in a separate process and measure its cost.
 
-    A small process starts the command, because at `exec` Linux counts the memory of the parent for the child.
+    A small process starts the command, because Linux counts the memory of the parent for the child until `exec`.
     """
     began = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-c", _MEASURING, *arguments], stdout=subprocess.PIPE, text=True, check=True, timeout=3600
+    result = subprocess.run(
+        [sys.executable, "-c", _MEASURING_PROGRAM, *arguments],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=3600,
     )
-    status, core_s, memory_gb = json.loads(done.stdout)
+    status, core_s, memory_gb = json.loads(result.stdout)
     if status not in (0, 1, 3):
         raise RuntimeError(f"marsyard {' '.join(arguments)} ended with {status}")
     return Cost(core_s, time.perf_counter() - began, memory_gb)
 
 
-_MEASURING = """
+_MEASURING_PROGRAM = """
 import json, os, sys
-quietly = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+discard_output = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
 words = [sys.executable, "-m", "marsyard", *sys.argv[1:]]
-_, status, used = os.wait4(os.posix_spawn(sys.executable, words, os.environ, file_actions=quietly), 0)
+_, status, used = os.wait4(os.posix_spawn(sys.executable, words, os.environ, file_actions=discard_output), 0)
 print(json.dumps([os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9]))
 """
 
 
-def time_page(path: Path, done: Callable[[Page], None], repeats: int = 5) -> list[float]:
-    """Time from opening a page in Debian's Chromium to the end of an action."""
-    browser = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
+def time_page(path: Path, action: Callable[[Page], None], repeats: int = 5) -> list[float]:
+    """Measure the time from opening a page in Debian's Chromium to the end of an action."""
+    browser = next((program for name in ("chromium", "chromium-browser") if (program := shutil.which(name))), None)
     times = []
     with sync_playwright() as playwright:
         # root in a container cannot start the sandbox; the pages are trusted
-        launched = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
+        chromium = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
         for _ in range(repeats):
-            page = launched.new_page(viewport={"width": 1280, "height": 900})
+            page = chromium.new_page(viewport={"width": 1280, "height": 900})
             began = time.perf_counter()
             page.goto(path.resolve().as_uri(), wait_until="commit")
-            done(page)
+            action(page)
             times.append(time.perf_counter() - began)
             page.close()
-        launched.close()
+        chromium.close()
     return times
 
 
-def hover_a_case(page: Page) -> None:
+def hover_over_case(page: Page) -> None:
     """Point at a case in the plot and wait for its tooltip."""
     page.locator(".explorer-plot circle.point").nth(5).hover(force=True)
     page.locator(".explorer-tip").wait_for(state="visible")

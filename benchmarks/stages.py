@@ -1,4 +1,4 @@
-"""Core-seconds of a `dimes-gusev` case by stage."""
+"""Core-seconds of the stages of a `dimes-gusev` case, measured by Python's profiler."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from benchmarks.timing import Measurement
 
-#: Functions of each stage, as end of the file name and function name; callees are included.
+#: Stage: its functions, each as the end of the file name and the function name. The time of callees is included.
 Stages = Mapping[str, tuple[tuple[str, str], ...]]
 STAGES: Stages = {
     "terrain and rocks": (("descent/exposure.py", "from_parameters"), ("descent/exposure.py", "scene")),
@@ -28,17 +28,17 @@ STAGES: Stages = {
     "feasible overlap": (("descent/score.py", "feasible_overlap_row"),),
 }
 
-#: Name of the remainder.
+#: Name of the time outside all stages.
 REMAINDER = "other"
 
 
 def measure_stages(run: Callable[[], object], repeats: int) -> list[Measurement]:
-    """Core-seconds of every stage and of the remainder, per run, after a warm-up run.
+    """Measure the core-seconds of every stage and of the remainder, per run, after a warm-up run.
 
     Python's profiler slows stages with many small calls (flight, instruments) by up to a half.
     """
     timings = profile_stages(run, repeats, STAGES)
-    return [Measurement(f"  of a case, profiled: {name}", values) for name, values in timings.items()]
+    return [Measurement(f"dimes-gusev case, profiled stage: {name}", values) for name, values in timings.items()]
 
 
 def profile_stages(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:
@@ -54,7 +54,7 @@ def profile_stages(run: Callable[[], object], repeats: int, stages: Stages) -> d
 
 
 def _sum_stage_seconds(profile: cProfile.Profile, stages: Stages) -> dict[str, float]:
-    """Seconds in the functions of each stage with their callees, and in all other functions."""
+    """Sum the seconds in the functions of each stage with their callees, and in all other functions."""
     entries = profile.getstats()
     seconds = dict.fromkeys(stages, 0.0)
     for entry in entries:

@@ -1,4 +1,4 @@
-"""Start-up times: the command line, and compilation of kernels after installation."""
+"""Run times of starting the command line, of compiling kernels after installation, and of the first campaign."""
 
 from __future__ import annotations
 
@@ -14,48 +14,47 @@ from benchmarks.timing import Measurement
 
 
 def measure(repeats: int) -> list[Measurement]:
-    """Wall-clock times of starting the command, of compiling kernels and of the first run."""
+    """Measure the wall-clock times of starting the command, of compiling kernels and of the first run."""
     return [
         Measurement("marsyard --help (wall s)", [_wall_s("--help") for _ in range(repeats)], limit=0.3),
         Measurement("marsyard list (wall s)", [_wall_s("list") for _ in range(repeats)], limit=0.6),
-        *_first_use(),
+        *_measure_first_run(),
     ]
 
 
-def _first_use() -> list[Measurement]:
-    """Time to compile kernels, and additional time of the first campaigns compared with a repetition.
+def _measure_first_run() -> list[Measurement]:
+    """Measure the compilation of kernels, and the additional time of a first campaign compared with a repetition.
 
-    The very first campaign also builds its terrains.
+    The campaign is run with an empty folder of terrains, with all terrains built, and again.
     """
     with TemporaryDirectory() as folder:
-        new, built = Path(folder, "new"), Path(folder, "built")
-        ahead = _wall_s("compile", more=_caching(new))
-        shutil.copytree(new, built)
+        empty, built = Path(folder, "new"), Path(folder, "built")
+        compile_s = _wall_s("compile", variables={"MARSYARD_CACHE": str(empty)})
+        shutil.copytree(empty, built)
 
         def run(cache: Path, name: str) -> float:
-            words = ("run", "dimes-smoke", "-n", "1", "--jobs", "1", "--set", "retain.showcase=none")
-            return _wall_s(*words, "--out", str(Path(folder, name)), more=_caching(cache), allowed=(0, 3))
+            arguments = ("run", "dimes-smoke", "-n", "1", "--jobs", "1", "--set", "retain.showcase=none")
+            variables = {"MARSYARD_CACHE": str(cache)}
+            return _wall_s(*arguments, "--out", str(Path(folder, name)), variables=variables, allowed=(0, 3))
 
-        first = run(new, "first")
-        shutil.copytree(new / "terrain", built / "terrain", dirs_exist_ok=True)
+        first = run(empty, "first")
+        shutil.copytree(empty / "terrain", built / "terrain", dirs_exist_ok=True)
         with_terrains = run(built, "with terrains")
-        again = min(run(built, f"again {number}") for number in range(2))
+        repeated = min(run(built, f"again {number}") for number in range(2))
     return [
-        Measurement("marsyard compile on a fresh installation, part of its set-up (wall s)", [ahead]),
-        Measurement("additional time of the first run for kernels (wall s)", [with_terrains - again], limit=3.0),
-        Measurement("the same with the eight terrains that it builds (wall s)", [first - again]),
+        Measurement("marsyard compile after installation (wall s)", [compile_s]),
+        Measurement("first run: additional time for kernels (wall s)", [with_terrains - repeated], limit=3.0),
+        Measurement("first run: additional time for kernels and eight terrains (wall s)", [first - repeated]),
     ]
 
 
-def _caching(folder: Path) -> dict[str, str]:
-    return {"MARSYARD_CACHE": str(folder)}
-
-
-def _wall_s(*words: str, more: dict[str, str] | None = None, allowed: tuple[int, ...] = (0,)) -> float:
-    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | (more or {})
+def _wall_s(*arguments: str, variables: dict[str, str] | None = None, allowed: tuple[int, ...] = (0,)) -> float:
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | (variables or {})
     start = time.perf_counter()
-    done = subprocess.run([sys.executable, "-m", "marsyard", *words], env=environment, capture_output=True, text=True)
+    result = subprocess.run(
+        [sys.executable, "-m", "marsyard", *arguments], env=environment, capture_output=True, text=True
+    )
     elapsed_s = time.perf_counter() - start
-    if done.returncode not in allowed:
-        raise RuntimeError(f"marsyard {' '.join(words)} ended with {done.returncode}: {done.stderr}")
+    if result.returncode not in allowed:
+        raise RuntimeError(f"marsyard {' '.join(arguments)} ended with {result.returncode}: {result.stderr}")
     return elapsed_s

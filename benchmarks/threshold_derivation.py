@@ -1,13 +1,12 @@
 """Monte Carlo derivation of the threshold of the IMU check: discrepancy of correct tracks from the IMU (section II.B).
 
-The paper uses "a velocity threshold established through Monte Carlo simulation". This simulation is geometric:
-attitudes, altitudes and features are drawn. The true cameras project a feature, the measured cameras locate it on the
-ground, and the resulting velocities are compared as in DIMES. Image content enters only as an error of the match.
-Errors of altitude and attitude are independent between images unless stated as common; common errors would reduce the
-discrepancy.
+The paper uses "a velocity threshold established through Monte Carlo simulation". This simulation is geometric. It draws
+attitudes, altitudes and features. The true cameras project a feature into the images, the measured cameras intersect
+its rays with the ground, and the resulting velocities are compared as in DIMES. Image content is modelled only as an
+error of the match. Errors of altitude and attitude are independent between images, except the common attitude error.
 
-The threshold is the smallest multiple of `step_m_s` that accepts a stated fraction of descents with one correct track
-in each pair, the minimum for DIMES.
+The threshold is the smallest multiple of `step_m_s` that accepts the fraction `kept` of descents with one correct track
+in each pair, the minimum for DIMES. `benchmarks.dimes_threshold` stores the result.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class ThresholdInputs:
     common_attitude_sd_deg, attitude_sd_deg
         Attitude error per axis: common to all images (star reference and gyro drift through entry), and independent.
     tag_sd_s, max_rate_deg_s
-        Error of an image's time tag, and maximum body rate, which turns it into an attitude error (paper: 60 deg/s).
+        Error of an image's time tag, and maximum body rate (paper: 60 deg/s). Their product is an attitude error.
     feature_height_sd_m
         Height of features relative to the level that the altimeter measures (relief).
     match_sd_m_s
@@ -59,7 +58,7 @@ class ThresholdInputs:
     kept
         Fraction of descents with one correct track in each pair that must pass the check.
     step_m_s
-        Step of the threshold.
+        Step to which the threshold is rounded up.
     """
 
     descents: int = 10_000
@@ -84,8 +83,9 @@ class ThresholdInputs:
 #: Velocity errors of correct tracks in m/s, by pair and template, axes east and north.
 TrackErrors = Float[np.ndarray, "descents 2 2 2"]
 
-_NOTHING = np.zeros((256, 256), dtype=np.float32)
-_UNUSED = DetectorCalibration(_NOTHING, 1.0, 0.0, 0.0, 1, 0.0, 1)
+#: Image and calibration of `View`, which the geometric simulation does not use.
+_EMPTY_IMAGE = np.zeros((256, 256), dtype=np.float32)
+_CALIBRATION = DetectorCalibration(_EMPTY_IMAGE, 1.0, 0.0, 0.0, 1, 0.0, 1)
 
 
 def descent_camera() -> CameraModel:
@@ -100,7 +100,7 @@ def descent_camera() -> CameraModel:
 
 
 def right_track_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> TrackErrors:
-    """Velocity errors of two correct tracks in each pair of `inputs.descents` descents with feasible overlap."""
+    """Draw velocity errors of two correct tracks in each pair of `inputs.descents` descents with feasible overlap."""
     camera, options = descent_camera(), DimesOptions()
     tracks: list[Float[np.ndarray, "2 2 2"]] = []
     while len(tracks) < inputs.descents:
@@ -113,71 +113,75 @@ def right_track_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Tra
 def _descent_errors(
     inputs: ThresholdInputs, camera: CameraModel, options: DimesOptions, rng: np.random.Generator
 ) -> Float[np.ndarray, "2 2 2"] | None:
-    """Errors of one descent; None if a pair has no feasible overlap for two templates."""
-    true, measured = _views(inputs, camera, rng)
-    velocity = inputs.max_speed_m_s * np.sqrt(rng.uniform()) * _direction(rng)
-    sunless = np.array([0.0, 0.0, -1.0])
+    """Draw the velocity errors of one descent; None if a pair has no feasible overlap for two templates."""
+    true_views, measured_views = _draw_views(inputs, camera, rng)
+    velocity = inputs.max_speed_m_s * np.sqrt(rng.uniform()) * _draw_direction(rng)
+    no_sun = np.array([0.0, 0.0, -1.0])
     errors = np.empty((2, 2, 2))
     for pair in range(2):
-        first, second = measured[pair], measured[pair + 1]
-        places = template_candidates(first, second, search_geometry(first, second, options), sunless, options)
-        appeal = rng.uniform(size=len(places.pixels))
-        chosen = best_candidates(appeal, places.pixels, places.preferred, 2, options.exclusion_px)
+        first, second = measured_views[pair], measured_views[pair + 1]
+        candidates = template_candidates(first, second, search_geometry(first, second, options), no_sun, options)
+        scores = rng.uniform(size=len(candidates.pixels))
+        chosen = best_candidates(scores, candidates.pixels, candidates.preferred, 2, options.exclusion_px)
         if len(chosen) < 2:
             return None
         heights = inputs.feature_height_sd_m * rng.standard_normal(2)
-        moved = velocity * inputs.interval_s
-        pixels = _project_again(true[pair], true[pair + 1], places.pixels[chosen], heights, moved)
+        displacement_m = velocity * inputs.interval_s
+        pixels = _project_features(
+            true_views[pair], true_views[pair + 1], candidates.pixels[chosen], heights, displacement_m
+        )
         ground, _ = ground_from_pixels(second, pixels, options.max_off_nadir_rad)
-        errors[pair] = (places.ground[chosen] - ground - moved) / inputs.interval_s
+        errors[pair] = (candidates.ground[chosen] - ground - displacement_m) / inputs.interval_s
     return np.asarray(errors + inputs.match_sd_m_s * rng.standard_normal((2, 2, 2)))
 
 
-def _project_again(
+def _project_features(
     first: View,
     second: View,
     pixels: Float[np.ndarray, "n 2"],
     heights_m: Float[np.ndarray, " n"],
-    moved_m: Float[np.ndarray, "2"],
+    displacement_m: Float[np.ndarray, "2"],
 ) -> Float[np.ndarray, "n 2"]:
-    """Project features at `pixels` of the first true camera, with these heights, into the second true camera."""
+    """Project features from pixels of the first true camera into the second; `heights_m` are those of the features."""
     origins, rays = first.camera.rays(pixels)
     features = origins + rays * ((heights_m - origins[:, 2]) / rays[:, 2])[:, None]
-    features[:, :2] -= moved_m
+    features[:, :2] -= displacement_m
     return np.asarray(second.camera.project(features)[0])
 
 
-def _views(inputs: ThresholdInputs, camera: CameraModel, rng: np.random.Generator) -> tuple[list[View], list[View]]:
-    """Three true and three measured views of a descent."""
+def _draw_views(
+    inputs: ThresholdInputs, camera: CameraModel, rng: np.random.Generator
+) -> tuple[list[View], list[View]]:
+    """Draw three true views and three measured views of a descent."""
     common = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
     true, measured = [], []
     for number, altitude in enumerate(inputs.altitudes_m):
-        attitude = _attitude(inputs, rng)
-        rate = np.radians(inputs.max_rate_deg_s) * rng.uniform() * np.array([*_direction(rng), 0.0])
-        own = np.radians(inputs.attitude_sd_deg) * rng.standard_normal(3)
-        error = Rotation.from_rotvec(common + own + rate * inputs.tag_sd_s * rng.standard_normal())
+        attitude = _draw_attitude(inputs, rng)
+        rate = np.radians(inputs.max_rate_deg_s) * rng.uniform() * np.array([*_draw_direction(rng), 0.0])
+        independent = np.radians(inputs.attitude_sd_deg) * rng.standard_normal(3)
+        error = Rotation.from_rotvec(common + independent + rate * inputs.tag_sd_s * rng.standard_normal())
         height = altitude * (1.0 + inputs.altitude_sd * rng.standard_normal())
         time = number * inputs.interval_s
-        true.append(_view(camera, attitude, altitude, time))
-        measured.append(_view(camera, error * attitude, height, time))
+        true.append(_create_view(camera, attitude, altitude, time))
+        measured.append(_create_view(camera, error * attitude, height, time))
     return true, measured
 
 
-def _attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
+def _draw_attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
     tilts = (
-        np.radians(limit) * rng.uniform() * np.array([*_direction(rng), 0.0])
+        np.radians(limit) * rng.uniform() * np.array([*_draw_direction(rng), 0.0])
         for limit in (inputs.max_cone_deg, inputs.max_nod_deg)
     )
     cone, nod = (Rotation.from_rotvec(tilt) for tilt in tilts)
     return cone * nod * Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True)
 
 
-def _view(camera: CameraModel, attitude: Rotation, altitude_m: float, time_s: float) -> View:
+def _create_view(camera: CameraModel, attitude: Rotation, altitude_m: float, time_s: float) -> View:
     centre = np.array([0.0, 0.0, altitude_m])
-    return View(_NOTHING, _NOTHING, camera.transform(rigid(attitude, centre)), centre, time_s, _UNUSED, 1)
+    return View(_EMPTY_IMAGE, _EMPTY_IMAGE, camera.transform(rigid(attitude, centre)), centre, time_s, _CALIBRATION, 1)
 
 
-def _direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:
+def _draw_direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(angle), np.sin(angle)])
 
@@ -201,12 +205,12 @@ class Discrepancies:
 def discrepancies(errors: TrackErrors, imu_sd_m_s: float, rng: np.random.Generator) -> Discrepancies:
     """Compute the discrepancies in DIMES' check for correct tracks with these errors."""
     imu = imu_sd_m_s * rng.standard_normal((len(errors), 1, 1, 2))
-    all_four = np.linalg.norm(errors[:, 1, None, :, :] - errors[:, 0, :, None, :] - imu, axis=-1)
-    return Discrepancies(single=all_four[:, 0, 0], best=all_four.min(axis=(1, 2)))
+    combinations = np.linalg.norm(errors[:, 1, None, :, :] - errors[:, 0, :, None, :] - imu, axis=-1)
+    return Discrepancies(single=combinations[:, 0, 0], best=combinations.min(axis=(1, 2)))
 
 
 def threshold_m_s(single: Float[np.ndarray, " descents"], kept: float, step_m_s: float) -> float:
-    """Smallest multiple of the step that exceeds the stated fraction of discrepancies."""
+    """Return the smallest multiple of the step that exceeds the fraction `kept` of the discrepancies."""
     return round(step_m_s * float(np.ceil(np.quantile(single, kept) / step_m_s)), 9)
 
 
@@ -221,7 +225,7 @@ class Harm:
     refused
         No reported velocity.
     wrong
-        Reported velocity beyond the requirement.
+        Reported velocity outside the requirement.
     """
 
     right: float
@@ -237,20 +241,20 @@ def harm(
     rng: np.random.Generator,
     required_m_s: float = 5.0,
 ) -> Harm:
-    """Add an error to one random track, uniform between the speeds of `wrong_by_m_s`, in a random direction.
+    """Simulate the check with one wrong track: its error is uniform between `wrong_by_m_s`, in a random direction.
 
-    With one template per pair in `errors`, the wrong track is the only track of its pair.
+    The wrong track is drawn at random. With one template per pair in `errors`, it is the only track of its pair.
     """
     outcomes = np.zeros(3)
     for tracks in errors:
-        spoilt = tracks.copy()
-        spoilt[rng.integers(2), rng.integers(tracks.shape[1])] += rng.uniform(*wrong_by_m_s) * _direction(rng)
-        change = np.zeros((2, 3))
-        change[1, :2] = imu_sd_m_s * rng.standard_normal(2)
-        best = rank_combinations(list(enumerate(spoilt[0])), list(enumerate(spoilt[1])), change)[0]
+        changed = tracks.copy()
+        changed[rng.integers(2), rng.integers(tracks.shape[1])] += rng.uniform(*wrong_by_m_s) * _draw_direction(rng)
+        imu_change = np.zeros((2, 3))
+        imu_change[1, :2] = imu_sd_m_s * rng.standard_normal(2)
+        best = rank_combinations(list(enumerate(changed[0])), list(enumerate(changed[1])), imu_change)[0]
         if not best.discrepancy_m_s < threshold_m_s:
             outcomes[1] += 1
         else:
-            outcomes[0 if np.hypot(*spoilt[1, best.second]) <= required_m_s else 2] += 1
+            outcomes[0 if np.hypot(*changed[1, best.second]) <= required_m_s else 2] += 1
     right, refused, wrong = outcomes / len(errors)
     return Harm(float(right), float(refused), float(wrong))

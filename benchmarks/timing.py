@@ -1,4 +1,4 @@
-"""Figures of a benchmark and their measurement."""
+"""Results of a benchmark with their limits, and the measurement of processor time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Measurement:
-    """Measurements of one quantity in core-seconds, unless its name states another unit, and bounds of their median."""
+    """Measured values of one quantity and limits of their median, in core-seconds unless the name contains a unit."""
 
     name: str
     values: list[float]
@@ -19,26 +19,26 @@ class Measurement:
 
     @property
     def median(self) -> float:
-        """Median of the measurements."""
+        """Median of the measured values."""
         return statistics.median(self.values)
 
     @property
     def limit_text(self) -> str:
-        """The bound as text."""
+        """The limit as text, for example "<= 2"."""
         if self.limit is not None:
             return f"<= {self.limit:g}"
         return f">= {self.minimum:g}" if self.minimum is not None else ""
 
     @property
     def is_within_limit(self) -> bool:
-        """Whether the median is within the bounds."""
+        """Whether the median is within the limits."""
         return (self.limit is None or self.median <= self.limit) and (
             self.minimum is None or self.median >= self.minimum
         )
 
 
 def core_seconds(run: Callable[[], object], repeats: int) -> list[float]:
-    """Processor time of each run after a warm-up run."""
+    """Measure the processor time of each run after a warm-up run."""
     run()
     times = []
     for _ in range(repeats):

@@ -1,4 +1,4 @@
-"""Run times of a tracking update, of its search compared with OpenCV's, and of a complete run."""
+"""Run times of a tracking update, of its template search and OpenCV's, and of a complete rover run."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ TARGET = np.array([10.0, 0.1, 0.2])
 BATCH = 20
 
 
-def _stops(options: VttOptions) -> tuple[RoverMeasurements, RoverMeasurements]:
-    """Two stops, 10 % of the distance apart, in front of a slanted face."""
+def _simulate_stops(options: VttOptions) -> tuple[RoverMeasurements, RoverMeasurements]:
+    """Simulate the measurements of two stops, 10 % of the distance apart, in front of a slanted face."""
     face = Plane(TARGET, np.array([-0.8, 0.0, 0.6]))
     drive = Drive(Scene((face,), draw_waves(1), TARGET), navcam(), VisualTargetTracker(options))
     drive.tracker.designate(RoverTarget(TARGET), pose(0.0, 0.0))
@@ -36,35 +36,39 @@ def _stops(options: VttOptions) -> tuple[RoverMeasurements, RoverMeasurements]:
     return drive.measurements[0], drive.measurements[1]
 
 
-def seeded_update(tracker: VisualTargetTracker | None = None) -> Callable[[], object]:
+def prepare_update(tracker: VisualTargetTracker | None = None) -> Callable[[], object]:
     """Return a function that updates a tracker at the second of two stops."""
     tracker = tracker or VisualTargetTracker(VttOptions())
-    first, second = _stops(tracker.options)
+    first, second = _simulate_stops(tracker.options)
     tracker.designate(RoverTarget(TARGET), pose(0.0, 0.0))
     tracker.update(first)
-    seeded = tracker.track
+    initial_track = tracker.track
 
     def run() -> None:
-        tracker.track = seeded
+        tracker.track = initial_track
         tracker.update(second)
 
     return run
 
 
-def _update_ms(tracker: VisualTargetTracker, repeats: int) -> list[float]:
-    update = seeded_update(tracker)
+def _measure_update_ms(tracker: VisualTargetTracker, repeats: int) -> list[float]:
+    update = prepare_update(tracker)
     batches = core_seconds(lambda: [update() for _ in range(BATCH)], repeats)
     return [1e3 * seconds / BATCH for seconds in batches]
 
 
-def updates(repeats: int) -> list[Measurement]:
-    """One update: scale, roll, 21 x 21 in 161 x 161, refinement, point stereo, criteria."""
+def measure_updates(repeats: int) -> list[Measurement]:
+    """Measure one update: scale, roll, search of 21 x 21 in 161 x 161, refinement, point stereo, criteria."""
     options = VttOptions()
-    brute = replace(options, coarse_levels=0)
+    full_search = replace(options, coarse_levels=0)
     return [
-        Measurement("target tracking update, ms", _update_ms(VisualTargetTracker(options), repeats), limit=2.0),
-        Measurement("the same by the full search, ms", _update_ms(VisualTargetTracker(brute), repeats)),
-        Measurement("the same by OpenCV's Lucas-Kanade, ms", _update_ms(lucas_kanade_tracker(), repeats)),
+        Measurement("tracking update (ms)", _measure_update_ms(VisualTargetTracker(options), repeats), limit=2.0),
+        Measurement(
+            "tracking update with full search (ms)", _measure_update_ms(VisualTargetTracker(full_search), repeats)
+        ),
+        Measurement(
+            "tracking update with OpenCV's Lucas-Kanade (ms)", _measure_update_ms(lucas_kanade_tracker(), repeats)
+        ),
     ]
 
 
@@ -73,42 +77,42 @@ def _repeat(search: Callable[[], object]) -> None:
         search()
 
 
-def searches(repeats: int) -> list[Measurement]:
-    """Template search: coarse to fine, at every position, and OpenCV's matchTemplate."""
-    figures = []
+def measure_searches(repeats: int) -> list[Measurement]:
+    """Measure the template search: coarse to fine, at every position, and by OpenCV's matchTemplate."""
+    measurements = []
     for side in (161, 600):
         options = VttOptions(search_px=side)
-        first, second = _stops(options)
-        place = navcam().left.project(
+        first, second = _simulate_stops(options)
+        pixel = navcam().left.project(
             navcam().geometry.rover_from_head(first.azimuth_rad, first.elevation_rad).inv().apply(TARGET)
         )[0]
-        template = extract_patch(first.left, place, 21)
-        window = search_window(second.left, place, side)[0].astype(np.float64)
-        a, b = template.astype(np.float32), window.astype(np.float32)
-        timed: dict[str, Callable[[], object]] = {
+        template = extract_patch(first.left, pixel, 21)
+        window = search_window(second.left, pixel, side)[0].astype(np.float64)
+        template_32, window_32 = template.astype(np.float32), window.astype(np.float32)
+        searches: dict[str, Callable[[], object]] = {
             "coarse to fine": partial(coarse_to_fine_peak, template, window, 1, 6),
             "at every position": partial(normalized_correlation, template, window),
-            "by cv2.matchTemplate": partial(cv2.matchTemplate, b, a, cv2.TM_CCOEFF_NORMED),
+            "by cv2.matchTemplate": partial(cv2.matchTemplate, window_32, template_32, cv2.TM_CCOEFF_NORMED),
         }
-        for name, search in timed.items():
-            batch = [1e3 * s / BATCH for s in core_seconds(partial(_repeat, search), repeats)]
-            figures.append(Measurement(f"21 x 21 in {side} x {side} {name}, ms", batch))
-    return figures
+        for name, search in searches.items():
+            batch_ms = [1e3 * s / BATCH for s in core_seconds(partial(_repeat, search), repeats)]
+            measurements.append(Measurement(f"template of 21 x 21 in {side} x {side}, {name} (ms)", batch_ms))
+    return measurements
 
 
-def runs(repeats: int) -> list[Measurement]:
-    """Closed loop from 10 m to 2 m in steps of 10 %, with 17 stereo pairs of rendered subframes among rocks."""
-    of_run = {
+def measure_runs(repeats: int) -> list[Measurement]:
+    """Measure a closed-loop run from 10 m to 2 m in steps of 10 %, with 17 stereo pairs of rendered subframes."""
+    settings = {
         "camera": {"preset": "research-navcam"},
         "target": {"diameter_m": 0.9, "shape": 2, "yaw_deg": 74.0, "across": 0.1},
         "sun": {"azimuth_deg": 260.0, "elevation_deg": 45.0},
         "legs": [{"motion": "approach", "step_fraction": 0.1, "goal_m": 2.0}],
     }
-    parameters = RoverScenarioParameters.model_validate(of_run)
+    parameters = RoverScenarioParameters.model_validate(settings)
     elapsed_s = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
-    return [Measurement("a rover's run from 10 m to 2 m, rendered", elapsed_s, limit=1.5)]
+    return [Measurement("rover run from 10 m to 2 m, rendered", elapsed_s, limit=1.5)]
 
 
 def measure(repeats: int) -> list[Measurement]:
-    """All figures of target tracking."""
-    return [*updates(repeats), *searches(repeats), *runs(min(repeats, 3))]
+    """Measure target tracking."""
+    return [*measure_updates(repeats), *measure_searches(repeats), *measure_runs(min(repeats, 3))]

@@ -1,4 +1,4 @@
-"""The documentation's site: ``make docs`` builds it into build/docs, with every warning an error."""
+"""Sphinx configuration of the documentation; ``make docs`` builds the site in build/docs, with warnings as errors."""
 
 import re
 import sys
@@ -18,7 +18,7 @@ release = metadata.version("marsyard")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["examples", "images"]
-# attributes of one name in several classes, named in the text by that name alone
+# an attribute name that exists in several classes is ambiguous in text; Sphinx warns about it
 suppress_warnings = ["ref.python"]
 source_suffix = {".md": "markdown"}
 
@@ -31,7 +31,7 @@ napoleon_use_ivar = True
 napoleon_attr_annotations = False
 python_use_unqualified_type_names = True
 
-# `name` in a docstring is a thing of the code
+# `name` in a docstring is the name of a Python object
 default_role = "py:obj"
 
 html_theme = "furo"
@@ -39,31 +39,31 @@ html_title = f"Marsyard {release}"
 html_show_copyright = False
 
 
-def split_attributes(_app: Sphinx, _what: str, _name: str, _thing: object, _options: object, lines: list[str]) -> None:
-    """Give each of several attributes that share a description an entry of its own, as Napoleon does with parameters.
+def split_attributes(_app: Sphinx, _what: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
+    """Split entries of several attributes with one description into one entry per attribute, as Napoleon does.
 
-    Without that, Sphinx takes all but the last of ``:ivar first, second: ...`` for the type of the last.
+    In ``:ivar first, second: ...``, Sphinx would interpret ``first,`` as the type of ``second``.
     """
     split: list[str] = []
     names: list[str] = []
-    described: list[str] = []
+    description: list[str] = []
     for line in [*lines, ""]:
-        begins = re.match(r":ivar ([^:]*,[^:]*):(.*)", line)
+        entry = re.match(r":ivar ([^:]*,[^:]*):(.*)", line)
         if names and line.strip() and line[0].isspace():
-            described.append(line)
+            description.append(line)
             continue
-        for one in names:
-            split += [f":ivar {one}:{described[0]}", *described[1:]]
-        names = [one.strip() for one in begins[1].split(",")] if begins else []
-        described = [begins[2]] if begins else []
-        if not begins:
+        for name in names:
+            split += [f":ivar {name}:{description[0]}", *description[1:]]
+        names = [name.strip() for name in entry[1].split(",")] if entry else []
+        description = [entry[2]] if entry else []
+        if not entry:
             split.append(line)
     lines[:] = split[:-1]
 
 
 def setup(app: Sphinx) -> None:
-    """Writes the generated pages and figures; shows diagrams, which GitHub draws, as they are written."""
-    # after Napoleon, which has Sphinx's usual priority of 500
+    """Write the generated pages and figures. Diagrams in Mermaid, which GitHub draws, are shown as source text."""
+    # after Napoleon, which has Sphinx's default priority of 500
     app.connect("autodoc-process-docstring", split_attributes, priority=600)
     write_pages()
     draw_figures(Path(__file__).parent / "generated")

@@ -1,4 +1,4 @@
-"""Figures of the explanations, drawn by the code that they explain."""
+"""Figures of the documentation (distortion, reflectance, sample sizes), drawn with Marsyard's own functions."""
 
 from __future__ import annotations
 
@@ -26,43 +26,47 @@ CAMERAS = ("mer-descent-flown", "mer-navcam", "mer-hazcam", "xc-55")
 
 
 def draw_figures(folder: Path) -> None:
-    """Writes them all."""
+    """Write all figures as SVG files."""
     folder.mkdir(exist_ok=True)
-    for name, figure in {"cameras": cameras(), "light": light(), "statistics": statistics()}.items():
+    for name, figure in {
+        "cameras": draw_distortion(),
+        "light": draw_reflectance(),
+        "statistics": draw_lower_bounds(),
+    }.items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
 
 
-def cameras() -> Figure:
-    """How far lenses move pixels from where a pinhole of their focal length has them, over the angle to the axis."""
+def draw_distortion() -> Figure:
+    """Draw the radial distortion of the cameras (pixels, relative to a pinhole) over the angle to the optical axis."""
     figure = Figure(figsize=(7.0, 3.6), layout="constrained")
     axes = figure.subplots()
     for name, style in zip(CAMERAS, ("-", "--", "-.", ":"), strict=True):
-        angle, moved = _distortion(preset(name).cameras()[0])
-        axes.plot(np.degrees(angle), moved, style, label=name)
+        angle, distortion_px = _compute_distortion(preset(name).cameras()[0])
+        axes.plot(np.degrees(angle), distortion_px, style, label=name)
     axes.axhline(0.0, color="0.7", linewidth=0.8)
     axes.set_yscale("symlog", linthresh=0.1)
-    axes.set(xlabel="angle to the optical axis (deg)", ylabel="moved away from the middle (px)")
+    axes.set(xlabel="angle to the optical axis (deg)", ylabel="radial distortion, outward (px)")
     axes.legend(frameon=False)
     return figure
 
 
-def _distortion(camera: CameraModel) -> tuple[np.ndarray, np.ndarray]:
-    """Angles to the axis of pixels along the middle row, and how far out they lie beyond ``focal length x tangent``."""
+def _compute_distortion(camera: CameraModel) -> tuple[np.ndarray, np.ndarray]:
+    """Angles of pixels to the axis, and their distortion: distance to the centre minus ``focal length x tangent``."""
     columns = np.linspace(0.5 * camera.size[0], camera.size[0] - 1.0, 200)
     pixels = np.stack([columns, np.full_like(columns, 0.5 * (camera.size[1] - 1))], axis=1)
     directions = camera.rays(pixels)[1]
     right = camera.rays(pixels[-1])[1] - camera.rays(pixels[0])[1]
     axis = np.asarray(camera.a) / np.linalg.norm(camera.a)
-    across = directions - (directions @ axis)[:, None] * axis
-    side = right - (right @ axis) * axis
-    tangent = across @ (side / np.linalg.norm(side)) / (directions @ axis)
-    # the focal length is that of the middle, where the lens moves nothing
+    perpendicular = directions - (directions @ axis)[:, None] * axis
+    row_direction = right - (right @ axis) * axis
+    tangent = perpendicular @ (row_direction / np.linalg.norm(row_direction)) / (directions @ axis)
+    # focal length at the image centre, where the distortion is zero
     focal = (columns[1] - columns[0]) / (tangent[1] - tangent[0])
     return np.arctan(tangent), (columns - columns[0]) - focal * (tangent - tangent[0])
 
 
-def light() -> Figure:
-    """Radiance factor of level ground of unit albedo under direct sun, over the phase angle in the sun's plane."""
+def draw_reflectance() -> Figure:
+    """Draw the radiance factor of level ground of unit albedo in direct sunlight over the emission angle."""
     emission = np.radians(np.linspace(-85.0, 85.0, 681))
     incidence = np.radians(INCIDENCE_DEG)
     phase = np.abs(emission - incidence)
@@ -74,13 +78,15 @@ def light() -> Figure:
         lambert = (1.0 - law.lunar_fraction) * np.cos(incidence)
         axes.plot(np.degrees(emission), law.normalisation() * surge * (lunar + lambert), style, label=name)
     axes.axvline(INCIDENCE_DEG, color="0.7", linewidth=0.8)
-    axes.set(xlabel="emission angle towards the sun (deg); the line: sun behind the camera", ylabel="I/F over albedo")
+    axes.set(
+        xlabel="emission angle towards the sun (deg); the line: sun behind the camera", ylabel="I/F divided by albedo"
+    )
     axes.legend(frameon=False)
     return figure
 
 
-def statistics() -> Figure:
-    """Lower bound of the success rate at 90 % confidence over the number of cases, for few failures."""
+def draw_lower_bounds() -> Figure:
+    """Draw the lower bound of the success rate at 90 % confidence over the number of cases, for 0 to 3 failures."""
     cases = np.unique(np.geomspace(10, 2000, 120).astype(int))
     figure = Figure(figsize=(7.0, 3.6), layout="constrained")
     axes = figure.subplots()
@@ -88,7 +94,7 @@ def statistics() -> Figure:
         bounds = [100.0 * proportion_lower(int(n) - failures, int(n), 0.9) for n in cases]
         axes.semilogx(cases, bounds, style, label=f"{failures} failed")
     axes.axhline(99.0, color="0.7", linewidth=0.8)
-    axes.text(11, 99.15, "99 % asked", color="0.35")
+    axes.text(11, 99.15, "99 % required", color="0.35")
     axes.set(xlabel="cases", ylabel="lower bound of success rate (%)", ylim=(80, 100.5))
     axes.legend(frameon=False)
     return figure

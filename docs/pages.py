@@ -1,4 +1,4 @@
-"""Pages of the site that are written from the program itself: commands, parameters, catalogue, ingested folders."""
+"""Generated pages of the documentation: commands, parameters of scenarios, catalogue, folders of `marsyard ingest`."""
 
 from __future__ import annotations
 
@@ -20,79 +20,80 @@ from marsyard.campaigns.definition.loading import catalogue
 from marsyard.scenarios.measured.layout import COLUMNS, IngestFile
 from marsyard.scenarios.systems import scenario, scenario_names
 
-#: Where they are written, and what each begins with.
+#: Folder of the generated pages.
 FOLDER = Path(__file__).parent / "reference" / "generated"
 
 
 def write_pages() -> None:
-    """Writes them all."""
+    """Write all generated pages."""
     FOLDER.mkdir(exist_ok=True)
-    (FOLDER / "cli.md").write_text(command_line_page())
-    (FOLDER / "catalogue.md").write_text(catalogue_page())
-    (FOLDER / "real-pictures.md").write_text(real_pictures_page())
+    (FOLDER / "cli.md").write_text(format_commands())
+    (FOLDER / "catalogue.md").write_text(format_catalogue())
+    (FOLDER / "real-pictures.md").write_text(format_ingest_keys())
     for name in scenario_names():
-        (FOLDER / f"parameters-{name}.md").write_text(parameters_page(name))
+        (FOLDER / f"parameters-{name}.md").write_text(format_parameters(name))
 
 
-def command_line_page() -> str:
-    """Every command with its arguments and options, by Typer itself."""
+def format_commands() -> str:
+    """Format every command with its arguments and options, by Typer."""
     command = [sys.executable, "-m", "typer", "marsyard.cli.app", "utils", "docs", "--name", "marsyard"]
-    written = subprocess.run(command, check=True, capture_output=True, text=True).stdout  # noqa: S603
-    return "# Command line\n" + written.split("\n", 1)[1]
+    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout  # noqa: S603
+    return "# Command line\n" + text.split("\n", 1)[1]
 
 
-def catalogue_page() -> str:
-    """The campaigns that ship with Marsyard."""
+def format_catalogue() -> str:
+    """Format a table of the campaigns of the catalogue."""
     rows = []
     for name, path in catalogue().items():
-        stated = tomllib.loads(path.read_text(encoding="utf-8"))
-        rows.append(f"| `{name}` | `{stated['scenario']}` | {stated['cases']:,} | {stated['description']} |")
-    head = ["# Catalogue", "", "`marsyard show NAME` prints a campaign: dispersions, their sources, what it asks.", ""]
-    return "\n".join([*head, "| campaign | scenario | cases | what |", "|---|---|---|---|", *rows, ""])
+        campaign = tomllib.loads(path.read_text(encoding="utf-8"))
+        rows.append(f"| `{name}` | `{campaign['scenario']}` | {campaign['cases']:,} | {campaign['description']} |")
+    header = ["# Catalogue", "", "`marsyard show NAME` prints a campaign: dispersions, sources, requirements.", ""]
+    return "\n".join([*header, "| campaign | scenario | cases | description |", "|---|---|---|---|", *rows, ""])
 
 
-def parameters_page(name: str) -> str:
-    """Every key that a campaign of a scenario may set or disperse."""
-    described = (scenario(name).__doc__ or "").strip().splitlines()[0]
-    head = [
+def format_parameters(name: str) -> str:
+    """Format a table of every key that a campaign of a scenario can set or disperse."""
+    description = (scenario(name).__doc__ or "").strip().splitlines()[0]
+    header = [
         f"# Parameters of `{name}`",
         "",
-        described,
+        description,
         "",
         "Keys are below `[parameters]`, as in `--set KEY=VALUE`.",
         "",
     ]
     rows = [
-        f"| `{key}` | {_kind(field)} | {_default(field)} | {field.description or ''} |"
-        for key, field in _fields(scenario(name).parameters_type)
+        f"| `{key}` | {_format_type(field)} | {_format_default(field)} | {field.description or ''} |"
+        for key, field in _walk_fields(scenario(name).parameters_type)
     ]
-    return "\n".join([*head, "| key | kind, allowed | default | what |", "|---|---|---|---|", *rows, ""])
+    return "\n".join([*header, "| key | type, allowed | default | description |", "|---|---|---|---|", *rows, ""])
 
 
-def real_pictures_page() -> str:
-    """Every key and column of a folder that `marsyard ingest` reads."""
+def format_ingest_keys() -> str:
+    """Format tables of every key and column of a folder that `marsyard ingest` reads."""
     keys = [
-        f"| `{key}` | {_kind(field)} | {_default(field)} | {field.description or ''} |"
-        for key, field in _fields(IngestFile)
+        f"| `{key}` | {_format_type(field)} | {_format_default(field)} | {field.description or ''} |"
+        for key, field in _walk_fields(IngestFile)
     ]
     columns = [
-        f"| `{one.name}` | {', '.join(one.tasks)} | {one.required or 'no'} | {one.description} |" for one in COLUMNS
+        f"| `{column.name}` | {', '.join(column.tasks)} | {column.required or 'no'} | {column.description} |"
+        for column in COLUMNS
     ]
     return "\n".join(
         [
-            "# Keys and columns of real pictures",
+            "# Keys and columns of real images",
             "",
-            "What `marsyard ingest` reads in a folder; see [real pictures](../../real-pictures.md).",
+            "Keys and columns that `marsyard ingest` reads in a folder; see [real images](../../real-pictures.md).",
             "",
             "## `ingest.toml`",
             "",
-            "| key | kind, allowed | default | what |",
+            "| key | type, allowed | default | description |",
             "|---|---|---|---|",
             *keys,
             "",
             "## `pictures.csv`",
             "",
-            "| column | tasks | needed | what |",
+            "| column | tasks | required | description |",
             "|---|---|---|---|",
             *columns,
             "",
@@ -100,63 +101,63 @@ def real_pictures_page() -> str:
     )
 
 
-def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Keys and fields of a model and of the models in it, in order."""
+def _walk_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Yield keys and fields of a model and of its nested models, in order."""
     for name, field in model.model_fields.items():
-        inner = _models_of(field.annotation)
-        if not inner:
+        nested = _nested_models(field.annotation)
+        if not nested:
             yield prefix + name, field
-        told: set[str] = set()
-        for one in inner:
-            found = {key: below for key, below in _fields(one, f"{prefix}{name}.") if key not in told}
-            told.update(found)
-            yield from found.items()
+        listed: set[str] = set()
+        for nested_model in nested:
+            fields = {key: entry for key, entry in _walk_fields(nested_model, f"{prefix}{name}.") if key not in listed}
+            listed.update(fields)
+            yield from fields.items()
 
 
-def _models_of(annotation: Any) -> list[type[BaseModel]]:
-    """The models that a field holds, where it holds one or one of several."""
+def _nested_models(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models that are possible values of a field."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     if get_origin(annotation) is Annotated:
-        return _models_of(get_args(annotation)[0])
-    return [model for one in get_args(annotation) for model in _models_of(one)] if _is_union(annotation) else []
+        return _nested_models(get_args(annotation)[0])
+    return [model for part in get_args(annotation) for model in _nested_models(part)] if _is_union(annotation) else []
 
 
 def _is_union(annotation: Any) -> bool:
     return get_origin(annotation) in (typing.Union, types.UnionType)
 
 
-def _kind(field: FieldInfo) -> str:
-    """Type and bounds of a field, as a user reads them."""
-    bounds = [_bound(one) for one in field.metadata if isinstance(one, BaseMetadata)]
-    return ", ".join([_type_name(field.annotation), *filter(None, bounds)])
+def _format_type(field: FieldInfo) -> str:
+    """Format the type and the limits of a field."""
+    limits = [_format_limits(entry) for entry in field.metadata if isinstance(entry, BaseMetadata)]
+    return ", ".join([_type_name(field.annotation), *filter(None, limits)])
 
 
-def _bound(one: BaseMetadata) -> str:
+def _format_limits(metadata: BaseMetadata) -> str:
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
-    found = [f"{sign} {getattr(one, name):g}" for name, sign in signs.items() if hasattr(one, name)]
-    return " ".join(found)
+    limits = [f"{sign} {getattr(metadata, name):g}" for name, sign in signs.items() if hasattr(metadata, name)]
+    return " ".join(limits)
 
 
 def _type_name(annotation: Any) -> str:
-    """A type in a word or two."""
+    """Name a type in a few words."""
     if get_origin(annotation) is Annotated:
         return _type_name(get_args(annotation)[0])
     if get_origin(annotation) is typing.Literal:
         return " or ".join(f"`{value}`" for value in get_args(annotation))
     if _is_union(annotation):
-        return " or ".join("none" if one is type(None) else _type_name(one) for one in get_args(annotation))
+        return " or ".join("none" if part is type(None) else _type_name(part) for part in get_args(annotation))
     if get_origin(annotation) in (tuple, list):
-        inner = sorted({_type_name(one) for one in get_args(annotation) if one is not Ellipsis})
-        return f"list of {', '.join(inner)}"
+        elements = sorted({_type_name(part) for part in get_args(annotation) if part is not Ellipsis})
+        return f"list of {', '.join(elements)}"
     if get_origin(annotation) is dict:
         return "table"
-    names = {float: "number", int: "whole number", str: "text", bool: "true or false"}
+    names = {float: "number", int: "integer", str: "text", bool: "true or false"}
     return names.get(annotation, f"`{getattr(annotation, '__name__', annotation)}`")
 
 
-def _default(field: FieldInfo) -> str:
+def _format_default(field: FieldInfo) -> str:
     if field.default is PydanticUndefined:
-        return "" if field.default_factory is None else "made"
+        return "" if field.default_factory is None else "computed"
     text = "none" if field.default is None else str(field.default)
     return f"`{text}`" if text and len(text) <= 60 else ""

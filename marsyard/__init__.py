@@ -1,6 +1,6 @@
 """Marsyard, a virtual Mars Yard: test vision software on rendered cases with ground truth.
 
-This package exports all names of `marsyard.api` and imports that module on first use.
+This package exports the names of `marsyard.api` and imports that module on first use.
 """
 
 # ruff: noqa: F405  (defined by the star import)

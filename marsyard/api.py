@@ -1,9 +1,9 @@
-"""The Python API for notebooks: campaigns, cases, views and results. See docs/examples/.
+"""The Python API for notebooks: load and run campaigns and cases, render images, read results. See docs/examples/.
 
 import marsyard
 
 campaign = marsyard.load_campaign("dimes-smoke", {"terrain.samples": 1024})
-marsyard.draw(campaign, 3)                      # the drawn values of case 3
+marsyard.draw(campaign, 3)                      # the randomly drawn parameter values of case 3
 marsyard.run_case(campaign, 3).row              # run the case in this process
 folder = marsyard.run_campaign(campaign, "runs/mine", jobs=2)
 marsyard.results(folder)                        # one row per case, a pandas data frame
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
 
 def catalogue() -> list[str]:
-    """Return the names of the campaigns that ship with Marsyard."""
+    """Return the names of the built-in campaigns."""
     return list(loading.catalogue())
 
 
 def sites() -> dict[str, str]:
-    """Return the descriptions of the sites by name."""
+    """Return the descriptions of the built-in sites by name."""
     from marsyard.sim.terrain import sites as presets
 
     return {name: site.description for name, site in presets().items()}
@@ -55,27 +55,27 @@ def load_campaign(
 
     - name_or_path: a name of `catalogue`, or the path of a TOML file
     - changes: values by dotted parameter path that override the file; these parameters are not dispersed
-    - cases, seed: override the file
-    - algorithms: override the file: the algorithm under test first, then the algorithms to compare it with
+    - cases, seed: number of cases and root seed, which override the file
+    - algorithms: algorithms, which override the file: first the algorithm under test, then those for comparison
     """
-    overrides = [f"{path}={_toml(value)}" for path, value in (changes or {}).items()]
+    overrides = [f"{path}={_format_toml(value)}" for path, value in (changes or {}).items()]
     return loading.load_campaign(str(name_or_path), overrides, cases, seed, algorithms)
 
 
 def draw(campaign: Campaign, case: int) -> dict[str, Any]:
-    """Return the drawn values of a case by parameter path."""
+    """Return the parameter values drawn from the dispersions for one case, by parameter path."""
     return campaign.draws(case)
 
 
 def draws(campaign: Campaign, cases: int) -> pd.DataFrame:
-    """Return the drawn values of the first cases, one row per case."""
+    """Return the parameter values drawn for the first `cases` cases, one row per case."""
     import pandas as pd
 
     return pd.DataFrame([campaign.draws(case) for case in range(cases)]).rename_axis("case")
 
 
 def run_case(campaign: Campaign, case: int) -> CaseResult:
-    """Run one case in this process; return its outcome, row, images and intermediate results (`products`).
+    """Run one case in this process; return its outcome, row of results, images and intermediate results (`products`).
 
     The row equals the row that `run_campaign` stores. A terrain that is not in the cache is built first.
     """
@@ -83,7 +83,7 @@ def run_case(campaign: Campaign, case: int) -> CaseResult:
 
 
 def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) -> Path:
-    """Run a campaign, store it in a new folder, write its report, and return the folder.
+    """Run a campaign with `jobs` worker processes, store it in a new folder, write its report; return the folder.
 
     Raises `marsyard.campaigns.errors.CampaignError` if the folder exists or cannot be written.
     """
@@ -102,7 +102,7 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
 
 
 def results(directory: str | Path) -> pd.DataFrame:
-    """Return the rows of a finished campaign: outcome, errors and draws, one row per case."""
+    """Return the stored results of a campaign: outcome, errors and drawn values, one row per case."""
     from marsyard.campaigns.store.table import refresh_table
     from marsyard.cli.outcome import read_frame
 
@@ -111,7 +111,7 @@ def results(directory: str | Path) -> pd.DataFrame:
 
 
 def verdicts(directory: str | Path) -> Sequence[Verdict]:
-    """Evaluate the requirements of a finished campaign."""
+    """Evaluate the requirements of a stored campaign; return one verdict per requirement."""
     from marsyard.campaigns.store.table import refresh_table
     from marsyard.reports.evaluation import evaluate_run
 
@@ -120,14 +120,14 @@ def verdicts(directory: str | Path) -> Sequence[Verdict]:
 
 
 def score(campaign: Campaign, rows: Sequence[CaseResult], metric: str) -> pd.Series[Any]:
-    """Return one column of the rows of finished cases; NaN for a case without that column."""
+    """Return the column `metric` of results of `run_case`, one value per case; NaN for a case without the column."""
     import pandas as pd
 
     return pd.Series([result.row.get(metric, float("nan")) for result in rows], name=metric).rename_axis("case")
 
 
 def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True, **pose: Any) -> list[RenderedImage]:
-    """Render a camera's view of a site: one image, or the left and right image of a stereo pair. Raises ValueError.
+    """Render an image of a site with ground truth; for a stereo camera, the left and right image. Raises ValueError.
 
     - site, camera: names as in `sites` and `marsyard render`; the site may also be the path of a DTM (.tif, .npz)
     - detector: whether to simulate the detector; otherwise only the radiance is rendered (`RenderedImage.frame`)
@@ -139,11 +139,11 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
     return render_images(ImageRequest.from_defaults(site, camera, **pose), detector=detector)
 
 
-def _toml(value: Any) -> str:
+def _format_toml(value: Any) -> str:
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{json.dumps(str(key))} = {_toml(inner)}" for key, inner in value.items()) + " }"
+        return "{ " + ", ".join(f"{json.dumps(str(key))} = {_format_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(inner) for inner in value) + "]"
+        return "[" + ", ".join(_format_toml(item) for item in value) + "]"
     if isinstance(value, bool):
         return "true" if value else "false"
     return json.dumps(str(value)) if isinstance(value, str | Path) else repr(value)

@@ -1,9 +1,9 @@
-"""Write training data: images of a campaign with ground truth, as shards in the WebDataset format.
+"""Training data (`marsyard dataset`): images of a campaign with ground truth, as shards in the WebDataset format.
 
-A shard is a tar file with all images of its cases. Each image has a key with these files: 16-bit image (`image.png`),
+A shard is a tar file with all images of its cases. The files of an image have a common key: 16-bit image (`image.png`),
 range (`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; for landings `hazard.png`: 0 safe,
-1 hazard, 255 unknown), camera model (`cahvor`) and metadata (`json`). The same campaign gives the same bytes. Existing
-shards are complete and are not written again, so that an interrupted command can be repeated.
+1 hazard, 255 unknown), camera model (`cahvor`) and metadata (`json`). Shards of the same campaign are identical byte by
+byte. Existing shards are complete and are not written again, so that an interrupted command can be repeated.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ MANIFEST = "dataset.json"
 def write_dataset(
     campaign: Campaign, folder: Path, cases_per_shard: int, jobs: int, bits_per_pixel: float | None = None
 ) -> list[Path]:
-    """Write the missing shards; return the paths of all shards. Images are compressed to `bits_per_pixel`.
+    """Write the shards that do not exist; return the paths of all shards.
 
+    `bits_per_pixel`: compress images with loss to this size; None: no compression with loss.
     Raises CampaignError if the scenario provides no samples, or the folder is read-only or contains another data set.
     """
     if not isinstance(campaign.scenario, ProvidesSamples):
@@ -53,13 +54,14 @@ def write_dataset(
     if missing:
         from joblib import Parallel, delayed
 
-        # built once here; otherwise each worker process would build them
-        _prepare_inputs(campaign, itertools.chain.from_iterable(cases for _, cases in missing))
+        # build terrains once here; otherwise each worker process would build them
+        _prepare_terrains(campaign, itertools.chain.from_iterable(cases for _, cases in missing))
         Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases, bits_per_pixel) for path, cases in missing)
     return paths
 
 
-def _prepare_inputs(campaign: Campaign, cases: Iterable[int]) -> None:
+def _prepare_terrains(campaign: Campaign, cases: Iterable[int]) -> None:
+    """Build the terrains (shared inputs) of the cases that are not in the cache."""
     base = campaign.base_parameters()
     for number in plan_inputs(campaign, cases).to_prepare:
         campaign.scenario.prepare(base, number)
@@ -90,6 +92,7 @@ def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int, bits
 
 
 def _write_shard(campaign: Campaign, path: Path, cases: range, bits_per_pixel: float | None) -> None:
+    """Write a shard to a temporary file, and rename it when it is complete."""
     partial_path = path.with_suffix(".part")
     with tarfile.open(partial_path, "w", format=tarfile.USTAR_FORMAT) as shard:
         for case in cases:

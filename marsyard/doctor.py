@@ -1,7 +1,7 @@
 """Command `marsyard doctor`: check that a campaign can run on this machine, and print a remedy for each problem.
 
-Drivers and libraries may crash the process and are tested in separate processes. At the top, this module imports only
-the GL probe from Marsyard, because users run this command when imports fail.
+GL drivers and libraries can crash a process and are therefore tested in separate processes. At its top, this module
+imports only the GL probe from Marsyard, so that the command also runs if other imports fail.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from marsyard import gl_probe
 #: The parent folder of the package: the checkout, or site-packages.
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "marsyard"
-#: Import names of distributions, where they differ from the distribution name.
+#: Import names of distributions whose import name differs from the distribution name.
 IMPORT_NAMES = {"opencv-python-headless": "cv2", "pyrender2": "pyrender", "pyyaml": "yaml"}
-#: Pairs of a required distribution and a distribution that overwrites its files.
+#: Pairs of a required distribution and a conflicting distribution that overwrites its files.
 CONFLICTS = (("pyrender2", "pyrender"), ("opencv-python-headless", "opencv-python"))
-#: The GL backends, the preferred one first, and their Debian packages.
+#: Debian packages of each GL backend; the preferred backend is first.
 BACKENDS = {"osmesa": "libosmesa6 libgl1 libxrender1", "egl": "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libxrender1"}
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 REINSTALL = "make setup, or: pip install -c constraints.txt -e ."
@@ -49,7 +49,7 @@ PROBE_TIMEOUT_S = 30.0
 
 
 class Verdict(Enum):
-    """Result of a check; only FAIL prevents a campaign from running."""
+    """Verdict of a check, with its colour on the terminal; only FAIL prevents a campaign from running."""
 
     OK = "green"
     WARN = "yellow"
@@ -58,7 +58,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Check:
-    """Result of a check: name, finding, verdict, and remedy of a problem."""
+    """Result of a check: name, finding, verdict, and the remedy of a problem (empty without a problem)."""
 
     name: str
     finding: str
@@ -75,9 +75,9 @@ def run(console: Console, *, as_json: bool = False) -> int:
         table.add_column(heading, overflow="fold")
     rows = []
     for check in checks:
-        word = check.verdict.name.lower()
-        rows.append({"check": check.name, "finding": check.finding, "verdict": word, "remedy": check.remedy})
-        table.add_row(Text(check.name), Text(check.finding), Text(word, check.verdict.value))
+        verdict = check.verdict.name.lower()
+        rows.append({"check": check.name, "finding": check.finding, "verdict": verdict, "remedy": check.remedy})
+        table.add_row(Text(check.name), Text(check.finding), Text(verdict, check.verdict.value))
     if as_json:
         summary = {"version": version, "root": str(ROOT), "can_run": not failed, "checks": rows}
         console.print(json.dumps(summary, indent=2), markup=False, highlight=False, soft_wrap=True)
@@ -97,7 +97,7 @@ def run_checks() -> Iterator[Check]:
     """Run all checks in the order of the table; slow checks run in parallel."""
     with ThreadPoolExecutor() as pool:
         rendering = {backend: pool.submit(probe_backend, backend) for backend in BACKENDS}
-        names = [_import_name(canonicalize_name(requirement.name)) for requirement in _requirements()]
+        names = [_import_name(canonicalize_name(requirement.name)) for requirement in _list_requirements()]
         # pyrender loads a GL library at import, which `probe_backend` tests
         imports = pool.submit(find_import_failures, [name for name in names if name != "pyrender"])
         yield check_python()
@@ -123,14 +123,14 @@ def check_python() -> Check:
     return Check("python", finding)
 
 
-def check_optimisation(enabled: bool) -> Check:
+def check_optimisation(has_assertions: bool) -> Check:
     """Check that assertions are enabled: pyrender makes GL calls inside `assert` statements."""
     remedy = "run Python without -O and unset PYTHONOPTIMIZE"
-    return Check("assertions", "on") if enabled else Check("assertions", "off (python -O)", Verdict.FAIL, remedy)
+    return Check("assertions", "on") if has_assertions else Check("assertions", "off (python -O)", Verdict.FAIL, remedy)
 
 
 def check_shadowing() -> Iterator[Check]:
-    """Check that Python imports this package, and that no distribution overwrites files of another."""
+    """Check that Python imports this package, and that no distribution overwrites files of another distribution."""
     spec = importlib.util.find_spec(PACKAGE)
     origins = [] if spec is None else list(spec.submodule_search_locations or ())
     if spec is not None and spec.origin is not None:
@@ -142,23 +142,23 @@ def check_shadowing() -> Iterator[Check]:
     else:
         yield Check("package shadowing", f"{PACKAGE} is imported from {origin}")
     owners = importlib.metadata.packages_distributions().get(PACKAGE, [])
-    others = sorted({canonicalize_name(owner) for owner in owners} - {"marsyard"})
-    if others:
-        finding = f"{', '.join(others)} also installs a package named {PACKAGE}"
-        yield Check("package names", finding, Verdict.WARN, f"pip uninstall {' '.join(others)}, then {REINSTALL}")
+    other_owners = sorted({canonicalize_name(owner) for owner in owners} - {"marsyard"})
+    if other_owners:
+        finding = f"{', '.join(other_owners)} also installs a package named {PACKAGE}"
+        yield Check("package names", finding, Verdict.WARN, f"pip uninstall {' '.join(other_owners)}, then {REINSTALL}")
     for required, conflicting in CONFLICTS:
-        if _version(conflicting) is not None:
+        if _find_version(conflicting) is not None:
             remedy = f"pip uninstall -y {conflicting} {required}, then {REINSTALL}"
             yield Check("package names", f"{conflicting} overwrites files of {required}", Verdict.FAIL, remedy)
 
 
 def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
     """Check the versions against pyproject.toml and constraints.txt; `failures` are those of `find_import_failures`."""
-    pins = _pins()
+    pins = _read_pins()
     valid, unpinned = 0, []
-    for requirement in _requirements():
+    for requirement in _list_requirements():
         name = canonicalize_name(requirement.name)
-        version = _version(name)
+        version = _find_version(name)
         if version is None:
             yield Check(name, "not installed", Verdict.FAIL, REINSTALL)
         elif not requirement.specifier.contains(version, prereleases=True):
@@ -175,7 +175,7 @@ def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
 
 
 def find_import_failures(modules: Iterable[str]) -> dict[str, str]:
-    """Import modules in a separate process; return the errors by module."""
+    """Import modules in a separate process; return the error messages by module."""
     remaining = list(modules)
     failures: dict[str, str] = {}
     while remaining:
@@ -200,12 +200,13 @@ for name in sys.argv[1:]:
 """
 
 
-def _requirements() -> list[Requirement]:
+def _list_requirements() -> list[Requirement]:
+    """List the distributions that Marsyard requires on this platform, without extras."""
     requirements = [Requirement(text) for text in importlib.metadata.requires("marsyard") or []]
     return [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
 
 
-def _pins() -> dict[str, str]:
+def _read_pins() -> dict[str, str]:
     """Return the versions of constraints.txt by canonical name; empty if Marsyard is not a checkout."""
     file = ROOT / "constraints.txt"
     lines = file.read_text().split() if file.is_file() else []
@@ -216,7 +217,7 @@ def _import_name(distribution: str) -> str:
     return IMPORT_NAMES.get(distribution, distribution.replace("-", "_"))
 
 
-def _version(distribution: str) -> str | None:
+def _find_version(distribution: str) -> str | None:
     try:
         return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
@@ -225,14 +226,14 @@ def _version(distribution: str) -> str | None:
 
 @dataclass(frozen=True)
 class Probe:
-    """Measurements of a frame rendered with one backend, or the reason for the failure."""
+    """Result of `gl_probe.probe` for one backend; `measurements` are None if it failed, for the reason `error`."""
 
     measurements: Mapping[str, Any] | None
     error: str = ""
 
 
 def probe_backend(backend: str) -> Probe:
-    """Render a frame with a backend in a separate process."""
+    """Render a test frame with a backend in a separate process."""
     process = _run_python("-P", str(Path(gl_probe.__file__)), backend)
     try:
         return Probe(json.loads(process.stdout.splitlines()[-1]))
@@ -323,7 +324,7 @@ def check_machine() -> Check:
 
 
 def check_threads(environment: Mapping[str, str], cores: int) -> Check:
-    """Check the thread counts in environment variables: more threads than cores slow down the workers."""
+    """Check the thread counts in environment variables; more threads than cores slow down the workers."""
     counts = {name: environment[name] for name in THREAD_VARIABLES if environment.get(name)}
     finding = ", ".join(f"{name}={value}" for name, value in counts.items()) or "not set; the libraries decide"
     if any(not value.isdigit() or int(value) > cores for value in counts.values()):
@@ -332,7 +333,7 @@ def check_threads(environment: Mapping[str, str], cores: int) -> Check:
 
 
 def check_systems() -> Iterator[Check]:
-    """Check the systems under test of Marsyard and of other packages."""
+    """Check the definitions of the systems under test, built in and from other packages."""
     try:
         from marsyard.scenarios.systems import BUILT_IN, registry
 

@@ -1,7 +1,8 @@
 """Render a small frame with one GL backend and check its depth: ``python -P gl_probe.py osmesa``.
 
-A separate program: PyOpenGL reads the backend from the environment at import, and a broken driver crashes its process.
-It does not import Marsyard, because the installer also runs it. The result is one line of JSON on standard output.
+This is a separate program, because PyOpenGL reads the backend from the environment at import, and a defective driver
+crashes its process. `marsyard doctor` and the installer run it; it does not import Marsyard. The result is one line of
+JSON on standard output.
 """
 
 from __future__ import annotations
@@ -11,19 +12,19 @@ import os
 import sys
 from typing import Any
 
-COLUMNS, ROWS = 96, 64
-FOCAL_PX = 96.0
+#: Size and focal length of the image, pixels; distances of the near and far clipping planes.
+COLUMNS, ROWS, FOCAL_PX = 96, 64, 96.0
 NEAR_M, FAR_M = 40.0, 400.0
-#: The planes ``z = -DISTANCE_M + TILT x`` and ``z = -DISTANCE_M + TILT y`` in front of a camera that looks along -z.
+#: Test planes ``z = -DISTANCE_M + TILT x`` and ``z = -DISTANCE_M + TILT y`` in front of a camera that looks along -z.
 DISTANCE_M, TILT = 100.0, 0.5
-#: Tolerance of the depth, metres: 24 bits between near and far resolve 1e-5 m here.
+#: Tolerance of the depth, metres; a 24-bit depth buffer resolves 1e-5 m at the test planes.
 DEPTH_TOLERANCE_M = 2e-3
 #: Tolerance of the offset of the depth sample from the pixel's centre, pixels; larger offsets are reported.
 OFFSET_TOLERANCE_PX = 0.01
 
 
 def probe(backend: str) -> dict[str, Any]:
-    """Render two tilted planes with the backend and compare the depth of every pixel with their equations."""
+    """Render two tilted planes with the backend; compare the depth of every pixel with the planes' equations."""
     os.environ["PYOPENGL_PLATFORM"] = backend
     import numpy as np
     import trimesh
@@ -36,7 +37,7 @@ def probe(backend: str) -> dict[str, Any]:
         raise SystemExit(f"cannot load the OpenGL libraries ({error})") from None
 
     x, y = (axis.ravel() for axis in np.meshgrid([-400.0, 400.0], [-400.0, 400.0]))
-    # pyrender counts pixels from the image's corner, so a pixel's centre lies at +0.5; its y axis points up
+    # in pyrender the centre of the first pixel has the coordinates (0.5, 0.5), and the y axis points up
     u, v = np.meshgrid(np.arange(COLUMNS) + 0.5 - COLUMNS / 2, np.arange(ROWS) + 0.5 - ROWS / 2)
     camera = pyrender.IntrinsicsCamera(FOCAL_PX, FOCAL_PX, COLUMNS / 2, ROWS / 2, znear=NEAR_M, zfar=FAR_M)
     renderer = pyrender.OffscreenRenderer(COLUMNS, ROWS)
@@ -49,7 +50,7 @@ def probe(backend: str) -> dict[str, Any]:
             scene.add(pyrender.Mesh.from_trimesh(plane, smooth=False))
             scene.add(camera, pose=np.eye(4))
             colour, depth = renderer.render(scene)
-            # pixel coordinates at which the depth was sampled; may differ from the pixel centre
+            # pixel coordinate at which the depth was sampled, from the plane's equation
             sample_positions = (DISTANCE_M / depth - 1.0) * FOCAL_PX / TILT
             offset = float(np.mean(sample_positions - pixels))
             offsets_px.append(offset)

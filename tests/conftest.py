@@ -1,4 +1,4 @@
-"""Settings and fixtures of all tests. Statements above the fixtures run before any import of Marsyard's packages."""
+"""Settings and fixtures of all tests. The statements at module level run before any import of Marsyard's packages."""
 
 from __future__ import annotations
 
@@ -73,16 +73,16 @@ class _SkipKernels(MetaPathFinder):
         return None
 
 
-_too_early = sorted(set(CHECKED_PACKAGES) & set(sys.modules))
-if _too_early:
-    raise RuntimeError(f"imported before the run-time checks of shapes were switched on: {', '.join(_too_early)}")
+_imported = sorted(set(CHECKED_PACKAGES) & set(sys.modules))
+if _imported:
+    raise RuntimeError(f"imported before the run-time checks of shapes were enabled: {', '.join(_imported)}")
 jaxtyping.install_import_hook(CHECKED_PACKAGES, "beartype.beartype")
 sys.meta_path.insert(0, _SkipKernels())
 
 
 def pytest_report_header() -> list[str]:
-    """State OpenGL backend and shared data, on which the results depend."""
-    data = SHARED_DATA if SHARED_DATA.is_dir() else "absent: the tests that need it are skipped"
+    """Report the OpenGL backend and the shared data, on which the results depend."""
+    data = SHARED_DATA if SHARED_DATA.is_dir() else "missing: tests that need it are skipped"
     return [f"GL backend: {_BACKEND}", f"shared data: {data}"]
 
 
@@ -95,7 +95,7 @@ def _opencv_single_threaded() -> None:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Folder of real camera labels and terrain next to the repository; without it, the test is skipped."""
+    """Return the folder of real camera labels and terrain next to the repository; skip the test without it."""
     if not SHARED_DATA.is_dir():
-        pytest.skip(f"needs the real data in {SHARED_DATA}, which is not there")
+        pytest.skip(f"needs the real data in {SHARED_DATA}, which does not exist")
     return SHARED_DATA

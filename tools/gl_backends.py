@@ -1,13 +1,13 @@
-"""Prints the GL backends whose libraries load on this machine, the preferred one first.
+"""Print the OpenGL backends whose libraries can be loaded on this machine, the preferred backend first.
 
-Runs on a bare Python, before anything is installed. Whether a backend also renders is for `marsyard doctor` to say.
+Runs before any package is installed. `marsyard doctor` checks whether a backend also renders.
 """
 
 import ctypes
 
 
-def loads(*names: str) -> bool:
-    """Whether one of these shared libraries can be loaded."""
+def can_load(*names: str) -> bool:
+    """Whether at least one of these shared libraries can be loaded."""
     for name in names:
         try:
             ctypes.CDLL(name)
@@ -17,19 +17,19 @@ def loads(*names: str) -> bool:
     return False
 
 
-def loadable_backends() -> list[str]:
-    """Names of the backends, as PyOpenGL calls them."""
-    # pyrender imports its viewer with itself, and that loads these, window or not
-    if not (loads("libGL.so.1") and loads("libX11.so.6") and loads("libXrender.so.1")):
+def find_backends() -> list[str]:
+    """Return the names of the loadable backends, as PyOpenGL uses them."""
+    # the import of pyrender includes its viewer, which loads these libraries even without a window
+    if not (can_load("libGL.so.1") and can_load("libX11.so.6") and can_load("libXrender.so.1")):
         return []
     backends = []
-    if loads("libOSMesa.so.8", "libOSMesa.so.7", "libOSMesa.so.6", "libOSMesa.so"):
+    if can_load("libOSMesa.so.8", "libOSMesa.so.7", "libOSMesa.so.6", "libOSMesa.so"):
         backends.append("osmesa")
-    # libEGL only passes on to a vendor's library
-    if loads("libEGL.so.1") and loads("libEGL_mesa.so.0", "libEGL_nvidia.so.0"):
+    # libEGL only forwards calls to the library of a vendor
+    if can_load("libEGL.so.1") and can_load("libEGL_mesa.so.0", "libEGL_nvidia.so.0"):
         backends.append("egl")
     return backends
 
 
 if __name__ == "__main__":
-    print(*loadable_backends())
+    print(*find_backends())

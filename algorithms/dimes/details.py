@@ -49,7 +49,7 @@ class Track:
 
 @dataclass(frozen=True)
 class PairDetails:
-    """Products of one pair of images.
+    """Intermediate products of one pair of consecutive images.
 
     - overlap_polygon: Outline (u, v) in the earlier image of the later image's footprint at zero horizontal motion
     - zero_phase_pixels: Centre of the zero-phase spot (u, v) in both images; NaN if invisible
@@ -69,7 +69,7 @@ class PairDetails:
 
 @dataclass(frozen=True)
 class DimesDetails:
-    """Intermediate products of the estimator.
+    """Intermediate products of `DimesEstimator`, returned as `VelocityEstimate.details`.
 
     - pairs: Both pairs of images; empty for unusable times, altitudes or attitudes
     - combinations: All combinations of valid tracks, best agreement with the IMU first

@@ -27,7 +27,7 @@ class ValidityCheck(Enum):
 
 @dataclass(frozen=True)
 class TrackMetrics:
-    """Validity metrics of a track.
+    """Validity metrics of a track, which `failed_checks` compares with the limits in the options (section II.A).
 
     - contrast: Harris interest of the template divided by its mean signal, per binned pixel
     - peak: Height of the correlation peak, at most 1

@@ -1,7 +1,4 @@
-"""Adapters from external programs to the algorithm protocols: measurements are written to files, answers read as JSON.
-
-The decoding functions (`_read_...`) raise AlgorithmError (BAD_ANSWER) for an answer of the wrong form.
-"""
+"""Estimators and trackers that run external programs: measurements are written to files, answers are read as JSON."""
 
 from __future__ import annotations
 
@@ -35,7 +32,10 @@ from marsyard.sim.measurements import (
 
 @dataclass(frozen=True)
 class ExecutableVelocityEstimator:
-    """Velocity estimator that runs an external program; `estimate` raises AlgorithmError if the program fails."""
+    """Velocity estimator that runs an external program for each descent.
+
+    `estimate` raises AlgorithmError if the program fails, exceeds a limit, or its answer has the wrong form.
+    """
 
     command: Command
     limits: ExecutableLimits
@@ -46,7 +46,7 @@ class ExecutableVelocityEstimator:
 
 
 class ExecutableVelocityStream:
-    """Velocity stream that runs an external program, one JSON line per call (docs/custom-algorithms.md).
+    """Velocity stream that runs an external program: one JSON request line per call (docs/custom-algorithms.md).
 
     Methods raise AlgorithmError if the program fails. One process of a `serve-stream:` program processes many descents.
     """
@@ -63,9 +63,8 @@ class ExecutableVelocityStream:
 
     def picture(self, frame: DescentFrame) -> interface.VelocityEstimate | None:
         """Send the next image and return the program's estimate, or None."""
-        return self._session.send_request(
-            "picture", {}, self._read_answer, {"frame": lambda folder: write_frame(folder, frame)}
-        )
+        files = {"frame": lambda folder: write_frame(folder, frame)}
+        return self._session.send_request("picture", {}, self._read_answer, files)
 
     def finish(self) -> interface.VelocityEstimate:
         """Return the program's final estimate; its details contain the output and the time of the whole descent."""
@@ -98,7 +97,7 @@ class ExecutableSiteEstimator:
 
 
 class ExecutableTargetTracker:
-    """Target tracker that runs an external program (docs/custom-algorithms.md).
+    """Target tracker that runs an external program: one JSON request line per call (docs/custom-algorithms.md).
 
     Methods raise AlgorithmError if the program fails. An `exec:` program ends with this tracker. A `serve:` program can
     be used by several trackers, one after another; a designation resets it.

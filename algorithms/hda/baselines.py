@@ -1,4 +1,4 @@
-"""Baselines from OpenCV: essential matrix for motion, semi-global matching for structure.
+"""Baseline landing site estimators with OpenCV: essential matrix for motion, semi-global matching for structure.
 
 All other stages are those of `HdaEstimator`.
 """
@@ -34,17 +34,17 @@ from marsyard.sim.measurements import LandingMeasurements
 
 #: Confidence of the robust estimation of the essential matrix.
 CONFIDENCE = 0.9999
-#: Methods and inlier distances, pixels. For a planar scene there are two solutions. Each method sometimes returns the
-#: wrong one, in which most tracks are behind a camera.
+#: Methods and inlier distances (pixels) of `cv2.findEssentialMat`; the best result is used. A planar scene has two
+#: solutions; each method sometimes returns the wrong solution, in which most tracks are behind a camera.
 ATTEMPTS = ((cv2.LMEDS, 1.0), (cv2.RANSAC, 0.1), (cv2.RANSAC, 0.3), (cv2.RANSAC, 1.0), (cv2.USAC_PROSAC, 0.1))
-#: Window of the semi-global matching, pixels, and the penalties of disparity steps recommended by OpenCV.
+#: Window side of the semi-global matching, pixels, and the penalties (P1, P2) of disparity steps recommended by OpenCV.
 BLOCK_PX = 5
-SMALL_STEP, LARGE_STEP = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
+SMALL_STEP_PENALTY, LARGE_STEP_PENALTY = 8 * BLOCK_PX**2, 32 * BLOCK_PX**2
 #: OpenCV requires the number of disparities to be a multiple of this.
 DISPARITY_STEP = 16
 #: OpenCV's unit of disparity, pixels.
 DISPARITY_UNIT = 1.0 / 16.0
-#: Largest cosine between the baseline and the mean optical axis.
+#: Largest cosine between the baseline and the mean optical axis for which images are rectified.
 MAX_BASELINE_COSINE = 0.8
 #: Largest side of a rectified image, in diagonals of the original images.
 MAX_SIDE_DIAGONALS = 2.0
@@ -52,7 +52,7 @@ MAX_SIDE_DIAGONALS = 2.0
 
 @final
 class EssentialMatrixEstimator:
-    """Motion from OpenCV's essential matrix, structure as in `HdaEstimator`."""
+    """Baseline landing site estimator: motion from OpenCV's essential matrix, structure as in `HdaEstimator`."""
 
     def __init__(self, options: HdaOptions | None = None) -> None:
         self.options = HdaOptions() if options is None else options
@@ -64,7 +64,7 @@ class EssentialMatrixEstimator:
 
 @final
 class SemiGlobalEstimator:
-    """Motion from OpenCV's essential matrix, structure from its semi-global matching of the rectified images."""
+    """Baseline landing site estimator: OpenCV's essential matrix and semi-global matching of rectified images."""
 
     def __init__(self, options: HdaOptions | None = None) -> None:
         self.options = HdaOptions() if options is None else options
@@ -75,9 +75,9 @@ class SemiGlobalEstimator:
 
 
 def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion | None:
-    """Estimate the motion by essential matrices; the one with most tracks in front of both cameras is returned.
+    """Estimate the motion by essential matrices; return the motion with most tracks in front of both cameras.
 
-    It is scaled so that the median depth equals the range. None if no motion was found.
+    The motion is scaled so that the median depth of the tracks equals the laser range. None without a solution.
     """
     focal = scene.views[1].focal_px
     accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
@@ -122,7 +122,7 @@ class Rectification:
 
 
 def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectification | None:
-    """Compute the rectification of a pair; None for motion along the optical axis."""
+    """Compute the rectification of a pair; None for motion along the optical axis or too large rectified images."""
     first_from_second = second_from_first.inv()
     baseline = float(np.linalg.norm(first_from_second.translation))
     baseline_axis = first_from_second.translation / baseline
@@ -134,15 +134,15 @@ def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectificat
     axis /= np.linalg.norm(axis)
     rectified_from_first = Rotation.from_matrix(np.stack([baseline_axis, np.cross(axis, baseline_axis), axis]))
     focal = views[0].focal_px
-    borders = [
+    border_rays = [
         rectified_from_first.apply(rotation.apply(view.camera.rays(view.camera.border(16))[1]))
         for view, rotation in zip(views, (Rotation.identity(), first_from_second.rotation), strict=True)
     ]
-    edges = np.concatenate(borders)
-    if np.any(edges[:, 2] <= 0.0):
+    rays = np.concatenate(border_rays)
+    if np.any(rays[:, 2] <= 0.0):
         return None
-    edges = focal * edges[:, :2] / edges[:, 2:]
-    low, high = np.floor(edges.min(axis=0)), np.ceil(edges.max(axis=0))
+    border_px = focal * rays[:, :2] / rays[:, 2:]
+    low, high = np.floor(border_px.min(axis=0)), np.ceil(border_px.max(axis=0))
     if float((high - low).max()) > MAX_SIDE_DIAGONALS * float(np.hypot(*views[0].camera.size)):
         return None
     camera = Cahv.from_axes(
@@ -158,7 +158,7 @@ def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectificat
 def match_disparities(
     views: Views, pair: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
 ) -> Float[np.ndarray, "rows columns"]:
-    """Disparities of the first rectified image from semi-global matching, pixels; NaN without a match."""
+    """Compute disparities (pixels) in the first rectified image by semi-global matching; NaN without a match."""
     first_from_rectified = pair.rectified_from_first.inv()
     full_scale = max(float(np.quantile(views[0].counts, 0.995)), 1.0)
     rotations = (first_from_rectified, second_from_first.rotation * first_from_rectified)
@@ -177,8 +177,8 @@ def match_disparities(
         minDisparity=min_disparity,
         numDisparities=count,
         blockSize=BLOCK_PX,
-        P1=SMALL_STEP,
-        P2=LARGE_STEP,
+        P1=SMALL_STEP_PENALTY,
+        P2=LARGE_STEP_PENALTY,
         disp12MaxDiff=1,
         uniquenessRatio=10,
         speckleWindowSize=100,
@@ -190,7 +190,7 @@ def match_disparities(
 
 
 def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> structure.Matches:
-    """Compute structure on the pixel grid of `HdaEstimator` from the disparities of the rectified images."""
+    """Compute points for the pixel grid of `HdaEstimator` from the disparities of the rectified images."""
     first, second = scene.views
     bounds = structure.depth_bounds(motion.depth_range_m, options.depth_margin)
     border = options.search_half_px + 1

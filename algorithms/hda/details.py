@@ -1,4 +1,4 @@
-"""Intermediate products of the hazard detection, shown in the paper's Figs. 1-5 and 7."""
+"""Intermediate products of hazard detection (paper: Figs. 1-5 and 7), and their conversion to plain arrays."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from marsyard.algorithms.hda.motion import Motion, View, Views, points_at_depth,
 from marsyard.algorithms.hda.structure import Matches
 from marsyard.algorithms.hda.tracking import Tracks
 
-#: The stages of Table I, in order; the scale is part of motion, the elevation map part of hazards.
+#: Stages of Table I, in order. "motion" includes the scale, "hazards" the elevation map.
 STAGES = ("tracking", "motion", "structure", "hazards")
 
 
 @dataclass(frozen=True)
 class Ground:
-    """Mapped ground.
+    """Maps of the ground, and the selected site.
 
-    - surface_from_camera: From the first camera's frame to the surface frame, both with their origin at that camera
-    - world_from_surface: Rotation about the vertical to the world frame, from the on-board pose
+    - surface_from_camera: Rotation from the first camera's frame to the surface frame; both origins are at that camera
+    - world_from_surface: Rotation about the vertical from the surface frame to the world frame, from the on-board pose
     - points: The point cloud in the surface frame, metres
     - apriori_cell: Row and column of the a-priori site, fractional, possibly outside the map
     - site_cell: Row and column of the selected site; None if no cell is safe
@@ -42,11 +42,11 @@ class Ground:
 
 @dataclass(frozen=True)
 class HdaDetails:
-    """Intermediate products of the estimator; None for stages that did not run.
+    """Intermediate products of `HdaEstimator`, returned as `SiteEstimate.details`; None for stages that did not run.
 
     - views: The two images with their cameras and on-board poses
-    - motion: Motion, and depths of the accepted tracks; scaled by the altimeter if there are matches
-    - ends_s: Processor time at the start and at the end of every completed stage of `STAGES`
+    - motion: Camera motion, and depths of the accepted tracks; scaled by the laser altimeter if there are matches
+    - ends_s: Processor time at the start, and at the end of every completed stage of `STAGES`
     """
 
     views: Views
@@ -63,8 +63,8 @@ class HdaDetails:
     @property
     def times_s(self) -> Mapping[str, float]:
         """Processor time of each completed stage."""
-        lengths = np.diff(self.ends_s)
-        return {name: float(length) for name, length in zip(STAGES, lengths, strict=False)}
+        durations = np.diff(self.ends_s)
+        return {name: float(duration) for name, duration in zip(STAGES, durations, strict=False)}
 
 
 def hda_products(details: HdaDetails) -> dict[str, Any]:

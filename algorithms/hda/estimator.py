@@ -1,8 +1,8 @@
-"""Hazard detection and avoidance from two images of one moving camera (sections II and III).
+"""Landing site estimator: hazard detection and avoidance from two images of one moving camera (sections II and III).
 
 The surface frame is level, with its origin at the first camera: z is up, x is the horizontal direction of increasing
-image columns, y = z x x. Only its azimuth in the world comes from the on-board pose; the options select the source of
-the vertical.
+image columns, y is the cross product of z and x. The options select the source of the vertical. The azimuth of the
+frame in the world comes from the on-board pose.
 """
 
 from __future__ import annotations
@@ -34,19 +34,20 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
 
-#: Solves for the motion from accepted tracks.
+#: Function that estimates the camera motion from accepted tracks; None without a solution.
 MotionSolver = Callable[[LandingScene, Tracks, HdaOptions], Motion | None]
-#: Solves for structure from the motion at its final scale.
+#: Function that computes points of the ground by stereo matching, from the motion at its final scale.
 StructureSolver = Callable[[LandingScene, Motion, HdaOptions], Matches]
 
 
 @final
 class HdaEstimator:
-    """The landing hazard avoidance of JPL's autonomous helicopter.
+    """Landing site estimator: the hazard avoidance of JPL's autonomous helicopter.
 
-    Motion is estimated from features tracked between two images, its scale from the laser range. A pixel grid matched
-    along epipolar segments gives points and an elevation map. Its slope and roughness give the safe landing map. The
-    site is the cell farthest from all hazards.
+    The camera motion is estimated from features tracked between two images, and scaled by the laser range. A grid of
+    pixels is matched along epipolar segments and triangulated to points, from which an elevation map is computed. Cells
+    with excessive slope or roughness are hazards in the safe landing map. The site is the safe cell farthest from all
+    unsafe cells.
     """
 
     def __init__(self, options: HdaOptions | None = None) -> None:
@@ -60,7 +61,7 @@ class HdaEstimator:
 def find_site(
     scene: LandingScene, solve_motion: MotionSolver, solve_structure: StructureSolver, options: HdaOptions
 ) -> SiteEstimate:
-    """Run all stages with these solvers for motion and structure."""
+    """Run all stages with these solvers for motion and structure; return the site or a failure outcome."""
     details = HdaDetails(scene.views)
     if not (np.isfinite(scene.range_m) and scene.range_m > 0.0):
         return _report_failure(SiteOutcome.NO_RANGE, scene, details)
@@ -75,14 +76,14 @@ def find_site(
         return _report_failure(SiteOutcome.NO_TRACKS, scene, details)
     motion = solve_motion(scene, tracks, options)
     details = replace(details, motion=motion)
-    failure = motion_failure(motion, options)
+    failure = check_motion(motion, options)
     if motion is None or failure is not None:
         return _report_failure(failure or SiteOutcome.NO_MOTION, scene, details)
     coordinates = undistort(scene.views[0].camera, tracks.first[tracks.accepted])
-    factor = scale_factor(scene.views, motion, coordinates, scene.range_m, options)
-    if not (np.isfinite(factor) and factor > 0.0):
+    scale = scale_factor(scene.views, motion, coordinates, scene.range_m, options)
+    if not (np.isfinite(scale) and scale > 0.0):
         return _report_failure(SiteOutcome.NO_MOTION, scene, details)
-    motion = motion.scale(factor)
+    motion = motion.scale(scale)
     details = details.end_stage(motion=motion)
     matches = solve_structure(scene, motion, options)
     details = details.end_stage(matches=matches)
@@ -103,7 +104,7 @@ def _report_failure(outcome: SiteOutcome, scene: LandingScene, details: HdaDetai
 
 
 def expected_pixels(scene: LandingScene, features: Points2, options: HdaOptions) -> Points2:
-    """Expected pixels of the features in the second image."""
+    """Predict the features' pixels (u, v) in the second image: unchanged, or from the poses (option `track_seed`)."""
     if options.track_seed is TrackSeed.NOTHING:
         return features
     coordinates = undistort(scene.views[0].camera, features)
@@ -121,8 +122,8 @@ def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions)
     return estimate_motion(first, second, scene.views[1].focal_px, depths, initial_motions, options)
 
 
-def motion_failure(motion: Motion | None, options: HdaOptions) -> SiteOutcome | None:
-    """Why a motion is rejected; None if it is accepted."""
+def check_motion(motion: Motion | None, options: HdaOptions) -> SiteOutcome | None:
+    """Return the reason why a motion is rejected; None if it is accepted."""
     if motion is None:
         return SiteOutcome.NO_MOTION
     min_inliers = max(options.min_inlier_fraction * len(motion.inliers), 6)
@@ -134,18 +135,18 @@ def motion_failure(motion: Motion | None, options: HdaOptions) -> SiteOutcome | 
 
 
 def match_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:
-    """Compute structure by matches along epipolar segments."""
+    """Compute points of the ground by matches along epipolar segments."""
     return dense_structure(scene.views, motion.second_from_first, motion.depth_range_m, options)
 
 
-#: Number of random triples for the robust plane through all points.
+#: Number of random point triples for the robust plane through all points.
 PLANE_TRIALS = 200
 
 
 def up_direction(first: View, up_camera: Vector3, points: Points3, options: HdaOptions) -> Vector3:
-    """Unit vector upwards in the first camera's frame, from the source that the options select.
+    """Unit vector upwards in the first camera's frame, from the source that the option `surface_frame` selects.
 
-    `up_camera` is the inclinometers' measurement; `points` are in the first camera's frame.
+    `up_camera` is the inclinometers' measurement; `points` are in the first camera's frame, metres.
     """
     if options.surface_frame is SurfaceFrame.INCLINOMETER:
         return up_camera
@@ -157,8 +158,8 @@ def up_direction(first: View, up_camera: Vector3, points: Points3, options: HdaO
 def plane_normal(points: Points3, seed: int) -> Vector3:
     """Unit normal, towards the origin, of the least-median-of-squares plane through at least four points.
 
-    The best plane through random triples is refined by least squares over the points within 2.5 standard deviations
-    (Rousseeuw & Leroy 1987).
+    The best plane through random triples is refined by least squares over the points within 2.5 standard deviations.
+    The standard deviation is 1.4826 (1 + 5 / (n - 3)) times the median distance (Rousseeuw & Leroy 1987).
     """
     rng = np.random.default_rng(seed)
     corners = points[rng.integers(0, len(points), (PLANE_TRIALS, 3))]
@@ -192,7 +193,7 @@ def world_from_surface(world_from_camera: Rotation, surface_from_first: Rotation
 def map_ground(
     scene: LandingScene, points_camera: Points3, resolution: hazards.Resolution, options: HdaOptions
 ) -> Ground | None:
-    """Compute the maps of points in the first camera's frame, and the site; None if the points cover no area."""
+    """Compute the maps of `points_camera` (first camera's frame), and the site; None if the points cover no area."""
     first = scene.views[0]
     to_surface = surface_from_camera(up_direction(first, scene.up_camera, points_camera, options))
     points = to_surface.apply(points_camera)

@@ -1,4 +1,4 @@
-"""Elevation map (section II.D), slope and roughness, safe landing map and selection of the site (section III)."""
+"""Elevation map (section II.D), hazard maps, safe landing map and selection of the landing site (section III)."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ MIN_WEIGHT = 0.1
 class ElevationMap:
     """Elevations on a level grid in the surface frame.
 
-    - elevation_m: z at the centre of each cell; NaN without near points. Rows run along -y, columns along x, as in the
-      image.
-    - corner_m: (x, y) of the centre of the first cell
+    - elevation_m: z at the centre of each cell; NaN if no point is near it. Rows run along -y, columns along x, as in
+      the image.
+    - corner_m: (x, y) of the centre of the first cell (row 0, column 0)
     - cell_m: Side of a cell
     """
 
@@ -33,11 +33,11 @@ class ElevationMap:
     cell_m: float
 
     def positions(self, cells: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Positions (x, y) of cells (row, column), also fractional ones."""
+        """Convert cells (row, column; may be fractional) to positions (x, y), metres."""
         return np.asarray(self.corner_m + self.cell_m * cells[..., ::-1] * np.array([1.0, -1.0]))
 
     def cells(self, positions: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Fractional cells (row, column) of positions (x, y)."""
+        """Convert positions (x, y), metres, to fractional cells (row, column)."""
         offsets = (positions - self.corner_m) / self.cell_m * np.array([1.0, -1.0])
         return np.asarray(offsets[..., ::-1])
 
@@ -45,8 +45,8 @@ class ElevationMap:
 def elevation_map(points: Points3) -> ElevationMap | None:
     """Compute the elevation map of points in the surface frame; None if they cover no area.
 
-    The cell side is sqrt(A / N) with A the area of the horizontal bounding box: about one point per cell. An elevation
-    is the mean of the points around a cell with bilinear weights.
+    The cell side is sqrt(A / N), where A is the area of the horizontal bounding box and N the number of points: about
+    one point per cell. The elevation of a cell is the bilinearly weighted mean of the points around its centre.
     """
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     extent = high - low
@@ -62,12 +62,12 @@ def elevation_map(points: Points3) -> ElevationMap | None:
     return ElevationMap(values, corner, cell)
 
 
-#: Minimum side of the squares for plane fits, cells: a median of squares needs more than a few points.
+#: Minimum side of the squares for plane fits, cells; a least-median-of-squares fit requires more than a few points.
 MIN_SIDE_CELLS = 3
 
 
 class Safety(IntEnum):
-    """Values of the safe landing map: green, yellow and red in the paper's figures, in this order."""
+    """Values of the safe landing map; in the paper's figures they are green, yellow and red."""
 
     SAFE = 0
     UNKNOWN = 1
@@ -101,10 +101,11 @@ def hazard_maps(ground: ElevationMap, options: HdaOptions) -> HazardMaps:
 
 
 def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.ndarray, "m n 3"], Raster, Raster]:
-    """Robust planes of the footprints, and elevation (metres) and slope (radians) interpolated between their centres.
+    """Fit robust planes to footprints; interpolate elevation (metres) and slope (radians) between their centres.
 
-    Squares of the footprint's side are distributed evenly over the map. Outside the outermost centres the extrapolation
-    is linear, with slopes clipped at zero. A square has NaN if fewer than half of its cells are valid.
+    The footprints are squares with the lander's diameter as side, distributed evenly over the map. Outside the
+    outermost centres the extrapolation is linear, with slopes clipped at zero. The plane of a square is NaN if fewer
+    than half of its cells are valid.
     """
     side = max(round(options.lander_diameter_m / ground.cell_m), MIN_SIDE_CELLS)
     shape = ground.elevation_m.shape
@@ -119,7 +120,7 @@ def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.
     centres = [start + 0.5 * (side - 1) for start in starts]
     rows, columns = (_interpolation_weights(centre, extent) for centre, extent in zip(centres, shape, strict=True))
     smooth = _interpolate(planes[..., 0], rows, columns)
-    # Along an axis with a single footprint, interpolation is impossible: the slope of its plane is used.
+    # Along an axis with a single footprint, extrapolate with the slope of its plane.
     for axis, centre in enumerate(centres):
         if len(centre) == 1:
             offsets = np.expand_dims(np.arange(shape[axis]) - centre[0], 1 - axis)
@@ -129,7 +130,7 @@ def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.
 
 
 def _square_starts(extent: int, side: int) -> Int[np.ndarray, "n"]:
-    """First cells of the squares along an axis, evenly distributed; empty if the axis is too short."""
+    """Indices of the first cells of evenly distributed squares along an axis; empty if the axis is too short."""
     if extent < side:
         return np.zeros(0, dtype=np.int64)
     count = round(extent / side)
@@ -139,7 +140,7 @@ def _square_starts(extent: int, side: int) -> Int[np.ndarray, "n"]:
 
 
 def _interpolation_weights(centres: Float[np.ndarray, "n"], extent: int) -> Float[np.ndarray, "extent n"]:
-    """Weights of the centres for every cell along an axis: piecewise linear, extrapolated at the ends."""
+    """Linear interpolation weights of the square centres for every cell along an axis, extrapolated at the ends."""
     if len(centres) == 1:
         return np.ones((extent, 1))
     weights = np.zeros((extent, len(centres)))
@@ -165,8 +166,8 @@ def safe_landing_map(
 ) -> UInt8[np.ndarray, "rows columns"]:
     """Classify cells by slope and roughness: values of `Safety`.
 
-    Hazards are dilated by the lander's diameter. Cells near the map's border or near an unknown cell are unknown.
-    Hazard has precedence over unknown.
+    Hazards are dilated by `hazard_growth` lander diameters. Cells within `unknown_growth` lander diameters of the map's
+    border or of an unknown cell are unknown. Hazard has precedence over unknown.
     """
     with np.errstate(invalid="ignore"):
         hazards = [slope_rad > options.max_slope_rad, roughness_m > options.max_roughness_m]
@@ -180,7 +181,7 @@ def safe_landing_map(
 
 
 def grassfire(marked: Mask) -> Raster:
-    """Grassfire transform (Blum 1973): distance of every cell from the nearest marked cell, cells; inf if none is."""
+    """Grassfire transform (Blum 1973): distance of every cell to the nearest marked cell, in cells; inf without any."""
     if not np.any(marked):
         return np.full(marked.shape, np.inf)
     distances = cv2.distanceTransform((~marked).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -192,9 +193,9 @@ def _dilate(marked: Mask, radius_cells: float) -> Mask:
 
 
 def safe_site(safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Vector2) -> tuple[int, int] | None:
-    """Select the safe cell (row, column) farthest from all unsafe cells; ties: the nearest to the a-priori site.
+    """Select the safe cell (row, column) farthest from all unsafe cells; None if no cell is safe.
 
-    None if no cell is safe. Cells outside the map are unsafe.
+    Of several such cells, the cell nearest to the a-priori site is selected. Cells outside the map are unsafe.
     """
     distances = grassfire(np.pad(safety != Safety.SAFE, 1, constant_values=True))[1:-1, 1:-1]
     farthest = float(distances.max(initial=0.0))
@@ -205,7 +206,7 @@ def safe_site(safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Vector2) 
     return int(best_cells[nearest, 0]), int(best_cells[nearest, 1])
 
 
-#: Number of fitted points, and of tested positions, per footprint diameter.
+#: Number of points for the plane fit, and of tested positions, per footprint diameter.
 POINTS_PER_DIAMETER = 16
 #: Ratio of standard deviation to median absolute value of a normal distribution.
 SIGMA_PER_MEDIAN = 1.4826
@@ -213,7 +214,7 @@ SIGMA_PER_MEDIAN = 1.4826
 
 @dataclass(frozen=True)
 class Resolution:
-    """Side of the correlation windows on the ground, and standard deviation of a point's elevation."""
+    """Map resolution: side of the matching windows on the ground, and standard deviation of a point's elevation."""
 
     window_m: float
     noise_m: float
@@ -222,8 +223,8 @@ class Resolution:
 def map_resolution(motion: Motion, focal_px: float, options: HdaOptions) -> Resolution:
     """Estimate the resolution of a map at the features' median depth.
 
-    The tracks' residuals give the match error perpendicular to epipolar lines. The same error is assumed along the
-    lines, where it causes a depth error.
+    The match error perpendicular to epipolar lines is estimated from the tracks' residuals. The same error is assumed
+    along the lines, where it causes a depth error.
     """
     depth = float(np.median(motion.depths[motion.inliers]))
     error_px = SIGMA_PER_MEDIAN * float(np.median(motion.residuals_px[motion.inliers]))
@@ -234,10 +235,11 @@ def map_resolution(motion: Motion, focal_px: float, options: HdaOptions) -> Reso
 def roughness_limit_m(resolution: Resolution, cell_m: float, options: HdaOptions) -> float:
     """Maximum roughness of a safe footprint in the map; zero or negative if the map cannot resolve hazards.
 
-    A match averages a window of side w. A cell of side s averages points up to a distance s, and its centre is up to
-    s / 2 from the top of a hazard. A paraboloid of width D has ``1 - 4 r2 / D**2`` of its height in the map, with r2
-    the mean square distance from its top: w**2 / 6 (window) + s**2 / 3 (weights) + s**2 / 2 (position). The limit is
-    the height in the map of the narrowest hazard at the lander's limit, minus the map's noise.
+    A map shows reduced heights. A match averages over a window of side w, a cell of side s averages over points up to a
+    distance s, and its centre is up to s / 2 from the top of a hazard along each axis. A paraboloid of base width D
+    therefore has the fraction ``1 - 4 r2 / D**2`` of its height in the map. r2 is the mean square distance of the
+    averaged points from its top: w**2 / 6 (window) + s**2 / 3 (bilinear weights) + s**2 / 2 (position). The limit is
+    the reduced height of the narrowest hazard at the lander's limit, minus the margin for the map's noise.
     """
     mean_square_m2 = resolution.window_m**2 / 6.0 + 5.0 / 6.0 * cell_m**2
     width = options.narrowest_hazard * options.max_roughness_m
@@ -251,14 +253,14 @@ def check_footprints(
     """Mark unsafe footprints as hazards in a safe landing map; return the new map.
 
     The maps of section III use planes of fixed squares only. This test fits a robust plane to the footprint at each
-    position and checks its slope and the largest distance from it. The positions are a lattice of `POINTS_PER_DIAMETER`
-    positions per diameter; each cell gets the result of the nearest position.
+    tested position; it checks the plane's slope and the largest distance of a cell from the plane. The positions form a
+    lattice of `POINTS_PER_DIAMETER` positions per diameter; each cell gets the result of the nearest position.
     """
     diameter_cells = options.lander_diameter_m / ground.cell_m
     step = max(int(diameter_cells / POINTS_PER_DIAMETER), 1)
     lattice = np.zeros(safety.shape, dtype=bool)
     lattice[::step, ::step] = True
-    # test the nearest lattice cell of each safe cell, also if it is not safe
+    # test the lattice cell nearest to each safe cell, even if that lattice cell is not safe
     is_tested = np.zeros_like(lattice)
     safe = np.argwhere(safety == Safety.SAFE)
     nearest = tuple(np.minimum((safe + step // 2) // step * step, (np.array(safety.shape) - 1) // step * step).T)
@@ -284,7 +286,7 @@ def check_footprints(
 
 
 def disc_cells(radius_cells: float) -> Int[np.ndarray, "n 2"]:
-    """Cells (row, column) of a disc, relative to its centre."""
+    """List the cells of a disc as offsets (row, column) from its centre."""
     radius = int(radius_cells)
     offsets = np.arange(-radius, radius + 1)
     cells = np.stack(np.meshgrid(offsets, offsets, indexing="ij"), axis=-1).reshape(-1, 2)

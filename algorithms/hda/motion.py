@@ -1,4 +1,4 @@
-"""Views with undistorted coordinates, and structure from motion: camera motion and feature depths (section II.B)."""
+"""Structure from motion: camera motion and feature depths from tracks (section II.B); corrected images and cameras."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ MIN_RESPONSE = 0.05
 
 @dataclass(frozen=True)
 class View:
-    """One image in its camera's frame.
+    """One corrected image with its camera.
 
     - counts: Detector counts corrected for frame transfer, pixel response and lens fall-off
-    - camera: Camera model, in the camera's own frame
+    - camera: Camera model in the camera frame
     - world_from_camera: Camera pose estimated on board
     """
 
@@ -55,10 +55,10 @@ def build_view(image: DetectorImage, pose: PoseMeasurement) -> View:
 def apply_flat_field(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
     """Correct counts for offset, frame transfer and response variations.
 
-    A lens transmits a third less light in its corners. This biases sums of absolute differences (Eq. 9) between image
-    centre and border. Over rendered rocks from 15 m, 20 % of the points were wrong without this correction and 0.5 %
-    with it. Frame transfer is removed first: at 10 ms it is half of the exposure's signal in the last of the MER
-    camera's 1,024 rows.
+    Image corners receive a third less light than the centre. This biases sums of absolute differences (Eq. 9) between
+    image centre and border. Over rendered rocks seen from 15 m, 20 % of the points were wrong without this correction
+    and 0.5 % with it. Frame transfer is removed first: at an exposure time of 10 ms its signal in the last of the MER
+    camera's 1,024 rows is half of the exposure's signal.
     """
     detector = image.calibration
     response = np.maximum(detector.flat_field, MIN_RESPONSE).astype(np.float32)
@@ -68,13 +68,13 @@ def apply_flat_field(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]
 
 
 def camera_pose(camera: CameraModel) -> RigidTransform:
-    """Transform from the camera frame to the frame of the camera model."""
+    """Transform from the camera frame (columns right, rows down, optical axis forward) to the camera model's frame."""
     axes = np.column_stack([camera.right, np.cross(camera.a, camera.right), camera.a])
     return rigid(Rotation.from_matrix(axes), np.array(camera.c))
 
 
 def undistort(camera: CameraModel, pixels: Points2) -> Points2:
-    """Normalised image coordinates of pixels; NaN if the ray does not point forward."""
+    """Convert pixels (u, v) to normalised image coordinates (x / z, y / z); NaN if the ray does not point forward."""
     directions = camera.rays(pixels)[1]
     with np.errstate(divide="ignore", invalid="ignore"):
         coordinates: Points2 = directions[:, :2] / directions[:, 2:]
@@ -83,19 +83,19 @@ def undistort(camera: CameraModel, pixels: Points2) -> Points2:
 
 
 def points_at_depth(coordinates: Points2, depths: Vector) -> Points3:
-    """Points (camera frame) of normalised image coordinates at depths (Eq. 6)."""
+    """Convert normalised image coordinates and depths to points in the camera frame (Eq. 6)."""
     return np.asarray(np.column_stack([coordinates, np.ones(len(coordinates))]) * depths[:, None])
 
 
 def project_points(camera: CameraModel, points: Points3) -> tuple[Points2, Flags]:
-    """Pixels of points in the camera frame, and whether they lie inside the image."""
+    """Project points in the camera frame to pixels (u, v); also return whether the pixels lie inside the image."""
     pixels, visible = camera.project(points)
     return pixels, visible & camera.in_frame(pixels)
 
 
 @dataclass(frozen=True)
 class LandingScene:
-    """Two views and the measurements taken with the first.
+    """Two views, and the measurements at the time of the first view.
 
     - range_m: Depth of the ground on the first camera's optical axis; NaN if unknown
     - up_camera: Unit vector upwards measured by the inclinometers, in the first camera's frame
@@ -129,9 +129,8 @@ START_SCALES_PX = (32.0, 8.0, 3.0)
 #: Maximum number of steps at each scale. Over slopes the initial plane is wrong: of 40 rendered pairs over steep ground
 #: 4 required 60 to 100 steps.
 ITERATIONS = 300
-START_TOLERANCE = 1e-4
-#: Step length (radians; fraction of the depth) below which the iteration has converged.
-TOLERANCE = 1e-9
+#: Step length (radians; fraction of the depth) below which the iteration has converged: at `START_SCALES_PX`, and last.
+START_TOLERANCE, TOLERANCE = 1e-4, 1e-9
 #: Largest relative deviation of an inlier's inverse depth from the plane fit.
 MAX_INVERSE_DEPTH_FRACTION = 0.6
 
@@ -142,9 +141,9 @@ class Motion:
 
     - second_from_first: From the first to the second camera's frame, metres
     - depths: Depths of the features in the first camera's frame, metres
-    - residuals_px: Reprojection errors in the second image
+    - residuals_px: Reprojection errors in the second image, pixels
     - inliers: Whether residual and depth of a feature are plausible
-    - parallax_px: Median image shift due to the translation, over the features that fit the motion
+    - parallax_px: Median image shift due to the translation, over the features with a small residual, pixels
     - converged: Whether the iteration reached a minimum
     """
 
@@ -168,7 +167,7 @@ class Motion:
 
 
 def plane_depths(coordinates: Points2, range_m: float, up_camera: Vector3) -> Vector:
-    """Depths of level ground at `range_m` on the optical axis; `range_m` itself if a depth is implausible."""
+    """Depths of level ground at the distance `range_m` on the optical axis; implausible depths become `range_m`."""
     up_components = np.column_stack([coordinates, np.ones(len(coordinates))]) @ up_camera
     with np.errstate(divide="ignore", invalid="ignore"):
         depths = range_m * up_camera[2] / up_components
@@ -183,28 +182,30 @@ def estimate_motion(
     initial_motions: tuple[RigidTransform, ...],
     options: HdaOptions,
 ) -> Motion:
-    """Estimate motion and depths of minimum cost from several initial motions.
+    """Estimate motion and depths by nonlinear least squares; return the best result of several initial motions.
 
-    `first` and `second` are normalised image coordinates, `focal_px` their unit in pixels. `depths` are initial depths
+    `first` and `second` are normalised image coordinates, `focal_px` the focal length. `depths` are initial depths
     (metres, from the altimeter); they define the scale of lengths. The unknowns are a unit quaternion, the translation
-    and the inverse depths; Cauchy's cost of the reprojection error in the second image (Eqs. 6-8) is minimised. The
-    motion is first solved for fixed depths, which avoids the second solution for planar scenes.
+    and the inverse depths. Cauchy's cost of the reprojection error in the second image (Eqs. 6-8) is minimised. The
+    motion is first estimated at fixed depths, which avoids the second solution for planar scenes.
     """
-    unit = float(np.median(depths))
+    length_unit_m = float(np.median(depths))
     stages = [(scale_px, False, START_TOLERANCE) for scale_px in START_SCALES_PX]
     stages.append((options.robust_px, True, TOLERANCE))
     candidates = []
     for start in initial_motions:
         cost, converged = np.inf, False
-        motion = kernels.Motion(start.rotation.as_quat(scalar_first=True), start.translation / unit, unit / depths)
+        quaternion = start.rotation.as_quat(scalar_first=True)
+        motion = kernels.Motion(quaternion, start.translation / length_unit_m, length_unit_m / depths)
         for scale_px, with_depths, tolerance in stages:
             matches = kernels.Matches(first, second, focal_px, scale_px)
             motion, cost, converged, _ = kernels.solve(matches, motion, with_depths, ITERATIONS, tolerance)
         candidates.append((motion, cost, converged))
     best, _, converged = min(candidates, key=lambda candidate: candidate[1])
-    second_from_first = rigid(Rotation.from_quat(best.q, scalar_first=True), unit * best.t)
+    second_from_first = rigid(Rotation.from_quat(best.q, scalar_first=True), length_unit_m * best.t)
     with np.errstate(divide="ignore"):
-        return assess_motion(first, second, focal_px, second_from_first, unit / best.inverse_depths, converged, options)
+        depths = length_unit_m / best.inverse_depths
+        return assess_motion(first, second, focal_px, second_from_first, depths, converged, options)
 
 
 def assess_motion(
@@ -219,9 +220,10 @@ def assess_motion(
     """Compute residuals, inliers and parallax of a motion; the arguments are those of `estimate_motion`."""
     quaternion = second_from_first.rotation.as_quat(scalar_first=True)
     inverse = 1.0 / depths
-    unmatched = kernels.Matches(first, np.zeros_like(first), focal_px, 1.0)
+    # with measurements of zero, residuals are the projections of the features, pixels
+    zero_matches = kernels.Matches(first, np.zeros_like(first), focal_px, 1.0)
     translations = (np.zeros(3), np.array(second_from_first.translation))
-    without_t, with_t = (kernels.residuals(unmatched, kernels.Motion(quaternion, t, inverse)) for t in translations)
+    without_t, with_t = (kernels.residuals(zero_matches, kernels.Motion(quaternion, t, inverse)) for t in translations)
     residuals = np.hypot(*(with_t - focal_px * second).T)
     is_fit = residuals <= options.max_residual_px
     return Motion(

@@ -17,7 +17,7 @@ class SurfaceFrame(Enum):
 
 
 class TrackSeed(Enum):
-    """Start of the search for a feature in the second image."""
+    """Start of the search for a feature in the second image; the values are the texts in campaign files."""
 
     NOTHING = "where it was in the first picture, as the paper has it"
     POSE = "where level ground at the measured range would move it by the on-board poses"
@@ -33,47 +33,47 @@ class HdaOptions:
     - block_px: Side of the blocks; the best feature of each block is used. 64 px give 80 blocks in 640 x 480 pixels,
       and 50 to 70 tracks; the paper had 59.
     - min_eigenvalue: Minimum eigenvalue lambda_t of Eq. 2, for the mean over the template instead of the sum, squared
-      counts per squared pixel. Noise of one count alone has about 0.2.
+      counts per squared pixel. An image of noise only, one count rms, has about 0.2.
     - min_track_correlation: Minimum correlation (Eq. 3) of a track at the finest level. Without `align`, wrong tracks
-      over rocks have up to 0.8; correct tracks have down to 0.6 if the heights of the images differ by 20 %.
+      over rocks have correlations up to 0.8; correct tracks have at least 0.6 if the camera heights differ by 20 %.
     - min_aligned_correlation: Minimum correlation of the aligned track with the warped template. Over 25 rendered pairs
       at the paper's limits, 99 % of the correct tracks of each pair have at least 0.91. Two thirds of the wrong tracks,
       most of which left the image, have less than 0.88.
-    - track_seed: Start of the search
+    - track_seed: Start of the search for a feature in the second image
     - align: Whether Gauss-Newton alignment with an affine warp follows the biquadratic fit of the paper. The fit has a
       bias towards whole pixels of up to 0.09 px and neglects rotation and scale. A track that cannot be aligned is
-      rejected: over rocks, at small changes, 6 of 276 such tracks were correct. Of 1,199 aligned tracks 4 were wrong
-      and the others accurate to 0.2 px, with a median of 0.004 px.
-    - min_tracks: Minimum number of tracks: five determine a motion, more are needed to detect outliers
-    - robust_px: Scale of Cauchy's cost of a residual, pixels: the standard deviation of good tracks
+      rejected: over rocks, at small changes of the view, only 6 of 276 such tracks were correct. Of 1,199 aligned
+      tracks 4 were wrong; the others had errors of up to 0.2 px, with a median of 0.004 px.
+    - min_tracks: Minimum number of tracks. Five tracks determine a motion; more are needed to detect outliers.
+    - robust_px: Scale of Cauchy's cost of a residual, pixels: the standard deviation of correct tracks
     - max_residual_px: Residual above which a track is an outlier
     - min_inlier_fraction: Minimum fraction of inliers among the tracks of an accepted motion
-    - min_parallax_px: Minimum median shift of the features by translation alone. Tracks are accurate to 0.1 px: below
-      this, depths would be wrong by more than 5 %.
+    - min_parallax_px: Minimum median shift of the features by translation alone. Tracks have errors of 0.1 px, so that
+      depth errors exceed 5 % at a smaller shift.
     - depth_margin: Relative margin added to the features' depth range (section II.C: 0.2 to 0.4)
-    - grid_px: Spacing of the grid of structure pixels
-    - search_half_px: Half width of the windows compared along epipolar segments
+    - grid_px: Spacing of the grid of pixels that are matched for structure
+    - search_half_px: Half width of the windows compared along epipolar segments, pixels
     - min_match_correlation: Minimum correlation (Eq. 3) of a structure match
     - max_return_px: Maximum forward-backward error, pixels: each structure match is matched back from the second image
-      to the first and rejected if the distance to its start is larger. None: no check, as in the paper. Both searches
-      use whole pixels near a line, with errors of up to 0.7 px.
+      to the first, and rejected if it ends farther from its start. None: no check, as in the paper. Both searches use
+      whole pixels near a line, with errors of up to 0.7 px.
     - min_points: Minimum number of points for an elevation map
-    - surface_frame: Source of the vertical
+    - surface_frame: Source of the vertical direction
     - lander_diameter_m: Side of the lander's footprint, by which hazards are dilated (section III). Helicopter: 2 m.
     - plane_trials: Random triples of points for the least-median-of-squares plane of a footprint. If half of the points
       are not on the plane, 30 trials find it in 98 % of footprints; if 30 % are not, in all but 3 in a million.
     - refine_planes: Whether each plane is refined by least squares over its inliers (Rousseeuw & Leroy 1987)
     - max_slope_rad, max_roughness_m: Limits of the lander, set by the user (section III)
     - hazard_growth, unknown_growth: Dilation of hazards, and of borders and holes of the map, in lander diameters. The
-      paper uses 1 for hazards. For "near" borders 0.5 is assumed: nearer, part of the lander would stand on unmapped
-      ground.
+      paper uses 1 for hazards. For cells "near" borders 0.5 is assumed: at a smaller distance, part of the lander would
+      be on unmapped ground.
     - check_footprints: Whether each position that is safe in the paper's maps is also checked with a plane fitted to
       its footprint, with a margin for the map's resolution (`marsyard.algorithms.hda.hazards.check_footprints`). The
-      paper interpolates planes and slopes between fixed squares: over curved ground the distance from that surface is
-      half of the distance from a plane.
+      paper interpolates planes and slopes between fixed squares. Over curved ground the distance from this interpolated
+      surface is half of the distance from a plane.
     - narrowest_hazard: Ratio of base width to height of the narrowest hazard. Rocks have heights of up to 0.65 widths
       (Golombek & Rapp 1997: 0.5, with a variation of one third).
-    - margin_deviations: Safety margin in standard deviations of the map's noise and of the vertical
+    - margin_deviations: Safety margin of `check_footprints`, in standard deviations of the map's noise and the vertical
     - match_error_px: Minimum error of a structure match: the biquadratic's bias towards whole pixels is up to 0.09 px
     - level_error_rad: Standard deviation of the vertical, including the map's tilt due to the motion's error
     - seed: Seed of the random triples, the same for every map: the result depends only on the measurements
@@ -114,7 +114,7 @@ class HdaOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, minimum in ((name, minimum) for minimum, names in _MINIMA.items() for name in names):
+        for name, minimum in ((name, minimum) for minimum, names in _NAMES_BY_MINIMUM.items() for name in names):
             if not getattr(self, name) >= minimum:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {minimum}")
         for name in _POSITIVE:
@@ -126,8 +126,8 @@ class HdaOptions:
             raise ValueError(f"depth_margin is {self.depth_margin}; it must be below 1")
 
 
-#: Minimum value: names of the options.
-_MINIMA = {
+#: Names of the options by their minimum value.
+_NAMES_BY_MINIMUM = {
     0: (
         *("depth_margin", "hazard_growth", "unknown_growth", "margin_deviations"),
         *("match_error_px", "level_error_rad", "seed"),
@@ -137,6 +137,7 @@ _MINIMA = {
     4: ("min_points",),
     6: ("min_tracks",),
 }
+#: Names of the options that must be positive.
 _POSITIVE = (
     *("robust_px", "max_return_px", "narrowest_hazard", "max_residual_px"),
     *("lander_diameter_m", "max_slope_rad", "max_roughness_m"),

@@ -1,4 +1,4 @@
-"""Dense structure by matches along epipolar segments (section II.C), and the scale from the laser altimeter."""
+"""Dense structure (points of the ground) by matches along epipolar segments (section II.C), and its scale."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from marsyard.algorithms.hda.options import HdaOptions
 
 
 class MatchStatus(IntEnum):
-    """Result of a structure match: accepted, or the first failed check."""
+    """Result of a structure match: accepted, or the failed check (correlation, depth bounds, reverse match)."""
 
     ACCEPTED = 0
     DISSIMILAR = 1
@@ -28,8 +28,8 @@ class MatchStatus(IntEnum):
 class Matches:
     """Structure matches between the images.
 
-    - first: Pixels (u, v) of the first image whose epipolar segment fits the second image
-    - starts, ends: Ends of the segments, at the smallest and the largest depth
+    - first: Pixels (u, v) of the first image whose epipolar segment lies inside the second image
+    - starts, ends: End points (u, v) of the segments, at the smallest and the largest depth
     - second: Matched pixels (u, v) of the second image
     - correlations: Eq. 3 at the match
     - depths: Triangulated depths in the first camera's frame, metres
@@ -69,7 +69,10 @@ def pixel_lattice(size: tuple[int, int], spacing_px: int, border_px: int) -> Poi
 def epipolar_segments(
     second: View, second_from_first: RigidTransform, coordinates: Points2, bounds_m: tuple[float, float], border_px: int
 ) -> tuple[Points2, Points2, Flags]:
-    """Ends of the epipolar segments of normalised coordinates (Eqs. 6-8), and whether both are inside the border."""
+    """Compute the end points of epipolar segments (Eqs. 6-8), and whether both lie inside the border.
+
+    `coordinates` are normalised image coordinates in the first image, `bounds_m` the depths of the end points.
+    """
     ends = []
     valid = np.ones(len(coordinates), dtype=bool)
     for depth in bounds_m:
@@ -103,8 +106,8 @@ def match_pixels(
     """Match whole pixels of the first image along their epipolar segments.
 
     The match is the minimum sum of absolute differences (Eq. 9) on the segment, refined by the biquadratic peak of the
-    correlations around it. (The paper says "the maximum SAD value"; the best match is the minimum.) Pixels are dropped
-    if their segment leaves the second image. Accepted matches pass the limits on correlation and depth and, with
+    correlations around it. (The paper has "the maximum SAD value"; the best match is the minimum.) Pixels whose segment
+    is partly outside the second image are omitted. Accepted matches pass the limits on correlation and depth and, with
     `max_return_px`, the check of the reverse match.
     """
     first, second = views
@@ -123,16 +126,16 @@ def match_pixels(
     statuses[~(correlations >= options.min_match_correlation)] = MatchStatus.DISSIMILAR
     if options.max_return_px is not None:
         k = np.flatnonzero(statuses == MatchStatus.ACCEPTED)
-        distances = return_distance(
+        errors_px = forward_backward_error(
             views, second_from_first, rounded[k], matches[k], coordinates[k], bounds_m, options.search_half_px
         )
-        statuses[k[distances > options.max_return_px]] = MatchStatus.NOT_RETURNED
+        statuses[k[errors_px > options.max_return_px]] = MatchStatus.NOT_RETURNED
     accepted = statuses == MatchStatus.ACCEPTED
     points = points_at_depth(coordinates[accepted], depths[accepted])
     return Matches(pixels, starts, ends, matched_pixels, correlations, depths, statuses, points)
 
 
-def return_distance(
+def forward_backward_error(
     views: Views,
     second_from_first: RigidTransform,
     pixels: Int[np.ndarray, "n 2"],
@@ -141,10 +144,10 @@ def return_distance(
     bounds_m: tuple[float, float],
     half_px: int,
 ) -> Float[np.ndarray, "n"]:
-    """Forward-backward error: distance of each pixel of the first image from the reverse match of its match.
+    """Forward-backward error, pixels: distance of each pixel of the first image from the reverse match of its match.
 
-    Pixels are integers, `coordinates` their normalised image coordinates. The reverse search covers the depth bounds in
-    the second camera's frame, clipped to the first image.
+    `coordinates` are the normalised image coordinates of `pixels`. The reverse search covers the depth bounds in the
+    second camera's frame, clipped to the first image.
     """
     first, second = views
     count, first_from_second = len(coordinates), second_from_first.inv()
@@ -153,12 +156,12 @@ def return_distance(
     points = [first_from_second.apply(points_at_depth(match_coordinates, z)) for z in depths]
     ends = [project_points(first.camera, point)[0] for point in points]
     starts, stops = (clip_to_image(first.camera.size, pixels.astype(np.float64), end, half_px + 1.0) for end in ends)
-    returned = matching.search_segments(second.counts, first.counts, matches, starts, stops, half_px)
-    return np.asarray(np.hypot(*(returned - pixels).T))
+    reverse_matches = matching.search_segments(second.counts, first.counts, matches, starts, stops, half_px)
+    return np.asarray(np.hypot(*(reverse_matches - pixels).T))
 
 
 def clip_to_image(size: tuple[int, int], origins: Points2, ends: Points2, border_px: float) -> Points2:
-    """Clip the ends of lines from `origins` inside an image of size (columns, rows) at its border."""
+    """Clip the end points of lines at the border of an image of size (columns, rows); `origins` lie inside it."""
     directions = np.nan_to_num(ends - origins)
     limits = np.where(directions > 0.0, np.array(size) - 1.0 - border_px, border_px)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -174,7 +177,7 @@ def dense_structure(
     return match_pixels(views, second_from_first, pixels, depth_bounds(depth_range_m, options.depth_margin), options)
 
 
-#: Offsets of the pixels matched around the laser spot; their median depth is that of the spot.
+#: Offsets of the pixels matched around the laser spot; their median depth is the depth of the spot.
 SPOT_OFFSETS_PX = np.arange(-4.0, 5.0, 2.0)
 #: Minimum number of matches in the spot.
 MIN_SPOT_MATCHES = 5
@@ -183,9 +186,9 @@ MIN_SPOT_MATCHES = 5
 def scale_factor(views: Views, motion: Motion, coordinates: Points2, range_m: float, options: HdaOptions) -> float:
     """Scale factor of the motion that makes the depth on the optical axis equal to the laser range.
 
-    Pixels around the laser spot are matched like structure pixels. With too few matches the depth comes from the plane
-    through the features' inverse depths (`coordinates` are their normalised image coordinates). The paper sets the
-    initial depths from the range and does not correct the scale afterwards.
+    Pixels around the laser spot are matched along their epipolar segments. With too few matches the depth is that of
+    the plane fit to the features' inverse depths (`coordinates` are their normalised image coordinates). The paper sets
+    the initial depths from the range and does not correct the scale afterwards.
     """
     spot, _ = views[0].camera.project(np.array([[0.0, 0.0, 1.0]]))
     du, dv = np.meshgrid(SPOT_OFFSETS_PX, SPOT_OFFSETS_PX)
@@ -197,6 +200,6 @@ def scale_factor(views: Views, motion: Motion, coordinates: Points2, range_m: fl
     depths = spot_matches.depths[spot_matches.accepted]
     if len(depths) >= MIN_SPOT_MATCHES:
         return range_m / float(np.median(depths))
-    design = np.column_stack([coordinates, np.ones(len(coordinates))])[motion.inliers]
-    plane = np.linalg.lstsq(design, 1.0 / motion.depths[motion.inliers], rcond=None)[0]
+    design_matrix = np.column_stack([coordinates, np.ones(len(coordinates))])[motion.inliers]
+    plane = np.linalg.lstsq(design_matrix, 1.0 / motion.depths[motion.inliers], rcond=None)[0]
     return range_m * float(plane[2])

@@ -1,4 +1,4 @@
-"""Selection of features and their tracking by correlation over an image pyramid (section II.A)."""
+"""Feature selection, and tracking by correlation over an image pyramid (section II.A)."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from marsyard.algorithms.image.correlation import halve
 from marsyard.algorithms.image.interest import structure_tensor
 from marsyard.algorithms.image.registration import Limits, register_template
 
-#: Half width of the window at all levels but the coarsest; minimum half width of templates and windows (Eq. 5).
+#: Half width of the search window at all levels except the coarsest; minimum half width of all templates and windows
+#: (Eq. 5), pixels.
 MIN_HALF_PX = 2
 
 
 @dataclass(frozen=True)
 class LevelSize:
-    """Half widths of template and window at a pyramid level, pixels of that level."""
+    """Half widths of template and search window at a pyramid level, pixels of that level."""
 
     template_half: int
     window_half: int
 
 
 def level_sizes(template_half: int, window_half: int) -> tuple[LevelSize, ...]:
-    """Sizes at each pyramid level, finest first (Eqs. 4 and 5).
+    """Compute the sizes at each pyramid level, finest level first (Eqs. 4 and 5).
 
-    w of Eq. 4 is assumed to be the half width of Eq. 5: with n = log2(w) - 2 levels the coarsest window has a half
-    width of 4 to 8. Fractions are truncated.
+    The w of Eq. 4 is assumed to be the half width of Eq. 5. With n = log2(w) - 2 levels, rounded down, the coarsest
+    window has a half width of 4 to 8.
     """
     coarsest = max(int(np.log2(window_half)) - 2, 0)
     sizes = []
@@ -42,13 +43,13 @@ def level_sizes(template_half: int, window_half: int) -> tuple[LevelSize, ...]:
 
 
 def feature_border_px(options: HdaOptions) -> int:
-    """Minimum distance of features from the image border, pixels: templates fit at all levels with one pixel margin."""
+    """Minimum distance of features from the image border, pixels: templates fit at all levels with a 1 px margin."""
     sizes = level_sizes(options.template_half_px, options.window_half_px)
     return max((size.template_half + 1) << level for level, size in enumerate(sizes))
 
 
 def pyramid(counts: Counts, levels: int) -> tuple[Float[np.ndarray, "_ _"], ...]:
-    """Image and its block averages over 2, 4, ... pixels, finest first, float32."""
+    """Build the image pyramid: the image and its averages over blocks of 2, 4, ... pixels, finest first, float32."""
     result = [counts.astype(np.float32)]
     for _ in range(levels - 1):
         result.append(halve(result[-1]))
@@ -67,27 +68,27 @@ def eigenvalue_test(image: Raster, support: int, min_eigenvalue: float) -> Raste
 
 
 def select_features(counts: Counts, options: HdaOptions) -> Points2:
-    """Pixels (u, v) of the best feature of each block, block by block along rows; blocks without a feature are skipped.
+    """Select the feature of highest interest in each block of the image; return pixels (u, v), block rows first.
 
-    The distance of features from the image border is at least `feature_border_px`.
+    Blocks without a feature are omitted. Features have at least the distance `feature_border_px` from the border.
     """
     interest = eigenvalue_test(counts.astype(np.float32), 2 * options.template_half_px + 1, options.min_eigenvalue)
     border = feature_border_px(options)
     interest[:border] = interest[-border:] = -np.inf
     interest[:, :border] = interest[:, -border:] = -np.inf
     side = options.block_px
-    filled = np.pad(interest, [(0, -extent % side) for extent in interest.shape], constant_values=-np.inf)
-    blocks = filled.reshape(filled.shape[0] // side, side, filled.shape[1] // side, side).swapaxes(1, 2)
+    padded = np.pad(interest, [(0, -extent % side) for extent in interest.shape], constant_values=-np.inf)
+    blocks = padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side).swapaxes(1, 2)
     best = blocks.reshape(*blocks.shape[:2], -1).argmax(axis=-1)
     row, column = (i * side for i in np.indices(best.shape))
     row, column = row + best // side, column + best % side
-    has_peak = np.isfinite(blocks.max(axis=(2, 3)))
-    return np.column_stack([column[has_peak], row[has_peak]]).astype(np.float64)
+    has_feature = np.isfinite(blocks.max(axis=(2, 3)))
+    return np.column_stack([column[has_feature], row[has_feature]]).astype(np.float64)
 
 
 #: Limits of an alignment: a height change of 20 % stretches the image by 25 %, and the first steps overshoot. The
-#: default limits (0.35, 1.5 px, 12 steps) rejected 20 % of the correct tracks at 20 % less height.
-ALIGNMENT = Limits(shift_px=2.5, stretch=0.5, steps=30)
+#: default limits of `Limits` rejected 20 % of the correct tracks after a descent by 20 % of the height.
+ALIGNMENT_LIMITS = Limits(shift_px=2.5, stretch=0.5, steps=30)
 
 
 @dataclass(frozen=True)
@@ -113,22 +114,24 @@ def track_features(first: Counts, second: Counts, features: Points2, expected: P
     peak of the correlations around the best pixel; with `align` it is refined by registration.
     """
     sizes = level_sizes(options.template_half_px, options.window_half_px)
-    firsts, seconds = (pyramid(counts, len(sizes)) for counts in (first, second))
+    first_levels, second_levels = (pyramid(counts, len(sizes)) for counts in (first, second))
     pixels = np.rint(features[:, ::-1]).astype(np.int64)
-    limit = float(max(first.shape))
-    expected_shifts = np.clip(np.nan_to_num(expected - features, nan=0.0), -limit, limit)[:, ::-1]
+    max_shift = float(max(first.shape))
+    expected_shifts = np.clip(np.nan_to_num(expected - features, nan=0.0), -max_shift, max_shift)[:, ::-1]
     shifts = np.rint(expected_shifts / 2 ** (len(sizes) - 1)).astype(np.int64)
     for level in range(len(sizes) - 1, -1, -1):
         size = sizes[level]
         shifts, _ = matching.search_windows(
-            firsts[level], seconds[level], pixels >> level, shifts, size.template_half, size.window_half
+            first_levels[level], second_levels[level], pixels >> level, shifts, size.template_half, size.window_half
         )
         shifts = 2 * shifts if level else shifts
-    tracked, correlations = matching.refine_shifts(firsts[0], seconds[0], pixels, shifts, options.template_half_px)
+    tracked, correlations = matching.refine_shifts(
+        first_levels[0], second_levels[0], pixels, shifts, options.template_half_px
+    )
     accepted = correlations >= options.min_track_correlation
     if options.align:
         for k in np.flatnonzero(accepted):
-            match = align_track(firsts[0], seconds[0], pixels[k], tracked[k], options)
+            match = align_track(first_levels[0], second_levels[0], pixels[k], tracked[k], options)
             accepted[k] = match is not None
             tracked[k] = tracked[k] if match is None else match
     return Tracks(features, tracked, correlations, accepted)
@@ -144,7 +147,7 @@ def align_track(
     half = options.template_half_px
     row, column = pixel
     template = first[row - half : row + half + 1, column - half : column + half + 1]
-    match = register_template(template, second, match_pixel[::-1] - half, "stretch", limits=ALIGNMENT)
+    match = register_template(template, second, match_pixel[::-1] - half, "stretch", limits=ALIGNMENT_LIMITS)
     if match is None or match.score < options.min_aligned_correlation:
         return None
     return np.asarray(match.corner[::-1] + half)

@@ -12,6 +12,7 @@ from scipy import fft, ndimage
 from marsyard.algorithms.arrays import Raster, Vector2
 from marsyard.algorithms.image.kernels import correlation as kernels
 
+#: Row and column offsets of 3 x 3 pixels from the centre.
 _ROW, _COLUMN = np.mgrid[-1.0:2.0, -1.0:2.0]
 
 
@@ -36,7 +37,7 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
     """Fit a quadratic by least squares to the 3 x 3 values around the peak; return its maximum's offset (row, column).
 
     In pixels, clipped to [-1, 1]. Zero if the peak is on the border or the quadratic has no maximum. The bias towards
-    whole pixels is up to several hundredths of a pixel; `refine_shift` has no such bias.
+    whole pixels is up to 0.09 px; `refine_shift` has no such bias.
     """
     if peak.on_border:
         return np.zeros(2)
@@ -55,8 +56,8 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
 def peak_width(surface: Raster, peak: Peak, level: float = 0.75) -> float:
     """Full width of the peak at `level` times its height along its longest direction, in pixels.
 
-    This is the major axis of the ellipse with the second moments of the connected region above the level: 1.15 for a
-    sharp peak of one pixel, the length of a ridge, and the surface's diagonal without a positive peak.
+    The width is the major axis of the ellipse with the second moments of the connected region above that value. A sharp
+    peak of one pixel has 1.15, a ridge its length. Without a positive peak the surface's diagonal is returned.
     """
     if peak.value <= 0.0:
         return float(np.hypot(*surface.shape))
@@ -77,7 +78,7 @@ def second_peak(surface: Raster, peak: Peak, exclusion: float) -> float:
 
 
 def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]) -> Float[np.ndarray, "_ _"]:
-    """Sums of products of the template with the window at every position, by FFT.
+    """Sums of products of the template with the window at every position where the template fits, by FFT.
 
     The transform has the window's size: wrap-around affects only positions where the template does not fit.
     """
@@ -92,7 +93,7 @@ def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Ra
 
     A is the template and B a patch of the window, each minus its mean. Entry (i, j) belongs to the patch with its upper
     left pixel at (i, j) of the window; the shape is (rows - n + 1, columns - m + 1). Values lie in [-1, 1] and decrease
-    with a contrast difference, unlike normalised correlation. Zero if neither has contrast.
+    with a contrast difference, unlike normalised correlation. Zero if both patches are uniform.
     """
     scale = max(float(np.abs(template).max()), float(np.abs(window).max()))
     a = template - template.mean(dtype=np.float64)
@@ -102,7 +103,7 @@ def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Ra
     return np.asarray(kernels.pseudo_normalized(cross, b, template.shape, float(np.sum(a * a)), floor))
 
 
-#: Search radius around a candidate of the coarser level, pixels: one for its error, one for sampling.
+#: Search radius around a candidate of the coarser level, pixels: one pixel for its error and one for sampling.
 SEARCH_RADIUS_PX = 2
 
 
@@ -110,22 +111,23 @@ def normalized_correlation(template: Float[np.ndarray, "n m"], window: Raster) -
     """Normalised correlation ``sum(A B) / sqrt(sum(A A) sum(B B))`` (tracking paper, Eq. 11).
 
     A is the template and B a patch of the window, each minus its mean. Entry (i, j) belongs to the patch with its upper
-    left pixel at (i, j); the shape is (rows - n + 1, columns - m + 1). Values lie in [-1, 1]; zero if either is flat.
-    Accurate to about 1e-5: products are summed in float32. Raises ValueError if the template exceeds the window.
+    left pixel at (i, j); the shape is (rows - n + 1, columns - m + 1). Values lie in [-1, 1]; zero if A or B is
+    uniform. Errors are about 1e-5, because products are summed in float32. Raises ValueError if the template is larger
+    than the window.
     """
     _check_fit(template, window)
     a, max_abs_a = kernels.subtract_mean(np.ascontiguousarray(template, dtype=np.float32))
     b, max_abs_b = kernels.subtract_mean(np.ascontiguousarray(window, dtype=np.float32))
-    return np.asarray(kernels.surface(a, b, _flat_energy(template, max(max_abs_a, max_abs_b))))
+    return np.asarray(kernels.correlation_surface(a, b, _flat_energy(template, max(max_abs_a, max_abs_b))))
 
 
 def coarse_to_fine_peak(template: Float[np.ndarray, "n m"], window: Raster, levels: int, candidates: int) -> Peak:
-    """Find the maximum of `normalized_correlation`, first at reduced resolution.
+    """Find the maximum of `normalized_correlation` by a coarse-to-fine search (tracking paper, section 4.3.2).
 
     Template and window are halved `levels` times. The best local maxima of the coarsest correlation, at most
-    `candidates`, are refined level by level; the best one at full resolution is returned. With 0 levels the search is
-    exhaustive. (Rosenfeld & Vanderbrug 1977; tracking paper, 4.3.2.) Raises ValueError if the template is larger than
-    the window, or too small to be halved.
+    `candidates`, are refined level by level (Rosenfeld & Vanderbrug 1977). The best maximum at full resolution is
+    returned. With 0 levels the search is exhaustive. Raises ValueError if the template is larger than the window, or
+    too small to be halved.
     """
     if min(template.shape) >> levels < 2:
         raise ValueError(f"a template of {template.shape} pixels cannot be halved {levels} times: fewer than 2 remain")
@@ -138,10 +140,11 @@ def coarse_to_fine_peak(template: Float[np.ndarray, "n m"], window: Raster, leve
     values = surface[maxima[:, 0], maxima[:, 1]]
     order = np.argsort(-values, kind="stable")[: candidates if levels else 1]
     positions, values = maxima[order], values[order]
-    for small, large in reversed(pyramid[:-1]):
-        a, max_abs = kernels.subtract_mean(np.ascontiguousarray(small, dtype=np.float32))
-        b = np.ascontiguousarray(large, dtype=np.float32)
-        positions, values = kernels.search_near(a, b, 2 * positions, SEARCH_RADIUS_PX, _flat_energy(small, max_abs))
+    for level_template, level_window in reversed(pyramid[:-1]):
+        a, max_abs = kernels.subtract_mean(np.ascontiguousarray(level_template, dtype=np.float32))
+        b = np.ascontiguousarray(level_window, dtype=np.float32)
+        floor = _flat_energy(level_template, max_abs)
+        positions, values = kernels.search_near(a, b, 2 * positions, SEARCH_RADIUS_PX, floor)
     best = int(np.argmax(values))
     row, column = (int(i) for i in positions[best])
     last_corner = (window.shape[0] - template.shape[0], window.shape[1] - template.shape[1])
@@ -161,5 +164,5 @@ def _check_fit(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ 
 
 
 def _flat_energy(template: Float[np.ndarray, "_ _"], max_abs: float) -> float:
-    """Energy below which a patch is flat, for values up to `max_abs`."""
+    """Energy (sum of squares) below which a patch is uniform except for rounding errors, for values up to `max_abs`."""
     return kernels.FLAT_ENERGY * template.size * max_abs * max_abs

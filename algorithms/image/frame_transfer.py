@@ -3,13 +3,13 @@
 Without a shutter a charge packet collects light in every row that it passes. The packet of physical row r passes rows
 r+1 .. N-1 while the detector is cleared before the exposure (`clear_row_s` in each), and rows r-1 .. 0 during the
 readout (`transfer_row_s` in each). n physical rows are summed into a delivered row. They are assumed to be equally
-bright, x_R counts per second each. Averaged over the n packets, a delivered row R of M is (divided by n)
+bright, x_R counts per second each. The mean signal y_R of the n packets of delivered row R (of M rows) is
 
     y_R = (t + (n-1)/2 (a + b)) x_R + n a P_R + n b (T - P_R - x_R)
 
-with t the exposure time, a and b the transfer and clear times per row, P_R the sum of x over the rows before R, and T
-the sum over all rows. Within its delivered row a packet passes (n-1)/2 physical rows on average in each direction.
-For known T this is a linear recursion in P. T follows from P_M = T, which is linear in T.
+where t is the exposure time, a and b are the transfer and clear times per row, P_R is the sum of x over the delivered
+rows before R, and T the sum over all delivered rows. Within its delivered row a packet passes (n-1)/2 physical rows on
+average in each direction. For known T this is a linear recursion in P. T follows from P_M = T, which is linear in T.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from marsyard.sim.measurements import DetectorCalibration
 def remove_frame_transfer(signal: Raster, calibration: DetectorCalibration, rows_summed: int) -> Raster:
     """Compute the signal of the exposure alone, in the units of `signal`.
 
-    `signal` contains counts above the offset, all rows of any columns; `rows_summed` is the number of physical rows per
-    row. The inversion is exact for a static scene that is constant within each delivered row. Without frame transfer it
-    is the identity. Raises ValueError if the exposure is too short compared with the row times.
+    `signal` contains counts above the offset, all rows of one or more columns; `rows_summed` is the number of physical
+    rows per delivered row. The inversion is exact for a static scene that is constant within each delivered row; it is
+    the identity without frame transfer. Raises ValueError if the exposure is too short compared with the row times.
     """
     n, a, b = rows_summed, calibration.transfer_row_s, calibration.clear_row_s
     if a == 0.0 and b == 0.0:

@@ -1,4 +1,4 @@
-"""Interest operators: structure tensor and Harris interest."""
+"""Interest operators for the selection of templates and features: structure tensor and Harris interest."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from jaxtyping import Float
 def structure_tensor(
     image: Float[np.ndarray, "rows columns"], support: int
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
-    """Mean products of the image gradients over a square of `support` pixels around every pixel.
+    """Mean products of the image gradients over a square of side `support` (pixels) around every pixel.
 
     Returns the means of ``g_u g_u``, ``g_v g_v`` and ``g_u g_v`` in squared counts per squared pixel, each of shape
-    (rows, columns). The gradient is Sobel's, scaled so that a ramp of one count per pixel gives one. Borders reflect.
+    (rows, columns). The Sobel gradient is scaled to 1 for a ramp of one count per pixel; image borders are mirrored.
     """
     values = image.astype(np.float32, copy=False)
     gradient_u = cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
@@ -32,8 +32,8 @@ def harris_interest(
     """Harris interest from the entries of `structure_tensor`, in counts per pixel.
 
     This is Noble's form of the Harris operator, ``determinant / trace`` of the mean structure tensor, which has no free
-    constant. ``sqrt(2 determinant / trace)`` is the root mean square gradient per axis if the texture is isotropic; it
-    is near zero without texture or with texture in one direction only.
+    constant. The returned ``sqrt(2 determinant / trace)`` is the root mean square gradient per axis if the texture is
+    isotropic; it is near zero without texture or with texture in one direction only.
     """
     determinant = np.maximum(uu * vv - uv * uv, 0.0)
     trace = uu + vv
@@ -42,5 +42,5 @@ def harris_interest(
 
 
 def local_mean(image: Float[np.ndarray, "rows columns"], support: int) -> Float[np.ndarray, "rows columns"]:
-    """Mean over a square of `support` pixels around every pixel; borders reflect."""
+    """Mean over a square of side `support` (pixels) around every pixel; the image is mirrored at its borders."""
     return np.asarray(cv2.blur(image.astype(np.float32, copy=False), (support, support)))

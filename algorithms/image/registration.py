@@ -1,10 +1,10 @@
-"""Registration and resampling of templates by quintic splines, to hundredths of a pixel.
+"""Registration and resampling of templates by quintic splines, with errors of hundredths of a pixel.
 
 Surface fits to a correlation peak are biased towards whole pixels (up to about 0.09 px for the biquadratic). OpenCV's
 warps displace samples by up to 0.05 px. Gauss-Newton registration of images interpolated by a high-order spline has no
 such bias. A pure-shift model is biased by up to tenths of a pixel if the image is stretched relative to the template; a
-linear map removes this bias. A round surface seen from another height causes quadratic distortion; a quadratic map
-removes this bias.
+linear map removes this bias. A curved surface seen from another position is also distorted quadratically; a quadratic
+map removes the bias due to this distortion.
 """
 
 from __future__ import annotations
@@ -22,25 +22,26 @@ from marsyard.algorithms.image.kernels import quintic
 from marsyard.algorithms.image.kernels import registration as kernels
 
 ORDER: Final = 5
-#: Step length that ends the shift refinement; the next step is smaller by a factor of at least ten.
+#: Step length below which the shift refinement ends; the next step is smaller by a factor of at least ten.
 ALIGNMENT_TOLERANCE_PX = 1e-3
 #: Margin around a patch for its spline; pixels outside it change the result by less than 1e-4 px.
 MARGIN_PX = 12
+#: Positions of the six spline coefficients relative to a point's pixel; the B-spline and its derivative.
 _TAPS = np.arange(ORDER + 1) - ORDER // 2
 _BASIS = BSpline.basis_element(np.arange(ORDER + 2) - (ORDER + 1) / 2.0, extrapolate=False)
 _SLOPE = _BASIS.derivative()
 
 
 def spline_coefficients(image: Raster) -> Raster:
-    """Coefficients of the quintic spline through the image, mirrored at its outermost pixels."""
+    """Compute the coefficients of the quintic spline through the image, mirrored at its outermost pixels."""
     return np.asarray(ndimage.spline_filter(image, order=ORDER, output=np.float64, mode="mirror"))
 
 
 def shifted_patch(coefficients: Raster, corner: Vector2, shape: tuple[int, int]) -> Float[np.ndarray, "3 n m"]:
-    """Patch of `shape` with its upper left pixel at `corner` (row, column), and its derivatives by row and column.
+    """Sample a patch with its upper left pixel at `corner` (row, column), and its derivatives by row and column.
 
-    All pixels have the same fraction of the shift: the spline is a separable filter with six taps. The patch must be at
-    least three pixels inside the image.
+    All pixels have the same fractional shift, so that the spline is a separable filter with six taps. The patch must
+    have a distance of at least three pixels from the border of `coefficients`.
     """
     integer_part = np.floor(corner)
     tap_positions = (corner - integer_part)[:, np.newaxis] - _TAPS
@@ -55,11 +56,11 @@ def shifted_patch(coefficients: Raster, corner: Vector2, shape: tuple[int, int])
 def refine_shift(
     template: Float[np.ndarray, "n m"], window: Raster, corner: Vector2, iterations: int = 6, max_shift_px: float = 1.5
 ) -> Vector2 | None:
-    """Refine the corner (row, column) of a template in the window to hundredths of a pixel.
+    """Refine the position `corner` (row, column) of a template's upper left pixel in the window.
 
-    Minimises ``sum (A - gain B)^2`` over shift and gain by Gauss-Newton from `corner`; the means of A and B are
-    subtracted. None if it moves more than `max_shift_px` or within three pixels of the window's border, or if the
-    normal equations are singular.
+    Minimises ``sum (A - gain B)^2`` over shift and gain by Gauss-Newton. A is the template and B the window's patch,
+    each minus its mean. None if the position moves by more than `max_shift_px` or closer than three pixels to the
+    window's border, or if the normal equations are singular.
     """
     low = np.maximum(np.floor(corner).astype(int) - MARGIN_PX, 0)
     high = np.floor(corner).astype(int) + np.array(template.shape) + MARGIN_PX
@@ -91,19 +92,19 @@ def refine_shift(
 #: Model of the registration: shift; shift and linear map; shift, linear and quadratic map of the offsets.
 Warp = Literal["shift", "stretch", "bend"]
 _ORDERS: dict[Warp, int] = {"shift": 0, "stretch": 1, "bend": 2}
-#: Step length that ends the registration; the remaining error is less than 1e-3 px.
+#: Step length below which the registration ends; the remaining error is less than 1e-3 px.
 REGISTRATION_TOLERANCE_PX = 3e-3
 #: Minimum pivot of the normal equations with unit diagonal; below it the texture does not determine the unknowns.
-SINGULAR = 1e-4
+MIN_PIVOT = 1e-4
 
 
 @dataclass(frozen=True)
 class Limits:
     """Limits of a registration.
 
-    - shift_px: Largest displacement of the centre
+    - shift_px: Largest displacement of the template's centre from its start
     - stretch: Largest entry of the linear map minus the identity, and of the quadratic map at the template's border
-    - steps: Maximum number of steps; four to six are usual
+    - steps: Maximum number of steps (typical: four to six)
     """
 
     shift_px: float = 1.5
@@ -117,7 +118,7 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class Registration:
-    """Registered template: corner (row, column in the window) without the warp, and normalised correlation."""
+    """Registered template: position (row, column) of its upper left pixel without the warp; normalised correlation."""
 
     corner: Vector2
     score: float
@@ -153,7 +154,8 @@ def register_template(
     Minimises ``sum (B(c + M d + Q(d)) - gain A(d) - offset)^2`` over the centre c, gain, offset and, depending on
     `warp`, the matrix M (otherwise the identity) and the quadratic form Q (otherwise zero). A is the template at
     offsets d from its centre, B the window's quintic spline. Inverse compositional method (Baker & Matthews 2004). None
-    if it leaves the limits or the window, does not converge, or the texture does not determine the unknowns.
+    if the limits are exceeded, the template leaves the window, the iteration does not converge, or the texture does not
+    determine the unknowns.
     """
     half = 0.5 * (len(template) - 1)
     part = window if isinstance(window, SplinePart) else build_spline(window, corner, len(template))
@@ -161,7 +163,7 @@ def register_template(
     start = corner - low + half
     bounds = (limits.shift_px, limits.stretch, limits.steps)
     converged, row, column, score = kernels.register(
-        template, part.coefficients, start[0], start[1], _ORDERS[warp], bounds, REGISTRATION_TOLERANCE_PX, SINGULAR
+        template, part.coefficients, start[0], start[1], _ORDERS[warp], bounds, REGISTRATION_TOLERANCE_PX, MIN_PIVOT
     )
     return Registration(np.array([row, column]) - half + low, score) if converged else None
 
@@ -173,7 +175,7 @@ def similarity_patch(
 
     - image: Image, mirrored at its outermost pixels
     - centre: Column and row (u, v) of the square's centre, within the image
-    - magnification: Scale factor; without a low-pass filter, for factors down to about 0.7
+    - magnification: Scale factor, at least about 0.7, because no low-pass filter is applied
     - roll_rad: Rotation, clockwise in the image
 
     Raises ValueError if the centre is outside the image.

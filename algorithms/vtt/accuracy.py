@@ -1,4 +1,4 @@
-"""Approach accuracy (Eqs. 1 to 5 and Table I of the tracking paper), and the hand-off to the arm (sections 3 and 7.4).
+"""Approach accuracy (tracking paper: Eqs. 1 to 5 and Table I), and hand-off of the target to the arm (3 and 7.4).
 
 Errors are in metres. They are 3-sigma values if the disparity error is a 3-sigma value (paper: 1 pixel).
 """
@@ -24,7 +24,7 @@ NAVIGATION_ERROR = 0.02
 
 @dataclass(frozen=True)
 class StereoDesign:
-    """Parameters of a stereo pair: focal length, pixel pitch and baseline."""
+    """Design parameters of a stereo camera: name, focal length, pixel pitch and baseline."""
 
     name: str
     focal_length_m: float
@@ -37,18 +37,18 @@ class StereoDesign:
         return self.focal_length_m / self.pixel_m
 
 
-#: Cameras of section 4.2. The pixel pitch of the manufacturer's specification reproduces the printed digits of Table I.
+#: Cameras of section 4.2. With the manufacturer's pixel pitch the printed digits of Table I are reproduced.
 PANCAM = StereoDesign("Pancam", 16e-3, 4.65e-6, 0.30)
 NAVCAM = StereoDesign("Navcam", 6e-3, 4.65e-6, 0.20)
 
 
 def stereo_range_error_m(range_m: float, focal_px: float, baseline_m: float, disparity_error_px: float = 1.0) -> float:
-    """Range error of stereo, Eq. 1: ``R^2 / (f_p B) * disparity error``."""
+    """Stereo range error, Eq. 1: ``R^2 / (f_p B) * disparity error``, with f_p the focal length and B the baseline."""
     return range_m * range_m / (focal_px * baseline_m) * disparity_error_px
 
 
 def drift_error_m(range_m: float, focal_px: float, drift_px: float) -> float:
-    """Error perpendicular to the line of sight of a point that drifted in the image, Eq. 4."""
+    """Error perpendicular to the line of sight, caused by a drift of the tracked point in the image, Eq. 4."""
     return range_m / focal_px * drift_px
 
 
@@ -71,9 +71,9 @@ class AccuracyRow:
 
     - name: Camera
     - designation_cm: Stereo range error at 10 m
-    - untracked_cm: Approach error at 2 m after 8 m with visual odometry, without tracker
+    - untracked_cm: Approach error at 2 m after a drive of 8 m with visual odometry and without tracker
     - stereo_cm: Stereo range error at 2 m: the first term of the last column
-    - drift_cm_px: Cross-range error per pixel of drift at 2 m: the factor of N in the last column
+    - drift_cm_px: Error per pixel of drift at 2 m: the factor of N in the last column
     """
 
     name: str
@@ -83,7 +83,7 @@ class AccuracyRow:
     drift_cm_px: float
 
     def tracked_cm(self, drift_px: float) -> float:
-        """Evaluate the last column for a drift in pixels."""
+        """Evaluate the last column (approach error with tracker, cm) for a drift in pixels."""
         return tracked_approach_error_m(self.stereo_cm, self.drift_cm_px * drift_px)
 
     @property
@@ -115,7 +115,7 @@ def table_1() -> tuple[AccuracyRow, AccuracyRow]:
 
 
 class HandOffOutcome(Enum):
-    """Result of a hand-off. All members except HANDED_OVER are expected failures: the arm receives no target."""
+    """Outcome of a hand-off. All members except HANDED_OVER are expected failures: the arm receives no target."""
 
     HANDED_OVER = "the arm has received the target"
     NOT_TRACKED = "the target is not tracked"
@@ -124,7 +124,7 @@ class HandOffOutcome(Enum):
 
 @dataclass(frozen=True)
 class ArmTarget:
-    """Target for the arm: position in the rover frame, metres, and its 3 sigma error by Eq. 5."""
+    """Target for the arm: position in the rover frame and its 3-sigma error (Eq. 5), metres."""
 
     position_rover: Float[np.ndarray, "3"]
     error_m: float
@@ -132,7 +132,7 @@ class ArmTarget:
 
 @dataclass(frozen=True)
 class HandOff:
-    """Outcome of a hand-off, and the target if it was handed over."""
+    """Outcome of a hand-off, and the target; None if it was not handed over."""
 
     outcome: HandOffOutcome
     target: ArmTarget | None
@@ -140,13 +140,13 @@ class HandOff:
 
 @dataclass(frozen=True)
 class GoalCriterion:
-    """Criterion for reaching the goal: the target's horizontal distance from the rover's origin."""
+    """Goal of an approach: horizontal distance of the target from the rover's origin, and tolerance, metres."""
 
     distance_m: float
     tolerance_m: float
 
     def is_met(self, position_rover: Float[np.ndarray, "3"]) -> bool:
-        """Whether a target at this position has the commanded distance, within the tolerance."""
+        """Whether a target at this position is at the commanded distance, within the tolerance."""
         return abs(float(np.hypot(position_rover[0], position_rover[1])) - self.distance_m) <= self.tolerance_m
 
 

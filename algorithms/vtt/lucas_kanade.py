@@ -1,4 +1,4 @@
-"""Baseline for the target tracker: OpenCV's pyramidal Lucas-Kanade as its matcher."""
+"""Baseline target tracker: `VisualTargetTracker` with OpenCV's pyramidal Lucas-Kanade method as matcher."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker
 from marsyard.sim.measurements import MastImage
 
-#: Pyramid levels below full resolution: with windows of 21 px the search range is about that of the search window.
+#: Pyramid levels below full resolution; with templates of 21 px the search range is about that of the correlation.
 LEVELS = 3
 #: Normalisation to the 8-bit images of OpenCV: standard deviation and mean, grey levels.
 SIGMA_GREY, MEAN_GREY = 40.0, 128.0
@@ -20,9 +20,9 @@ SIGMA_GREY, MEAN_GREY = 40.0, 128.0
 def match_by_lucas_kanade(
     sighting: Sighting, image: MastImage, predicted: Float[np.ndarray, "2"], change: ViewChange, options: VttOptions
 ) -> Match | None:
-    """Compute the optical flow of the target from the old image, magnified and rolled, to the new one; a `Matcher`.
+    """Match the target by its optical flow from the old image, magnified and rolled, to the new image; a `Matcher`.
 
-    The score is the normalised correlation at the match, 0 if the flow does not converge inside the window.
+    The score is the normalised correlation at the match; 0 if the flow does not converge or leaves the image.
     """
     window, corner = search_window(image, predicted, options.search_px)
     if min(window.shape) < options.template_px:
@@ -31,7 +31,7 @@ def match_by_lucas_kanade(
     old_patch = extract_patch(sighting.image, sighting.pixel, side, change)
     half, centre = (options.template_px - 1) // 2, (side - 1) // 2
     template = old_patch[centre - half : centre + half + 1, centre - half : centre + half + 1]
-    # OpenCV requires images of equal size: pad a window that is clipped at the frame's border
+    # OpenCV requires images of equal size: pad a window that was clipped at the frame's border
     rows, columns = window.shape
     new_patch = np.pad(window.astype(np.float64), ((0, side - rows), (0, side - columns)), mode="edge")
     start_point = np.full((1, 1, 2), centre, dtype=np.float32)
@@ -65,5 +65,5 @@ def _normalize_to_8_bits(image: Float[np.ndarray, "rows columns"]) -> UInt8[np.n
 
 
 def lucas_kanade_tracker(options: VttOptions | None = None) -> VisualTargetTracker:
-    """Create the target tracker with this matcher; options of the correlation search have no effect."""
+    """Create a target tracker that matches by Lucas-Kanade; options of the correlation search have no effect."""
     return VisualTargetTracker(options, match_by_lucas_kanade)

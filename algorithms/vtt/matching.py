@@ -1,4 +1,4 @@
-"""Prediction of the target, magnification and roll (4.1, 4.3.1); template extraction and matching (4.3.2, 4.3.3)."""
+"""Target tracker: prediction of position, magnification and roll (sections 4.1, 4.3.1); matching (4.3.2, 4.3.3)."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from marsyard.sim.measurements import MastImage, RoverTarget, SiteTarget
 
 @dataclass(frozen=True)
 class Sighting:
-    """Images and poses of the last stop with a match, the reference for the next update.
+    """Image and poses of the last stop with a match: the reference for the next update.
 
-    The template is resampled from the image when magnification and roll are known: a single interpolation, at the
-    target's sub-pixel position.
+    At the next update the template is resampled from this image with magnification and roll, in a single interpolation
+    at the target's sub-pixel position.
 
     - image: The left image
     - pixel: The target in the left image, full-frame (u, v)
@@ -53,7 +53,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class ViewChange:
-    """Change of the target's appearance since the last match: magnification, and clockwise roll."""
+    """Change of the target's image since the last match: magnification (Eq. 6), and clockwise roll (Eq. 10)."""
 
     magnification: float = 1.0
     roll_rad: float = 0.0
@@ -64,7 +64,7 @@ class Match:
     """The target in the new left image.
 
     - pixel: Full-frame (u, v)
-    - score: Normalised correlation (Eq. 11) of the template with the image there
+    - score: Normalised correlation (Eq. 11) of the template with the image at `pixel`
     - template: The old image around the target, magnified and rolled
     """
 
@@ -83,17 +83,20 @@ def extract_patch(
     image: MastImage, pixel: Vector2, side: int, change: ViewChange | None = None
 ) -> Float[np.ndarray, "side side"]:
     """Resample a square around a full-frame pixel (sub-pixel position), magnified and rolled by `change`."""
-    used = ViewChange() if change is None else change
-    # convert only the patch's diagonal and the spline's margin to floating point
-    half = int(np.ceil(0.75 * side / min(used.magnification, 1.0))) + MARGIN_PX + 1
+    change = ViewChange() if change is None else change
+    # convert only the pixels within half of the patch's diagonal, and the spline's margin, to floating point
+    half = int(np.ceil(0.75 * side / min(change.magnification, 1.0))) + MARGIN_PX + 1
     centre = pixel - np.array(image.corner, dtype=np.float64)
     start = np.maximum(np.floor(centre).astype(int) - half, 0)
     region = image.counts[start[1] : max(int(centre[1]) + half, 1), start[0] : max(int(centre[0]) + half, 1)]
-    return similarity_patch(region.astype(np.float64), centre - start, side, used.magnification, used.roll_rad)
+    return similarity_patch(region.astype(np.float64), centre - start, side, change.magnification, change.roll_rad)
 
 
 def search_window(image: MastImage, pixel: Vector2, side: int) -> tuple[Counts, tuple[int, int]]:
-    """Square of `side` pixels around a full-frame pixel, clipped to the image, and its corner in the frame."""
+    """Extract a square of `side` pixels around a full-frame pixel, clipped to the image.
+
+    Also returns the full-frame pixel (u, v) of its upper left corner.
+    """
     start = np.rint(pixel - 0.5 * (side - 1)).astype(int) - np.array(image.corner)
     end = np.maximum(start + side, 0)
     start = np.maximum(start, 0)
@@ -113,7 +116,7 @@ def window_fits(image: MastImage, pixel: Vector2, side: int) -> bool:
 class Refinement:
     """Sub-pixel match.
 
-    - corner: Row and column of the template's upper left pixel in the image's counts
+    - corner: Row and column of the template's upper left pixel in `MastImage.counts`
     - score: Normalised correlation of the shifted template
     - warped_score: Normalised correlation of the warped template
     """
@@ -128,8 +131,8 @@ def refine_match(
 ) -> Refinement:
     """Refine a match by registration: a pure shift, then the affine and quadratic warps that the options select.
 
-    `corner` is that of the integer peak. `offset` is the sub-pixel offset of the peak fit, the result if registration
-    fails. If a warp is not determined by the texture, the result of the previous model is returned.
+    `corner` is the match at the integer peak, `offset` the sub-pixel offset from the peak fit. If the shift cannot be
+    registered, `corner + offset` is returned; if a warp cannot, the result of the previous model.
     """
     start = np.maximum(corner.astype(int) - MARGIN_PX - 2, 0)
     end = corner.astype(int) + len(template) + MARGIN_PX + 2
@@ -172,21 +175,21 @@ def match_by_correlation(
 
 
 def designated_position_world(target: RoverTarget | SiteTarget, world_from_rover: RigidTransform) -> Vector3:
-    """World position of a target designated by position; `world_from_rover` is the pose at designation."""
+    """Convert a target designated by position to world coordinates; `world_from_rover` is the pose at designation."""
     if isinstance(target, RoverTarget):
         return np.asarray(world_from_rover.apply(target.position_rover.copy()))
     return np.asarray(SITE_FROM_WORLD.inv().apply(target.position_site.copy()))
 
 
 def pose_change(old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform) -> RigidTransform:
-    """Transform from the old frame to the new frame."""
+    """Transform from a moving frame at its old pose to the same frame at its new pose."""
     return compose(new_world_from_frame.inv(), old_world_from_frame)
 
 
 def predicted_position(
     position: Vector3, old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform
 ) -> Vector3:
-    """Position of a static point in a moving frame (rover or mast head), from its old position in that frame."""
+    """Predict the position of a static point in a moving frame (rover or mast head) from its old position."""
     return np.asarray(pose_change(old_world_from_frame, new_world_from_frame).apply(position.copy()))
 
 
@@ -204,10 +207,10 @@ def magnification(old_position: Vector3, old_centre: Vector3, new_position: Vect
 
 
 def horizontal_axis(camera: CameraModel) -> Vector3:
-    """Unit vector Hx along the image's x axis, Eqs. 7 to 9; A and H need not be perpendicular."""
-    hs = np.linalg.norm(np.cross(camera.a, camera.h))
-    hc = camera.a @ camera.h
-    return np.asarray((camera.h - hc * camera.a) / hs)
+    """Unit vector Hx along the image's x axis, Eqs. 7 to 9; A and H of the camera model may not be perpendicular."""
+    h_s = np.linalg.norm(np.cross(camera.a, camera.h))
+    h_c = camera.a @ camera.h
+    return np.asarray((camera.h - h_c * camera.a) / h_s)
 
 
 def roll_points(
@@ -217,10 +220,10 @@ def roll_points(
     new_from_old: RigidTransform,
     offset_m: float,
 ) -> Float[np.ndarray, "2 2"] | None:
-    """Pixels (u, v) in the new image of the target and of an auxiliary point, which define the roll (before Eq. 10).
+    """Project the target and an auxiliary point to pixels (u, v) of the new image; their direction defines the roll.
 
-    The auxiliary point is at a distance `offset_m` (k in the paper) along the old image's x axis. Each camera is in the
-    frame of its stop. None if the new camera cannot image one of the points.
+    The auxiliary point has a distance of `offset_m` (k in the paper, before Eq. 10) from the target along the old
+    image's x axis. Each camera is in the frame of its stop. None if the new camera cannot image one of the points.
     """
     points = np.stack([old_position, old_position + offset_m * horizontal_axis(old_camera)])
     pixels, visible = new_camera.project(np.asarray(new_from_old.apply(points)))
@@ -228,6 +231,6 @@ def roll_points(
 
 
 def roll_angle(reference_px: Float[np.ndarray, "2 2"]) -> float:
-    """Clockwise roll of the target's image, radians, from `roll_points`: Eq. 10 and the text after it."""
+    """Clockwise roll of the target's image, radians, from the pixels of `roll_points` (Eq. 10 and following text)."""
     delta_u, delta_v = reference_px[1] - reference_px[0]
     return float(np.arctan2(delta_v, delta_u))

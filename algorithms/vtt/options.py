@@ -17,32 +17,32 @@ class VttOptions:
     - search_px: Side of the search window, full-frame pixels (paper: 161; 200 and 600 in section 5.2)
     - scale, roll: Whether the template is magnified (Eq. 6) and rolled (Eqs. 7 to 10) before it is matched. Without
       both this is the paper's pure NCC.
-    - roll_lever_m: Distance k of the hypothetical point next to the target (paper: 5 cm, "arbitrary, small")
+    - roll_lever_m: Distance k of the auxiliary point from the target, for the roll (paper: 5 cm, "arbitrary, small")
     - coarse_levels: Number of pyramid levels below full resolution; 0 searches all positions at full resolution
     - coarse_candidates: Number of local maxima of the coarse correlation that are refined at full resolution
     - subpixel: Whether the left and right matches are refined to sub-pixel accuracy (not specified in the paper). The
-      error of one step is magnified by the following steps: 16 steps from 10 m to 2 m turn 0.3 px, the error of whole
-      pixels, into 3 px.
+      following steps magnify the error of a step: with whole pixels, whose error is 0.3 px, 16 steps from 10 m to 2 m
+      cause an error of 3 px.
     - warp: Model of the refinement: a shift (``shift``), also an affine distortion (``stretch``), or also a quadratic
-      distortion (``bend``). The paper's tracker used none. The approach to a slanted surface causes an affine
-      distortion, to a round one a quadratic distortion. A simpler model has the same bias at each step (docs/adr/0010).
-      The score is that of the shifted template.
+      distortion (``bend``). The paper's tracker had no warp. In an approach, a slanted surface is distorted affinely
+      and a round surface also quadratically. A simpler model has the same bias at each step (docs/adr/0010). The match
+      score is that of the shifted template.
     - epipolar_tolerance_px: Search range perpendicular to the epipolar curve of the right image (paper: 2, default)
     - stereo_search_fraction: Range of searched disparities around the prediction, as a fraction of `search_px` (paper:
       one half)
     - seed_range_m: Smallest and largest range of a target designated by a pixel, for its first stereo search
-    - aim_pair: Whether the mast centres the target between the two cameras instead of in the left one (as in the
-      paper). The disparity of a pancam at 2 m is 512 px: a target centred in the left image is outside the right one.
+    - aim_pair: Whether the mast centres the target between the two images instead of in the left image (as in the
+      paper). A pancam has a disparity of 512 px at 2 m: a target centred in the left image is outside the right image.
     - min_match_score, min_stereo_score: Minimum NCC of the template match and of the stereo match (paper: 0.7, "set
       empirically")
     - stereo_disparity_error_px: 3-sigma disparity error in the tolerances (paper: 1 pixel)
     - pose_error: Error of the estimated position in the tolerances, as a fraction of the distance driven. 0.2 covers
-      20 % wheel slip, typical of gentle slopes. Visual odometry requires less (paper: "roughly 2%"), steep ground
-      without it more, up to 1.
+      20 % wheel slip, typical of gentle slopes. With visual odometry a smaller value is sufficient (paper: "roughly
+      2%"); on steep ground without visual odometry up to 1 is required.
     - direction_error_rad: Error of the direction to the target, from attitude and mast, in the tolerance of the
-      position: 1.7 deg
-    - min_tolerance_m: Part of both tolerances that does not depend on distance: terrain relief seen by a drifted
-      match, and mast pointing
+      position (default 1.7 deg)
+    - min_tolerance_m: Part of both tolerances that does not depend on distance: terrain relief around a drifted match,
+      and mast pointing errors
     - max_lost_updates: Consecutive updates after a loss in which the target can be recovered (paper: N, default 2)
     """
 
@@ -89,7 +89,7 @@ class VttOptions:
 
     @property
     def disparity_search_px(self) -> float:
-        """Disparities searched on each side of the predicted one, pixels."""
+        """Range of disparities searched on each side of the predicted disparity, pixels."""
         return 0.5 * self.stereo_search_fraction * self.search_px
 
 

@@ -1,7 +1,7 @@
-"""Mast pointing at the target (section 4.1, action 2).
+"""Mast angles and image regions that point the mast cameras at the target (section 4.1, action 2).
 
-The mast turns in azimuth and elevation only. Both angles are computed from the calibrated camera models, including lens
-distortion, and the mast's geometry, by Newton's method on the target's pixel.
+The mast rotates in azimuth and elevation only. Newton's method determines both angles for which the target's pixel is
+at the image centre, with the calibrated camera models (including lens distortion) and the mast's geometry.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget
 
-#: Maximum number of Newton steps, and the error below which a step is the last one (quadratic convergence).
+#: Maximum number of Newton steps, and the pixel error below which only one more step is made (quadratic convergence).
 STEPS, TOLERANCE_PX = 12, 1e-2
-#: Prevents rounding errors from moving a border that lies on a whole pixel.
-_SLACK_PX = 1e-6
+#: Tolerance of region borders, so that rounding errors do not move a border that lies on a whole pixel.
+_BORDER_TOLERANCE_PX = 1e-6
 
 
 def mast_angles(position_rover: Vector3, mast: MastCalibration, use_both: bool = False) -> tuple[float, float] | None:
-    """Compute azimuth and elevation that centre a point in the left image.
+    """Compute azimuth and elevation (radians) of the mast that centre a point in the left image.
 
-    With `use_both`, its pixels in both images have opposite offsets from the image centres: a near target stays
-    in both. None if there is no solution within the mast's limits.
+    With `use_both`, the mean of the point's offsets from both image centres is zero, so that both images show a near
+    target. None if there is no solution within the mast's limits.
     """
     cameras = (mast.left, mast.right) if use_both else (mast.left,)
     min_azimuth, max_azimuth = mast.geometry.azimuth_limits_rad
@@ -37,7 +37,7 @@ def mast_angles(position_rover: Vector3, mast: MastCalibration, use_both: bool =
     x, y, z = position_rover - mast.geometry.base_m - np.array([0.0, 0.0, mast.geometry.elbow_m[2]])
     angles = np.array([np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y))])
     for _ in range(STEPS):
-        offset, jacobian = _offset(position_rover, mast.geometry, cameras, angles)
+        offset, jacobian = _compute_offset(position_rover, mast.geometry, cameras, angles)
         if not np.all(np.isfinite(jacobian)) or abs(np.linalg.det(jacobian)) < 1e-9:
             return None
         angles = angles - np.linalg.solve(jacobian, offset)
@@ -48,10 +48,10 @@ def mast_angles(position_rover: Vector3, mast: MastCalibration, use_both: bool =
     return None
 
 
-def _offset(
+def _compute_offset(
     position_rover: Vector3, mast: MastGeometry, cameras: tuple[CameraModel, ...], angles: Vector2
 ) -> tuple[Vector2, Float[np.ndarray, "2 2"]]:
-    """Mean offset of the point's pixels from the image centres, and its Jacobian by azimuth and elevation.
+    """Compute the mean offset of the point's pixels from the image centres, and its Jacobian by azimuth and elevation.
 
     If the head rotates about an axis w through a, a point p fixed to the rover moves by -w x (p - a) in the head frame.
     """
@@ -61,10 +61,10 @@ def _offset(
     left_direction = np.array([sine, cosine, 0.0])
     elbow = mast.base_m + np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ mast.elbow_m
     axes = ((np.array([0.0, 0.0, -1.0]), mast.base_m), (-left_direction, elbow))
-    motion = np.stack([-to_head @ np.cross(axis, position_rover - point) for axis, point in axes], axis=-1)
-    point = rover_from_head.inv().apply(position_rover.copy())
-    offsets = [camera.project(point)[0] - image_centre(camera) for camera in cameras]
-    jacobians = [camera.projection_jacobian(point) @ motion for camera in cameras]
+    derivatives = np.stack([-to_head @ np.cross(axis, position_rover - origin) for axis, origin in axes], axis=-1)
+    position_head = rover_from_head.inv().apply(position_rover.copy())
+    offsets = [camera.project(position_head)[0] - image_centre(camera) for camera in cameras]
+    jacobians = [camera.projection_jacobian(position_head) @ derivatives for camera in cameras]
     return np.mean(offsets, axis=0), np.mean(jacobians, axis=0)
 
 
@@ -74,12 +74,12 @@ def image_centre(camera: CameraModel) -> Vector2:
 
 
 def bounding_box(pixels: Points2, margin_px: float, camera: CameraModel, horizontal_px: float = 0.0) -> PixelBox | None:
-    """Bounding box of pixels with a margin, and `horizontal_px` more horizontally; None if a pixel is out of frame."""
+    """Bounding box of pixels with a margin, in columns plus `horizontal_px`; None if a pixel is out of frame."""
     if not bool(np.all(camera.in_frame(pixels))):
         return None
     margin = margin_px + np.array([horizontal_px, 0.0])
-    start = np.maximum(np.floor(pixels.min(axis=0) - margin + _SLACK_PX).astype(int), 0)
-    end = np.minimum(np.ceil(pixels.max(axis=0) + margin - _SLACK_PX).astype(int) + 1, camera.size)
+    start = np.maximum(np.floor(pixels.min(axis=0) - margin + _BORDER_TOLERANCE_PX).astype(int), 0)
+    end = np.minimum(np.ceil(pixels.max(axis=0) + margin - _BORDER_TOLERANCE_PX).astype(int) + 1, camera.size)
     return PixelBox((int(start[0]), int(start[1])), (int(end[0] - start[0]), int(end[1] - start[1])))
 
 
@@ -102,7 +102,7 @@ def aim_at_position(position_rover: Vector3, mast: MastCalibration, options: Vtt
 
 
 def aim_at_pixel(target: PixelTarget, mast: MastCalibration, options: VttOptions) -> MastAim | None:
-    """Compute the mast aim for a designated pixel; the right image region covers all ranges in `seed_range_m`."""
+    """Compute the mast aim for a designated pixel, or None; the right region covers all ranges in `seed_range_m`."""
     margin = 0.5 * options.search_px + MARGIN_PX
     box = bounding_box(target.pixel[None], margin, mast.left)
     curve = epipolar_pixels(mast.left.rays(target.pixel), mast.left, mast.right, options.seed_range_m)

@@ -1,4 +1,4 @@
-"""Point stereo along the epipolar curve, and triangulation (section 4.4)."""
+"""Point stereo: match of one point along the epipolar curve of the right image, and triangulation (section 4.4)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class StereoMatch:
     """The target in the right image.
 
     - pixel: (u, v) in the right full frame
-    - score: Normalised correlation of the warped template. A slanted face is stretched in the right image. At 63 to 76
-      deg the correlation at the correct position is 0.66 to 0.70 without the warp, and above 0.9 with it.
+    - score: Normalised correlation of the warped template. A slanted face is stretched in the right image. At slants of
+      63 to 76 deg the correlation at the correct position is 0.66 to 0.70 without the warp, and above 0.9 with it.
     - band: The searched part of the right image, counts
     - band_corner: (u, v) of the band's upper left pixel in the full frame
     """
@@ -38,10 +38,10 @@ Sight = tuple[Vector3, Vector3]
 
 
 def epipolar_pixels(sight: Sight, left: CameraModel, right: CameraModel, ranges_m: tuple[float, float]) -> Points2:
-    """Right pixels of the points along a left pixel's line of sight, from far to near; both cameras in one frame.
+    """Project points along a left pixel's line of sight to the right image, from far to near: the epipolar curve.
 
-    The points have a spacing of about half a pixel of disparity; those invisible to the right camera are omitted. With
-    lens distortion the curve is not straight.
+    The points have a spacing of about half a pixel of disparity; points invisible to the right camera are omitted. Both
+    cameras are in one frame. With lens distortion the curve is not straight.
     """
     origin, direction = sight
     max_inverse, min_inverse = (1.0 / ranges_m[0], 1.0 / ranges_m[1])
@@ -53,7 +53,7 @@ def epipolar_pixels(sight: Sight, left: CameraModel, right: CameraModel, ranges_
 
 @lru_cache(maxsize=32)
 def disparity_px_m(left: CameraModel, right: CameraModel) -> float:
-    """Focal length times baseline, which equals disparity times range, pixels times metres. Cached."""
+    """Focal length times baseline, which equals disparity times range, in pixels times metres."""
     return right.focal_lengths[0] * float(np.linalg.norm(right.c - left.c))
 
 
@@ -69,20 +69,20 @@ def point_stereo(
 ) -> StereoMatch | None:
     """Match the left template near the epipolar `curve` (full-frame pixels) of the right image; None if none fits."""
     half, tolerance = (len(template) - 1) // 2, options.epipolar_tolerance_px
-    local = curve - np.array(image.corner, dtype=np.float64)
+    curve_px = curve - np.array(image.corner, dtype=np.float64)
     rows, columns = image.counts.shape
-    local = local[(local[:, 0] > half - 1.0) & (local[:, 0] < columns - half)]
-    if len(local) == 0:
+    curve_px = curve_px[(curve_px[:, 0] > half - 1.0) & (curve_px[:, 0] < columns - half)]
+    if len(curve_px) == 0:
         return None
     half_height = half + int(np.ceil(tolerance))
-    start = np.maximum(np.ceil(local.min(axis=0)).astype(int) - np.array([half, half_height]), 0)
-    end = np.minimum(np.floor(local.max(axis=0)).astype(int) + np.array([half, half_height]) + 1, [columns, rows])
+    start = np.maximum(np.ceil(curve_px.min(axis=0)).astype(int) - np.array([half, half_height]), 0)
+    end = np.minimum(np.floor(curve_px.max(axis=0)).astype(int) + np.array([half, half_height]) + 1, [columns, rows])
     if np.any(end - start < len(template)):
         return None
     band = image.counts[start[1] : end[1], start[0] : end[0]].astype(np.float64)
     surface = normalized_correlation(template, band)
     # accept only positions within the tolerance above or below the curve
-    columns_px, rows_px = (local[np.argsort(local[:, 0])] - start - half).T
+    columns_px, rows_px = (curve_px[np.argsort(curve_px[:, 0])] - start - half).T
     curve_rows = np.interp(np.arange(surface.shape[1]), columns_px, rows_px)
     peak = highest_peak(np.where(np.abs(np.arange(surface.shape[0])[:, None] - curve_rows) > tolerance, -1.0, surface))
     corner = start[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
@@ -98,22 +98,22 @@ def point_stereo(
 
 
 def triangulate(left: CameraModel, right: CameraModel, left_pixel: Vector2, right_pixel: Vector2) -> Vector3 | None:
-    """Triangulate the lines of sight of two pixels by `nearest_point`."""
+    """Triangulate a left and a right pixel: `nearest_point` of their lines of sight."""
     return nearest_point(left.rays(left_pixel), right.rays(right_pixel))
 
 
 def nearest_point(left: Sight, right: Sight) -> Vector3 | None:
     """Midpoint of the shortest segment between two lines of sight, in their frame, metres.
 
-    None if they are parallel or the segment is behind a camera.
+    None if they are parallel or an end of the segment is behind its camera.
     """
-    (a, d), (b, e) = left, right
-    offset, cosine = b - a, float(d @ e)
+    (left_origin, left_ray), (right_origin, right_ray) = left, right
+    offset, cosine = right_origin - left_origin, float(left_ray @ right_ray)
     determinant = 1.0 - cosine * cosine
     if not determinant > 1e-14:
         return None
-    left_range_m = float(offset @ (d - cosine * e)) / determinant
-    right_range_m = float(offset @ (cosine * d - e)) / determinant
+    left_range_m = float(offset @ (left_ray - cosine * right_ray)) / determinant
+    right_range_m = float(offset @ (cosine * left_ray - right_ray)) / determinant
     if not (left_range_m > 0.0 and right_range_m > 0.0):
         return None
-    return np.asarray(0.5 * (a + left_range_m * d + b + right_range_m * e))
+    return np.asarray(0.5 * (left_origin + left_range_m * left_ray + right_origin + right_range_m * right_ray))

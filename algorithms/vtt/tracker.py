@@ -1,7 +1,7 @@
-"""Visual target tracker: the loop of section 4.1, its states, and the loss criteria.
+"""Visual target tracker: the tracking loop of section 4.1, its states, and the loss criteria.
 
-The steps are functions in `pointing`, `matching`, `stereo` and `accuracy`. The state of a track is an immutable
-`Track`; the tracker stores the latest one.
+The steps of the loop are functions in `pointing`, `matching`, `stereo` and `accuracy`. The tracker stores its state in
+an immutable `Track` and replaces it in each update. The "seed" is the first update, which extracts the first template.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasure
 
 @dataclass(frozen=True)
 class Journey:
-    """Distances that determine the tolerances.
+    """Distances that determine the tolerances of an update.
 
-    - seed_m, last_m, now_m: Distance from the camera to the target at the seed, at the last match, and now
-    - step_m, driven_m: Rover motion since the last match, and path length since the seed
+    - seed_m, last_m, now_m: Distance from the camera to the target at the seed, at the last match, and in this update
+    - step_m, driven_m: Rover displacement since the last match, and path length since the seed
     """
 
     seed_m: float
@@ -49,24 +49,24 @@ class Journey:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Maximum accepted corrections: of the target's distance, and of its position since the seed."""
+    """Maximum accepted corrections (see `Evidence`): of the target's distance and of its position, metres."""
 
     distance_m: float
     position_m: float
 
 
 def tolerances(journey: Journey, left: CameraModel, right: CameraModel, options: VttOptions) -> Tolerances:
-    """Compute the tolerances of Fig. 5 for this update: a floor plus the root sum square of the errors."""
-    scale = disparity_px_m(left, right)
+    """Compute the tolerances of Fig. 5 for this update: a minimum plus the root sum square of the errors."""
+    focal_times_baseline = disparity_px_m(left, right)
 
-    def tolerance(reference_m: float, motion_m: float, lateral_m: float) -> float:
+    def compute_tolerance(reference_m: float, motion_m: float, lateral_m: float) -> float:
         error_px = options.stereo_disparity_error_px
-        errors_m = [stereo_range_error_m(m, scale, 1.0, error_px) for m in (reference_m, journey.now_m)]
+        errors_m = [stereo_range_error_m(m, focal_times_baseline, 1.0, error_px) for m in (reference_m, journey.now_m)]
         return options.min_tolerance_m + math.hypot(*errors_m, options.pose_error * motion_m, lateral_m)
 
     return Tolerances(
-        distance_m=tolerance(journey.last_m, journey.step_m, 0.0),
-        position_m=tolerance(journey.seed_m, journey.driven_m, options.direction_error_rad * journey.now_m),
+        distance_m=compute_tolerance(journey.last_m, journey.step_m, 0.0),
+        position_m=compute_tolerance(journey.seed_m, journey.driven_m, options.direction_error_rad * journey.now_m),
     )
 
 
@@ -86,7 +86,7 @@ class Evidence:
 
 
 def find_losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) -> tuple[TargetLoss, ...]:
-    """Return the loss criteria that are met."""
+    """Return the reasons for a loss: low scores, or corrections above their tolerances."""
     criteria = {
         TargetLoss.LOW_MATCH_SCORE: evidence.match_score < options.min_match_score,
         TargetLoss.LOW_STEREO_SCORE: evidence.stereo_score < options.min_stereo_score,
@@ -97,9 +97,10 @@ def find_losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) ->
 
 
 def next_state(state: TrackingState, lost_updates: int, found: bool, limit: int) -> tuple[TrackingState, int]:
-    """State after an update, and number of updates since the loss (Fig. 6).
+    """Return the state after an update, and the number of updates since the loss (Fig. 6).
 
-    After a loss the state is LOST. Up to `limit` further updates can recover the target; then FAILURE is final.
+    `found`: whether the update matched the target. After a loss the state is LOST. Up to `limit` further updates can
+    recover the target; afterwards the state is FAILURE until the target is cleared.
     """
     if state in (TrackingState.FAILURE, TrackingState.NO_TARGET):
         return state, lost_updates
@@ -113,21 +114,21 @@ def next_state(state: TrackingState, lost_updates: int, found: bool, limit: int)
 
 @dataclass(frozen=True)
 class VttDetails:
-    """Intermediate products of one update, shown in the paper's Figs. 15 and 17 and Table III.
+    """Intermediate products of one update (paper: Figs. 15 and 17, Table III), returned as `TargetUpdate.details`.
 
-    - seeded: Whether this update extracted the first template
+    - seeded: Whether this update is the seed
     - predicted_pixel: Predicted full-frame (u, v) in the left image; None if invisible
     - window, window_corner: Left search window, counts, and the full-frame (u, v) of its upper left pixel; None
       without `predicted_pixel`
     - change: Computed magnification and roll since the last match, used or not; None at the seed or if invisible
-    - match: The left match with the template that was searched; None if the window does not fit
+    - match: Match in the left image, with the template that was searched; None if the window does not fit
     - template: The new image around the match: the next template before magnification and roll
-    - stereo: The right match; None without a left match, or if it does not fit
+    - stereo: Match in the right image; None without a left match, or if the search range does not fit
     - distance_m: Triangulated distance from the left camera to the target; NaN without triangulation
     - azimuth_rad: Direction from the left camera to the target in the rover frame, positive to the right
     - azimuth_change_rad: Change of the direction in the world since the last match, positive to the right
     - position_world: Triangulated target in the estimated world frame, metres; None without triangulation
-    - step_m: Estimated rover motion since the last match
+    - step_m: Estimated rover displacement since the last match
     - evidence, allowed: Input of the loss criteria and their tolerances; None at the seed and for incomplete updates
     """
 
@@ -173,10 +174,12 @@ class Track:
 
 @final
 class VisualTargetTracker:
-    """Tracks a target by its template, scaled and rolled with the rover's motion; see `TargetTracker`.
+    """Target tracker: normalised correlation of a template that is magnified and rolled with the rover's motion.
 
-    `PURE_NCC` as options is the paper's baseline; `matcher` replaces the search in the left image (see
-    `marsyard.algorithms.vtt.matching`).
+    Implements `TargetTracker` by the method of "Targeted Driving Using Visual Tracking" (section 4). The match in the
+    left image is triangulated with the right image; four loss criteria reject wrong matches. `matcher` searches the
+    target in the left image (see `marsyard.algorithms.vtt.matching`). With `PURE_NCC` as options the tracker is the
+    paper's baseline.
     """
 
     def __init__(
@@ -203,7 +206,7 @@ class VisualTargetTracker:
         self.track = None
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
-        """Compute the mast aim from this pose; None without a target, or if the mast cannot point at it."""
+        """Compute the mast aim for this rover pose; None without a target, or if the mast cannot point at it."""
         if self.track is None:
             return None
         if self.track.sighting is None and isinstance(self.track.designated, PixelTarget):
@@ -212,7 +215,7 @@ class VisualTargetTracker:
         return None if expected is None else aim_at_position(expected, mast, self.options)
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
-        """Match the target in a new stereo pair, with `VttDetails`. In the state FAILURE no search is made."""
+        """Find the target in a new stereo pair, with `VttDetails`. In the state FAILURE no search is made."""
         if self.track is None:
             return TargetUpdate(TrackingState.NO_TARGET, (), None)
         if self.track.state is TrackingState.FAILURE:
@@ -231,7 +234,7 @@ class VisualTargetTracker:
 
 @dataclass(frozen=True)
 class UpdateResult:
-    """Result of one update: losses, or the target in the rover frame and the new reference."""
+    """Result of one update: the losses, or the target's position (rover frame, metres) and the new reference."""
 
     losses: tuple[TargetLoss, ...]
     details: VttDetails
@@ -241,7 +244,7 @@ class UpdateResult:
 
 @dataclass(frozen=True)
 class Stop:
-    """Measurements of a stop, and the estimated head pose; cameras are in the head's frame."""
+    """Measurements of a rover stop, and the estimated pose of the mast head; cameras are in the head's frame."""
 
     measurements: RoverMeasurements
     rover_from_head: RigidTransform
@@ -265,14 +268,14 @@ class Stop:
         return self.measurements.mast.right
 
     def distance_m(self, position_head: Vector3) -> float:
-        """Distance from the left camera's centre."""
+        """Distance of a point from the left camera's centre."""
         return float(np.linalg.norm(position_head - self.left.c))
 
 
 def expected_position(track: Track, world_from_frame: RigidTransform) -> Vector3 | None:
     """Predict the target position in the rover or head frame of this pose; None for a pixel target before the seed."""
-    if track.sighting is not None:
-        last = track.sighting
+    last = track.sighting
+    if last is not None:
         return matching.predicted_position(last.position_head, last.world_from_head, world_from_frame)
     if isinstance(track.designated, PixelTarget):
         return None
@@ -320,8 +323,9 @@ def follow_track(
     change = matching.ViewChange(magnification, matching.roll_angle(points))
     window, window_corner = matching.search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
-    used = matching.ViewChange(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
-    match = matcher(last, measurements.left, predicted, used, options)
+    applied_magnification = change.magnification if options.scale else 1.0
+    applied_change = matching.ViewChange(applied_magnification, change.roll_rad if options.roll else 0.0)
+    match = matcher(last, measurements.left, predicted, applied_change, options)
     if match is None:
         return UpdateResult((TargetLoss.OUT_OF_VIEW,), details)
     template = matching.extract_patch(measurements.left, match.pixel, options.template_px)
@@ -336,7 +340,7 @@ def follow_track(
 def triangulate_target(
     stop: Stop, pixel: Vector2, template: Patch, ranges_m: tuple[float, float], details: VttDetails, options: VttOptions
 ) -> UpdateResult:
-    """Triangulate the target from its left pixel by point stereo over these ranges."""
+    """Triangulate the target from its left pixel, by point stereo over the ranges `ranges_m`."""
     sight = stop.left.rays(pixel)
     curve = epipolar_pixels(sight, stop.left, stop.right, ranges_m)
     stereo = point_stereo(template, stop.measurements.right, curve, options)
@@ -364,7 +368,7 @@ def triangulate_target(
 def check_losses(
     track: Track, last: matching.Sighting, result: UpdateResult, stop: Stop, expected_m: float, options: VttOptions
 ) -> UpdateResult:
-    """Apply the four loss criteria to a match."""
+    """Apply the four loss criteria to a match; `expected_m` is the predicted distance from the left camera."""
     details, sighting = result.details, result.sighting
     match, stereo, position = details.match, details.stereo, details.position_world
     if sighting is None or match is None or stereo is None or position is None or track.seed_world is None:

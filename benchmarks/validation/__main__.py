@@ -42,29 +42,29 @@ CHECKS = (
 )
 
 
-def _arguments() -> argparse.Namespace:
+def _parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.validation", description=__doc__)
     names = [check.name for check in CHECKS]
-    parser.add_argument("--only", action="append", choices=names, help="this check; may be given again for another")
+    parser.add_argument("--only", action="append", choices=names, help="run only this check; can be repeated")
     parser.add_argument(
-        "--quick", action="store_true", help="fewer samples, the same limits; nothing is kept and no page is written"
+        "--quick", action="store_true", help="fewer samples, the same limits; stores no results and writes no page"
     )
     return parser.parse_args()
 
 
-def _print(console: Console, title: str, measures: list[Measure]) -> None:
+def _print_table(console: Console, title: str, measures: list[Measure]) -> None:
     table = Table(title=title, title_justify="left")
-    for column in ("claim", "limit", "measured", "", "how"):
+    for column in ("property", "limit", "measured", "", "method"):
         table.add_column(column, overflow="fold")
     for measure in measures:
         verdict = "-" if measure.limit is None else ("[green]met" if measure.passed else "[bold red]missed")
-        limit = "" if measure.limit is None else document.shown(measure, measure.limit)
-        table.add_row(measure.claim, limit, document.shown(measure, measure.measured), verdict, measure.how)
+        limit = "" if measure.limit is None else document.format_value(measure, measure.limit)
+        table.add_row(measure.claim, limit, document.format_value(measure, measure.measured), verdict, measure.how)
     console.print(table)
 
 
 def main() -> int:
-    arguments = _arguments()
+    arguments = _parse_arguments()
     console = Console()
     measured: dict[str, list[Measure]] = {}
     for check in CHECKS:
@@ -72,10 +72,10 @@ def main() -> int:
             continue
         start = time.perf_counter()
         measured[check.name] = list(check.run(arguments.quick))
-        _print(console, f"{check.name} ({time.perf_counter() - start:.0f} s)", measured[check.name])
+        _print_table(console, f"{check.name} ({time.perf_counter() - start:.0f} s)", measured[check.name])
         if not arguments.quick:
             # after each check, so that an interruption loses only the current check
-            document.write(CHECKS, document.keep({check.name: measured[check.name]}, arguments.quick))
+            document.write_page(CHECKS, document.store({check.name: measured[check.name]}, arguments.quick))
     missed = [measure.claim for measures in measured.values() for measure in measures if not measure.passed]
     for claim in missed:
         console.print(f"[bold red]missed:[/] {claim}")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.validation.chaos import DEEDS, ChaosParameters, draw_fault
+from benchmarks.validation.chaos import FAULTS, ChaosParameters, draw_fault
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.workers import ExecutorConfig
@@ -32,12 +32,12 @@ case_time_s = 6
 memory_gb = 0.4
 """
 
-#: Minimum and maximum of the uniform time between kills, seconds.
-KILLED_AFTER_S = (0.2, 6.0)
+#: Minimum and maximum of the uniform time before each kill, seconds.
+KILL_TIMES_S = (0.2, 6.0)
 
 
-class Silence:
-    """A progress watch without output."""
+class SilentProgress:
+    """Progress display without output."""
 
     def begin(self, stage: str, total: int) -> None:
         pass
@@ -49,65 +49,74 @@ class Silence:
         pass
 
 
-def same_rows(quick: bool) -> Iterator[Measure]:
-    """Compare rows of all ways to run a campaign with rows of one worker, for misbehaving and rendered cases."""
-    share, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
+def check_rows(quick: bool) -> Iterator[Measure]:
+    """Compare the rows of all ways to run a campaign with those of one worker, for faulty and for rendered cases."""
+    faulty, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
     with TemporaryDirectory() as name:
         folder = Path(name)
-        settings = [f"share={share}", f"cases={cases}"]
-        what = f"cases, {100 * share:g} % of which misbehave"
-        yield from _in_every_way(str(_write_campaign(folder)), folder / "chaos", settings, kills, what)
+        settings = [f"share={faulty}", f"cases={cases}"]
+        population = f"cases, {100 * faulty:g} % of which misbehave"
+        yield from _compare_executors(str(_write_campaign(folder)), folder / "chaos", settings, kills, population)
         rendered = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
-        yield from _in_every_way("dimes-smoke", folder / "rendered", rendered, kills, "rendered descents")
+        yield from _compare_executors("dimes-smoke", folder / "rendered", rendered, kills, "rendered descents")
 
 
-def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: int, what: str) -> Iterator[Measure]:
+def _compare_executors(
+    campaign: str, folder: Path, settings: Sequence[str], kills: int, population: str
+) -> Iterator[Measure]:
     folder.mkdir()
-    expected = _rows_of(campaign, folder / "one", ExecutorConfig(1), settings)
+    expected = _run_campaign(campaign, folder / "one", ExecutorConfig(1), settings)
     cases = len(expected)
     replayed = range(0, cases, max(cases // 8, 1))
     cluster = ExecutorConfig(cluster="local:2")
-    ways: dict[str, Callable[[], list[dict[str, Any]]]] = {
-        "two workers": lambda: _rows_of(campaign, folder / "two", ExecutorConfig(2), settings),
-        "a Dask cluster of two": lambda: _rows_of(campaign, folder / "cluster", cluster, settings),
+    runs: dict[str, Callable[[], list[dict[str, Any]]]] = {
+        "two workers": lambda: _run_campaign(campaign, folder / "two", ExecutorConfig(2), settings),
+        "a Dask cluster of two": lambda: _run_campaign(campaign, folder / "cluster", cluster, settings),
         f"a runner killed {kills} times": lambda: _run_with_kills(campaign, folder / "killed", settings, kills),
         "single replays": lambda: [dict(replay(folder / "one", case).row) for case in replayed],
     }
-    for way, run in ways.items():
+    for name, run in runs.items():
         rows = run()
         differing = sum(bool(differing_columns(row, expected[int(row["case"])])) for row in rows)
-        missing = (len(replayed) if way == "single replays" else cases) - len(rows)
-        how = f"{len(rows)} of {cases} {what}; all columns but times"
-        yield Measure(f"{what}: rows of {way} that differ from one worker's, or lack", differing + missing, "", 0, how)
+        missing = (len(replayed) if name == "single replays" else cases) - len(rows)
+        how = f"{len(rows)} of {cases} {population}; all columns except times"
+        claim = f"{population}: rows of {name} that are missing or differ from those of one worker"
+        yield Measure(claim, differing + missing, "", 0, how)
 
 
-def survival(quick: bool) -> Iterator[Measure]:
-    """Compare a campaign with randomly misbehaving cases with an undisturbed one."""
-    cases, share = (60, 0.15) if quick else (400, 0.03)
+def check_survival(quick: bool) -> Iterator[Measure]:
+    """Compare a campaign with random faults with the same campaign without faults."""
+    cases, faulty = (60, 0.15) if quick else (400, 0.03)
     with TemporaryDirectory() as name:
         folder = Path(name)
         file = _write_campaign(folder)
-        took, rows = {}, {}
-        for part in (0.0, share):
+        elapsed_s, rows = {}, {}
+        for fraction in (0.0, faulty):
             began = time.monotonic()
-            rows[part] = _rows_of(
-                file, folder / f"{part}", ExecutorConfig(2), [f"share={part}", f"cases={cases}", "work_s=0.4"]
+            rows[fraction] = _run_campaign(
+                file, folder / f"{fraction}", ExecutorConfig(2), [f"share={fraction}", f"cases={cases}", "work_s=0.4"]
             )
-            took[part] = time.monotonic() - began
-        campaign = load_campaign(str(file), [f"share={share}"])
-        deeds = [_draw_fault(campaign, case) for case in range(cases)]
-        wrong = sum(row["outcome"] != DEEDS.get(done, "VALID") for row, done in zip(rows[share], deeds, strict=True))
-        healthy = [k for k, done in enumerate(deeds) if not done]
-        changed = sum(bool(differing_columns(rows[share][k], rows[0.0][k])) for k in healthy)
-        loops = deeds.count("loop")
-        counts = ", ".join(f"{deeds.count(done)} {done}" for done in DEEDS)
+            elapsed_s[fraction] = time.monotonic() - began
+        campaign = load_campaign(str(file), [f"share={faulty}"])
+        faults = [_draw_fault(campaign, case) for case in range(cases)]
+        wrong = sum(
+            row["outcome"] != FAULTS.get(fault, "VALID") for row, fault in zip(rows[faulty], faults, strict=True)
+        )
+        healthy = [case for case, fault in enumerate(faults) if not fault]
+        changed = sum(bool(differing_columns(rows[faulty][case], rows[0.0][case])) for case in healthy)
+        loops = faults.count("loop")
+        counts = ", ".join(f"{faults.count(fault)} {fault}" for fault in FAULTS)
         how = f"{cases} cases of 0.4 s on two workers; {counts}"
-        yield Measure("outcomes that are not those of the deed", wrong, "", 0, how)
-        yield Measure("healthy cases whose rows changed", changed, "", 0, f"{how}; {len(healthy)} healthy")
+        yield Measure("outcomes that do not match the fault of the case", wrong, "", 0, how)
+        yield Measure("cases without fault whose rows changed", changed, "", 0, f"{how}; {len(healthy)} without fault")
         limits_s = loops * campaign.configuration.limits.case_time_s
-        ratio = (took[share] - limits_s) / took[0.0]
+        ratio = (elapsed_s[faulty] - limits_s) / elapsed_s[0.0]
         yield Measure(
-            "time beyond the limits, over the undisturbed", ratio, "", 1.5, f"{how}; {limits_s:g} s of limits"
+            "time minus time limits, divided by the time without faults",
+            ratio,
+            "",
+            1.5,
+            f"{how}; limits: {limits_s:g} s",
         )
 
 
@@ -123,10 +132,10 @@ def _write_campaign(folder: Path) -> Path:
     return path
 
 
-def _rows_of(
+def _run_campaign(
     campaign: str | Path, directory: Path, executor: ExecutorConfig, settings: Sequence[str]
 ) -> list[dict[str, Any]]:
-    run_campaign(load_campaign(str(campaign), settings), directory, executor, Silence())
+    run_campaign(load_campaign(str(campaign), settings), directory, executor, SilentProgress())
     return read_rows(directory / "cases.parquet")
 
 
@@ -140,7 +149,7 @@ def _run_with_kills(campaign: str, directory: Path, settings: Sequence[str], kil
         runner = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while not (directory / "campaign.json").exists() and runner.poll() is None:
             time.sleep(0.01)
-        time.sleep(rng.uniform(*KILLED_AFTER_S))
+        time.sleep(rng.uniform(*KILL_TIMES_S))
         runner.kill()
         runner.wait()
         command = [*program, "resume", str(directory), "--jobs", "2", "--allow-changed"]
@@ -149,4 +158,4 @@ def _run_with_kills(campaign: str, directory: Path, settings: Sequence[str], kil
     return read_rows(directory / "cases.parquet")
 
 
-CHECKS = (Check("rows", "Campaigns", same_rows), Check("survival", "Campaigns", survival))
+CHECKS = (Check("rows", "Campaigns", check_rows), Check("survival", "Campaigns", check_survival))

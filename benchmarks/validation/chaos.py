@@ -1,4 +1,4 @@
-"""A scenario whose cases misbehave at random, as a custom algorithm may."""
+"""A scenario with random faults (exception, endless loop, memory, abort), as a custom algorithm may have."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ class ChaosParameters(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     work_s: float = Field(default=0.05, ge=0.0, description="processor time of a case")
-    share: float = Field(default=0.0, ge=0.0, le=1.0, description="of cases that misbehave")
+    share: float = Field(default=0.0, ge=0.0, le=1.0, description="fraction of cases that misbehave")
 
 
 #: Faults of misbehaving cases, and their expected outcomes.
-DEEDS = {"raise": "CRASHED", "loop": "TIMED_OUT", "swell": "OUT_OF_MEMORY", "abort": "CRASHED"}
+FAULTS = {"raise": "CRASHED", "loop": "TIMED_OUT", "swell": "OUT_OF_MEMORY", "abort": "CRASHED"}
 
 
 def draw_fault(parameters: ChaosParameters, streams: Streams) -> str:
-    """Fault of a case; empty for a healthy case."""
+    """Draw the fault of a case; empty for a case without fault."""
     rng = streams.generator("chaos")
-    return str(rng.choice(list(DEEDS))) if rng.random() < parameters.share else ""
+    return str(rng.choice(list(FAULTS))) if rng.random() < parameters.share else ""
 
 
 class ChaosScenario:
-    """Compute for `work_s`, then answer, raise, loop in C, allocate without end, or abort."""
+    """Scenario that computes for `work_s`, then answers, raises, loops in C, allocates without end, or aborts."""
 
     name = "chaos"
     parameters_type = ChaosParameters
@@ -46,16 +46,16 @@ class ChaosScenario:
         end = time.process_time() + parameters.work_s
         while time.process_time() < end:
             pass
-        done = draw_fault(parameters, streams)
-        if done == "raise":
+        fault = draw_fault(parameters, streams)
+        if fault == "raise":
             raise ZeroDivisionError("by chance")
-        if done == "loop":
+        if fault == "loop":
             # backtracks 2^64 times in C
             re.match("(a+)+$", "a" * 64 + "b")
-        if done == "abort":
+        if fault == "abort":
             os.abort()
-        hoard = []
-        while done == "swell":
-            hoard.append(np.ones(4_000_000))
+        arrays = []
+        while fault == "swell":
+            arrays.append(np.ones(4_000_000))
         number = float(streams.generator("number").normal())
         return CaseResult("VALID", True, {"number": number, "hash": int(streams.generator("hash").integers(2**62))})

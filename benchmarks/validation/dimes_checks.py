@@ -16,11 +16,12 @@ from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes import DimesOptions
 
 SEED = 4002
-HARMLESS = 0.995
+#: Required fraction of descents with a correct velocity or none, and required velocity error.
+REQUIRED_FRACTION = 0.995
 REQUIREMENT_M_S = 5.0
 
 
-def imu_check(quick: bool) -> Iterator[Measure]:
+def check_imu_threshold(quick: bool) -> Iterator[Measure]:
     """Compare the threshold with a second implementation of its Monte Carlo derivation."""
     inputs, descents = ThresholdInputs(), 300 if quick else 3000
     rng = np.random.default_rng(SEED)
@@ -28,41 +29,45 @@ def imu_check(quick: bool) -> Iterator[Measure]:
     threshold = DimesOptions().imu_threshold_m_s
     single = reference.single()
     how = f"{descents} descents of a second implementation by first-order propagation; threshold {threshold:g} m/s"
-    # bounds: three standard errors of the quantiles, sqrt(q (1 - q) / n) divided by density times quantile, which is
+    # limits: three standard errors of the quantiles, sqrt(q (1 - q) / n) divided by density times quantile, which is
     # 0.44 at the median and 0.03 at 99.5 %
-    median = float(np.median(single)) / _stored_median_m_s() - 1.0
+    median = float(np.median(single)) / _read_stored_median_m_s() - 1.0
     limit = 3.4 / math.sqrt(descents)
-    yield Measure("right tracks' discrepancy, median, from the stored derivation's", abs(median), "", limit, how)
+    yield Measure("discrepancy of correct tracks: median against the stored derivation", abs(median), "", limit, how)
     tail = float(np.quantile(single, inputs.kept)) / threshold - 1.0
     limit = 7.0 / math.sqrt(descents)
-    yield Measure("right tracks' discrepancy, 99.5 % quantile, from the threshold", abs(tail), "", limit, how)
-    bound = inputs.kept - 3.0 * math.sqrt(inputs.kept * (1.0 - inputs.kept) / descents)
-    kept = float(np.mean(single < threshold))
-    claim = "descents with one right track a pair that pass the IMU check"
-    yield Measure(claim, kept, "", bound, f"{how}; limit: 99.5 % less three deviations of the simulation", "at least")
-    kept = float(np.mean(reference.best() < threshold))
-    yield Measure("descents with two right tracks a pair that pass the IMU check", kept, "", 0.995, how, "at least")
+    yield Measure("discrepancy of correct tracks: 99.5 % quantile against the threshold", abs(tail), "", limit, how)
+    limit = inputs.kept - 3.0 * math.sqrt(inputs.kept * (1.0 - inputs.kept) / descents)
+    passed = float(np.mean(single < threshold))
+    claim = "descents with one correct track per pair that pass the IMU check"
+    yield Measure(
+        claim, passed, "", limit, f"{how}; limit: 99.5 % minus three standard deviations of the simulation", "at least"
+    )
+    passed = float(np.mean(reference.best() < threshold))
+    yield Measure(
+        "descents with two correct tracks per pair that pass the IMU check", passed, "", 0.995, how, "at least"
+    )
     for tracks in (1, 2):
         for low, high in WRONG_BY_M_S:
-            right, refused = reference.right_or_refused(tracks, (low, high), threshold, rng)
-            by = f"{low:g} m/s" if low == high else f"{low:g} to {high:g} m/s"
+            right, refused = reference.right_or_refused_fractions(tracks, (low, high), threshold, rng)
+            error_range = f"{low:g} m/s" if low == high else f"{low:g} to {high:g} m/s"
             yield Measure(
-                f"one of {2 * tracks} tracks wrong by {by}: a right velocity or none",
+                f"one of {2 * tracks} tracks wrong by {error_range}: correct velocity or none",
                 right + refused,
                 "",
-                HARMLESS,
-                f"{how}; {100.0 * right:.2f} % right, {100.0 * refused:.2f} % refused",
+                REQUIRED_FRACTION,
+                f"{how}; {100.0 * right:.2f} % correct, {100.0 * refused:.2f} % refused",
                 "at least",
             )
 
 
-def _stored_median_m_s() -> float:
+def _read_stored_median_m_s() -> float:
     """Median discrepancy of one correct track in each pair, from the stored derivation."""
     quantiles = json.loads(STORED.read_text())["discrepancy_quantiles_m_s"]
     return float(quantiles["one right track in each pair"]["0.5"])
 
 
-def estimators(quick: bool) -> Iterator[Measure]:
+def compare_estimators(quick: bool) -> Iterator[Measure]:
     descents = record_descents("dimes-smoke", 4 if quick else 48)
     for name, estimator in ESTIMATORS.items():
         results = run_estimator(estimator, descents)
@@ -72,9 +77,9 @@ def estimators(quick: bool) -> Iterator[Measure]:
         how = (
             f"{valid.size} of {len(descents)} descents of dimes-smoke answered, {wrong} wrong by more than 5 m/s, "
             f"largest error {valid.max() if valid.size else float('nan'):.2g} m/s, "
-            f"{1e3 * float(np.median(results.seconds)):.0f} core-ms a triple"
+            f"{1e3 * float(np.median(results.seconds)):.0f} core-ms for three images"
         )
         yield Measure(f"velocity error, rms: {name}", rms, "m/s", None, how)
 
 
-CHECKS = (Check("imu-check", "DIMES", imu_check), Check("estimators", "DIMES", estimators))
+CHECKS = (Check("imu-check", "DIMES", check_imu_threshold), Check("estimators", "DIMES", compare_estimators))

@@ -1,6 +1,6 @@
-"""Motion of image patches: symmetric Gauss-Newton estimation, and fits to the peak of the correlation.
+"""Estimators of the motion of image patches: symmetric Gauss-Newton, and fits to the peak of the correlation.
 
-Independent of the algorithms under test, because this estimator validates the renderer.
+They validate the renderer and share no code with the algorithms under test.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ MARGIN = HALF + 6
 
 
 @cache
-def _quintic() -> tuple[BSpline, BSpline]:
+def _quintic_spline() -> tuple[BSpline, BSpline]:
     basis = BSpline.basis_element(np.arange(-3.0, 4.0), extrapolate=False)
     return basis, basis.derivative()
 
 
-def _taps(shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _spline_weights(shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Integer part of shifts, and weights of the six neighbouring spline coefficients with their derivatives."""
-    whole = np.floor(shift).astype(int)
-    away = (shift - whole)[:, None] - np.arange(-2.0, 4.0)
-    value, slope = _quintic()
-    return whole, np.nan_to_num(value(away)), np.nan_to_num(slope(away))
+    integer = np.floor(shift).astype(int)
+    distance = (shift - integer)[:, None] - np.arange(-2.0, 4.0)
+    value, slope = _quintic_spline()
+    return integer, np.nan_to_num(value(distance)), np.nan_to_num(slope(distance))
 
 
-class SmoothPicture:
+class SmoothImage:
     """Image smoothed by a Gaussian of one pixel, interpolated by a quintic spline."""
 
-    def __init__(self, picture: np.ndarray) -> None:
-        smoothed = ndimage.gaussian_filter(picture.astype(np.float64), SIGMA_PX)
+    def __init__(self, image: np.ndarray) -> None:
+        smoothed = ndimage.gaussian_filter(image.astype(np.float64), SIGMA_PX)
         self._coefficients = ndimage.spline_filter(smoothed, order=5)
 
     def patches(self, centres: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -47,18 +47,18 @@ class SmoothPicture:
 
         Shapes (n, PATCH, PATCH) and (n, 2, PATCH, PATCH).
         """
-        columns, wu, du = _taps(shift[:, 0])
-        rows, wv, dv = _taps(shift[:, 1])
+        columns, wu, du = _spline_weights(shift[:, 0])
+        rows, wv, dv = _spline_weights(shift[:, 1])
         first_row = (centres[:, 1] + rows - HALF - 2)[:, None] + np.arange(PATCH + 5)
         first_column = (centres[:, 0] + columns - HALF - 2)[:, None] + np.arange(PATCH + 5)
         block = self._coefficients[first_row[:, :, None], first_column[:, None, :]]
-        along = sliding_window_view(block, 6, axis=2)
-        across_value = np.einsum("nrck,nk->nrc", along, wu)
-        across_slope = np.einsum("nrck,nk->nrc", along, du)
-        down_value = sliding_window_view(across_value, 6, axis=1)
-        value = np.einsum("nrck,nk->nrc", down_value, wv)
-        by_v = np.einsum("nrck,nk->nrc", down_value, dv)
-        by_u = np.einsum("nrck,nk->nrc", sliding_window_view(across_slope, 6, axis=1), wv)
+        row_windows = sliding_window_view(block, 6, axis=2)
+        row_value = np.einsum("nrck,nk->nrc", row_windows, wu)
+        row_slope = np.einsum("nrck,nk->nrc", row_windows, du)
+        column_windows = sliding_window_view(row_value, 6, axis=1)
+        value = np.einsum("nrck,nk->nrc", column_windows, wv)
+        by_v = np.einsum("nrck,nk->nrc", column_windows, dv)
+        by_u = np.einsum("nrck,nk->nrc", sliding_window_view(row_slope, 6, axis=1), wv)
         return value, np.stack([by_u, by_v], axis=1)
 
 
@@ -68,14 +68,14 @@ class Shifts:
 
     Attributes
     ----------
-    found
+    motion_px
         Motion (u, v) of each patch from the first image to the second, shape (n, 2).
     response
         Derivative of the estimate (second axis) with respect to the motion of each pixel (last axis), shape
         (n, 2, PATCH, PATCH, 2). The expected estimate is the sum of the pixel motions with these weights.
     """
 
-    found: np.ndarray
+    motion_px: np.ndarray
     response: np.ndarray
 
     def expected(self, motion: np.ndarray) -> np.ndarray:
@@ -83,7 +83,7 @@ class Shifts:
         return np.einsum("nirck,nrck->ni", self.response, motion)
 
 
-def symmetric_shifts(first: SmoothPicture, second: SmoothPicture, centres: np.ndarray, iterations: int = 8) -> Shifts:
+def symmetric_shifts(first: SmoothImage, second: SmoothImage, centres: np.ndarray, iterations: int = 8) -> Shifts:
     """Estimate shifts d with ``first(x - d / 2) = gain * second(x + d / 2) + offset`` per patch by least squares."""
     count = len(centres)
     shift = np.zeros((count, 2))
@@ -91,13 +91,13 @@ def symmetric_shifts(first: SmoothPicture, second: SmoothPicture, centres: np.nd
     for _ in range(iterations):
         a, slope_a = first.patches(centres, -0.5 * shift)
         b, slope_b = second.patches(centres, 0.5 * shift)
-        away = a - gain[:, None, None] * b - offset[:, None, None]
+        residual = a - gain[:, None, None] * b - offset[:, None, None]
         by_shift = 0.5 * (slope_a + gain[:, None, None, None] * slope_b)
         design = np.concatenate(
             [by_shift.reshape(count, 2, -1), b.reshape(count, 1, -1), np.ones((count, 1, PATCH * PATCH))], axis=1
         )
         normal = design @ design.transpose(0, 2, 1)
-        step = np.linalg.solve(normal, (design @ away.reshape(count, -1, 1)))[..., 0]
+        step = np.linalg.solve(normal, (design @ residual.reshape(count, -1, 1)))[..., 0]
         shift += np.clip(step[:, :2], -0.5, 0.5)
         gain += step[:, 2]
         offset += step[:, 3]
@@ -113,34 +113,34 @@ def peak_fits(first: np.ndarray, second: np.ndarray, centres: np.ndarray) -> tup
 
     Both fit the peak of the normalised correlation over shifts of up to two pixels.
     """
-    reach = np.arange(-HALF, HALF + 1)
-    rows, columns = centres[:, 1, None] + reach, centres[:, 0, None] + reach
+    offsets = np.arange(-HALF, HALF + 1)
+    rows, columns = centres[:, 1, None] + offsets, centres[:, 0, None] + offsets
     template = _normalise(first[rows[:, :, None], columns[:, None, :]])
     surface = np.empty((len(centres), 5, 5))
     for i in range(5):
         for j in range(5):
-            moved = _normalise(second[(rows + i - 2)[:, :, None], (columns + j - 2)[:, None, :]])
-            surface[:, i, j] = np.sum(template * moved, axis=(1, 2))
+            shifted = _normalise(second[(rows + i - 2)[:, :, None], (columns + j - 2)[:, None, :]])
+            surface[:, i, j] = np.sum(template * shifted, axis=(1, 2))
     best = surface[:, 1:4, 1:4].reshape(len(centres), -1).argmax(axis=1)
     top, left = best // 3, best % 3
-    around = np.arange(3)
+    neighbours = np.arange(3)
     z = surface[
         np.arange(len(centres))[:, None, None],
-        (top[:, None] + around)[:, :, None],
-        (left[:, None] + around)[:, None, :],
+        (top[:, None] + neighbours)[:, :, None],
+        (left[:, None] + neighbours)[:, None, :],
     ]
-    whole = np.stack([left, top], axis=-1) - 1.0
+    integer = np.stack([left, top], axis=-1) - 1.0
     lines = np.stack([z[:, 1, :], z[:, :, 1]], axis=1)
     parabola = 0.5 * (lines[..., 0] - lines[..., 2]) / (lines[..., 0] - 2.0 * lines[..., 1] + lines[..., 2])
-    return whole + parabola, whole + _biquadratic(z)
+    return integer + parabola, integer + _fit_quadric(z)
 
 
 def _normalise(patches: np.ndarray) -> np.ndarray:
-    away = patches - patches.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
-    return away / np.sqrt(np.sum(away**2, axis=(1, 2), keepdims=True))
+    deviation = patches - patches.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
+    return deviation / np.sqrt(np.sum(deviation**2, axis=(1, 2), keepdims=True))
 
 
-def _biquadratic(z: np.ndarray) -> np.ndarray:
+def _fit_quadric(z: np.ndarray) -> np.ndarray:
     """Maximum (u, v) of the least-squares quadric through 3 x 3 values."""
     v, u = np.mgrid[-1.0:2.0, -1.0:2.0]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(9, 6)

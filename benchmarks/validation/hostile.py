@@ -1,4 +1,4 @@
-"""A scenario whose cases damage their process or other cases, as a custom algorithm may."""
+"""A scenario with faults that damage the process or other cases, as a custom algorithm may have."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
 #: Objects that survive the end of a case.
-_kept: list[Any] = []
+_survivors: list[Any] = []
 
 
 class HostileParameters(BaseModel):
@@ -41,7 +41,7 @@ def _leave_thread() -> None:
 def _leave_pool() -> None:
     pool = ProcessPoolExecutor(2, mp_context=get_context("fork"))
     pool.submit(time.sleep, 0.0).result()
-    _kept.append(pool)
+    _survivors.append(pool)
 
 
 def _leave_fork() -> None:
@@ -58,9 +58,9 @@ def _leave_orphan() -> None:
     os.waitpid(middle, 0)
 
 
-def _session() -> subprocess.Popen[bytes]:
+def _leave_session() -> subprocess.Popen[bytes]:
     child = subprocess.Popen(["sleep", "3600"], start_new_session=True, close_fds=False)
-    _kept.append(child)
+    _survivors.append(child)
     return child
 
 
@@ -76,23 +76,23 @@ def _kill_supervisor() -> None:
     time.sleep(60)
 
 
-def _loop() -> None:
+def _loop_in_c() -> None:
     # backtracks 2^64 times in C
     re.match("(a+)+$", "a" * 64 + "b")
 
 
-def _flood() -> None:
+def _print_endlessly() -> None:
     while True:
         os.write(1, b"and so on\n" * 1000)
 
 
-def _swell() -> None:
-    hoard = []
+def _allocate() -> None:
+    arrays = []
     while True:
-        hoard.append(np.ones(4_000_000))
+        arrays.append(np.ones(4_000_000))
 
 
-def _alter_state() -> None:
+def _change_state() -> None:
     import cv2
 
     cv2.setUseOptimized(False)
@@ -114,55 +114,55 @@ def _close_stream() -> None:
     sys.stdout.close()
 
 
-def _spoil_inputs() -> None:
+def _change_inputs() -> None:
     input_copy = InputCopy([np.ones(9)])
     input_copy.inputs[0].flags.writeable = True
     input_copy.inputs[0][:] = 0.0
     input_copy.check()
 
 
-#: Mark of a process whose state a case has changed.
-_SPOILED = "spoiled"
+#: Entry of `_survivors` that shows that an earlier case has changed the state of this process.
+_CHANGED_STATE = "spoiled"
 
 #: Faults of misbehaving cases and their expected outcomes; a VALID case must have the row of a healthy case.
-DEEDS: Mapping[str, tuple[Callable[[], object], str]] = {
+FAULTS: Mapping[str, tuple[Callable[[], object], str]] = {
     "leave a thread": (_leave_thread, "VALID"),
     "leave a pool of processes": (_leave_pool, "VALID"),
     "leave a forked child": (_leave_fork, "VALID"),
-    "leave a session": (_session, "VALID"),
+    "leave a process in a new session": (_leave_session, "VALID"),
     "leave an orphan": (_leave_orphan, "VALID"),
-    "wait for a session": (lambda: _session().wait(), "TIMED_OUT"),
-    "loop in C": (_loop, "TIMED_OUT"),
+    "wait for a process in a new session": (lambda: _leave_session().wait(), "TIMED_OUT"),
+    "loop in C": (_loop_in_c, "TIMED_OUT"),
     "sleep": (lambda: time.sleep(3600), "TIMED_OUT"),
     "stop the supervisor": (_stop_supervisor, "TIMED_OUT"),
     "kill itself": (lambda: os.kill(os.getpid(), signal.SIGKILL), "CRASHED"),
     "kill its group": (lambda: os.killpg(0, signal.SIGKILL), "CRASHED"),
     "kill the supervisor": (_kill_supervisor, "CRASHED"),
     "abort": (os.abort, "CRASHED"),
-    "leave by exit": (lambda: os._exit(0), "CRASHED"),
-    "raise at length": (_raise_long, "CRASHED"),
+    "exit": (lambda: os._exit(0), "CRASHED"),
+    "raise with a long message": (_raise_long, "CRASHED"),
     "close all files": (lambda: os.closerange(3, 1024), "CRASHED"),
     "close standard output": (_close_stream, "VALID"),
-    "alter the state": (_alter_state, "VALID"),
-    "alter what nobody compares": (lambda: _kept.append(_SPOILED), "VALID"),
+    "change the process state": (_change_state, "VALID"),
+    "change state that is not compared": (lambda: _survivors.append(_CHANGED_STATE), "VALID"),
     "handle signals": (lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN), "VALID"),
-    "write at length": (_flood, "TOO_MUCH_OUTPUT"),
-    "take all memory": (_swell, "OUT_OF_MEMORY"),
+    "print without end": (_print_endlessly, "TOO_MUCH_OUTPUT"),
+    "allocate without end": (_allocate, "OUT_OF_MEMORY"),
     "answer with an array": (lambda: {"number": np.zeros(3)}, "CRASHED"),
-    "answer with a huge integer": (lambda: {"number": 10**5000}, "CRASHED"),
+    "answer with an integer of 5000 digits": (lambda: {"number": 10**5000}, "CRASHED"),
     "answer with text in a metric": (lambda: {"number": "far"}, "CRASHED"),
-    "spoil its inputs": (_spoil_inputs, "CRASHED"),
+    "change its inputs": (_change_inputs, "CRASHED"),
 }
 
 
 def draw_fault(parameters: HostileParameters, streams: Streams) -> str:
-    """Fault of a case; empty for a healthy case."""
+    """Draw the fault of a case; empty for a case without fault."""
     rng = streams.generator("deed")
-    return str(rng.choice(list(DEEDS))) if rng.random() < parameters.misbehaving else ""
+    return str(rng.choice(list(FAULTS))) if rng.random() < parameters.misbehaving else ""
 
 
 class HostileScenario:
-    """Compute numbers that change with any altered process state, then apply the fault of the case."""
+    """Scenario that computes numbers which depend on the process state, then applies the fault of the case."""
 
     name = "hostile"
     parameters_type = HostileParameters
@@ -174,15 +174,15 @@ class HostileScenario:
         """There are no shared inputs."""
 
     def run(self, parameters: HostileParameters, streams: Streams) -> CaseResult:
-        if _SPOILED in _kept:
-            raise RuntimeError("an earlier case of this process has spoiled it")
+        if _CHANGED_STATE in _survivors:
+            raise RuntimeError("an earlier case has changed the state of this process")
         time.sleep(0.02)
-        row = _numbers(streams)
-        wrong = DEEDS[done][0]() if (done := draw_fault(parameters, streams)) else None
-        return CaseResult("VALID", True, {**row, **(wrong if isinstance(wrong, dict) else {})})
+        row = _compute_numbers(streams)
+        faulty_row = FAULTS[fault][0]() if (fault := draw_fault(parameters, streams)) else None
+        return CaseResult("VALID", True, {**row, **(faulty_row if isinstance(faulty_row, dict) else {})})
 
 
-def _numbers(streams: Streams) -> dict[str, float | str | bool]:
+def _compute_numbers(streams: Streams) -> dict[str, float | str | bool]:
     import cv2
 
     rng = streams.generator("number")

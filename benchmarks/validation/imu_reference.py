@@ -27,7 +27,7 @@ from benchmarks.threshold_derivation import ThresholdInputs
 FOCAL_PX, HALF_PX = 14.67e-3 / 48e-6, 127.5
 #: Template side, minimum distance of two templates and margin of the search window, in pixels, as in the field test
 #: paper and `DimesOptions`.
-TEMPLATE_PX, APART_PX, MARGIN_PX = 31, 31.0, 4
+TEMPLATE_PX, MIN_DISTANCE_PX, MARGIN_PX = 31, 31.0, 4
 #: Positions tried per pair; without two templates among them, the pair has no feasible overlap.
 TRIES = 200
 REQUIRED_M_S = 5.0
@@ -66,10 +66,10 @@ class Reference:
         """Minimum discrepancy of two correct tracks in each pair."""
         return np.asarray(_discrepancies(self.tracks, self.imu).min(axis=(1, 2)))
 
-    def right_or_refused(
+    def right_or_refused_fractions(
         self, templates: int, wrong_by_m_s: tuple[float, float], threshold_m_s: float, rng: np.random.Generator
     ) -> tuple[float, float]:
-        """Fractions of descents with a correct velocity and without one, if one track is wrong."""
+        """Simulate one wrong track; return the fractions of descents with a correct velocity and without a velocity."""
         tracks = self.tracks[:, :, :templates].copy()
         n = len(tracks)
         angle, size = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(*wrong_by_m_s, n)
@@ -91,78 +91,80 @@ def _discrepancies(
 
 
 def _descent_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "2 2 2"] | None:
-    """Velocity errors by pair and template; None if a pair has no feasible overlap for two templates."""
+    """Draw velocity errors by pair and template; None if a pair has no feasible overlap for two templates."""
     heights, interval = np.array(inputs.altitudes_m), inputs.interval_s
-    attitudes = [_attitude(inputs, rng) for _ in heights]
+    attitudes = [_draw_attitude(inputs, rng) for _ in heights]
     speed, course = inputs.max_speed_m_s * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
-    moved = interval * speed * np.array([np.cos(course), np.sin(course)])
-    of_height = inputs.altitude_sd * rng.standard_normal(3)
-    turned = _attitude_errors(inputs, rng)
+    displacement = interval * speed * np.array([np.cos(course), np.sin(course)])
+    height_errors = inputs.altitude_sd * rng.standard_normal(3)
+    rotations = _draw_attitude_errors(inputs, rng)
     errors = np.empty((2, 2, 2))
     for pair in range(2):
-        slopes = _templates(attitudes[pair : pair + 2], heights[pair : pair + 2], inputs, rng)
+        slopes = _draw_templates(attitudes[pair : pair + 2], heights[pair : pair + 2], inputs, rng)
         if slopes is None:
             return None
-        (h1, h2), (a1, a2), (e1, e2) = (one[pair : pair + 2] for one in (heights, of_height, turned))
-        later = (h1 * slopes - moved) / h2
+        (h1, h2), (a1, a2), (e1, e2) = (values[pair : pair + 2] for values in (heights, height_errors, rotations))
+        second_slopes = (h1 * slopes - displacement) / h2
         relief = inputs.feature_height_sd_m * rng.standard_normal((2, 1))
-        displaced = h1 * (a1 * slopes + _rotate_slopes(e1, slopes)) - h2 * (a2 * later + _rotate_slopes(e2, later))
-        errors[pair] = (displaced + relief * (slopes - later)) / interval
+        position_errors = h1 * (a1 * slopes + _rotate_slopes(e1, slopes)) - h2 * (
+            a2 * second_slopes + _rotate_slopes(e2, second_slopes)
+        )
+        errors[pair] = (position_errors + relief * (slopes - second_slopes)) / interval
     return np.asarray(errors + inputs.match_sd_m_s * rng.standard_normal((2, 2, 2)))
 
 
-def _attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
+def _draw_attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
     """Draw an attitude with coning, nodding and random heading according to `ThresholdInputs`."""
     heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0.0, 2.0 * np.pi)])
     tilts = []
     for limit_deg in (inputs.max_cone_deg, inputs.max_nod_deg):
-        towards = rng.uniform(0.0, 2.0 * np.pi)
-        axis = np.array([np.cos(towards), np.sin(towards), 0.0])
+        azimuth = rng.uniform(0.0, 2.0 * np.pi)
+        axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         tilts.append(Rotation.from_rotvec(np.radians(limit_deg) * rng.uniform() * axis))
     return tilts[0] * tilts[1] * heading
 
 
-def _attitude_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """Rotation of each measured attitude relative to the true one, radians, world axes."""
+def _draw_attitude_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    """Draw the rotation of each measured attitude relative to the true attitude, radians, world axes."""
     common = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
-    own = np.radians(inputs.attitude_sd_deg) * rng.standard_normal((3, 3))
+    independent = np.radians(inputs.attitude_sd_deg) * rng.standard_normal((3, 3))
     rates = np.radians(inputs.max_rate_deg_s) * rng.uniform(size=3)
-    towards = rng.uniform(0.0, 2.0 * np.pi, 3)
-    late = inputs.tag_sd_s * rng.standard_normal(3)
-    tags = (rates * late)[:, None] * np.column_stack([np.cos(towards), np.sin(towards), np.zeros(3)])
-    return np.asarray(common + own + tags)
+    azimuths = rng.uniform(0.0, 2.0 * np.pi, 3)
+    tag_errors_s = inputs.tag_sd_s * rng.standard_normal(3)
+    axes = np.column_stack([np.cos(azimuths), np.sin(azimuths), np.zeros(3)])
+    return np.asarray(common + independent + (rates * tag_errors_s)[:, None] * axes)
 
 
 def _rotate_slopes(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """First-order change of slopes whose rays are rotated by a small vector."""
+    """Compute the first-order change of slopes if their rays are rotated by a small vector."""
     rays = np.column_stack([slopes, -np.ones(len(slopes))])
     change = np.cross(error, rays)
     return np.asarray(change[:, :2] + slopes * change[:, 2:])
 
 
-def _templates(
+def _draw_templates(
     attitudes: list[Rotation], heights: Float[np.ndarray, "2"], inputs: ThresholdInputs, rng: np.random.Generator
 ) -> Float[np.ndarray, "2 2"] | None:
-    """Slopes of two random templates in the first view with feasible overlap; None if none are found."""
+    """Draw the slopes of two templates in the first view with feasible overlap; None if there are none."""
     pixels = rng.uniform(-HALF_PX, HALF_PX, (TRIES, 2))
     rays = attitudes[0].apply(np.column_stack([pixels / FOCAL_PX, -np.ones(TRIES)]))
     down = -rays[:, 2]
-    seen = down > np.cos(np.radians(55.0)) * np.linalg.norm(rays, axis=1)
-    pixels, slopes = pixels[seen], rays[seen, :2] / down[seen, None]
+    is_usable = down > np.cos(np.radians(55.0)) * np.linalg.norm(rays, axis=1)
+    pixels, slopes = pixels[is_usable], rays[is_usable, :2] / down[is_usable, None]
     gsd_m = heights[1] / FOCAL_PX
     search_px = np.ceil(inputs.max_speed_m_s * inputs.interval_s / gsd_m) + MARGIN_PX
-    half_m = 0.5 * TEMPLATE_PX * gsd_m, (0.5 * TEMPLATE_PX + search_px) * gsd_m
-    room = _inside(attitudes[0], slopes, half_m[0] / heights[0])
-    room &= _inside(attitudes[1], slopes * heights[0] / heights[1], half_m[1] / heights[1])
-    pixels, slopes = pixels[room], slopes[room]
+    half_sides_m = 0.5 * TEMPLATE_PX * gsd_m, (0.5 * TEMPLATE_PX + search_px) * gsd_m
+    is_feasible = _is_inside(attitudes[0], slopes, half_sides_m[0] / heights[0])
+    is_feasible &= _is_inside(attitudes[1], slopes * heights[0] / heights[1], half_sides_m[1] / heights[1])
+    pixels, slopes = pixels[is_feasible], slopes[is_feasible]
     if len(pixels) == 0:
         return None
-    apart = np.flatnonzero(np.abs(pixels - pixels[0]).max(axis=1) >= APART_PX)
-    return None if apart.size == 0 else np.asarray(slopes[[0, apart[0]]])
+    distant = np.flatnonzero(np.abs(pixels - pixels[0]).max(axis=1) >= MIN_DISTANCE_PX)
+    return None if distant.size == 0 else np.asarray(slopes[[0, distant[0]]])
 
 
-def _inside(attitude: Rotation, slopes: Float[np.ndarray, "n 2"], half: float) -> Bool[np.ndarray, " n"]:
-    """Whether ground squares around these slopes are inside the frame; `half` is half the side over the height."""
+def _is_inside(attitude: Rotation, slopes: Float[np.ndarray, "n 2"], half: float) -> Bool[np.ndarray, " n"]:
+    """Whether ground squares around slopes are inside the frame; `half` is half the side divided by the height."""
     inside = np.ones(len(slopes), dtype=bool)
     for corner in ((-half, -half), (-half, half), (half, -half), (half, half)):
         body = attitude.inv().apply(np.column_stack([slopes + np.array(corner), -np.ones(len(slopes))]))

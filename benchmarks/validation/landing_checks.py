@@ -29,15 +29,15 @@ PAPER = HdaOptions(track_seed=TrackSeed.POSE, grid_px=4)
 OPTIONS = replace(PAPER, block_px=32)
 
 
-def noise_free(camera: str) -> DetectorParameters:
-    """Detector of a camera with 16 bits and a large full well, so that shot noise is below 1e-4 of the signal."""
+def make_noise_free_detector(camera: str) -> DetectorParameters:
+    """Return a camera's detector with 16 bits and a large full well, so that shot noise is below 1e-4 of the signal."""
     well = 1e9
-    own = preset(camera).detector
-    return own.model_copy(
+    original = preset(camera).detector
+    return original.model_copy(
         update={
             "full_well_e": well,
             "gain_e_dn": well / 2**16,
-            "responsivity_e_s": own.responsivity_e_s * well / own.full_well_e,
+            "responsivity_e_s": original.responsivity_e_s * well / original.full_well_e,
             "bits": 16,
             "read_noise_e": 0.0,
             "dark_e_s": 0.0,
@@ -47,9 +47,9 @@ def noise_free(camera: str) -> DetectorParameters:
     )
 
 
-def exact(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
-    """Parameters of an image pair as in `hda-map`, with attitudes of a helicopter and without errors."""
-    none = {"position_m": 0.0, "motion_m": 0.0, "tilt_deg": 0.0, "azimuth_deg": 0.0, "turn_deg": 0.0}
+def draw_exact_parameters(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
+    """Draw parameters of an image pair as in `hda-map`, with attitudes of a helicopter and without errors."""
+    no_errors = {"position_m": 0.0, "motion_m": 0.0, "tilt_deg": 0.0, "azimuth_deg": 0.0, "turn_deg": 0.0}
     east, north = rng.uniform(0.0, 102.4, 2)
     roll, pitch, yaw = rng.normal(0.0, 2.0, 3)
     return LandingScenarioParameters.model_validate(
@@ -58,7 +58,7 @@ def exact(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
             "terrain": {"samples": 2048},
             "location": {**BANK, "terrain": int(rng.integers(8)), "east_m": east, "north_m": north},
             "sun": {"azimuth_deg": rng.uniform(90.0, 270.0), "elevation_deg": rng.uniform(30.0, 65.0)},
-            "detector": noise_free("xc-55").model_dump(),
+            "detector": make_noise_free_detector("xc-55").model_dump(),
             "flown": {
                 "height_m": rng.uniform(8.0, 15.0),
                 "heading_deg": rng.uniform(0.0, 360.0),
@@ -69,16 +69,16 @@ def exact(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
                 "pitch_deg": pitch,
                 "yaw_deg": yaw,
             },
-            "navigation": {**none, "inclinometer_deg": 0.0},
+            "navigation": {**no_errors, "inclinometer_deg": 0.0},
             "laser": LaserParameters(noise_m=0.0, count_m=0.0).model_dump(),
         }
     )
 
 
-def errors(number: int) -> dict[str, dict[str, Scalar]]:
-    """Errors of one pair with both sets of options; the sites alternate."""
+def simulate_errors(number: int) -> dict[str, dict[str, Scalar]]:
+    """Simulate the errors of one image pair with both sets of options; the sites alternate."""
     streams = Streams(SEED, "landing checks", number)
-    p = exact(SITES[number % len(SITES)], streams.generator("pair"))
+    p = draw_exact_parameters(SITES[number % len(SITES)], streams.generator("pair"))
     world = World.from_parameters(p)
     flight = Flight.from_parameters(p, world.ground.surface, streams)
     pair = take_images(p, world, flight, camera_optics(p.optics), streams)
@@ -93,33 +93,35 @@ def errors(number: int) -> dict[str, dict[str, Scalar]]:
 
 
 def _rms(rows: Sequence[dict[str, Scalar]], value: Callable[[dict[str, Scalar]], float]) -> float:
-    """Root mean square over all pairs; NaN, which exceeds every bound, if a pair has no map."""
+    """Root mean square over all pairs; NaN, which exceeds every limit, if a pair has no map."""
     return float(np.sqrt(np.mean([value(row) ** 2 for row in rows])))
 
 
-def accuracy(quick: bool) -> Iterator[Measure]:
-    pairs = [errors(number) for number in range(6 if quick else 100)]
+def check_accuracy(quick: bool) -> Iterator[Measure]:
+    pairs = [simulate_errors(number) for number in range(6 if quick else 100)]
     for site in (*SITES, ""):
         rows = [pair["ours"] for pair in pairs if pair["ours"]["site"] == site or not site]
-        where = f"{len(rows)} noise-free pairs" + (f" over {site}" if site else "")
+        population = f"{len(rows)} noise-free pairs" + (f" over {site}" if site else "")
         limits = (None, None, None) if site else (ROTATION_LIMIT_DEG, BASELINE_LIMIT, ELEVATION_LIMIT)
         tracks = float(np.median([float(row["tracks"]) for row in rows]))
-        how = f"{where}, 8 to 15 m high, 0.2 of that apart, {tracks:.0f} tracks, scale and vertical exact"
-        yield Measure("rotation's error, rms", _rms(rows, _value("rotation_error_deg")), "deg", limits[0], how)
-        moved = _rms(rows, _value("baseline_error_fraction"))
-        yield Measure("baseline's error, direction and length, over its length, rms", moved, "", limits[1], how)
+        how = (
+            f"{population}, height 8 to 15 m, baseline 0.2 of the height, {tracks:.0f} tracks, exact scale and vertical"
+        )
+        yield Measure("rotation error, rms", _rms(rows, _column("rotation_error_deg")), "deg", limits[0], how)
+        baseline = _rms(rows, _column("baseline_error_fraction"))
+        yield Measure("baseline error, direction and length, divided by its length, rms", baseline, "", limits[1], how)
         elevation = _rms(rows, lambda row: float(row.get("elevation_rms_m", np.nan)) / float(row["range_m"]))
-        yield Measure("elevation's error over the height, rms", elevation, "", limits[2], how)
-    few = [pair["paper"] for pair in pairs]
-    tracks = float(np.median([float(row["tracks"]) for row in few]))
-    how = f"the same {len(few)} pairs"
-    turned = _rms(few, _value("rotation_error_deg"))
-    claim = f"rotation's error of the paper's features, {tracks:.0f} tracks, rms"
-    yield Measure(claim, turned, "deg", ROTATION_LIMIT_DEG, how)
+        yield Measure("elevation error divided by the height, rms", elevation, "", limits[2], how)
+    paper_rows = [pair["paper"] for pair in pairs]
+    tracks = float(np.median([float(row["tracks"]) for row in paper_rows]))
+    how = f"the same {len(paper_rows)} pairs"
+    rotation = _rms(paper_rows, _column("rotation_error_deg"))
+    claim = f"rotation error with the paper's features, {tracks:.0f} tracks, rms"
+    yield Measure(claim, rotation, "deg", ROTATION_LIMIT_DEG, how)
 
 
-def _value(name: str) -> Callable[[dict[str, Scalar]], float]:
+def _column(name: str) -> Callable[[dict[str, Scalar]], float]:
     return lambda row: float(row[name])
 
 
-CHECKS = (Check("landing", "Landing", accuracy),)
+CHECKS = (Check("landing", "Landing", check_accuracy),)

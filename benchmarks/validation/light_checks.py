@@ -1,4 +1,4 @@
-"""Checks of light: opposition peak, cast shadows, reflectance law, clouds and sun."""
+"""Checks of the illumination in images: opposition peak, cast shadows, reflectance law, cloud shadows, sun disc."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.stats import qmc
 
 from benchmarks.validation.limits import find_limit
 from benchmarks.validation.motion import View, render
-from benchmarks.validation.raycast import Ground, meet_triangles
+from benchmarks.validation.raycast import Ground, cast_triangles
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import cameras, descent_view, ground_view, renderer, rock_view
 from marsyard.sim.camera import Cahv, CameraModel
@@ -23,7 +23,8 @@ from marsyard.sim.terrain import Surface
 #: Brightness is albedo times the cosine of incidence in sunlight, and 0 in shadow.
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
 FLAT_ALBEDO = 0.2
-FARTHEST_FROM_A_MAST_M = 40.0
+MAX_MAST_RANGE_M = 40.0
+#: Reflectance laws of the check, by name.
 LAWS = {
     "Lambert": Photometry(lunar_fraction=0.0, surge_amplitude=0.0),
     "Mars": Photometry(),
@@ -32,44 +33,44 @@ LAWS = {
 }
 
 
-def _flat(albedo: float = FLAT_ALBEDO) -> Surface:
+def _make_flat_surface(albedo: float = FLAT_ALBEDO) -> Surface:
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = albedo
     return Surface.from_samples(samples, 64.0)
 
 
 def run_opposition(quick: bool) -> Iterator[Measure]:
-    """Compare the centre of the opposition peak in the image with the antisolar point."""
+    """Compare the centre of the opposition peak in images with the antisolar point."""
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     rng = np.random.default_rng(3)
-    surface = _flat()
+    surface = _make_flat_surface()
     for name, camera in cameras().items():
         errors = []
         for _ in range(3 if quick else 10):
             # the antisolar point is at a random pixel
             pixel = rng.uniform(0.2, 0.8, 2) * camera.size
-            turn = Rotation.align_vectors(np.array([[0.2, 0.1, -1.0]]), camera.boresight()[None])[0]
-            pose = rigid(turn, np.array([0.0, 0.0, 800.0]))
+            attitude = Rotation.align_vectors(np.array([[0.2, 0.1, -1.0]]), camera.boresight()[None])[0]
+            pose = rigid(attitude, np.array([0.0, 0.0, 800.0]))
             _, ray = camera.transform(pose).rays(pixel)
             if ray[2] > -0.3:
                 continue
             view = View(Scene(surface, (0.0, 0.0), Sun(-ray), law), camera, pose)
             radiance = render(renderer(), view).radiance.astype(np.float64)
-            errors.append(float(np.linalg.norm(_peak(radiance) - pixel)))
-        how = f"{len(errors)} suns; centre of the light above 90 % of the peak's height"
-        claim = f"opposition peak from the antisolar point: {name}"
+            errors.append(float(np.linalg.norm(_locate_peak(radiance) - pixel)))
+        how = f"{len(errors)} positions of the sun; centroid of radiance above 90 % of the peak"
+        claim = f"distance of opposition peak from antisolar point: {name}"
         yield Measure(claim, max(errors), "px", find_limit(claim), how)
 
 
-def _peak(radiance: np.ndarray) -> np.ndarray:
-    """Centre of the light above 90 % of the peak's height."""
+def _locate_peak(radiance: np.ndarray) -> np.ndarray:
+    """Centroid of the radiance above 90 % of the peak."""
     weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)
     v, u = np.mgrid[: radiance.shape[0], : radiance.shape[1]]
     return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
 
 
 def make_uniform(view: View, sun: Sun) -> View:
-    """The view with another sun, uniform albedo and Lambert's law."""
+    """Return the view with this sun, uniform albedo and Lambert's law."""
     samples = view.scene.surface.levels[0].copy()
     samples[..., 1] = FLAT_ALBEDO
     scene = replace(
@@ -80,65 +81,67 @@ def make_uniform(view: View, sun: Sun) -> View:
         objects=replace(view.scene.objects, albedo=np.full(len(view.scene.objects), FLAT_ALBEDO)),
         ground_texture=Texture(),
         object_texture=Texture(),
-        # one ray per pixel, because light is compared at the intersection of this ray
+        # one ray per pixel, because shadows are compared at the intersection of this ray
         edge_rays=1,
     )
     return replace(view, scene=scene)
 
 
-def _shadow_row(name: str, view: View, sun: Sun, count: int, farthest: float, step: float) -> Measure:
+def _compare_shadows(name: str, view: View, sun: Sun, count: int, farthest: float, step: float) -> Measure:
     view = make_uniform(view, sun)
     frame = render(renderer(), view)
     points = frame.points_world().reshape(-1, 3)
-    seen = np.flatnonzero(frame.range_m.ravel() < farthest)
-    pixels = np.random.default_rng(6).choice(seen, min(count, seen.size), replace=False)
+    candidates = np.flatnonzero(frame.range_m.ravel() < farthest)
+    pixels = np.random.default_rng(6).choice(candidates, min(count, candidates.size), replace=False)
     points, normals = points[pixels], frame.normal.reshape(-1, 3)[pixels].astype(np.float64)
-    towards = np.asarray(sun.direction, dtype=np.float64)
-    facing = normals @ towards
-    share = frame.radiance.ravel()[pixels] / (FLAT_ALBEDO * np.maximum(facing, 1e-6))
-    ours = (facing > 0.0) & (share > 0.5)
+    to_sun = np.asarray(sun.direction, dtype=np.float64)
+    cos_i = normals @ to_sun
+    sunlit_fraction = frame.radiance.ravel()[pixels] / (FLAT_ALBEDO * np.maximum(cos_i, 1e-6))
+    rendered_lit = (cos_i > 0.0) & (sunlit_fraction > 0.5)
     ground = Ground(view.scene.surface)
-    # the renderer smooths distant ground: use exact heights, because only shadows are compared
+    # the renderer smooths distant ground; exact heights are used, because only shadows are compared
     on_ground = frame.body.ravel()[pixels] < 0
     points[on_ground, 2] = ground.height(points[on_ground, 0], points[on_ground, 1])
-    hidden = ground.hides(points, towards, step)
-    rays = np.broadcast_to(towards, points.shape)
-    hidden |= np.isfinite(meet_triangles(view.scene.objects, points, rays, nearest=2e-3))
-    theirs = (facing > 0.0) & ~hidden
-    agree = float(np.mean(ours == theirs))
-    cast = (facing > 0.0) & hidden
-    dark_text = f", of which {np.mean(~ours[cast]):.0%} are dark in the picture" if cast.any() else ""
+    hidden = ground.hides(points, to_sun, step)
+    rays = np.broadcast_to(to_sun, points.shape)
+    hidden |= np.isfinite(cast_triangles(view.scene.objects, points, rays, nearest=2e-3))
+    reference_lit = (cos_i > 0.0) & ~hidden
+    agreement = float(np.mean(rendered_lit == reference_lit))
+    in_cast_shadow = (cos_i > 0.0) & hidden
+    rendered_dark = ~rendered_lit[in_cast_shadow]
+    dark_text = f", of which {np.mean(rendered_dark):.0%} are dark in the image" if in_cast_shadow.any() else ""
     how = (
-        f"{pixels.size} random pixels, {np.mean(facing <= 0.0):.1%} turned from the sun, "
-        f"{np.mean(cast):.1%} in cast shadow{dark_text}; {np.mean(theirs & ~ours):.2%} wrongly dark"
+        f"{pixels.size} random pixels, {np.mean(cos_i <= 0.0):.1%} facing away from the sun, "
+        f"{np.mean(in_cast_shadow):.1%} in cast shadow{dark_text}; "
+        f"{np.mean(reference_lit & ~rendered_lit):.2%} wrongly dark"
     )
     # about three times the maximum disagreement from the air (0.03 %), and twice that from a mast (0.24 %)
-    limit = 0.999 if farthest > FARTHEST_FROM_A_MAST_M else 0.995
-    return Measure(f"shadows as an independent ray cast has them: {name}", agree, "", limit, how, "at least")
+    limit = 0.999 if farthest > MAX_MAST_RANGE_M else 0.995
+    return Measure(f"shadows equal to those of independent ray casting: {name}", agreement, "", limit, how, "at least")
 
 
 def run_shadows(quick: bool) -> Iterator[Measure]:
     count = 2000 if quick else 20000
-    low, lower = (
+    sun_20_deg, sun_10_deg = (
         Sun(direction(np.radians(110.0), np.radians(20.0))),
         Sun(direction(np.radians(245.0), np.radians(10.0))),
     )
     pisgah = descent_view("pisgah", 2000.0, (1024, 1024))
     ground_only = replace(pisgah, scene=replace(pisgah.scene, objects=pisgah.scene.objects.none()))
     dunes, ripples = descent_view("kelso", 1000.0, (1024, 1024)), ground_view("gusev")
-    for sun, elevation in ((low, 20), (lower, 10)):
-        yield _shadow_row(f"pisgah's ground from 2 km, sun at {elevation} deg", ground_only, sun, count, 1e5, 0.4)
-        yield _shadow_row(f"kelso's dunes from 1 km, sun at {elevation} deg", dunes, sun, count, 1e5, 0.4)
-        yield _shadow_row(
-            f"ripples from a mast, sun at {elevation} deg", ripples, sun, count // 2, FARTHEST_FROM_A_MAST_M, 0.008
+    for sun, elevation in ((sun_20_deg, 20), (sun_10_deg, 10)):
+        yield _compare_shadows(f"pisgah's ground from 2 km, sun at {elevation} deg", ground_only, sun, count, 1e5, 0.4)
+        yield _compare_shadows(f"kelso's dunes from 1 km, sun at {elevation} deg", dunes, sun, count, 1e5, 0.4)
+        yield _compare_shadows(
+            f"ripples from a mast, sun at {elevation} deg", ripples, sun, count // 2, MAX_MAST_RANGE_M, 0.008
         )
-    yield _shadow_row("pisgah with rocks from 2 km, sun at 20 deg", pisgah, low, count // 2, 1e5, 0.4)
-    rocks, high = rock_view("gusev", 5.0), Sun(direction(np.radians(35.0), np.radians(30.0)))
-    yield _shadow_row("rocks from a mast, sun at 30 deg", rocks, high, count // 4, FARTHEST_FROM_A_MAST_M, 0.008)
+    yield _compare_shadows("pisgah with rocks from 2 km, sun at 20 deg", pisgah, sun_20_deg, count // 2, 1e5, 0.4)
+    rocks, sun_30_deg = rock_view("gusev", 5.0), Sun(direction(np.radians(35.0), np.radians(30.0)))
+    yield _compare_shadows("rocks from a mast, sun at 30 deg", rocks, sun_30_deg, count // 4, MAX_MAST_RANGE_M, 0.008)
 
 
-def _single_pixel() -> Cahv:
-    """A nadir camera with 9 x 9 pixels."""
+def _make_nadir_camera() -> Cahv:
+    """Create a nadir camera with 9 x 9 pixels."""
     return Cahv.from_field_of_view(
         horizontal_rad=0.002,
         size=(9, 9),
@@ -148,118 +151,137 @@ def _single_pixel() -> Cahv:
     )
 
 
-def _rendered_brightness(law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
-    """Brightness of flat ground in direct sunlight, from the central pixel of an image."""
-    turn = Rotation.align_vectors(-to_eye[None], np.array([[0.0, 0.0, -1.0]]))[0]
-    view = View(Scene(_flat(), (0.0, 0.0), Sun(to_sun), law), _single_pixel(), rigid(turn, 100.0 * to_eye))
+def _render_brightness(law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
+    """Render flat ground in direct sunlight; return the brightness of the central pixel."""
+    attitude = Rotation.align_vectors(-to_eye[None], np.array([[0.0, 0.0, -1.0]]))[0]
+    view = View(
+        Scene(_make_flat_surface(), (0.0, 0.0), Sun(to_sun), law), _make_nadir_camera(), rigid(attitude, 100.0 * to_eye)
+    )
     return float(render(renderer(), view).radiance[4, 4])
 
 
-def _law(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: npt.ArrayLike) -> np.ndarray:
+def _reflectance(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: npt.ArrayLike) -> np.ndarray:
     """Independent implementation of the law of `Photometry`, for unit albedo and K."""
     g = np.arccos(np.clip(cos_g, -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
-    share = law.lunar_fraction
-    return surge * (2.0 * share * cos_i / (cos_i + cos_e) + (1.0 - share) * cos_i)
+    lunar = law.lunar_fraction
+    return surge * (2.0 * lunar * cos_i / (cos_i + cos_e) + (1.0 - lunar) * cos_i)
 
 
 def run_reflectance(quick: bool) -> Iterator[Measure]:
     rng = np.random.default_rng(9)
     pairs = 10 if quick else 40
     for name, law in LAWS.items():
-        bare = replace(law, sky_share=0.0, surrounding_albedo=0.0)
-        away, off = [], []
+        sun_only = replace(law, sky_share=0.0, surrounding_albedo=0.0)
+        reciprocity_errors, formula_errors = [], []
         for _ in range(pairs):
             first, second = (
                 direction(float(rng.uniform(0.0, 2.0 * np.pi)), float(np.arcsin(rng.uniform(0.15, 1.0))))
                 for _ in range(2)
             )
-            there, back = _rendered_brightness(bare, first, second), _rendered_brightness(bare, second, first)
+            forward, backward = _render_brightness(sun_only, first, second), _render_brightness(sun_only, second, first)
             # I/F divided by the cosine of incidence is pi times the bidirectional reflectance
-            away.append(abs(there / first[2] / (back / second[2]) - 1.0))
-            expected = FLAT_ALBEDO * bare.normalisation() * _law(bare, first[2], second[2], float(first @ second))
-            off.append(float(abs(there / expected - 1.0)))
-        how = f"{pairs} pairs of sun and eye over flat ground"
-        albedo = abs(_spherical_albedo(bare, 20) * bare.normalisation() - 1.0)
-        for claim, measured, by in (
-            ("rendered reflectance is reciprocal", max(away), how),
-            ("rendered brightness against the formula", max(off), how),
-            ("spherical albedo from the stated one", albedo, "the law integrated over sun and eye by Sobol points"),
+            reciprocity_errors.append(abs(forward / first[2] / (backward / second[2]) - 1.0))
+            expected = (
+                FLAT_ALBEDO
+                * sun_only.normalisation()
+                * _reflectance(sun_only, first[2], second[2], float(first @ second))
+            )
+            formula_errors.append(float(abs(forward / expected - 1.0)))
+        how = f"{pairs} pairs of sun and camera directions over flat ground"
+        albedo = abs(_spherical_albedo(sun_only, 20) * sun_only.normalisation() - 1.0)
+        for claim, measured, method in (
+            ("rendered reflectance is reciprocal", max(reciprocity_errors), how),
+            ("rendered brightness compared with the formula", max(formula_errors), how),
+            (
+                "spherical albedo, difference from the specified value",
+                albedo,
+                "the law integrated over sun and camera directions by Sobol points",
+            ),
         ):
-            yield Measure(f"{claim}: {name}", measured, "", find_limit(f"{claim}: {name}"), by)
+            yield Measure(f"{claim}: {name}", measured, "", find_limit(f"{claim}: {name}"), method)
 
 
 def _spherical_albedo(law: Photometry, log2_points: int) -> float:
     """Fraction of isotropic light that the law with A = K = 1 reflects, by quasi-Monte Carlo.
 
-    Sun and eye are drawn in proportion to their cosines. The result is the mean of I/F over the cosine of incidence.
+    Directions of sun and camera are drawn in proportion to their cosines. The result is the mean of I/F divided by the
+    cosine of incidence.
     """
-    one, two, turn = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(log2_points).T
-    cos_i, cos_e = np.sqrt(1.0 - one), np.sqrt(1.0 - two)
-    cos_g = cos_i * cos_e + np.sqrt(one * two) * np.cos(2.0 * np.pi * turn)
-    return float(np.mean(_law(law, cos_i, cos_e, cos_g) / cos_i))
+    u_sun, u_camera, u_azimuth = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(log2_points).T
+    cos_i, cos_e = np.sqrt(1.0 - u_sun), np.sqrt(1.0 - u_camera)
+    cos_g = cos_i * cos_e + np.sqrt(u_sun * u_camera) * np.cos(2.0 * np.pi * u_azimuth)
+    return float(np.mean(_reflectance(law, cos_i, cos_e, cos_g) / cos_i))
 
 
 def run_clouds(quick: bool) -> Iterator[Measure]:
     """Measure cloud cover and motion of cloud shadows in images."""
     camera, law = cameras()["MER descent camera, CAHVOR, 45 deg"], LAMBERT
     sun = Sun(direction(np.radians(150.0), np.radians(45.0)))
-    given = CloudParameters(cover=0.3, size_m=400.0, optical_depth=50.0)
-    lit = FLAT_ALBEDO * float(sun.direction[2])
-    covers, moved = [], []
+    parameters = CloudParameters(cover=0.3, size_m=400.0, optical_depth=50.0)
+    direct_light = FLAT_ALBEDO * float(sun.direction[2])
+    covers, motion_errors = [], []
     for seed in range(2 if quick else 8):
-        layer = CloudLayer.draw(given, np.random.default_rng(seed))
-        scene = Scene(_flat(), (0.0, 0.0), sun, law, clouds=layer, edge_rays=1)
+        layer = CloudLayer.draw(parameters, np.random.default_rng(seed))
+        scene = Scene(_make_flat_surface(), (0.0, 0.0), sun, law, clouds=layer, edge_rays=1)
         rng = np.random.default_rng(100 + seed)
-        more = FLAT_ALBEDO * given.sky_light(sun)
-        for place in rng.uniform(0.0, 12800.0, (4, 2)):
-            picture = _from_above(scene, camera, place, 0.0)
-            covers.append(1.0 - float(np.mean((picture - more) / lit)))
-            later = _from_above(
-                scene, camera, place + 3.75 * np.array([given.wind_east_m_s, given.wind_north_m_s]), 3.75
+        sky_light = FLAT_ALBEDO * parameters.sky_light(sun)
+        for position in rng.uniform(0.0, 12800.0, (4, 2)):
+            image = _render_from_above(scene, camera, position, 0.0)
+            covers.append(1.0 - float(np.mean((image - sky_light) / direct_light)))
+            later = _render_from_above(
+                scene, camera, position + 3.75 * np.array([parameters.wind_east_m_s, parameters.wind_north_m_s]), 3.75
             )
-            steep = np.hypot(*np.gradient(picture))
-            clear = steep > 0.2 * steep.max()
-            moved.append(float(np.max(np.abs(later - picture)[clear] / steep[clear])))
-    how = (
-        f"{len(covers)} pictures from 2 km over flat ground, {2 if quick else 8} layers; {given.cover:g} was asked for"
-    )
+            slope = np.hypot(*np.gradient(image))
+            is_edge = slope > 0.2 * slope.max()
+            motion_errors.append(float(np.max(np.abs(later - image)[is_edge] / slope[is_edge])))
+    how = f"{len(covers)} images from 2 km over flat ground, {2 if quick else 8} layers; cover {parameters.cover:g}"
     yield Measure(
-        "share of the ground in clouds' shadows, from the stated one", abs(float(np.mean(covers)) - 0.3), "", 0.1, how
+        "fraction of the ground in cloud shadows, difference from the specified cover",
+        abs(float(np.mean(covers)) - 0.3),
+        "",
+        0.1,
+        how,
     )
-    how = "two pictures 3.75 s apart, the later from a place that drifted with the wind; change over slope at the edges"
-    # the same function is evaluated at a shifted position: the bound allows for rounding
-    yield Measure("motion of clouds' shadows from the wind's", max(moved), "px", 1e-4, how)
+    how = "two images 3.75 s apart, the second camera moved with the wind; change divided by slope at the edges"
+    # the same function is evaluated at a shifted position: the limit allows for rounding
+    yield Measure("motion of cloud shadows, difference from the wind", max(motion_errors), "px", 1e-4, how)
 
 
-def _from_above(scene: Scene, camera: CameraModel, place: np.ndarray, time_s: float) -> np.ndarray:
-    pose = rigid(Rotation.identity(), np.array([*place, 2000.0]))
+def _render_from_above(scene: Scene, camera: CameraModel, position: np.ndarray, time_s: float) -> np.ndarray:
+    pose = rigid(Rotation.identity(), np.array([*position, 2000.0]))
     return renderer().render(scene, PixelRays.of(camera), pose, time_s).radiance.astype(np.float64)
 
 
 def run_sun(quick: bool) -> Iterator[Measure]:
-    """Measure position and light of the sun's disc in the sky."""
+    """Compare direction and flux of the sun's disc in the image with those of the sun."""
     camera = cameras()["MER navcam, CAHVOR, 45 deg"]
-    off, flux = [], []
+    direction_errors, flux_errors = [], []
     for azimuth_deg, elevation_deg in (
         ((90.0, 12.0), (97.0, 16.0)) if quick else ((90.0, 12.0), (97.0, 16.0), (80.0, 5.0))
     ):
         sun = Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)))
         law = Photometry(sky_share=0.3, sky=DustySky(0.5, 0.95, 0.65))
         pose = rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5]))
-        scene = Scene(_flat(), (0.0, 0.0), sun, law, mesh_finest_m=0.5, mesh_reach_m=2000.0)
+        scene = Scene(_make_flat_surface(), (0.0, 0.0), sun, law, mesh_finest_m=0.5, mesh_reach_m=2000.0)
         rays = PixelRays.of(camera)
         radiance = renderer().render(scene, rays, pose).radiance.astype(np.float64)
-        light = np.where(radiance > 1000.0, radiance, 0.0)
+        sun_radiance = np.where(radiance > 1000.0, radiance, 0.0)
         rows, columns = np.indices(radiance.shape)
-        centre = np.array([(light * columns).sum(), (light * rows).sum()]) / light.sum()
-        off.append(float(np.linalg.norm(centre - camera.project(1e9 * sun.direction)[0])))
-        angle = np.square(rays.pixel_angles.astype(np.float64)).reshape(radiance.shape)
-        flux.append(abs(float((light * angle).sum()) / np.pi - 1.0))
-    claim = "the sun's disc from the sun's direction"
-    yield Measure(claim, max(off), "px", find_limit(claim), f"{len(off)} suns in the navcam's sky")
-    claim = "light of the sun's disc from the direct sun"
-    yield Measure(claim, max(flux), "", find_limit(claim), "the same pictures")
+        centre = np.array([(sun_radiance * columns).sum(), (sun_radiance * rows).sum()]) / sun_radiance.sum()
+        direction_errors.append(float(np.linalg.norm(centre - camera.project(1e9 * sun.direction)[0])))
+        solid_angle = np.square(rays.pixel_angles.astype(np.float64)).reshape(radiance.shape)
+        flux_errors.append(abs(float((sun_radiance * solid_angle).sum()) / np.pi - 1.0))
+    claim = "position of the sun's disc, difference from the sun's direction"
+    yield Measure(
+        claim,
+        max(direction_errors),
+        "px",
+        find_limit(claim),
+        f"{len(direction_errors)} positions of the sun in navcam images",
+    )
+    claim = "flux of the sun's disc compared with direct sunlight"
+    yield Measure(claim, max(flux_errors), "", find_limit(claim), "the same images")
 
 
 CHECKS = (

@@ -1,6 +1,6 @@
-"""Bounds of figures without a requirement: three times the value measured when the bound was set.
+"""Limits of measurements without a requirement: three times the value measured when the limit was set.
 
-A looser bound would detect only gross faults. The figures repeat to a few per cent on one machine; the factor of three
+A wider limit would detect only gross faults. The values repeat to a few per cent on one machine. The factor of three
 allows for other processors and OpenGL libraries. Document the reason for every increased entry.
 """
 
@@ -36,36 +36,36 @@ MEASURED: Mapping[str, float] = {
     "bias of motion, gusev from 2 km": 0.0013,
     "bias of motion, meridiani from 2 km": 0.00041,
     "bias of motion, rock at 10 m": 0.0051,
-    "bias of motion, grazed ground and rocks around it, 10 m": 0.0058,
+    "bias of motion, ground at grazing view and rocks around the large rock, 10 m": 0.0058,
     "bias of motion, rock at 5 m": 0.003,
     "bias of motion, rock at 2 m": 0.0007,
     "bias of motion, the HiRISE tile from 300 m": 0.00046,
-    "the estimator's own bias, gusev from 2 km, 256 samples a pixel": 0.00064,
-    "the estimator's own bias, rock at 5 m, 256 samples a pixel": 0.00098,
-    "opposition peak from the antisolar point: MER descent camera, CAHVOR, 45 deg": 0.007,
-    "opposition peak from the antisolar point: MER navcam, CAHVOR, 45 deg": 0.012,
-    "opposition peak from the antisolar point: hazcam, CAHVORE, 124 deg": 0.016,
-    "opposition peak from the antisolar point: Opportunity's hazcam from its label, CAHVORE, 124 deg": 0.014,
-    "opposition peak from the antisolar point: research pancam, 16 mm": 0.0065,
-    "opposition peak from the antisolar point: Sony XC-55": 0.015,
+    "bias of the estimator, gusev from 2 km, 256 samples per pixel": 0.00064,
+    "bias of the estimator, rock at 5 m, 256 samples per pixel": 0.00098,
+    "distance of opposition peak from antisolar point: MER descent camera, CAHVOR, 45 deg": 0.007,
+    "distance of opposition peak from antisolar point: MER navcam, CAHVOR, 45 deg": 0.012,
+    "distance of opposition peak from antisolar point: hazcam, CAHVORE, 124 deg": 0.016,
+    "distance of opposition peak from antisolar point: Opportunity's hazcam from its label, CAHVORE, 124 deg": 0.014,
+    "distance of opposition peak from antisolar point: research pancam, 16 mm": 0.0065,
+    "distance of opposition peak from antisolar point: Sony XC-55": 0.015,
     "rendered reflectance is reciprocal: Lambert": 7.6e-08,
-    "rendered brightness against the formula: Lambert": 6.8e-08,
+    "rendered brightness compared with the formula: Lambert": 6.8e-08,
     # rounding error of a sum of a million terms, which differs between processors
-    "spherical albedo from the stated one: Lambert": 1e-12,
+    "spherical albedo, difference from the specified value: Lambert": 1e-12,
     "rendered reflectance is reciprocal: Mars": 8.3e-08,
-    "rendered brightness against the formula: Mars": 6e-08,
-    "spherical albedo from the stated one: Mars": 5.5e-06,
+    "rendered brightness compared with the formula: Mars": 6e-08,
+    "spherical albedo, difference from the specified value: Mars": 5.5e-06,
     "rendered reflectance is reciprocal: dark lava": 9.9e-08,
-    "rendered brightness against the formula: dark lava": 5.6e-08,
-    "spherical albedo from the stated one: dark lava": 5.9e-06,
+    "rendered brightness compared with the formula: dark lava": 5.6e-08,
+    "spherical albedo, difference from the specified value: dark lava": 5.9e-06,
     "rendered reflectance is reciprocal: narrow surge": 8.5e-08,
-    "rendered brightness against the formula: narrow surge": 6.9e-08,
-    "spherical albedo from the stated one: narrow surge": 1.6e-05,
-    "the sun's disc from the sun's direction": 0.0082,
-    "light of the sun's disc from the direct sun": 0.0019,
+    "rendered brightness compared with the formula: narrow surge": 6.9e-08,
+    "spherical albedo, difference from the specified value: narrow surge": 1.6e-05,
+    "position of the sun's disc, difference from the sun's direction": 0.0082,
+    "flux of the sun's disc compared with direct sunlight": 0.0019,
 }
 
 
 def find_limit(claim: str) -> float:
-    """Bound of a claim, rounded to two digits. Raises KeyError for an unknown claim."""
+    """Return the limit of a claim, rounded to two digits. Raises KeyError for an unknown claim."""
     return float(f"{FACTOR * MEASURED[claim]:.2g}")

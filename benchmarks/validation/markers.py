@@ -1,4 +1,4 @@
-"""Positions of rendered markers on undulating ground, compared with the camera model.
+"""Errors of the positions of rendered markers on undulating ground, relative to the camera model.
 
 Markers are Gaussian spots of albedo on black ground, at the ground intersections of random pixels' rays. The expected
 centre of light is computed from the camera model only; perspective moves it by hundredths of a pixel.
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.validation.raycast import Ground
-from benchmarks.validation.scenes import OVERHEAD, PAINT, cameras
+from benchmarks.validation.scenes import LAMBERTIAN, OVERHEAD_SUN, cameras
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import PixelRays, Renderer, Scene
@@ -26,8 +26,8 @@ from marsyard.sim.terrain import Surface
 SIDE = 2048
 #: Size of a marker in the image: geometric mean of the standard deviations of its ellipse, pixels.
 SPOT_PX = 2.7
-#: Half side of the window in which the light is summed, and minimum distance of markers, pixels.
-WINDOW, APART = 14, 46
+#: Half side of the window over which radiance is summed, and minimum distance of markers, pixels.
+WINDOW, MIN_DISTANCE = 14, 46
 #: Maximum angle between the line of sight and the vertical.
 MAX_OBLIQUITY_RAD = np.radians(68.0)
 #: Maximum off-nadir angle of a camera's axis.
@@ -36,7 +36,7 @@ MARKERS = 1000
 
 
 @dataclass(frozen=True)
-class Marked:
+class MarkedView:
     """Ground with markers, a camera above it, and the expected pixels of the markers."""
 
     scene: Scene
@@ -45,16 +45,16 @@ class Marked:
     expected: np.ndarray
 
 
-def _looking_down(camera: CameraModel, rng: np.random.Generator) -> Rotation:
+def _draw_attitude(camera: CameraModel, rng: np.random.Generator) -> Rotation:
     """Draw an attitude with a downward boresight, tilted by up to `MAX_TILT_RAD`."""
-    tilt, about, spin = rng.uniform(0.2, 1.0) * MAX_TILT_RAD, *rng.uniform(0.0, 2.0 * np.pi, 2)
-    target = np.array([np.sin(tilt) * np.cos(about), np.sin(tilt) * np.sin(about), -np.cos(tilt)])
-    turned = Rotation.align_vectors(target[None], camera.boresight()[None])[0]
-    return Rotation.from_rotvec(spin * target) * turned
+    tilt, azimuth, spin = rng.uniform(0.2, 1.0) * MAX_TILT_RAD, *rng.uniform(0.0, 2.0 * np.pi, 2)
+    target = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])
+    pointing = Rotation.align_vectors(target[None], camera.boresight()[None])[0]
+    return Rotation.from_rotvec(spin * target) * pointing
 
 
-def _rolling(extent_m: float, rng: np.random.Generator) -> np.ndarray:
-    """Heights of a periodic ground of long waves with slopes of a few degrees."""
+def _draw_undulating_heights(extent_m: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw the heights of a periodic ground with long waves and slopes of a few degrees."""
     phase = np.arange(SIDE) * (2.0 * np.pi / SIDE)
     heights = np.zeros((SIDE, SIDE))
     for _ in range(6):
@@ -65,56 +65,56 @@ def _rolling(extent_m: float, rng: np.random.Generator) -> np.ndarray:
     return heights
 
 
-def mark_view(camera: CameraModel, height_m: float, rng: np.random.Generator) -> Marked:
+def create_marked_view(camera: CameraModel, height_m: float, rng: np.random.Generator) -> MarkedView:
     """Create ground with as many markers as fit into the image."""
-    pose = rigid(_looking_down(camera, rng), np.array([0.0, 0.0, height_m]))
+    pose = rigid(_draw_attitude(camera, rng), np.array([0.0, 0.0, height_m]))
     world_camera = camera.transform(pose)
     pixels = _scatter_points(camera.size, rng)
     origins, rays = world_camera.rays(pixels)
     steep = rays[:, 2] < -np.cos(MAX_OBLIQUITY_RAD)
     pixels, origins, rays = pixels[steep], np.array(origins[steep]), rays[steep]
-    reach = np.abs((origins - rays * (origins[:, 2:] / rays[:, 2:]))[:, :2]).max() * 1.15
-    spacing = 2.0 * reach / SIDE
+    half_side = np.abs((origins - rays * (origins[:, 2:] / rays[:, 2:]))[:, :2]).max() * 1.15
+    spacing = 2.0 * half_side / SIDE
     samples = np.zeros((SIDE, SIDE, 2), dtype=np.float32)
-    samples[..., 0] = _rolling(2.0 * reach, rng)
-    bare = Ground(Surface.from_samples(samples.copy(), spacing))
-    distance = bare.cast(origins, rays, 10.0 * height_m, 2.0 * spacing)
+    samples[..., 0] = _draw_undulating_heights(2.0 * half_side, rng)
+    ground = Ground(Surface.from_samples(samples.copy(), spacing))
+    distance = ground.cast(origins, rays, 10.0 * height_m, 2.0 * spacing)
     points = origins + distance[:, None] * rays
-    sigma = SPOT_PX / np.sqrt(_picture_area(world_camera, bare, points))
-    for point, one in zip(points, sigma, strict=True):
-        _paint(samples[..., 1], point / spacing, one / spacing)
+    sigmas = SPOT_PX / np.sqrt(_image_area(world_camera, ground, points))
+    for point, sigma in zip(points, sigmas, strict=True):
+        _add_spot(samples[..., 1], point / spacing, sigma / spacing)
     surface = Surface.from_samples(samples, spacing)
     expected = np.stack(
         [
-            _centre_of_light(world_camera, bare, point, np.hypot(one, spacing / np.sqrt(3.0)))
-            for point, one in zip(points, sigma, strict=True)
+            _expected_centre(world_camera, ground, point, np.hypot(sigma, spacing / np.sqrt(3.0)))
+            for point, sigma in zip(points, sigmas, strict=True)
         ]
     )
     scene = Scene(
         surface,
         (0.0, 0.0),
-        OVERHEAD,
-        PAINT,
+        OVERHEAD_SUN,
+        LAMBERTIAN,
         ground_shadows=False,
-        mesh_finest_m=reach / 250.0,
-        mesh_reach_m=4.0 * reach,
+        mesh_finest_m=half_side / 250.0,
+        mesh_reach_m=4.0 * half_side,
     )
-    return Marked(scene, camera, pose, expected)
+    return MarkedView(scene, camera, pose, expected)
 
 
 def _scatter_points(size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    """Random pixels with a minimum distance: a jittered grid."""
-    cell = APART + 12
-    across, down = (side // cell for side in size)
-    corners = np.stack(np.meshgrid(np.arange(across), np.arange(down)), axis=-1).reshape(-1, 2)
-    scale = np.array(size) / [across, down]
-    free = scale - APART
-    pixels = (corners + 0.5) * scale - 0.5 + rng.uniform(-0.5, 0.5, corners.shape) * free
+    """Draw random pixels with a minimum distance, on a jittered grid."""
+    cell = MIN_DISTANCE + 12
+    columns, rows = (side // cell for side in size)
+    corners = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
+    scale = np.array(size) / [columns, rows]
+    jitter = scale - MIN_DISTANCE
+    pixels = (corners + 0.5) * scale - 0.5 + rng.uniform(-0.5, 0.5, corners.shape) * jitter
     inside = (pixels > WINDOW + 2).all(axis=1) & (pixels < np.array(size) - WINDOW - 3).all(axis=1)
     return pixels[inside]
 
 
-def _picture_area(camera: CameraModel, ground: Ground, points: np.ndarray) -> np.ndarray:
+def _image_area(camera: CameraModel, ground: Ground, points: np.ndarray) -> np.ndarray:
     """Image area of one square metre of horizontal ground, pixels."""
     jacobian = camera.projection_jacobian(points)
     gradient = ground.gradient(points[..., 0], points[..., 1])
@@ -122,45 +122,46 @@ def _picture_area(camera: CameraModel, ground: Ground, points: np.ndarray) -> np
     return np.abs(np.linalg.det(by_plan))
 
 
-def _paint(albedo: np.ndarray, place: np.ndarray, sigma: float) -> None:
+def _add_spot(albedo: np.ndarray, position: np.ndarray, sigma: float) -> None:
     """Add a Gaussian spot to a periodic grid; position and sigma in samples."""
-    reach = int(np.ceil(6.0 * sigma))
-    columns, rows = (round(float(one)) + np.arange(-reach, reach + 1) for one in place[:2])
-    spot = np.exp(-((rows[:, None] - place[1]) ** 2 + (columns[None, :] - place[0]) ** 2) / (2.0 * sigma**2))
+    half_width = int(np.ceil(6.0 * sigma))
+    columns, rows = (round(float(centre)) + np.arange(-half_width, half_width + 1) for centre in position[:2])
+    spot = np.exp(-((rows[:, None] - position[1]) ** 2 + (columns[None, :] - position[0]) ** 2) / (2.0 * sigma**2))
     albedo[np.ix_(rows % SIDE, columns % SIDE)] += (0.5 * spot).astype(np.float32)
 
 
-def _centre_of_light(camera: CameraModel, ground: Ground, marker: np.ndarray, sigma: float) -> np.ndarray:
-    """Mean pixel of a marker, weighted by brightness under the overhead sun and by image area."""
+def _expected_centre(camera: CameraModel, ground: Ground, marker: np.ndarray, sigma: float) -> np.ndarray:
+    """Centroid of a marker in pixels, weighted by brightness under the overhead sun and by image area."""
     offset = sigma * np.linspace(-5.5, 5.5, 45)
     dx, dy = np.meshgrid(offset, offset)
     x, y = marker[0] + dx, marker[1] + dy
     points = np.stack([x, y, ground.height(x, y)], axis=-1)
     gradient = ground.gradient(x, y)
     cos_i = 1.0 / np.sqrt(1.0 + np.sum(gradient**2, axis=-1))
-    weight = cos_i * _picture_area(camera, ground, points) * np.exp(-(dx**2 + dy**2) / (2.0 * sigma**2))
+    weight = cos_i * _image_area(camera, ground, points) * np.exp(-(dx**2 + dy**2) / (2.0 * sigma**2))
     pixels, visible = camera.project(points)
-    near = visible & (np.abs(pixels - np.rint(camera.project(marker)[0])) < WINDOW + 0.5).all(axis=-1)
-    return (weight[near, None] * pixels[near]).sum(axis=0) / weight[near].sum()
+    in_window = visible & (np.abs(pixels - np.rint(camera.project(marker)[0])) < WINDOW + 0.5).all(axis=-1)
+    return (weight[in_window, None] * pixels[in_window]).sum(axis=0) / weight[in_window].sum()
 
 
-def _locate_marker(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
-    u0, v0 = np.rint(near).astype(int)
+def _locate_marker(radiance: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Centroid of the radiance in the window around the expected pixel."""
+    u0, v0 = np.rint(expected).astype(int)
     v, u = np.mgrid[v0 - WINDOW : v0 + WINDOW + 1, u0 - WINDOW : u0 + WINDOW + 1]
     light = radiance[v, u].astype(np.float64)
     return np.array([(light * u).sum(), (light * v).sum()]) / light.sum()
 
 
-def marker_errors(renderer: Renderer, camera: CameraModel, seed: int, count: int = MARKERS) -> np.ndarray:
-    """Errors (u, v) of `count` markers over several poses, shape (count, 2)."""
+def measure_marker_errors(renderer: Renderer, camera: CameraModel, seed: int, count: int = MARKERS) -> np.ndarray:
+    """Measure the errors (u, v) of `count` markers from several poses, pixels, shape (count, 2)."""
     rng = np.random.default_rng(seed)
     rays = PixelRays.of(camera)
     errors: list[np.ndarray] = []
     while len(errors) < count:
-        # from the height of a mast to that of a parachute descent
-        marked = mark_view(camera, float(10.0 ** rng.uniform(0.2, 3.3)), rng)
-        radiance = renderer.render(marked.scene, rays, marked.pose).radiance
-        errors += [_locate_marker(radiance, near) - near for near in marked.expected]
+        # heights from a mast (1.6 m) to a parachute descent (2 km)
+        view = create_marked_view(camera, float(10.0 ** rng.uniform(0.2, 3.3)), rng)
+        radiance = renderer.render(view.scene, rays, view.pose).radiance
+        errors += [_locate_marker(radiance, expected) - expected for expected in view.expected]
     return np.stack(errors[:count])
 
 
@@ -169,8 +170,8 @@ def main() -> None:
     renderer = Renderer(backend)  # type: ignore[arg-type]
     errors = {}
     for seed, (name, camera) in enumerate(cameras().items()):
-        away = np.linalg.norm(marker_errors(renderer, camera, seed, count), axis=1)
-        errors[name] = {"rms": float(np.sqrt(np.mean(away**2))), "worst": float(away.max())}
+        errors_px = np.linalg.norm(measure_marker_errors(renderer, camera, seed, count), axis=1)
+        errors[name] = {"rms": float(np.sqrt(np.mean(errors_px**2))), "worst": float(errors_px.max())}
     print(json.dumps({"gl": renderer.description(), "errors": errors}))
 
 

@@ -1,4 +1,4 @@
-"""Subpixel motion of rendered images compared with the motion of the camera; detects aliasing.
+"""Measurement of the subpixel motion of rendered images, compared with the motion of the camera; detects aliasing.
 
 The camera moves sideways so that the image centre moves by 0.0, 0.1 ... 1.0 pixel along the columns. The true motion of
 each pixel is the projection of its world point by the moved camera. Patches with occluding edges are excluded.
@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from benchmarks.validation.estimators import HALF, MARGIN, PATCH, SmoothPicture, peak_fits, symmetric_shifts
+from benchmarks.validation.estimators import HALF, MARGIN, PATCH, SmoothImage, peak_fits, symmetric_shifts
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import Frame, PixelRays, Renderer, Scene
 
 STEPS_PX = np.linspace(0.0, 1.0, 11)
 #: Maximum relative difference of the motions within a patch; larger values mark an edge.
-MAX_SPREAD = 0.1
+MAX_MOTION_RANGE = 0.1
 #: Body number of patches that show more than one body.
 MIXED = -3
 
@@ -37,13 +37,13 @@ class View:
     world_from_body: RigidTransform
     footprint: float = 1.0
 
-    def transform(self, offset_world_m: np.ndarray) -> View:
-        """The same view from a shifted position."""
+    def shift(self, offset_world_m: np.ndarray) -> View:
+        """Return the same view from a shifted position."""
         pose = rigid(self.world_from_body.rotation, self.world_from_body.translation + offset_world_m)
         return replace(self, world_from_body=pose)
 
     def rays(self, camera: CameraModel) -> PixelRays:
-        """Rays of the camera or of a part of it."""
+        """Return the rays of the camera or of a part of its image."""
         rays = PixelRays.of(camera)
         return replace(rays, pixel_angles=np.float32(self.footprint) * rays.pixel_angles)
 
@@ -80,28 +80,28 @@ def render(renderer: Renderer, view: View, samples: int = 1) -> Frame:
     )
 
 
-#: Side in samples of the parts in which an oversampled image is rendered.
-PIECE = 1024
+#: Side of the tiles in which an oversampled image is rendered, samples.
+TILE_SIDE = 1024
 
 
 def supersample(renderer: Renderer, view: View, samples: int) -> np.ndarray:
-    """Mean over samples x samples rays in each pixel; the footprint of each ray is its part of the pixel."""
+    """Render the mean of samples x samples rays in each pixel; the footprint of each ray is its part of the pixel."""
     fine = view.camera.scale(samples)
     columns, rows = view.camera.size
-    step = PIECE // samples
-    picture = np.empty((rows, columns))
+    step = TILE_SIDE // samples
+    image = np.empty((rows, columns))
     for row in range(0, rows, step):
         for column in range(0, columns, step):
             size = (min(step, columns - column), min(step, rows - row))
             part = fine.crop(column * samples, row * samples, (size[0] * samples, size[1] * samples))
             radiance = renderer.render(view.scene, view.rays(part), view.world_from_body).radiance
             blocks = radiance.reshape(size[1], samples, size[0], samples)
-            picture[row : row + size[1], column : column + size[0]] = blocks.mean(axis=(1, 3), dtype=np.float64)
-    return picture
+            image[row : row + size[1], column : column + size[0]] = blocks.mean(axis=(1, 3), dtype=np.float64)
+    return image
 
 
-def sideways(view: View, frame: Frame) -> np.ndarray:
-    """World offset that moves the image centre by one pixel along the columns."""
+def compute_sideways_offset(view: View, frame: Frame) -> np.ndarray:
+    """Compute the world offset of the camera that moves the image centre by one pixel along u."""
     rows, columns = frame.range_m.shape
     middle = (slice(rows // 2 - HALF, rows // 2 + HALF + 1), slice(columns // 2 - HALF, columns // 2 + HALF + 1))
     distance = float(np.median(frame.range_m[middle]))
@@ -109,19 +109,19 @@ def sideways(view: View, frame: Frame) -> np.ndarray:
     return -right * distance / view.camera.focal_lengths[0]
 
 
-def true_motion(frame: Frame, view: View, other: View) -> np.ndarray:
+def compute_true_motion(frame: Frame, view: View, target: View) -> np.ndarray:
     """Motion (u, v) of every pixel's point between two views; NaN in the sky and for invisible points."""
     points = frame.points_world()
-    camera = view.camera.transform(other.world_from_body)
+    camera = view.camera.transform(target.world_from_body)
     pixels, _ = camera.project(points)
     # the difference of two projections is more accurate than the pixel position of a ray in single precision (1e-4 px)
-    here, _ = view.camera.transform(view.world_from_body).project(points)
-    return pixels - here
+    original, _ = view.camera.transform(view.world_from_body).project(points)
+    return pixels - original
 
 
-def _windows(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    reach = np.arange(-HALF, HALF + 1)
-    return values[(centres[:, 1, None] + reach)[:, :, None], (centres[:, 0, None] + reach)[:, None, :]]
+def _extract_patches(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    offsets = np.arange(-HALF, HALF + 1)
+    return values[(centres[:, 1, None] + offsets)[:, :, None], (centres[:, 0, None] + offsets)[:, None, :]]
 
 
 def patch_grid(size: tuple[int, int], stride: int = PATCH) -> np.ndarray:
@@ -131,12 +131,12 @@ def patch_grid(size: tuple[int, int], stride: int = PATCH) -> np.ndarray:
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
-def _whole_patches(motion: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Select patches with nearly uniform motion."""
-    windows = _windows(motion, centres)
-    spread = np.ptp(windows, axis=(1, 2)).max(axis=-1)
-    alike = spread <= MAX_SPREAD * np.linalg.norm(windows, axis=-1).max(axis=(1, 2))
-    return centres[alike]
+def _select_patches(motion: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Select patches with nearly uniform motion, which contain no occluding edge."""
+    patches = _extract_patches(motion, centres)
+    motion_range = np.ptp(patches, axis=(1, 2)).max(axis=-1)
+    is_uniform = motion_range <= MAX_MOTION_RANGE * np.linalg.norm(patches, axis=-1).max(axis=(1, 2))
+    return centres[is_uniform]
 
 
 def measure(
@@ -144,30 +144,30 @@ def measure(
 ) -> Iterator[Motion]:
     """Yield the errors of the measured motion for each step."""
     first = render(renderer, view, samples)
-    unit = sideways(view, first)
-    first_smooth = SmoothPicture(first.radiance)
-    one_pixel = true_motion(first, view, view.transform(unit))
-    centres = _whole_patches(one_pixel, patch_grid(view.camera.size, stride))
+    unit = compute_sideways_offset(view, first)
+    first_smooth = SmoothImage(first.radiance)
+    one_pixel = compute_true_motion(first, view, view.shift(unit))
+    centres = _select_patches(one_pixel, patch_grid(view.camera.size, stride))
     for step in steps:
-        other = view.transform(step * unit)
-        second = render(renderer, other, samples)
-        shifts = symmetric_shifts(first_smooth, SmoothPicture(second.radiance), centres)
+        shifted = view.shift(step * unit)
+        second = render(renderer, shifted, samples)
+        shifts = symmetric_shifts(first_smooth, SmoothImage(second.radiance), centres)
         # motion relative to the midpoint of both images, as in the estimator
-        ahead, back = true_motion(first, view, other), true_motion(second, other, view)
-        seen_from_both = ~np.isnan(_windows(ahead - back, centres)).any(axis=(1, 2, 3))
-        motion = 0.5 * (_windows(ahead, centres) - _windows(back, centres))
-        mean_ahead = _windows(ahead, centres).mean(axis=(1, 2))
+        ahead, back = compute_true_motion(first, view, shifted), compute_true_motion(second, shifted, view)
+        is_visible_in_both = ~np.isnan(_extract_patches(ahead - back, centres)).any(axis=(1, 2, 3))
+        motion = 0.5 * (_extract_patches(ahead, centres) - _extract_patches(back, centres))
+        mean_ahead = _extract_patches(ahead, centres).mean(axis=(1, 2))
         parabola, biquadratic = peak_fits(first.radiance, second.radiance, centres)
         yield Motion(
             float(step),
-            (shifts.found - shifts.expected(motion))[seen_from_both],
-            (parabola - mean_ahead)[seen_from_both],
-            (biquadratic - mean_ahead)[seen_from_both],
-            _shown_requirement(_windows(first.body, centres))[seen_from_both],
+            (shifts.motion_px - shifts.expected(motion))[is_visible_in_both],
+            (parabola - mean_ahead)[is_visible_in_both],
+            (biquadratic - mean_ahead)[is_visible_in_both],
+            _body_of_patches(_extract_patches(first.body, centres))[is_visible_in_both],
         )
 
 
-def _shown_requirement(bodies: np.ndarray) -> np.ndarray:
+def _body_of_patches(bodies: np.ndarray) -> np.ndarray:
     """Body of each patch, or `MIXED`."""
     lowest, highest = bodies.min(axis=(1, 2)), bodies.max(axis=(1, 2))
     return np.where(lowest == highest, lowest, MIXED)

@@ -1,4 +1,4 @@
-"""Checks of image motion: all sites from 2 km, and rocks from a mast."""
+"""Checks of the motion of rendered images: all sites from 2 km, and rocks from a mast."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.validation.scenes import descent_view, renderer, rock_view, tile
 from marsyard.sim.render.renderer import edge_pixels
 from marsyard.sim.terrain.sites import sites
 
-#: Bound for the quick control: images with 16 samples per pixel are less accurate than with 256.
+#: Limit of the quick control, whose images have 16 samples per pixel and are less accurate than with 256.
 QUICK_CONTROL_LIMIT_PX = 0.005
 DESCENT_HEIGHT_M = 2000.0
 #: Height at which a pixel of the descent camera is 0.25 m; the orthoimage has 0.5 m.
@@ -34,28 +34,28 @@ CONTROL_STEPS_PX = np.array([0.25, 0.5])
 QUICK_STEPS_PX = np.array([0.3, 0.5, 0.8])
 
 
-def bias(errors: Sequence[np.ndarray]) -> float:
+def max_bias(errors: Sequence[np.ndarray]) -> float:
     """Maximum mean error over both axes and all steps."""
     return float(max(np.abs(error.mean(axis=0)).max() for error in errors))
 
 
-def uncertainty(errors: Sequence[np.ndarray]) -> float:
+def max_standard_error(errors: Sequence[np.ndarray]) -> float:
     """Maximum standard error of the mean errors."""
     return float(max((error.std(axis=0, ddof=1) / np.sqrt(len(error))).max() for error in errors))
 
 
-def _row(claim: str, errors: Sequence[np.ndarray], steps: np.ndarray, limit: float | None = None) -> Measure:
-    """Row of a bias; the default bound is that of `limits`."""
+def _measure_bias(claim: str, errors: Sequence[np.ndarray], steps: np.ndarray, limit: float | None = None) -> Measure:
+    """Measure a bias; the default limit is that of `limits`."""
     scatter = max(error.std(axis=0, ddof=1).max() for error in errors)
     patches = min(len(error) for error in errors)
     how = (
         f"{patches} patches, {len(steps)} steps from {steps[0]:.2g} to {steps[-1]:.2g} px; "
-        f"one patch scatters by {scatter:.2g} px, the mean by {uncertainty(errors):.1g} px"
+        f"standard deviation of one patch {scatter:.2g} px, of the mean {max_standard_error(errors):.1g} px"
     )
-    return Measure(claim, bias(errors), "px", find_limit(claim) if limit is None else limit, how)
+    return Measure(claim, max_bias(errors), "px", find_limit(claim) if limit is None else limit, how)
 
 
-def _fits(motions: Sequence[Motion]) -> tuple[float, float]:
+def _median_fit_errors(motions: Sequence[Motion]) -> tuple[float, float]:
     """Maximum median errors of parabola and quadric; medians, because parabolas have outliers."""
     return tuple(  # type: ignore[return-value]
         float(max(np.abs(np.median(getattr(motion, fit), axis=0)).max() for motion in motions))
@@ -63,39 +63,41 @@ def _fits(motions: Sequence[Motion]) -> tuple[float, float]:
     )
 
 
-def run(quick: bool) -> Iterator[Measure]:
+def run_motion(quick: bool) -> Iterator[Measure]:
     steps = QUICK_STEPS_PX if quick else STEPS_PX
     fits: list[tuple[float, float]] = []
     for name, where in sites().items():
         if where.descent is None:
             continue
         motions = list(measure(renderer(), descent_view(name, DESCENT_HEIGHT_M, DESCENT_SIZE), steps))
-        fits.append(_fits(motions))
-        yield _row(f"bias of motion, {name} from 2 km", [motion.error for motion in motions], steps)
+        fits.append(_median_fit_errors(motions))
+        yield _measure_bias(f"bias of motion, {name} from 2 km", [motion.error for motion in motions], steps)
     for distance in DISTANCES_M:
         # overlapping patches at 10 m, because fewer than 200 separate patches fit onto the rock
         stride = 24 if distance > 5.0 else PATCH
         motions = list(measure(renderer(), rock_view(ROCK_SITE, distance), steps, stride=stride))
-        fits.append(_fits(motions))
-        rock = _commonest_rock(motions[0])
+        fits.append(_median_fit_errors(motions))
+        rock = _most_frequent_rock(motions[0])
         on_rock = [motion.error[motion.body == rock] for motion in motions]
-        yield _row(f"bias of motion, rock at {distance:g} m", on_rock, steps)
+        yield _measure_bias(f"bias of motion, rock at {distance:g} m", on_rock, steps)
         around = [motion.error[motion.body != rock] for motion in motions]
         if min(len(error) for error in around) >= 200:
-            yield _row(f"bias of motion, grazed ground and rocks around it, {distance:g} m", around, steps)
+            yield _measure_bias(
+                f"bias of motion, ground at grazing view and rocks around the large rock, {distance:g} m", around, steps
+            )
     raw = replace(rock_view(ROCK_SITE, 10.0), footprint=1.0 / 64.0)
     errors = [motion.error for motion in measure(renderer(), raw, np.array([0.25, 0.5, 0.75]))]
     yield Measure(
-        "the same of raw point samples, rock and ground from 10 m: what the limit is to catch",
-        bias(errors),
+        "bias of motion with point samples (aliasing), rock and ground from 10 m",
+        max_bias(errors),
         "px",
         None,
         "3 steps",
     )
     for index, fit in enumerate(("parabola", "biquadratic")):
-        worst = max(one[index] for one in fits)
+        max_error = max(errors[index] for errors in fits)
         yield Measure(
-            f"pixel locking of a {fit} through the correlation's peak", worst, "px", None, "of the same pictures"
+            f"pixel locking of a {fit} through the correlation peak", max_error, "px", None, "the same images"
         )
 
 
@@ -105,10 +107,10 @@ def run_tile(quick: bool) -> Iterator[Measure]:
         return
     steps = QUICK_STEPS_PX if quick else STEPS_PX
     errors = [motion.error for motion in measure(renderer(), view, steps)]
-    yield _row(f"bias of motion, the HiRISE tile from {TILE_HEIGHT_M:g} m", errors, steps)
+    yield _measure_bias(f"bias of motion, the HiRISE tile from {TILE_HEIGHT_M:g} m", errors, steps)
 
 
-def _commonest_rock(motion: Motion) -> int:
+def _most_frequent_rock(motion: Motion) -> int:
     rocks = motion.body[motion.body >= 0]
     return int(np.bincount(rocks).argmax())
 
@@ -122,22 +124,23 @@ def run_control(quick: bool) -> Iterator[Measure]:
     samples = 4 if quick else CONTROL_SAMPLES
     for name, view in _control_views():
         motions = list(measure(renderer(), view, CONTROL_STEPS_PX, samples))
-        claim = f"the estimator's own bias, {name}, {samples**2} samples a pixel"
+        claim = f"bias of the estimator, {name}, {samples**2} samples per pixel"
         limit = QUICK_CONTROL_LIMIT_PX if quick else None
-        yield _row(claim, [motion.error for motion in motions], CONTROL_STEPS_PX, limit)
+        yield _measure_bias(claim, [motion.error for motion in motions], CONTROL_STEPS_PX, limit)
 
 
-def _edge_error(view: View) -> tuple[float, float, int]:
-    """Relative RMS error of radiance at edge pixels with one ray and as rendered, and the number of pixels.
+def _measure_edge_error(view: View) -> tuple[float, float, int]:
+    """Return the relative RMS error of radiance at edge pixels with one ray and with several, and their number.
 
     The reference has 256 rays per pixel, with ground and texture as smooth as in the pixel.
     """
     single = replace(view, scene=replace(view.scene, edge_rays=1))
-    one, several = render(renderer(), single), render(renderer(), view)
-    edges = edge_pixels(one.radiance, one.range_m, one.body)
+    one_ray, several_rays = render(renderer(), single), render(renderer(), view)
+    edges = edge_pixels(one_ray.radiance, one_ray.range_m, one_ray.body)
     true = supersample(renderer(), replace(single, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
     before, after = (
-        float(np.sqrt(np.mean((frame.radiance - true).ravel()[edges] ** 2)) / true.mean()) for frame in (one, several)
+        float(np.sqrt(np.mean((frame.radiance - true).ravel()[edges] ** 2)) / true.mean())
+        for frame in (one_ray, several_rays)
     )
     return before, after, edges.size
 
@@ -145,22 +148,22 @@ def _edge_error(view: View) -> tuple[float, float, int]:
 def run_edges(quick: bool) -> Iterator[Measure]:
     size = (192, 160) if quick else (384, 320)
     for distance in OUTLINE_DISTANCES_M:
-        whole = rock_view(ROCK_SITE, distance)
+        full_view = rock_view(ROCK_SITE, distance)
         # the upper left part of the image contains an outline in front of distant ground
-        view = replace(whole, camera=whole.camera.crop(0, 0, size))
-        before, after, count = _edge_error(view)
+        view = replace(full_view, camera=full_view.camera.crop(0, 0, size))
+        before, after, count = _measure_edge_error(view)
         yield Measure(
             f"radiance at outlines, rms, {distance:g} m from a rock",
             after,
             "of the mean",
             None,
-            f"{count} pixels that hold an edge, against 256 rays a pixel; by one ray a pixel {before:.2g}",
+            f"{count} edge pixels, compared with 256 rays per pixel; with one ray per pixel {before:.2g}",
         )
 
 
 CHECKS = (
-    Check("edges", "Motion of the picture", run_edges),
-    Check("motion", "Motion of the picture", run),
-    Check("motion-tile", "Motion of the picture", run_tile),
-    Check("motion-control", "Motion of the picture", run_control),
+    Check("edges", "Motion of images", run_edges),
+    Check("motion", "Motion of images", run_motion),
+    Check("motion-tile", "Motion of images", run_tile),
+    Check("motion-control", "Motion of images", run_control),
 )

@@ -1,7 +1,7 @@
-"""Independent ray casting: SciPy's B-splines and bisection for the ground, brute force for triangles.
+"""Independent ray casting for checks of the renderer: SciPy's B-splines and bisection, brute force for triangles.
 
-Independent of the renderer: heights are from `scipy.ndimage.map_coordinates`, and triangles are intersected by solving
-for barycentric coordinates.
+It shares no code with the renderer: heights are from `scipy.ndimage.map_coordinates`, and triangles are intersected by
+solving for barycentric coordinates.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ class Ground:
         self.lowest, self.highest = float(self._control.min()), float(self._control.max())
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        places = np.stack([np.ravel(y), np.ravel(x)]) / self._spacing
-        return map_coordinates(self._control, places, order=3, mode="grid-wrap", prefilter=False).reshape(np.shape(x))
+        positions = np.stack([np.ravel(y), np.ravel(x)]) / self._spacing
+        return map_coordinates(self._control, positions, order=3, mode="grid-wrap", prefilter=False).reshape(
+            np.shape(x)
+        )
 
     def gradient(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Slopes by central differences over a hundredth of a sample."""
@@ -73,9 +75,9 @@ class Ground:
         return np.where(hit, 0.5 * (low + high), np.inf)
 
     def hides(self, points: np.ndarray, towards: np.ndarray, step: float) -> np.ndarray:
-        """Whether the ground occludes a distant light source in the direction `towards`."""
-        reach = max((self.highest - float(points[:, 2].min())) / max(towards[2], 1e-3), step)
-        t = np.concatenate([[0.05 * step], np.arange(step, reach + step, step)])
+        """Whether the ground occludes a distant light source in the direction `towards`, for each point."""
+        length = max((self.highest - float(points[:, 2].min())) / max(towards[2], 1e-3), step)
+        t = np.concatenate([[0.05 * step], np.arange(step, length + step, step)])
         hidden = np.zeros(len(points), dtype=bool)
         size = max(BLOCK // t.size, 1)
         for first in range(0, len(points), size):
@@ -85,43 +87,45 @@ class Ground:
         return hidden
 
 
-def meet_triangles(objects: Objects, origins: np.ndarray, directions: np.ndarray, nearest: float = 0.0) -> np.ndarray:
+def cast_triangles(objects: Objects, origins: np.ndarray, directions: np.ndarray, nearest: float = 0.0) -> np.ndarray:
     """Distance of each ray to the nearest triangle beyond `nearest`; infinite if none."""
     ranges = np.full(len(directions), np.inf)
     for body in range(len(objects)):
         corners = objects.triangles[objects.first_triangle[body] : objects.first_triangle[body + 1]]
-        rays = _passing(corners, origins, directions)
+        rays = _select_rays(corners, origins, directions)
         if rays.size:
-            distance = _nearest_of(corners, origins[rays], directions[rays], nearest)
+            distance = _intersect_triangles(corners, origins[rays], directions[rays], nearest)
             ranges[rays] = np.minimum(ranges[rays], distance)
     return ranges
 
 
-def _passing(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Rays that intersect the bounding sphere of a body."""
+def _select_rays(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Select rays that intersect the bounding sphere of a body."""
     middle = corners.reshape(-1, 3).mean(axis=0)
     radius = np.linalg.norm(corners - middle, axis=-1).max()
     to_middle = middle - origins
-    along = np.sum(to_middle * directions, axis=1)
-    return np.flatnonzero((np.sum(to_middle**2, axis=1) - along**2 <= radius**2) & (along > -radius))
+    distance = np.sum(to_middle * directions, axis=1)
+    return np.flatnonzero((np.sum(to_middle**2, axis=1) - distance**2 <= radius**2) & (distance > -radius))
 
 
-def _nearest_of(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, nearest: float) -> np.ndarray:
+def _intersect_triangles(
+    corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, nearest: float
+) -> np.ndarray:
     """Solve ``origin + t direction = a + p (b - a) + q (c - a)`` for each ray and triangle by Cramer's rule."""
     a, b, c = (corners[None, :, k] for k in range(3))
     first, second = b - a, c - a
     normal = np.cross(first, second)
     ranges = np.empty(len(directions))
     size = max(BLOCK // (4 * corners.shape[0]), 1)
-    for at in range(0, len(directions), size):
-        origin, direction = origins[at : at + size, None], directions[at : at + size, None]
-        away = origin - a
+    for start in range(0, len(directions), size):
+        origin, direction = origins[start : start + size, None], directions[start : start + size, None]
+        offset = origin - a
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = -1.0 / np.sum(direction * normal, axis=-1)
-            t = np.sum(away * normal, axis=-1) * scale
-            across = np.cross(away, direction)
-            p = np.sum(second * across, axis=-1) * scale
-            q = -np.sum(first * across, axis=-1) * scale
+            t = np.sum(offset * normal, axis=-1) * scale
+            moment = np.cross(offset, direction)
+            p = np.sum(second * moment, axis=-1) * scale
+            q = -np.sum(first * moment, axis=-1) * scale
         hit = (p >= -1e-12) & (q >= -1e-12) & (p + q <= 1.0 + 1e-12) & (t > nearest)
-        ranges[at : at + size] = np.where(hit, t, np.inf).min(axis=1)
+        ranges[start : start + size] = np.where(hit, t, np.inf).min(axis=1)
     return ranges

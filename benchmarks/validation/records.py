@@ -1,4 +1,4 @@
-"""Results of checks: claim, bound and measured value."""
+"""Results of validation checks: claim, limit and measured value."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Measure:
-    """One row of the validation.
+    """One row of the tables in docs/validation.md.
 
     Attributes
     ----------
@@ -18,7 +18,7 @@ class Measure:
     measured, unit
         Measured value and its unit; "" for a fraction.
     limit, sense
-        Bound (None for values without a bound), and whether it is an upper or lower bound.
+        Limit (None for values without a limit), and whether it is an upper or lower limit.
     how
         Short description of the method.
     """
@@ -32,10 +32,10 @@ class Measure:
 
     @property
     def passed(self) -> bool:
-        """Whether the bound is met; True without a bound."""
+        """Whether the limit is met; True without a limit."""
         if self.limit is None:
             return True
-        # NaN exceeds every bound
+        # NaN exceeds every limit
         return self.measured <= self.limit if self.sense == "at most" else self.measured >= self.limit
 
 
@@ -50,7 +50,7 @@ class Check:
     section
         Heading of its rows in the document.
     run
-        Function that yields the measurements; its argument selects fewer samples (with the same bounds).
+        Function that yields the measurements; its argument `quick` selects fewer samples (with the same limits).
     """
 
     name: str

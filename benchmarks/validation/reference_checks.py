@@ -1,7 +1,7 @@
-"""Check of rendering against an independent renderer: Mitsuba 3, with the same camera rays, sun and Lambertian ground.
+"""Check of rendering against the independent renderer Mitsuba 3, with the same rays, sun and Lambertian ground.
 
-Needs the extra `validate`. Mitsuba gets the ground as a mesh of the spline surface, finer than its samples, with
-interpolated normals, and the objects' triangles. Every pixel's ray is the same in both.
+Needs the extra `validate`. Mitsuba renders the triangles of objects and a mesh of the spline surface of the ground,
+finer than its samples, with interpolated normals. Both renderers use the same rays.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from marsyard.sim.frames import direction
 from marsyard.sim.render import Frame, Sun
 from marsyard.sim.terrain import Surface
 
-#: Relative difference of radiance that counts as equal.
-EQUAL = 0.01
-#: Pixels about a shadow's edge that are left out of the comparison of radiance.
+#: Maximum relative difference of radiances that are considered equal.
+MAX_RELATIVE_DIFFERENCE = 0.01
+#: Distance from a shadow's edge, pixels, within which radiance is not compared.
 EDGE_PX = 1
-#: Vertices of the mesh per sample of the terrain: at 5, its linear normals alone differ by 1 % under a sun at 10 deg.
-FINER = 9
+#: Vertices of the mesh per terrain sample. With 5, linear normals cause differences of 1 % if the sun is at 10 deg.
+VERTICES_PER_SAMPLE = 9
 
 
-def ground_mesh(
+def make_ground_mesh(
     surface: Surface, low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, their normals, and triangles of a rectangle of the surface."""
-    step = surface.spacing_m / FINER
+    """Return vertices, their normals, and triangles of a rectangle of the surface."""
+    step = surface.spacing_m / VERTICES_PER_SAMPLE
     x, y = (np.arange(low[axis], high[axis], step) for axis in (0, 1))
     east, north = (grid.ravel() for grid in np.meshgrid(x, y))
     vertices = np.column_stack([east, north, surface.height(east, north)])
@@ -49,7 +49,7 @@ def ground_mesh(
 
 
 def _load_mesh(mi: Any, path: Path, vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> Any:
-    """Mesh with interpolated normals, by way of a file: Mitsuba then needs no LLVM newer than Debian's."""
+    """Load a mesh with interpolated normals from a file; other ways need a newer LLVM than Debian's."""
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False, validate=False)
     path.write_bytes(trimesh.exchange.ply.export_ply(mesh, vertex_normal=True))
     reflectance = {"type": "uniform", "value": FLAT_ALBEDO}
@@ -60,20 +60,20 @@ def _load_mesh(mi: Any, path: Path, vertices: np.ndarray, normals: np.ndarray, f
 def render_reference(
     view: View, frame: Frame
 ) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
-    """Radiance factor by Mitsuba along the rays of a frame, and whether the points they meet are in cast shadow."""
+    """Compute the radiance factor along the rays of a frame with Mitsuba, and whether the points are in cast shadow."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_mono")
     sun = np.asarray(view.scene.sun.direction, dtype=np.float64)
     points = frame.points_world().reshape(-1, 3)
-    seen = points[np.isfinite(points).all(axis=1)]
-    # terrain that may shade the points seen lies towards the sun
-    reach = np.ptp(view.scene.surface.levels[0][..., 0]) / sun[2] * sun[:2]
-    low = np.minimum(seen[:, :2].min(axis=0), (seen[:, :2] + np.minimum(reach, 0.0)).min(axis=0)) - 5.0
-    high = np.maximum(seen[:, :2].max(axis=0), (seen[:, :2] + np.maximum(reach, 0.0)).max(axis=0)) + 5.0
-    # single precision: coordinates about the middle of what is seen
-    origin = seen.mean(axis=0)
-    vertices, normals, faces = ground_mesh(view.scene.surface, low, high)
+    visible = points[np.isfinite(points).all(axis=1)]
+    # terrain that may shade the visible points is in the direction of the sun
+    shadow_offset = np.ptp(view.scene.surface.levels[0][..., 0]) / sun[2] * sun[:2]
+    low = np.minimum(visible[:, :2].min(axis=0), (visible[:, :2] + np.minimum(shadow_offset, 0.0)).min(axis=0)) - 5.0
+    high = np.maximum(visible[:, :2].max(axis=0), (visible[:, :2] + np.maximum(shadow_offset, 0.0)).max(axis=0)) + 5.0
+    # coordinates relative to the mean visible point, because Mitsuba uses single precision
+    origin = visible.mean(axis=0)
+    vertices, normals, faces = make_ground_mesh(view.scene.surface, low, high)
     objects = view.scene.objects
     corners = objects.triangles.reshape(-1, 3) - origin
     numbers = np.arange(len(corners)).reshape(-1, 3)
@@ -86,8 +86,8 @@ def render_reference(
     scene = mi.load_dict({"type": "scene", "light": light, **shapes})
     pose, rays = frame.world_from_body, frame.rays
     starts = pose.apply(rays.centre + rays.origins.reshape(-1, 3)) - origin
-    towards = pose.rotation.apply(rays.directions.reshape(-1, 3).astype(np.float64))
-    ray = mi.Ray3f(mi.Point3f(*starts.T.astype(np.float32)), mi.Vector3f(*towards.T.astype(np.float32)))
+    directions = pose.rotation.apply(rays.directions.reshape(-1, 3).astype(np.float64))
+    ray = mi.Ray3f(mi.Point3f(*starts.T.astype(np.float32)), mi.Vector3f(*directions.T.astype(np.float32)))
     sampler = mi.load_dict({"type": "independent", "sample_count": 1})
     sampler.seed(1, len(starts))
     integrator = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0, "hide_emitters": True})
@@ -108,9 +108,9 @@ def _compare(name: str, view: View, sun: Sun) -> Iterator[Measure]:
         ndimage.maximum_filter(reference_lit, 3) != ndimage.minimum_filter(reference_lit, 3), iterations=EDGE_PX
     )
     difference = np.abs(frame.radiance - reference)
-    equal = difference <= EQUAL * np.maximum(reference, 0.02 * FLAT_ALBEDO)
+    equal = difference <= MAX_RELATIVE_DIFFERENCE * np.maximum(reference, 0.02 * FLAT_ALBEDO)
     how = (
-        f"{equal.size:,} pixels, {np.mean(edge):.1%} at a shadow's edge, "
+        f"{equal.size:,} pixels, {np.mean(edge):.1%} near a shadow's edge, "
         f"{np.mean(in_shadow & facing):.1%} in cast shadow; median difference "
         f"{np.median(difference[~edge] / np.maximum(reference[~edge], 1e-3)):.2%}"
     )
@@ -120,7 +120,7 @@ def _compare(name: str, view: View, sun: Sun) -> Iterator[Measure]:
 
 
 def run_reference(quick: bool) -> Iterator[Measure]:
-    """Compare descent pictures pixel by pixel."""
+    """Compare descent images pixel by pixel."""
     size = (256, 256) if quick else (512, 512)
     for site, height_m, elevation_deg in (("gusev", 300.0, 35.0), ("pisgah", 300.0, 20.0), ("pisgah", 300.0, 10.0)):
         sun = Sun(direction(np.radians(110.0), np.radians(elevation_deg)))

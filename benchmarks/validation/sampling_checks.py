@@ -1,4 +1,4 @@
-"""Check of random streams: no two of ten million streams have the same seed."""
+"""Check of random streams: all of ten million streams have different seeds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.streams import stream_key
 
 #: Constants of NumPy's `SeedSequence` (numpy/random/bit_generator.pyx), whose algorithm is fixed.
-_INIT, _MULT, _LEFT, _RIGHT, _SHIFT = 0x43B0D7E5, 0x931E8875, 0xCA01F9DD, 0x4973F715, 16
+_INIT, _MULT, _MIX_LEFT, _MIX_RIGHT, _SHIFT = 0x43B0D7E5, 0x931E8875, 0xCA01F9DD, 0x4973F715, 16
 _POOL = 4
 _MASK = 2**32 - 1
 
@@ -32,7 +32,7 @@ class _Hash:
 
 
 def _mix(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    result = np.asarray(np.uint32(_LEFT) * x - np.uint32(_RIGHT) * y, dtype=np.uint32)
+    result = np.asarray(np.uint32(_MIX_LEFT) * x - np.uint32(_MIX_RIGHT) * y, dtype=np.uint32)
     return result ^ (result >> np.uint32(_SHIFT))
 
 
@@ -51,7 +51,7 @@ def seeds(words: np.ndarray) -> np.ndarray:
     Pools, (sequences, 2) of uint64.
     """
     hashed = _Hash()
-    pool = [hashed(words[:, place]) for place in range(_POOL)]
+    pool = [hashed(words[:, index]) for index in range(_POOL)]
     for source in range(_POOL):
         for target in range(_POOL):
             if source != target:
@@ -64,17 +64,17 @@ def seeds(words: np.ndarray) -> np.ndarray:
 
 def stream_words(seed: int, campaign: str, cases: np.ndarray, name: str) -> np.ndarray:
     """Entropy of one stream for many cases, in the layout of `seeds`."""
-    head = [seed & _MASK, seed >> 32, 0, 0]
+    root_words = [seed & _MASK, seed >> 32, 0, 0]
     key = list(stream_key(campaign, 0, name))
-    words = np.tile(np.array([*head, *key], dtype=np.uint32), (cases.size, 1))
+    words = np.tile(np.array([*root_words, *key], dtype=np.uint32), (cases.size, 1))
     words[:, _POOL + 4] = cases
     return words
 
 
-def stream_names() -> list[str]:
-    """Names of twenty streams of campaigns."""
-    drawn = [f"dispersion:{path}" for path in load_campaign("dimes-gusev").drawn_paths]
-    return [*drawn[:14], "altimeter", "detector noise", "gusts", "image clock", "inertial unit", "landing"]
+def list_stream_names() -> list[str]:
+    """Return the names of twenty streams of campaigns."""
+    dispersions = [f"dispersion:{path}" for path in load_campaign("dimes-gusev").drawn_paths]
+    return [*dispersions[:14], "altimeter", "detector noise", "gusts", "image clock", "inertial unit", "landing"]
 
 
 def all_seeds(campaigns: int, cases: int, names: Sequence[str]) -> np.ndarray:
@@ -82,25 +82,25 @@ def all_seeds(campaigns: int, cases: int, names: Sequence[str]) -> np.ndarray:
     numbers = np.arange(cases)
     return np.concatenate(
         [
-            seeds(stream_words(place // 2, ("dimes-gusev", "dimes-meridiani")[place % 2], numbers, name))
-            for place in range(campaigns)
+            seeds(stream_words(index // 2, ("dimes-gusev", "dimes-meridiani")[index % 2], numbers, name))
+            for index in range(campaigns)
             for name in names
         ]
     )
 
 
-def collisions(found: np.ndarray) -> int:
+def collisions(pools: np.ndarray) -> int:
     """Count rows that are equal to an earlier row."""
-    order = np.lexsort((found[:, 1], found[:, 0]))
-    return int(np.all(found[order[1:]] == found[order[:-1]], axis=1).sum())
+    order = np.lexsort((pools[:, 1], pools[:, 0]))
+    return int(np.all(pools[order[1:]] == pools[order[:-1]], axis=1).sum())
 
 
 def run_streams(quick: bool) -> Iterator[Measure]:
     """Count equal seeds of neighbouring campaigns, cases and streams."""
-    names = stream_names()
+    names = list_stream_names()
     results = all_seeds(CAMPAIGNS // 5 if quick else CAMPAIGNS, CASES // 10 if quick else CASES, names)
     how = f"{len(results):,} streams: {len(names)} names, cases from 0, root seeds from 0, two campaigns; 128-bit seeds"
-    yield Measure("seeds of two random streams that are equal", collisions(results), "pairs", 0.0, how)
+    yield Measure("pairs of random streams with equal seeds", collisions(results), "pairs", 0.0, how)
 
 
 CHECKS = (Check("streams", "Random streams", run_streams),)

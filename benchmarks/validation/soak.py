@@ -1,4 +1,4 @@
-"""Soak test: a campaign with misbehaving cases, killed and resumed, compared with an undisturbed campaign."""
+"""Soak test: a campaign with faulty cases, killed and resumed, compared with the same campaign without faults."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.validation.hostile import DEEDS, HostileParameters, draw_fault
+from benchmarks.validation.hostile import FAULTS, HostileParameters, draw_fault
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.replay import differing_columns
@@ -41,14 +41,14 @@ confidence = 0.9
 population = "all"
 """
 
-#: Environment variable that marks the processes of the campaign.
+#: Environment variable that identifies the processes of the campaign.
 _MARK = "MARSYARD_SOAK"
 
-#: Maximum time per case, seconds; normally it takes a tenth of this.
-_GUARD_S = 20.0
+#: Maximum time per case, seconds; a case normally needs a tenth of it.
+_MAX_CASE_S = 20.0
 
 #: Maximum time until processes of a killed campaign have ended, seconds.
-_GOING_S = 10.0
+_MAX_SHUTDOWN_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class Soak:
         Whether the last run ended by itself.
     seconds
         Duration of all runs.
-    deeds
-        Fault of each case; empty for healthy cases.
+    faults
+        Fault of each case; empty for cases without fault.
     wrong_outcomes, changed
         Cases with an unexpected outcome; valid cases whose row differs from the undisturbed campaign.
     processes, files
@@ -74,15 +74,17 @@ class Soak:
     kills: int
     ended: bool
     seconds: float
-    deeds: tuple[str, ...]
+    faults: tuple[str, ...]
     wrong_outcomes: tuple[str, ...]
     changed: tuple[int, ...]
     processes: int
     files: int
 
 
-def soak(folder: Path, cases: int, kills: int, misbehaving: float, killed_after_s: tuple[float, float]) -> Soak:
-    """Run the soak test in a folder.
+def run_soak_test(
+    folder: Path, cases: int, kills: int, misbehaving: float, killed_after_s: tuple[float, float]
+) -> Soak:
+    """Run the soak test in a folder, with and without faults.
 
     Parameters
     ----------
@@ -102,30 +104,30 @@ def soak(folder: Path, cases: int, kills: int, misbehaving: float, killed_after_
     killed = _run_with_kills(folder, misbehaving, kills, killed_after_s, environment)
     ended = _run(folder, "soaked", None, environment, cases) == 0 or (folder / "soaked" / "cases.parquet").exists()
     seconds = time.monotonic() - began
-    deadline = time.monotonic() + _GOING_S
-    while _processes(folder) and time.monotonic() < deadline:
+    deadline = time.monotonic() + _MAX_SHUTDOWN_S
+    while _find_processes(folder) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert healthy == 0, "the undisturbed campaign failed"
     rows = {name: read_rows(folder / name / "cases.parquet") for name in ("healthy", "soaked")}
     campaign = load_campaign(str(folder / "soak.toml"), [f"misbehaving={misbehaving}"])
-    deeds = tuple(_draw_fault(campaign, case) for case in range(cases))
-    pairs = list(zip(deeds, rows["soaked"], rows["healthy"], strict=True))
+    faults = tuple(_draw_fault(campaign, case) for case in range(cases))
+    pairs = list(zip(faults, rows["soaked"], rows["healthy"], strict=True))
     return Soak(
         kills=killed,
         ended=ended,
         seconds=seconds,
-        deeds=deeds,
+        faults=faults,
         wrong_outcomes=tuple(
-            f"case {row['case']} ({done or 'healthy'}): {row['outcome']}: {row['error'][:200]}"
-            for done, row, _ in pairs
-            if row["outcome"] != (DEEDS[done][1] if done else "VALID")
+            f"case {row['case']} ({fault or 'healthy'}): {row['outcome']}: {row['error'][:200]}"
+            for fault, row, _ in pairs
+            if row["outcome"] != (FAULTS[fault][1] if fault else "VALID")
         ),
         changed=tuple(
             int(row["case"])
             for _, row, undisturbed in pairs
             if row["outcome"] == "VALID" and differing_columns(row, undisturbed)
         ),
-        processes=len(_processes(folder)),
+        processes=len(_find_processes(folder)),
         files=len(list(temporary.iterdir())),
     )
 
@@ -143,7 +145,7 @@ def _run(folder: Path, name: str, misbehaving: float | None, environment: Mappin
     silent = subprocess.DEVNULL
     command = _command(folder, name, misbehaving)
     return subprocess.run(
-        command, env=environment, stdout=silent, stderr=silent, timeout=60.0 + cases * _GUARD_S, check=False
+        command, env=environment, stdout=silent, stderr=silent, timeout=60.0 + cases * _MAX_CASE_S, check=False
     ).returncode
 
 
@@ -165,15 +167,15 @@ def _run_with_kills(
     return killed
 
 
-def _processes(folder: Path) -> list[int]:
-    """Ids of living processes that carry the mark of the soak test."""
+def _find_processes(folder: Path) -> list[int]:
+    """Ids of living processes whose environment contains the mark of the soak test."""
     mark = f"{_MARK}={folder}".encode()
-    problems = []
+    ids = []
     for process in Path("/proc").glob("[1-9]*"):
         with suppress(OSError):
             if mark in (process / "environ").read_bytes():
-                problems.append(int(process.name))
-    return problems
+                ids.append(int(process.name))
+    return ids
 
 
 def _draw_fault(campaign: Any, case: int) -> str:
@@ -182,22 +184,24 @@ def _draw_fault(campaign: Any, case: int) -> str:
     return draw_fault(parameters, campaign.streams(case))
 
 
-def isolation(quick: bool) -> Iterator[Measure]:
-    """Run the soak test with misbehaving and healthy cases, and compare it with healthy cases."""
-    cases, kills, share = (60, 1, 0.4) if quick else (300, 3, 0.4)
+def check_isolation(quick: bool) -> Iterator[Measure]:
+    """Run the soak test and compare it with the same campaign without faults."""
+    cases, kills, misbehaving = (60, 1, 0.4) if quick else (300, 3, 0.4)
     with TemporaryDirectory() as name:
-        result = soak(Path(name), cases, kills, share, (5.0, 40.0))
-    healthy = result.deeds.count("")
-    kinds = len(set(result.deeds)) - 1
+        result = run_soak_test(Path(name), cases, kills, misbehaving, (5.0, 40.0))
+    healthy = result.faults.count("")
+    kinds = len(set(result.faults)) - 1
     how = f"{cases} cases, {cases - healthy} of which misbehave in {kinds} ways; killed {result.kills} times"
     yield Measure("soak: campaigns that did not end by themselves", float(not result.ended), "", 0, how)
-    yield Measure("soak: outcomes that are not those of the deed", len(result.wrong_outcomes), "", 0, how)
-    yield Measure("soak: rows of cases that answered, changed by others", len(result.changed), "", 0, how)
-    yield Measure("soak: processes left", result.processes, "", 0, how)
-    yield Measure("soak: temporary files left", result.files, "", 0, how)
+    yield Measure("soak: outcomes that do not match the fault of the case", len(result.wrong_outcomes), "", 0, how)
+    yield Measure(
+        "soak: rows of valid cases that differ from the campaign without faults", len(result.changed), "", 0, how
+    )
+    yield Measure("soak: remaining processes", result.processes, "", 0, how)
+    yield Measure("soak: remaining temporary files", result.files, "", 0, how)
     yield Measure("soak: time of the campaign", result.seconds, "s", None, how)
     for text in result.wrong_outcomes:
         print(text)
 
 
-CHECKS = (Check("soak", "Campaigns", isolation),)
+CHECKS = (Check("soak", "Campaigns", check_isolation),)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from scipy import stats
 
-from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, planted_found, quiet_nights
+from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, count_detections, count_false_alarms
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.history import WINDOW
 from marsyard.reports.statistics.proportions import (
@@ -28,11 +28,11 @@ from marsyard.reports.statistics.samples import (
 
 CONFIDENCE = 0.9
 #: Cases per terrain.
-_ON_TERRAIN = 8
+_CASES_PER_TERRAIN = 8
 
 
 def _min_coverage(nominal: float, trials: int) -> float:
-    """Bound of a simulated coverage: nominal coverage minus three standard deviations of the simulation."""
+    """Limit of a simulated coverage: nominal coverage minus three standard deviations of the simulation."""
     return nominal - 3.0 * math.sqrt(nominal * (1.0 - nominal) / trials)
 
 
@@ -41,7 +41,7 @@ def _fraction(hits: Iterator[bool], trials: int) -> float:
 
 
 def run_intervals(quick: bool) -> Iterator[Measure]:
-    """Coverage of the intervals of independent values."""
+    """Measure the coverage of intervals of independent values."""
     trials = 200 if quick else 1000
     rng = np.random.default_rng(1)
     draws: tuple[tuple[str, Callable[[int], np.ndarray], float, float], ...] = (
@@ -52,14 +52,14 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         ("mean", mean_interval),
         ("standard deviation", standard_deviation_interval),
     )
-    for name, draw, mean, spread in draws:
-        for what, interval in intervals:
-            truth = mean if what == "mean" else spread
+    for name, draw, mean, deviation in draws:
+        for statistic, interval in intervals:
+            truth = mean if statistic == "mean" else deviation
             interval_pairs = (interval(draw(30), 0.95) for _ in range(trials))
             covered = _fraction((low <= truth <= high for low, high in interval_pairs), trials)
-            how = f"{trials} samples of 30; BCa, widened; limit: nominal less three deviations of the simulation"
+            how = f"{trials} samples of 30; BCa, widened; limit: nominal minus three deviations of the simulation"
             yield Measure(
-                f"95 % interval of the {what}, {name}", covered, "", _min_coverage(0.95, trials), how, "at least"
+                f"95 % interval of the {statistic}, {name}", covered, "", _min_coverage(0.95, trials), how, "at least"
             )
     truth = float(stats.norm.ppf(0.95))
     bounds = [quantile_bounds(rng.normal(size=80), 0.95, CONFIDENCE) for _ in range(20 * trials)]
@@ -71,63 +71,71 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         points = rng.normal(size=(21, 2)) @ np.array([[2.0, 0.0], [0.9, 0.4]])
         ellipse = error_ellipse(points[:20], 0.95)
         assert ellipse is not None
-        turn = math.radians(ellipse.angle_deg)
+        angle = math.radians(ellipse.angle_deg)
         x, y = points[20] - ellipse.centre
-        along, across = x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn)
-        inside += (along / ellipse.semi_major) ** 2 + (across / ellipse.semi_minor) ** 2 <= 1.0
-    how = f"{4 * trials} samples of 20, and one error more each"
+        major, minor = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
+        inside += (major / ellipse.semi_major) ** 2 + (minor / ellipse.semi_minor) ** 2 <= 1.0
+    how = f"{4 * trials} samples of 20 errors, each with one further error"
     yield Measure(
-        "95 % ellipse holds the next error", inside / (4 * trials), "", _min_coverage(0.95, 4 * trials), how, "at least"
+        "95 % ellipse contains the next error",
+        inside / (4 * trials),
+        "",
+        _min_coverage(0.95, 4 * trials),
+        how,
+        "at least",
     )
 
 
-def _cases(rng: np.random.Generator, rate: float, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
+def _draw_successes(
+    rng: np.random.Generator, rate: float, correlation: float, terrains: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Draw successes on terrains with beta-distributed rates."""
     weight = (1.0 - correlation) / correlation
     rates = rng.beta(rate * weight, (1.0 - rate) * weight, terrains)
-    terrain = np.repeat(np.arange(terrains), _ON_TERRAIN)
+    terrain = np.repeat(np.arange(terrains), _CASES_PER_TERRAIN)
     return rng.random(terrain.size) < rates[terrain], terrain
 
 
 def run_clustered(quick: bool) -> Iterator[Measure]:
-    """Coverage of the bounds of cases that share terrains."""
+    """Measure the coverage of the bounds of cases that share terrains."""
     trials = 400 if quick else 3000
     rng = np.random.default_rng(2)
     for rate in (0.99, 0.95, 0.8):
         for correlation in (0.05, 0.3, 0.9):
             for terrains in (20, 60, 250):
-                shown = [
-                    clustered_evidence(*_cases(rng, rate, correlation, terrains), CONFIDENCE) for _ in range(trials)
+                evidence = [
+                    clustered_evidence(*_draw_successes(rng, rate, correlation, terrains), CONFIDENCE)
+                    for _ in range(trials)
                 ]
-                lower = float(np.mean([one.lower <= rate for one in shown]))
-                upper = float(np.mean([one.upper >= rate for one in shown]))
+                lower = float(np.mean([bounds.lower <= rate for bounds in evidence]))
+                upper = float(np.mean([bounds.upper >= rate for bounds in evidence]))
                 claim = f"90 % bounds, rate {rate}, correlation {correlation}, {terrains} terrains"
-                how = f"{trials} campaigns, {_ON_TERRAIN} cases a terrain; the worse of both bounds"
+                how = f"{trials} campaigns, {_CASES_PER_TERRAIN} cases per terrain; the worse of both bounds"
                 yield Measure(claim, min(lower, upper), "", _min_coverage(CONFIDENCE, trials), how, "at least")
 
 
 def run_shared(quick: bool) -> Iterator[Measure]:
-    """Coverage of the intervals of errors that share terrains: mean, standard deviation, quantile."""
+    """Measure the coverage of intervals of errors that share terrains: mean, standard deviation, quantile."""
     trials = 100 if quick else 600
     rng = np.random.default_rng(6)
     truths = {"mean": 0.0, "standard deviation": 1.0, "95 % quantile": float(stats.norm.ppf(0.95))}
     for correlation in (0.05, 0.3, 0.9):
         for terrains in (12, 60, 250):
-            coverage = [_check_coverage(*_errors(rng, correlation, terrains), truths) for _ in range(trials)]
-            for what, nominal in (("mean", 0.95), ("standard deviation", 0.95), ("95 % quantile", CONFIDENCE)):
-                covered = float(np.min(np.mean([one[what] for one in coverage], axis=0)))
-                interval = "bounds" if what.endswith("quantile") else "interval"
-                claim = f"{100 * nominal:.0f} % {interval} of the {what}, "
+            coverage = [_check_coverage(*_draw_errors(rng, correlation, terrains), truths) for _ in range(trials)]
+            for statistic, nominal in (("mean", 0.95), ("standard deviation", 0.95), ("95 % quantile", CONFIDENCE)):
+                covered = float(np.min(np.mean([covers[statistic] for covers in coverage], axis=0)))
+                interval = "bounds" if statistic.endswith("quantile") else "interval"
+                claim = f"{100 * nominal:.0f} % {interval} of the {statistic}, "
                 claim += f"correlation {correlation}, {terrains} terrains"
-                how = f"{trials} campaigns, 1 to 14 normal errors a terrain"
+                how = f"{trials} campaigns, 1 to 14 normal errors per terrain"
                 yield Measure(claim, covered, "", _min_coverage(nominal, trials), how, "at least")
 
 
-def _errors(rng: np.random.Generator, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
+def _draw_errors(rng: np.random.Generator, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
     """Draw standard normal errors that are correlated within a terrain, and their terrains."""
     terrain = np.repeat(np.arange(terrains), rng.integers(1, 15, terrains))
-    shared, own = rng.normal(size=terrains)[terrain], rng.normal(size=terrain.size)
-    return math.sqrt(correlation) * shared + math.sqrt(1.0 - correlation) * own, terrain
+    shared, independent = rng.normal(size=terrains)[terrain], rng.normal(size=terrain.size)
+    return math.sqrt(correlation) * shared + math.sqrt(1.0 - correlation) * independent, terrain
 
 
 def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
@@ -136,65 +144,68 @@ def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, f
     covered: dict[str, tuple[bool, ...]] = {
         "95 % quantile": (lower <= truths["95 % quantile"], upper >= truths["95 % quantile"])
     }
-    for what, interval in (("mean", mean_interval), ("standard deviation", standard_deviation_interval)):
+    for statistic, interval in (("mean", mean_interval), ("standard deviation", standard_deviation_interval)):
         low, high = interval(errors, 0.95, terrain)
-        covered[what] = (low <= truths[what] <= high,)
+        covered[statistic] = (low <= truths[statistic] <= high,)
     return covered
 
 
 def run_sequential(quick: bool) -> Iterator[Measure]:
-    """Error rates of adaptive campaigns whose true rate equals the required rate, so that every verdict is false."""
+    """Measure error rates of sequential campaigns whose true rate equals the required rate: every verdict is false."""
     trials = 300 if quick else 2000
     rng = np.random.default_rng(3)
-    for asked, max_cases in ((0.9, 512), (0.99, 1000)):
+    for required, max_cases in ((0.9, 512), (0.99, 1000)):
         for correlation in (None, 0.2):
-            wrong = np.mean([_simulate_decision(rng, asked, max_cases, correlation) for _ in range(trials)], axis=0)
+            wrong = np.mean([_simulate_decision(rng, required, max_cases, correlation) for _ in range(trials)], axis=0)
             kind = "independent cases" if correlation is None else f"cases on terrains, correlation {correlation}"
-            how = f"{trials} campaigns of up to {max_cases} cases at a true rate of {asked}; Monte Carlo error allowed"
+            how = (
+                f"{trials} campaigns of up to {max_cases} cases at a true rate of {required}; Monte Carlo error allowed"
+            )
             limit = 1.0 - _min_coverage(CONFIDENCE, trials)
-            for word, share in zip(("PASS", "FAIL"), wrong.tolist(), strict=True):
-                yield Measure(f"false {word} of {asked} at 90 %, {kind}", share, "", limit, how)
+            for verdict, fraction in zip(("PASS", "FAIL"), wrong.tolist(), strict=True):
+                yield Measure(f"false {verdict} of {required} at 90 %, {kind}", fraction, "", limit, how)
 
 
 def _simulate_decision(
-    rng: np.random.Generator, asked: float, max_cases: int, correlation: float | None
+    rng: np.random.Generator, required: float, max_cases: int, correlation: float | None
 ) -> tuple[bool, bool]:
-    """Simulate a campaign; return whether its first deciding look gives PASS, and whether FAIL."""
+    """Simulate a campaign; return whether its first decision is PASS, and whether it is FAIL."""
     if correlation is None:
-        success, terrain = rng.random(max_cases) < asked, np.arange(max_cases)
+        success, terrain = rng.random(max_cases) < required, np.arange(max_cases)
     else:
-        success, terrain = _cases(rng, asked, correlation, -(-max_cases // _ON_TERRAIN))
+        success, terrain = _draw_successes(rng, required, correlation, -(-max_cases // _CASES_PER_TERRAIN))
         order = rng.permutation(success.size)
         success, terrain = success[order][:max_cases], terrain[order][:max_cases]
     for look in planned_looks(max_cases):
         confidence, first = confidence_at(CONFIDENCE, look.risk_fraction), success[: look.cases]
         if correlation is None:
-            seen = int(first.sum()), look.cases, confidence
-            lower, upper = proportion_lower(*seen), proportion_upper(*seen)
+            counts = int(first.sum()), look.cases, confidence
+            lower, upper = proportion_lower(*counts), proportion_upper(*counts)
         else:
-            shown = clustered_evidence(first, terrain[: look.cases], confidence)
-            lower, upper = shown.lower, shown.upper
-        if lower >= asked or upper < asked:
-            return lower >= asked, upper < asked
+            evidence = clustered_evidence(first, terrain[: look.cases], confidence)
+            lower, upper = evidence.lower, evidence.upper
+        if lower >= required or upper < required:
+            return lower >= required, upper < required
     return False, False
 
 
 def run_nights(quick: bool) -> Iterator[Measure]:
-    """False alarms of nights without a change, and detection of planted regressions."""
-    in_a_row, planted = (100, 100) if quick else (2000, 1000)
-    alarms = quiet_nights(in_a_row, seed=4)
-    what = f"three campaigns of {CASES} cases: {', '.join(KINDS)}"
-    how = f"{alarms} of {in_a_row} nights in a row, kept in a history, each against up to {WINDOW} before; {what}"
-    yield Measure("nights with a false alarm", alarms / in_a_row, "", 0.01, how)
+    """Measure false alarms of nights without a change, and detection of simulated regressions."""
+    unchanged, changed = (100, 100) if quick else (2000, 1000)
+    alarms = count_false_alarms(unchanged, seed=4)
+    campaigns = f"three campaigns of {CASES} cases: {', '.join(KINDS)}"
+    how = f"{alarms} of {unchanged} successive nights, each compared with up to {WINDOW} earlier nights; {campaigns}"
+    yield Measure("nights with a false alarm", alarms / unchanged, "", 0.01, how)
     if not quick:
-        bound = proportion_upper(alarms, in_a_row, 0.95)
+        upper_bound = proportion_upper(alarms, unchanged, 0.95)
         yield Measure(
-            "nights with a false alarm, upper bound at 95 % confidence", bound, "", 0.01, "of the same nights"
+            "nights with a false alarm, upper bound at 95 % confidence", upper_bound, "", 0.01, "the same nights"
         )
-    for kind, nights in ((KINDS[0], planted), (KINDS[1], planted // 4)):
-        named = planted_found(kind, nights, seed=5) / nights
-        claim = f"nights that name a regression, errors {WORSE:g} times as large, {kind}"
-        yield Measure(claim, named, "", 0.95, f"{nights} nights, each against {BEFORE} before; {what}", "at least")
+    for kind, nights in ((KINDS[0], changed), (KINDS[1], changed // 4)):
+        detected = count_detections(kind, nights, seed=5) / nights
+        claim = f"nights that detect a regression, errors {WORSE:g} times as large, {kind}"
+        how = f"{nights} nights, each compared with {BEFORE} earlier nights; {campaigns}"
+        yield Measure(claim, detected, "", 0.95, how, "at least")
 
 
 CHECKS = (

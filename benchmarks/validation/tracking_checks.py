@@ -34,79 +34,83 @@ NO_ERRORS: dict[str, Any] = {
 }
 
 
-def exact(number: int, camera: str) -> RoverScenarioParameters:
-    """A run of `vtt-montecarlo` with exact pose, cameras and mast, without noise."""
+def draw_exact_parameters(number: int, camera: str) -> RoverScenarioParameters:
+    """Draw the parameters of a run of `vtt-montecarlo` with exact pose, cameras and mast, without noise."""
     campaign = load_campaign("vtt-montecarlo")
     drawn = campaign.with_values({**campaign.draws(number), "camera.preset": camera, "world.terrain": number % 8})
-    stated = drawn.model_dump()
-    (leg,) = stated["legs"]
+    settings = drawn.model_dump()
+    (leg,) = settings["legs"]
     return RoverScenarioParameters.model_validate(
-        stated
+        settings
         | NO_ERRORS
         # error-free visual odometry measures the slip; it takes no time, so that the sun moves as in the campaign
-        | {"legs": [leg | {"visual_odometry": True}], "timing": stated["timing"] | {"visual_odometry_s": 0.0}}
-        | {"camera": stated["camera"] | {"detector_noise": False}}
+        | {"legs": [leg | {"visual_odometry": True}], "timing": settings["timing"] | {"visual_odometry_s": 0.0}}
+        | {"camera": settings["camera"] | {"detector_noise": False}}
     )
 
 
-def driven(number: int, camera: str) -> dict[str, Scalar]:
-    """Row of a run without errors."""
-    p = exact(number, camera)
+def simulate_run(number: int, camera: str) -> dict[str, Scalar]:
+    """Simulate a run without errors and return its row."""
+    p = draw_exact_parameters(number, camera)
     run = run_case(p, Streams(SEED, "validation tracking", number))
     return {**score_run(p, run), **fixed_conditions(p, run), **run_conditions(p, run)}
 
 
-def drift(quick: bool) -> Iterator[Measure]:
-    """Drift at 2 m of selectable targets (unoccluded and lit) that are designated at 10 m."""
-    wanted = 3 if quick else 50
+def check_drift(quick: bool) -> Iterator[Measure]:
+    """Measure the drift at 2 m of selectable targets (unoccluded and lit) that are designated at 10 m."""
+    targets = 3 if quick else 50
     all_rows: list[dict[str, Scalar]] = []
     for camera in CAMERAS:
-        rows = (driven(number, camera) for number in count(1000))
-        chosen = list(islice((row for row in rows if row["selectable"]), wanted))
-        yield from _drifts(chosen, camera, tested=False)
-        all_rows += chosen
-    yield from _drifts(all_rows, "both cameras", tested=True)
+        rows = (simulate_run(number, camera) for number in count(1000))
+        selectable = list(islice((row for row in rows if row["selectable"]), targets))
+        yield from _measure_drifts(selectable, camera, has_limit=False)
+        all_rows += selectable
+    yield from _measure_drifts(all_rows, "both cameras", has_limit=True)
 
 
-def _drifts(rows: list[dict[str, Scalar]], name: str, *, tested: bool) -> Iterator[Measure]:
+def _measure_drifts(rows: list[dict[str, Scalar]], name: str, *, has_limit: bool) -> Iterator[Measure]:
     px = np.array([float(row["drift_px"]) for row in rows])
     how = (
         f"{len(rows)} targets on rendered rocks, 10 m to 2 m in steps of 10 %, no noise, exact pose and cameras, "
-        f"the sun moving by {_sun_moved_deg(rows):.0f} deg; "
+        f"sun motion {_median_sun_motion_deg(rows):.0f} deg; "
         f"{np.count_nonzero(np.isnan(px))} not tracked to the end"
     )
-    if tested:
+    if has_limit:
         yield _measure_losses(f"targets lost before 2 m: {name}", int(np.isnan(px).sum()), len(px), how)
     tracked = px[~np.isnan(px)]
     rms, worst = float(np.sqrt(np.mean(tracked**2))), float(tracked.max())
-    yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_LIMIT_PX if tested else None, how)
+    yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_LIMIT_PX if has_limit else None, how)
     yield Measure(
-        f"drift of the tracked point, worst: {name}", worst, "px", DRIFT_WORST_LIMIT_PX if tested else None, how
+        f"drift of the tracked point, maximum: {name}", worst, "px", DRIFT_WORST_LIMIT_PX if has_limit else None, how
     )
 
 
 def _measure_losses(claim: str, lost: int, cases: int, how: str) -> Measure:
-    """Row of the fraction of lost cases, which other figures exclude; one lost case is always allowed."""
+    """Return the fraction of lost cases, which the other rows exclude; one lost case is always allowed."""
     return Measure(claim, lost / cases, "", max(LOST_LIMIT, 1.0 / cases), how)
 
 
-def _sun_moved_deg(rows: list[dict[str, Scalar]]) -> float:
+def _median_sun_motion_deg(rows: list[dict[str, Scalar]]) -> float:
     return float(np.median([float(row["sun_motion_deg"]) for row in rows]))
 
 
-def stereo(quick: bool) -> Iterator[Measure]:
-    """Ratio of the range error of the first pair at 10 m to Eq. 1 with the true disparity errors."""
+def check_stereo(quick: bool) -> Iterator[Measure]:
+    """Compare the range error of the first pair at 10 m with Eq. 1, using the true disparity errors."""
     for camera in CAMERAS:
-        rows = [_designation_errors(number, camera) for number in range(10 if quick else 60)]
+        rows = [_simulate_designation(number, camera) for number in range(10 if quick else 60)]
         pairs = [row for row in rows if row is not None]
         measured = [row for row in pairs if np.isfinite(row[0])]
         errors, expected = np.array(measured).reshape(-1, 2).T
         ratio = float(np.sqrt(np.mean(errors**2) / np.mean(expected**2)))
-        how = f"first pairs of {len(errors)} runs of vtt-accuracy at rocks of 1.5 m, disparity wrong by 1/3 px rms"
+        how = f"first pairs of {len(errors)} runs of vtt-accuracy at rocks of 1.5 m, disparity error 1/3 px rms"
         yield Measure(
-            f"stereo range error at 10 m over Eq. 1, less 1: {camera}", abs(ratio - 1.0), "", RANGE_LIMIT, how
+            f"stereo range error at 10 m divided by that of Eq. 1, minus 1: {camera}",
+            abs(ratio - 1.0),
+            "",
+            RANGE_LIMIT,
+            how,
         )
-        how = f"of {len(pairs)} selectable targets; the row above leaves them out"
+        how = f"of {len(pairs)} selectable targets; the row above excludes these pairs"
         yield _measure_losses(
             f"first stereo pairs in which the target is not found: {camera}",
             len(pairs) - len(measured),
@@ -115,8 +119,8 @@ def stereo(quick: bool) -> Iterator[Measure]:
         )
 
 
-def _designation_errors(number: int, camera: str) -> tuple[float, float] | None:
-    """Range error of a first pair (NaN if the target is not found) and its value from Eq. 1, metres.
+def _simulate_designation(number: int, camera: str) -> tuple[float, float] | None:
+    """Simulate a first pair: range error (NaN if the target is not found) and its value from Eq. 1, metres.
 
     None if the target is not selectable.
     """
@@ -130,20 +134,20 @@ def _designation_errors(number: int, camera: str) -> tuple[float, float] | None:
     if not row["selectable"]:
         return None
     error = _range_error_m(run) if run.stops[0].update.found else float("nan")
-    return error, _expected_m(run, float(row["disparity_error_start_px"]))
+    return error, _expected_range_error_m(run, float(row["disparity_error_start_px"]))
 
 
 def _range_error_m(run: Run) -> float:
     """First reported position minus the designated point, along the line of sight."""
     stop = run.stops[0]
     eye = stop.stance.world_from_rover.inv().apply(run.rig.eyes(stop.world_from_head)[0])
-    sight = (stop.point_rover - eye) / np.linalg.norm(stop.point_rover - eye)
-    return float(stop.error_m() @ sight)
+    line_of_sight = (stop.point_rover - eye) / np.linalg.norm(stop.point_rover - eye)
+    return float(stop.error_m() @ line_of_sight)
 
 
-def _expected_m(run: Run, disparity_error_px: float) -> float:
+def _expected_range_error_m(run: Run, disparity_error_px: float) -> float:
     rig = run.rig.calibrated
     return stereo_range_error_m(run.stops[0].range_m, disparity_px_m(rig.left, rig.right), 1.0, disparity_error_px)
 
 
-CHECKS = (Check("tracking-drift", "Tracking", drift), Check("tracking-stereo", "Tracking", stereo))
+CHECKS = (Check("tracking-drift", "Tracking", check_drift), Check("tracking-stereo", "Tracking", check_stereo))

@@ -1,4 +1,4 @@
-"""A calibration by OpenCV, ROS or Kalibr: how near our camera is to it, and where a point is seen."""
+"""Read a camera calibration by OpenCV, ROS or Kalibr: accuracy of the conversion, use in a campaign, projection."""
 
 import tempfile
 from pathlib import Path
@@ -19,13 +19,14 @@ CHAIN = """cam0:
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "camchain.yaml"
     path.write_text(CHAIN)
-    (read,) = read_calibrations(path)
-    print(f"{type(read.camera).__name__}: {read.residual.rms_px:.2f} px off (RMS), {read.residual.max_px:.2f} at most")
+    (calibration,) = read_calibrations(path)
+    residual = calibration.residual
+    print(f"{type(calibration.camera).__name__}: {residual.rms_px:.2f} px off (RMS), maximum {residual.max_px:.2f} px")
 
-    # in a campaign it stands under camera.model; DIMES bins whole pixels, so that its size must divide the picture's
+    # the campaign key is camera.model; DIMES bins whole pixels, so the binned size must divide the image size
     changes = {"camera.model": str(path), "detector.rows_summed": 1, "dimes.binned_size": [376, 240]}
     campaign = marsyard.load_campaign("dimes-smoke", changes)
     print("columns:", campaign.configuration.parameters["camera"]["model"]["columns"])
 
-pixel, seen = read.camera.project(np.array([0.2, -0.1, 1.0]))
-print("pixel:", pixel.round(2), "seen:", bool(seen))
+pixel, is_visible = calibration.camera.project(np.array([0.2, -0.1, 1.0]))
+print("pixel:", pixel.round(2), "visible:", bool(is_visible))

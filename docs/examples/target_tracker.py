@@ -1,11 +1,11 @@
-"""A target tracker that is a program: it reads a line, answers in a line, and finds the target to whole pixels.
+"""A target tracker as a program: it reads one request per line, answers in one line, and finds whole pixels only.
 
     marsyard run vtt-montecarlo -n 20 --algorithm "exec:python docs/examples/target_tracker.py" --algorithm vtt
     marsyard conformance "exec:python docs/examples/target_tracker.py" --task tracking
 
-The template of the last stop is looked for in the left picture as it is, neither magnified nor rolled, then its patch
-in the right picture; the target is where the two lines of sight come nearest to each other. Marsyard's readers are used
-for files; a program in another language reads them itself (docs/custom-algorithms.md).
+The template of the last stop is searched in the left image without correction of scale or roll. Its patch is then
+searched in the right image. The target is the point nearest to both lines of sight. The program uses Marsyard's readers
+for files; a program in another language reads the files itself (docs/custom-algorithms.md).
 """
 
 from __future__ import annotations
@@ -22,37 +22,39 @@ from marsyard.algorithms.exchange import read_mast, read_pose, read_stop, read_t
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements, RoverTarget
 
-HALF = 10  # of the template
-REACH = 70  # of its search around the expected place, and of the disparity
-LEAST_SCORE = 0.7
+HALF_PX = 10  # half of the template
+SEARCH_PX = 70  # maximum distance from the predicted pixel, and maximum disparity error
+STEREO_ROWS_PX = 3  # maximum distance from the predicted row in the right image
+MIN_SCORE = 0.7
+ASSUMED_RANGE_M = 6.0  # range of a target that was designated by its pixel
 
 
 class WholePixelTracker:
-    """What is known of the target, and the answers to what is asked."""
+    """State of the target, and answers to the requests."""
 
     def __init__(self) -> None:
         self.state = "NO_TARGET"
         self.target_world: np.ndarray | None = None
-        self.picked: PixelTarget | None = None
+        self.designated: PixelTarget | None = None
         self.template: np.ndarray | None = None
 
-    def answer(self, asked: dict[str, Any]) -> dict[str, Any]:
-        """The answer to one line."""
-        if asked["do"] == "aim":
-            return {"aim": self.aim(read_pose(asked["world_from_rover"]), read_mast(Path(asked["mast"])))}
-        if asked["do"] == "update":
-            return self.update(read_stop(Path(asked["stop"]), read_mast(Path(asked["mast"]))))
-        self.__init__()  # type: ignore[misc]  # whatever comes, the last target is forgotten
-        if asked["do"] == "designate":
-            self.designate(asked)
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Return the answer to one request."""
+        if request["do"] == "aim":
+            return {"aim": self.aim(read_pose(request["world_from_rover"]), read_mast(Path(request["mast"])))}
+        if request["do"] == "update":
+            return self.update(read_stop(Path(request["stop"]), read_mast(Path(request["mast"]))))
+        self.__init__()  # type: ignore[misc]  # all other requests reset the state
+        if request["do"] == "designate":
+            self.designate(request)
         return {"state": self.state}
 
-    def designate(self, asked: dict[str, Any]) -> None:
-        """Takes a target."""
-        target, pose = read_target(asked["target"]), read_pose(asked["world_from_rover"])
+    def designate(self, request: dict[str, Any]) -> None:
+        """Set the target."""
+        target, pose = read_target(request["target"]), read_pose(request["world_from_rover"])
         self.state = "NORMAL"
         if isinstance(target, PixelTarget):
-            self.picked = target
+            self.designated = target
         elif isinstance(target, RoverTarget):
             self.target_world = pose.apply(target.position_rover)
         else:
@@ -60,16 +62,16 @@ class WholePixelTracker:
             self.target_world = np.array([east, north, -down])
 
     def aim(self, pose: Any, mast: MastCalibration) -> dict[str, Any] | None:
-        """Straight at the target, and the frames whole."""
+        """Return mast angles that point at the target, with full frames; None if they are outside the limits."""
         if self.target_world is not None:
             x, y, z = pose.inv().apply(self.target_world) - mast.geometry.base_m - mast.geometry.elbow_m
             angles = (float(np.arctan2(-y, x)), float(np.arctan2(z - mast.geometry.head_m[2], np.hypot(x, y))))
-        elif self.picked is not None:
-            angles = (self.picked.azimuth_rad, self.picked.elevation_rad)
+        elif self.designated is not None:
+            angles = (self.designated.azimuth_rad, self.designated.elevation_rad)
         else:
             return None
         limits = (mast.geometry.azimuth_limits_rad, mast.geometry.elevation_limits_rad)
-        if not all(least <= angle <= most for angle, (least, most) in zip(angles, limits, strict=True)):
+        if not all(low <= angle <= high for angle, (low, high) in zip(angles, limits, strict=True)):
             return None
         boxes = {
             name: {"corner": [0, 0], "size": list(camera.size)}
@@ -78,98 +80,98 @@ class WholePixelTracker:
         return {"azimuth_rad": angles[0], "elevation_rad": angles[1], **boxes}
 
     def update(self, stop: RoverMeasurements) -> dict[str, Any]:
-        """Looks for the target in a stop's pictures."""
+        """Search the target in the images of a stop."""
         if self.state == "NO_TARGET":
             return {"state": "NO_TARGET", "losses": []}
         world_from_head = stop.world_from_rover * stop.mast.geometry.rover_from_head(
             stop.azimuth_rad, stop.elevation_rad
         )
         left, right = stop.mast.left.transform(world_from_head), stop.mast.right.transform(world_from_head)
-        place = self.expected(left)
-        if place is None or (self.template is None and patch(stop.left, place) is None):
-            return self.lost("OUT_OF_VIEW", stop)
+        pixel = self.predict_pixel(left)
+        if pixel is None or (self.template is None and extract_patch(stop.left, pixel) is None):
+            return self.report_loss("OUT_OF_VIEW", stop)
         if self.template is not None:
-            place, score = best(stop.left, place, REACH, REACH, self.template)
-            if score < LEAST_SCORE:
-                return self.lost("LOW_MATCH_SCORE", stop)
-        found = patch(stop.left, place)
-        if found is None:
-            return self.lost("OUT_OF_VIEW", stop)
-        # where the right camera sees it if it is as far as expected, or where the picture was taken of
-        ahead = self.target_world if self.target_world is not None else seen_at(left, place, 6.0)
-        guess = np.asarray(right.project(ahead)[0])
-        other, score = best(stop.right, guess, REACH, 3, found)
-        if score < LEAST_SCORE:
-            return self.lost("LOW_STEREO_SCORE", stop)
-        self.target_world = between(left, place, right, other)
-        self.template, self.picked, self.state = found, None, "NORMAL"
-        return {"state": self.state, "losses": [], "position_rover": self.position(stop)}
+            pixel, score = find_template(stop.left, pixel, SEARCH_PX, SEARCH_PX, self.template)
+            if score < MIN_SCORE:
+                return self.report_loss("LOW_MATCH_SCORE", stop)
+        patch = extract_patch(stop.left, pixel)
+        if patch is None:
+            return self.report_loss("OUT_OF_VIEW", stop)
+        # predicted pixel in the right image, for the last position of the target or for the assumed range
+        assumed = self.target_world if self.target_world is not None else point_at(left, pixel, ASSUMED_RANGE_M)
+        predicted = np.asarray(right.project(assumed)[0])
+        right_pixel, score = find_template(stop.right, predicted, SEARCH_PX, STEREO_ROWS_PX, patch)
+        if score < MIN_SCORE:
+            return self.report_loss("LOW_STEREO_SCORE", stop)
+        self.target_world = intersect_rays(left, pixel, right, right_pixel)
+        self.template, self.designated, self.state = patch, None, "NORMAL"
+        return {"state": self.state, "losses": [], "position_rover": self.position_rover(stop)}
 
-    def expected(self, left: CameraModel) -> np.ndarray | None:
-        """The pixel at which the target should be."""
+    def predict_pixel(self, left: CameraModel) -> np.ndarray | None:
+        """Return the expected pixel of the target in the left image; None if it is not visible."""
         if self.target_world is None:
-            return None if self.picked is None else np.asarray(self.picked.pixel)
-        pixel, ahead = left.project(self.target_world)
-        return np.asarray(pixel) if bool(ahead) else None
+            return None if self.designated is None else np.asarray(self.designated.pixel)
+        pixel, is_in_front = left.project(self.target_world)
+        return np.asarray(pixel) if bool(is_in_front) else None
 
-    def lost(self, why: str, stop: RoverMeasurements) -> dict[str, Any]:
-        """The answer where it was not found; it may be again."""
+    def report_loss(self, reason: str, stop: RoverMeasurements) -> dict[str, Any]:
+        """Return the answer for a lost target, which a later stop can find again."""
         self.state = "LOST"
-        return {"state": "LOST", "losses": [why], "position_rover": self.position(stop)}
+        return {"state": "LOST", "losses": [reason], "position_rover": self.position_rover(stop)}
 
-    def position(self, stop: RoverMeasurements) -> list[float] | None:
-        """The target from here."""
+    def position_rover(self, stop: RoverMeasurements) -> list[float] | None:
+        """Return the position of the target in the rover frame."""
         if self.target_world is None:
             return None
         return list(map(float, stop.world_from_rover.inv().apply(self.target_world)))
 
 
-def patch(image: MastImage, place: np.ndarray) -> np.ndarray | None:
-    """The picture about a pixel of the full frame; None where it is not all there."""
-    column, row = np.rint(place).astype(int) - np.array(image.corner)
+def extract_patch(image: MastImage, pixel: np.ndarray) -> np.ndarray | None:
+    """Return the patch around a pixel of the full frame; None if a part of it is outside the image."""
+    column, row = np.rint(pixel).astype(int) - np.array(image.corner)
     rows, columns = image.counts.shape
-    if not (HALF <= column < columns - HALF and HALF <= row < rows - HALF):
+    if not (HALF_PX <= column < columns - HALF_PX and HALF_PX <= row < rows - HALF_PX):
         return None
-    return image.counts[row - HALF : row + HALF + 1, column - HALF : column + HALF + 1].astype(np.float32)
+    return image.counts[row - HALF_PX : row + HALF_PX + 1, column - HALF_PX : column + HALF_PX + 1].astype(np.float32)
 
 
-def best(
-    image: MastImage, place: np.ndarray, columns: int, rows: int, template: np.ndarray
+def find_template(
+    image: MastImage, pixel: np.ndarray, columns: int, rows: int, template: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Where a template matches best within so many columns and rows of a pixel of the full frame, and how well."""
-    if not np.all(np.isfinite(place)):
-        return place, 0.0
-    near = np.rint(place).astype(int) - np.array(image.corner) - (HALF + np.array([columns, rows]))
-    far = near + 2 * (HALF + np.array([columns, rows])) + 1
-    near, far = np.maximum(near, 0), np.maximum(far, 0)
-    window = image.counts[near[1] : far[1], near[0] : far[0]].astype(np.float32)
-    if min(window.shape) < 2 * HALF + 1 or template.std() < 1.0:
-        return place, 0.0
+    """Search a template within some columns and rows around a pixel; return the best pixel (full frame) and score."""
+    if not np.all(np.isfinite(pixel)):
+        return pixel, 0.0
+    start = np.rint(pixel).astype(int) - np.array(image.corner) - (HALF_PX + np.array([columns, rows]))
+    end = start + 2 * (HALF_PX + np.array([columns, rows])) + 1
+    start, end = np.maximum(start, 0), np.maximum(end, 0)
+    window = image.counts[start[1] : end[1], start[0] : end[0]].astype(np.float32)
+    if min(window.shape) < 2 * HALF_PX + 1 or template.std() < 1.0:
+        return pixel, 0.0
     scores = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
-    _, score, _, at = cv2.minMaxLoc(np.where(np.isfinite(scores), scores, 0.0))
-    return np.array(at, dtype=np.float64) + near + HALF + np.array(image.corner), float(score)
+    _, score, _, location = cv2.minMaxLoc(np.where(np.isfinite(scores), scores, 0.0))
+    return np.array(location, dtype=np.float64) + start + HALF_PX + np.array(image.corner), float(score)
 
 
-def seen_at(camera: CameraModel, pixel: np.ndarray, range_m: float) -> np.ndarray:
-    """The point so far along a pixel's line of sight."""
+def point_at(camera: CameraModel, pixel: np.ndarray, range_m: float) -> np.ndarray:
+    """Return the point at a range along a pixel's line of sight."""
     origin, direction = camera.rays(pixel)
     return np.asarray(origin + range_m * direction)
 
 
-def between(left: CameraModel, left_px: np.ndarray, right: CameraModel, right_px: np.ndarray) -> np.ndarray:
-    """Where two lines of sight come nearest to each other."""
-    (a, along_a), (b, along_b) = left.rays(left_px), right.rays(right_px)
-    distances = np.linalg.lstsq(np.stack([along_a, -along_b], axis=-1), b - a, rcond=None)[0]
-    return np.asarray(0.5 * (a + distances[0] * along_a + b + distances[1] * along_b))
+def intersect_rays(left: CameraModel, left_px: np.ndarray, right: CameraModel, right_px: np.ndarray) -> np.ndarray:
+    """Return the midpoint of the shortest segment between two lines of sight."""
+    (left_origin, left_ray), (right_origin, right_ray) = left.rays(left_px), right.rays(right_px)
+    ranges = np.linalg.lstsq(np.stack([left_ray, -right_ray], axis=-1), right_origin - left_origin, rcond=None)[0]
+    return np.asarray(0.5 * (left_origin + ranges[0] * left_ray + right_origin + ranges[1] * right_ray))
 
 
 def main() -> None:
-    """Answers line by line until the input ends."""
+    """Answer the requests on standard input, one per line, until the input ends."""
     tracker = WholePixelTracker()
     print(json.dumps({"exchange": 2, "ready": True}), flush=True)
     for line in sys.stdin:
-        asked = json.loads(line)
-        print(json.dumps({"exchange": 2, "id": asked["id"], **tracker.answer(asked)}), flush=True)
+        request = json.loads(line)
+        print(json.dumps({"exchange": 2, "id": request["id"], **tracker.answer(request)}), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""The command line. Commands import their dependencies when they run, so that ``--help`` is fast."""
+"""The command line `marsyard`: registers all commands; defines `list`, `show` and `doctor`.
+
+Commands import their dependencies when they run, so that ``--help`` is fast.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +28,11 @@ from marsyard.cli.terrain import app as terrain
 from marsyard.cli.terrain import gallery, render
 
 
-class _PlainFlags:
-    """Hide the value type of flags in the help of a command or group."""
+class _FlagsWithoutType:
+    """Mixin that hides the value type of flags in the help of a command or group."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Return the parameters; flags have no value type."""
+        """Return the parameters; the value type of flags is removed."""
         parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
         for parameter in parameters:
             if getattr(parameter, "is_flag", False):
@@ -37,11 +40,11 @@ class _PlainFlags:
         return parameters
 
 
-class _Command(_PlainFlags, TyperCommand):
+class _Command(_FlagsWithoutType, TyperCommand):
     pass
 
 
-class _Group(_PlainFlags, TyperGroup):
+class _Group(_FlagsWithoutType, TyperGroup):
     pass
 
 
@@ -104,15 +107,15 @@ def show(
 
     if figure is not None and draw is None:
         raise CampaignError("--figure plots draws: give the number of cases with --draw N")
-    loaded = load_campaign(campaign, override or [])
+    definition = load_campaign(campaign, override or [])
     if figure is not None and draw is not None:
-        write_draws_figure(loaded, draw, figure)
+        write_draws_figure(definition, draw, figure)
     if as_json:
-        typer.echo(json.dumps(describe_campaign(loaded, draw), indent=2))
+        typer.echo(json.dumps(describe_campaign(definition, draw), indent=2))
     elif draw is None:
-        show_campaign(loaded, console())
+        show_campaign(definition, console())
     else:
-        show_draws(loaded, draw, console())
+        show_draws(definition, draw, console())
     if figure is not None:
         typer.echo(f"figure: {figure}", err=as_json)
 
@@ -133,7 +136,7 @@ def _print_version(is_requested: bool) -> None:
 
 
 @app.callback()
-def _marsyard(
+def _define_global_options(
     version: Annotated[
         bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
@@ -170,11 +173,11 @@ def _format_warning(
 
 
 def main() -> None:
-    """Run the command line. A defect of the program ends with a traceback and status 2; status 1 is for verdicts."""
-    # if `pgrep` is not installed, loky warns at the end of each worker, without consequences
+    """Run the command line; an unexpected error prints a traceback and exits with status 2 (1 is for verdicts)."""
+    # if `pgrep` is not installed, loky prints a needless warning at the end of each worker
     warnings.filterwarnings("ignore", message="Failed to kill subprocesses")
     warnings.formatwarning = _format_warning
-    if not {"--help", "--version"}.issuperset(sys.argv[1:]):  # these run without NumPy
+    if not {"--help", "--version"}.issuperset(sys.argv[1:]):  # both options work without NumPy
         from marsyard.sim.parameters import current_options
 
         sys.argv[1:] = current_options(sys.argv[1:])

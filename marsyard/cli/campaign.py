@@ -52,19 +52,19 @@ def run(arguments: RunOptions) -> None:
     changes = list(arguments.override or [])
     if arguments.case_time is not None:
         changes.append(f"limits.case_time_s={arguments.case_time}")
-    loaded = load_campaign(arguments.campaign, changes, arguments.cases, arguments.seed, arguments.algorithm or [])
+    campaign = load_campaign(arguments.campaign, changes, arguments.cases, arguments.seed, arguments.algorithm or [])
     # imported after loading, so that an error in the file is reported without delay
     from marsyard.campaigns.running.engine import run_campaign
     from marsyard.cli import outcome
 
     executor = make_executor(arguments.jobs, arguments.cluster)
     if arguments.dry_run:
-        outcome.print_estimate(loaded, executor)
-        outcome.print_limits(loaded)
+        outcome.print_estimate(campaign, executor)
+        outcome.print_limits(campaign)
         return
-    directory = arguments.out if arguments.out is not None else default_directory(loaded.configuration.name)
+    directory = arguments.out if arguments.out is not None else default_directory(campaign.configuration.name)
     run_cases = outcome.run_until_decided if arguments.until_decided else run_campaign
-    run_and_evaluate(directory, lambda watch: run_cases(loaded, directory, executor, watch))
+    run_and_evaluate(directory, lambda watch: run_cases(campaign, directory, executor, watch))
 
 
 @options.handle_user_errors
@@ -149,7 +149,7 @@ def replay(
     replayed = rerun_case(directory, case)
     target = out if out is not None else case_directory(directory, case)
     if (replayed.failed or replayed.products is None) and (target / "products.json").exists():
-        written = [f"{target} keeps its previous products: this run of the case produced none"]
+        output_lines = [f"{target} keeps its previous products: this run of the case produced none"]
     else:  # replace the products, stages and figures together or not at all
         packed = replayed.products or pack_products({})
         products = unpack_products(packed)
@@ -157,13 +157,13 @@ def replay(
             write_packed(folder, packed, replayed.row)
             stages = write_stages(folder / "stages", products) if save_stages else 0
             figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
-        lines = [f"stages: {stages} files in {target / 'stages'}"] if save_stages else []
-        written = [f"products: {target}", *lines, *(f"figure: {figure}" for figure in figures)]
+        stage_lines = [f"stages: {stages} files in {target / 'stages'}"] if save_stages else []
+        output_lines = [f"products: {target}", *stage_lines, *(f"figure: {figure}" for figure in figures)]
     typer.echo(f"case {case}: {replayed.row['outcome']}")
     for line in (replayed.row["error"] and (replayed.row["traceback"] or replayed.row["error"]), replayed.note):
         if line:
             typer.echo(line)
-    typer.echo("\n".join(written))
+    typer.echo("\n".join(output_lines))
     if replayed.changed:
         typer.echo(f"changed since the campaign was run: {'; '.join(replayed.changed)}")
     if replayed.stored is None:
@@ -178,7 +178,7 @@ def replay(
 
 
 def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
-    """Return the configuration of the workers from the options `--jobs` and `--cluster`."""
+    """Create the configuration of the workers from the options `--jobs` and `--cluster`."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.execution.workers import ExecutorConfig, available_cores
 
@@ -190,7 +190,7 @@ def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
 
 
 def run_and_evaluate(directory: Path, work: Callable[[Watch], None]) -> None:
-    """Run `work`, evaluate the campaign, and exit with the status of its verdict."""
+    """Run the campaign by the function `work`, evaluate it, and exit with the status of its verdict."""
     from marsyard.cli.outcome import evaluate_and_report
     from marsyard.cli.progress import RunLog
 
@@ -201,7 +201,7 @@ def run_and_evaluate(directory: Path, work: Callable[[Watch], None]) -> None:
 
 @contextmanager
 def show_progress(directory: Path, next_command: str) -> Iterator[Watch]:
-    """Show the progress of work in a folder; an interruption prints the next command and exits with status 130."""
+    """Show the progress of a campaign; an interruption prints `next_command` and exits with status 130."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.record import read
     from marsyard.cli.progress import campaign_progress

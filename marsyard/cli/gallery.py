@@ -24,13 +24,13 @@ Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]
 PAGE, SHEET = "index.html", "contact-sheet.png"
 #: Maximum width of the images on the page; JPEG quality of these images and of the full-size files.
 PAGE_WIDTH_PX, PAGE_QUALITY, FULL_QUALITY = 760, 82, 92
-#: Contact sheet: columns, cell size, gap, label height, maximum file size, and the grey-level counts to try.
+#: Contact sheet: columns, cell size, gap, label height, maximum file size, and the numbers of grey levels to try.
 COLUMNS, CELL_PX, GAP_PX, LABEL_PX, SHEET_BYTES = 4, (240, 180), 8, 22, 300_000
 SHEET_GREYS = (64, 48, 40, 32, 26, 21, 16, 12, 8)
-#: Display: percentiles of the signal for black and white, factor of the black percentile, and gamma exponent.
+#: Display: percentiles of the signal for black and white, factor applied to the black percentile, gamma exponent.
 BLACK_PERCENTILE, WHITE_PERCENTILE, BLACK_FRACTION, GAMMA = 0.5, 99.7, 0.6, 0.65
 
-#: Site, camera, and settings that replace the camera's defaults.
+#: Images of the gallery: site, camera, and settings that replace the camera's defaults.
 VIEWS: Sequence[tuple[str, str, dict[str, Any]]] = (
     ("gusev", "mer-descent-flown", {"altitude_m": 1400.0, "sun_azimuth_deg": 270.0, "sun_elevation_deg": 30.0}),
     ("gusev", "mer-navcam", {"east_m": 30.0, "north_m": 40.0, "azimuth_deg": 340.0, "sun_azimuth_deg": 265.0}),
@@ -55,7 +55,7 @@ TERRAIN_CAMERA, TERRAIN_ALTITUDE_M = "mer-descent-flown", 500.0
 
 @dataclass(frozen=True)
 class GalleryImage:
-    """An image of the gallery."""
+    """One rendered image of the gallery."""
 
     request: ImageRequest
     grey: Grey  #: grey levels for display
@@ -64,16 +64,16 @@ class GalleryImage:
     @property
     def caption(self) -> str:
         """Text with camera, height, viewing direction and sun direction."""
-        s = self.request
-        direction = "looking straight down" if s.elevation_deg == -90.0 else f"looking to {s.azimuth_deg:g}°"
+        r = self.request
+        direction = "looking straight down" if r.elevation_deg == -90.0 else f"looking to {r.azimuth_deg:g}°"
         return (
-            f"{s.camera}, {s.altitude_m:g} m above the ground, {direction}; "
-            f"sun elevation {s.sun_elevation_deg:g}°, azimuth {s.sun_azimuth_deg:g}°"
+            f"{r.camera}, {r.altitude_m:g} m above the ground, {direction}; "
+            f"sun elevation {r.sun_elevation_deg:g}°, azimuth {r.sun_azimuth_deg:g}°"
         )
 
 
 def render_gallery(folder: Path, overwrite: bool, terrain_files: Sequence[Path] = ()) -> Path:
-    """Render all views, and DTM files; write the gallery and return the path of the page. Raises ValueError."""
+    """Render all `VIEWS` and DTM files; write the gallery and return the path of the page. Raises ValueError."""
     requests = [ImageRequest.from_defaults(site, camera, **settings) for site, camera, settings in VIEWS]
     for file in terrain_files:
         if not is_terrain_file(str(file)):
@@ -95,7 +95,7 @@ def render_gallery(folder: Path, overwrite: bool, terrain_files: Sequence[Path] 
 
 
 def render_gallery_image(number: int, request: ImageRequest) -> GalleryImage:
-    """Render an image with detector model; the left image of a stereo pair."""
+    """Render an image with the detector model; for a stereo camera, the left image."""
     image = render_images(request, both=False)[0]
     if image.auto_exposure is None or image.counts is None:
         raise ValueError("an image without detector counts cannot be displayed")
@@ -105,9 +105,9 @@ def render_gallery_image(number: int, request: ImageRequest) -> GalleryImage:
 
 
 def map_to_grey(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarray, "rows columns"]) -> Grey:
-    """Map counts above the offset to grey levels for display; `ground` marks the pixels that see the ground.
+    """Map counts above the offset to grey levels for display; `ground` marks the pixels that show the ground.
 
-    White is the brightest ground; a brighter sky is compressed into the upper levels (Reinhard et al. 2002, eq. 4).
+    The brightest ground is white; a brighter sky is compressed into the upper levels (Reinhard et al. 2002, eq. 4).
     """
     white = float(np.percentile(signal[ground] if ground.any() else signal, WHITE_PERCENTILE))
     black = BLACK_FRACTION * float(np.percentile(signal, BLACK_PERCENTILE))
@@ -123,21 +123,21 @@ def write_gallery(images: Sequence[GalleryImage], folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     groups: dict[str, list[dict[str, Any]]] = {}
     for image in images:
-        s, (rows, columns) = image.request, image.grey.shape
-        full = encode_image(".jpg", image.grey, [cv2.IMWRITE_JPEG_QUALITY, FULL_QUALITY])
-        (folder / image.file).write_bytes(full)
+        r, (rows, columns) = image.request, image.grey.shape
+        full_size_jpeg = encode_image(".jpg", image.grey, [cv2.IMWRITE_JPEG_QUALITY, FULL_QUALITY])
+        (folder / image.file).write_bytes(full_size_jpeg)
         width = min(PAGE_WIDTH_PX, columns)
-        small = cv2.resize(image.grey, (width, round(rows * width / columns)), interpolation=cv2.INTER_AREA)
-        inline = encode_image(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, PAGE_QUALITY])
+        reduced = cv2.resize(image.grey, (width, round(rows * width / columns)), interpolation=cv2.INTER_AREA)
+        page_jpeg = encode_image(".jpg", reduced, [cv2.IMWRITE_JPEG_QUALITY, PAGE_QUALITY])
         command = (
-            f"marsyard render {s.site} --camera {s.camera} --scale {s.scale} --altitude {s.altitude_m:g} "
-            f"--east {s.east_m:g} --north {s.north_m:g} "
-            f"--azimuth {s.azimuth_deg:g} --elevation {s.elevation_deg:g} --sun-azimuth {s.sun_azimuth_deg:g} "
-            f"--sun-elevation {s.sun_elevation_deg:g} --out {Path(s.site).stem}"
+            f"marsyard render {r.site} --camera {r.camera} --scale {r.scale} --altitude {r.altitude_m:g} "
+            f"--east {r.east_m:g} --north {r.north_m:g} "
+            f"--azimuth {r.azimuth_deg:g} --elevation {r.elevation_deg:g} --sun-azimuth {r.sun_azimuth_deg:g} "
+            f"--sun-elevation {r.sun_elevation_deg:g} --out {Path(r.site).stem}"
         )
         values = {"file": image.file, "columns": columns, "rows": rows, "caption": image.caption, "command": command}
-        source = f"data:image/jpeg;base64,{base64.b64encode(inline).decode()}"
-        groups.setdefault(s.site, []).append({"source": source, **values})
+        source = f"data:image/jpeg;base64,{base64.b64encode(page_jpeg).decode()}"
+        groups.setdefault(r.site, []).append({"source": source, **values})
     (folder / SHEET).write_bytes(draw_contact_sheet(images))
     site_images = [(load_site(name), entries) for name, entries in groups.items()]
     page = page_environment().get_template("gallery.html.j2").render(groups=site_images, version=version("marsyard"))
@@ -146,7 +146,7 @@ def write_gallery(images: Sequence[GalleryImage], folder: Path) -> Path:
 
 
 def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
-    """Return a PNG file of at most `SHEET_BYTES` with all images reduced, with as many grey levels as fit."""
+    """Draw all images, reduced, on one PNG of at most `SHEET_BYTES`, with as many grey levels as possible."""
     cell_width, cell_height = CELL_PX
     rows = -(-len(images) // COLUMNS)
     size = (rows * (cell_height + LABEL_PX + GAP_PX) + GAP_PX, COLUMNS * (cell_width + GAP_PX) + GAP_PX)
@@ -156,8 +156,9 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
         left = GAP_PX + number % COLUMNS * (cell_width + GAP_PX)
         height, width = image.grey.shape
         cropped_height = min(height, round(width * cell_height / cell_width))
-        first = (height - cropped_height) // 3  # crop more rows at the bottom: the horizon is in the upper part
-        cell = cv2.resize(image.grey[first : first + cropped_height], CELL_PX, interpolation=cv2.INTER_AREA)
+        first_row = (height - cropped_height) // 3  # crop more rows at the bottom: the horizon is in the upper part
+        cropped = image.grey[first_row : first_row + cropped_height]
+        cell = cv2.resize(cropped, CELL_PX, interpolation=cv2.INTER_AREA)
         sheet[top : top + cell_height, left : left + cell_width] = cell
         label = f"{Path(image.request.site).name}  {image.request.camera}  {image.request.altitude_m:g} m"
         position = (left + 1, top + cell_height + LABEL_PX - 8)

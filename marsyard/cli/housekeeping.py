@@ -1,4 +1,4 @@
-"""Commands `marsyard clean` and `compile`: cached terrains and compiled kernels on disk."""
+"""Commands `marsyard clean` and `compile`: remove caches (terrains, compiled kernels) from disk; compile kernels."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ KINDS = {
     "terrain": "terrains of campaigns; rebuilt when a case needs one, seconds to minutes each",
     "kernels": "compiled code; recompiled at the next run, about one minute",
 }
-#: The kind with a size limit (MARSYARD_CACHE_GB).
-LIMITED = "terrain"
+#: Kind of cached files with a size limit (MARSYARD_CACHE_GB).
+KIND_WITH_LIMIT = "terrain"
 
 
 @handle_user_errors
@@ -42,38 +42,38 @@ def clean(
         if kind not in KINDS:
             raise CampaignError(unknown_name_message("kind", kind, KINDS))
     caches = [cache_usage(kind) for kind in kinds or KINDS]
-    freed = 0
+    removed_bytes = 0
     paths = [path for cache in caches for path in sorted(cache["folder"].rglob("*"), reverse=True)] if yes else []
     for path in paths:
         try:
             if path.is_dir() and not path.is_symlink():
                 path.rmdir()
-            elif path.suffix != UNFINISHED:  # a file that another process is writing
+            elif path.suffix != UNFINISHED:  # files with this suffix are being written by another process
                 size = path.stat().st_size
                 path.unlink()
-                freed += size
+                removed_bytes += size
         except OSError:  # not empty, in use, or already removed
             continue
     if as_json:
-        typer.echo(json.dumps({"kept": caches, "removed_bytes": freed}, indent=2, default=str))
+        typer.echo(json.dumps({"kept": caches, "removed_bytes": removed_bytes}, indent=2, default=str))
         return
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("kind", "files", "size", "limit", "folder", "contents"):
-        right = heading in ("files", "size", "limit")
-        table.add_column(heading, justify="right" if right else "left", overflow="fold")
+        is_numeric = heading in ("files", "size", "limit")
+        table.add_column(heading, justify="right" if is_numeric else "left", overflow="fold")
     for cache in caches:
         limit = "none" if cache["limit_bytes"] is None else size_text(cache["limit_bytes"])
         kind, size = cache["kind"], size_text(cache["bytes"])
         table.add_row(kind, str(cache["files"]), size, limit, str(cache["folder"]), KINDS[kind])
     console().print(table)
     if yes:
-        typer.echo(f"removed {size_text(freed)}")
+        typer.echo(f"removed {size_text(removed_bytes)}")
     else:
         typer.echo("nothing was removed; to remove these files: marsyard clean --yes")
 
 
 def cache_usage(kind: str) -> dict[str, Any]:
-    """Return folder, file count and size of a cache. Raises CampaignError for an invalid MARSYARD_CACHE_GB."""
+    """Return folder, number of files and size of a cache. Raises CampaignError for an invalid MARSYARD_CACHE_GB."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.sim.cache import cache_directory, limit_bytes
 
@@ -87,7 +87,7 @@ def cache_usage(kind: str) -> dict[str, Any]:
             continue
     size = sum(sizes)
     try:
-        limit = limit_bytes(folder, size) if kind == LIMITED else None
+        limit = limit_bytes(folder, size) if kind == KIND_WITH_LIMIT else None
     except ValueError as error:
         raise CampaignError(str(error)) from error
     return {"kind": kind, "folder": folder, "files": len(sizes), "bytes": size, "limit_bytes": limit}
@@ -95,9 +95,9 @@ def cache_usage(kind: str) -> dict[str, Any]:
 
 @handle_user_errors
 def compile_kernels() -> None:
-    """Compile the numeric kernels before the first run.
+    """Compile the numeric kernels before the first run, by running a small case of each system.
 
-    Run a small case of each system. The cache of compiled code is valid until the source changes.
+    The compiled code is cached and valid until the source code changes.
     """
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.execution.worker_process import limit_threads

@@ -1,4 +1,4 @@
-"""Commands `marsyard new` and `ingest`: create a campaign from options or questions, or from recorded pictures."""
+"""Commands `marsyard new` and `ingest`: create a campaign file from options or questions, or from recorded images."""
 
 from __future__ import annotations
 
@@ -62,26 +62,27 @@ def new(arguments: NewOptions) -> None:
         raise CampaignError(f"{path}: the file exists; use --overwrite to replace it, or --out to write another file")
     if not name or any(letter in name for letter in '/\\"\n'):
         raise CampaignError(f"'{name}' is not a valid campaign name: slashes and quotes are not allowed")
-    interactive, paths = arguments.system is None and _is_terminal(), template_paths()
+    is_interactive, paths = arguments.system is None and _is_terminal(), template_paths()
     find_problem = partial(_find_name_problem, list(paths))
-    system = arguments.system or _ask("System", next(iter(paths)), interactive, find_problem)
+    system = arguments.system or _ask_user("System", next(iter(paths)), is_interactive, find_problem)
     if system not in paths:
         raise CampaignError(f"--system: {unknown_name_message('system', system, paths)}")
     template: CampaignTemplate = import_object(paths[system])
-    asks_camera, asks_flight = (interactive and option not in template.refused for option in ("camera", "flight"))
+    ask_camera, ask_flight = (is_interactive and option not in template.refused for option in ("camera", "flight"))
     names = [name for name, preset in sites().items() if getattr(preset, template.scale) is not None]
-    site = arguments.site or _ask("Site", template.site, interactive, partial(_find_name_problem, names))
-    camera = arguments.camera or _ask("Camera file (empty: the paper's camera)", "", asks_camera, _find_camera_problem)
-    flight = arguments.flight or _ask("Trajectory file (empty: simulated)", "", asks_flight, _find_file_problem)
+    site = arguments.site or _ask_user("Site", template.site, is_interactive, partial(_find_name_problem, names))
+    question = "Camera file (empty: the paper's camera)"
+    camera = arguments.camera or _ask_user(question, "", ask_camera, _find_camera_problem)
+    flight = arguments.flight or _ask_user("Trajectory file (empty: simulated)", "", ask_flight, _find_file_problem)
     question, default = f"Requirement: {template.bound_text}", f"{template.bound:g}"
     bound = math.nan if arguments.bound is None else arguments.bound
     if math.isnan(bound):
-        bound = float(_ask(question, default, interactive, partial(_find_number_problem, template.max_bound)))
+        bound = float(_ask_user(question, default, is_interactive, partial(_find_number_problem, template.max_bound)))
     choices = Choices(name, site, camera, arguments.detector or "", flight, arguments.axes, bound, arguments.cases)
-    loaded = _write_and_load(path, template, choices)
+    campaign = _write_and_load(path, template, choices)
     summary = f"{path}: {system} over {site}, {count(arguments.cases, 'case')}"
     typer.echo(f"{summary}. To show it: `marsyard show {path}`. To run it:\n  marsyard run {path}")
-    for limit in evidence_limits(loaded):
+    for limit in evidence_limits(campaign):
         typer.echo(f"note: {limit}")
 
 
@@ -107,15 +108,15 @@ def _write_and_load(path: Path, template: CampaignTemplate, choices: Choices) ->
         raise
 
 
-def _ask(question: str, default: str, interactive: bool, find_problem: Callable[[str], str]) -> str:
-    """Ask on the terminal until the answer is valid; return the default if not interactive."""
+def _ask_user(question: str, default: str, is_interactive: bool, find_problem: Callable[[str], str]) -> str:
+    """Ask the user until the answer is valid (`find_problem` returns ""); return the default if not interactive."""
 
     def check(answer: str) -> str:
         if problem := find_problem(answer):
             raise typer.BadParameter(problem)
         return answer
 
-    if not interactive:
+    if not is_interactive:
         return default
     return str(typer.prompt(question, default=default, show_default=bool(default), value_proc=check))
 
@@ -159,7 +160,7 @@ def ingest(
     out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
     system: Annotated[str | None, Option(help="System under test; by default `measured`.")] = None,
 ) -> None:
-    """Create a campaign from recorded pictures with measured attitude and altitude."""
+    """Create a campaign from recorded images with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
     from marsyard.reports.wording import count
@@ -190,7 +191,7 @@ def ingest(
     except CampaignError:  # remove a campaign that cannot be run
         shutil.rmtree(out)
         raise
-    typer.echo(f"{count(ingested.cases, 'case')} of {count(ingested.pictures, 'picture')}: {out}")
+    typer.echo(f"{count(ingested.cases, 'case')} of {count(ingested.pictures, 'image')}: {out}")
     if ingested.note:
         typer.echo(ingested.note)
     typer.echo(f"to run the cases: marsyard run {out / CAMPAIGN_FILE}")

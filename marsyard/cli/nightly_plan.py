@@ -1,4 +1,4 @@
-"""Plan of nightly campaigns, and the run of these campaigns in one night."""
+"""Nightly runs (`marsyard nightly`): the plan file, the run of its campaigns in one night, and the result page."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 class PlannedCampaign(Parameters):
-    """A campaign of the plan, with values that override its campaign file."""
+    """One campaign of the plan, with values that override its campaign file."""
 
     campaign: Annotated[str, Field(min_length=1)]
     cases: Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)] | None = None
@@ -47,14 +47,14 @@ class PlannedCampaign(Parameters):
     algorithms: Texts = ()
 
     def load(self, seed: int, night: int, folder: Path) -> Campaign:
-        """Load the campaign with the root seed of a night; paths are relative to the plan's folder."""
+        """Load the campaign with the root seed of a night; relative paths start in `folder`, the folder of the plan."""
         path = folder / self.campaign
         name = str(path) if path.is_file() else self.campaign
         return load_campaign(name, self.override, self.cases, night_seed(seed, night), self.algorithms)
 
 
 class Plan(Parameters):
-    """Campaigns to run each night."""
+    """Plan of the campaigns to run each night, read from a TOML file."""
 
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = Field(
         default=0, description="seed from which the root seed of each night is derived: each night draws new cases"
@@ -81,7 +81,7 @@ def night_seed(seed: int, night: int) -> int:
 
 
 def hash_definition(campaign: Campaign) -> str:
-    """Hash a campaign's definition without seed and texts; only nights with equal hashes are compared."""
+    """Hash a campaign's definition except seed, texts and number of cases; only equal definitions are compared."""
     excluded = {"seed", "description", "retain", "limits", "cases"}
     definition = campaign.configuration.model_dump(mode="json", exclude=excluded)
     return hashlib.sha256(json.dumps(definition, sort_keys=True).encode()).hexdigest()
@@ -89,7 +89,7 @@ def hash_definition(campaign: Campaign) -> str:
 
 @dataclass(frozen=True)
 class NightlyRun:
-    """A nightly run in progress."""
+    """A nightly run in progress: history, number of the night, output folder, executor and plan."""
 
     history: History
     number: int
@@ -129,7 +129,7 @@ def publish_page(history: History, night: int, out: Path, changes: Sequence[Chan
 
 
 def write_page(history: History, night: int, out: Path, changes: Sequence[Change]) -> str:
-    """Write the page with the results of the night so far; return its text."""
+    """Write the page with the results of the night so far, and the significant changes; return its text."""
     nights = {record.night: record for record in history.nights()}
     earlier = [record for number, record in nights.items() if number < night]
     compared = sum(bool(comparison.before) for comparison in list_comparisons(history, night))

@@ -1,4 +1,4 @@
-"""Commands `marsyard conformance`, `export`, `score` and `dataset`: test and score algorithms, export data."""
+"""Commands `marsyard conformance`, `export`, `score` and `dataset`: check and score algorithms, export data."""
 
 from __future__ import annotations
 
@@ -40,18 +40,19 @@ def export(
 
     truth = truth_folder(out) if truth is None else truth
     no_products = ["retain.products=none", "retain.showcase=none"]
-    recorder = f"{EXPORT}{out.resolve()}" + ("" if bits_per_pixel is None else f"{LOSSY}{bits_per_pixel:g}")
-    loaded = load_campaign(campaign, [*(override or []), *no_products], cases, seed, [recorder])
+    # the "algorithm" of an export writes the cases to the folder
+    exporter = f"{EXPORT}{out.resolve()}" + ("" if bits_per_pixel is None else f"{LOSSY}{bits_per_pixel:g}")
+    export_definition = load_campaign(campaign, [*(override or []), *no_products], cases, seed, [exporter])
     command = ["marsyard", "export", campaign, "--out", str(out), "--truth", str(truth)]
     command += [] if cases is None else ["-n", str(cases)]
     command += [] if seed is None else ["--seed", str(seed)]
     command += [word for value in override or [] for word in ("--set", value)]
     command += [] if bits_per_pixel is None else ["--bits-per-pixel", f"{bits_per_pixel:g}"]
-    loaded = replace(loaded, command=tuple(command))
+    export_definition = replace(export_definition, command=tuple(command))
     with show_progress(truth, f"the same command again ({out})") as watch:
-        export_campaign(loaded, out, truth, make_executor(jobs, cluster), watch)
+        export_campaign(export_definition, out, truth, make_executor(jobs, cluster), watch)
     crashed = int(record.read(truth)["cases_crashed"])
-    total = loaded.configuration.total_cases
+    total = export_definition.configuration.total_cases
     typer.echo(f"exported {total - crashed} of {count(total, 'case')} to {out}")
     typer.echo(f"ground truth (do not distribute with the cases): {truth}")
     typer.echo(f"to score the results: marsyard score {out} ANSWERS.csv")
@@ -101,7 +102,7 @@ def dataset(
 ) -> None:
     """Write images with range, normals, rock masks, hazard maps and poses as WebDataset shards.
 
-    Landing campaigns give two images per case. Existing shards are kept: repeat the command to continue.
+    Landing campaigns have two images per case. Existing shards are not written again: repeat the command to continue.
     """
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.dataset import write_dataset
@@ -139,8 +140,8 @@ def conformance(
         findings.append(finding)
         if as_json:
             continue
-        word = "[green]ok  [/]" if finding.passed else "[bold red]FAIL[/]"
-        console().print(f"{word} {finding.check:<14}", end="", highlight=False)
+        result = "[green]ok  [/]" if finding.passed else "[bold red]FAIL[/]"
+        console().print(f"{result} {finding.check:<14}", end="", highlight=False)
         lines = [f"{finding.requirement} ({finding.note})" if finding.note else finding.requirement]
         if not finding.passed:
             lines += [f"{'':20}{line}" for line in (finding.problem, f"to fix: {finding.next_step}")]

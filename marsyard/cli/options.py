@@ -1,4 +1,4 @@
-"""Options, arguments, exit status, error handling and console that the commands share."""
+"""Options, arguments, exit status, error handling and console used by several commands."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 class Exit(IntEnum):
     """Exit status of the program; if several apply, the order of precedence is 2, 1, 3."""
 
-    MET = 0
-    FAILED = 1
-    WRONG = 2
-    INSUFFICIENT = 3
-    INTERRUPTED = 130
+    MET = 0  #: all requirements are met, or there are none
+    FAILED = 1  #: a requirement failed, or a case crashed
+    WRONG = 2  #: the command or a file is invalid
+    INSUFFICIENT = 3  #: not enough cases for a verdict
+    INTERRUPTED = 130  #: by Ctrl-C or SIGTERM
 
 
 CampaignArgument = Annotated[
@@ -79,7 +79,7 @@ Options = TypeVar("Options")
 
 
 def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
-    """Make the fields of a dataclass the options of a command, which receives one instance."""
+    """Decorate a command: its options are the fields of the dataclass `kind`, and its argument one instance of it."""
     hints = get_type_hints(kind, include_extras=True)
     fields = [field.replace(annotation=hints[name]) for name, field in inspect.signature(kind).parameters.items()]
 
@@ -96,7 +96,7 @@ def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], C
 
 
 def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
-    """Wrap a command: a user error, a full disk or a read-only disk prints one message and exits with status 2."""
+    """Decorate a command: a user error, a full or a read-only disk prints one message and exits with status 2."""
 
     @functools.wraps(command)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
@@ -114,13 +114,13 @@ def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Paramete
 
 
 def fail(error: object) -> NoReturn:
-    """End the command with one message and status 2."""
+    """Print an error message and exit with status 2."""
     typer.echo(f"error: {error}", err=True)
     raise typer.Exit(Exit.WRONG) from None
 
 
 def console(*, stderr: bool = False) -> Console:
-    """Create the console for a command's output."""
+    """Create a console for a command's output."""
     from rich.console import Console
 
     return Console(stderr=stderr)

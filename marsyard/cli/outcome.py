@@ -1,4 +1,4 @@
-"""Evaluate stored campaigns: verdict, exit status, report, table and images; serve a dashboard."""
+"""Evaluation of stored campaigns for the commands: verdicts, exit status, report, CSV and PDF; dashboard server."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     """Evaluate a campaign, write its report, print the verdicts, and return the exit status.
 
     The status of an unfinished campaign is never 0; its verdict uses the rows stored so far. `requirements` replace the
-    requirements of the campaign; the record of the campaign is then not changed.
+    requirements of the campaign; in this case the record of the campaign is not changed.
     Raises StoreError if the folder contains no campaign with rows, or the report cannot be written.
     """
     stored = record.read(directory)
@@ -76,7 +76,7 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
         lines.insert(0, f"INCOMPLETE: {len(run.all_cases)} of {count(stored['cases'], 'case')}; {reason}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    # requirements met by a part of the cases are not yet met by all cases
+    # an unfinished campaign cannot meet its requirements: replace status 0
     return evaluation.exit_code if finished else evaluation.exit_code or Exit.INSUFFICIENT
 
 
@@ -131,7 +131,7 @@ def write_csv(directory: Path) -> Path:
 
 
 def print_page(directory: Path) -> Path:
-    """Print the report to PDF with a headless browser."""
+    """Print the report page `report.html` to `report.pdf` with a headless browser; return the path of the PDF."""
     browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         raise CampaignError(f"--pdf requires a browser; install chromium ({', '.join(_BROWSERS)})")
@@ -173,9 +173,9 @@ _MAX_DRAWS = 5000
 
 
 def evidence_limits(campaign: Campaign) -> list[str]:
-    """Explain why requirements cannot reach PASS even without failures, with a remedy; empty if all can.
+    """Explain which requirements cannot be PASS even without a failure, with a remedy; empty if all can be PASS.
 
-    Covers requirements with a confidence level and assumes that each applies to all cases; subsets need more cases.
+    Includes requirements with a confidence level. Each is assumed to apply to all cases; subsets require more cases.
     """
     configuration = campaign.configuration
     requirements = [item for item in configuration.requirements if item.decide_by != ESTIMATE]
@@ -189,19 +189,19 @@ def evidence_limits(campaign: Campaign) -> list[str]:
     level = f"{format_fraction(strictest.probability)} at {format_fraction(strictest.confidence)} confidence"
     limits = []
     if cases < min_cases:
-        needed = f"{level} takes at least {count(min_cases, 'case')} without a failure"
-        limits.append(f"{strictest.id}: {needed}; the campaign has {cases}.")
-    supply = design.terrains
-    if supply is None:
+        condition = f"{level} takes at least {count(min_cases, 'case')} without a failure"
+        limits.append(f"{strictest.id}: {condition}; the campaign has {cases}.")
+    terrain_supply = design.terrains
+    if terrain_supply is None:
         return limits
     # number of distinct terrains: assigned in turn, or drawn at random
-    terrains = min(cases, supply.terrains) if supply.in_turn else cases
+    terrains = min(cases, terrain_supply.terrains) if terrain_supply.in_turn else cases
     path = next((path for path in ("location.terrain", "world.terrain") if path in configuration.dispersions), None)
-    if not supply.in_turn and path is not None and cases <= _MAX_DRAWS:
+    if not terrain_supply.in_turn and path is not None and cases <= _MAX_DRAWS:
         terrains = len({campaign.draws(case)[path] for case in range(int(configuration.design.nominal), cases)})
     # if several cases share a terrain, the evidence is limited by the number of terrains
     if terrains < min(cases, min_cases):
-        limits.append(supply.advice(min_cases, strictest.probability, strictest.confidence))
+        limits.append(terrain_supply.advice(min_cases, strictest.probability, strictest.confidence))
     return limits
 
 
@@ -229,15 +229,16 @@ def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
 
 
 def print_limits(campaign: Campaign) -> None:
-    """Print why the campaign's requirements cannot be PASS, and the remedy."""
+    """Print which requirements of the campaign cannot be PASS, and the remedy (see `evidence_limits`)."""
     for limit in evidence_limits(campaign):
         typer.echo(f"note: {limit}")
 
 
 def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
-    """Run a campaign until its verdicts are decided; see `marsyard.reports.statistics.proportions`.
+    """Run a campaign until its verdicts are decided, with at most the configured number of cases.
 
-    The number of cases is the maximum. Raises CampaignError for dependent draws or if no requirement has a confidence.
+    See `marsyard.reports.statistics.proportions`. Raises CampaignError for dependent draws, or if no requirement has a
+    confidence level.
     """
     configuration = campaign.configuration
     design = read_sampling_design(configuration.model_dump(mode="json"))
@@ -245,12 +246,12 @@ def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorCon
         raise CampaignError(f"--until-decided: {design.no_probability}")
     if all(requirement.decide_by == ESTIMATE for requirement in configuration.requirements):
         raise CampaignError("--until-decided: the campaign has no requirement with a confidence level")
-    limit = configuration.total_cases
-    first = configuration.model_copy(
-        update={"cases": planned_looks(limit)[0].cases, "appended": (), "max_cases": limit}
+    max_cases = configuration.total_cases
+    first_block = configuration.model_copy(
+        update={"cases": planned_looks(max_cases)[0].cases, "appended": (), "max_cases": max_cases}
     )
     command = (*campaign.command, "--until-decided")
-    run_campaign(Campaign(first, campaign.scenario, command), directory, executor, watch)
+    run_campaign(Campaign(first_block, campaign.scenario, command), directory, executor, watch)
     continue_until_decided(directory, executor, watch)
 
 
@@ -271,7 +272,7 @@ def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Wat
 
 
 class _SiteHandler(SimpleHTTPRequestHandler):
-    """Serve the files of the site's folder only, without folder listings and log messages.
+    """Request handler that serves only files in the dashboard's folder, without folder listings and log messages.
 
     `names` are the allowed host names of the server.
     """
@@ -281,7 +282,7 @@ class _SiteHandler(SimpleHTTPRequestHandler):
         super().__init__(*args, **kwargs)
 
     def parse_request(self) -> bool:
-        """Reject a request with another host name: protects against DNS rebinding."""
+        """Reject requests with the host name of a different server (protection against DNS rebinding)."""
         if not super().parse_request():
             return False
         if not is_own_host(self.headers.get("Host", ""), self._names):
@@ -307,7 +308,7 @@ class _SiteHandler(SimpleHTTPRequestHandler):
 
 
 def is_own_host(header: str, names: Collection[str]) -> bool:
-    """Whether a Host header contains an IP address, which DNS cannot redirect, or a name of this server.
+    """Whether a Host header contains a name of this server, or an IP address (which DNS cannot redirect).
 
     >>> [is_own_host(text, ["localhost"]) for text in ("127.0.0.1:80", "[::1]", "LOCALHOST:8", "evil.example", "")]
     [True, True, True, False, False]
@@ -324,6 +325,6 @@ def is_own_host(header: str, names: Collection[str]) -> bool:
 
 
 def create_server(directory: Path, host: str, port: int) -> ThreadingHTTPServer:
-    """Create a server of a site's folder; port 0 selects a free port."""
+    """Create an HTTP server of a dashboard's folder; port 0 selects a free port."""
     names = {"localhost", host.lower(), socket.gethostname().lower()}
     return ThreadingHTTPServer((host, port), partial(_SiteHandler, directory=str(directory), names=names))

@@ -1,4 +1,7 @@
-"""Render images of a site with ground-truth layers, camera model and metadata, for `render` and `gallery`."""
+"""Render images of a site with ground-truth layers, camera model and metadata.
+
+Used by the commands `marsyard render` and `gallery`, and by `marsyard.render_view`.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,7 @@ MAX_ALTITUDE_M = 20000.0
 
 @dataclass(frozen=True)
 class ImageRequest:
-    """Site, camera pose and sun direction of an image."""
+    """Site, camera, camera pose, sun direction and seed of an image to render; lengths in metres, angles in degrees."""
 
     site: str
     camera: str
@@ -60,7 +63,7 @@ class ImageRequest:
 
     @classmethod
     def from_defaults(cls, site: str, camera: str, **settings: Any) -> ImageRequest:
-        """Return the camera's default pose, changed by `settings`. Raises ValueError for an invalid value."""
+        """Create a request with the camera's default pose, changed by `settings`; raises ValueError if invalid."""
         if not is_terrain_file(site):
             _check_name("site", site, sites())
         _check_name("camera", camera, sensor.PRESETS)
@@ -79,7 +82,7 @@ class ImageRequest:
 
     @property
     def site_definition(self) -> Site:
-        """The preset site, or a site made from the DTM file. Raises ValueError if the file is not usable."""
+        """The preset site, or the site created from the DTM file. Raises ValueError if the file is not usable."""
         return load_site(self.site, self.max_hole_fraction)
 
     def _check(self) -> None:
@@ -107,7 +110,7 @@ class ImageRequest:
 
 @dataclass(frozen=True)
 class RenderedImage:
-    """An image of a single camera or of one camera of a stereo pair."""
+    """Rendered image of a single camera, or of one camera of a stereo pair, with ground truth."""
 
     suffix: str  #: ``-left`` or ``-right`` for a stereo pair; empty for a single camera
     camera_world: CameraModel  #: camera model in the world frame
@@ -116,7 +119,7 @@ class RenderedImage:
     scene: Scene
     auto_exposure: sensor.AutoExposure | None  #: detector with automatic exposure time; None without detector
     counts: UInt16[np.ndarray, "rows columns"] | None  #: None without detector
-    #: whether a pixel sees a filled hole of a DTM; None for a preset site
+    #: whether a pixel shows a filled hole of a DTM; None for a preset site
     filled: Bool[np.ndarray, "rows columns"] | None
 
     def to_uint16(self) -> UInt16[np.ndarray, "rows columns"]:
@@ -133,7 +136,7 @@ class RenderedImage:
 
 
 def render_images(request: ImageRequest, *, detector: bool = True, both: bool = True) -> list[RenderedImage]:
-    """Render the image; for a stereo pair both images, or the left image only."""
+    """Render the requested image. A stereo camera has two images; with `both` False, only the left one is rendered."""
     preset, site = sensor.preset(request.camera), request.site_definition
     ground = SiteGround.of(site, "descent" if request.scale == "descent" else "ground", seed=request.seed)
     cameras = preset.cameras()
@@ -143,7 +146,7 @@ def render_images(request: ImageRequest, *, detector: bool = True, both: bool = 
     sun = Sun(towards_sun, ground.site.environment.sun_radius_rad)
     selected = cameras if both else cameras[:1]
     rays = [PixelRays.of(camera) for camera in selected]
-    # The baseline of a pair is so short that one scene serves both cameras.
+    # The baseline of a stereo pair is short: both cameras use the scene built for the left camera.
     eye = Eye.of(rays[0], pose, ground.surface)
     scene = _add_rover(site_scene(ground, eye, sun), request, ground)
     smallest_rad = smallest_rock_rad(ground.rocks, eye) if ground.rocks is not None else 0.0
@@ -160,18 +163,18 @@ def render_images(request: ImageRequest, *, detector: bool = True, both: bool = 
 
 
 def _add_rover(scene: Scene, request: ImageRequest, ground: SiteGround) -> Scene:
-    """Add the rover that carries the camera, standing level with the camera at its place on the rover's body."""
+    """Add the rover on which the camera is mounted: level, with its mounting point at the camera's position."""
     mount = STANCES[request.camera].on_rover_m
     if mount is None:
         return scene
-    level = mast_pose(ground.surface, request.east_m, request.north_m, request.altitude_m, request.azimuth_deg, 0.0)
-    stance = RoverStance(rigid(level.rotation, level.apply(-np.array(mount))), 0.0, (0.0, 0.0), np.zeros(6))
+    camera = mast_pose(ground.surface, request.east_m, request.north_m, request.altitude_m, request.azimuth_deg, 0.0)
+    stance = RoverStance(rigid(camera.rotation, camera.apply(-np.array(mount))), 0.0, (0.0, 0.0), np.zeros(6))
     rover = rover_objects(RoverParameters(), stance, MER_MAST, 0.0, 0.0)
     return scene.with_objects(Objects.join([scene.objects, rover]))
 
 
 def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:
-    """Mark the pixels that see filled holes of a DTM; None for a preset site."""
+    """Mark the pixels that show filled holes of a DTM; None for a preset site."""
     terrain = ground.terrain
     if terrain.source is None:
         return None
@@ -185,15 +188,16 @@ def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows col
 def _expose(
     request: ImageRequest, ground: SiteGround, camera: CameraModel, number: int, frame: Frame, sun: Sun
 ) -> tuple[sensor.AutoExposure, UInt16[np.ndarray, "rows columns"]]:
-    """Expose the camera's detector with automatic exposure time; rows are not summed."""
+    """Simulate the detector with automatic exposure time and without summed rows; return the detector and counts."""
     streams = Streams(request.seed, "render", number)
     preset, environment = sensor.preset(request.camera), ground.site.environment
-    # the preset may be defined for the distance of another planet from the sun
+    # the preset may be defined for the sun distance of another planet
     sun_au = 1.0 / math.sqrt(environment.solar_irradiance)
     sunlight = {"responsivity_e_s": preset.light.responsivity_e_s(sun_au), "sun_au": sun_au}
     parameters = preset.detector.model_copy(update={**sunlight, "rows_summed": 1})
     detector = sensor.Detector.draw(sensor.natural_fall_off(camera), parameters, streams.generator("detector response"))
-    # rendered I/F is relative to the irradiance at the ground; detector I/F to that at the top of the atmosphere
+    # the rendered radiance factor I/F is relative to the solar irradiance at the ground, the detector's I/F to that at
+    # the top of the atmosphere
     position = np.asarray(frame.world_from_body.translation)
     height = float(position[2]) - float(ground.surface.height(*position[:2]))
     hazy = add_haze(frame, environment, sun, environment.mean_extinction_m(height))
@@ -208,14 +212,14 @@ def _expose(
 
 
 def truth_layers(image: RenderedImage) -> dict[str, Any]:
-    """Return the ground-truth layers, each with the rows and columns of the image, and the pose."""
+    """Compute the ground-truth layers, each with the rows and columns of the image, and the pose."""
     frame, scene = image.frame, image.scene
     directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
     phase = np.degrees(np.arccos(np.clip(-(directions @ scene.sun.direction), -1.0, 1.0)))
     ground = np.isfinite(frame.range_m)
-    # Second rendering without diffuse light: zero radiance marks shadow.
+    # Render again without diffuse light: pixels with zero radiance are in shadow.
     direct_light = replace(scene.photometry, sky_share=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
-    sunlit = process_renderer(default_backend()).render(
+    direct_frame = process_renderer(default_backend()).render(
         replace(scene, photometry=direct_light, edge_rays=1), frame.rays, frame.world_from_body
     )
     names = np.append(scene.objects.names, [-2, -1])  # body indices -2 (sky) and -1 (ground)
@@ -225,7 +229,7 @@ def truth_layers(image: RenderedImage) -> dict[str, Any]:
         "point_m": frame.points_world(),
         "normal": frame.normal,
         "object": names[frame.body].astype(np.int32),
-        "shadow": ground & (sunlit.radiance <= 0.0),
+        "shadow": ground & (direct_frame.radiance <= 0.0),
         "phase_deg": np.where(ground, phase.reshape(ground.shape), np.nan).astype(np.float32),
         "world_from_body": frame.world_from_body.as_matrix(),
         **({} if image.filled is None else {"filled": image.filled}),
@@ -233,8 +237,8 @@ def truth_layers(image: RenderedImage) -> dict[str, Any]:
 
 
 def write_image(image: RenderedImage, request: ImageRequest, prefix: Path) -> list[Path]:
-    """Write the files of an image and return their paths."""
-    png, npz, cahvor, sidecar = (_path(prefix, image.suffix, ending) for ending in SUFFIXES)
+    """Write the files of an image (see `SUFFIXES`); return their paths."""
+    png, npz, cahvor, metadata = (_build_path(prefix, image.suffix, ending) for ending in SUFFIXES)
     is_encoded, encoded = cv2.imencode(".png", image.to_uint16())
     if not is_encoded:
         raise ValueError(f"{png} could not be encoded")
@@ -242,12 +246,12 @@ def write_image(image: RenderedImage, request: ImageRequest, prefix: Path) -> li
     with npz.open("wb") as file:
         np.savez(file, **truth_layers(image))
     write_cahvor(image.camera_body, cahvor, f"{request.camera}{image.suffix} at {request.site}", frame=BODY_FRAME)
-    sidecar.write_text(json.dumps(describe_image(image, request), indent=2) + "\n", encoding="utf-8")
-    return [png, npz, cahvor, sidecar]
+    metadata.write_text(json.dumps(describe_image(image, request), indent=2) + "\n", encoding="utf-8")
+    return [png, npz, cahvor, metadata]
 
 
 def describe_image(image: RenderedImage, request: ImageRequest) -> dict[str, Any]:
-    """Return the metadata of an image: all inputs and the quantities in its files."""
+    """Return the metadata of an image: all inputs, and a description of the quantities in its files."""
     columns, rows = image.camera_world.size
     scene, auto_exposure, detector = image.scene, image.auto_exposure, None
     png: dict[str, Any] = {
@@ -287,7 +291,7 @@ def describe_image(image: RenderedImage, request: ImageRequest) -> dict[str, Any
     }
 
 
-def _path(prefix: Path, suffix: str, ending: str) -> Path:
+def _build_path(prefix: Path, suffix: str, ending: str) -> Path:
     return prefix.with_name(f"{prefix.name}{suffix}{ending}")
 
 
@@ -295,13 +299,13 @@ def check_files(prefix: Path, camera: str, overwrite: bool) -> None:
     """Raise ValueError if the files cannot be written, or exist and `overwrite` is False."""
     folder = prefix.parent
     if prefix.name in ("", ".", ".."):
-        raise ValueError(f"--out {prefix} is not a file name; give a path without extension, such as pictures/gusev")
+        raise ValueError(f"--out {prefix} is not a file name; give a path without extension, such as images/gusev")
     if not folder.is_dir():
         raise ValueError(f"--out {prefix}: the folder {folder} does not exist")
     if not os.access(folder, os.W_OK):
         raise ValueError(f"--out {prefix}: the folder {folder} is not writable")
     suffixes = ("",) if sensor.preset(camera).design.baseline_m is None else ("-left", "-right")
-    paths = [_path(prefix, suffix, ending) for suffix in suffixes for ending in SUFFIXES]
+    paths = [_build_path(prefix, suffix, ending) for suffix in suffixes for ending in SUFFIXES]
     existing = [str(path) for path in paths if path.exists()]
     if existing and not overwrite:
         raise ValueError(f"{', '.join(existing)}: files exist; use --overwrite to replace them")
@@ -312,6 +316,6 @@ def _check_name(kind: str, name: str, names: Iterable[str]) -> None:
     allowed = list(names)
     if name in allowed:
         return
-    close = get_close_matches(name, allowed, n=1) or [candidate for candidate in allowed if name and name in candidate]
-    hint = f"; did you mean {' or '.join(close)}?" if close else "."
+    similar = get_close_matches(name, allowed, n=1) or [known for known in allowed if name and name in known]
+    hint = f"; did you mean {' or '.join(similar)}?" if similar else "."
     raise ValueError(f"no {kind} is called '{name}'{hint} Allowed: {', '.join(allowed)}")

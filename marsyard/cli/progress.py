@@ -1,6 +1,6 @@
 """Progress of a running campaign: bars with rate and remaining time on a terminal, text lines otherwise, and `run.log`.
 
-The public classes implement `Watch` of `marsyard.campaigns.running.engine`.
+The public classes implement the protocol `Watch` of `marsyard.campaigns.running.engine`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from marsyard.campaigns.running.engine import Watch
 
 LOG_FILE = "run.log"
-#: Seconds between two lines of a stage, on the console and in the log.
+#: Time between two progress lines of a stage, on the console and in the log, seconds.
 LINE_INTERVAL_S, LOG_INTERVAL_S = 10.0, 60.0
 
 
 def remaining_s(done: int, total: int, elapsed_s: float) -> float:
-    """Estimated remaining time, seconds, from the mean rate so far."""
+    """Estimate the remaining time, seconds, from the mean rate so far."""
     return elapsed_s / done * (total - done) if done else 0.0
 
 
@@ -49,6 +49,8 @@ def _elapsed_s(task: Task) -> float:
 
 
 class _RateColumn(ProgressColumn):
+    """Mean rate of a stage."""
+
     def render(self, task: Task) -> Text:
         return Text(format_rate(int(task.completed), _elapsed_s(task)))
 
@@ -92,7 +94,7 @@ class BarProgress:
 
 
 class LineProgress:
-    """Print a line at the start and end of a stage and every 10 s."""
+    """Text lines: at the start and end of a stage, and every `LINE_INTERVAL_S`."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -125,7 +127,7 @@ class LineProgress:
 
 
 class RunLog:
-    """A `Watch` that writes the log and forwards to another watch; errors in writing the log are ignored."""
+    """`Watch` that writes `run.log` and forwards each call to `watch`; errors in writing the log are ignored."""
 
     def __init__(self, directory: Path, watch: Watch) -> None:
         self._path, self._watch = directory / LOG_FILE, watch
@@ -141,8 +143,8 @@ class RunLog:
         if not self._has_entries:
             return  # the campaign did not start, and the folder may belong to another campaign
         duration = f"{time.monotonic() - self._start_s:.1f} s"
-        stopped = "" if kind is None else f", {self._stage}: {self._done}/{self._total}: {kind.__name__}: {error}"
-        self._write(f"{'stopped' if stopped else 'ended'} after {duration}{stopped}")
+        reason = "" if kind is None else f", {self._stage}: {self._done}/{self._total}: {kind.__name__}: {error}"
+        self._write(f"{'stopped' if reason else 'ended'} after {duration}{reason}")
 
     def begin(self, stage: str, total: int) -> None:
         """Log the start of a stage."""

@@ -12,7 +12,7 @@ from typer import Argument, Option
 from marsyard.cli.campaign import make_executor, stop_on_signals
 from marsyard.cli.options import DirectoryArgument, Exit, JobsOption, JsonOption, console, handle_user_errors
 
-LOOPBACK = "127.0.0.1"
+LOOPBACK_ADDRESS = "127.0.0.1"
 
 
 @handle_user_errors
@@ -68,17 +68,17 @@ def compare(
     from marsyard.reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
-    paired, differences = comparison.compare_campaigns(*runs)
-    names, same_terrains = [str(run.directory) for run in runs], comparison.have_same_terrains(*runs)
+    is_paired, differences = comparison.compare_campaigns(*runs)
+    names, have_same_terrains = [str(run.directory) for run in runs], comparison.have_same_terrains(*runs)
     if as_json:
-        data = {"first": names[0], "second": names[1], "paired": paired, "same_terrains": same_terrains}
+        data = {"first": names[0], "second": names[1], "paired": is_paired, "same_terrains": have_same_terrains}
         typer.echo(json.dumps({**data, "figures": comparison.campaign_diff_data(differences)}, indent=2))
         return
     out = console()
     out.print(grid_table("Side by side", comparison.campaign_diff_grid(["first", "second"], differences)))
     out.print(f"first: {names[0]}\nsecond: {names[1]}", markup=False, highlight=False, soft_wrap=True)
-    unpaired = "on the same terrains: comparison by terrain" if same_terrains else "on different terrains: unpaired"
-    method = "same draws: paired comparison" if paired else f"different draws {unpaired}"
+    terrains = "the same terrains: comparison by terrain" if have_same_terrains else "different terrains: unpaired"
+    method = "same draws: paired comparison" if is_paired else f"different draws on {terrains}"
     out.print(f"Cases: {method}. p: two-sided, corrected for the number of metrics (Holm).", soft_wrap=True)
 
 
@@ -92,7 +92,7 @@ def dashboard(
         Path | None, Option(metavar="FILE", help="Requirements file to use instead of the built-in requirements.")
     ] = None,
     serve: Annotated[int | None, Option(metavar="PORT", help="Serve it on this machine only.", min=0)] = None,
-    host: Annotated[str, Option(metavar="ADDRESS", help="With --serve: address to listen on.")] = LOOPBACK,
+    host: Annotated[str, Option(metavar="ADDRESS", help="With --serve: address to listen on.")] = LOOPBACK_ADDRESS,
 ) -> None:
     """Write a dashboard of stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
     from marsyard.campaigns.definition.requirements import read_requirements
@@ -102,9 +102,9 @@ def dashboard(
     missing = [str(directory) for directory in directories if not directory.is_dir()]
     if missing:
         raise CampaignError(f"no such folder: {', '.join(missing)}")
-    listed = None if requirements is None else {item.id: item for item in read_requirements(requirements)}
+    requirements_by_id = None if requirements is None else {item.id: item for item in read_requirements(requirements)}
     with report_write_errors(out):
-        site = write_site(out, directories, listed)
+        site = write_site(out, directories, requirements_by_id)
     for problem in site.problems:
         typer.echo(f"not shown: {problem}", err=True)
     typer.echo(f"campaigns: {site.campaigns}")

@@ -1,12 +1,15 @@
-"""Print a campaign's definition and drawn values on the terminal; write the stages of a case to files."""
+"""Print a campaign (`marsyard show`): definition, drawn values; write the stages of a case (`replay --save-stages`)."""
 
 from __future__ import annotations
 
 import json
 import math
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -20,12 +23,8 @@ from marsyard.reports.wording import count, requirement_text, split_unit
 
 if TYPE_CHECKING:
     from marsyard.reports.section import Grid
-import re
-from collections.abc import Mapping
 
-import numpy as np
-
-#: Width of a column of drawn values with its margin, characters.
+#: Width of a column of drawn values including its margin, characters.
 _VALUE_WIDTH = 12
 _STATISTICS = ("minimum", "mean", "maximum")
 #: Number of quantiles of a distribution in the figure.
@@ -37,12 +36,12 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
     """Print a campaign: description, parameters, dispersions and requirements."""
     configuration = campaign.configuration
     _print_header(configuration, console)
-    table = _table("Parameters", "parameter", "value")
+    table = _create_table("Parameters", "parameter", "value")
     for path, value in leaves(configuration.parameters):
         nominal = f"; nominal {value}" if configuration.design.nominal else ""
         table.add_row(Text(path), Text(f"dispersed{nominal}" if path in configuration.dispersions else str(value)))
     console.print(table)
-    table = _table("Dispersions", "parameter", "distribution", "bounds", "unit", "source")
+    table = _create_table("Dispersions", "parameter", "distribution", "bounds", "unit", "source")
     for path, dispersion in campaign.marginals.items():
         data, bounds = _dispersion_data(campaign, path), dispersion.bounds()
         name = Text(path)
@@ -58,12 +57,12 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
         table.add_row(name, Text(dispersion.describe()), Text(bounds_text), Text(data["unit"]), source)
     console.print(table)
     if configuration.correlations:
-        table = _table("Correlated", "parameters", "by", "matrix", "source")
+        table = _create_table("Correlated", "parameters", "by", "matrix", "source")
         for group in configuration.correlations:
             rows = "\n".join(" ".join(f"{value:8.3g}" for value in row) for row in getattr(group, group.kind))
             table.add_row(Text("\n".join(group.parameters)), Text(group.kind), Text(rows), Text(group.source))
         console.print(table)
-    table = _table("Requirements", "id", "statement", "criterion")
+    table = _create_table("Requirements", "id", "statement", "criterion")
     for item in configuration.requirements:
         table.add_row(Text(item.id), Text(item.statement), Text(requirement_text(item)))
     console.print(table)
@@ -74,27 +73,27 @@ def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
 
     A row starts with minimum, mean and maximum over all cases, or the number of distinct values if not numeric.
     """
-    drawn, nominal = list_drawn_values(campaign, cases), int(campaign.configuration.design.nominal)
+    values_by_path, nominal_cases = list_drawn_values(campaign, cases), int(campaign.configuration.design.nominal)
     _print_header(campaign.configuration, console)
-    cases = cases if drawn else 0
-    units = {path: campaign.marginals[path].unit for path in drawn}
+    cases = cases if values_by_path else 0
+    units = {path: campaign.marginals[path].unit for path in values_by_path}
     names = {path: f"{path} ({unit})" if unit else path for path, unit in units.items()}
-    longest = max((len(name) for name in names.values()), default=0)
-    visible = min(cases, max(1, (console.width - longest) // _VALUE_WIDTH - len(_STATISTICS)))
-    hint = "" if visible == cases else "; --json prints all cases"
-    table = _table(f"Draws of {count(cases - nominal, 'case')}{hint}", "parameter")
+    name_width = max((len(name) for name in names.values()), default=0)
+    visible_cases = min(cases, max(1, (console.width - name_width) // _VALUE_WIDTH - len(_STATISTICS)))
+    hint = "" if visible_cases == cases else "; --json prints all cases"
+    table = _create_table(f"Draws of {count(cases - nominal_cases, 'case')}{hint}", "parameter")
     table.box = box.SIMPLE_HEAD
-    headings = ["nominal" if nominal and case == 0 else f"case {case}" for case in range(visible)]
+    headings = ["nominal" if nominal_cases and case == 0 else f"case {case}" for case in range(visible_cases)]
     for heading in (*_STATISTICS, *headings):
         table.add_column(heading, justify="right", overflow="fold")
-    for path, values in drawn.items():
-        random = values[nominal:]
+    for path, values in values_by_path.items():
+        draws = values[nominal_cases:]
         statistics = ["", "", ""]
-        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in random):
-            statistics[1] = count(len({_format_value(value) for value in random}), "distinct value")
-        elif random:
-            statistics = [_format_value(value) for value in (min(random), sum(random) / len(random), max(random))]
-        texts = [Text(_format_value(value)) for value in values[:visible]]
+        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in draws):
+            statistics[1] = count(len({_format_value(value) for value in draws}), "distinct value")
+        elif draws:
+            statistics = [_format_value(value) for value in (min(draws), sum(draws) / len(draws), max(draws))]
+        texts = [Text(_format_value(value)) for value in values[:visible_cases]]
         table.add_row(Text(names[path]), *map(Text, statistics), *texts)
     console.print(table)
 
@@ -106,9 +105,10 @@ def describe_campaign(campaign: Campaign, cases: int | None) -> dict[str, Any]:
     data["design"]["text"] = _sampling_text(configuration)
     data["dispersions"] = [_dispersion_data(campaign, path) for path in configuration.dispersions]
     if cases is not None:
-        drawn = list_drawn_values(campaign, cases)
+        values_by_path = list_drawn_values(campaign, cases)
         data["draws"] = [
-            {"case": case, "values": {path: values[case] for path, values in drawn.items()}} for case in range(cases)
+            {"case": case, "values": {path: values[case] for path, values in values_by_path.items()}}
+            for case in range(cases)
         ]
     return data
 
@@ -122,12 +122,12 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
 
     if path.suffix not in _FIGURE_FORMATS:
         raise CampaignError(f"--figure {path}: unknown file format; allowed: {', '.join(_FIGURE_FORMATS)}")
-    nominal = int(campaign.configuration.design.nominal)
-    drawn = {name: values[nominal:] for name, values in list_drawn_values(campaign, cases).items()}
-    if not any(drawn.values()):
+    nominal_cases = int(campaign.configuration.design.nominal)
+    draws = {name: values[nominal_cases:] for name, values in list_drawn_values(campaign, cases).items()}
+    if not any(draws.values()):
         raise CampaignError(f"--figure {path}: no parameter is drawn in {count(cases, 'case')}")
     marginals = []
-    for name, values in drawn.items():
+    for name, values in draws.items():
         dispersion, quantiles = campaign.marginals[name], None
         if not dispersion.formulas:
             quantiles = [dispersion.quantile((index + 0.5) / _QUANTILES) for index in range(_QUANTILES)]
@@ -137,22 +137,22 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
 
 
 def list_drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
-    """Return the drawn values of the first cases by parameter.
+    """Return the drawn values of the first cases by parameter path.
 
     Raises CampaignError if the campaign has fewer cases or the values of a case cannot be drawn.
     """
     total = campaign.configuration.total_cases
     if not 1 <= cases <= total:
         raise CampaignError(f"--draw {cases}: the campaign has {count(total, 'case')}; allowed: 1 to {total}")
-    drawn: dict[str, list[Any]] = {path: [] for path in campaign.configuration.dispersions}
+    values_by_path: dict[str, list[Any]] = {path: [] for path in campaign.configuration.dispersions}
     for case in range(cases):
         try:
             values = campaign.draws(case)
         except ValueError as error:
             raise CampaignError(f"case {case} cannot be drawn: {error}") from error
         for path, value in values.items():
-            drawn[path].append(value)
-    return drawn
+            values_by_path[path].append(value)
+    return values_by_path
 
 
 def _print_header(configuration: CampaignConfiguration, console: Console) -> None:
@@ -194,7 +194,7 @@ def _format_value(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
-def _table(title: str, *headings: str) -> Table:
+def _create_table(title: str, *headings: str) -> Table:
     table = Table(title=title or None, title_justify="left")
     for heading in headings:
         table.add_column(heading, overflow="fold")
@@ -202,7 +202,7 @@ def _table(title: str, *headings: str) -> Table:
 
 
 def grid_table(title: str, grid: Grid) -> Table:
-    """Convert a report's table for the terminal: names left-aligned, numbers right-aligned."""
+    """Convert a table of a report to a terminal table: names left-aligned, numbers right-aligned."""
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
     for index, heading in enumerate(grid.head):
         table.add_column(heading, justify="right" if index else "left", overflow="fold")
@@ -211,6 +211,7 @@ def grid_table(title: str, grid: Grid) -> Table:
     return table
 
 
+#: Types of arrays that are written as images.
 _PIXEL_TYPES = (np.uint8, np.uint16)
 
 
@@ -218,7 +219,7 @@ def write_stages(directory: Path, products: Mapping[str, Any]) -> int:
     """Write each product to a separate file, numbered in the order of the stages; return the number of files.
 
     An image (8 or 16 bits, 1 or 3 channels) is written as PNG with unchanged counts, other arrays as `.npy`, and other
-    values as JSON. A table or list with arrays becomes a folder. Raises StoreError.
+    values as JSON. A mapping or list with arrays is written as a folder. Raises StoreError.
     """
     with report_write_errors(directory):
         return _write_products(directory, products)

@@ -4,27 +4,33 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Option
 
-from marsyard.cli.options import BitsOption, JsonOption, MaxHolesOption, SiteArgument, console, fail
+from marsyard.cli.options import (
+    BitsOption,
+    JsonOption,
+    MaxHolesOption,
+    OverwriteOption,
+    SiteArgument,
+    console,
+    fail,
+    with_options,
+)
 
 if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
     from marsyard.sim.terrain.imported import EmbeddedDtm, RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
     from marsyard.sim.terrain.surface import TerrainStatistics
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 
-from marsyard.cli.options import OverwriteOption, with_options
-
-#: Maximum side length of an image, pixels. Colours are (blue, green, red).
+#: Nadir image: maximum side length, pixels; colours (blue, green, red) of filled holes and of the outline of a DTM.
 MAX_PIXELS = 2048
 HOLE_COLOUR, OUTLINE_COLOUR = (40, 40, 220), (0, 200, 255)
 
@@ -74,17 +80,17 @@ def stats(
         definition = load_site(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
         parameters = definition.terrain(scale)
         source = parameters.source
-        real = None if source is None else embed(source, parameters.samples, parameters.spacing_m)
+        dtm = None if source is None else embed(source, parameters.samples, parameters.spacing_m)
         grid_north = None if source is None else grid_north_deg(source.dtm)
         surface = synthesise(parameters, np.random.default_rng(seed))
         if picture is not None:
-            write_terrain_image(picture, surface, real)
+            write_terrain_image(picture, surface, dtm)
     except ValueError as error:
         fail(error)
-    measured = terrain_statistics(surface, None if real is None else real.real_samples(parameters.samples))
-    extent = None if real is None else real.extent
+    statistics = terrain_statistics(surface, None if dtm is None else dtm.real_samples(parameters.samples))
+    extent = None if dtm is None else dtm.extent
     if not as_json:
-        _print_statistics(site, parameters, seed, measured, extent, grid_north)
+        _print_statistics(site, parameters, seed, statistics, extent, grid_north)
         return
     paper = PAPER.get(site)
     published: dict[str, Any] | None = None
@@ -96,7 +102,7 @@ def stats(
         "side_m": parameters.samples * parameters.spacing_m,
         "spacing_m": parameters.spacing_m,
         "seed": seed,
-        "measured": {key: value if math.isfinite(value) else None for key, value in asdict(measured).items()},
+        "measured": {key: value if math.isfinite(value) else None for key, value in asdict(statistics).items()},
         "paper": published,
         "real": None if extent is None else asdict(extent),
         "grid_north_deg": grid_north,
@@ -108,7 +114,7 @@ def _print_statistics(
     name: str,
     parameters: TerrainParameters,
     seed: int,
-    measured: TerrainStatistics,
+    statistics: TerrainStatistics,
     extent: RealExtent | None,
     grid_north: float | None,
 ) -> None:
@@ -120,17 +126,17 @@ def _print_statistics(
     side, paper = parameters.samples * parameters.spacing_m, PAPER.get(name)
     albedo, slope, relief, contrast = "", "", "", ""
     if paper is not None:
-        albedo, slope, contrast = _range(paper.albedo, 1), _range(paper.mean_slope_deg, 0), paper.contrast
+        albedo, slope, contrast = _format_range(paper.albedo, 1), _format_range(paper.mean_slope_deg, 0), paper.contrast
         relief = "" if paper.relief_m is None else f"more than {paper.relief_m[0]:.0f}"
     table = Table(box=None, pad_edge=False)
     table.add_column("")
     table.add_column("terrain", justify="right")
     table.add_column("field test paper, III.A")
-    table.add_row("albedo", f"{measured.albedo:.2f}", albedo)
-    for length_m, value in ((30, measured.mean_slope_30_m_deg), (90, measured.mean_slope_90_m_deg)):
+    table.add_row("albedo", f"{statistics.albedo:.2f}", albedo)
+    for length_m, value in ((30, statistics.mean_slope_30_m_deg), (90, statistics.mean_slope_90_m_deg)):
         table.add_row(f"mean slope over {length_m} m, deg", "-" if math.isnan(value) else f"{value:.2f}", slope)
-    table.add_row("relief, m", f"{measured.relief_m:.{1 if measured.relief_m >= 10.0 else 2}f}", relief)
-    table.add_row("image contrast, RMS / mean", f"{measured.contrast:.3f}", contrast)
+    table.add_row("relief, m", f"{statistics.relief_m:.{1 if statistics.relief_m >= 10.0 else 2}f}", relief)
+    table.add_row("image contrast, RMS / mean", f"{statistics.contrast:.3f}", contrast)
     out = console()
     out.print(f"{name}: {side:g} m x {side:g} m, sample spacing {parameters.spacing_m:g} m, seed {seed}")
     out.print(table)
@@ -156,13 +162,13 @@ def _print_statistics(
         )
 
 
-def _range(values: tuple[float, float], digits: int) -> str:
+def _format_range(values: tuple[float, float], digits: int) -> str:
     low, high = values
     return f"{low:.{digits}f}" if low == high else f"{low:.{digits}f}-{high:.{digits}f}"
 
 
-def write_terrain_image(path: Path, surface: Surface, real: EmbeddedDtm | None) -> None:
-    """Write a shaded nadir image as PNG, grid north up; for a DTM, mark its outline and filled holes.
+def write_terrain_image(path: Path, surface: Surface, dtm: EmbeddedDtm | None) -> None:
+    """Write a shaded nadir image of a terrain as PNG, grid north up; mark a DTM's outline and filled holes.
 
     Raises ValueError if the file exists or cannot be written.
     """
@@ -180,12 +186,12 @@ def write_terrain_image(path: Path, surface: Surface, real: EmbeddedDtm | None) 
     shaded = nadir_picture(surface, level, np.radians(315.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
     grey = np.clip(255.0 * shaded / np.percentile(shaded, 99.8), 0.0, 255.0).astype(np.uint8)
     image = np.repeat(grey[..., None], 3, axis=2)
-    if real is not None:
+    if dtm is not None:
         step = 2**level
-        holes = real.filled_samples(side)[::step, ::step]
+        holes = dtm.filled_samples(side)[::step, ::step]
         image[holes] = (0.4 * image[holes] + 0.6 * np.array(HOLE_COLOUR)).astype(np.uint8)
-        south_west = real.columns.start // step, real.rows.start // step
-        north_east = real.columns.stop // step, real.rows.stop // step
+        south_west = dtm.columns.start // step, dtm.rows.start // step
+        north_east = dtm.columns.stop // step, dtm.rows.stop // step
         cv2.rectangle(image, south_west, north_east, OUTLINE_COLOUR, 1)
     try:
         is_written = cv2.imwrite(str(path), image[::-1])
@@ -251,7 +257,7 @@ def render(arguments: RenderOptions) -> None:
 
 @contextmanager
 def report_image_errors(out: Path) -> Iterator[None]:
-    """End the command with status 2 if images cannot be rendered or written."""
+    """Print an error and end the command with status 2 if images cannot be rendered or written."""
     from marsyard.sim.render.backend import RenderingError
 
     try:

@@ -1,4 +1,4 @@
-"""The guard against slow-downs, on ratios that are drawn: quiet where nothing changed, loud where something did."""
+"""Tests of the detection of slow paths (`benchmarks.check`) with random ratios: false alarms and detections."""
 
 from __future__ import annotations
 
@@ -12,39 +12,40 @@ from benchmarks.check import PAIRS, compare, log_ratios, select_slower
 PATHS = ("one", "two", "three", "four", "five", "six")
 
 
-def draw(rng: np.random.Generator, spread: float, times: float = 1.0) -> dict[str, list[float]]:
-    return {name: (np.log(times) + spread * rng.standard_normal(PAIRS)).tolist() for name in PATHS}
+def draw_ratios(rng: np.random.Generator, sd: float, factor: float = 1.0) -> dict[str, list[float]]:
+    return {name: (np.log(factor) + sd * rng.standard_normal(PAIRS)).tolist() for name in PATHS}
 
 
-@pytest.mark.parametrize("spread", [0.03, 0.2])
-def test_noise_raises_no_alarm(spread: float) -> None:
-    """At most 1 % of comparisons may call an unchanged program slower: more than 9 of 400 is less likely than 1 %."""
+@pytest.mark.parametrize("sd", [0.03, 0.2])
+def test_unchanged_paths_raise_few_alarms(sd: float) -> None:
+    """The false alarm rate is at most 1 %: more than 9 alarms in 400 comparisons have a probability below 1 %."""
     rng = np.random.default_rng(1)
-    alarms = sum(bool(select_slower(compare(draw(rng, spread), draw(rng, spread)))) for _ in range(400))
+    alarms = sum(bool(select_slower(compare(draw_ratios(rng, sd), draw_ratios(rng, sd)))) for _ in range(400))
     assert alarms <= 9
 
 
-def test_growth_within_what_is_allowed_is_none() -> None:
+def test_accepted_growth_raises_few_alarms() -> None:
     rng = np.random.default_rng(2)
-    alarms = sum(bool(select_slower(compare(draw(rng, 0.05, 1.1), draw(rng, 0.05)))) for _ in range(200))
+    alarms = sum(bool(select_slower(compare(draw_ratios(rng, 0.05, 1.1), draw_ratios(rng, 0.05)))) for _ in range(200))
     assert alarms <= 6
 
 
-@pytest.mark.parametrize(("spread", "times"), [(0.05, 1.3), (0.2, 1.8)])
-def test_a_slow_down_is_found(spread: float, times: float) -> None:
+@pytest.mark.parametrize(("sd", "factor"), [(0.05, 1.3), (0.2, 1.8)])
+def test_slower_path_is_detected(sd: float, factor: float) -> None:
     rng = np.random.default_rng(3)
-    found = 0
+    detected = 0
     for _ in range(100):
-        now = draw(rng, spread) | {"three": draw(rng, spread, times)["three"]}
-        found += [one.name for one in select_slower(compare(now, draw(rng, spread)))] == ["three"]
-    assert found >= 95
+        now = draw_ratios(rng, sd) | {"three": draw_ratios(rng, sd, factor)["three"]}
+        slower = select_slower(compare(now, draw_ratios(rng, sd)))
+        detected += [comparison.name for comparison in slower] == ["three"]
+    assert detected >= 95
 
 
-def test_ratios_are_those_of_processor_time() -> None:
-    def busy(seconds: float) -> None:
+def test_ratio_of_processor_times_is_measured() -> None:
+    def occupy_processor(seconds: float) -> None:
         end = time.process_time() + seconds
         while time.process_time() < end:
             pass
 
-    ratios = log_ratios(lambda: busy(0.02), lambda: busy(0.01), 3)
+    ratios = log_ratios(lambda: occupy_processor(0.02), lambda: occupy_processor(0.01), 3)
     assert np.median(ratios) == pytest.approx(np.log(2.0), abs=0.1)

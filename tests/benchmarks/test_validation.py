@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.bounds import CALLS
+from benchmarks.minimum_costs import CALLS
 from benchmarks.stages import STAGES
 from benchmarks.threshold_derivation import ThresholdInputs, right_track_errors
 from benchmarks.validation import dimes_checks, landing_checks, tracking_checks
@@ -22,7 +22,7 @@ from benchmarks.validation.records import Measure
 NAN = float("nan")
 #: Start of a claim: reason for a limit of more than four times the measured value.
 WIDER = {
-    "right tracks' discrepancy": "three standard errors of a quantile",
+    "discrepancy of correct tracks": "three standard errors of a quantile",
     "stereo range error": "55 pairs leave the ratio uncertain by 10 %",
     "false PASS": "the guaranteed error rate",
     "false FAIL": "the guaranteed error rate",
@@ -43,17 +43,17 @@ def _lose_drifts(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     """Every second target is lost; the others do not drift at all."""
     row = {"selectable": True, "sun_motion_deg": 5.0}
     monkeypatch.setattr(
-        tracking_checks, "driven", lambda number, camera: row | {"drift_px": NAN if number % 2 else 0.1}
+        tracking_checks, "simulate_run", lambda number, camera: row | {"drift_px": NAN if number % 2 else 0.1}
     )
-    return list(tracking_checks.drift(quick=False))
+    return list(tracking_checks.check_drift(quick=False))
 
 
 def _lose_stereo_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     """Every second target is not found; the others have the errors of Eq. 1 of the tracking paper."""
     monkeypatch.setattr(
-        tracking_checks, "_designation_errors", lambda number, camera: (NAN if number % 2 else 0.1, 0.1)
+        tracking_checks, "_simulate_designation", lambda number, camera: (NAN if number % 2 else 0.1, 0.1)
     )
-    return list(tracking_checks.stereo(quick=False))
+    return list(tracking_checks.check_stereo(quick=False))
 
 
 def _lose_landing_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
@@ -65,8 +65,8 @@ def _lose_landing_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
         row |= {"rotation_error_deg": value, "baseline_error_fraction": value}
         return {"paper": row, "ours": row}
 
-    monkeypatch.setattr(landing_checks, "errors", errors)
-    return list(landing_checks.accuracy(quick=False))
+    monkeypatch.setattr(landing_checks, "simulate_errors", errors)
+    return list(landing_checks.check_accuracy(quick=False))
 
 
 @pytest.mark.parametrize("lose", [_lose_drifts, _lose_stereo_pairs, _lose_landing_pairs])
@@ -89,7 +89,7 @@ def test_limits_are_close_to_the_measured_values() -> None:
 def test_unmet_requirements_keep_their_original_limit() -> None:
     rows = {row.claim: row for row in read_measures()}
     required = {"deg": landing_checks.ROTATION_LIMIT_DEG, "": 0.95}
-    for start in ("rotation's error of the paper's features", "nights that name a regression"):
+    for start in ("rotation error with the paper's features", "nights that detect a regression"):
         selected = [row for claim, row in rows.items() if claim.startswith(start)]
         assert selected
         assert all(row.limit == required[row.unit] for row in selected)
@@ -104,9 +104,9 @@ def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(dimes_checks, "right_track_errors", halve_errors, raising=False)
     real = dimes_checks.DimesOptions
     monkeypatch.setattr(dimes_checks, "DimesOptions", lambda: real(imu_threshold_m_s=2.3))
-    failed = failed_claims(list(dimes_checks.imu_check(quick=True)))
-    assert "right tracks' discrepancy, 99.5 % quantile, from the threshold" in failed
-    assert "descents with one right track a pair that pass the IMU check" in failed
+    failed = failed_claims(list(dimes_checks.check_imu_threshold(quick=True)))
+    assert "discrepancy of correct tracks: 99.5 % quantile against the threshold" in failed
+    assert "descents with one correct track per pair that pass the IMU check" in failed
 
 
 def test_second_implementation_agrees_without_instrument_errors() -> None:

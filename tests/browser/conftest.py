@@ -25,12 +25,12 @@ Open = Callable[..., tuple[Page, PageLog]]
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     path = next((executable for name in ("chromium", "chromium-browser") if (executable := shutil.which(name))), None)
-    assert path is not None, "these tests drive Debian's Chromium: apt-get install chromium"
+    assert path is not None, "these tests need Debian's Chromium: apt-get install chromium"
     with sync_playwright() as playwright:
         # root in a container cannot start the sandbox; the pages are trusted
-        launched = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"], timeout=120_000)
-        yield launched
-        launched.close()
+        instance = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"], timeout=120_000)
+        yield instance
+        instance.close()
 
 
 @pytest.fixture

@@ -58,7 +58,7 @@ def _index_path(campaigns: Path) -> Path:
 
 
 def _find_violations(page: Page) -> list[str]:
-    """Violations of the levels A and AA that axe-core finds."""
+    """Return the violations of the levels A and AA that axe-core finds."""
     violations = Axe().run(page, options={"runOnly": {"type": "tag", "values": LEVELS}}).response["violations"]
     return [f"{violation['id']}: {node['html']}" for violation in violations for node in violation["nodes"]]
 

@@ -1,4 +1,4 @@
-"""Fixtures of campaigns of the fake scenario."""
+"""Fixtures that write and run campaigns of the fake scenario; used by all tests of campaigns."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.campaigns.fake_campaign import FAILING_CASES, RecordingWatch, run, wr
 
 @pytest.fixture
 def campaign_file(tmp_path: Path) -> Callable[..., Path]:
-    """Write a campaign: `campaign_file(parameters="...", dispersions=..., requirement=..., head=..., more=...)`."""
+    """Return `write_campaign` for the temporary folder: `campaign_file("altitude_m = 1500", dispersions="...")`."""
     return partial(write_campaign, tmp_path)
 
 
@@ -24,6 +24,6 @@ def watch() -> RecordingWatch:
 
 @pytest.fixture(scope="session")
 def failing_campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run a campaign: one case raises, two abort their process, one has no answer. Tests must not change it."""
+    """Run `FAILING_CASES` and return the campaign folder. Tests must not change the folder."""
     folder = tmp_path_factory.mktemp("campaign")
     return run(write_campaign(folder, FAILING_CASES), folder / "failing_campaign", RecordingWatch())

@@ -1,4 +1,4 @@
-"""Write and run campaign files of the fake scenario."""
+"""Functions for the tests of campaigns: write and run campaign files of the fake scenario."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store.table import read_rows
 
-HEAD = """
+TOP_LEVEL_KEYS = """
 name = "fake"
 scenario = "tests.campaigns.fake_scenario:FakeScenario"
-description = "a campaign without a world"
+description = "a campaign without terrain"
 cases = 12
 seed = 5
 """
@@ -34,7 +34,7 @@ bound = 5.0
 probability = 0.99
 confidence = 0.9
 """
-#: A case that raises, two that abort their process, one without an answer.
+#: Case 3 raises, cases 5 and 6 abort their process, case 2 has no answer.
 FAILING_CASES = "raising_cases = [3]\naborting_cases = [5, 6]\nrefusing_cases = [2]"
 
 
@@ -42,13 +42,14 @@ def write_campaign(
     folder: Path,
     parameters: str = "",
     *,
-    head: str = HEAD,
+    top_level_keys: str = TOP_LEVEL_KEYS,
     dispersions: str = DISPERSIONS,
     requirement: str = REQUIREMENT,
-    more: str = "",
+    extra_tables: str = "",
 ) -> Path:
+    """Write a campaign file; each argument is the TOML text of one part. Return its path."""
     path = folder / "fake.toml"
-    path.write_text(f"{head}\n[parameters]\n{parameters}\n{dispersions}\n{requirement}\n{more}\n")
+    path.write_text(f"{top_level_keys}\n[parameters]\n{parameters}\n{dispersions}\n{requirement}\n{extra_tables}\n")
     return path
 
 
@@ -72,6 +73,7 @@ class RecordingWatch:
 
 
 def run(path: Path, directory: Path, watch: RecordingWatch, *overrides: str, jobs: int = 2) -> Path:
+    """Run a campaign file with overrides of its keys; return the campaign folder."""
     run_campaign(load_campaign(str(path), overrides), directory, ExecutorConfig(jobs), watch)
     return directory
 

@@ -1,4 +1,4 @@
-"""A fast scenario without terrain and rendering; its parameters select the cases that fail, and how."""
+"""Fast scenarios without terrain and rendering for the tests of campaigns; parameters select the failing cases."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ class Wind(BaseModel):
 
 
 class FakeParameters(BaseModel):
+    """Fields `*_cases` contain the numbers of the cases with this fault."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     altitude_m: float = Field(default=2000.0, gt=0.0)
@@ -72,9 +74,9 @@ def misbehave(parameters: FakeParameters, case: int) -> None:
     if case in parameters.exiting_cases:
         os._exit(0)
     if case in parameters.forking_cases and os.fork() == 0:
-        # the child has its own session, keeps the worker's open files and leaves a temporary file
+        # the child starts its own session, inherits the worker's open files and creates a temporary file
         os.setsid()
-        Path(tempfile.gettempdir(), "left-behind").touch()
+        Path(tempfile.gettempdir(), "temporary-file").touch()
         time.sleep(3600)
     if case in parameters.stopping_cases:
         os.kill(os.getppid(), signal.SIGSTOP)
@@ -94,7 +96,7 @@ class FakeScenario:
 
     def prepare(self, parameters: FakeParameters, shared_input: int) -> None:
         if parameters.fail_prepare:
-            raise OSError("no room for the terrain")
+            raise OSError("the disk is full")
         Path(parameters.cache, f"shared-{shared_input}").touch()
 
     def run(self, parameters: FakeParameters, streams: Streams) -> CaseResult:
@@ -104,10 +106,10 @@ class FakeScenario:
         if streams.case in parameters.aborting_cases:
             os.abort()
         misbehave(parameters, streams.case)
-        answered = streams.case not in parameters.refusing_cases
+        has_answer = streams.case not in parameters.refusing_cases
         # the environment variable imitates a change of the algorithm's code
         scale = parameters.error_scale * float(os.environ.get("FAKE_ERROR_SCALE", "1"))
-        error = scale * streams.generator("noise").normal(size=2) if answered else np.full(2, np.nan)
+        error = scale * streams.generator("noise").normal(size=2) if has_answer else np.full(2, np.nan)
         row = {
             "velocity_error_m_s": np.hypot(*error),
             "velocity_error_x_m_s": error[0],
@@ -119,10 +121,10 @@ class FakeScenario:
             "threads": os.environ["OMP_NUM_THREADS"],
             "hash_of_text": hash("marsyard") % 2**31,
         }
-        products = {"picture": np.arange(6, dtype=np.uint16).reshape(2, 3), "title": "a", "nested": [{"x": np.eye(2)}]}
+        products = {"image": np.arange(6, dtype=np.uint16).reshape(2, 3), "title": "a", "nested": [{"x": np.eye(2)}]}
         if parameters.products == "bad":
-            products = {"thing": object()}
-        return CaseResult("VALID" if answered else "SILENT", answered, row, products)
+            products = {"unsupported": object()}
+        return CaseResult("VALID" if has_answer else "SILENT", has_answer, row, products)
 
 
 class SelectingScenario(FakeScenario):

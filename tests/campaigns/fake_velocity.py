@@ -1,4 +1,4 @@
-"""A scenario for velocity estimators without rendering: one fixed descent, with a different inertial error per case."""
+"""A scenario without rendering for tests of velocity estimators: one descent, with a random inertial error per case."""
 
 from __future__ import annotations
 
@@ -36,13 +36,14 @@ class FakeVelocityScenario:
         """There are no shared inputs."""
 
     def run(self, parameters: FakeVelocityParameters, streams: Streams) -> CaseResult:
-        p, inertial_error_m_s = parameters, streams.generator("inertial").normal(size=3)
-        exact = inputs.descent()
-        measurements = replace(exact, interval_velocities_m_s=exact.interval_velocities_m_s + inertial_error_m_s)
+        inertial_error_m_s = streams.generator("inertial").normal(size=3)
+        descent = inputs.descent()
+        measurements = replace(descent, interval_velocities_m_s=descent.interval_velocities_m_s + inertial_error_m_s)
 
         def evaluate(algorithm: str) -> CaseResult:
+            executable, case = parameters.executable, streams.case
             run_result = run_algorithm(
-                lambda: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(measurements),
+                lambda: VELOCITY.make(algorithm, DimesOptions(), executable, case).estimate(measurements),
                 check_velocity,
             )
             velocity = None if run_result.answer is None else run_result.answer.velocity_m_s
@@ -54,4 +55,4 @@ class FakeVelocityScenario:
             )
 
         input_text = f"{measurements.interval_velocities_m_s.tolist()}"
-        return case_result(p.algorithms, evaluate, {"image_hash": input_text})
+        return case_result(parameters.algorithms, evaluate, {"image_hash": input_text})

@@ -1,4 +1,4 @@
-"""A scenario whose cases damage their worker process or return invalid rows."""
+"""A scenario for the tests of isolation: cases damage their worker process or return invalid rows."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from pydantic import BaseModel, ConfigDict
 from marsyard.scenarios.interface import CaseResult, record_conditions
 from marsyard.sim.streams import Streams
 
-#: Faults, in the order of the case numbers.
+#: Case number n has fault n modulo the number of faults.
 FAULTS = (
-    "nothing",
+    "no fault",
     "text in a metric",
     "text in a population",
     "int of 400 digits",
     "int of 5000 digits",
     "closes files",
-    "closes output",
+    "closes standard output",
     "error without a message",
-    "surrogates",
+    "surrogate characters",
     "raises",
     "exits",
     "list in a column",
@@ -32,6 +32,8 @@ class HostileParameters(BaseModel):
 
 
 class SilentError(Exception):
+    """An exception whose message cannot be formatted."""
+
     def __str__(self) -> str:
         raise RuntimeError("no message")
 
@@ -48,25 +50,25 @@ class HostileScenario:
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         fault = FAULTS[streams.case % len(FAULTS)]
-        conditions = {"near": streams.case < 2 * len(FAULTS), "height_m": 10.0 + streams.case}
+        conditions = {"is_low": streams.case < 2 * len(FAULTS), "height_m": 10.0 + streams.case}
         record_conditions(conditions)
         row: dict[str, Any] = {"velocity_error_m_s": 1.0, "met": True, "number": 1, "text": "a", **conditions}
         outcome = "VALID"
         if fault == "text in a metric":
             row["velocity_error_m_s"] = "small"
         elif fault == "text in a population":
-            row["near"] = "yes"
+            row["is_low"] = "yes"
         elif fault == "int of 400 digits":
             row["number"] = 10**400
         elif fault == "int of 5000 digits":
             row["velocity_error_m_s"] = 10**5000
         elif fault == "closes files":
             os.closerange(3, 256)
-        elif fault == "closes output":
+        elif fault == "closes standard output":
             os.close(1)
         elif fault == "error without a message":
             raise SilentError
-        elif fault == "surrogates":
+        elif fault == "surrogate characters":
             outcome, row["text \udc80"] = "VALID \udc80", "\udc80"
         elif fault == "raises":
             raise ValueError("the algorithm raised")

@@ -19,12 +19,12 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def read_page(page: str) -> str:
-    """Text of a page in one line."""
+    """Return the text of a page in one line."""
     return " ".join((DOCS / page).read_text(encoding="utf-8").split())
 
 
 def find_cells(page: str, start: str) -> list[str]:
-    """Cells of the table row that starts with the text `start`."""
+    """Return the cells of the table row that starts with the text `start`."""
     (row,) = [line for line in (DOCS / page).read_text(encoding="utf-8").splitlines() if line.startswith(f"| {start}")]
     return [cell.strip() for cell in row.strip("|").split("|")]
 
@@ -47,9 +47,9 @@ def parse_percent(text: str) -> float:
 def test_quoted_bounds_on_wrong_velocities_are_correct(column: int) -> None:
     wrong, answers = parse_counts(find_cells("dimes.md", "wrong answers (error above 5 m/s)")[column])
     assert wrong == 0
-    decisive = find_cells("dimes.md", "upper bound of their rate at 90 % confidence, terrains counted")[column]
-    terrains = int(decisive.split(" over ")[1].split()[0])
-    assert parse_percent(decisive) == round(100.0 * proportion_upper(0, terrains, 0.9), 2)
+    by_terrain = find_cells("dimes.md", "upper bound of their rate at 90 % confidence, terrains counted")[column]
+    terrains = int(by_terrain.split(" over ")[1].split()[0])
+    assert parse_percent(by_terrain) == round(100.0 * proportion_upper(0, terrains, 0.9), 2)
     independent = find_cells("dimes.md", "upper bound for independent cases")[column]
     assert parse_percent(independent) == round(100.0 * proportion_upper(0, answers, 0.9), 2)
 

@@ -12,6 +12,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
+#: Minimum number of pages of the site; a smaller number shows that the build skipped pages.
 MIN_PAGES = 40
 
 

@@ -1,4 +1,4 @@
-"""Names, docstrings, comments and pages use the project's vocabulary (docs/glossary.md), not private language."""
+"""Tests that names, docstrings, comments and pages use the project's vocabulary (docs/glossary.md)."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ NAME_WORDS = {
     "beside": "next to",
     "crew": "executor",
 }
-#: Names that are kept, with the reason.
+#: Patterns of accepted names, with the reason.
 ALLOWED_NAMES = {r"least_(squares|median|absolute|sum)": "terms of estimation"}
-#: Patterns of text that have a plain form.
+#: Patterns of rejected text, with the recommended form.
 PHRASES = {
     r"\banew\b": "again",
     r"\bbeside\b": "next to",
@@ -49,14 +49,14 @@ PHRASES = {
 }
 
 
-def python_files() -> list[Path]:
-    """Sources of the packages and benchmarks, as git lists them."""
+def list_python_files() -> list[Path]:
+    """List the Python files of packages, benchmarks and tests, by git."""
     listed = subprocess.run(["git", "ls-files", *PACKAGES], cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
     return [ROOT / name for name in listed.stdout.split() if name.endswith(".py")]
 
 
-def names_of(tree: ast.AST) -> Iterator[tuple[str, int]]:
-    """Names that a module defines: functions, classes, arguments and variables, with their lines."""
+def find_names(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Yield the names that a module defines (functions, classes, arguments, variables), with their lines."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name, node.lineno
@@ -66,12 +66,12 @@ def names_of(tree: ast.AST) -> Iterator[tuple[str, int]]:
             yield node.id, node.lineno
 
 
-def words_of(name: str) -> list[str]:
+def split_name(name: str) -> list[str]:
     return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)]
 
 
-def prose_of(text: str) -> Iterator[tuple[str, int]]:
-    """Docstrings and comments of a module, with their lines; quoted code is removed."""
+def find_prose(text: str) -> Iterator[tuple[str, int]]:
+    """Yield the docstrings and comments of a module, with their lines."""
     for node in ast.walk(ast.parse(text)):
         body = getattr(node, "body", None)
         for statement in body if isinstance(body, list) else []:
@@ -83,7 +83,8 @@ def prose_of(text: str) -> Iterator[tuple[str, int]]:
             yield token.string, token.start[0]
 
 
-def offences(text: str, line: int) -> Iterator[str]:
+def find_offences(text: str, line: int) -> Iterator[str]:
+    """Yield a message for each rejected pattern in a text that starts at a line; quoted code is ignored."""
     for number, part in enumerate(text.splitlines()):
         plain = re.sub(r"`[^`]*`", "", part)
         for pattern, instead in PHRASES.items():
@@ -94,10 +95,10 @@ def offences(text: str, line: int) -> Iterator[str]:
 def test_names_use_the_vocabulary() -> None:
     wrong = [
         f"{path.relative_to(ROOT)}:{line}: {name} ({word}: use {NAME_WORDS[word]})"
-        for path in python_files()
-        for name, line in names_of(ast.parse(path.read_text(encoding="utf-8")))
+        for path in list_python_files()
+        for name, line in find_names(ast.parse(path.read_text(encoding="utf-8")))
         if not any(re.search(allowed, name) for allowed in ALLOWED_NAMES)
-        for word in words_of(name)
+        for word in split_name(name)
         if word in NAME_WORDS
     ]
     assert not wrong, "\n".join(wrong)
@@ -106,14 +107,14 @@ def test_names_use_the_vocabulary() -> None:
 def test_docstrings_and_comments_use_the_vocabulary() -> None:
     wrong = [
         f"{path.relative_to(ROOT)}:{found}"
-        for path in python_files()
-        for text, line in prose_of(path.read_text(encoding="utf-8"))
-        for found in offences(text, line)
+        for path in list_python_files()
+        for text, line in find_prose(path.read_text(encoding="utf-8"))
+        for found in find_offences(text, line)
     ]
     assert not wrong, "\n".join(wrong)
 
 
-#: The generated pages repeat texts that are checked at their source.
+#: Pages of the documentation. Generated pages are excluded, because their texts are checked at their source.
 PAGES = sorted(path for path in (ROOT / "docs").rglob("*.md") if "generated" not in path.parts)
 
 
@@ -122,4 +123,4 @@ def test_pages_use_the_vocabulary(page: Path) -> None:
     text = re.sub(
         r"^```.*?^```$", lambda block: "\n" * block[0].count("\n"), page.read_text(encoding="utf-8"), flags=re.M | re.S
     )
-    assert not list(offences(text, 1))
+    assert not list(find_offences(text, 1))

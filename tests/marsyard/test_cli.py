@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 from marsyard.cli import app as cli
-from tests.campaigns.fake_campaign import HEAD, REQUIREMENT, write_campaign
+from tests.campaigns.fake_campaign import REQUIREMENT, TOP_LEVEL_KEYS, write_campaign
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
@@ -109,11 +109,11 @@ def test_stages_are_saved_as_separate_files(finished: Path, marsyard: Command, t
     assert (result.status, result.err) == (0, "")
     stages = tmp_path / "case" / "stages"
     files = sorted(str(path.relative_to(stages)) for path in stages.rglob("*.*"))
-    assert files == ["01-picture.png", "02-title.json", "03-nested/01-0/01-x.npy"]
-    picture = cv2.imread(str(stages / "01-picture.png"), cv2.IMREAD_UNCHANGED)
-    assert picture is not None
-    assert picture.dtype == np.uint16
-    assert picture.tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert files == ["01-image.png", "02-title.json", "03-nested/01-0/01-x.npy"]
+    image = cv2.imread(str(stages / "01-image.png"), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image.dtype == np.uint16
+    assert image.tolist() == [[0, 1, 2], [3, 4, 5]]
     assert f"stages: 3 files in {stages}" in result.out
 
 
@@ -295,16 +295,16 @@ def test_list_and_show_print_campaigns(tmp_path: Path, marsyard: Command, monkey
 
 
 def test_names_in_brackets_are_not_markup(tmp_path: Path, marsyard: Command) -> None:
-    head = HEAD.replace("a campaign without a world", "[red]bold[/red] [oops")
-    result = marsyard("show", write_campaign(tmp_path, head=head))
+    top_level_keys = TOP_LEVEL_KEYS.replace("a campaign without terrain", "[red]bold[/red] [oops")
+    result = marsyard("show", write_campaign(tmp_path, top_level_keys=top_level_keys))
     assert "[red]bold[/red] [oops" in result.out
 
 
 def test_version_and_doctor_print_their_output(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     assert re.fullmatch(r"marsyard \d+\.\d+\.\d+\n", marsyard("--version").out)
-    monkeypatch.setattr("marsyard.doctor.run", lambda console, as_json: console.print("looked") or 1)
+    monkeypatch.setattr("marsyard.doctor.run", lambda console, as_json: console.print("checked") or 1)
     result = marsyard("doctor")
-    assert (result.status, result.out) == (1, "looked\n")
+    assert (result.status, result.out) == (1, "checked\n")
 
 
 def test_help_is_fast() -> None:

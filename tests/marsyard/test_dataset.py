@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
-from marsyard.dataset import _prepare_inputs
+from marsyard.dataset import _prepare_terrains
 from marsyard.scenarios.descent.exposure import World
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.sim.camera import read_cahvor
@@ -63,7 +63,7 @@ def test_only_terrains_of_the_cases_are_built(tmp_path: Path, monkeypatch: pytes
     dispersion = '"location.terrain" = { distribution = "integer", low = 0, high = 19, source = "any" }'
     path.write_text(CAMPAIGN.replace("bank = 1", "bank = 20").replace("samples = 512", "samples = 256") + dispersion)
     campaign = load_campaign(str(path))
-    _prepare_inputs(campaign, range(2))
+    _prepare_terrains(campaign, range(2))
     used = {campaign.parameters(case).model_dump()["location"]["terrain"] for case in range(2)}
     assert len(list((tmp_path / "cache" / "terrain").iterdir())) == len(used)
 

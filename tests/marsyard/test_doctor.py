@@ -126,7 +126,7 @@ def test_folder_without_init_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 def test_conflicting_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: {"marsyard": ["Sim_Games", "marsyard"]})
-    monkeypatch.setattr(doctor, "_version", lambda _: "0.1.45")
+    monkeypatch.setattr(doctor, "_find_version", lambda _: "0.1.45")
     _, conflict, *others = doctor.check_shadowing()
     assert "sim-games also installs a package named marsyard" in conflict.finding
     assert any("pip uninstall -y pyrender pyrender2" in other.remedy for other in others)
@@ -143,8 +143,8 @@ def test_missing_old_and_broken_dependencies_are_reported(monkeypatch: pytest.Mo
     needs = ["numpy>=2.2", "scipy>=1.17", "joblib>=1.5", "dask>=2025.9; extra == 'dask'", "rich>=14"]
     versions = {"scipy": "1.9", "joblib": "1.6.0", "rich": "14.0"}
     monkeypatch.setattr(importlib.metadata, "requires", lambda _: needs)
-    monkeypatch.setattr(doctor, "_version", versions.get)
-    monkeypatch.setattr(doctor, "_pins", lambda: {"rich": "15.0.0"})
+    monkeypatch.setattr(doctor, "_find_version", versions.get)
+    monkeypatch.setattr(doctor, "_read_pins", lambda: {"rich": "15.0.0"})
     checks = {check.name: check for check in doctor.check_dependencies({"joblib": "OSError: truncated"})}
     assert {name: check.verdict for name, check in checks.items()} == {
         "numpy": Verdict.FAIL,
@@ -169,7 +169,7 @@ def test_module_that_exits_does_not_hide_other_failures(monkeypatch: pytest.Monk
 
 
 def test_python_without_assertions_fails() -> None:
-    assert doctor.check_optimisation(enabled=False).verdict is Verdict.FAIL
+    assert doctor.check_optimisation(has_assertions=False).verdict is Verdict.FAIL
 
 
 def test_more_threads_than_cores_give_a_warning() -> None:

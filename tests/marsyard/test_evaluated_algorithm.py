@@ -98,8 +98,8 @@ def test_reports_name_the_evaluated_algorithm(folder: Path) -> None:
     suite = Xml.parse(folder / "run" / "junit.xml").getroot()  # noqa: S314
     properties = {entry.get("name"): entry.get("value") for entry in suite.iter("property")}
     assert (properties["algorithm"], properties["algorithm_source"]) == ("mine:Mine", source)
-    twin = json.loads((folder / "run" / "report.json").read_text())
-    assert [entry["name"] for entry in twin["algorithm_details"] if entry["tested"]] == ["mine:Mine"]
+    report = json.loads((folder / "run" / "report.json").read_text())
+    assert [entry["name"] for entry in report["algorithm_details"] if entry["tested"]] == ["mine:Mine"]
 
 
 def test_dashboard_names_the_evaluated_algorithm(folder: Path, tmp_path: Path) -> None:
@@ -134,9 +134,9 @@ def test_command_in_the_report_repeats_the_campaign(folder: Path, tmp_path: Path
     )
     assert first["configuration"] == second["configuration"]
     assert first["algorithms"] == second["algorithms"]
-    keep = ("case", "outcome", "image_hash", "algorithm", "homography.velocity_error_m_s")
+    columns = ("case", "outcome", "image_hash", "algorithm", "homography.velocity_error_m_s")
     rows = [
-        [{key: row[key] for key in keep} for row in read_case_rows(run_folder)]
+        [{column: row[column] for column in columns} for row in read_case_rows(run_folder)]
         for run_folder in (folder / "run", repeated_run)
     ]
     assert rows[0] == rows[1]

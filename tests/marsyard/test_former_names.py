@@ -1,4 +1,4 @@
-"""Former names of keys, columns and options: accepted with a warning that states the current name."""
+"""Tests of former names of keys, columns and options: they are accepted with a warning."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ confidence = 0.9
 population = "valid and room"
 """
 
-
+#: Pairs (former name, current name) in `CAMPAIGN`.
 NAMES = (("place", "location"), ("cone_minor_share", "cone_minor_fraction"), ("room", "feasible_overlap"))
 
 
-def current(text: str) -> str:
+def replace_former_names(text: str) -> str:
     for former, now in NAMES:
         text = text.replace(former, now)
     return text
@@ -54,36 +54,36 @@ def current(text: str) -> str:
 def files(tmp_path: Path) -> tuple[Path, Path]:
     paths = tmp_path / "former.toml", tmp_path / "current.toml"
     paths[0].write_text(CAMPAIGN)
-    paths[1].write_text(current(CAMPAIGN))
+    paths[1].write_text(replace_former_names(CAMPAIGN))
     return paths
 
 
-def test_a_campaign_with_former_names_is_the_same_campaign(files: tuple[Path, Path]) -> None:
+def test_campaign_with_former_names_equals_the_current_one(files: tuple[Path, Path]) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DeprecatedNameWarning)
         former = load_campaign(str(files[0]))
     expected = load_campaign(str(files[1]))
     assert former.configuration == expected.configuration
     assert former.draws(1) == expected.draws(1)
-    texts = {str(one.message) for one in caught}
+    texts = {str(warning.message) for warning in caught}
     assert "'place' is now 'location'; the former name is accepted until 0.2" in texts
     assert {text.split("'")[1] for text in texts} == {"place", "cone_minor_share", "room"}
 
 
-def test_an_option_with_a_former_name_sets_the_parameter(files: tuple[Path, Path]) -> None:
+def test_override_with_a_former_name_sets_the_parameter(files: tuple[Path, Path]) -> None:
     with pytest.warns(DeprecatedNameWarning, match="'place' is now 'location'"):
         campaign = load_campaign(str(files[1]), ["place.terrain=1"])
     assert campaign.configuration.parameters["location"]["terrain"] == 1
     assert set(campaign.configuration.dispersions) == {"descent.cone_minor_fraction"}
 
 
-def test_draws_are_those_of_the_former_names(files: tuple[Path, Path]) -> None:
+def test_renamed_parameters_keep_their_draws(files: tuple[Path, Path]) -> None:
     campaign = load_campaign(str(files[1]))
     uniform = campaign.streams(0).generator("dispersion:descent.cone_minor_share").random()
     assert campaign.draws(0)["descent.cone_minor_fraction"] == pytest.approx(2.0 * uniform - 1.0, abs=1e-12)
 
 
-def test_a_stored_campaign_is_read_by_the_current_names(files: tuple[Path, Path], tmp_path: Path) -> None:
+def test_stored_campaign_is_read_with_current_names(files: tuple[Path, Path], tmp_path: Path) -> None:
     expected = load_campaign(str(files[1])).configuration
     record.begin(tmp_path, expected, create_identity(expected), "test")
     text = (tmp_path / "campaign.json").read_text()
@@ -100,25 +100,25 @@ def test_a_stored_campaign_is_read_by_the_current_names(files: tuple[Path, Path]
     assert run.record["requirements"][0]["population"] == "valid and feasible_overlap"
 
 
-def test_a_former_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_former_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "argv", ["marsyard", "replay", str(tmp_path), "0", "--step"])
     with (
         pytest.warns(DeprecatedNameWarning, match="'--step' is now '--save-stages'"),
-        pytest.raises(SystemExit) as ended,
+        pytest.raises(SystemExit) as raised,
     ):
         main()
-    assert ended.value.code == 2
+    assert raised.value.code == 2
     assert sys.argv[-1] == "--save-stages"
 
 
-def test_current_names_exist_and_former_ones_do_not() -> None:
+def test_current_names_exist_and_former_names_do_not() -> None:
     """Each entry of the table is used: a key of some parameters, a column of some scenario."""
     schemas = " ".join(json.dumps(scenario(name).parameters_type.model_json_schema()) for name in scenario_names())
     schemas += json.dumps(type(load_campaign("dimes-smoke").configuration).model_json_schema())
     for former, now in TABLE["keys"].items():
         assert f'"{now}": {{' in schemas, now
         assert former in ("own", "least", "most") or f'"{former}": {{' not in schemas, former
-    stated = [columns for name in scenario_names() if (columns := row_columns(name)) is not None]
+    column_sets = [columns for name in scenario_names() if (columns := row_columns(name)) is not None]
     for former, now in TABLE["columns"].items():
-        assert any(now in (*one.flags, *one.numbers) for one in stated), now
-        assert not any(former in (*one.flags, *one.numbers) for one in stated), former
+        assert any(now in (*columns.flags, *columns.numbers) for columns in column_sets), now
+        assert not any(former in (*columns.flags, *columns.numbers) for columns in column_sets), former

@@ -1,4 +1,4 @@
-"""Tests of `marsyard gallery`: figures, page and contact sheet."""
+"""Tests of `marsyard gallery`: images, page and contact sheet."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class _Links(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def figures() -> list[GalleryImage]:
-    """Figures of white noise, the worst case for compression."""
+def images() -> list[GalleryImage]:
+    """Create images of white noise, the worst case for compression."""
     rng = np.random.default_rng(1)
     return [
         GalleryImage(
@@ -53,18 +53,18 @@ def figures() -> list[GalleryImage]:
     ]
 
 
-def test_every_site_and_camera_is_shown(figures: list[GalleryImage]) -> None:
-    assert {figure.request.site for figure in figures} == set(sites())
-    assert {figure.request.camera for figure in figures} == set(PRESETS)
-    for figure in figures:
-        site = sites()[figure.request.site]
+def test_every_site_and_camera_is_shown(images: list[GalleryImage]) -> None:
+    assert {image.request.site for image in images} == set(sites())
+    assert {image.request.camera for image in images} == set(PRESETS)
+    for image in images:
+        site = sites()[image.request.site]
         assert site.descent is None or any(
-            other.request.scale == "descent" for other in figures if other.request.site == site.name
+            other.request.scale == "descent" for other in images if other.request.site == site.name
         )
 
 
-def test_page_links_only_to_its_images(figures: list[GalleryImage], tmp_path: Path) -> None:
-    page = write_gallery(figures, tmp_path / "new" / "gallery")
+def test_page_links_only_to_its_images(images: list[GalleryImage], tmp_path: Path) -> None:
+    page = write_gallery(images, tmp_path / "new" / "gallery")
     links = _Links()
     text = page.read_text()
     links.feed(text)
@@ -74,22 +74,22 @@ def test_page_links_only_to_its_images(figures: list[GalleryImage], tmp_path: Pa
             assert f'id="{link[1:]}"' in text
         elif not link.startswith("data:image/jpeg;base64,"):
             assert (page.parent / link).is_file()
-    assert len(links.texts) == len(figures)
-    assert all(figure.caption in alternative for figure, alternative in zip(figures, links.texts, strict=True))
+    assert len(links.texts) == len(images)
+    assert all(image.caption in alternative for image, alternative in zip(images, links.texts, strict=True))
     for command in re.findall(r"<code>(marsyard render [^<]*)</code>", text):
         assert "--camera" in command
 
 
-def test_contact_sheet_is_small(figures: list[GalleryImage]) -> None:
+def test_contact_sheet_is_small(images: list[GalleryImage]) -> None:
     smooth = np.linspace(0.0, 255.0, 640 * 480).reshape(480, 640)
     rng = np.random.default_rng(2)
-    pictures = [
+    smooth_images = [
         GalleryImage(
-            figure.request, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), figure.file
+            image.request, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), image.file
         )
-        for figure in figures
+        for image in images
     ]
-    sheet = draw_contact_sheet(pictures)
+    sheet = draw_contact_sheet(smooth_images)
     assert len(sheet) <= SHEET_BYTES
     decoded = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_UNCHANGED)
     assert decoded is not None

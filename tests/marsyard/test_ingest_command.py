@@ -30,7 +30,7 @@ def test_ingested_images_are_run_and_reported(tmp_path: Path) -> None:
         tmp_path / "run",
     )
     status, output = run_command("ingest", str(folder), "--out", str(cases))
-    assert (status, "1 case of 2 pictures" in output) == (0, True)
+    assert (status, "1 case of 2 images" in output) == (0, True)
     status, output = run_command("run", str(cases / "campaign.toml"), "--out", str(run), "--jobs", "1")
     assert status == 0, output
     frame = pd.read_parquet(run / "cases.parquet")

@@ -32,15 +32,15 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
     return run_command
 
 
-def _check_picture(prefix: Path, size: tuple[int, int], multiple: int) -> None:
-    """Check that image, camera model, metadata and truth of one picture agree."""
+def _check_image(prefix: Path, size: tuple[int, int], multiple: int) -> None:
+    """Check that image, camera model, metadata and truth files of one image agree."""
     columns, rows = size
-    picture = cv2.imread(f"{prefix}.png", cv2.IMREAD_UNCHANGED)
-    assert picture is not None
-    assert picture.dtype == np.uint16
-    assert picture.shape == (rows, columns)
-    assert (picture % multiple == 0).all()
-    assert picture.std() > 0.0
+    image = cv2.imread(f"{prefix}.png", cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image.dtype == np.uint16
+    assert image.shape == (rows, columns)
+    assert (image % multiple == 0).all()
+    assert image.std() > 0.0
     metadata = json.loads(Path(f"{prefix}.json").read_text())
     assert "# Frame: body" in Path(f"{prefix}.cahvor").read_text()
     camera = read_cahvor(f"{prefix}.cahvor").transform(RigidTransform.from_matrix(metadata["world_from_body"]))
@@ -67,7 +67,7 @@ def test_detector_image_from_above_is_consistent(marsyard: Command, tmp_path: Pa
     prefix = tmp_path / "hover"
     status, message = marsyard("render", "heli-hazardous", "--camera", "xc-55", "--out", prefix, "--azimuth", 30)
     assert status == 0, message
-    _check_picture(prefix, (640, 480), multiple=256)  # 8 bits in 16
+    _check_image(prefix, (640, 480), multiple=256)  # 8 bits in 16
     metadata = json.loads(Path(f"{prefix}.json").read_text())
     assert metadata["shot"]["altitude_m"] == 10.0
     assert metadata["detector"]["exposure_s"] == metadata["png"]["exposure_s"]
@@ -79,14 +79,14 @@ def test_stereo_pair_of_radiance_is_consistent(marsyard: Command, tmp_path: Path
     status, message = marsyard("render", "heli-hazardous", "--camera", "research-navcam", "--out", prefix, *options)
     assert status == 0, message
     for eye in ("left", "right"):
-        _check_picture(tmp_path / f"pair-{eye}", (1024, 768), multiple=1)
+        _check_image(tmp_path / f"pair-{eye}", (1024, 768), multiple=1)
     left, right = (read_cahvor(f"{prefix}-{eye}.cahvor") for eye in ("left", "right"))
     assert np.linalg.norm(left.c - right.c) == pytest.approx(0.2)
-    picture = cv2.imread(f"{prefix}-left.png", cv2.IMREAD_UNCHANGED)
+    image = cv2.imread(f"{prefix}-left.png", cv2.IMREAD_UNCHANGED)
     with np.load(f"{prefix}-left.npz") as truth:
         radiance = truth["radiance_factor"]
-    assert picture is not None
-    np.testing.assert_allclose(picture / 65535.0, np.clip(radiance, 0.0, 1.0), atol=1.0 / 65535.0)
+    assert image is not None
+    np.testing.assert_allclose(image / 65535.0, np.clip(radiance, 0.0, 1.0), atol=1.0 / 65535.0)
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 
 
 def test_stored_rows_are_evaluated_again(make_run: MakeRun, marsyard: Command, tmp_path: Path) -> None:
-    directory, requirements = make_run("run"), tmp_path / "asked.toml"
+    directory, requirements = make_run("run"), tmp_path / "requirements.toml"
     requirements.write_text(REQUIREMENTS)
     status, out, _ = marsyard("report", directory, "--requirements", requirements, "--csv")
     assert (status, "STRICT" in out, "verdict: FAIL" in out) == (1, True, True)
@@ -96,7 +96,7 @@ def test_stored_rows_are_evaluated_again(make_run: MakeRun, marsyard: Command, t
 
 def test_pdf_is_written(make_run: MakeRun, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     directory = make_run("run")
-    assert shutil.which("chromium"), "printing takes Debian's Chromium"
+    assert shutil.which("chromium"), "the test needs Debian's Chromium"
     status, out, err = marsyard("report", directory, "--pdf")
     assert (status, err) == (3, "")
     assert f"pdf: {(directory / 'report.pdf').resolve()}" in out
@@ -107,13 +107,13 @@ def test_pdf_is_written(make_run: MakeRun, marsyard: Command, monkeypatch: pytes
 
 
 def test_two_campaigns_are_compared(make_run: MakeRun, marsyard: Command) -> None:
-    both = make_run("a"), make_run("b", 2, seed=8)
-    status, out, err = marsyard("compare", *both)
+    runs = make_run("a"), make_run("b", 2, seed=8)
+    status, out, err = marsyard("compare", *runs)
     assert (status, err) == (0, "")
     assert "came to an end" in out
     assert "different draws" in out
-    reported = json.loads(marsyard("compare", *both, "--json")[1])
-    assert (reported["second"], reported["paired"]) == (str(both[1]), False)
+    reported = json.loads(marsyard("compare", *runs, "--json")[1])
+    assert (reported["second"], reported["paired"]) == (str(runs[1]), False)
     figures = {figure["name"]: figure for figure in reported["figures"]}
     assert figures["came to an end"]["first"] == {"rate": 1.0, "cases": 40}
 
@@ -208,6 +208,6 @@ def test_undecidable_requirements_are_rejected(tmp_path: Path) -> None:
     campaign = load_campaign(str(write_campaign(tmp_path, requirement="")))
     with pytest.raises(CampaignError, match="no requirement with a confidence level"):
         run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), RecordingWatch())
-    latin = write_campaign(tmp_path, more='[design]\nkind = "latin-hypercube"\n')
+    latin = write_campaign(tmp_path, extra_tables='[design]\nkind = "latin-hypercube"\n')
     with pytest.raises(CampaignError, match="only independent random samples"):
         run_until_decided(load_campaign(str(latin)), tmp_path / "run", ExecutorConfig(jobs=1), RecordingWatch())

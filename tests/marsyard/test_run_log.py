@@ -1,4 +1,4 @@
-"""Tests of the log file of a campaign: command, progress and end."""
+"""Tests of the log file of a campaign: command, progress, end and interruptions."""
 
 from __future__ import annotations
 

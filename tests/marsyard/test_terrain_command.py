@@ -56,24 +56,24 @@ def test_file_statistics_report_real_and_filled_posts(tile: str) -> None:
 
 def test_holes_are_rejected_or_counted_and_marked(tmp_path: Path) -> None:
     """Half of the tile has no heights, as after reprojection."""
-    path, picture = tmp_path / "half.npz", tmp_path / "half.png"
+    path, figure = tmp_path / "half.npz", tmp_path / "half.png"
     heights = np.add.outer(np.sin(np.arange(64) / 5.0), np.cos(np.arange(64) / 6.0))
     heights[:, :31] = np.nan
     np.savez(path, dem=heights, dem_gsd=2.0)
     status, output = run_terrain_command("stats", str(path))
     assert status == 2
     assert "48.4% of its posts have no height; allowed: up to 5.0%" in output
-    status, output = run_terrain_command("stats", str(path), "--max-holes", "0.5", "--picture", str(picture))
+    status, output = run_terrain_command("stats", str(path), "--max-holes", "0.5", "--picture", str(figure))
     assert status == 0, output
     assert "1984 posts without height (48.4%)" in " ".join(output.split())
-    image = cv2.imread(str(picture))
+    image = cv2.imread(str(figure))
     assert image is not None
     is_red = (image[..., 2].astype(int) - image[..., 1]) > 40
     # 128 samples per side; the outline covers a few red pixels
     assert is_red.sum() == pytest.approx(31 * 64, rel=0.1)
     west = np.flatnonzero(is_red.any(axis=0))
     assert west[0] == pytest.approx(32, abs=1)
-    assert run_terrain_command("stats", str(path), "--max-holes", "0.5", "--picture", str(picture))[0] == 2
+    assert run_terrain_command("stats", str(path), "--max-holes", "0.5", "--picture", str(figure))[0] == 2
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The run-time check of shapes is on in the tests, and leaves compiled kernels alone."""
+"""Tests that array shapes are checked at run time in the tests, and that compiled kernels are not wrapped."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import pytest
 from marsyard.sim.frames import direction, rigid
 
 
-def test_a_wrong_shape_is_refused() -> None:
+def test_wrong_shape_is_rejected() -> None:
     rotation = importlib.import_module("scipy.spatial.transform").Rotation.identity()
     with pytest.raises(jaxtyping.TypeCheckError):
         rigid(rotation, np.zeros(4))
 
 
-def test_a_right_shape_passes() -> None:
+def test_correct_shape_is_accepted() -> None:
     assert direction(0.0, 0.0).shape == (3,)
 
 

@@ -1,4 +1,4 @@
-"""Bilinear accumulation of points on a grid, and least-median-of-squares planes of parts of the grid."""
+"""Kernels of hazard detection: elevation map of points (section II.D) and least-median-of-squares planes (III)."""
 
 from __future__ import annotations
 
@@ -17,25 +17,28 @@ SIGMA_PER_MEDIAN = 1.4826
 
 @njit(cache=True)
 def accumulate_bilinear(rows: Array, columns: Array, values: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Sums of weighted values and of weights; each value is distributed to four cells with bilinear weights."""
+    """Distribute values at fractional cells to the four nearest cells with bilinear weights (section II.D).
+
+    Returns the sums of weighted values and of weights per cell.
+    """
     sums = np.zeros(shape)
     weights = np.zeros(shape)
     for k in range(values.size):
         row, column = math.floor(rows[k]), math.floor(columns[k])
-        fr, fc = rows[k] - row, columns[k] - column
+        row_offset, column_offset = rows[k] - row, columns[k] - column
         for i in range(2):
             for j in range(2):
                 r, c = int(row) + i, int(column) + j
                 if 0 <= r < shape[0] and 0 <= c < shape[1]:
-                    weight = (fr if i else 1.0 - fr) * (fc if j else 1.0 - fc)
+                    weight = (row_offset if i else 1.0 - row_offset) * (column_offset if j else 1.0 - column_offset)
                     sums[r, c] += weight * values[k]
                     weights[r, c] += weight
     return sums, weights
 
 
 @njit(cache=True)
-def _plane_through(x: Array, y: Array, z: Array, i: int, j: int, k: int) -> tuple[float, float, float]:
-    """Value at (0, 0) and slopes of the plane through three points; NaN if they are collinear."""
+def _fit_exact_plane(x: Array, y: Array, z: Array, i: int, j: int, k: int) -> tuple[float, float, float]:
+    """Value at (0, 0) and slopes of the plane through the points i, j and k; NaN if they are collinear."""
     ux, uy, uz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
     vx, vy, vz = x[k] - x[i], y[k] - y[i], z[k] - z[i]
     determinant = ux * vy - uy * vx
@@ -47,7 +50,7 @@ def _plane_through(x: Array, y: Array, z: Array, i: int, j: int, k: int) -> tupl
 
 
 @njit(cache=True)
-def _least_squares(x: Array, y: Array, z: Array, mask: NDArray[np.bool_]) -> tuple[float, float, float]:
+def _fit_least_squares_plane(x: Array, y: Array, z: Array, mask: NDArray[np.bool_]) -> tuple[float, float, float]:
     """Value at (0, 0) and slopes of the least-squares plane of the points in `mask`; NaN if they are collinear."""
     n, mx, my, mz = 0, 0.0, 0.0, 0.0
     for i in range(x.size):
@@ -80,10 +83,10 @@ def _least_squares(x: Array, y: Array, z: Array, mask: NDArray[np.bool_]) -> tup
 
 @njit(cache=True)
 def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> tuple[float, float, float]:
-    """Value at (0, 0) and slopes of the least-median-of-squares plane, the best of planes through random triples.
+    """Value at (0, 0) and slopes of the least-median-of-squares plane (section III): the best plane of random triples.
 
-    `triples` are uniform numbers in [0, 1), one row per trial. x and y are integers (cells). The median is that of
-    Rousseeuw & Leroy (1987): the (n / 2 + 2)-th smallest value for the three unknowns of a plane.
+    `triples` are uniform random numbers in [0, 1), one row per trial. x and y are integers (cells). The median of n
+    values is their (n / 2 + 2)-th smallest, for three unknowns (Rousseeuw & Leroy 1987). `refine`: fit to the inliers.
     """
     n = x.size
     order = min(n // 2 + 2, n) - 1
@@ -98,7 +101,7 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
         low, high = min(i, j), max(i, j)
         k += k >= low
         k += k >= high
-        value, slope_x, slope_y = _plane_through(x, y, z, i, j, k)
+        value, slope_x, slope_y = _fit_exact_plane(x, y, z, i, j, k)
         if math.isnan(value):
             continue
         closer_count = 0
@@ -106,7 +109,7 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
             distance = abs(z[m] - value - slope_x * x[m] - slope_y * y[m])
             distances[m] = distance
             closer_count += distance < best
-        # The median is below the best one only if enough distances are.
+        # The median can only improve if enough distances are below the best median.
         if closer_count > order:
             best = np.partition(distances, order)[order]
             plane = (value, slope_x, slope_y)
@@ -116,7 +119,7 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
     inliers = np.empty(n, dtype=np.bool_)
     for m in range(n):
         inliers[m] = abs(z[m] - plane[0] - plane[1] * x[m] - plane[2] * y[m]) <= limit
-    refined = _least_squares(x, y, z, inliers)
+    refined = _fit_least_squares_plane(x, y, z, inliers)
     return plane if math.isnan(refined[0]) else refined
 
 
@@ -125,7 +128,7 @@ def footprint_planes(
     elevation: Array, first_rows: NDArray[np.int64], first_columns: NDArray[np.int64], side: int, min_cells: int,
     triples: Array, refine: bool,
 ) -> Array:  # fmt: skip
-    """Planes of squares of `side` cells with these first rows and columns, shape (rows, columns, 3).
+    """Fit robust planes to squares of `side` cells that start at these rows and columns, shape (rows, columns, 3).
 
     Value at the square's centre, slopes per column and per row; NaN if fewer than `min_cells` cells are valid.
     """
@@ -156,25 +159,25 @@ def evaluate_footprints(
     elevation: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], offsets: NDArray[np.int64],
     fit_offsets: NDArray[np.int64], min_cells: int, triples: Array, refine: bool,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Slope per cell of the robust plane through each footprint, and the maximum distance of a cell from it.
+    """Fit a robust plane to each footprint; return its slope per cell and the maximum distance of a cell from it.
 
-    `offsets` are a footprint's cells relative to its centre (row, column), `fit_offsets` those used for the plane fit.
-    NaN if fewer than `min_cells` of the latter are valid.
+    `rows` and `columns` are the footprints' centres, `offsets` a footprint's cells relative to its centre (row,
+    column), `fit_offsets` the cells for the plane fit. NaN if fewer than `min_cells` of the fit's cells are valid.
     """
     count = rows.size
     slopes, roughness = np.full(count, np.nan), np.full(count, np.nan)
     n = fit_offsets.shape[0]
     x, y, z = np.empty(n), np.empty(n), np.empty(n)
     for k in range(count):
-        known_count = 0
+        valid_count = 0
         for m in range(n):
             i, j = rows[k] + fit_offsets[m, 0], columns[k] + fit_offsets[m, 1]
             if 0 <= i < elevation.shape[0] and 0 <= j < elevation.shape[1] and not math.isnan(elevation[i, j]):
-                x[known_count], y[known_count], z[known_count] = fit_offsets[m, 1], fit_offsets[m, 0], elevation[i, j]
-                known_count += 1
-        if known_count < min_cells:
+                x[valid_count], y[valid_count], z[valid_count] = fit_offsets[m, 1], fit_offsets[m, 0], elevation[i, j]
+                valid_count += 1
+        if valid_count < min_cells:
             continue
-        value, slope_x, slope_y = robust_plane(x[:known_count], y[:known_count], z[:known_count], triples, refine)
+        value, slope_x, slope_y = robust_plane(x[:valid_count], y[:valid_count], z[:valid_count], triples, refine)
         max_distance = 0.0
         for m in range(offsets.shape[0]):
             i, j = rows[k] + offsets[m, 0], columns[k] + offsets[m, 1]

@@ -1,4 +1,4 @@
-"""Pixel correlation, sub-pixel peak fit, and searches in a window and along an epipolar segment."""
+"""Kernels of 'Vision Guided Landing': correlation tracker (section II.A) and search on epipolar segments (II.C)."""
 
 from __future__ import annotations
 
@@ -11,37 +11,38 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Array = NDArray[np.float64]
 
-#: Minimum energy per pixel (squared counts) of a textured patch; rounding errors alone stay below it.
+#: Minimum energy per pixel (squared counts) of a textured patch; rounding errors in a uniform patch are smaller.
 FLAT_ENERGY = 1e-6
 
 
 @njit(cache=True)
 def correlation(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int) -> float:
-    """Normalised correlation (Eq. 3) of two mean-free patches centred at (r1, c1) and (r2, c2), inside their images."""
-    sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0
+    """Correlation (Eq. 3, section II.A) of two patches, each minus its mean, centred at (r1, c1) and (r2, c2)."""
+    sum_a, sum_b, sum_aa, sum_bb, sum_ab = 0.0, 0.0, 0.0, 0.0, 0.0
     # Subtract the centre value first to avoid cancellation in the variances.
-    base_a = np.float64(first[r1, c1])
-    base_b = np.float64(second[r2, c2])
+    centre_a = np.float64(first[r1, c1])
+    centre_b = np.float64(second[r2, c2])
     for i in range(-half, half + 1):
         for j in range(-half, half + 1):
-            a = first[r1 + i, c1 + j] - base_a
-            b = second[r2 + i, c2 + j] - base_b
-            sa += a
-            sb += b
-            saa += a * a
-            sbb += b * b
-            sab += a * b
+            a = first[r1 + i, c1 + j] - centre_a
+            b = second[r2 + i, c2 + j] - centre_b
+            sum_a += a
+            sum_b += b
+            sum_aa += a * a
+            sum_bb += b * b
+            sum_ab += a * b
     n = (2 * half + 1) ** 2
-    energy = saa - sa * sa / n + sbb - sb * sb / n
-    return 0.0 if energy <= FLAT_ENERGY * n else 2.0 * (sab - sa * sb / n) / energy
+    energy = sum_aa - sum_a * sum_a / n + sum_bb - sum_b * sum_b / n
+    return 0.0 if energy <= FLAT_ENERGY * n else 2.0 * (sum_ab - sum_a * sum_b / n) / energy
 
 
 @njit(cache=True)
 def fit_biquadratic_peak(z: Array) -> tuple[float, float, float]:
-    """Row, column and value of the maximum of a least-squares quadratic fit to 3 x 3 values.
+    """Row, column and value of the maximum of a quadratic least-squares fit to 3 x 3 values (section II.A).
 
-    The position is clamped to [-1, 1]. Returns the centre and its value if the quadratic has no maximum.
+    The position is relative to the centre, clamped to [-1, 1]. Returns the centre and its value without a maximum.
     """
+    # gradient (gr, gc) and second derivatives (rr, cc, rc) of the quadratic
     gr, gc, rr, cc, rc, mean = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(3):
         for j in range(3):
@@ -72,7 +73,7 @@ def window_fits(image: Image, row: int, column: int, radius: int) -> bool:
 def search_window(
     first: Image, second: Image, r1: int, c1: int, row: int, column: int, half: int, radius: int
 ) -> tuple[int, int, float]:
-    """Position and value of the highest correlation within `radius` pixels of (row, column); -2 if no window fits."""
+    """Row, column and value of the highest correlation within `radius` of (row, column); -2 if no window fits."""
     best_row, best_column, best = row, column, -2.0
     for i in range(row - radius, row + radius + 1):
         for j in range(column - radius, column + radius + 1):
@@ -87,7 +88,7 @@ def search_window(
 def search_windows(
     first: Image, second: Image, positions: NDArray[np.int64], shifts: NDArray[np.int64], half: int, radius: int
 ) -> tuple[NDArray[np.int64], Array]:
-    """Best shift of each position (row, column) within `radius` of its initial shift, and Eq. 3; -2 if none fits."""
+    """Best shift of each position (row, column) near its initial shift, and its correlation; -2 if no window fits."""
     new_shifts = shifts.copy()
     values = np.full(positions.shape[0], -2.0)
     for k in range(positions.shape[0]):
@@ -103,7 +104,7 @@ def search_windows(
 def refine_peak(
     first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int
 ) -> tuple[float, float, float]:
-    """Row, column and correlation of the biquadratic peak around (r2, c2); NaN if a window does not fit."""
+    """Row, column and value of the biquadratic correlation peak around (r2, c2); NaN if a window does not fit."""
     if not window_fits(second, r2, c2, half + 1):
         return math.nan, math.nan, math.nan
     z = np.empty((3, 3))
@@ -119,7 +120,7 @@ def refine_peak(
 def refine_shifts(
     first: Image, second: Image, positions: NDArray[np.int64], shifts: NDArray[np.int64], half: int
 ) -> tuple[Array, Array]:
-    """Sub-pixel positions (u, v) in the second image and their correlations; NaN if a window does not fit."""
+    """Sub-pixel positions (u, v) in the second image and their correlations (II.A, II.C); NaN if no window fits."""
     pixels = np.empty((positions.shape[0], 2))
     values = np.empty(positions.shape[0])
     for k in range(positions.shape[0]):
@@ -133,16 +134,16 @@ def refine_shifts(
 def absolute_differences(
     first: NDArray[np.uint16], second: NDArray[np.uint16], r1: int, c1: int, r2: int, c2: int, half: int, max_sum: int
 ) -> int:
-    """Sum of absolute differences (Eq. 9) of the windows around two pixels; stops when it exceeds `max_sum`."""
+    """Sum of absolute differences (Eq. 9, section II.C) of two windows; stops when the sum exceeds `max_sum`."""
     width = 2 * half + 1
     total = 0
     for i in range(-half, half + 1):
         a = first[r1 + i, c1 - half : c1 - half + width]
         b = second[r2 + i, c2 - half : c2 - half + width]
-        row = 0
+        row_sum = 0
         for j in range(width):
-            row += int(abs(np.int32(a[j]) - np.int32(b[j])))
-        total += row
+            row_sum += int(abs(np.int32(a[j]) - np.int32(b[j])))
+        total += row_sum
         if total > max_sum:
             break
     return total
@@ -157,10 +158,10 @@ def search_segments(
     ends: Array,
     half: int,
 ) -> NDArray[np.int64]:
-    """Find the match of each pixel (u, v) of the first image on its epipolar segment in the second image.
+    """Find the match of each pixel (u, v) on its epipolar segment in the second image (section II.C).
 
-    The match is the pixel that minimises the sum of absolute differences (Eq. 9). Samples are one pixel apart along the
-    longer axis, rounded to whole pixels. All windows must lie inside the image.
+    The match is the pixel of minimum sum of absolute differences (Eq. 9). The tested pixels are one pixel apart along
+    the longer axis of the segment, rounded to whole pixels. All windows must lie inside the image.
     """
     best_pixels = np.empty_like(pixels)
     for k in range(pixels.shape[0]):

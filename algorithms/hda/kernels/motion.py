@@ -1,4 +1,4 @@
-"""Motion of a camera and depths of features by robust least squares: Levenberg-Marquardt with the depths eliminated."""
+"""Kernel of structure from motion (section II.B): robust least squares by Levenberg-Marquardt, depths eliminated."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+#: Damping above which the iteration ends without convergence.
 MAX_DAMPING = 1e12
-#: Curvature added for each depth, fraction of the squared focal length: depths do not change without camera motion.
-DEPTH_FLOOR = 1e-14
+#: Curvature added for each depth, fraction of the squared focal length; without camera motion, depths do not change.
+DEPTH_CURVATURE = 1e-14
 
 
 class Matches(NamedTuple):
@@ -92,7 +93,7 @@ def cauchy_cost(r: Array, scale: float) -> float:
 
 @njit(cache=True)
 def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, Jm: Array, Jd: Array) -> None:
-    """Derivatives of one residual by rotation (from the left) and translation (`Jm`), and by inverse depth (`Jd`)."""
+    """Derivatives of one residual by rotation (left-multiplied) and translation (`Jm`), and by inverse depth (`Jd`)."""
     ax = R[0, 0] * x + R[0, 1] * y + R[0, 2]
     ay = R[1, 0] * x + R[1, 1] * y + R[1, 2]
     az = R[2, 0] * x + R[2, 1] * y + R[2, 2]
@@ -128,17 +129,17 @@ def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, wi
     for i in range(n):
         weight = 1.0 / (1.0 + (r[i, 0] ** 2 + r[i, 1] ** 2) / scale**2)
         _jacobian(first[i, 0], first[i, 1], motion.inverse_depths[i], focal, R, motion.t, Jm, Jd)
-        curvature[i] = weight * (Jd[0] ** 2 + Jd[1] ** 2) * (1.0 + damping) + DEPTH_FLOOR * focal**2
+        curvature[i] = weight * (Jd[0] ** 2 + Jd[1] ** 2) * (1.0 + damping) + DEPTH_CURVATURE * focal**2
         slope[i] = weight * (Jd[0] * r[i, 0] + Jd[1] * r[i, 1])
         for a in range(6):
             mixed[i, a] = weight * (Jm[0, a] * Jd[0] + Jm[1, a] * Jd[1])
-        eliminated = 1.0 / curvature[i] if with_depths else 0.0
+        inverse_curvature = 1.0 / curvature[i] if with_depths else 0.0
         for a in range(6):
-            g[a] += weight * (Jm[0, a] * r[i, 0] + Jm[1, a] * r[i, 1]) - mixed[i, a] * slope[i] * eliminated
+            g[a] += weight * (Jm[0, a] * r[i, 0] + Jm[1, a] * r[i, 1]) - mixed[i, a] * slope[i] * inverse_curvature
             diagonal[a] += weight * (Jm[0, a] ** 2 + Jm[1, a] ** 2)
             for b in range(6):
                 S[a, b] += weight * (Jm[0, a] * Jm[0, b] + Jm[1, a] * Jm[1, b])
-                S[a, b] -= mixed[i, a] * mixed[i, b] * eliminated
+                S[a, b] -= mixed[i, a] * mixed[i, b] * inverse_curvature
     for a in range(6):
         S[a, a] += damping * diagonal[a] + 1e-15 * focal**2
     step, depth_steps = np.full(6, math.nan), np.zeros(n)
@@ -154,10 +155,10 @@ def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, wi
 def solve(
     matches: Matches, start: Motion, with_depths: bool, iterations: int, tolerance: float
 ) -> tuple[Motion, float, bool, int]:
-    """Minimise Cauchy's cost from an initial motion; translation and depths have the same unit.
+    """Minimise Cauchy's cost from the motion `start`; translation and depths have the same unit.
 
-    Returns motion with inverse depths, cost, whether it converged (step length below the tolerance), and the number of
-    steps.
+    Returns the motion with inverse depths, its cost, whether the iteration converged (step length below `tolerance`),
+    and the number of steps. `with_depths`: whether the inverse depths are estimated or fixed.
     """
     motion = start
     r = residuals(matches, motion)
@@ -168,13 +169,13 @@ def solve(
         trial = Motion(rotate_quaternion(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps)
         new_r = residuals(matches, trial)
         new_cost = cauchy_cost(new_r, matches.scale)
-        size = math.sqrt(np.sum(step * step))
+        step_length = math.sqrt(np.sum(step * step))
         if new_cost <= cost:
             motion, r, cost = trial, new_r, new_cost
             damping = max(damping * 0.1, 1e-12)
-            if size < tolerance:
+            if step_length < tolerance:
                 return motion, cost, True, iteration + 1
-        elif size < tolerance:
+        elif step_length < tolerance:
             return motion, cost, True, iteration + 1
         else:
             damping *= 10.0

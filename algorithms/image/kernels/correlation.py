@@ -1,7 +1,7 @@
-"""Compiled correlation; definitions and input checks are in `marsyard.algorithms.image.correlation`.
+"""Compiled kernels of `marsyard.algorithms.image.correlation`, which contains the definitions and checks the inputs.
 
-Normalised correlation uses float32 images, so that a vector register holds eight values. Sums that are subtracted from
-each other are float64.
+Normalised correlation uses float32 images, so that a vector register contains eight values. Sums that are subtracted
+from each other are float64. Eq. 11 is that of the tracking paper.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Array = NDArray[np.float64]
 
-#: Energy of a patch, relative to that of its largest value, below which the patch is flat: rounding errors only.
+#: A patch with less energy is uniform except for rounding errors; fraction of (number of pixels) x (largest value)^2.
 FLAT_ENERGY = 1e-12
 
 
@@ -40,7 +40,7 @@ def subtract_mean(image: Image) -> tuple[Image, float]:
 
 @njit(cache=True)
 def energy(image: Image) -> float:
-    """Sum of squares."""
+    """Energy of an image: sum of squares."""
     total = 0.0
     for i in range(image.shape[0]):
         row = image[i]
@@ -51,16 +51,16 @@ def energy(image: Image) -> float:
 
 
 @njit(cache=True)
-def ratio(cross: float, energy_a: float, energy_b: float, floor: float) -> float:
-    """Eq. 11 from its three sums; 0 if either patch is flat."""
+def normalize(cross: float, energy_a: float, energy_b: float, floor: float) -> float:
+    """Compute Eq. 11, ``cross / sqrt(energy_a energy_b)``; 0 if an energy is at most `floor`."""
     if energy_a <= floor or energy_b <= floor:
         return 0.0
     return min(max(cross / math.sqrt(energy_a * energy_b), -1.0), 1.0)
 
 
 @njit(cache=True)
-def surface(template: Image, window: Image, floor: float) -> Array:
-    """Eq. 11 at every position where the template fits; template and window are given minus their means.
+def correlation_surface(template: Image, window: Image, floor: float) -> Array:
+    """Compute Eq. 11 at every position where the template fits; both arguments must have a mean of zero.
 
     The inner loop multiplies a row of the window by one number, for vector instructions.
     """
@@ -90,7 +90,7 @@ def surface(template: Image, window: Image, floor: float) -> Array:
         for j in range(columns):
             total += sums[j + m - 1]
             total_squares += squares[j + m - 1]
-            result[i, j] = ratio(cross[j], energy_a, total_squares - total * total / count, floor)
+            result[i, j] = normalize(cross[j], energy_a, total_squares - total * total / count, floor)
             total -= sums[j]
             total_squares -= squares[j]
         _add_row(sums, squares, window[i], -1.0)
@@ -99,6 +99,7 @@ def surface(template: Image, window: Image, floor: float) -> Array:
 
 @njit(cache=True)
 def _add_row(sums: Array, squares: Array, row: Image, sign: float) -> None:
+    """Add a row to column sums and sums of squares (`sign` 1), or subtract it (-1)."""
     for j in range(row.size):
         value = np.float64(row[j])
         sums[j] += sign * value
@@ -111,8 +112,8 @@ def search_near(
 ) -> tuple[NDArray[np.int64], Array]:
     """Search the best position within `radius` rows and columns of each position (row, column).
 
-    Returns the best positions and Eq. 11 at each. Positions outside the window are moved to its border. The template is
-    given minus its mean, the window unchanged: all sums are float64.
+    Returns the best positions and Eq. 11 at each. Positions outside the window are clamped to its border. The template
+    must have a mean of zero; the window is unchanged, because all sums are float64.
     """
     n, m = template.shape
     last_row, last_column = window.shape[0] - n, window.shape[1] - m
@@ -135,7 +136,7 @@ def search_near(
                         cross += template_row[c] * value
                         total += value
                         squares += value * value
-                score = ratio(cross, energy_a, squares - total * total / count, floor)
+                score = normalize(cross, energy_a, squares - total * total / count, floor)
                 if score > values[k]:
                     values[k] = score
                     best[k, 0], best[k, 1] = i, j
@@ -149,7 +150,7 @@ def pseudo_normalized(cross: Array, window: Array, shape: tuple[int, int], energ
     0 where the sum of both energies is at most `floor`; clipped to [-1, 1].
     """
     n, m = shape
-    sums, squares = _integrals(window)
+    sums, squares = _integral_images(window)
     result = np.empty((window.shape[0] - n + 1, window.shape[1] - m + 1))
     for i in range(result.shape[0]):
         for j in range(result.shape[1]):
@@ -161,7 +162,7 @@ def pseudo_normalized(cross: Array, window: Array, shape: tuple[int, int], energ
 
 
 @njit(cache=True)
-def _integrals(image: Array) -> tuple[Array, Array]:
+def _integral_images(image: Array) -> tuple[Array, Array]:
     """Integral images of the image and of its squares, shapes (rows + 1, columns + 1)."""
     rows, columns = image.shape
     sums, squares = np.zeros((rows + 1, columns + 1)), np.zeros((rows + 1, columns + 1))

@@ -1,4 +1,4 @@
-"""Compiled evaluation of cubic splines from their coefficients, equal to SciPy's `map_coordinates`."""
+"""Compiled evaluation of cubic splines from their coefficients, equal to SciPy's `map_coordinates`; used by DIMES."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @njit(cache=True)
 def sample(coefficients: Array, pixels: Array, row: int, column: int, values: Array) -> None:
-    """Evaluate the spline at `pixels` (u, v), shape (n, m, 2); the first coefficient is that of pixel (row, column).
+    """Store the spline at `pixels` (u, v), shape (n, m, 2), in `values`; the first coefficient is at (row, column).
 
     All pixels must lie within the centres of the outermost coefficients; the spline is mirrored at these centres.
     """
@@ -28,15 +28,16 @@ def sample(coefficients: Array, pixels: Array, row: int, column: int, values: Ar
             is_inside = r >= 0 and c >= 0 and r + 3 < rows and c + 3 < columns
             total = 0.0
             for a in range(4):
-                line = coefficients[r + a if is_inside else _mirror_index(r + a, rows)]
+                coefficient_row = coefficients[r + a if is_inside else _mirror_index(r + a, rows)]
                 for b in range(4):
-                    total += line[c + b if is_inside else _mirror_index(c + b, columns)] * weights_v[a] * weights_u[b]
+                    k = c + b if is_inside else _mirror_index(c + b, columns)
+                    total += coefficient_row[k] * weights_v[a] * weights_u[b]
             values[i, j] = total
 
 
 @njit(cache=True)
 def _weights(fraction: float, weights: Array) -> None:
-    """Weights of the four coefficients around a point at `fraction` after its pixel; their sum is 1."""
+    """Store the cubic B-spline weights of four coefficients; the point is `fraction` pixels after the second one."""
     complement = 1.0 - fraction
     weights[0] = complement * complement * complement / 6.0
     weights[1] = (fraction * fraction * (fraction - 2.0) * 3.0 + 4.0) / 6.0
@@ -55,9 +56,9 @@ def _mirror_index(index: int, size: int) -> int:
 
 @njit(cache=True)
 def clamp(pixels: Array, visible: NDArray[np.bool_], columns: int, rows: int) -> tuple[float, float, float, float]:
-    """Clamp pixels (u, v), shape (n, m, 2), to the image; invisible ones are moved to its upper left corner.
+    """Clamp pixels (u, v), shape (n, m, 2), to the image in place; invisible pixels become its upper left pixel.
 
-    Returns the resulting limits (left, right, top, bottom).
+    Returns the bounding box of the clamped pixels (left, right, top, bottom).
     """
     left, right = math.inf, -math.inf
     top, bottom = math.inf, -math.inf

@@ -1,4 +1,4 @@
-"""Compiled evaluation of quintic splines from their coefficients."""
+"""Compiled evaluation of quintic splines from their coefficients, for `marsyard.algorithms.image.registration`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _spline_2_to_3(x: float) -> float:
 
 @njit(cache=True, inline="always")
 def _all_weights(fraction: float) -> tuple[float, float, float, float, float, float]:
-    """Weights of the six coefficients around a point at `fraction` after its pixel, starting two pixels before it."""
+    """Weights of the six coefficients around a point `fraction` pixels after its pixel, from two pixels before it."""
     return (
         _spline_2_to_3(fraction + 2.0),
         _spline_1_to_2(fraction + 1.0),
@@ -45,7 +45,7 @@ def _all_weights(fraction: float) -> tuple[float, float, float, float, float, fl
 
 @njit(cache=True)
 def quintic_weights(fraction: float, weights: Array) -> None:
-    """Store the six weights of a point."""
+    """Store the six weights of `_all_weights`."""
     weights[0], weights[1], weights[2], weights[3], weights[4], weights[5] = _all_weights(fraction)
 
 
@@ -60,7 +60,10 @@ def _compute_weights(fractions: Array, weights: Array) -> None:
 
 @njit(cache=True)
 def sample(coefficients: Array, side: int, row: float, column: float, warp: Array, values: Array) -> bool:
-    """Evaluate the spline at ``(row, column) + warp @ (y, x, yy, yx, xx)`` of a square's offsets; False if outside."""
+    """Evaluate the spline at ``(row, column) + warp @ (y, x, y y, y x, x x)``; return False if a point is outside.
+
+    (y, x) are the offsets of the pixels of a square of `side` pixels from its centre.
+    """
     half = 0.5 * (side - 1)
     last_row, last_column = coefficients.shape[0] - 4, coefficients.shape[1] - 4
     rows, columns = np.empty(side * side, dtype=np.int64), np.empty(side * side, dtype=np.int64)
@@ -94,7 +97,7 @@ def sample(coefficients: Array, side: int, row: float, column: float, warp: Arra
 
 @njit(cache=True)
 def sample_shifted(coefficients: Array, side: int, row: float, column: float, values: Array) -> bool:
-    """`sample` for a pure shift: all pixels have the same fraction, so that rows and columns are separable."""
+    """Evaluate `sample` for a pure shift: all pixels have the same weights, and rows and columns are separable."""
     half = 0.5 * (side - 1)
     v, u = row - half, column - half
     if not (v >= 2.0 and u >= 2.0 and v + side <= coefficients.shape[0] - 3):
@@ -129,8 +132,8 @@ def sample_with_derivatives(
 ) -> None:
     """Evaluate a patch of the spline and its two derivatives; the upper left pixel is (row, column) plus a fraction.
 
-    `row_taps` and `column_taps` are the six filter taps of values and of slopes, shape (2, 6), starting two pixels
-    before. `output`, shape (3, rows, columns), receives values, derivatives by row and derivatives by column.
+    `row_taps` and `column_taps` are the six filter taps for values and for slopes, shape (2, 6), from two pixels before
+    the pixel. Values, derivatives by row and by column are stored in `output`, shape (3, rows, columns).
     """
     _, height, width = output.shape
     values, slopes = np.empty(width + 5), np.empty(width + 5)

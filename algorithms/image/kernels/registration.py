@@ -1,4 +1,4 @@
-"""Compiled registration; definitions and input checks are in `marsyard.algorithms.image.registration`."""
+"""Compiled kernels of `marsyard.algorithms.image.registration`; definitions and input checks are in that module."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNKNOWNS = (4, 8, 14)
 
 @njit(cache=True)
 def build_design_matrix(template: Array, unknowns: int) -> Array:
-    """Design matrix, one row per pixel: template, constant, derivatives by shift (2), affine (4), quadratic (6)."""
+    """Build the design matrix, one row per pixel: template, 1, derivatives by shift (2), affine (4), quadratic (6)."""
     side = template.shape[0]
     half = 0.5 * (side - 1)
     mean = template.mean()
@@ -46,8 +46,8 @@ def build_design_matrix(template: Array, unknowns: int) -> Array:
 
 
 @njit(cache=True)
-def products(matrix: Array) -> Array:
-    """``matrix^T matrix``."""
+def normal_matrix(matrix: Array) -> Array:
+    """Compute the normal matrix ``matrix^T matrix``."""
     unknowns = matrix.shape[1]
     sums = np.zeros((unknowns, unknowns))
     for k in range(matrix.shape[0]):
@@ -59,8 +59,8 @@ def products(matrix: Array) -> Array:
 
 
 @njit(cache=True)
-def project(matrix: Array, values: Array, sums: Array) -> None:
-    """``matrix^T values``."""
+def multiply_transposed(matrix: Array, values: Array, sums: Array) -> None:
+    """Store ``matrix^T values`` in `sums`."""
     sums[:] = 0.0
     for k in range(matrix.shape[0]):
         design_row = matrix[k]
@@ -69,7 +69,7 @@ def project(matrix: Array, values: Array, sums: Array) -> None:
 
 
 @njit(cache=True)
-def cholesky(matrix: Array, min_pivot: float) -> bool:
+def factorize_cholesky(matrix: Array, min_pivot: float) -> bool:
     """Replace a matrix with unit diagonal by its lower Cholesky factor; False if a pivot is below `min_pivot`."""
     for i in range(len(matrix)):
         for j in range(i + 1):
@@ -101,10 +101,10 @@ def solve(lower: Array, values: Array) -> None:
 
 @njit(cache=True)
 def compose_with_inverse(warp: Array, change: Array) -> bool:
-    """Compose a warp with the inverse of a small one, in place; False if the small one is singular.
+    """Compose a warp with the inverse of the small warp ``identity + change``, in place; False if that is singular.
 
-    Both have shape (2, 5): coefficients of y, x, y^2, y x and x^2. Products of quadratic terms are neglected: they
-    vanish with the change.
+    Both arrays have shape (2, 5): coefficients of y, x, y^2, y x and x^2. Products of quadratic terms are neglected,
+    because they vanish at convergence.
     """
     a, b, c, d = 1.0 + change[0, 0], change[0, 1], change[1, 0], 1.0 + change[1, 1]
     determinant = a * d - b * c
@@ -142,10 +142,10 @@ def register(
     tolerance: float,
     min_pivot: float,
 ) -> tuple[bool, float, float, float]:
-    """Register a template: convergence, row and column of its centre, and correlation. See `register_template`.
+    """Register a template (see `register_template`); return convergence, row and column of its centre, correlation.
 
     `order` is 0 for a pure shift, 1 with affine terms, 2 also with quadratic terms. `limits` are the largest shift, the
-    largest warp size and the number of steps.
+    largest warp size and the maximum number of steps.
     """
     side = template.shape[0]
     half = 0.5 * (side - 1)
@@ -157,8 +157,8 @@ def register(
         if not scales[p] > 0.0:
             return failed
     matrix /= scales
-    lower = products(matrix)
-    if not cholesky(lower, min_pivot):
+    lower = normal_matrix(matrix)
+    if not factorize_cholesky(lower, min_pivot):
         return failed
     values = np.empty(side * side)
     solution = np.empty(unknowns)
@@ -172,7 +172,7 @@ def register(
         if not is_inside:
             return failed
         values -= values.mean()
-        project(matrix, values, solution)
+        multiply_transposed(matrix, values, solution)
         norm = math.sqrt(np.sum(values * values))
         if not (solution[0] > 0.0 and norm > 0.0):
             return failed
@@ -185,7 +185,7 @@ def register(
             return failed
         warp_change = 0.0
         if order > 0:
-            # the solution warps the template: compose the warp with its inverse
+            # inverse compositional: the solution warps the template, so compose the warp with its inverse
             for i in range(2):
                 change[i, 0], change[i, 1] = solution[4 + 2 * i] / gain, solution[5 + 2 * i] / gain
                 if order > 1:

@@ -16,9 +16,9 @@ from marsyard.algorithms.hda.structure import (
     dense_structure,
     depth_bounds,
     epipolar_segments,
+    forward_backward_error,
     match_pixels,
     pixel_lattice,
-    return_distance,
     scale_factor,
     triangulate,
 )
@@ -217,7 +217,7 @@ def test_correct_matches_pass_the_reverse_check(scene: Pass, landing_scene: Land
     _, _, is_inside = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
     pixels, positions = pixels[is_inside].astype(np.int64), positions[is_inside]
     true_pixels = np.rint(scene.camera(1).project(scene.ground(0, pixels.astype(np.float64)))[0]).astype(np.int64)
-    return_distance_px = return_distance(
+    return_distance_px = forward_backward_error(
         landing_scene.views, scene.second_from_first, pixels, true_pixels, positions, (7.0, 13.0), 5
     )
     # Both searches use whole pixels: 0.7 px each, plus the effect of relief within a window.

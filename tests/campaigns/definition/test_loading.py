@@ -15,10 +15,12 @@ from marsyard.campaigns.definition.loading import catalogue, find_campaign, load
 from marsyard.campaigns.errors import ConfigurationError
 
 CampaignFile = Callable[..., Path]
+#: Module of the fake scenarios.
 FAKE = "tests.campaigns.fake_scenario"
 
 
 def load_and_expect_error(path: Path | str, *overrides: str, cases: int | None = None, seed: int | None = None) -> str:
+    """Return the message of the error that loading the campaign raises."""
     with pytest.raises(ConfigurationError) as raised:
         load_campaign(str(path), overrides, cases, seed)
     return str(raised.value)
@@ -107,7 +109,7 @@ def test_draws_with_invalid_combinations_are_reported(campaign_file: CampaignFil
 
 
 @pytest.mark.parametrize(
-    ("head", "message"),
+    ("top_level_keys", "message"),
     [
         ("name='a'\nscenario='descnt'\ncases=1", "unknown scenario 'descnt' (did you mean 'descent'?)"),
         ("name='a'\nscenario='no_such_module:X'\ncases=1", "cannot import scenario 'no_such_module:X': No module"),
@@ -121,8 +123,8 @@ def test_draws_with_invalid_combinations_are_reported(campaign_file: CampaignFil
         (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nx=", "not valid TOML"),
     ],
 )
-def test_invalid_campaign_keys_are_reported(campaign_file: CampaignFile, head: str, message: str) -> None:
-    path = campaign_file(head=head)
+def test_invalid_campaign_keys_are_reported(campaign_file: CampaignFile, top_level_keys: str, message: str) -> None:
+    path = campaign_file(top_level_keys=top_level_keys)
     text = load_and_expect_error(path)
     assert text.startswith(f"{path}: ")
     assert message in text
@@ -156,7 +158,7 @@ def test_duplicate_requirement_ids_are_rejected(campaign_file: CampaignFile) -> 
 
 def test_all_problems_are_listed_together(campaign_file: CampaignFile) -> None:
     path = campaign_file(
-        "altitude_m = -1\nwnd = 3", more="[retain]\nshowcase = 'best'", dispersions="[dispersions]\nkind = 3"
+        "altitude_m = -1\nwnd = 3", extra_tables="[retain]\nshowcase = 'best'", dispersions="[dispersions]\nkind = 3"
     )
     with pytest.raises(ConfigurationError) as raised:
         load_campaign(str(path), [], cases=0)
@@ -186,10 +188,10 @@ def test_catalogue_campaigns_load_by_name() -> None:
         assert find_campaign(name) == path
         configuration = load_campaign(name).configuration
         assert configuration.name == name
-        assert [path for path, entry in configuration.dispersions.items() if not entry.source] == []
+        assert [key for key, dispersion in configuration.dispersions.items() if not dispersion.source] == []
 
 
-def test_example_of_the_documentation_loads(tmp_path: Path) -> None:
+def test_documented_sampling_example_can_be_loaded(tmp_path: Path) -> None:
     text = (Path(__file__).parents[3] / "docs" / "sampling.md").read_text()
     example = text.partition("```toml\n")[2].partition("```")[0]
     path = tmp_path / "example.toml"
@@ -206,11 +208,11 @@ def test_overrides_replace_values_and_dispersions(campaign_file: CampaignFile) -
     assert configuration.parameters["altitude_m"] == 1500.0
     assert configuration.parameters["kind"] == "smooth"
     assert configuration.parameters["heights_m"] == [3.0, 4.5]
-    # Setting a parameter removes its dispersion.
+    # setting a parameter removes its dispersion
     assert set(configuration.dispersions) == {"terrain"}
-    quoted = load_campaign(path, ['dispersions."wind.east_m_s".low=-5', "cases=3", "parameters.kind=x"]).configuration
-    assert quoted.dispersions["wind.east_m_s"].quantile(1e-9) == pytest.approx(-5.0)
-    assert quoted.cases == 3
+    changed = load_campaign(path, ['dispersions."wind.east_m_s".low=-5', "cases=3", "parameters.kind=x"]).configuration
+    assert changed.dispersions["wind.east_m_s"].quantile(1e-9) == pytest.approx(-5.0)
+    assert changed.cases == 3
 
 
 @pytest.mark.parametrize(
@@ -235,36 +237,37 @@ def test_invalid_overrides_are_reported_by_option(campaign_file: CampaignFile, o
     assert message in text
 
 
+#: Words of valid and invalid keys and values for random campaign files.
 _WORDS = """
 name scenario cases seed parameters dispersions requirements retain wind altitude_m wind.east_m_s distribution uniform
 low high choice values truncate norm gamma id
 """
-_words = st.sampled_from(_WORDS.split())
+_random_words = st.sampled_from(_WORDS.split())
 
 
 def _to_toml(value: object) -> str:
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_to_toml(str(key))} = {_to_toml(inner)}" for key, inner in value.items()) + "}"
+        return "{" + ", ".join(f"{_to_toml(str(key))} = {_to_toml(entry)}" for key, entry in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(_to_toml, value)) + "]"
     if isinstance(value, str):
-        return '"' + "".join(f"\\u{ord(letter):04x}" for letter in value) + '"'
+        return '"' + "".join(f"\\u{ord(character):04x}" for character in value) + '"'
     return str(value).lower()
 
 
-_values = st.recursive(
-    st.booleans() | st.integers(-(10**6), 10**6) | st.floats() | _words,
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_words, inner, max_size=4),
+_random_values = st.recursive(
+    st.booleans() | st.integers(-(10**6), 10**6) | st.floats() | _random_words,
+    lambda elements: st.lists(elements, max_size=3) | st.dictionaries(_random_words, elements, max_size=4),
     max_leaves=8,
 )
 
 
-@given(changes=st.dictionaries(_words, _values, min_size=1, max_size=3))
+@given(changes=st.dictionaries(_random_words, _random_values, min_size=1, max_size=3))
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_random_files_load_or_report_their_keys(tmp_path: Path, changes: dict[str, object]) -> None:
+def test_random_files_are_loaded_or_their_keys_reported(tmp_path: Path, changes: dict[str, object]) -> None:
     base: dict[str, object] = {"name": "fake", "scenario": "tests.campaigns.fake_scenario:FakeScenario", "cases": 3}
     text = "\n".join(f"{_to_toml(key)} = {_to_toml(value)}" for key, value in {**base, **changes}.items())
-    path = tmp_path / "fuzzed.toml"
+    path = tmp_path / "random.toml"
     path.write_text(text)
     tomllib.loads(text)
     assert all(find_error_keys(lambda: load_campaign(str(path))))
@@ -290,36 +293,39 @@ _VALID_TABLES: dict[str, dict[str, object]] = {
 
 
 @given(
-    position=st.sampled_from([(table, key) for table, inner in _VALID_TABLES.items() for key in inner]),
-    value=_values,
+    table_and_key=st.sampled_from([(table, key) for table, entries in _VALID_TABLES.items() for key in entries]),
+    value=_random_values,
     is_removed=st.booleans(),
 )
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_invalid_value_is_reported_by_its_key(
-    tmp_path: Path, position: tuple[str, str], value: object, is_removed: bool
+    tmp_path: Path, table_and_key: tuple[str, str], value: object, is_removed: bool
 ) -> None:
-    table, key = position
-    tables = {name: dict(inner) for name, inner in _VALID_TABLES.items()}
+    table, key = table_and_key
+    tables = {name: dict(entries) for name, entries in _VALID_TABLES.items()}
     tables[table].pop(key) if is_removed else tables[table].update({key: value})
-    head = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\ncases = 12\n'
-    texts = [f"{name} = {_to_toml([inner] if name == 'requirements' else inner)}" for name, inner in tables.items()]
+    top_level_keys = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\ncases = 12\n'
+    lines = [
+        f"{name} = {_to_toml([entries] if name == 'requirements' else entries)}" for name, entries in tables.items()
+    ]
     path = tmp_path / "invalid.toml"
-    path.write_text(head + "\n".join(texts))
+    path.write_text(top_level_keys + "\n".join(lines))
     reported_keys = find_error_keys(lambda: load_campaign(str(path)))
-    # an invalid table is reported by the table's own name
-    assert all(name.startswith(table) for name in reported_keys), reported_keys
+    # an invalid table is reported by the name of the table
+    assert all(reported_key.startswith(table) for reported_key in reported_keys), reported_keys
     # no key accepts a table as value; a requirement needs metric and probability
-    assert reported_keys or not (key in ("metric", "probability") if is_removed else isinstance(value, dict))
+    is_invalid = key in ("metric", "probability") if is_removed else isinstance(value, dict)
+    assert reported_keys or not is_invalid
 
 
-@given(override=st.text(max_size=20) | st.builds("{}={}".format, _words, st.text(max_size=8)))
+@given(override=st.text(max_size=20) | st.builds("{}={}".format, _random_words, st.text(max_size=8)))
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_overrides_raise_only_configuration_errors(campaign_file: CampaignFile, override: str) -> None:
     with contextlib.suppress(ConfigurationError):
         load_campaign(str(campaign_file()), [override])
 
 
-def test_choice_between_tables_uses_defaults_for_omitted_keys(campaign_file: CampaignFile) -> None:
+def test_drawn_table_uses_defaults_for_omitted_keys(campaign_file: CampaignFile) -> None:
     """Omitted keys of a drawn table take their defaults, not the campaign's parameters."""
     choice = "[dispersions]\nwind = {distribution='choice', values=[{}, {east_m_s=3}, {north_m_s=-4, east_m_s=5}]}"
     path = str(campaign_file("wind = {north_m_s = 20}", dispersions=choice))
@@ -327,8 +333,8 @@ def test_choice_between_tables_uses_defaults_for_omitted_keys(campaign_file: Cam
     winds = {tuple(campaign.parameters(case).wind.model_dump().values()) for case in range(40)}  # type: ignore[attr-defined]
     assert winds == {(0.0, 0.0), (3.0, 0.0), (5.0, -4.0)}
     # setting a value of the table removes the dispersion of the table
-    fixed = load_campaign(path, ["wind.east_m_s=7"])
-    assert fixed.configuration.dispersions == {}
+    campaign_with_fixed_wind = load_campaign(path, ["wind.east_m_s=7"])
+    assert campaign_with_fixed_wind.configuration.dispersions == {}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Tests that the columns of requirements are checked against the scenario before terrain is built."""
+"""Tests of requirements: unknown columns in metrics and populations are reported before terrain is built."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.scenarios.descent.scenario import DescentScenario
 
-SCORE = """
+SCORE_MODULE = """
 def braking(case):
     return {"lateral_j": 1.0, "soft": True}
 """
 REQUIREMENT = """
 [[requirements]]
-id = "OWN"
+id = "CUSTOM"
 metric = "{metric}"
 {bound}
 probability = 0.9
@@ -28,8 +28,9 @@ population = "{population}"
 
 
 def _write_campaign(folder: Path, metric: str, population: str = "valid", bound: str = "bound = 5.0") -> Path:
+    """Write the campaign dimes-smoke with one custom requirement instead of its requirements."""
     text = catalogue()["dimes-smoke"].read_text(encoding="utf-8").partition("[[requirements]]")[0]
-    path = folder / "mine.toml"
+    path = folder / "custom.toml"
     path.write_text(text + REQUIREMENT.format(metric=metric, population=population, bound=bound))
     return path
 
@@ -61,16 +62,14 @@ def test_misspelt_columns_are_reported_before_terrain_is_built(
     assert not (tmp_path / "run").exists()
 
 
-def test_columns_of_scores_and_compared_algorithms_are_accepted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "my_scores.py").write_text(SCORE)
+def test_score_columns_and_algorithm_columns_are_accepted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_scores.py").write_text(SCORE_MODULE)
     monkeypatch.chdir(tmp_path)
     path = _write_campaign(tmp_path, "braking_lateral_j", "valid and braking_soft")
     load_campaign(str(path), ['scores=["my_scores:braking"]'])
     with pytest.raises(ConfigurationError, match="braking_lateral_j"):
         load_campaign(str(path))
-    comparison = _write_campaign(tmp_path, "homography.velocity_error_m_s", "homography.answered".partition(".")[2])
+    comparison = _write_campaign(tmp_path, "homography.velocity_error_m_s", "answered")
     load_campaign(str(comparison), algorithms=["dimes", "homography"])
 
 

@@ -1,4 +1,4 @@
-"""Tests of the shipped requirements and of files of requirements."""
+"""Tests of the requirements shipped with Marsyard and of requirement files of users."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from marsyard.campaigns.definition.requirements import read_requirements, select
 from marsyard.campaigns.errors import ConfigurationError
 from tests.campaigns.fake_campaign import write_campaign
 
+#: Bounds in the units of the metrics (m/s, m, s); None: the metric is true or false.
 BOUNDS = {
     "DIMES-VEL": 5.0, "DIMES-HARM": 5.0, "DIMES-AVAIL": None, "VTT-POS": 0.03, "VTT-TRACK": None, "VTT-HARM": None,
     "HDA-SAFE": None, "HDA-POS": 2.0, "HDA-TIME": 2.0,
 }  # fmt: skip
 
 
-def test_shipped_requirements_state_their_source() -> None:
+def test_shipped_requirements_have_a_source() -> None:
     shipped = shipped_requirements()
-    assert {name: requirement.bound for name, requirement in shipped.items()} == BOUNDS
+    assert {requirement_id: requirement.bound for requirement_id, requirement in shipped.items()} == BOUNDS
     assert all(
         requirement.kind and requirement.source and requirement.statement and requirement.campaigns
         for requirement in shipped.values()
@@ -34,26 +35,26 @@ def test_campaigns_of_requirements_exist() -> None:
 
 
 @pytest.mark.parametrize("name", catalogue())
-def test_campaigns_include_their_shipped_requirements(name: str) -> None:
+def test_campaigns_include_all_applicable_requirements(name: str) -> None:
     """The requirements' lists of campaigns agree with the campaigns' lists of requirements."""
     shipped = shipped_requirements()
     ids = {
         requirement.id for requirement in load_campaign(name).configuration.requirements if requirement.id in shipped
     }
-    assert ids == {one["id"] for one in select_applicable(list(shipped.values()), name)}
+    assert ids == {entry["id"] for entry in select_applicable(list(shipped.values()), name)}
 
 
 @pytest.mark.parametrize("name", catalogue())
-def test_campaigns_keep_metric_and_bound_of_shipped_requirements(name: str) -> None:
+def test_campaigns_do_not_change_metric_and_bound_of_shipped_requirements(name: str) -> None:
     for requirement in load_campaign(name).configuration.requirements:
-        original = shipped_requirements().get(requirement.id)
-        if original is not None:
+        shipped = shipped_requirements().get(requirement.id)
+        if shipped is not None:
             assert (requirement.metric, requirement.bound, requirement.kind) == (
-                original.metric,
-                original.bound,
-                original.kind,
+                shipped.metric,
+                shipped.bound,
+                shipped.kind,
             )
-            assert select_applicable([original], name)
+            assert select_applicable([shipped], name)
 
 
 def test_campaign_may_change_population_and_confidence(tmp_path: Path) -> None:
@@ -69,7 +70,7 @@ def test_campaign_may_change_population_and_confidence(tmp_path: Path) -> None:
     ("entry", "message"),
     [('id = "DIMES-VEE"', "did you mean 'DIMES-VEL'"), ('id = "DIMES-VEL"\nbound = 9.0', "requirements[0].bound")],
 )
-def test_unknown_requirement_names_are_reported(tmp_path: Path, entry: str, message: str) -> None:
+def test_unknown_id_and_changed_bound_are_reported(tmp_path: Path, entry: str, message: str) -> None:
     path = write_campaign(tmp_path, requirement=f"[[requirements]]\n{entry}\n")
     with pytest.raises(ConfigurationError) as raised:
         load_campaign(str(path))
@@ -82,7 +83,7 @@ ENTRY = (
 
 
 def test_campaign_patterns_select_requirements(tmp_path: Path) -> None:
-    path = tmp_path / "asked.toml"
+    path = tmp_path / "requirements.toml"
     path.write_text(ENTRY)
     (requirement,) = select_applicable(read_requirements(path), "dimes-gusev")
     assert (requirement["id"], "campaigns" in requirement) == ("A", False)
@@ -99,7 +100,7 @@ def test_campaign_patterns_select_requirements(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_requirement_file_is_rejected(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "asked.toml"
+    path = tmp_path / "requirements.toml"
     path.write_text(text)
     with pytest.raises(ConfigurationError) as raised:
         read_requirements(path)
@@ -111,8 +112,8 @@ def test_missing_file_is_reported(tmp_path: Path) -> None:
         read_requirements(tmp_path / "none.toml")
 
 
-def test_texts_of_requirements_name_no_algorithm() -> None:
-    # the user selects the algorithm; reports name it
+def test_requirement_texts_do_not_contain_algorithm_names() -> None:
+    # the user selects the algorithm, so texts may only cite an algorithm's paper
     algorithm_name = re.compile(r"\b(DIMES|VTT|HDA|NCC)\b(?! paper)")
     for name, path in catalogue().items():
         campaign = tomllib.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Tests of the isolation of cases: processes, threads and process state do not reach the next case."""
+"""Tests of the isolation of cases: processes, threads and changed process state do not affect the next case."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 #: Maximum duration of runs that could wait forever, in seconds.
 MAX_DURATION_S = 60.0
 
-_held_objects: list[object] = []
+#: State that remains in the worker process after an item, such as references to running processes.
+_worker_state: list[object] = []
 
 
 def run_items(
@@ -42,20 +43,19 @@ def run_items(
 ) -> dict[int, TaskResult[Any]]:
     """Run items in one worker; return their results after the worker has ended."""
     with LocalExecutor(1) as workers:
-        return {
-            result.item: result
-            for result in chain.from_iterable(workers.run(Work(task, items, limits or WorkLimits())))
-        }
+        batches = workers.run(Work(task, items, limits or WorkLimits()))
+        return {result.item: result for result in chain.from_iterable(batches)}
 
 
-def is_gone(process: int) -> bool:
+def has_ended(process: int) -> bool:
+    """Return whether no process has this id, or the process is a zombie (state Z)."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
     except OSError:
         return True
 
 
-def leave_running(kind: str, folder: str, item: int) -> int:
+def start_endless_tasks(kind: str, folder: str, item: int) -> int:
     """Start endless threads or processes in the first item and record the process ids."""
     processes = []
     if item == 0 and kind == "thread":
@@ -63,13 +63,13 @@ def leave_running(kind: str, folder: str, item: int) -> int:
     elif item == 0 and kind == "pool":
         pool = ProcessPoolExecutor(2, mp_context=get_context("fork"))
         processes = list(pool.map(get_process_id, range(2)))
-        _held_objects.append(pool)
+        _worker_state.append(pool)
     elif item == 0 and kind == "fork":
         processes = [fork_sleeping_child()]
     elif item == 0 and kind == "session":
         child = subprocess.Popen(["sleep", "3600"], start_new_session=True, close_fds=False)
         processes = [child.pid]
-        _held_objects.append(child)
+        _worker_state.append(child)
     elif item == 0 and kind == "orphan":
         parent = os.fork()
         if parent == 0:
@@ -99,22 +99,22 @@ def fork_sleeping_child() -> int:
 
 
 @pytest.mark.parametrize("kind", ["thread", "pool", "fork", "session", "orphan"])
-def test_processes_left_by_case_end_with_it(kind: str, tmp_path: Path) -> None:
+def test_processes_started_by_a_case_end_with_the_case(kind: str, tmp_path: Path) -> None:
     start_s = time.monotonic()
-    results = run_items(partial(leave_running, kind, str(tmp_path)), range(3))
+    results = run_items(partial(start_endless_tasks, kind, str(tmp_path)), range(3))
     assert time.monotonic() - start_s < MAX_DURATION_S
-    started = tmp_path / "processes"
-    processes = list(map(int, started.read_text().split())) if started.exists() else []
+    id_file = tmp_path / "processes"
+    processes = list(map(int, id_file.read_text().split())) if id_file.exists() else []
     assert len(processes) == {"thread": 0, "pool": 2}.get(kind, 1)
-    assert all(map(is_gone, processes))
+    assert all(map(has_ended, processes))
     # the next items run in another process
     assert results[1].result == results[2].result != results[0].result
-    kind_of_task = "threads" if kind == "thread" else "child processes"
-    assert f"{kind_of_task} that are still running" in results[0].changed[-1]
+    task_text = "threads" if kind == "thread" else "child processes"
+    assert f"{task_text} that are still running" in results[0].changed[-1]
     assert results[1].changed == results[2].changed == ()
 
 
-def wait_for_session(folder: str, item: int) -> int:
+def wait_for_child_in_new_session(folder: str, item: int) -> int:
     if item == 1:
         child = subprocess.Popen(["sleep", "3600"], start_new_session=True, close_fds=False)
         Path(folder, "processes").write_text(str(child.pid))
@@ -122,36 +122,37 @@ def wait_for_session(folder: str, item: int) -> int:
     return item
 
 
-def test_child_in_own_session_respects_time_limit(tmp_path: Path) -> None:
+def test_time_limit_ends_child_in_separate_session(tmp_path: Path) -> None:
     start_s = time.monotonic()
-    results = run_items(partial(wait_for_session, str(tmp_path)), range(4), WorkLimits(time_s=2.0))
+    results = run_items(partial(wait_for_child_in_new_session, str(tmp_path)), range(4), WorkLimits(time_s=2.0))
     assert time.monotonic() - start_s < MAX_DURATION_S
     error = results[1].error
     assert isinstance(error, WorkerExitError)
     assert error.outcome == TIMED_OUT
-    assert " in wait_for_session" in error.trace
+    assert " in wait_for_child_in_new_session" in error.trace
     assert {item: result.result for item, result in results.items() if item != 1} == {0: 0, 2: 2, 3: 3}
-    assert is_gone(int((tmp_path / "processes").read_text()))
+    assert has_ended(int((tmp_path / "processes").read_text()))
 
 
-def signal_supervisor(kind: int, folder: str, item: int) -> int:
+def signal_supervisor(signal_number: int, folder: str, item: int) -> int:
+    """Fork a child and send a signal to the parent of the worker process in item 1."""
     if item == 1:
         Path(folder, "processes").write_text(str(fork_sleeping_child()))
-        os.kill(os.getppid(), kind)
+        os.kill(os.getppid(), signal_number)
         time.sleep(3600)
     return item
 
 
-@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGSTOP])
-def test_signal_to_supervisor_ends_only_the_case(kind: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGSTOP])
+def test_signal_to_supervisor_ends_only_the_case(signal_number: int, tmp_path: Path) -> None:
     start_s = time.monotonic()
-    results = run_items(partial(signal_supervisor, kind, str(tmp_path)), range(3), WorkLimits(time_s=2.0))
+    results = run_items(partial(signal_supervisor, signal_number, str(tmp_path)), range(3), WorkLimits(time_s=2.0))
     assert time.monotonic() - start_s < MAX_DURATION_S
     error = results[1].error
     assert isinstance(error, WorkerExitError)
-    assert error.outcome == (CRASHED if kind == signal.SIGKILL else TIMED_OUT)
+    assert error.outcome == (CRASHED if signal_number == signal.SIGKILL else TIMED_OUT)
     assert (results[0].result, results[2].result) == (0, 2)
-    assert is_gone(int((tmp_path / "processes").read_text()))
+    assert has_ended(int((tmp_path / "processes").read_text()))
 
 
 def overwrite_board(item: int) -> int:
@@ -163,30 +164,31 @@ def overwrite_board(item: int) -> int:
     return item
 
 
-def test_only_executor_processes_are_signalled(monkeypatch: pytest.MonkeyPatch) -> None:
-    signalled = []
+def test_process_ids_written_by_a_case_are_not_signalled(monkeypatch: pytest.MonkeyPatch) -> None:
+    signalled_processes = []
     kill = os.kill
 
-    def record_and_kill(process: int, number: int) -> None:
-        signalled.append(process)
+    def record_and_kill(process: int, signal_number: int) -> None:
+        signalled_processes.append(process)
         if process > 1:
-            kill(process, number)
+            kill(process, signal_number)
 
     monkeypatch.setattr("os.kill", record_and_kill)
-    monkeypatch.setattr("os.killpg", lambda group, number: record_and_kill(group, number))
+    monkeypatch.setattr("os.killpg", lambda group, signal_number: record_and_kill(group, signal_number))
     with LocalExecutor(1) as workers:
         (batch,) = workers.run(Work(overwrite_board, [1], WorkLimits(time_s=3.0)))
         worker = workers._workers[0]
         assert isinstance(batch[0].error, WorkerExitError)
         assert batch[0].error.outcome == TIMED_OUT
     assert worker is not None
-    assert signalled
-    assert min(signalled) > 1
+    assert signalled_processes
+    assert min(signalled_processes) > 1  # the board contained process id 1
 
 
+#: Changes of the process state, by their description in the notes of a campaign.
 STATE_CHANGES = {
     "the working folder": lambda: os.chdir("/"),
-    "environment variables": lambda: os.environ.update(LEFT_BEHIND="1"),
+    "environment variables": lambda: os.environ.update(SET_BY_CASE="1"),
     "sys.path": lambda: sys.path.insert(0, "/nowhere"),
     "the warning filters": lambda: warnings.simplefilter("ignore"),
     "NumPy's error handling (numpy.seterr)": lambda: np.seterr(all="ignore"),
@@ -202,9 +204,11 @@ STATE_CHANGES = {
 
 
 def read_state() -> tuple[object, ...]:
+    """Return the parts of the process state that a case can change, and two random numbers."""
     import cv2
 
-    unity, little = float("1"), 2.0**-60
+    # the rounding mode decides whether this sum is 1
+    rounded_sum = float("1") + 2.0**-60
     return (
         Path.cwd(),
         dict(os.environ),
@@ -213,7 +217,7 @@ def read_state() -> tuple[object, ...]:
         np.geterr(),
         sys.getrecursionlimit(),
         cv2.useOptimized(),
-        unity + little,
+        rounded_sum,
         signal.getsignal(signal.SIGUSR1),
         random.random(),  # noqa: S311
         np.random.random_sample(),  # noqa: NPY002
@@ -232,14 +236,14 @@ def read_and_change_state(seconds: float, item: int) -> object:
 
 
 @pytest.mark.parametrize("seconds", [0.01, 0.0])
-def test_process_state_does_not_reach_next_case(seconds: float) -> None:
-    """The check also holds for short cases that run in one batch."""
-    number = 2 * len(STATE_CHANGES)
-    run_results = run_items(partial(read_and_change_state, seconds), range(number))
-    results: list[Any] = [run_results[item].result for item in range(number)]
+def test_changed_process_state_is_restored_for_the_next_case(seconds: float) -> None:
+    """The state is also restored between short cases (0 s), which run in one batch."""
+    n_items = 2 * len(STATE_CHANGES)
+    run_results = run_items(partial(read_and_change_state, seconds), range(n_items))
+    results: list[Any] = [run_results[item].result for item in range(n_items)]
     # the last two entries are random numbers: they depend on the case, not on the worker
     assert len({str((result[1][:-2], result[2])) for result in results}) == 1
-    assert len({str(result[1][-2:]) for result in results}) == number
+    assert len({str(result[1][-2:]) for result in results}) == n_items
     for position, name in enumerate(STATE_CHANGES):
         assert run_results[2 * position].changed == ()
         assert run_results[2 * position + 1].changed == (name,)
@@ -247,11 +251,11 @@ def test_process_state_does_not_reach_next_case(seconds: float) -> None:
     assert results[5][1][-2:] == single_result[1][-2:]
 
 
-def import_and_alter(folder: Path, item: int) -> tuple[str | None, ...]:
+def change_environment(folder: Path, item: int) -> tuple[str | None, ...]:
     """Return environment variables; the first case then changes them, directly and by importing a module."""
-    variables = (os.environ.get("SET_BY_MODULE"), os.environ.get("LEFT_BEHIND"), os.environ.get("HOME"))
+    variables = (os.environ.get("SET_BY_MODULE"), os.environ.get("SET_BY_CASE"), os.environ.get("HOME"))
     if item == 0:
-        os.environ["LEFT_BEHIND"] = "1"
+        os.environ["SET_BY_CASE"] = "1"
         sys.path.append(str(folder))
         __import__("changes_environment")
         del os.environ["HOME"]
@@ -261,23 +265,23 @@ def import_and_alter(folder: Path, item: int) -> tuple[str | None, ...]:
 def test_environment_is_restored_after_import_in_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/somewhere")
     (tmp_path / "changes_environment.py").write_text("import os\nos.environ['SET_BY_MODULE'] = 'yes'\n")
-    results = run_items(partial(import_and_alter, tmp_path), range(3))
+    results = run_items(partial(change_environment, tmp_path), range(3))
     assert results[0].changed == ("environment variables", "sys.path")
     assert [results[item].result for item in (1, 2)] == [("yes", None, "/somewhere")] * 2
 
 
 def crash_after_other_case(item: int) -> int:
-    """Change state that is not compared between cases; the next case in this worker then crashes."""
-    if item in _held_objects or item == 3:
-        request_fresh_worker()
+    """Crash if the previous item ran in this worker (its state is not restored); item 3 always crashes."""
+    if item in _worker_state or item == 3:
+        request_fresh_worker()  # reports the crash
         return -1
-    _held_objects.append(item + 1)
+    _worker_state.append(item + 1)
     time.sleep(0.01)
     return item
 
 
 def test_crash_after_other_case_is_repeated_in_fresh_worker() -> None:
-    _held_objects.clear()
+    _worker_state.clear()
     results = run_items(crash_after_other_case, range(5))
     assert {item: result.result for item, result in results.items()} == {0: 0, 1: 1, 2: 2, 3: -1, 4: 4}
     # crashed_only_after names the earlier case; case 3 crashes in a fresh worker too
@@ -291,7 +295,7 @@ def close_files(item: int) -> int:
     return item
 
 
-def test_closing_worker_files_crashes_only_that_case() -> None:
+def test_case_that_closes_worker_files_is_the_only_crashed_case() -> None:
     results = run_items(close_files, range(4))
     assert str(results[1].error) == "the case closed or replaced the worker's file descriptors"
     assert {item: result.result for item, result in results.items() if item != 1} == {0: 0, 2: 2, 3: 3}
@@ -311,18 +315,20 @@ def share_memory(item: int) -> int:
     return int(block[item])
 
 
-def test_memory_shared_by_forked_children_counts_once() -> None:
+def test_memory_shared_by_forked_children_is_counted_once() -> None:
+    # five processes with 100 MB each would exceed 0.3 GB if shared pages counted five times
     results = run_items(share_memory, [0], WorkLimits(memory_bytes=0.3e9))
     assert results[0].error is None
     assert results[0].result == 1
 
 
-def test_long_error_texts_keep_both_ends() -> None:
+def test_long_error_texts_are_shortened_in_the_middle() -> None:
     row = make_unfinished_row(0, CRASHED, "begin" + "x" * 200_000 + "end", "first" + "y" * 200_000 + "last")
-    for column, head, tail in (("error", "begin", "end"), ("traceback", "first", "last")):
+    for column, first_text, last_text in (("error", "begin", "end"), ("traceback", "first", "last")):
         text = str(row[column])
+        # 8000 characters of text, and a line with the number of omitted characters
         assert len(text) < 8_100
-        assert text.startswith(head)
-        assert text.endswith(tail)
+        assert text.startswith(first_text)
+        assert text.endswith(last_text)
         assert "characters omitted" in text
     assert make_unfinished_row(0, CRASHED, "short", "")["error"] == "short"

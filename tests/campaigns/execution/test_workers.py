@@ -44,8 +44,9 @@ def abort_once(marker: str, item: int) -> int:
 
 
 def raise_or_exit(item: int) -> object:
+    """Raise in item 0, exit in item 1, return a function in item 2."""
     if item == 0:
-        raise LookupError("nothing there")
+        raise LookupError("no such key")
     if item == 1:
         os._exit(3)
     return lambda: None if item == 2 else item
@@ -77,7 +78,7 @@ def test_errors_are_assigned_to_their_tasks() -> None:
         assert isinstance(results[1].error, WorkerExitError)
         assert str(results[1].error) == "the worker process died: EXIT (3)"
         assert callable(results[2].result)
-        # the pool still works
+        # the executor still works
         assert [result.result for result in run_items(workers, partial(sleep_and_return, 0.0), [7])] == [7]
 
 
@@ -94,7 +95,7 @@ def test_interruption_does_not_wait_for_tasks() -> None:
     assert time.monotonic() - start_s < 20.0
 
 
-def test_items_are_read_as_needed() -> None:
+def test_items_are_read_only_as_workers_need_them() -> None:
     n_items = 0
 
     def items() -> object:
@@ -128,9 +129,9 @@ def exceed_limit(folder: str, item: int) -> int:
     return item
 
 
-def test_only_tasks_over_a_limit_are_ended(tmp_path: Path) -> None:
+def test_only_tasks_that_exceed_a_limit_are_ended(tmp_path: Path) -> None:
     limits = WorkLimits(time_s=3.0, memory_bytes=0.2e9, output_bytes=1e5)
-    # one worker runs the items in order; later batches hold several items
+    # one worker runs the items in order; later batches contain several items
     with LocalExecutor(1) as workers:
         results = {
             result.item: result
@@ -152,7 +153,7 @@ def test_only_tasks_over_a_limit_are_ended(tmp_path: Path) -> None:
         "wrote more than its limit of 0.1 MB",
         "the worker process died: SIGSEGV (-11)",
     ]
-    # each error has the trace of the running line
+    # each error contains the trace of the line that was running
     for error in errors.values():
         assert isinstance(error, WorkerExitError)
         assert " in exceed_limit" in error.trace
@@ -169,7 +170,8 @@ def leak_memory(item: int, arrays: list[object] = []) -> int:  # noqa: B006  (th
     return item
 
 
-def test_memory_leak_does_not_end_the_task_at_the_limit() -> None:
+def test_memory_leak_of_earlier_tasks_does_not_end_a_task() -> None:
+    # twelve tasks leak 32 MB each
     limits = WorkLimits(memory_bytes=0.2e9)
     with LocalExecutor(1) as workers:
         results = list(run_items(workers, leak_memory_slowly, range(12), limits))
@@ -189,12 +191,12 @@ def start_endless_process(item: int) -> int:
     return item
 
 
-def test_processes_started_by_a_task_end_with_it() -> None:
+def test_processes_started_by_a_task_end_with_the_task() -> None:
     with LocalExecutor(1) as workers:
         (result,) = run_items(workers, start_endless_process, [0], WorkLimits(time_s=1.0))
         assert isinstance(result.error, WorkerExitError)
         processes = subprocess.run(["ps", "-eo", "ppid,args"], capture_output=True, text=True, check=True).stdout
-    # process 1 adopts orphans
+    # process 1 becomes the parent of processes whose parent has ended
     assert not [
         line for line in processes.splitlines() if line.split()[1:] == ["sleep", "3600"] and line.split()[0] == "1"
     ]
@@ -204,14 +206,14 @@ def exit_at_start(*_: object) -> None:
     os._exit(7)
 
 
-def test_workers_that_die_at_start_are_a_campaign_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_that_die_at_start_raise_a_campaign_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with LocalExecutor(1) as workers:
         monkeypatch.setattr("marsyard.campaigns.execution.workers.run_batch", exit_at_start)
         with pytest.raises(CampaignError, match="worker processes die before they start a case"):
             list(workers.run(Work(get_process_id, range(3))))
 
 
-def test_memory_counts_private_pages(tmp_path: Path) -> None:
+def test_used_memory_counts_only_private_pages(tmp_path: Path) -> None:
     size = 40_000_000
     # objects of earlier tests must not be released during the measurement
     gc.collect()
@@ -224,6 +226,7 @@ def test_memory_counts_private_pages(tmp_path: Path) -> None:
     private_pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
     np.frombuffer(private_pages, np.uint8)[:] = 1
     assert used_memory([os.getpid()]) - memory_with_map > 0.5 * size
+    # no process has an id above 2^22
     assert used_memory([2**22 + 1]) == 0.0
 
 
@@ -232,7 +235,7 @@ def test_batches_last_about_one_second_and_shrink_at_the_end() -> None:
     sizes = []
     while batch := batches.next():
         sizes.append(len(batch))
-        batches.record_time(len(batch), 0.05 * len(batch))
+        batches.record_time(len(batch), 0.05 * len(batch))  # 20 cases per second
     assert sum(sizes) == 400
     assert sizes[:5] == [1, 2, 4, 8, 16]
     assert max(sizes) == 20

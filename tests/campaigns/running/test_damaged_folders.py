@@ -1,4 +1,4 @@
-"""Tests of damaged campaign folders: each is used again or rejected with one message."""
+"""Tests of damaged campaign folders: commands use the folder again or report its damage."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_run_killed_before_its_record_can_be_restarted(
 ) -> None:
     directory = tmp_path / "run"
     directory.mkdir()
-    create_store(directory / ROWS_FILE, {"identity": "of the run that was killed"})
+    create_store(directory / ROWS_FILE, {"identity": "killed run"})
     with pytest.raises(StoreError, match="a run was stopped before its first case: start it again with --out"):
         resume_campaign(directory, ExecutorConfig(1), watch)
     run(campaign_file(), directory, watch, "cases=2", jobs=1)
@@ -131,7 +131,7 @@ def test_full_temporary_folder_is_reported(monkeypatch: pytest.MonkeyPatch) -> N
         LocalExecutor(1)
 
 
-def test_full_disk_is_reported_by_commands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_full_disk_is_reported_without_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     @handle_user_errors
     def command() -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "somewhere")
@@ -143,7 +143,7 @@ def test_full_disk_is_reported_by_commands(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_invalid_site_and_distribution_are_reported_by_key(tmp_path: Path) -> None:
-    path = tmp_path / "c.toml"
+    path = tmp_path / "campaign.toml"
     path.write_text('name = "x"\nscenario = "landing"\ncases = 3\nseed = 1\n[parameters]\nsite = {a = 1}\n')
     with pytest.raises(ConfigurationError, match=r"parameters\.site: input should be a valid string"):
         load_campaign(str(path))

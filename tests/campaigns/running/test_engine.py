@@ -38,11 +38,11 @@ def test_campaign_with_failing_cases_finishes(
     assert rows[5]["error"] == "the worker process died: SIGABRT (-6)"
     assert "fake_scenario.py" in rows[5]["traceback"]
     # same rows with one worker, without the failing cases, and for single replayed cases
-    single = read_case_rows(run(campaign_file(FAILING_CASES), tmp_path / "single", watch, jobs=1))
-    assert [differing_columns(row, other) for row, other in zip(rows, single, strict=True)] == [()] * 12
-    healthy = read_case_rows(run(campaign_file("refusing_cases = [2]"), tmp_path / "healthy", watch))
+    single_worker_rows = read_case_rows(run(campaign_file(FAILING_CASES), tmp_path / "single", watch, jobs=1))
+    assert [differing_columns(*pair) for pair in zip(rows, single_worker_rows, strict=True)] == [()] * 12
+    rows_without_faults = read_case_rows(run(campaign_file("refusing_cases = [2]"), tmp_path / "no-faults", watch))
     for case in (0, 1, 2, 4, 7, 8, 9, 10, 11):
-        assert differing_columns(rows[case], healthy[case]) == ()
+        assert differing_columns(rows[case], rows_without_faults[case]) == ()
     for case in (3, 5, 7):
         replayed = replay(failing_campaign, case)
         assert replayed.stored is not None
@@ -50,14 +50,14 @@ def test_campaign_with_failing_cases_finishes(
     assert watch.notes == []
 
 
-def test_table_keeps_types_and_nan(failing_campaign: Path) -> None:
+def test_table_has_column_types_and_nan_values(failing_campaign: Path) -> None:
     schema = pq.read_schema(failing_campaign / "cases.parquet")
-    kinds = {name: str(schema.field(name).type) for name in schema.names}
-    assert list(kinds)[:3] == ["case", "outcome", "answered"]
-    assert list(kinds)[-4:] == ["wall_time_s", "cpu_time_s", "error", "traceback"]
+    column_types = {name: str(schema.field(name).type) for name in schema.names}
+    assert list(column_types)[:3] == ["case", "outcome", "answered"]
+    assert list(column_types)[-4:] == ["wall_time_s", "cpu_time_s", "error", "traceback"]
     expected = {"case": "int64", "answered": "bool", "velocity_error_m_s": "double", "terrain": "int64"}
-    assert expected.items() <= kinds.items()
-    assert (kinds["kind"], kinds["clear"], kinds["wall_time_s"]) == ("string", "bool", "double")
+    assert expected.items() <= column_types.items()
+    assert (column_types["kind"], column_types["clear"], column_types["wall_time_s"]) == ("string", "bool", "double")
     frame = pd.read_parquet(failing_campaign / "cases.parquet")
     assert frame["velocity_error_m_s"].isna().tolist() == [case in (2, 3, 5, 6) for case in range(12)]
     assert pq.read_table(failing_campaign / "cases.parquet")["velocity_error_m_s"].null_count == 0
@@ -93,27 +93,29 @@ def test_shared_inputs_are_prepared_once(campaign_file: CampaignFile, tmp_path: 
 
 def test_failed_shared_inputs_are_noted(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     run(campaign_file("shared = 1\nfail_prepare = true"), tmp_path / "run", watch, "cases=1", jobs=1)
-    note = "shared input 0 could not be prepared: OSError: no room for the terrain"
+    note = "shared input 0 could not be prepared: OSError: the disk is full"
     assert watch.notes == [note]
 
 
 def test_used_folder_is_rejected(
     campaign_file: CampaignFile, failing_campaign: Path, tmp_path: Path, watch: RecordingWatch
 ) -> None:
-    before = {path: path.stat().st_mtime_ns for path in failing_campaign.rglob("*")}
+    times_before = {path: path.stat().st_mtime_ns for path in failing_campaign.rglob("*")}
     with pytest.raises(StoreError, match="contains a campaign"):
         run(campaign_file(), failing_campaign, watch)
-    assert {path: path.stat().st_mtime_ns for path in failing_campaign.rglob("*")} == before
+    assert {path: path.stat().st_mtime_ns for path in failing_campaign.rglob("*")} == times_before
+    # either file shows that a folder contains results
     for name in ("report.html", "cases.sqlite"):
         (tmp_path / name).mkdir()
         (tmp_path / name / name).touch()
         with pytest.raises(StoreError, match=name):
             run(campaign_file(), tmp_path / name, watch)
+    # the parent of this folder is a file
     with pytest.raises(StoreError, match="cannot be written"):
         run(campaign_file(), tmp_path / "fake.toml" / "run", watch)
 
 
-def test_unknown_metric_stops_the_campaign_early(
+def test_unknown_metric_stops_the_campaign_after_one_case(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     requirement = "[[requirements]]\nid='a'\nmetric='velocity_eror_m_s'\nbound=1\nprobability=0.9\nconfidence=0.9"

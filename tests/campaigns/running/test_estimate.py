@@ -13,9 +13,10 @@ from marsyard.campaigns.running.preparation import estimate
 CampaignFile = Callable[..., Path]
 
 
-def test_trial_cases_estimate_time_and_disk_space(campaign_file: CampaignFile) -> None:
+def test_estimate_follows_from_trial_cases(campaign_file: CampaignFile) -> None:
     campaign = load_campaign(str(campaign_file("sleep_s = 0.05")), ["cases=1000", "retain.products=all"])
     cost = estimate(campaign, jobs=2)
+    # an estimate runs at most 9 trial cases
     assert (cost.trials, cost.unfinished) == (9, 0)
     assert 0.05 <= cost.case_s < 0.5
     assert cost.time_s == pytest.approx(1000 * cost.case_s / 2)

@@ -1,4 +1,4 @@
-"""Tests that input files belong to a campaign's identity: `resume` and `append` detect changed files."""
+"""Tests of the input files in a campaign's identity: `resume` and `append` detect changed files."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from tests.campaigns.fake_campaign import RecordingWatch, run
 
+#: Linear (CAHV) camera model with a focal length of 1200 px.
 CAMERA = (
     "Model = CAHV = perspective, linear\nDimensions = 1024 1024\nC = 0 0 0\nA = 0 0 1\nH = 1200 0 512\nV = 0 1200 512\n"
 )
@@ -46,49 +47,49 @@ def table(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def finished(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch, table: Path) -> Path:
-    """Run a campaign whose parameters name an input file."""
+def finished_campaign(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch, table: Path) -> Path:
+    """Run a campaign with one input file."""
     return run(campaign_file(f'table = "{table}"'), tmp_path / "done", watch, "cases=2", jobs=1)
 
 
-def test_changed_input_file_is_detected(finished: Path, table: Path, watch: RecordingWatch) -> None:
-    assert list(record.read(finished)["identity"]["inputs"]) == [str(table)]
-    resume_campaign(finished, ExecutorConfig(1), watch)
+def test_changed_input_file_is_detected(finished_campaign: Path, table: Path, watch: RecordingWatch) -> None:
+    assert list(record.read(finished_campaign)["identity"]["inputs"]) == [str(table)]
+    resume_campaign(finished_campaign, ExecutorConfig(1), watch)
     table.write_text("1,2,4\n")
     commands: tuple[Callable[[], None], ...] = (
-        lambda: resume_campaign(finished, ExecutorConfig(1), watch),
-        lambda: append_cases(finished, 1, ExecutorConfig(1), watch),
+        lambda: resume_campaign(finished_campaign, ExecutorConfig(1), watch),
+        lambda: append_cases(finished_campaign, 1, ExecutorConfig(1), watch),
     )
     for command in commands:
         with pytest.raises(CampaignError, match=r"Changed:\n  .*table.csv \(\w{12}, now \w{12}\)\nTo continue"):
             command()
-    assert replay(finished, 0).changed[0].startswith(str(table))
-    append_cases(finished, 1, ExecutorConfig(1), watch, allow_changed=True)
-    (change,) = record.read(finished)["changes"]
+    assert replay(finished_campaign, 0).changed[0].startswith(str(table))
+    append_cases(finished_campaign, 1, ExecutorConfig(1), watch, allow_changed=True)
+    (change,) = record.read(finished_campaign)["changes"]
     assert "table.csv" in change["in"][0]
-    append_cases(finished, 1, ExecutorConfig(1), watch)
+    append_cases(finished_campaign, 1, ExecutorConfig(1), watch)
 
 
-def test_campaigns_without_input_hashes_resume_and_store_them(
-    finished: Path, table: Path, watch: RecordingWatch
+def test_missing_input_hashes_are_added_when_a_campaign_continues(
+    finished_campaign: Path, table: Path, watch: RecordingWatch
 ) -> None:
-    stored = json.loads((finished / "campaign.json").read_text())
+    stored = json.loads((finished_campaign / "campaign.json").read_text())
     del stored["identity"]["inputs"]
-    (finished / "campaign.json").write_text(json.dumps(stored))
-    append_cases(finished, 1, ExecutorConfig(1), watch)
+    (finished_campaign / "campaign.json").write_text(json.dumps(stored))
+    append_cases(finished_campaign, 1, ExecutorConfig(1), watch)
     assert any("table.csv" in note and "no hash is stored" in note for note in watch.notes)
-    assert record.read(finished)["identity"]["inputs"]
+    assert record.read(finished_campaign)["identity"]["inputs"]
     table.write_text("other\n")
     with pytest.raises(CampaignError, match=r"table\.csv"):
-        resume_campaign(finished, ExecutorConfig(1), watch)
+        resume_campaign(finished_campaign, ExecutorConfig(1), watch)
 
 
 def test_dispersed_input_files_belong_to_the_identity(campaign_file: CampaignFile, tmp_path: Path, table: Path) -> None:
-    other = tmp_path / "other.csv"
-    other.write_text("4,5,6\n")
-    dispersions = f'[dispersions]\ntable = {{distribution = "choice", values = ["{table}", "{other}"]}}\n'
+    second_table = tmp_path / "second.csv"
+    second_table.write_text("4,5,6\n")
+    dispersions = f'[dispersions]\ntable = {{distribution = "choice", values = ["{table}", "{second_table}"]}}\n'
     campaign = load_campaign(str(campaign_file(f'table = "{table}"', dispersions=dispersions)))
-    assert set(create_identity(campaign.configuration).inputs or {}) == {str(table), str(other)}
+    assert set(create_identity(campaign.configuration).inputs or {}) == {str(table), str(second_table)}
 
 
 def test_terrain_camera_and_datasheet_belong_to_the_identity(tmp_path: Path) -> None:
@@ -103,12 +104,13 @@ def test_terrain_camera_and_datasheet_belong_to_the_identity(tmp_path: Path) -> 
         f"detector.file={files['sensor.toml']}",
     ]
     configuration = load_campaign("dimes-gusev", overrides).configuration
-    before = create_identity(configuration)
-    assert set(before.inputs or {}) == {str(path) for path in files.values()}
+    initial_identity = create_identity(configuration)
+    assert set(initial_identity.inputs or {}) == {str(path) for path in files.values()}
     np.savez(files["site.npz"], dem=rng.normal(size=(64, 64)), dem_gsd=4.0)
     files["cam.cahv"].write_text(CAMERA.replace("1200", "1201"))
     files["sensor.toml"].write_text(DATASHEET.replace("25.0", "26.0"))
-    changed = before.differences(create_identity(configuration))
+    changed = initial_identity.differences(create_identity(configuration))
+    # each difference starts with the path of the file
     assert [line.split(" ")[0] for line in changed] == sorted(str(path) for path in files.values())
     # the campaign stores the content of the camera file and datasheet, so these files may be deleted
     files["cam.cahv"].unlink()

@@ -1,4 +1,4 @@
-"""Tests of shared inputs (terrains): only used inputs are built, and estimates include their cost."""
+"""Tests of shared inputs (terrains): a campaign builds only used inputs, and its estimate includes their cost."""
 
 from __future__ import annotations
 
@@ -15,83 +15,83 @@ from marsyard.campaigns.running.engine import append_cases
 from marsyard.campaigns.running.preparation import estimate, find_used_inputs, plan_inputs
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import scenario, scenario_names
-from tests.campaigns.fake_campaign import HEAD, RecordingWatch, read_case_rows, run
+from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, RecordingWatch, read_case_rows, run
 
 CampaignFile = Callable[..., Path]
 DISPERSION = '[dispersions]\nterrain = {distribution = "integer", low = 0, high = 9}'
 
 
 @pytest.fixture
-def selecting(campaign_file: CampaignFile, tmp_path: Path) -> Path:
-    """Write a campaign with three cases over ten terrains."""
-    head = HEAD.replace("FakeScenario", "SelectingScenario").replace("cases = 12", "cases = 3")
+def selecting_campaign(campaign_file: CampaignFile, tmp_path: Path) -> Path:
+    """Write a campaign with three cases and ten terrains; each case uses one terrain."""
+    top_level_keys = TOP_LEVEL_KEYS.replace("FakeScenario", "SelectingScenario").replace("cases = 12", "cases = 3")
     folder = tmp_path / "inputs"
     folder.mkdir()
-    return campaign_file(f'shared = 10\ncache = "{folder}"', head=head, dispersions=DISPERSION)
+    return campaign_file(f'shared = 10\ncache = "{folder}"', top_level_keys=top_level_keys, dispersions=DISPERSION)
 
 
-def _list_inputs(folder: Path) -> set[str]:
+def _list_built_inputs(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_only_used_inputs_are_built(selecting: Path, tmp_path: Path, watch: RecordingWatch) -> None:
-    directory = run(selecting, tmp_path / "run", watch)
+def test_only_used_inputs_are_built(selecting_campaign: Path, tmp_path: Path, watch: RecordingWatch) -> None:
+    directory = run(selecting_campaign, tmp_path / "run", watch)
     expected = {f"shared-{row['terrain']}" for row in read_case_rows(directory)}
-    assert _list_inputs(tmp_path / "inputs") == expected
+    assert _list_built_inputs(tmp_path / "inputs") == expected
     assert watch.steps["preparing"] == len(expected) <= 3
     # appended cases build their inputs
     append_cases(directory, 3, ExecutorConfig(1), watch)
-    assert _list_inputs(tmp_path / "inputs") == {f"shared-{row['terrain']}" for row in read_case_rows(directory)}
+    assert _list_built_inputs(tmp_path / "inputs") == {f"shared-{row['terrain']}" for row in read_case_rows(directory)}
 
 
-def test_cache_warnings_become_notes(selecting: Path, tmp_path: Path, watch: RecordingWatch) -> None:
-    run(selecting, tmp_path / "run", watch)
+def test_cache_warnings_are_recorded_as_notes(selecting_campaign: Path, tmp_path: Path, watch: RecordingWatch) -> None:
+    run(selecting_campaign, tmp_path / "run", watch)
     assert {note for note in watch.notes if "was damaged" in note} == {
-        f"input {name.removeprefix('shared-')} was damaged" for name in _list_inputs(tmp_path / "inputs")
+        f"input {name.removeprefix('shared-')} was damaged" for name in _list_built_inputs(tmp_path / "inputs")
     }
 
 
-def test_estimate_includes_inputs_to_build(selecting: Path, tmp_path: Path) -> None:
-    campaign = load_campaign(str(selecting))
+def test_estimate_includes_inputs_to_build(selecting_campaign: Path, tmp_path: Path) -> None:
+    campaign = load_campaign(str(selecting_campaign))
     n_inputs = len(find_used_inputs(campaign, range(3)))
-    first = estimate(campaign, jobs=1)
-    assert (first.inputs, first.inputs_bytes) == (n_inputs, n_inputs * 1e6)
-    assert first.input_s > 0.0
-    assert first.time_s == pytest.approx(3 * first.case_s + n_inputs * first.input_s)
+    first_estimate = estimate(campaign, jobs=1)
+    assert (first_estimate.inputs, first_estimate.inputs_bytes) == (n_inputs, n_inputs * 1e6)
+    assert first_estimate.input_s > 0.0
+    assert first_estimate.time_s == pytest.approx(3 * first_estimate.case_s + n_inputs * first_estimate.input_s)
     # the trial cases have built the inputs
-    assert len(_list_inputs(tmp_path / "inputs")) == n_inputs
-    second = estimate(campaign, jobs=1)
-    assert (second.inputs, second.inputs_bytes, second.input_s) == (0, 0, 0.0)
+    assert len(_list_built_inputs(tmp_path / "inputs")) == n_inputs
+    second_estimate = estimate(campaign, jobs=1)
+    assert (second_estimate.inputs, second_estimate.inputs_bytes, second_estimate.input_s) == (0, 0, 0.0)
 
 
 def test_inputs_beyond_cache_limit_are_built_by_cases(
-    selecting: Path, tmp_path: Path, watch: RecordingWatch, monkeypatch: pytest.MonkeyPatch
+    selecting_campaign: Path, tmp_path: Path, watch: RecordingWatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("MARSYARD_CACHE_GB", "0.0015")
-    directory = run(selecting, tmp_path / "run", watch)
-    assert len(_list_inputs(tmp_path / "inputs")) == 1
+    monkeypatch.setenv("MARSYARD_CACHE_GB", "0.0015")  # one input of 1 MB fits
+    directory = run(selecting_campaign, tmp_path / "run", watch)
+    assert len(_list_built_inputs(tmp_path / "inputs")) == 1
     assert any("more than the cache limit" in note for note in watch.notes)
     assert len(read_case_rows(directory)) == 3
 
 
-def test_invalid_cache_limit_is_reported(selecting: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_cache_limit_is_reported(selecting_campaign: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE_GB", "plenty")
     with pytest.raises(CampaignError, match="MARSYARD_CACHE_GB is 'plenty'"):
-        plan_inputs(load_campaign(str(selecting)), range(3))
+        plan_inputs(load_campaign(str(selecting_campaign)), range(3))
 
 
-def test_all_inputs_are_built_without_case_inputs(
+def test_all_inputs_are_built_if_scenario_has_no_case_inputs(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
-    """The method `case_inputs` is optional for custom scenarios."""
+    """The method `case_inputs` is optional in custom scenarios."""
     folder = tmp_path / "inputs"
     folder.mkdir()
     path = campaign_file(f'shared = 4\ncache = "{folder}"')
     run(path, tmp_path / "run", watch, "cases=2")
-    assert len(_list_inputs(folder)) == 4
+    assert len(_list_built_inputs(folder)) == 4
 
 
-def test_eight_descents_over_gusev_need_eight_terrains() -> None:
+def test_eight_gusev_descents_use_eight_terrains() -> None:
     campaign = load_campaign("dimes-gusev", [], 8)
     assert len(find_used_inputs(campaign, range(8))) == 8
     parameters: list[Any] = [campaign.parameters(case) for case in range(8)]
@@ -101,7 +101,7 @@ def test_eight_descents_over_gusev_need_eight_terrains() -> None:
 
 
 @pytest.mark.parametrize("name", ["hda-hazardous", "vtt-montecarlo", "vtt-accuracy", "dimes-fieldtest", "dimes-smoke"])
-def test_cases_use_terrains_of_their_campaign(name: str) -> None:
+def test_used_inputs_are_shared_inputs_of_the_campaign(name: str) -> None:
     campaign = load_campaign(name)
     all_inputs = campaign.scenario.shared_inputs(campaign.base_parameters())
     assert isinstance(campaign.scenario, SelectsInputs)
@@ -112,6 +112,6 @@ def test_cases_use_terrains_of_their_campaign(name: str) -> None:
 
 
 def test_every_scenario_with_shared_inputs_selects_them() -> None:
-    assert [name for name in scenario_names() if not isinstance(scenario(name), SelectsInputs)] == [
-        name for name in scenario_names() if name.startswith("measured")
-    ]
+    """Scenarios of measured images have no shared inputs."""
+    names_without_selection = [name for name in scenario_names() if not isinstance(scenario(name), SelectsInputs)]
+    assert names_without_selection == [name for name in scenario_names() if name.startswith("measured")]

@@ -1,4 +1,4 @@
-"""Tests of interrupted and killed campaigns and of hostile cases: no row is lost and no other case changes."""
+"""Tests of interrupted campaigns and of hostile cases: no row is lost, and the rows of other cases are unchanged."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
 def _start_campaign(path: Path, directory: Path, **environment: str) -> subprocess.Popen[bytes]:
+    """Run a campaign of 500 cases in a process; return the process as soon as rows are stored."""
     command = [sys.executable, "-m", "marsyard", "run", str(path), "--jobs", "2", "--out", str(directory)]
     process = subprocess.Popen(
         [*command, "--set", "sleep_s=0.2", "-n", "500"],
@@ -37,7 +38,7 @@ def _start_campaign(path: Path, directory: Path, **environment: str) -> subproce
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 180.0
-    # the write-ahead log of an empty table has two pages; more pages mean that rows exist
+    # the write-ahead log of an empty table has two pages of 4 kB; a log of more than four pages contains rows
     log = directory / "cases.sqlite-wal"
     while not (log.exists() and log.stat().st_size > 4 * 4200) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -49,18 +50,18 @@ def _find_workers(process: subprocess.Popen[bytes]) -> list[int]:
     return [int(child) for child in children if "loky_posix" in Path(f"/proc/{child}/cmdline").read_text()]
 
 
-def _is_gone(pid: int) -> bool:
+def _has_ended(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
     except OSError:
         return True
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp_path: Path, kind: int) -> None:
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp_path: Path, signal_number: int) -> None:
     process = _start_campaign(campaign_file(dispersions=""), tmp_path / "run")
     workers = _find_workers(process)
-    process.send_signal(kind)
+    process.send_signal(signal_number)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130
     assert re.search(rb"interrupted; the rows so far are in \S+ \(\d+ of 500\)\. To continue: marsyard resume ", errors)
@@ -71,19 +72,19 @@ def test_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp_pa
     assert 0 < stored["cases_finished"] == len(read_case_rows(tmp_path / "run")) < 500
     assert (tmp_path / "run" / "cases.sqlite").exists()
     assert len(workers) == 2
-    assert all(map(_is_gone, workers))
+    assert all(map(_has_ended, workers))
 
 
-def test_workers_end_with_a_killed_parent(campaign_file: CampaignFile, tmp_path: Path) -> None:
+def test_workers_end_when_their_parent_is_killed(campaign_file: CampaignFile, tmp_path: Path) -> None:
     process = _start_campaign(campaign_file(dispersions=""), tmp_path / "run")
     workers = _find_workers(process)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
     deadline = time.monotonic() + 10.0
-    while not all(map(_is_gone, workers)) and time.monotonic() < deadline:
+    while not all(map(_has_ended, workers)) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert len(workers) == 2
-    assert all(map(_is_gone, workers))
+    assert all(map(_has_ended, workers))
 
 
 def _find_marked_processes(mark: str) -> list[int]:
@@ -91,13 +92,13 @@ def _find_marked_processes(mark: str) -> list[int]:
     processes = []
     for process in Path("/proc").glob("[1-9]*"):
         with suppress(OSError):
-            if mark.encode() in (process / "environ").read_bytes() and not _is_gone(int(process.name)):
+            if mark.encode() in (process / "environ").read_bytes() and not _has_ended(int(process.name)):
                 processes.append(int(process.name))
     return processes
 
 
 @pytest.mark.parametrize(
-    ("kind", "extra_parameters"),
+    ("signal_number", "parameters"),
     [
         (signal.SIGINT, ""),
         (signal.SIGTERM, ""),
@@ -105,26 +106,26 @@ def _find_marked_processes(mark: str) -> list[int]:
         (signal.SIGKILL, "stopping_cases = [0, 1, 2, 3, 4, 5]"),
     ],
 )
-def test_no_process_outlives_the_campaign(
-    campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: int, extra_parameters: str
+def test_all_processes_end_with_the_campaign(
+    campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signal_number: int, parameters: str
 ) -> None:
-    """Processes in their own sessions end, and temporary files are removed.
+    """Processes in separate sessions also end, and temporary files are removed.
 
     After SIGKILL, the next executor removes the temporary folder.
     """
     temporary = tmp_path / "tmp"
     temporary.mkdir()
-    path = campaign_file(f"forking_cases = [0, 1, 2, 3, 4, 5]\n{extra_parameters}", dispersions="")
+    path = campaign_file(f"forking_cases = [0, 1, 2, 3, 4, 5]\n{parameters}", dispersions="")
     process = _start_campaign(path, tmp_path / "run", TMPDIR=str(temporary), MARSYARD_TEST_RUN=str(tmp_path))
-    process.send_signal(kind)
+    process.send_signal(signal_number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == (-9 if kind == signal.SIGKILL else 130)
-    assert (b"interrupted; the rows so far" in errors) == (kind != signal.SIGKILL)
+    assert process.returncode == (-9 if signal_number == signal.SIGKILL else 130)
+    assert (b"interrupted; the rows so far" in errors) == (signal_number != signal.SIGKILL)
     deadline = time.monotonic() + 10.0
     while _find_marked_processes(str(tmp_path)) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert _find_marked_processes(str(tmp_path)) == []
-    if kind == signal.SIGKILL:
+    if signal_number == signal.SIGKILL:
         monkeypatch.setattr("tempfile.tempdir", str(temporary))
         with LocalExecutor(1):
             assert len(list(temporary.iterdir())) == 1
@@ -157,7 +158,7 @@ with stop_on_signals():
     assert (process.returncode, errors) == (130, b"killed\n")
 
 
-def test_side_effects_on_the_worker_are_reported(
+def test_changes_of_the_worker_process_are_reported(
     failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     path = campaign_file("state_changing_cases = [1, 7]\nforking_cases = [4]\nrefusing_cases = [2]")
@@ -167,14 +168,15 @@ def test_side_effects_on_the_worker_are_reported(
         "case 4 changed its worker process: child processes that are still running (python)",
         "case 7 changed its worker process: the working folder",
     ]
-    for row, other in zip(rows, read_case_rows(failing_campaign), strict=True):
-        assert row["case"] in (3, 5, 6) or differing_columns(row, other) == ()
+    # cases 3, 5 and 6 of `failing_campaign` have no result
+    for row, expected_row in zip(rows, read_case_rows(failing_campaign), strict=True):
+        assert row["case"] in (3, 5, 6) or differing_columns(row, expected_row) == ()
 
 
 def test_hostile_cases_do_not_affect_other_cases(
     failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
-    hostile = {
+    faults = {
         "raising_cases": (0, "CRASHED"),
         "aborting_cases": (1, "CRASHED"),
         "exiting_cases": (4, "CRASHED"),
@@ -182,35 +184,35 @@ def test_hostile_cases_do_not_affect_other_cases(
         "allocating_cases": (8, "OUT_OF_MEMORY"),
         "flooding_cases": (9, "TOO_MUCH_OUTPUT"),
     }
-    parameters = "\n".join(f"{name} = [{case}]" for name, (case, _) in hostile.items())
+    parameters = "\n".join(f"{name} = [{case}]" for name, (case, _) in faults.items())
     limits = "[limits]\ncase_time_s = 4\nmemory_gb = 0.25\noutput_mb = 0.1"
-    path = campaign_file(f"{parameters}\nrefusing_cases = [2]", more=limits)
+    path = campaign_file(f"{parameters}\nrefusing_cases = [2]", extra_tables=limits)
     rows = read_case_rows(run(path, tmp_path / "hostile", watch, "retain.showcase=none"))
-    expected = dict(hostile.values())
+    expected = dict(faults.values())
     outcomes = {row["case"]: row["outcome"] for row in rows if row["outcome"] not in ("VALID", "SILENT")}
     assert outcomes == expected
-    for row, other in zip(rows, read_case_rows(failing_campaign), strict=True):
-        assert row["case"] in (*expected, 3, 5, 6) or differing_columns(row, other) == ()
+    for row, expected_row in zip(rows, read_case_rows(failing_campaign), strict=True):
+        assert row["case"] in (*expected, 3, 5, 6) or differing_columns(row, expected_row) == ()
     stored = record.read(tmp_path / "hostile")
     assert (stored["state"], stored["cases_finished"], stored["cases_crashed"]) == ("finished", 12, 6)
     # each failed case has an error and a trace; case 4 exits without a trace
     assert all(rows[case]["error"] and "fake_scenario.py" in rows[case]["traceback"] for case in expected if case != 4)
     # only the case that timed out runs again
-    before = read_case_rows(tmp_path / "hostile")
+    rows_before = read_case_rows(tmp_path / "hostile")
     resume_campaign(tmp_path / "hostile", ExecutorConfig(1), watch, retry=["timed-out"], case_time_s=1.0)
     assert read_case_rows(tmp_path / "hostile")[7]["error"] == "took longer than its limit of 1 s"
-    for row, other in zip(before, read_case_rows(tmp_path / "hostile"), strict=True):
-        assert row["case"] == 7 or str(row) == str(other)
+    for row_before, row in zip(rows_before, read_case_rows(tmp_path / "hostile"), strict=True):
+        assert row["case"] == 7 or str(row) == str(row_before)
     assert [session["command"] for session in record.read(tmp_path / "hostile")["sessions"]] == ["run", "resume"]
 
 
-def _kill_and_resume(path: Path, directory: Path, cases: int, kills: int, rng: np.random.Generator) -> int:
-    """Kill and resume a campaign at random times; return the number of kills before its end."""
+def _kill_and_resume(path: Path, directory: Path, cases: int, n_kills: int, rng: np.random.Generator) -> int:
+    """Kill and resume a campaign at random times; return how often it was still running when it was killed."""
     program = [sys.executable, "-m", "marsyard"]
     command = [*program, "run", str(path), "--jobs", "2", "-n", str(cases), "--out", str(directory)]
     command += ["--set", "retain.showcase=none"]
     n_killed = 0
-    for _ in range(kills):
+    for _ in range(n_kills):
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
         while process.poll() is None and not (directory / "campaign.json").exists():
             time.sleep(0.02)
@@ -220,6 +222,7 @@ def _kill_and_resume(path: Path, directory: Path, cases: int, kills: int, rng: n
         process.communicate()
         command = [*program, "resume", str(directory), "--jobs", "2", "--allow-changed"]
     result = subprocess.run(command, capture_output=True, text=True)
+    # exit code 3: no verdict on requirements
     assert result.returncode in (0, 3), result.stderr
     return n_killed
 
@@ -227,9 +230,9 @@ def _kill_and_resume(path: Path, directory: Path, cases: int, kills: int, rng: n
 def test_resumed_campaign_has_the_same_rows(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     path = campaign_file("sleep_s = 0.02", requirement="")
     assert _kill_and_resume(path, tmp_path / "killed", 150, 2, np.random.default_rng(8)) >= 1
-    undisturbed = read_case_rows(run(path, tmp_path / "run", watch, "cases=150", "retain.showcase=none"))
+    uninterrupted = read_case_rows(run(path, tmp_path / "run", watch, "cases=150", "retain.showcase=none"))
     resumed = read_case_rows(tmp_path / "killed")
-    assert [differing_columns(*pair) for pair in zip(resumed, undisturbed, strict=True)] == [()] * 150
+    assert [differing_columns(*pair) for pair in zip(resumed, uninterrupted, strict=True)] == [()] * 150
     first, *later = record.read(tmp_path / "killed")["sessions"]
     assert first["command"] == "run"
     assert {session["command"] for session in later} == {"resume"}

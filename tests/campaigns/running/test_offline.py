@@ -26,7 +26,7 @@ from marsyard.sim.measurements import DescentMeasurements
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 
 CASES = 3
-FILE = f"""
+CAMPAIGN = f"""
 name = "fake-velocity"
 scenario = "tests.campaigns.fake_velocity:FakeVelocityScenario"
 cases = {CASES}
@@ -41,6 +41,8 @@ confidence = 0.5
 
 
 class Exported(NamedTuple):
+    """Folders of an exported campaign: the cases, and their truth."""
+
     directory: Path
     truth: Path
 
@@ -48,17 +50,15 @@ class Exported(NamedTuple):
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     folder = tmp_path_factory.mktemp("offline")
-    (folder / "fake.toml").write_text(FILE)
+    (folder / "fake.toml").write_text(CAMPAIGN)
     export = Exported(folder / "out", truth_folder(folder / "out"))
     export_campaign(load_export_campaign(export), *export, ExecutorConfig(1), RecordingWatch())
     return export
 
 
 def load_export_campaign(exported: Exported, *settings: str) -> Campaign:
-    overrides = ["retain.showcase=none", *settings]
-    return load_campaign(
-        str(exported.directory.parent / "fake.toml"), overrides, None, None, [f"export:{exported.directory}"]
-    )
+    path = str(exported.directory.parent / "fake.toml")
+    return load_campaign(path, ["retain.showcase=none", *settings], None, None, [f"export:{exported.directory}"])
 
 
 def estimate_exported(exported: Exported) -> dict[int, VelocityEstimate]:
@@ -72,6 +72,7 @@ def estimate_exported(exported: Exported) -> dict[int, VelocityEstimate]:
 
 
 def write_answers(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
+    """Write a table of answers in the format of external algorithms."""
     lines = ["case,outcome,velocity_east_m_s,velocity_north_m_s"]
     for case, estimate in answers.items():
         numbers = ["", ""] if estimate.velocity_m_s is None else [repr(float(value)) for value in estimate.velocity_m_s]
@@ -80,15 +81,15 @@ def write_answers(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
     return path
 
 
-def test_external_answers_score_as_a_normal_run(exported: Exported, tmp_path: Path) -> None:
+def test_external_answers_are_scored_as_in_a_normal_run(exported: Exported, tmp_path: Path) -> None:
     watch = RecordingWatch()
-    scored = create_scoring_campaign(*exported, write_answers(tmp_path / "theirs.csv", estimate_exported(exported)))
+    scored = create_scoring_campaign(*exported, write_answers(tmp_path / "external.csv", estimate_exported(exported)))
     run_campaign(scored, tmp_path / "scored", ExecutorConfig(1), watch)
-    normal_run = load_campaign(str(exported.directory.parent / "fake.toml"))
-    run_campaign(normal_run, tmp_path / "own", ExecutorConfig(1), watch)
-    for row, other in zip(read_case_rows(tmp_path / "scored"), read_case_rows(tmp_path / "own"), strict=True):
-        assert differing_columns(row, other) == ("algorithm",)
-        assert row["algorithm"] == "theirs"
+    normal_campaign = load_campaign(str(exported.directory.parent / "fake.toml"))
+    run_campaign(normal_campaign, tmp_path / "normal", ExecutorConfig(1), watch)
+    for row, normal_row in zip(read_case_rows(tmp_path / "scored"), read_case_rows(tmp_path / "normal"), strict=True):
+        assert differing_columns(row, normal_row) == ("algorithm",)
+        assert row["algorithm"] == "external"
         assert row["velocity_error_m_s"] < 1.0
     assert find_cases_with_changed_images(exported.truth, tmp_path / "scored") == []
     assert watch.notes == []
@@ -96,6 +97,7 @@ def test_external_answers_score_as_a_normal_run(exported: Exported, tmp_path: Pa
 
 def test_truth_is_stored_in_a_separate_folder(exported: Exported) -> None:
     rows = read_case_rows(exported.truth)
+    # the true east velocity of the fake descent is 12 m/s
     assert [row["velocity_true_x_m_s"] for row in rows] == [12.0] * CASES
     files = sorted(path.relative_to(exported.directory).as_posix() for path in exported.directory.rglob("*"))
     assert {name for name in files if "/" not in name} == {"README.md", "cases", "export.json"}
@@ -116,9 +118,9 @@ def test_export_resumes_and_rejects_other_exports(exported: Exported) -> None:
     assert {path: path.stat().st_mtime_ns for path in times} == times
     with pytest.raises(StoreError, match="contains the truth of another export"):
         export_campaign(load_export_campaign(exported, "seed=4"), *exported, ExecutorConfig(1), RecordingWatch())
-    elsewhere = Exported(exported.directory, exported.truth.with_name("new-truth"))
+    new_truth = Exported(exported.directory, exported.truth.with_name("new-truth"))
     with pytest.raises(StoreError, match="already exists and is not empty"):
-        export_campaign(load_export_campaign(exported), *elsewhere, ExecutorConfig(1), RecordingWatch())
+        export_campaign(load_export_campaign(exported), *new_truth, ExecutorConfig(1), RecordingWatch())
 
 
 def test_tables_with_missing_or_unknown_cases_are_rejected(exported: Exported, tmp_path: Path) -> None:
@@ -135,6 +137,6 @@ def test_tables_with_missing_or_unknown_cases_are_rejected(exported: Exported, t
         create_scoring_campaign(tmp_path, exported.truth, incomplete)
 
 
-def test_closed_loops_cannot_be_exported(tmp_path: Path) -> None:
+def test_target_trackers_cannot_be_exported(tmp_path: Path) -> None:
     with pytest.raises(CampaignError, match="a target tracker cannot run offline"):
         load_campaign("vtt-checkout-1", [], 1, None, [f"export:{tmp_path}"])

@@ -22,101 +22,101 @@ CampaignFile = Callable[..., Path]
 
 
 @pytest.fixture
-def finished(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> Path:
-    """Run a small campaign that a test may modify."""
+def finished_campaign(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> Path:
+    """Run a campaign of four cases; tests may change its folder."""
     return run(campaign_file("raising_cases = [2]"), tmp_path / "done", watch, "cases=4", jobs=1)
 
 
 def test_appended_cases_follow_existing_cases(
-    finished: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
+    finished_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
-    before = [str(row) for row in read_case_rows(finished)]
-    append_cases(finished, 3, ExecutorConfig(1), watch)
-    append_cases(finished, 1, ExecutorConfig(2), watch)
-    rows = read_case_rows(finished)
-    assert [str(row) for row in rows[:4]] == before
-    stored = record.read(finished)
+    rows_before = [str(row) for row in read_case_rows(finished_campaign)]
+    append_cases(finished_campaign, 3, ExecutorConfig(1), watch)
+    append_cases(finished_campaign, 1, ExecutorConfig(2), watch)
+    rows = read_case_rows(finished_campaign)
+    assert [str(row) for row in rows[:4]] == rows_before
+    stored = record.read(finished_campaign)
     assert (stored["cases"], stored["state"], stored["configuration"]["appended"]) == (8, "finished", [3, 1])
     # independent draws: appended cases equal the cases of a larger campaign
-    larger = read_case_rows(run(campaign_file("raising_cases = [2]"), tmp_path / "whole", watch, "cases=8", jobs=1))
+    larger = read_case_rows(run(campaign_file("raising_cases = [2]"), tmp_path / "larger", watch, "cases=8", jobs=1))
     assert [differing_columns(*pair) for pair in zip(rows, larger, strict=True)] == [()] * 8
-    assert replay(finished, 7).differing == ()
+    assert replay(finished_campaign, 7).differing == ()
     with pytest.raises(CampaignError, match="0 cases cannot be added"):
-        append_cases(finished, 0, ExecutorConfig(1), watch)
+        append_cases(finished_campaign, 0, ExecutorConfig(1), watch)
 
 
 def test_resume_of_finished_campaign_runs_nothing(
-    finished: Path, watch: RecordingWatch, monkeypatch: pytest.MonkeyPatch
+    finished_campaign: Path, watch: RecordingWatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = {name: (finished / name).stat().st_mtime_ns for name in ("campaign.json", "cases.parquet")}
-    record_before = record.read(finished)
+    times_before = {name: (finished_campaign / name).stat().st_mtime_ns for name in ("campaign.json", "cases.parquet")}
+    record_before = record.read(finished_campaign)
     watch.steps.clear()
 
     def reject_executor(*_: object) -> None:
         raise AssertionError("a worker is started")
 
     monkeypatch.setattr("marsyard.campaigns.running.engine.create_executor", reject_executor)
-    resume_campaign(finished, ExecutorConfig(1), watch)
+    resume_campaign(finished_campaign, ExecutorConfig(1), watch)
     assert watch.notes[-1] == "the campaign is finished: all 4 cases have rows; nothing is run"
     assert watch.steps == {}
-    assert {name: (finished / name).stat().st_mtime_ns for name in before} == before
-    assert record.read(finished) == record_before
+    assert {name: (finished_campaign / name).stat().st_mtime_ns for name in times_before} == times_before
+    assert record.read(finished_campaign) == record_before
 
 
-def test_crashed_cases_are_repeated_on_request(finished: Path, watch: RecordingWatch) -> None:
-    times = {row["case"]: row["wall_time_s"] for row in read_case_rows(finished)}
-    resume_campaign(finished, ExecutorConfig(1), watch)
-    assert {row["case"]: row["wall_time_s"] for row in read_case_rows(finished)} == times
-    resume_campaign(finished, ExecutorConfig(1), watch, retry=["crashed"])
-    repeated = {row["case"]: row["wall_time_s"] for row in read_case_rows(finished)}
+def test_crashed_cases_are_repeated_on_request(finished_campaign: Path, watch: RecordingWatch) -> None:
+    times = {row["case"]: row["wall_time_s"] for row in read_case_rows(finished_campaign)}
+    resume_campaign(finished_campaign, ExecutorConfig(1), watch)
+    assert {row["case"]: row["wall_time_s"] for row in read_case_rows(finished_campaign)} == times
+    resume_campaign(finished_campaign, ExecutorConfig(1), watch, retry=["crashed"])
+    repeated = {row["case"]: row["wall_time_s"] for row in read_case_rows(finished_campaign)}
     assert [case for case in times if repeated[case] != times[case]] == [2]
 
 
-def test_changed_versions_need_permission(
-    finished: Path, watch: RecordingWatch, monkeypatch: pytest.MonkeyPatch
+def test_changed_versions_are_rejected_without_allow_changed(
+    finished_campaign: Path, watch: RecordingWatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     versions = read_versions()
     monkeypatch.setattr("marsyard.campaigns.definition.identity.read_versions", lambda: {**versions, "numpy": "0.9"})
-    before = {path: path.read_bytes() for path in finished.glob("c*.*")}
+    contents_before = {path: path.read_bytes() for path in finished_campaign.glob("c*.*")}
     message = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo continue nevertheless.*--allow-changed"
     commands: tuple[Callable[[], None], ...] = (
-        lambda: resume_campaign(finished, ExecutorConfig(1), watch),
-        lambda: append_cases(finished, 2, ExecutorConfig(1), watch),
+        lambda: resume_campaign(finished_campaign, ExecutorConfig(1), watch),
+        lambda: append_cases(finished_campaign, 2, ExecutorConfig(1), watch),
     )
     for command in commands:
         with pytest.raises(CampaignError, match=message):
             command()
-    assert {path: path.read_bytes() for path in before} == {
-        **before,
-        finished / "campaign.lock": before[finished / "campaign.lock"],
+    assert {path: path.read_bytes() for path in contents_before} == {
+        **contents_before,
+        finished_campaign / "campaign.lock": contents_before[finished_campaign / "campaign.lock"],
     }
-    append_cases(finished, 2, ExecutorConfig(1), watch, allow_changed=True)
-    (change,) = record.read(finished)["changes"]
+    append_cases(finished_campaign, 2, ExecutorConfig(1), watch, allow_changed=True)
+    (change,) = record.read(finished_campaign)["changes"]
     assert (change["cases_before"], change["in"]) == (4, [f"numpy ({np.__version__}, now 0.9)"])
-    assert record.read(finished)["identity"]["versions"]["numpy"] == "0.9"
+    assert record.read(finished_campaign)["identity"]["versions"]["numpy"] == "0.9"
 
 
-def test_changed_configuration_is_rejected(finished: Path, watch: RecordingWatch) -> None:
-    text = (finished / "campaign.json").read_text()
-    (finished / "campaign.json").write_text(text.replace('"altitude_m": 2000.0', '"altitude_m": 2001.0'))
+def test_changed_configuration_is_rejected(finished_campaign: Path, watch: RecordingWatch) -> None:
+    text = (finished_campaign / "campaign.json").read_text()
+    (finished_campaign / "campaign.json").write_text(text.replace('"altitude_m": 2000.0', '"altitude_m": 2001.0'))
     with pytest.raises(CampaignError, match="configuration \\("):
-        resume_campaign(finished, ExecutorConfig(1), watch)
+        resume_campaign(finished_campaign, ExecutorConfig(1), watch)
 
 
 def test_store_of_another_campaign_is_rejected(
-    finished: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
+    finished_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     other = run(campaign_file(""), tmp_path / "other", watch, "cases=1", "seed=77", jobs=1)
-    shutil.copy(other / "cases.sqlite", finished / "cases.sqlite")
+    shutil.copy(other / "cases.sqlite", finished_campaign / "cases.sqlite")
     with pytest.raises(StoreError, match="belong to different campaigns"):
-        resume_campaign(finished, ExecutorConfig(1), watch)
+        resume_campaign(finished_campaign, ExecutorConfig(1), watch)
 
 
-def test_locked_folder_is_rejected(finished: Path, watch: RecordingWatch) -> None:
-    with folder_lock(finished):
+def test_locked_folder_is_rejected(finished_campaign: Path, watch: RecordingWatch) -> None:
+    with folder_lock(finished_campaign):
         commands: tuple[Callable[[], None], ...] = (
-            lambda: resume_campaign(finished, ExecutorConfig(1), watch),
-            lambda: append_cases(finished, 2, ExecutorConfig(1), watch),
+            lambda: resume_campaign(finished_campaign, ExecutorConfig(1), watch),
+            lambda: append_cases(finished_campaign, 2, ExecutorConfig(1), watch),
         )
         for command in commands:
             with pytest.raises(StoreError, match="is in use"):

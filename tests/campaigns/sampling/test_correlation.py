@@ -17,10 +17,11 @@ from marsyard.campaigns.sampling.design import Correlation
 
 CampaignFile = Callable[..., Path]
 CASES = 4000
-HEAD = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
-#: Tolerance in standard errors: a correct sampler exceeds it for one of 16,000 seeds.
+TOP_LEVEL_KEYS = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
+#: Tolerance in standard errors: a correct sampler exceeds it for one of 16,000 seeds (normal, two-sided).
 MAX_STANDARD_ERRORS = 4.0
 
+#: Three correlated parameters of different distributions, and one outside the group.
 SKEWED = """
 [dispersions]
 "wind.east_m_s" = {distribution = "gamma", a = 2.0, scale = 3.0, truncate = [0.0, 40.0]}
@@ -31,6 +32,7 @@ terrain = {distribution = "integer", low = 0, high = 3}
 parameters = ["wind.east_m_s", "wind.north_m_s", "altitude_m"]
 rank = [[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]]
 """
+#: Two correlated normal parameters; the matrix is a covariance or a correlation.
 NORMAL = """
 [dispersions]
 "wind.east_m_s" = {{distribution = "normal", mean = 1{east}}}
@@ -41,9 +43,10 @@ parameters = ["wind.east_m_s", "wind.north_m_s"]
 """
 
 
-def load_correlated(file: CampaignFile, dispersions: str, design: str = "random", cases: int = CASES) -> Campaign:
+def load_correlated(write_file: CampaignFile, dispersions: str, design: str = "random", cases: int = CASES) -> Campaign:
+    """Load a campaign of the fake scenario with correlated dispersions."""
     text = f'[design]\nkind = "{design}"\n{dispersions}'
-    return load_campaign(str(file(head=HEAD.format(cases=cases), dispersions=text)))
+    return load_campaign(str(write_file(top_level_keys=TOP_LEVEL_KEYS.format(cases=cases), dispersions=text)))
 
 
 def draw_table(campaign: Campaign, cases: int = CASES) -> np.ndarray:
@@ -61,26 +64,27 @@ def rank_standard_error(rank: float, cases: int) -> float:
 
 @pytest.mark.parametrize(("design", "cases"), [("random", CASES), ("latin-hypercube", CASES), ("sobol", 4096)])
 def test_rank_correlation_holds_for_any_distribution(campaign_file: CampaignFile, design: str, cases: int) -> None:
-    group = load_correlated(campaign_file, SKEWED, design, cases)
-    draws = draw_table(group, cases)
-    estimate = np.atleast_2d(stats.spearmanr(draws).statistic)
-    ranks = group.configuration.correlations[0].rank
+    campaign = load_correlated(campaign_file, SKEWED, design, cases)
+    draws = draw_table(campaign, cases)
+    estimated_ranks = np.atleast_2d(stats.spearmanr(draws).statistic)
+    ranks = campaign.configuration.correlations[0].rank
     assert ranks is not None
     for row in range(3):
         for column in range(row):
             rank = ranks[row][column]
-            assert abs(estimate[row, column] - rank) < MAX_STANDARD_ERRORS * rank_standard_error(rank, cases), (
+            assert abs(estimated_ranks[row, column] - rank) < MAX_STANDARD_ERRORS * rank_standard_error(rank, cases), (
                 row,
                 column,
             )
     # the parameter outside the group is uncorrelated
-    assert np.abs(estimate[3, :3]).max() < MAX_STANDARD_ERRORS / np.sqrt(cases - 1)
+    assert np.abs(estimated_ranks[3, :3]).max() < MAX_STANDARD_ERRORS / np.sqrt(cases - 1)
 
 
 @pytest.mark.parametrize("design", ["random", "latin-hypercube"])
-def test_members_keep_their_distributions(campaign_file: CampaignFile, design: str) -> None:
+def test_correlated_parameters_have_their_marginal_distributions(campaign_file: CampaignFile, design: str) -> None:
     draws = draw_table(load_correlated(campaign_file, SKEWED, design))
-    gamma, low, high = stats.gamma(2, scale=3), *stats.norm(2000, 100).cdf([1700, 2100])
+    gamma = stats.gamma(2, scale=3)
+    low, high = stats.norm(2000, 100).cdf([1700, 2100])
     cdfs = [
         lambda x: gamma.cdf(x) / gamma.cdf(40),
         stats.uniform(-10, 20).cdf,
@@ -97,23 +101,23 @@ def test_members_keep_their_distributions(campaign_file: CampaignFile, design: s
         (", sd = 2", ", sd = 3", "correlation = [[1.0, -0.75], [-0.75, 1.0]]"),
     ],
 )
-def test_normal_groups_have_the_stated_covariance(
+def test_normal_groups_have_the_specified_covariance(
     campaign_file: CampaignFile, east: str, north: str, matrix: str
 ) -> None:
     """Whitened draws are independent standard normal numbers (Kolmogorov-Smirnov tests)."""
     draws = draw_table(load_correlated(campaign_file, NORMAL.format(east=east, north=north, matrix=matrix)))
     covariance = np.array([[4.0, -4.5], [-4.5, 9.0]])
-    white = np.linalg.solve(np.linalg.cholesky(covariance), (draws - [1.0, -2.0]).T)
-    for row in (*white, (white[0] + white[1]) / np.sqrt(2), (white[0] - white[1]) / np.sqrt(2)):
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), (draws - [1.0, -2.0]).T)
+    for row in (*whitened, (whitened[0] + whitened[1]) / np.sqrt(2), (whitened[0] - whitened[1]) / np.sqrt(2)):
         assert stats.kstest(row, stats.norm.cdf).pvalue > 1e-3
-    assert stats.kstest((white**2).sum(axis=0), stats.chi2(2).cdf).pvalue > 1e-3
-    # Wishart: the variance of an entry s_ij is (c_ij^2 + c_ii c_jj) / (n - 1)
+    assert stats.kstest((whitened**2).sum(axis=0), stats.chi2(2).cdf).pvalue > 1e-3
+    # Wishart distribution: the variance of an entry s_ij is (c_ij^2 + c_ii c_jj) / (n - 1)
     variances = np.diag(covariance)
-    error = np.sqrt((covariance**2 + np.outer(variances, variances)) / (CASES - 1))
-    assert np.all(np.abs(np.cov(draws.T) - covariance) < MAX_STANDARD_ERRORS * error)
+    standard_error = np.sqrt((covariance**2 + np.outer(variances, variances)) / (CASES - 1))
+    assert np.all(np.abs(np.cov(draws.T) - covariance) < MAX_STANDARD_ERRORS * standard_error)
 
 
-def test_conversion_of_rank_correlation_is_exact() -> None:
+def test_normal_correlation_gives_the_rank_correlation() -> None:
     """Compare 2 sin(pi/6 rho_s) with Spearman's coefficient of a bivariate normal by quadrature."""
     group = Correlation(parameters=("a", "b"), rank=((1.0, 0.4), (0.4, 1.0)))
     rho = group.normal_correlation[0, 1]
@@ -124,19 +128,19 @@ def test_conversion_of_rank_correlation_is_exact() -> None:
     assert spearman == pytest.approx(0.4, abs=1e-9)
 
 
-def test_added_member_does_not_change_earlier_members(campaign_file: CampaignFile) -> None:
-    before = load_correlated(campaign_file, SKEWED).draws(7)
-    longer = SKEWED.replace('"altitude_m"]', '"altitude_m", "heights_m.0"]').replace(
+def test_added_parameter_does_not_change_draws_of_the_group(campaign_file: CampaignFile) -> None:
+    draws_before = load_correlated(campaign_file, SKEWED).draws(7)
+    text = SKEWED.replace('"altitude_m"]', '"altitude_m", "heights_m.0"]').replace(
         "rank = [[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]]",
         "rank = [[1.0, 0.6, -0.3, 0.1], [0.6, 1.0, 0.2, 0.1], [-0.3, 0.2, 1.0, 0.1], [0.1, 0.1, 0.1, 1.0]]",
     )
-    longer = longer.replace("[dispersions]", '[dispersions]\n"heights_m.0" = {distribution = "uniform", low=0, high=1}')
-    after = load_correlated(campaign_file, longer).draws(7)
-    assert after.pop("heights_m.0") != before["altitude_m"]
-    assert after == before
+    text = text.replace("[dispersions]", '[dispersions]\n"heights_m.0" = {distribution = "uniform", low=0, high=1}')
+    draws_after = load_correlated(campaign_file, text).draws(7)
+    assert draws_after.pop("heights_m.0") != draws_before["altitude_m"]
+    assert draws_after == draws_before
 
 
-def test_overridden_member_leaves_its_group(campaign_file: CampaignFile) -> None:
+def test_overridden_parameter_is_removed_from_its_group(campaign_file: CampaignFile) -> None:
     path = str(campaign_file(dispersions=SKEWED))
     (group,) = load_campaign(path, ["wind.north_m_s=3"]).configuration.correlations
     assert (group.parameters, group.rank) == (("wind.east_m_s", "altitude_m"), ((1.0, -0.3), (-0.3, 1.0)))

@@ -19,8 +19,8 @@ from marsyard.campaigns.errors import ConfigurationError
 from marsyard.campaigns.sampling.design import build_stratified_design
 
 CampaignFile = Callable[..., Path]
-HEAD = (
-    'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = {seed}\ncases = {cases}\n{more}\n'
+TOP_LEVEL_KEYS = (
+    'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = {seed}\ncases = {cases}\n'
 )
 DISPERSIONS = """
 [dispersions]
@@ -41,18 +41,19 @@ error_scale = {distribution = "grid", values = [0.5, 2.0]}
 
 
 def load_design(
-    file: CampaignFile,
+    campaign_file: CampaignFile,
     kind: str,
     cases: int,
     *,
     dispersions: str = DISPERSIONS,
     nominal: bool = False,
     seed: int = 5,
-    more: str = "",
+    extra_keys: str = "",
 ) -> Campaign:
+    """Load a campaign of the fake scenario with a sampling design."""
     design = f'[design]\nkind = "{kind}"\nnominal = {str(nominal).lower()}\n'
-    head = HEAD.format(cases=cases, seed=seed, more=more)
-    return load_campaign(str(file(head=head, dispersions=design + dispersions)))
+    top_level_keys = TOP_LEVEL_KEYS.format(cases=cases, seed=seed) + extra_keys
+    return load_campaign(str(campaign_file(top_level_keys=top_level_keys, dispersions=design + dispersions)))
 
 
 def read_probabilities(campaign: Campaign, cases: range) -> np.ndarray:
@@ -71,19 +72,19 @@ def test_each_latin_hypercube_stratum_has_one_case(campaign_file: CampaignFile, 
             assert sorted(np.floor(column * cases).astype(int).tolist()) == list(range(cases))
 
 
-def test_drawn_values_are_stratified(campaign_file: CampaignFile) -> None:
+def test_latin_hypercube_values_are_stratified(campaign_file: CampaignFile) -> None:
     campaign = load_design(campaign_file, "latin-hypercube", 200, dispersions=DISPERSIONS + GROUP)
     draws = [campaign.draws(case) for case in range(200)]
-    normal = stats.norm.cdf([draw["wind.north_m_s"] for draw in draws])
-    assert sorted(np.floor(200 * normal).astype(int).tolist()) == list(range(200))
+    probabilities = stats.norm.cdf([draw["wind.north_m_s"] for draw in draws])
+    assert sorted(np.floor(200 * probabilities).astype(int).tolist()) == list(range(200))
     assert [draw["kind"] for draw in draws].count("rough") == 100
 
 
 def test_latin_hypercube_columns_are_uncorrelated(campaign_file: CampaignFile) -> None:
     points = read_probabilities(load_design(campaign_file, "latin-hypercube", 2000), range(2000))
-    difference = stats.spearmanr(points).statistic - np.eye(4)
-    # maximum of six pairs of random orders: below 4.5 standard errors
-    assert np.abs(difference).max() < 4.5 / np.sqrt(1999)
+    rank_error = stats.spearmanr(points).statistic - np.eye(4)
+    # limit for the maximum of six pairs of columns: 4.5 standard errors of 1 / sqrt(n - 1)
+    assert np.abs(rank_error).max() < 4.5 / np.sqrt(1999)
 
 
 def test_sobol_design_is_a_digital_net(campaign_file: CampaignFile) -> None:
@@ -107,11 +108,12 @@ def test_sobol_discrepancy_is_below_random_draws(campaign_file: CampaignFile) ->
 def test_single_case_equals_case_of_full_design(campaign_file: CampaignFile, kind: str, nominal: bool) -> None:
     cases = 6 * 16 + nominal
     design: dict[str, Any] = {"dispersions": DISPERSIONS + GRID + GROUP, "nominal": nominal}
-    forward = load_design(campaign_file, kind, cases, **design)
-    draws = [forward.draws(case) for case in range(cases)]
+    campaign = load_design(campaign_file, kind, cases, **design)
+    draws = [campaign.draws(case) for case in range(cases)]
     for case in (cases - 1, 17, 3, 0):
         build_stratified_design.cache_clear()
         assert load_design(campaign_file, kind, cases, **design).draws(case) == draws[case]
+    # all cases differ
     assert len({str(draw) for draw in draws}) == cases
 
 
@@ -122,24 +124,24 @@ def test_added_dispersion_does_not_change_other_draws(
     campaign_file: CampaignFile, kind: str, name: str, case: int
 ) -> None:
     """The position in the file is arbitrary; in a Sobol design the new dispersion must be the last."""
-    others = DISPERSIONS.replace('"wind.east_m_s" = {distribution = "uniform", low = 0, high = 1}', "")
+    other_dispersions = DISPERSIONS.replace('"wind.east_m_s" = {distribution = "uniform", low = 0, high = 1}', "")
     entry = f'"{name}" = {{distribution = "uniform", low = 0, high = 1}}\n'
-    without = load_design(campaign_file, kind, 64, dispersions=others).draws(case)
+    draws_without = load_design(campaign_file, kind, 64, dispersions=other_dispersions).draws(case)
     texts = (
-        [others + entry]
+        [other_dispersions + entry]
         if kind == "sobol"
-        else [others + entry, others.replace("[dispersions]", f"[dispersions]\n{entry}")]
+        else [other_dispersions + entry, other_dispersions.replace("[dispersions]", f"[dispersions]\n{entry}")]
     )
     for text in texts:
         draw = load_design(campaign_file, kind, 64, dispersions=text).draws(case)
         assert 0.0 < draw.pop(name) < 1.0
-        assert draw == without
+        assert draw == draws_without
 
 
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
-def test_appended_block_keeps_earlier_cases(campaign_file: CampaignFile, kind: str) -> None:
+def test_appended_cases_do_not_change_earlier_cases(campaign_file: CampaignFile, kind: str) -> None:
     before = load_design(campaign_file, kind, 33, nominal=True)
-    after = load_design(campaign_file, kind, 33, nominal=True, more="appended = [16, 8]")
+    after = load_design(campaign_file, kind, 33, nominal=True, extra_keys="appended = [16, 8]")
     assert after.configuration.total_cases == 57
     assert [after.draws(case) for case in range(33)] == [before.draws(case) for case in range(33)]
     points = read_probabilities(after, range(1, 57))
@@ -149,7 +151,7 @@ def test_appended_block_keeps_earlier_cases(campaign_file: CampaignFile, kind: s
             assert sorted(np.floor(block[:, 0] * len(block)).astype(int).tolist()) == list(range(len(block)))
 
 
-def test_latin_hypercube_depends_on_the_number_of_cases(campaign_file: CampaignFile) -> None:
+def test_latin_hypercube_draws_depend_on_number_of_cases(campaign_file: CampaignFile) -> None:
     small, large = (load_design(campaign_file, "latin-hypercube", cases) for cases in (10, 11))
     assert small.draws(3) != large.draws(3)
     assert load_design(campaign_file, "random", 10).draws(3) == load_design(campaign_file, "random", 11).draws(3)
@@ -182,7 +184,7 @@ def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "cases", "more", "message"),
+    ("kind", "cases", "options", "message"),
     [
         ("sobol", 48, {}, "design: a Sobol design needs a power of 2, such as 32 or 64"),
         ("sobol", 32, {"nominal": True}, "31 cases after the nominal case"),
@@ -190,13 +192,13 @@ def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
         ("random", 7, {"dispersions": DISPERSIONS + GRID}, "cases: 7 cases do not fit the sampling design: the grid"),
         ("latin-hypercube", 1, {"nominal": True}, "no case remains"),
         ("latin-hypercube", 2**20 + 1, {}, "has at most 1048576 cases"),
-        ("sobol", 8, {"more": "appended = [8, 3]"}, "appended[1]: 3 cases do not fit the sampling design"),
+        ("sobol", 8, {"extra_keys": "appended = [8, 3]"}, "appended[1]: 3 cases do not fit the sampling design"),
         ("halton", 8, {}, "design.kind: input should be 'random', 'latin-hypercube' or 'sobol', got 'halton'"),
     ],
 )
 def test_invalid_designs_are_rejected(
-    campaign_file: CampaignFile, kind: str, cases: int, more: dict[str, object], message: str
+    campaign_file: CampaignFile, kind: str, cases: int, options: dict[str, object], message: str
 ) -> None:
     with pytest.raises(ConfigurationError) as raised:
-        load_design(campaign_file, kind, cases, **more)  # type: ignore[arg-type]
+        load_design(campaign_file, kind, cases, **options)  # type: ignore[arg-type]
     assert message in str(raised.value)

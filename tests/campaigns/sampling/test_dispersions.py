@@ -21,9 +21,8 @@ from marsyard.sim.streams import Streams
 
 CampaignFile = Callable[..., Path]
 CASES = 2000
-#: Significance level: a correct sampler fails for one of 1000 seeds. The seeds are fixed.
+#: Smallest accepted p-value of a test: a correct sampler fails for one of 1000 seeds. The seeds are fixed.
 MIN_P = 1e-3
-
 
 _ADAPTER: TypeAdapter[Dispersion] = TypeAdapter(AnyDispersion)
 
@@ -34,6 +33,7 @@ def make_dispersion(**keys: object) -> Dispersion:
 
 @cache
 def draw_uniform() -> list[float]:
+    """Draw one uniform number per case."""
     return [float(Streams(1, "ks", case).generator("dispersion:x").random()) for case in range(CASES)]
 
 
@@ -42,7 +42,7 @@ def draw_values(dispersion: Dispersion) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("dispersion", "shape"),
+    ("dispersion", "reference"),
     [
         (make_dispersion(distribution="uniform", low=-30, high=30), stats.uniform(-30, 60)),
         (make_dispersion(distribution="normal", mean=5, sd=2), stats.norm(5, 2)),
@@ -55,11 +55,11 @@ def draw_values(dispersion: Dispersion) -> np.ndarray:
     ],
     ids=lambda value: value.describe() if isinstance(value, Dispersion) else "",
 )
-def test_continuous_draws_follow_their_distribution(dispersion: Dispersion, shape: object) -> None:
-    assert stats.kstest(draw_values(dispersion), shape.cdf).pvalue > MIN_P  # type: ignore[attr-defined]
+def test_continuous_draws_follow_their_distribution(dispersion: Dispersion, reference: object) -> None:
+    assert stats.kstest(draw_values(dispersion), reference.cdf).pvalue > MIN_P  # type: ignore[attr-defined]
 
 
-_SHAPES: dict[str, dict[str, st.SearchStrategy[float]]] = {
+_SHAPE_PARAMETERS: dict[str, dict[str, st.SearchStrategy[float]]] = {
     "beta": {"a": st.floats(0.5, 8.0), "b": st.floats(0.5, 8.0)},
     "expon": {},
     "gamma": {"a": st.floats(0.5, 20.0)},
@@ -74,24 +74,25 @@ _SHAPES: dict[str, dict[str, st.SearchStrategy[float]]] = {
 }
 
 
-@given(data=st.data(), name=st.sampled_from(sorted(_SHAPES)))
+@given(data=st.data(), name=st.sampled_from(sorted(_SHAPE_PARAMETERS)))
 @settings(max_examples=25)
 def test_truncated_scipy_draws_follow_their_distribution(data: st.DataObject, name: str) -> None:
     """The significance level of 1e-6 gives one false failure in 40,000 runs of 25 examples."""
-    keys = {key: data.draw(values) for key, values in _SHAPES[name].items()}
+    keys = {key: data.draw(values) for key, values in _SHAPE_PARAMETERS[name].items()}
     keys |= {"loc": data.draw(st.floats(-100.0, 100.0)), "scale": data.draw(st.floats(0.1, 100.0))}
-    shape = getattr(stats, name)(**keys)
+    reference = getattr(stats, name)(**keys)
     first = data.draw(st.floats(0.0, 0.9))
-    limits = [float(shape.ppf(max(first, 1e-9))), float(shape.ppf(data.draw(st.floats(first + 0.05, 1.0 - 1e-9))))]
+    last = data.draw(st.floats(first + 0.05, 1.0 - 1e-9))
+    limits = [float(reference.ppf(max(first, 1e-9))), float(reference.ppf(last))]
     draws = draw_values(make_dispersion(distribution=name, truncate=limits, **keys))
     assert limits[0] <= draws.min()
     assert draws.max() <= limits[1]
-    low, high = shape.cdf(limits)
-    assert stats.kstest(draws, lambda x: (shape.cdf(x) - low) / (high - low)).pvalue > 1e-6
+    low, high = reference.cdf(limits)
+    assert stats.kstest(draws, lambda x: (reference.cdf(x) - low) / (high - low)).pvalue > 1e-6
 
 
 @pytest.mark.parametrize(
-    ("keys", "shape"),
+    ("keys", "reference"),
     [
         ({"distribution": "poisson", "mu": 3.5}, stats.poisson(3.5)),
         ({"distribution": "poisson", "mu": 3.5, "truncate": [1.5, 6.0]}, stats.poisson(3.5)),
@@ -99,19 +100,20 @@ def test_truncated_scipy_draws_follow_their_distribution(data: st.DataObject, na
         ({"distribution": "geom", "p": 0.25, "truncate": [6, 15]}, stats.geom(0.25)),
     ],
 )
-def test_discrete_scipy_draws_follow_their_weights(keys: dict[str, Any], shape: Any) -> None:
+def test_discrete_scipy_draws_follow_their_weights(keys: dict[str, Any], reference: Any) -> None:
     dispersion = make_dispersion(**keys)
     draws = [dispersion.quantile(value) for value in np.random.default_rng(3).random(CASES)]
     assert {type(value) for value in draws} == {int}
     first, last = keys.get("truncate", (0, 60))
     allowed = np.arange(np.ceil(first), last + 1)
-    probabilities = shape.pmf(allowed) / shape.pmf(allowed).sum()
+    probabilities = reference.pmf(allowed) / reference.pmf(allowed).sum()
     assert set(draws) <= set(allowed.astype(int).tolist())
+    # the chi-square test needs more than five expected draws; other values are counted together
     is_frequent = probabilities * CASES > 5
     observed = np.array([draws.count(int(value)) for value in allowed])
     table = [np.append(counts[is_frequent], counts[~is_frequent].sum()) for counts in (observed, probabilities * CASES)]
-    used = table[1] > 0
-    assert stats.chisquare(table[0][used], table[1][used]).pvalue > MIN_P
+    is_used = table[1] > 0
+    assert stats.chisquare(table[0][is_used], table[1][is_used]).pvalue > MIN_P
 
 
 @pytest.mark.parametrize("name", sorted(scipy_distributions()))
@@ -128,14 +130,14 @@ def test_scipy_distributions_give_finite_values_or_errors(name: str) -> None:
         assert low <= dispersion.quantile(0.3) <= high
 
 
-def test_grids_have_the_stated_levels() -> None:
+def test_grids_have_the_expected_levels() -> None:
     assert make_dispersion(distribution="grid", low=0, high=1, levels=5).extremes() == (0.0, 0.25, 0.5, 0.75, 1.0)
     assert make_dispersion(distribution="grid", low=-1, high=2, step=0.1).extremes()[::10] == (-1.0, 0.0, 1.0, 2.0)
     grid = make_dispersion(distribution="grid", values=["a", 2, {"b": 3.0}])
     assert [grid.quantile((position + 0.5) / 3) for position in range(3)] == ["a", 2, {"b": 3.0}]
 
 
-def test_formulas_use_drawn_values(campaign_file: CampaignFile) -> None:
+def test_formulas_use_draws_and_parameters(campaign_file: CampaignFile) -> None:
     text = """
     [dispersions]
     lowest_altitude_m = {distribution = "uniform", low = "altitude_m - 300", high = "altitude_m - 100"}
@@ -172,7 +174,7 @@ def test_truncation_in_the_far_tail_is_accurate() -> None:
     assert draws.mean() - 9.0 == pytest.approx(stats.truncnorm(9, 20).mean() - 9.0, rel=0.1)
 
 
-def test_integers_and_choices_follow_their_weights() -> None:
+def test_integers_and_choices_follow_their_probabilities() -> None:
     counts = np.unique_counts(draw_values(make_dispersion(distribution="integer", low=-1, high=2)))
     assert counts.values.tolist() == [-1, 0, 1, 2]
     assert stats.chisquare(counts.counts).pvalue > MIN_P
@@ -192,20 +194,20 @@ def test_draws_stay_within_their_bounds(probability: float) -> None:
 
 def test_draws_of_a_case_do_not_depend_on_other_cases(campaign_file: CampaignFile) -> None:
     campaign = load_campaign(str(campaign_file()))
-    forward = [campaign.draws(case) for case in range(5)]
-    assert [load_campaign(str(campaign_file())).draws(case) for case in reversed(range(5))] == forward[::-1]
-    assert load_campaign(str(campaign_file()), cases=1000).draws(3) == forward[3]
-    assert load_campaign(str(campaign_file()), seed=6).draws(3) != forward[3]
-    assert len({str(draw) for draw in forward}) == 5
+    draws = [campaign.draws(case) for case in range(5)]
+    assert [load_campaign(str(campaign_file())).draws(case) for case in reversed(range(5))] == draws[::-1]
+    assert load_campaign(str(campaign_file()), cases=1000).draws(3) == draws[3]
+    assert load_campaign(str(campaign_file()), seed=6).draws(3) != draws[3]
+    assert len({str(draw) for draw in draws}) == 5
 
 
 def test_added_dispersion_does_not_change_other_draws(campaign_file: CampaignFile) -> None:
     path = str(campaign_file())
-    before = load_campaign(path).draws(4)
+    draws_before = load_campaign(path).draws(4)
     overrides = ['dispersions."wind.north_m_s"={distribution="normal", mean=0, sd=3}']
-    after = load_campaign(path, overrides).draws(4)
-    assert after.pop("wind.north_m_s") != 0.0
-    assert after == before
+    draws_after = load_campaign(path, overrides).draws(4)
+    assert draws_after.pop("wind.north_m_s") != 0.0
+    assert draws_after == draws_before
 
 
 def test_draws_set_the_parameters(campaign_file: CampaignFile) -> None:
@@ -218,9 +220,9 @@ def test_draws_set_the_parameters(campaign_file: CampaignFile) -> None:
 
 
 @pytest.mark.parametrize("design", ["random", "sobol"])
-def test_in_turn_integers_repeat_after_all_are_used(campaign_file: CampaignFile, design: str) -> None:
+def test_in_turn_integers_are_used_in_order_and_repeated(campaign_file: CampaignFile, design: str) -> None:
     dispersions = '[dispersions]\nterrain = {distribution = "in-turn", low = 2, high = "2 + 2"}\n'
-    path = campaign_file(dispersions=dispersions, more=f'[design]\nkind = "{design}"\n')
+    path = campaign_file(dispersions=dispersions, extra_tables=f'[design]\nkind = "{design}"\n')
     campaign = load_campaign(str(path), cases=8)
     assert [campaign.draws(case)["terrain"] for case in range(8)] == [2, 3, 4, 2, 3, 4, 2, 3]
     with pytest.raises(ValidationError, match="must not be above"):

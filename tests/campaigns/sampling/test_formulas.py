@@ -1,4 +1,4 @@
-"""Tests of formulas: arithmetic over parameters; other syntax is rejected."""
+"""Tests of formulas: arithmetic with parameters is evaluated; other syntax is rejected."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from marsyard.campaigns.sampling.dispersion import MAX_LENGTH, formula
 
+#: Values of parameters by path, as formulas use them.
 VALUES = {"altitude_m": 2000.0, "wind.east_m_s": -3.0, "heights_m.1": 4, "on": True, "site": "gusev"}
 
 
@@ -73,7 +74,7 @@ def test_formula_names_are_parameter_paths() -> None:
         "[" * 200 + "1" + "]" * 200,
     ],
 )
-def test_other_syntax_than_arithmetic_is_rejected(text: str) -> None:
+def test_non_arithmetic_syntax_is_rejected(text: str) -> None:
     with pytest.raises(ValueError, match=r"is neither a number nor a formula|has at most"):
         formula(text)
 
@@ -96,7 +97,7 @@ def test_formulas_without_a_value_are_reported(text: str, message: str) -> None:
 
 
 @given(text=st.text(max_size=40) | st.text("ab.[]()+-*/0123456789e ,", max_size=40))
-def test_random_text_is_parsed_or_rejected(text: str) -> None:
+def test_random_text_has_a_finite_value_or_is_rejected(text: str) -> None:
     try:
         parsed = formula(text)
         value = parsed.value(dict.fromkeys(parsed.names, 1.5))
@@ -107,12 +108,13 @@ def test_random_text_is_parsed_or_rejected(text: str) -> None:
 
 @given(st.recursive(
     st.floats(-1e3, 1e3).map(repr) | st.sampled_from(["a", "t.b"]),
-    lambda inner: st.builds("({} {} {})".format, inner, st.sampled_from("+-*"), inner) | inner.map("(-{})".format),
+    lambda term: st.builds("({} {} {})".format, term, st.sampled_from("+-*"), term) | term.map("(-{})".format),
     max_leaves=8,
 ))  # fmt: skip
 def test_formulas_evaluate_like_python(text: str) -> None:
     if len(text) > MAX_LENGTH:
         return
+    # in Python, the parameter path t.b is an attribute
     table = type("Table", (), {"b": -0.75})
     expected = eval(text, {"a": 2.5, "t": table})  # noqa: S307
     assert formula(text).value({"a": 2.5, "t.b": -0.75}) == expected

@@ -1,4 +1,4 @@
-"""Tests of the stores of rows, tables, records and products."""
+"""Tests of the files of a campaign folder: rows (SQLite), table of rows (Parquet), record and products."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ def complete_row(row: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def open_store(folder: Path, rows: Iterable[dict[str, Any]]) -> Iterator[RowStore]:
+    """Create a store in `folder`, add completed rows and open it."""
     create_store(folder / "cases.sqlite", {"identity": "abc"})
     with RowStore(folder / "cases.sqlite", thorough=True) as store:
         store.add(map(complete_row, rows))
@@ -74,7 +75,7 @@ def test_failed_transaction_stores_no_row(tmp_path: Path) -> None:
         assert store.count() == 1
 
 
-def test_rows_are_kept_without_closing_the_store(tmp_path: Path) -> None:
+def test_rows_are_stored_before_the_store_is_closed(tmp_path: Path) -> None:
     (tmp_path / "copy").mkdir()
     with open_store(tmp_path, [{"case": 0}]):
         for name in ("cases.sqlite", "cases.sqlite-wal"):
@@ -85,13 +86,14 @@ def test_rows_are_kept_without_closing_the_store(tmp_path: Path) -> None:
 
 def test_full_disk_is_reported_without_loss_of_rows(tmp_path: Path) -> None:
     with open_store(tmp_path, [{"case": 0}]) as store:
-        store._connection.execute("PRAGMA max_page_count = 12")
+        store._connection.execute("PRAGMA max_page_count = 12")  # imitates a full disk
         with pytest.raises(StoreError, match="the disk is full; all earlier rows are stored"):
             store.add(complete_row({"case": case, "text": "x" * 1000}) for case in range(1, 100))
         assert store.count() == 1
 
 
 def _truncate(path: Path, pages: float) -> None:
+    """Shorten the database file to a number of pages of 4096 bytes."""
     with path.open("r+b") as file:
         file.truncate(int(pages * 4096))
 
@@ -118,10 +120,10 @@ def test_damaged_store_is_rejected_and_unchanged(tmp_path: Path, damage: Callabl
     with open_store(tmp_path, ({"case": case, "text": "x" * 100} for case in range(300))):
         pass
     damage(path)
-    before = path.read_bytes() if path.exists() else None
+    content = path.read_bytes() if path.exists() else None
     with pytest.raises(StoreError, match=message):
         RowStore(path, thorough=True)
-    assert (path.read_bytes() if path.exists() else None) == before
+    assert (path.read_bytes() if path.exists() else None) == content
 
 
 def test_store_of_another_version_is_rejected(tmp_path: Path) -> None:
@@ -142,25 +144,25 @@ def write_rows_table(folder: Path, rows: Iterable[dict[str, Any]], measures: tup
 
 def test_columns_have_the_narrowest_type(tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = [
-        {"case": 1, "mixed": 2.5, "whole": 2, "odd": "x", "huge": 1, "late": "y"},
-        {"case": 0, "mixed": 1, "whole": 1, "odd": 1, "huge": 10**30, "lacking": 1.0},
+        {"case": 1, "number": 2.5, "integer": 2, "mixed": "x", "large": 1, "only_case_1": "y"},
+        {"case": 0, "number": 1, "integer": 1, "mixed": 1, "large": 10**30, "only_case_0": 1.0},
     ]
-    path = write_rows_table(tmp_path, rows, ("absent",))
+    path = write_rows_table(tmp_path, rows, ("metric",))
     first, second = read_rows(path)
-    assert (first["mixed"], type(first["whole"]), first["odd"], first["huge"]) == (1.0, int, "1", 1e30)
-    assert math.isnan(second["lacking"])
-    assert math.isnan(first["absent"])
-    assert ("late" in first, second["late"]) == (False, "y")
+    assert (first["number"], type(first["integer"]), first["mixed"], first["large"]) == (1.0, int, "1", 1e30)
+    assert math.isnan(second["only_case_0"])
+    assert math.isnan(first["metric"])
+    assert ("only_case_1" in first, second["only_case_1"]) == (False, "y")
     assert not list(tmp_path.glob("*.partial"))
     # the order of columns follows the case numbers, not the order of storage
-    row_columns = ["mixed", "whole", "odd", "huge", "lacking", "late", "absent"]
+    row_columns = ["number", "integer", "mixed", "large", "only_case_0", "only_case_1", "metric"]
     names = ["case", "outcome", "answered", *row_columns, "wall_time_s", "cpu_time_s", "error", "traceback"]
     assert pq.read_schema(path).names == names
     assert str(read_rows(path, 1)) == str([second])
 
 
 def test_tables_are_written_in_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("marsyard.campaigns.store.table._GROUP", 7)
+    monkeypatch.setattr("marsyard.campaigns.store.table._GROUP_ROWS", 7)
     rows = [{"case": case, "x": case / 3, **({"y": case} if case % 5 else {"z": True})} for case in range(50)]
     path = write_rows_table(tmp_path, rows)
     assert pq.ParquetFile(path).num_row_groups == 8
@@ -202,33 +204,33 @@ def test_invalid_records_are_rejected(tmp_path: Path) -> None:
         record.stored_configuration(tmp_path)
 
 
-_leaf = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5)
-_array = st.sampled_from(
+_leaves = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5)
+_arrays = st.sampled_from(
     [np.arange(3, dtype=np.uint16), np.eye(2), np.zeros((0, 2), np.float32), np.array(["ab", "c"])]
 )
-_key = st.text(max_size=3)
-_products = st.dictionaries(
+_keys = st.text(max_size=3)
+_random_products = st.dictionaries(
     st.text(max_size=5),
-    st.recursive(_leaf | _array, lambda inner: st.lists(inner, max_size=2) | st.dictionaries(_key, inner)),
+    st.recursive(_leaves | _arrays, lambda entry: st.lists(entry, max_size=2) | st.dictionaries(_keys, entry)),
     max_size=4,
 )
 
 
-def _is_equal(value: Any, other: Any) -> bool:
+def _is_equal(value: Any, expected: Any) -> bool:
     if isinstance(value, np.ndarray):
-        return value.dtype == other.dtype and np.array_equal(value, other)
+        return value.dtype == expected.dtype and np.array_equal(value, expected)
     if isinstance(value, dict):
-        return value.keys() == other.keys() and all(_is_equal(value[key], other[key]) for key in value)
+        return value.keys() == expected.keys() and all(_is_equal(value[key], expected[key]) for key in value)
     if isinstance(value, list):
-        return len(value) == len(other) and all(map(_is_equal, value, other))
-    return type(value) is type(other) and value == other
+        return len(value) == len(expected) and all(map(_is_equal, value, expected))
+    return type(value) is type(expected) and value == expected
 
 
-@given(products=_products)
+@given(products=_random_products)
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_products_are_read_as_written(tmp_path: Path, products: dict[str, Any]) -> None:
     save_packed(tmp_path, pack_products(products), {})
-    assert _is_equal(products, load_products(tmp_path))
+    assert _is_equal(load_products(tmp_path), products)
 
 
 @pytest.mark.parametrize("value", [object(), np.array([object()]), {1, 2}])
@@ -239,8 +241,8 @@ def test_unsupported_products_are_rejected(tmp_path: Path, value: object) -> Non
         load_products(tmp_path)
 
 
-def test_columns_of_a_sum_are_its_summands() -> None:
-    shared = {"probability": 0.9, "confidence": 0.9}
-    total = Requirement.model_validate({"id": "A", "metric": "a_s + b_s", "bound": 2.0, **shared})
-    flag = Requirement.model_validate({"id": "B", "metric": "safe", **shared})
-    assert numeric_metrics([total, flag]) == ["a_s", "b_s"]
+def test_numeric_columns_of_a_sum_are_its_summands() -> None:
+    confidence = {"probability": 0.9, "confidence": 0.9}
+    total = Requirement.model_validate({"id": "A", "metric": "a_s + b_s", "bound": 2.0, **confidence})
+    boolean = Requirement.model_validate({"id": "B", "metric": "safe", **confidence})
+    assert numeric_metrics([total, boolean]) == ["a_s", "b_s"]

@@ -48,7 +48,7 @@ def test_stuck_altimeter_repeats_an_earlier_range() -> None:
     assert stuck_range_m(Faults(), 10.0) is None
 
 
-def test_at_least_two_images_are_received() -> None:
+def test_minimum_of_two_images_is_received() -> None:
     rng = np.random.default_rng(0)
     assert len(draw_received_images(Faults(), 40, rng)) == 40
     received = draw_received_images(Faults(lost_pictures=0.75), 40, rng)

@@ -45,7 +45,7 @@ def find_problem(**parts: Any) -> tuple[str, str]:
         ({"flight": {"motion": "nowhere:X"}}, "flight", "cannot import motion 'nowhere:X': No module named 'nowhere'"),
         ({"flight": {"motion": "custom_parts:Glidr"}}, "flight", "has no attribute 'Glidr'"),
         ({"flight": {"motion": "glidr"}}, "flight", "unknown motion 'glidr'; allowed: a custom one as module:name"),
-        ({"flight": {"motion": "custom_parts:sideways"}}, "flight", "not a valid motion: it is a function"),
+        ({"flight": {"motion": "custom_parts:lateral_impact"}}, "flight", "not a valid motion: it is a function"),
         ({"flight": {"motion": "custom_parts:StarTracker"}}, "flight", "is not a valid motion: missing members: fly"),
         (
             {"flight": {"motion": "custom_parts:Glider", "options": {"glide": 1.0}}},
@@ -71,7 +71,11 @@ def find_problem(**parts: Any) -> tuple[str, str]:
         ({"altimeter": {"beam": 2.0}}, "altimeter.beam", "did you mean 'beam_deg'?"),
         ({"scores": ["custom_parts:Glider"]}, "scores", "is not a valid score: it is a class, not a function"),
         ({"scores": ["custom_parts:MASS_KG"]}, "scores", "is not a valid score: it is a float, not a function"),
-        ({"scores": ["custom_parts:sideways"] * 2}, "scores", "the score 'custom_parts:sideways' is listed twice"),
+        (
+            {"scores": ["custom_parts:lateral_impact"] * 2},
+            "scores",
+            "the score 'custom_parts:lateral_impact' is listed twice",
+        ),
     ],
 )
 def test_errors_are_reported_with_the_invalid_key(parts: dict[str, Any], key: str, message: str) -> None:

@@ -32,7 +32,7 @@ def run_suite(spec: str, *checks: str) -> dict[str, Finding]:
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [("Glider", "dynamics"), ("PulsedLidar", "instrument"), ("StarTracker", "instrument"), ("sideways", "score")],
+    [("Glider", "dynamics"), ("PulsedLidar", "instrument"), ("StarTracker", "instrument"), ("lateral_impact", "score")],
 )
 def test_examples_of_the_documentation_conform(name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))

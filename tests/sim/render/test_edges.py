@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.motion import View, supersample
-from benchmarks.validation.raycast import meet_triangles
+from benchmarks.validation.raycast import cast_triangles
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
@@ -84,7 +84,7 @@ def test_nearest_triangle_equals_exhaustive_search(rocky: View) -> None:
     objects, pose = rocky.scene.objects, rocky.world_from_body
     rays = pose.rotation.apply(rocky.rays(rocky.camera).directions[::37].astype(np.float64))
     starts = np.broadcast_to(pose.translation, rays.shape)
-    expected = meet_triangles(objects, starts, rays)
+    expected = cast_triangles(objects, starts, rays)
     result = np.array([nearest_hit(objects.hierarchy, Ray(*pose.translation, *ray), np.inf).distance for ray in rays])
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.95
     np.testing.assert_allclose(result, expected, rtol=1e-9)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.validation.raycast import meet_triangles
+from benchmarks.validation.raycast import cast_triangles
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects
 from marsyard.sim.render.kernels.hierarchy import list_in_beam, nearest_hit
@@ -29,7 +29,7 @@ def _draw_rays(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def test_nearest_triangle_equals_exhaustive_search(objects: Objects) -> None:
     rays = _draw_rays(np.random.default_rng(7), 800)
-    expected = meet_triangles(objects, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
+    expected = cast_triangles(objects, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
     result = np.array([nearest_hit(objects.hierarchy, Ray(*EYE, *ray), np.inf).distance for ray in rays])
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.9
     np.testing.assert_allclose(result, expected, rtol=1e-9)

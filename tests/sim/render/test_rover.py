@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validation.raycast import meet_triangles
+from benchmarks.validation.raycast import cast_triangles
 from marsyard.sim.camera import Cahv
 from marsyard.sim.dynamics import MER, ROCKY_8, RoverParameters, settle
 from marsyard.sim.frames import direction, rigid
@@ -76,7 +76,7 @@ def test_head_does_not_occlude_its_cameras(azimuth_deg: float, elevation_deg: fl
         # The central part of the image, which shows the targets.
         u, v = np.meshgrid(np.linspace(430.0, 590.0, 9), np.linspace(430.0, 590.0, 9))
         origins, directions = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))
-        hit_distances = meet_triangles(objects, origins, directions, nearest=1e-3)
+        hit_distances = cast_triangles(objects, origins, directions, nearest=1e-3)
         # Views to the side and down show the deck 0.9 m below, views ahead do not.
         assert hit_distances.min() > (0.9 if azimuth_deg else 100.0)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validation.raycast import Ground, meet_triangles
+from benchmarks.validation.raycast import Ground, cast_triangles
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
@@ -46,7 +46,7 @@ def _compare_with_ray_cast(frame: Frame, scene: Scene, count: int, step: float) 
     fraction = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(facing, 1e-6))
     is_shaded = Ground(scene.surface).hides(points, to_sun, step)
     rays = np.broadcast_to(to_sun, points.shape)
-    is_shaded |= np.isfinite(meet_triangles(scene.objects, points, rays, nearest=2e-3))
+    is_shaded |= np.isfinite(cast_triangles(scene.objects, points, rays, nearest=2e-3))
     actual, expected = (facing > 0.0) & (fraction > 0.5), (facing > 0.0) & ~is_shaded
     return float(np.mean(actual == expected)), float(np.mean((facing > 0.0) & is_shaded))
 
@@ -128,7 +128,7 @@ def test_shaded_positions_equal_an_exhaustive_search(elevation: float) -> None:
     result = np.empty(len(positions), dtype=np.bool_)
     sun_hidden(casters, *positions.T.copy(), result)
     rays = np.broadcast_to(sun.direction, positions.shape)
-    expected = np.isfinite(meet_triangles(objects, positions, rays, nearest=0.0))
+    expected = np.isfinite(cast_triangles(objects, positions, rays, nearest=0.0))
     assert 0.1 < np.mean(expected) < 0.9
     np.testing.assert_array_equal(result, expected)
 
