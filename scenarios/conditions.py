@@ -43,7 +43,7 @@ def ground_columns(ground: SiteGround | None) -> dict[str, Scalar]:
 
 def optics_columns(optics: OpticsParameters) -> dict[str, Scalar]:
     """Return the dispersed errors of a camera's optics."""
-    return optics.model_dump(include={"defocus_px", "stray_light", "dust_discs"})
+    return optics.model_dump(include={"defocus_px", "stray_light", "dust_discs", "dust_depth"})
 
 
 def contrast_columns(image: UInt16[np.ndarray, "rows columns"], detector: DetectorParameters) -> dict[str, Scalar]:

@@ -19,7 +19,7 @@ _AZIMUTHS, _DISTANCES, _LINES_PER_BODY = 1440, 64, 60
 #: Sizes of the ridges in lines of the mesh, and their RMS height relative to the hill's; assumed.
 _RIDGE_SIZES, _RIDGES = (12.0, 6.0, 3.0), 0.25
 #: Minimum height of a face above the plain, metres, and albedo relative to the plain's; assumed.
-_BASE_M, _HILL_ALBEDO = 3.0, 0.85
+_BASE_M, _HILL_ALBEDO = 1.0, 0.85
 _MARS_RADIUS_M = 3.39e6
 #: Mean width of a rock's silhouette divided by its diameter and height: between an ellipse (pi/4) and a rectangle.
 _SILHOUETTE = 0.85

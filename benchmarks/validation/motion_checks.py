@@ -77,7 +77,7 @@ def run_motion(quick: bool) -> Iterator[Measure]:
         stride = 24 if distance > 5.0 else PATCH
         motions = list(measure(renderer(), rock_view(ROCK_SITE, distance), steps, stride=stride))
         fits.append(_median_fit_errors(motions))
-        rock = _most_frequent_rock(motions[0])
+        rock = _dominant_rock(motions[0])
         on_rock = [motion.error[motion.body == rock] for motion in motions]
         yield _measure_bias(f"bias of motion, rock at {distance:g} m", on_rock, steps)
         around = [motion.error[motion.body != rock] for motion in motions]
@@ -110,7 +110,7 @@ def run_tile(quick: bool) -> Iterator[Measure]:
     yield _measure_bias(f"bias of motion, the HiRISE tile from {TILE_HEIGHT_M:g} m", errors, steps)
 
 
-def _most_frequent_rock(motion: Motion) -> int:
+def _dominant_rock(motion: Motion) -> int:
     rocks = motion.body[motion.body >= 0]
     return int(np.bincount(rocks).argmax())
 
