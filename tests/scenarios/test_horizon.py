@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from marsyard.cli.pictures import ImageRequest, render_images
+from marsyard.cli.pictures import ImageRequest, RenderedImage, render_images
 from marsyard.scenarios.horizon import HILL_NAME, add_unresolved_rocks, hill_objects
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.render import Frame, Scene
@@ -47,9 +47,15 @@ def test_faces_and_normals_of_hills_point_up() -> None:
     assert np.all(hills.normals[..., 2] > 0.0)
 
 
-def test_navigation_camera_sees_the_hills_of_gusev_above_the_horizon() -> None:
-    request = ImageRequest.from_defaults("gusev", "mer-navcam", azimuth_deg=100.0, elevation_deg=-5.0)
-    image = render_images(request, detector=False, both=False)[0]
+@pytest.fixture(scope="module")
+def gusev_image() -> RenderedImage:
+    """Return the image of a navigation camera towards the Columbia Hills."""
+    request = ImageRequest.from_defaults("gusev", "mer-navcam", azimuth_deg=100.0, elevation_deg=-12.0)
+    return render_images(request, detector=False, both=False)[0]
+
+
+def test_navigation_camera_sees_the_hills_of_gusev_above_the_horizon(gusev_image: RenderedImage) -> None:
+    image = gusev_image
     names = np.append(image.scene.objects.names, [-2, -1])[image.frame.body]
     is_hill = names == HILL_NAME
     up = image.frame.rays.directions.reshape(*is_hill.shape, 3) @ image.frame.world_from_body.rotation.as_matrix()[2]
@@ -71,9 +77,8 @@ def test_rover_is_visible_at_the_sides_of_its_hazard_camera() -> None:
     assert not middle.any()
 
 
-def test_unresolved_rocks_hide_distant_ground_by_their_frontal_area() -> None:
-    request = ImageRequest.from_defaults("gusev", "mer-navcam", azimuth_deg=270.0)
-    image = render_images(request, detector=False, both=False)[0]
+def test_unresolved_rocks_hide_distant_ground_by_their_frontal_area(gusev_image: RenderedImage) -> None:
+    image = gusev_image
     frame, ground = image.frame, SiteGround.of(site("gusev"), "ground")
     rocks, limit_rad, rms_slope = ground.rocks, 1.2e-3, 0.02
     assert rocks is not None
