@@ -157,6 +157,10 @@ _LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
 #: The head: depth, height, how much wider than the cameras' baseline, and how far behind their centres it ends, m.
 _HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
 _SIDES = 24
+#: The stowed instrument arm: joints relative to the front edge of the body at the height of the deck, m (x forward, y
+#: left, z up); radii of its links and of the turret that carries the instruments, and length of the turret, m. Assumed.
+_ARM_JOINTS_M = ((0.06, 0.30, -0.02), (0.20, -0.30, 0.0), (0.22, 0.06, -0.01))
+_ARM_RADIUS_M, _TURRET_RADIUS_M, _TURRET_M = 0.025, 0.06, 0.18
 
 Triangles = Float64[np.ndarray, "triangles 3 3"]
 
@@ -182,6 +186,10 @@ def rover_objects(
         _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m)),
         _rod((x, y, rover.deck_m), (x, y, z + mast.elbow_m[2]), _MAST_RADIUS_M),
     ]
+    shoulder, elbow, wrist = np.array([0.5 * length, 0.0, rover.deck_m]) + np.array(_ARM_JOINTS_M)
+    turret = np.array([0.0, 0.5 * _TURRET_M, 0.0])
+    parts += [_rod(shoulder, elbow, _ARM_RADIUS_M), _rod(elbow, wrist, _ARM_RADIUS_M)]
+    parts.append(_rod(wrist - turret, wrist + turret, _TURRET_RADIUS_M))
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
     for side, bogie in enumerate(compute_bogie_pivots(rover, stance.differential_rad)):
         front, middle, rear = centres[3 * side : 3 * side + 3]
@@ -195,9 +203,9 @@ def rover_objects(
     rover_from_head = mast.rover_from_head(azimuth_rad, elevation_rad)
     middle_of_head = (-_BEHIND_M - 0.5 * depth, 0.0, 0.0)
     parts.append(_transform(_box((depth, baseline_m + wider, height), middle_of_head), rover_from_head))
-    # the elevation axis, from the elbow to the head's middle
-    elbow, end = rover_from_head.apply(np.array([-mast.head_m, middle_of_head]))
-    parts.append(_rod(elbow, end, _MAST_RADIUS_M))
+    # the elevation axis, from the mast's elbow to the head's middle
+    top, end = rover_from_head.apply(np.array([-mast.head_m, middle_of_head]))
+    parts.append(_rod(top, end, _MAST_RADIUS_M))
     triangles = _transform(np.concatenate(parts), stance.world_from_rover)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals = across / np.linalg.norm(across, axis=1, keepdims=True)
