@@ -6,6 +6,7 @@ import re
 import tomllib
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +20,7 @@ class DeprecatedNameWarning(FutureWarning):
 
 @cache
 def _read_renamed(section: str) -> Mapping[str, str]:
-    """Read the current names by deprecated name: keys, columns, options or streams."""
+    """Read the current names by deprecated name: keys, columns, options, values or streams."""
     with Path(__file__).with_name("renamed.toml").open("rb") as file:
         names: dict[str, str] = tomllib.load(file)[section]
     return names
@@ -47,6 +48,15 @@ def current_column(name: str, exists: Callable[[str], bool]) -> str:
 def current_options(words: Sequence[str]) -> list[str]:
     """Replace deprecated names of options in the words of a command line."""
     return [_warn_deprecated(word, _read_renamed("options").get(word, word)) for word in words]
+
+
+class Choice(Enum):
+    """Base class of options with named values in campaign files; deprecated values are accepted."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Choice | None:
+        current = _read_renamed("values").get(str(value))
+        return None if current is None else cls(_warn_deprecated(str(value), current))
 
 
 def stream_name(path: str) -> str:

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
-
-class SurfaceFrame(Enum):
-    """Source of the vertical direction (paper: section II.D). The azimuth always comes from the on-board pose."""
-
-    INCLINOMETER = "the inclinometers"
-    STATE = "the on-board filter's attitude"
-    PLANE = "a robust plane through the points: the ground is taken to have no mean slope"
+from marsyard.sim.parameters import Choice
 
 
-class TrackSeed(Enum):
-    """Start of the search for a feature in the second image; the values are the texts in campaign files."""
+class SurfaceFrame(Choice):
+    """Source of the vertical direction (paper: section II.D). The azimuth always comes from the on-board pose.
 
-    NOTHING = "where it was in the first picture, as the paper has it"
-    POSE = "where level ground at the measured range would move it by the on-board poses"
+    Inclinometers, attitude of the on-board filter, or a robust plane through the points (no mean slope).
+    """
+
+    INCLINOMETER = "inclinometers"
+    STATE = "filter"
+    PLANE = "plane"
+
+
+class TrackSeed(Choice):
+    """Start of the search for a feature in the second image.
+
+    Its position in the first image (as in the paper), or its position according to the on-board poses if the ground is
+    level at the measured range.
+    """
+
+    NOTHING = "unchanged"
+    POSE = "poses"
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,7 @@ def _find_number_problem(limit: float, answer: str) -> str:
 @handle_user_errors
 def ingest(
     folder: Annotated[
-        Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and pictures (docs/real-pictures.md).")
+        Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and images (docs/real-pictures.md).")
     ],
     out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
     system: Annotated[str | None, Option(help="System under test; by default `measured`.")] = None,

@@ -93,7 +93,7 @@ def _describe_fault(fault: str, size: float) -> tuple[str, str]:
     name, unit = description["name"], description.get("unit")
     if unit is None or math.isnan(size):
         return name, ""
-    if unit == "share":
+    if unit == "fraction":
         return name, f"{100.0 * size:g} %"
     return name, f"{size:g}" if unit == "number" else f"{size:g} {unit}"
 

@@ -1,1 +1,1 @@
-"""A helicopter, or a lander, that looks for a place to land in two pictures (Johnson, Montgomery & Matthies)."""
+"""A helicopter, or a lander, that selects a landing site in two images (Johnson, Montgomery & Matthies)."""

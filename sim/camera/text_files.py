@@ -26,7 +26,7 @@ from marsyard.sim.camera.pds import is_pds3, is_xml, read_pds3, read_pds4
 _FORMAT_BYTES = 4096
 
 #: Descriptions of the frames of reference, written into the files.
-BODY_FRAME = "body (metres); the body's pose in the world, where it is known, is stated next to this file"
+BODY_FRAME = "body (metres); the file next to this one contains the body's pose in the world if it is known"
 HEAD_FRAME = "head of the mast (metres: x forward, y left, z up at azimuth and elevation zero)"
 
 _TYPE_NAMES = {

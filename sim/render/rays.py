@@ -90,7 +90,7 @@ class PixelRays:
         view_of_pixel = np.zeros((rows, columns), dtype=np.uint8)
         axes: list[Float64[np.ndarray, "3 3"]] = []
         focal: list[float] = []
-        # the picture is divided into quarters until each part fits in a view
+        # the image is divided into quarters until each part fits in a view
         pending = [(slice(0, rows), slice(0, columns))]
         while pending:
             part = pending.pop(0)

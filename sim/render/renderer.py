@@ -50,13 +50,13 @@ NO_CEILING = np.full((1, 1), np.inf, dtype=np.float32)
 MIN_PIXELS = 20_000
 #: Options of glibc's mallopt (malloc.h).
 _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
-#: Size from which memory is mapped separately: terrains are larger, pictures are smaller.
+#: Size from which memory is mapped separately: terrains are larger, images are smaller.
 _MMAP_THRESHOLD_BYTES = 32 << 20
 #: Size of the free end of the heap from which it is returned to the system.
 _TRIM_THRESHOLD_BYTES = 1 << 30
 #: Number of scenes between returns of freed memory; a return after each scene takes 10 % of a rover case's time.
 _TRIM_INTERVAL_SCENES = 16
-#: Rays along each side of a picture that determine the visible ground.
+#: Rays along each side of an image that determine the visible ground.
 _PROBES = 9
 
 
@@ -83,7 +83,7 @@ def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side:
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture before the detector model, and its ground truth.
+    """An image before the detector model, and its ground truth.
 
     - radiance: radiance factor (I/F)
     - range_m: distance along each pixel's ray from its origin, infinite for the sky
@@ -204,7 +204,7 @@ class Renderer:
             world_from_view[:3, :3] = pose.rotation @ view_from_body.T
             world_from_view[:3, 3] = pose.position
             # near plane at 5 % of the height above the ground: nearer surfaces are clipped; the depth is only a first
-            # guess, so its low resolution at large distances has no effect on the picture
+            # guess, so its low resolution at large distances has no effect on the image
             far = 2.0 * scene.mesh_reach_m + clearance_m
             pictures.append(renderer.draw(world_from_view, float(focal), 0.05 * clearance_m, far))
         # a single view is not copied
@@ -261,7 +261,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def keep_freed_memory() -> None:
-    """Configure glibc to reuse the memory of freed pictures; this saves 4 % of the run time of a descent case."""
+    """Configure glibc to reuse the memory of freed images; this saves 4 % of the run time of a descent case."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD_BYTES)

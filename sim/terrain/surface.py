@@ -85,7 +85,7 @@ class Surface:
         return np.asarray(values.reshape(*x.shape, 4))
 
 
-#: Illumination for which contrast is stated: the sun's elevation, and the fraction of diffuse light.
+#: Illumination that defines the contrast: the sun's elevation, and the fraction of diffuse light.
 CONTRAST_SUN_ELEVATION_DEG = 45.0
 CONTRAST_SKY_FRACTION = 0.15
 CONTRAST_LUNAR_FRACTION = 0.55  #: Fraction of Lommel-Seeliger reflection (McEwen 1991).

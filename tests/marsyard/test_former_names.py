@@ -13,6 +13,7 @@ import pytest
 
 from marsyard.campaigns.definition.identity import create_identity
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import ConfigurationError
 from marsyard.campaigns.store import record
 from marsyard.cli.app import main
 from marsyard.reports.stored import read_run
@@ -68,6 +69,15 @@ def test_campaign_with_former_names_equals_the_current_one(files: tuple[Path, Pa
     texts = {str(warning.message) for warning in caught}
     assert "'place' is now 'location'; the former name is accepted until 0.2" in texts
     assert {text.split("'")[1] for text in texts} == {"place", "cone_minor_share", "room"}
+
+
+def test_former_value_of_an_option_is_its_current_value() -> None:
+    former = "where level ground at the measured range would move it by the on-board poses"
+    with pytest.warns(DeprecatedNameWarning, match="is now 'poses'"):
+        campaign = load_campaign("hda-benign", [f'hda.track_seed="{former}"'])
+    assert campaign.configuration.parameters["hda"]["track_seed"] == "poses"
+    with pytest.raises(ConfigurationError, match="input should be 'unchanged' or 'poses'"):
+        load_campaign("hda-benign", ["hda.track_seed=nothing"])
 
 
 def test_override_with_a_former_name_sets_the_parameter(files: tuple[Path, Path]) -> None:

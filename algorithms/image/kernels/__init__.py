@@ -1,1 +1,1 @@
-"""Compiled kernels of pictures; the typed functions around them say what they compute."""
+"""Compiled image kernels; the typed functions that call them document their inputs and outputs."""

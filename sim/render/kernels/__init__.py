@@ -1,1 +1,1 @@
-"""Compiled kernels of the picture."""
+"""Compiled rendering kernels."""

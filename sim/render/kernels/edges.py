@@ -44,7 +44,7 @@ BEAM_RADIUS_PX = 0.8
 def _is_range_jump(range0: float, range1: float, range2: float, range3: float) -> bool:
     """Whether the range jumps between the second and the third of four pixels in a line.
 
-    The inverse range of a plane is linear in the picture, so it has no jump.
+    The inverse range of a plane is linear in the image, so it has no jump.
     """
     if not abs(range2 - range1) > MIN_RANGE_JUMP * max(range1, range2):
         return False

@@ -138,7 +138,7 @@ def _project(
 def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None:
     """First guesses of distance, and footprints, from the four samples around each ray; 0 if depth is discontinuous.
 
-    Inverse depth is interpolated, as the inverse depth of a plane is linear in the picture.
+    Inverse depth is interpolated, as the inverse depth of a plane is linear in the image.
     """
     for k in range(min(width, STRIP)):
         a, b, c, d = work[UPPER_LEFT + k], work[UPPER_RIGHT + k], work[LOWER_LEFT + k], work[LOWER_RIGHT + k]
