@@ -116,8 +116,10 @@ def match_pixels(
     starts, ends, valid = epipolar_segments(second, second_from_first, coordinates, bounds_m, border)
     pixels, coordinates, starts, ends = pixels[valid], coordinates[valid], starts[valid], ends[valid]
     rounded = pixels.astype(np.int64)
-    matches = matching.search_segments(first.counts, second.counts, rounded, starts, ends, options.search_half_px)
-    matched_pixels, correlations = matching.refine_shifts(
+    matches = matching.match_along_epipolar_segments(
+        first.counts, second.counts, rounded, starts, ends, options.search_half_px
+    )
+    matched_pixels, correlations = matching.refine_positions(
         first.counts, second.counts, rounded[:, ::-1], (matches - rounded)[:, ::-1], options.search_half_px
     )
     depths = triangulate(coordinates, undistort(second.camera, matched_pixels), second_from_first)
@@ -156,7 +158,9 @@ def forward_backward_error(
     points = [first_from_second.apply(points_at_depth(match_coordinates, z)) for z in depths]
     ends = [project_points(first.camera, point)[0] for point in points]
     starts, stops = (clip_to_image(first.camera.size, pixels.astype(np.float64), end, half_px + 1.0) for end in ends)
-    reverse_matches = matching.search_segments(second.counts, first.counts, matches, starts, stops, half_px)
+    reverse_matches = matching.match_along_epipolar_segments(
+        second.counts, first.counts, matches, starts, stops, half_px
+    )
     return np.asarray(np.hypot(*(reverse_matches - pixels).T))
 
 

@@ -121,11 +121,11 @@ def track_features(first: Counts, second: Counts, features: Points2, expected: P
     shifts = np.rint(expected_shifts / 2 ** (len(sizes) - 1)).astype(np.int64)
     for level in range(len(sizes) - 1, -1, -1):
         size = sizes[level]
-        shifts, _ = matching.search_windows(
+        shifts, _ = matching.find_best_shifts(
             first_levels[level], second_levels[level], pixels >> level, shifts, size.template_half, size.window_half
         )
         shifts = 2 * shifts if level else shifts
-    tracked, correlations = matching.refine_shifts(
+    tracked, correlations = matching.refine_positions(
         first_levels[0], second_levels[0], pixels, shifts, options.template_half_px
     )
     accepted = correlations >= options.min_track_correlation

@@ -1,6 +1,7 @@
-"""Approach accuracy (tracking paper: Eqs. 1 to 5 and Table I), and hand-off of the target to the arm (3 and 7.4).
+"""Approach accuracy (tracking paper: Eqs. 1 to 5, Table I), and hand-off of the target to the arm (sections 3, 7.4).
 
-Errors are in metres. They are 3-sigma values if the disparity error is a 3-sigma value (paper: 1 pixel).
+Errors are in metres, and in centimetres in the rows of Table I. They are 3-sigma values if the disparity error is a
+3-sigma value (paper: 1 pixel).
 """
 
 from __future__ import annotations
@@ -93,7 +94,9 @@ class AccuracyRow:
 
 
 def accuracy_row(design: StereoDesign) -> AccuracyRow:
-    """Compute a row of Table I; the error without tracker (Eq. 3) is the root sum square of designation and navigation.
+    """Compute a row of Table I.
+
+    The error without tracker (Eq. 3) is the root sum square of the stereo error at designation and the odometry error.
 
     Each column is rounded before the next one is computed, as in the paper: 42.0 cm for the navcam is
     ``sqrt(38.8^2 + 16^2)``; with 38.75 it would be 41.9.

@@ -18,10 +18,10 @@ from marsyard.sim.dynamics import Resting, State, Trajectory
 from marsyard.sim.dynamics.rotorcraft import (
     Air,
     AirParameters,
+    AltimeterErrors,
     FlownPath,
     GroundPatch,
     LandingGuidance,
-    LandingLaser,
     Phase,
     RotorcraftFlight,
     RotorcraftParameters,
@@ -236,7 +236,7 @@ def land(
     p, path = transit.parameters, transit.flight.path
     noise = np.hypot(laser.parameters.noise_m, laser.parameters.noise * p.guidance.flare_range_m)
     errors_m = noise * streams.generator("laser noise, landing").standard_normal(len(transit.air.gusts_m_s))
-    altimeter = LandingLaser(laser.scale, errors_m, laser_stuck_m)
+    altimeter = AltimeterErrors(laser.scale, errors_m, laser_stuck_m)
     start = float(transit.navigated.boundaries_s[-1])
     transit_errors = _interpolate_at_knots(path, transit.navigated.boundaries_s, transit.navigated.errors(path))
     errors, previous, end = transit_errors, None, None
@@ -250,7 +250,7 @@ def land(
         errors = np.concatenate([transit_errors, leg_errors[len(transit_errors) :]])
         change_m = np.inf if previous is None else float(np.abs(path.rows[:, :3] - previous.rows[:, :3]).max())
         previous, iterations = path, iterations + 1
-    time = flight.first(Phase.ON_GROUND)
+    time = flight.phase_start_s(Phase.ON_GROUND)
     if time is None:
         return None
     # the receiver's averaged solutions, with the helicopter at rest

@@ -12,17 +12,17 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
-#: Minimum number of pages of the site; a smaller number shows that the build skipped pages.
+#: Minimum number of pages of the site; fewer pages mean that the build skipped some.
 MIN_PAGES = 40
 
 
-class Page(HTMLParser):
+class PageParser(HTMLParser):
     """Parser that collects links, loaded files and anchors of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.links: list[str] = []
-        self.loads: list[str] = []
+        self.resources: list[str] = []
         self.anchors: set[str] = set()
         self.feed(text)
 
@@ -32,18 +32,18 @@ class Page(HTMLParser):
         if tag == "a" and "href" in attributes:
             self.links.append(attributes["href"])
         elif tag in ("script", "img") and "src" in attributes:
-            self.loads.append(attributes["src"])
+            self.resources.append(attributes["src"])
         elif tag == "link" and attributes.get("rel") == "stylesheet":
-            self.loads.append(attributes["href"])
+            self.resources.append(attributes["href"])
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Page]:
+def site(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, PageParser]:
     out = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-E", "-b", "html", "-d", str(out / "trees")]
     result = subprocess.run([*command, str(DOCS), str(out / "html")], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    pages = {path: Page(path.read_text(encoding="utf-8")) for path in (out / "html").rglob("*.html")}
+    pages = {path: PageParser(path.read_text(encoding="utf-8")) for path in (out / "html").rglob("*.html")}
     assert len(pages) >= MIN_PAGES
     return pages
 
@@ -56,7 +56,7 @@ def _select_local(targets: list[str]) -> Iterator[tuple[str, str]]:
             yield unquote(parts.path), unquote(parts.fragment)
 
 
-def test_links_have_targets(site: dict[Path, Page]) -> None:
+def test_links_have_targets(site: dict[Path, PageParser]) -> None:
     broken = []
     for path, page in site.items():
         for target, fragment in _select_local(page.links):
@@ -66,19 +66,19 @@ def test_links_have_targets(site: dict[Path, Page]) -> None:
     assert not broken
 
 
-def test_pages_load_only_files_of_the_site(site: dict[Path, Page]) -> None:
-    loaded = [target for page in site.values() for target in page.loads]
+def test_pages_load_only_files_of_the_site(site: dict[Path, PageParser]) -> None:
+    loaded = [target for page in site.values() for target in page.resources]
     assert [target for target in loaded if urlsplit(target).netloc] == []
     missing = [
         target
         for path, page in site.items()
-        for target, _ in _select_local(page.loads)
+        for target, _ in _select_local(page.resources)
         if target and not (path.parent / target).exists()
     ]
     assert not missing
 
 
-def test_every_scenario_has_a_parameter_page(site: dict[Path, Page]) -> None:
+def test_every_scenario_has_a_parameter_page(site: dict[Path, PageParser]) -> None:
     from marsyard.scenarios.systems import scenario_names
 
     names = {path.stem for path in site}

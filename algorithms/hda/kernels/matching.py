@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Array = NDArray[np.float64]
 
-#: Minimum energy per pixel (squared counts) of a textured patch; rounding errors in a uniform patch are smaller.
-FLAT_ENERGY = 1e-6
+#: Sum of the variances of two patches (squared counts) up to which they count as textureless, with a correlation of 0;
+#: rounding errors in uniform patches are smaller.
+MIN_VARIANCE = 1e-6
 
 
 @njit(cache=True)
@@ -33,14 +34,15 @@ def correlation(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int,
             sum_ab += a * b
     n = (2 * half + 1) ** 2
     energy = sum_aa - sum_a * sum_a / n + sum_bb - sum_b * sum_b / n
-    return 0.0 if energy <= FLAT_ENERGY * n else 2.0 * (sum_ab - sum_a * sum_b / n) / energy
+    return 0.0 if energy <= MIN_VARIANCE * n else 2.0 * (sum_ab - sum_a * sum_b / n) / energy
 
 
 @njit(cache=True)
 def fit_biquadratic_peak(z: Array) -> tuple[float, float, float]:
     """Row, column and value of the maximum of a quadratic least-squares fit to 3 x 3 values (section II.A).
 
-    The position is relative to the centre, clamped to [-1, 1]. Returns the centre and its value without a maximum.
+    The position is relative to the centre, clamped to [-1, 1]. If the fit has no maximum, the centre and its value are
+    returned.
     """
     # gradient (gr, gc) and second derivatives (rr, cc, rc) of the quadratic
     gr, gc, rr, cc, rc, mean = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -70,7 +72,7 @@ def window_fits(image: Image, row: int, column: int, radius: int) -> bool:
 
 
 @njit(cache=True)
-def search_window(
+def find_best_match(
     first: Image, second: Image, r1: int, c1: int, row: int, column: int, half: int, radius: int
 ) -> tuple[int, int, float]:
     """Row, column and value of the highest correlation within `radius` of (row, column); -2 if no window fits."""
@@ -85,17 +87,20 @@ def search_window(
 
 
 @njit(cache=True)
-def search_windows(
+def find_best_shifts(
     first: Image, second: Image, positions: NDArray[np.int64], shifts: NDArray[np.int64], half: int, radius: int
 ) -> tuple[NDArray[np.int64], Array]:
-    """Best shift of each position (row, column) near its initial shift, and its correlation; -2 if no window fits."""
+    """Shift of highest correlation within `radius` of the initial shift of each position (row, column).
+
+    Returns also this correlation; it is -2 if no window lies inside the image.
+    """
     new_shifts = shifts.copy()
     values = np.full(positions.shape[0], -2.0)
     for k in range(positions.shape[0]):
         r, c = positions[k, 0], positions[k, 1]
         if not window_fits(first, r, c, half):
             continue
-        i, j, values[k] = search_window(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half, radius)
+        i, j, values[k] = find_best_match(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half, radius)
         new_shifts[k, 0], new_shifts[k, 1] = i - r, j - c
     return new_shifts, values
 
@@ -117,7 +122,7 @@ def refine_peak(
 
 
 @njit(cache=True)
-def refine_shifts(
+def refine_positions(
     first: Image, second: Image, positions: NDArray[np.int64], shifts: NDArray[np.int64], half: int
 ) -> tuple[Array, Array]:
     """Sub-pixel positions (u, v) in the second image and their correlations (II.A, II.C); NaN if no window fits."""
@@ -131,7 +136,7 @@ def refine_shifts(
 
 
 @njit(cache=True)
-def absolute_differences(
+def sum_absolute_differences(
     first: NDArray[np.uint16], second: NDArray[np.uint16], r1: int, c1: int, r2: int, c2: int, half: int, max_sum: int
 ) -> int:
     """Sum of absolute differences (Eq. 9, section II.C) of two windows; stops when the sum exceeds `max_sum`."""
@@ -150,7 +155,7 @@ def absolute_differences(
 
 
 @njit(cache=True)
-def search_segments(
+def match_along_epipolar_segments(
     first: NDArray[np.uint16],
     second: NDArray[np.uint16],
     pixels: NDArray[np.int64],
@@ -171,7 +176,7 @@ def search_segments(
         for n in range(steps + 1):
             u = round(starts[k, 0] + du * n / steps)
             v = round(starts[k, 1] + dv * n / steps)
-            value = absolute_differences(first, second, pixels[k, 1], pixels[k, 0], v, u, half, best)
+            value = sum_absolute_differences(first, second, pixels[k, 1], pixels[k, 0], v, u, half, best)
             if value < best:
                 best = value
                 best_pixels[k, 0], best_pixels[k, 1] = u, v

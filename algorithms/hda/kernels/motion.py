@@ -1,4 +1,4 @@
-"""Kernel of structure from motion (section II.B): robust least squares by Levenberg-Marquardt, depths eliminated."""
+"""Kernel of structure from motion (section II.B): robust Levenberg-Marquardt with the inverse depths eliminated."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ Array = NDArray[np.float64]
 
 #: Damping above which the iteration ends without convergence.
 MAX_DAMPING = 1e12
-#: Curvature added for each depth, fraction of the squared focal length; without camera motion, depths do not change.
+#: Regularisation added to the Hessian diagonal of each inverse depth, as a fraction of the squared focal length. It
+#: keeps inverse depths fixed that are not observable because the camera does not move.
 DEPTH_CURVATURE = 1e-14
 
 
@@ -93,7 +94,7 @@ def cauchy_cost(r: Array, scale: float) -> float:
 
 @njit(cache=True)
 def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, Jm: Array, Jd: Array) -> None:
-    """Derivatives of one residual by rotation (left-multiplied) and translation (`Jm`), and by inverse depth (`Jd`)."""
+    """Jacobian of one residual: rotation (left perturbation) and translation (`Jm`, 2 x 6), inverse depth (`Jd`, 2)."""
     ax = R[0, 0] * x + R[0, 1] * y + R[0, 2]
     ay = R[1, 0] * x + R[1, 1] * y + R[1, 2]
     az = R[2, 0] * x + R[2, 1] * y + R[2, 2]
@@ -158,7 +159,7 @@ def solve(
     """Minimise Cauchy's cost from the motion `start`; translation and depths have the same unit.
 
     Returns the motion with inverse depths, its cost, whether the iteration converged (step length below `tolerance`),
-    and the number of steps. `with_depths`: whether the inverse depths are estimated or fixed.
+    and the number of steps. `with_depths` estimates the inverse depths; otherwise they are fixed.
     """
     motion = start
     r = residuals(matches, motion)

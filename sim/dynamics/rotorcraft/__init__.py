@@ -1,13 +1,13 @@
-"""Small autonomous helicopter: flight at constant height for images, and landing on a site (landing paper, V).
+"""Small autonomous helicopter: level flight for image acquisition, and landing on a site (landing paper, V).
 
 Thrust acts along the body's z axis, and drag is proportional to the airspeed: the helicopter pitches forward to fly and
 tilts into the wind. Pitch, roll and yaw follow the autopilot's commands as second-order systems, disturbed by gusts;
 thrust follows with a lag. The autopilot uses a delayed state. It computes the speed from the distance to the goal, the
 acceleration from the speed error, and the tilt from the acceleration, with a trim against steady wind.
 
-The flight for images is controlled with true states, because its deviation from the path has no influence on results.
-The landing is controlled with navigation's states, so that navigation errors become touchdown errors. Below the height
-of the flare the autopilot only controls the velocity to zero, and gusts displace the helicopter.
+The imaging flight is controlled with true states, because its deviation from the path has no influence on results. The
+landing is controlled with the estimated navigation states, so that navigation errors become touchdown errors. Below the
+flare height the autopilot controls the velocity to zero, but not the position, so that gusts displace the helicopter.
 
 Not modelled: inflow near the ground, wind that depends on position, and sliding or tipping after the touchdown. The
 skids stay at the point of first contact, and the tilt decays to zero.
@@ -62,7 +62,7 @@ class RotorcraftParameters(Parameters):
     The paper contains no values. All are assumed: an attitude loop of about 1 Hz, position loops several times slower.
     """
 
-    drag_s: Annotated[Positive, Field(description="time constant of the speed under drag alone, s")] = 5.0
+    drag_s: Annotated[Positive, Field(description="time constant of the decay of airspeed by drag, s")] = 5.0
     attitude_hz: Annotated[Positive, Field(le=5.0, description="natural frequency of pitch and roll, 1/s")] = 0.9
     heading_hz: Annotated[Positive, Field(le=5.0, description="natural frequency of yaw, 1/s")] = 0.5
     damping: Annotated[Positive, Field(le=2.0, description="damping ratio of the angles")] = 0.8
@@ -79,7 +79,7 @@ class RotorcraftParameters(Parameters):
     step_s: Annotated[Positive, Field(le=0.05, description="step of the simulation")] = 0.02
     vibration: VibrationParameters = VibrationParameters()
 
-    def craft(self, gravity_m_s2: float) -> kernels.Craft:
+    def to_kernel(self, gravity_m_s2: float) -> kernels.Craft:
         """Convert the parameters to SI units for the kernels."""
         rad_per_deg, rad_per_cycle = math.radians(1.0), 2.0 * math.pi
         return kernels.Craft(
@@ -106,9 +106,11 @@ class TransitParameters(Parameters):
     speed_m_s: Annotated[Positive, Field(le=15.0, description="commanded speed, m/s (assumed)")] = 1.0
     acceleration_m_s2: Annotated[Positive, Field(le=3.0, description="acceleration to that speed (assumed)")] = 1.0
     hover_s: Annotated[NonNegative, Field(le=600.0, description="duration of the initial hover, s (assumed)")] = 15.0
-    settle_s: Annotated[NonNegative, Field(le=60.0, description="at speed before the first image (assumed)")] = 1.5
+    settle_s: Annotated[
+        NonNegative, Field(le=60.0, description="duration at constant speed before the first image, s (assumed)")
+    ] = 1.5
     pictures: Annotated[int, bounded_field(2, 1000, "number of images")] = 40
-    pictures_s: Annotated[Positive, Field(le=120.0, description="from the first to the last image, s")] = 5.0
+    pictures_s: Annotated[Positive, Field(le=120.0, description="duration from the first to the last image, s")] = 5.0
 
     @property
     def lead_s(self) -> float:
@@ -119,9 +121,9 @@ class TransitParameters(Parameters):
 class LandingGuidance(Parameters):
     """Parameters of the guidance from the last image to the ground (paper, V).
 
-    The distances of 2 m and 1.5 m are from the paper, and the wait is its run time; the other values are assumed. In
-    the paper the helicopter approaches the site during the descent, and below 1.5 m only the blades' pitch changes
-    slowly. Here the autopilot below that height controls the velocity to zero, no longer the position.
+    The distances of 2 m and 1.5 m are from the paper, and `wait_s` is the run time of its algorithm; the other values
+    are assumed. In the paper the helicopter approaches the site during the descent, and below 1.5 m only the collective
+    pitch is reduced slowly. In this model the autopilot controls the velocity below that height, not the position.
     """
 
     wait_s: Annotated[NonNegative, Field(le=60.0, description="from the last image to the answer, s")] = 1.8
@@ -150,17 +152,18 @@ class Vibration:
         return cls(rate, amplitudes, 2.0 * np.pi * rng.random(6))
 
     def derivative(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 6"]:
-        """Compute the displacement (order 0) or its time derivative of an order."""
+        """Compute the time derivative of the given order; order 0 is the displacement."""
         phases = self.rate_rad_s * times_s[:, None] + self.phases_rad + 0.5 * np.pi * order
         return np.asarray(self.amplitudes * self.rate_rad_s**order * np.sin(phases))
 
 
 @dataclass(frozen=True)
 class FlownPath(Trajectory):
-    """Simulated motion: states at equidistant times (rows: see `kernels`), interpolated exactly, plus vibration.
+    """Simulated motion: states at equidistant times (columns: see `kernels`), interpolated exactly, plus vibration.
 
-    Position and angles are twice continuously differentiable. The body frame has its origin at camera, laser and
-    instruments, x forward, y to the left, z up along the rotor's axis.
+    Position and angles are twice continuously differentiable. The body frame has its origin at the camera; laser
+    and inertial unit are assumed to be at the same point. Its axes are x forward, y to the left, z up along the rotor's
+    axis.
     """
 
     start_s: float
@@ -194,7 +197,7 @@ class FlownPath(Trajectory):
     def _interpolate(
         self, interval: np.ndarray, t: Float64[np.ndarray, "n 1"], column: int
     ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-        """Interpolate a vector and its first two derivatives (consecutive columns); the second one is linear."""
+        """Interpolate a vector and its first two derivatives (consecutive columns); the second derivative is linear."""
         value, first, second = np.split(self.rows[interval, column : column + 9], 3, axis=1)
         third = (self.rows[interval + 1, column + 6 : column + 9] - second) / self.step_s
         return (
@@ -250,7 +253,7 @@ class GroundPatch:
 
 
 @dataclass(frozen=True)
-class LandingLaser:
+class AltimeterErrors:
     """Errors of the laser altimeter during the landing.
 
     - scale: reading / true range
@@ -270,7 +273,7 @@ class Phase(Enum):
     WAIT = kernels.WAIT
     APPROACH = kernels.APPROACH
     DESCENT = kernels.DESCEND
-    LANDING = kernels.FLARE
+    FLARE = kernels.FLARE
     ON_GROUND = kernels.REST
 
 
@@ -289,7 +292,7 @@ class RotorcraftFlight:
     heading_rad: float
     craft: RotorcraftParameters
 
-    def first(self, phase: Phase) -> float | None:
+    def phase_start_s(self, phase: Phase) -> float | None:
         """Return the time at which a phase began; None if it did not occur."""
         knots = np.flatnonzero(self.phases == phase.value)
         return float(self.path.knots_s[knots[0]]) if knots.size else None
@@ -298,7 +301,7 @@ class RotorcraftFlight:
 def simulate_transit(
     craft: RotorcraftParameters,
     transit: TransitParameters,
-    over_m: Float64[np.ndarray, "3"],
+    first_image_position_m: Float64[np.ndarray, "3"],
     course_rad: float,
     heading_rad: float,
     gravity_m_s2: float,
@@ -307,8 +310,9 @@ def simulate_transit(
 ) -> RotorcraftFlight:
     """Simulate the flight at constant height until `TAIL_S` after the last image.
 
-    `over_m` is the commanded position at the first image; course and heading are the directions of flight and nose,
-    counterclockwise from east. `rng` draws the vibration. Raises ValueError if the gusts end before the flight.
+    `first_image_position_m` is the commanded position at the first image; course and heading are the directions of
+    flight and nose, counterclockwise from east. `rng` draws the phases of the vibration. Raises ValueError if the gusts
+    end before the flight.
     """
     p, step = transit, craft.step_s
     count = int(np.ceil((p.lead_s + p.pictures_s + TAIL_S) / step - 1e-9)) + 1
@@ -324,9 +328,9 @@ def simulate_transit(
     course = np.array([np.cos(course_rad), np.sin(course_rad), 0.0])
     profile = (distance, p.acceleration_m_s2 * elapsed_ramp, acceleration)
     reference = np.concatenate([np.multiply.outer(values, course) for values in profile], axis=1)
-    reference[:, :3] += over_m
+    reference[:, :3] += first_image_position_m
     # start: hover, with the trim that balances the mean wind
-    constants = craft.craft(gravity_m_s2)
+    constants = craft.to_kernel(gravity_m_s2)
     trim = -air.mean_m_s / constants.drag_s
     east, north, _ = trim.tolist()
     forward = np.cos(heading_rad) * east + np.sin(heading_rad) * north
@@ -352,14 +356,16 @@ def simulate_landing(
     errors: Float64[np.ndarray, "m 9"],
     air: Air,
     ground: GroundPatch,
-    laser: LandingLaser,
+    laser: AltimeterErrors,
     end_s: float | None = None,
 ) -> RotorcraftFlight:
-    """Continue a flight to a site and land, until `end_s`, by default `rest_s` after touchdown or time limit.
+    """Continue a flight to a site and land.
 
-    `site_m` is the site's east and north in navigation's coordinates. `errors` are navigation's position, velocity and
-    angles (yaw, pitch, roll) minus the true ones at the knots from the flight's start on; the last row also applies to
-    all later knots. Raises ValueError if the gusts or the laser's noise end before the longest possible flight.
+    The simulation ends at `end_s`; by default `rest_s` after the touchdown, or at the time limit without a touchdown.
+
+    `site_m` is the site's east and north in the coordinates of the navigation. `errors` are the estimated position,
+    velocity and angles (yaw, pitch, roll) minus the true ones at the knots from the flight's start on; the last row also
+    applies to all later knots. Raises ValueError if the gusts or the laser's noise end before the longest possible flight.
     """
     step, before = flown.craft.step_s, len(flown.path.rows)
     count = before + int(np.ceil((guidance.wait_s + guidance.max_duration_s) / step))
@@ -379,7 +385,7 @@ def simulate_landing(
         laser_stuck_m=np.nan if laser.stuck_m is None else laser.stuck_m,
     )
     flight = kernels.Flight(rows, flown.autopilot.copy(), flown.heading_rad, air.mean_m_s, air.gusts_m_s, step)
-    craft = flown.craft.craft(flown.path.gravity_m_s2)
+    craft = flown.craft.to_kernel(flown.path.gravity_m_s2)
     kernels.land(flight, phases, before - 1, padded_errors, laser.noise_m, ground.as_kernel(), commands, craft)
     landed = np.flatnonzero(phases == Phase.ON_GROUND.value)
     if end_s is not None:

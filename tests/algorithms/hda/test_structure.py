@@ -95,10 +95,10 @@ def test_best_match_has_minimum_absolute_difference() -> None:
     second = np.roll(first, (3, 9), axis=(0, 1))
     pixels = np.array([[30, 25], [50, 40]])
     starts, ends = pixels + np.array([-2.0, -0.7]), pixels + np.array([18.0, 6.7])
-    result = matching.search_segments(first, second, pixels, starts, ends, 5)
+    result = matching.match_along_epipolar_segments(first, second, pixels, starts, ends, 5)
     np.testing.assert_array_equal(result, pixels + np.array([9, 3]))
     total = int(np.abs(first[20:31, 25:36].astype(int) - second[20:31, 28:39].astype(int)).sum())
-    assert matching.absolute_differences(first, second, 25, 30, 25, 33, 5, 2**62) == total
+    assert matching.sum_absolute_differences(first, second, 25, 30, 25, 33, 5, 2**62) == total
 
 
 def test_matches_and_depths_equal_exact_scene(scene: Pass, landing_scene: LandingScene) -> None:

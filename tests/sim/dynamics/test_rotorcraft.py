@@ -12,9 +12,9 @@ from marsyard.sim.dynamics.rotorcraft import (
     TAIL_S,
     Air,
     AirParameters,
+    AltimeterErrors,
     GroundPatch,
     LandingGuidance,
-    LandingLaser,
     Phase,
     RotorcraftFlight,
     RotorcraftParameters,
@@ -54,7 +54,7 @@ def _fly_landing(
     errors[:, 0] = east_error_m
     heights = 2.0 + slope * np.tile(0.5 * np.arange(101.0) - 25.0, (101, 1))
     ground = GroundPatch(SITE - 25.0, 0.5, heights)
-    laser = LandingLaser(1.0, np.zeros(len(air.gusts_m_s)), stuck_m)
+    laser = AltimeterErrors(1.0, np.zeros(len(air.gusts_m_s)), stuck_m)
     return simulate_landing(flight, GUIDANCE, SITE, errors, air, ground, laser)
 
 
@@ -66,7 +66,7 @@ def test_air_shorter_than_the_flight_is_rejected() -> None:
 
 
 def _touchdown_position(flight: RotorcraftFlight) -> np.ndarray:
-    time = flight.first(Phase.ON_GROUND)
+    time = flight.phase_start_s(Phase.ON_GROUND)
     assert time is not None
     return flight.path.state(time).position_m
 
@@ -158,12 +158,12 @@ def test_touchdown_error_is_proportional_to_gusts() -> None:
 
 def test_phases_start_at_the_heights_of_the_paper() -> None:
     flight = _fly_landing(slope=0.1, craft=SMOOTH, **CALM)
-    state = {phase: flight.path.state(time) for phase in Phase if (time := flight.first(phase)) is not None}
+    state = {phase: flight.path.state(time) for phase in Phase if (time := flight.phase_start_s(phase)) is not None}
     assert list(state) == list(Phase)
     assert state[Phase.APPROACH].time_s - TRANSIT.pictures_s == pytest.approx(GUIDANCE.wait_s, abs=0.05)
     # Commands use the state 0.1 s earlier: 0.2 m at 2 m/s, 0.07 m at the descent's 0.7 m/s.
     assert np.hypot(*(state[Phase.DESCENT].position_m[:2] - SITE)) == pytest.approx(2.0, abs=0.25)
-    flare_start = state[Phase.LANDING].position_m
+    flare_start = state[Phase.FLARE].position_m
     assert flare_start[2] - 2.0 - 0.1 * (flare_start[0] - SITE[0]) == pytest.approx(1.5, abs=0.1)
     landed = state[Phase.ON_GROUND]
     assert landed.position_m[2] - 2.0 - 0.1 * (landed.position_m[0] - SITE[0]) == pytest.approx(CRAFT.gear_m, abs=0.01)
@@ -176,8 +176,8 @@ def test_phases_start_at_the_heights_of_the_paper() -> None:
 
 def test_stuck_altimeter_prevents_deceleration() -> None:
     flight = _fly_landing(stuck_m=9.0, **CALM)
-    assert flight.first(Phase.LANDING) is None
-    time = flight.first(Phase.ON_GROUND)
+    assert flight.phase_start_s(Phase.FLARE) is None
+    time = flight.phase_start_s(Phase.ON_GROUND)
     assert time is not None
     assert flight.path.state(time).velocity_m_s[2] == pytest.approx(-GUIDANCE.descent_m_s, abs=0.05)
 

@@ -38,19 +38,21 @@ def test_nearest_triangle_equals_exhaustive_search(objects: Objects) -> None:
 @pytest.mark.parametrize("axis", [*_draw_rays(np.random.default_rng(8), 12), *np.eye(3), *-np.eye(3)], ids=str)
 @pytest.mark.parametrize("half_angle", [1e-3, 0.05, 0.5])
 def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.ndarray, half_angle: float) -> None:
-    """All triangles hit by random rays within the half angle and a maximum distance are listed, and few others."""
-    farthest = 9.0
+    """All triangles that random rays in the beam hit are listed; all listed triangles are near the frustum around it."""
+    max_distance_m = 9.0
     rng = np.random.default_rng(9)
     buffer = np.empty(1500, dtype=np.int64)
-    listed = set(buffer[: list_in_beam(objects.hierarchy, Ray(*EYE, *axis), half_angle, farthest, buffer)].tolist())
+    listed = set(
+        buffer[: list_in_beam(objects.hierarchy, Ray(*EYE, *axis), half_angle, max_distance_m, buffer)].tolist()
+    )
     perpendicular = np.cross(axis, _draw_rays(rng, 400))
     perpendicular /= np.linalg.norm(perpendicular, axis=1, keepdims=True)
     angles = half_angle * rng.uniform(0.0, 1.0, (400, 1))
     hit: set[int] = set()
     for ray in np.cos(angles) * axis + np.sin(angles) * perpendicular:
-        hit |= _list_hits(objects, ray, farthest)
+        hit |= _list_hits(objects, ray, max_distance_m)
     assert hit <= listed
-    # A wide beam has hits: the test is significant.
+    # A wide beam must have hits; otherwise the test checks nothing.
     assert hit or half_angle < 0.5
     # The beam lists triangles in a square frustum, which is larger than the cone at its corners.
     centres = objects.triangles.mean(axis=1) - EYE
@@ -71,9 +73,9 @@ def test_beam_reports_an_overflow_of_its_list(objects: Objects) -> None:
     assert list_in_beam(Objects.none().hierarchy, Ray(*EYE, *axis), 0.3, 9.0, buffer) == 0
 
 
-def _list_hits(objects: Objects, ray: np.ndarray, farthest: float) -> set[int]:
+def _list_hits(objects: Objects, ray: np.ndarray, max_distance_m: float) -> set[int]:
     """Numbers of all triangles that a ray from the eye hits up to a distance, from barycentric coordinates."""
     first, second, third = objects.triangles.transpose(1, 0, 2)
     columns = np.stack([second - first, third - first, np.broadcast_to(-ray, first.shape)], axis=2)
     u, v, t = np.linalg.solve(columns, (EYE - first)[:, :, None])[:, :, 0].T
-    return set(np.flatnonzero((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0) & (t < farthest)).tolist())
+    return set(np.flatnonzero((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0) & (t < max_distance_m)).tolist())

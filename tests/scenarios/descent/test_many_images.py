@@ -1,4 +1,4 @@
-"""Tests of descents with any number of images: inputs of each algorithm and truth of each answer."""
+"""Tests of descents with any number of images: images for each algorithm, and true velocity for each answer."""
 
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,13 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 from tests.scenarios.descent.settings import DESCENT, PERFECT, parameters, run
 
-STREAM_ESTIMATOR = "tests.scenarios.descent.test_many_pictures:Inertial"
+STREAM_ESTIMATOR = "tests.scenarios.descent.test_many_images:Inertial"
 #: Nine images of a descent that contain the three images of a standard descent.
 NINE_IMAGES: dict[str, Any] = {"pictures": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
 
 
 class Inertial:
-    """Return the inertial velocity: after each image for the last interval, at the end for the last instant."""
+    """Return the inertial velocity: its mean over the last interval after each image, its last value at the end."""
 
     def start(self) -> None:
         self.frames: list[DescentFrame] = []
@@ -41,8 +41,8 @@ class Inertial:
         )
 
 
-class Halfway(Inertial):
-    """Return a mean velocity with a span from the middle of the first interval to the last image."""
+class LastThreeQuarters(Inertial):
+    """Return a mean velocity with a span from a quarter of the descent to the last image."""
 
     def finish(self) -> VelocityEstimate:
         first, *_, last = (frame.image.time_s for frame in self.frames)
@@ -55,7 +55,7 @@ def nine_images() -> CaseResult:
     return run(algorithm=STREAM_ESTIMATOR, compared=["dimes"], **NINE_IMAGES, **PERFECT)
 
 
-def test_truth_has_the_span_of_the_answer(nine_images: CaseResult) -> None:
+def test_true_velocity_is_averaged_over_the_span_of_the_answer(nine_images: CaseResult) -> None:
     """Each answer is compared with the true mean velocity over its own span; the inertial unit has no errors."""
     row: Any = nine_images.row
     assert (nine_images.outcome, row["stream_pictures"], row["pictures_before_answer"]) == ("VALID", 9, 2)
@@ -93,7 +93,7 @@ def test_dimes_input_images_are_stored_for_figures() -> None:
 
 def test_span_between_images_is_interpolated() -> None:
     """The span starts a quarter of the descent after the first image: the truth is interpolated between the images."""
-    spec = "tests.scenarios.descent.test_many_pictures:Halfway"
+    spec = "tests.scenarios.descent.test_many_images:LastThreeQuarters"
     first, second = (
         run(algorithm=spec, pictures=pictures, descent=DESCENT | {"interval_s": 4.0 / (pictures - 1)}, **PERFECT)
         for pictures in (2, 9)
@@ -153,6 +153,6 @@ def test_default_image_triple_is_evenly_spaced(pictures: int, positions: tuple[i
     assert parameters(pictures=pictures).triple_indices == positions
 
 
-def test_no_image_is_captured_after_firing() -> None:
+def test_image_times_after_thruster_ignition_are_rejected() -> None:
     with pytest.raises(ValueError, match=r"image \d of 9 would be taken at .* s, after the thrusters' firing"):
         run(pictures=9)

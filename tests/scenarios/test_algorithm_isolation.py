@@ -1,4 +1,4 @@
-"""Tests of the isolation of algorithms: an algorithm cannot affect inputs, process or row of other algorithms."""
+"""Tests of the isolation of algorithms: an algorithm cannot affect the inputs, process or row of another one."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), ca
     from tests.scenarios.rover.short_run import SHORT_RUN
     from tests.scenarios.test_fieldtest import make_parameters
 
-    compared_paths = [f"{SPY}:{name}" for name in compared]
+    compared_paths = [f"{SPY}:{spy}" for spy in compared]
     algorithms: dict[str, Any] = {"algorithm": f"{SPY}:{algorithm}", "compared": compared_paths}
     circle = {"legs": [{"motion": "circle", "step_deg": 5.0, "steps": 1}]}
     parameters: dict[str, Any] = {
@@ -65,8 +65,8 @@ def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), ca
     return selected.run(selected.parameters_type.model_validate(parameters[name]), Streams(1, "handover", case))
 
 
-def list_images(inputs: Any) -> list[np.ndarray]:
-    """Return the counts in the inputs of an algorithm."""
+def list_image_counts(inputs: Any) -> list[np.ndarray]:
+    """Return the pixel counts of each image in the inputs of an algorithm."""
     images = inputs.images if hasattr(inputs, "images") else (inputs.left, inputs.right)
     return [image.counts for image in images]
 
@@ -86,7 +86,7 @@ def test_algorithm_cannot_change_the_measurements_of_other_algorithms(name: str,
     assert result.failure is not None
     assert "changed its measurements" in result.failure.error
     inputs = next(entry for entry in spies.RECORDED_INPUTS if not isinstance(entry, tuple))
-    assert all(counts.mean() > 1.0 for counts in list_images(inputs))
+    assert all(counts.mean() > 1.0 for counts in list_image_counts(inputs))
     assert result.row[f"{spy}.error"] == ""
 
 
@@ -113,7 +113,7 @@ def test_input_copies_are_equal_and_independent() -> None:
 
 
 class ZeroDifferenceArray(np.ndarray):
-    """An array whose difference to any value is zero."""
+    """Array whose subtraction always returns zeros."""
 
     def __sub__(self, other: Any) -> Any:
         return np.zeros(self.shape)
@@ -164,8 +164,8 @@ def test_conditions_are_recorded_before_the_algorithm_runs(name: str, flags: set
     assert flags <= recorded.keys()
 
 
-def test_raising_tracker_fails_runs_with_selectable_targets() -> None:
-    """In 5 of 20 runs the tracker raises: the requirement counts them as failures."""
+def test_runs_with_a_tracker_exception_count_as_failures() -> None:
+    """In 5 of 20 runs the tracker raises an exception; their rows lack the column of the metric."""
     crashed_case, complete_case = (run_small_case("rover", spy, case=4) for spy in ("RaisingTracker", "TrackerSpy"))
     assert crashed_case.outcome == "CRASHED"
     assert crashed_case.row["selectable"] is complete_case.row["selectable"] is True
@@ -181,7 +181,7 @@ def test_raising_tracker_fails_runs_with_selectable_targets() -> None:
     assert (result.status, result.n, result.failures) == (Status.FAIL, 20, 5)
 
 
-def test_crashed_landing_has_no_site_report_column() -> None:
-    """The columns are unknown after a crash; a verdict then counts the case as a failure with a reported site."""
+def test_row_of_a_rejected_answer_has_no_site_columns() -> None:
+    """Without an accepted answer the columns are absent; a verdict then counts the case as a reported unsafe site."""
     row = run_small_case("landing", "ForcedSiteWriter").row
     assert not {"site_reported", "no_site_reported", "converged"} & row.keys()
