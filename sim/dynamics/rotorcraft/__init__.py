@@ -362,10 +362,10 @@ def simulate_landing(
     """Continue a flight to a site and land.
 
     The simulation ends at `end_s`; by default `rest_s` after the touchdown, or at the time limit without a touchdown.
-
     `site_m` is the site's east and north in the coordinates of the navigation. `errors` are the estimated position,
-    velocity and angles (yaw, pitch, roll) minus the true ones at the knots from the flight's start on; the last row also
-    applies to all later knots. Raises ValueError if the gusts or the laser's noise end before the longest possible flight.
+    velocity and angles (yaw, pitch, roll) minus the true ones at the knots from the flight's start on; the last row
+    also applies to all later knots. Raises ValueError if the gusts or the laser's noise end before the longest possible
+    flight.
     """
     step, before = flown.craft.step_s, len(flown.path.rows)
     count = before + int(np.ceil((guidance.wait_s + guidance.max_duration_s) / step))
