@@ -256,7 +256,7 @@ class OutcomesBySize:
             counts = {name: int(mask.sum()) for name, mask in masks.items()}
             values = {name: value(rows) for _, name, value, _ in self.extra_columns}
             head = {self.kind: kind, "size": size, "n": len(rows)}
-            records.append({**head, **counts, f"{last_outcome}_share": last_fraction, **values})
+            records.append({**head, **counts, f"{last_outcome}_fraction": last_fraction, **values})
         return records
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
@@ -274,7 +274,7 @@ class OutcomesBySize:
             [
                 *(name, size or NOTHING, f"{record['n']:,}"),
                 *(f"{record[kind]:,} ({percent(record[kind] / record['n'])})" for kind in self.styles),
-                rates.interval_text(record[f"{last}_share"]),
+                rates.interval_text(record[f"{last}_fraction"]),
                 *(text(record[name]) for _, name, _, text in self.extra_columns),
             ]
             for record, (name, size) in zip(records, texts, strict=True)
@@ -285,7 +285,7 @@ class OutcomesBySize:
         }
         figure = stacked_bars([" ".join(pair).strip() for pair in texts], percentages, f"% of {self.cases.lower()}")
         caption = self.caption or " ".join(f"{style.capitalize()}: {name}." for name, style in self.styles.values())
-        data = [{**record, f"{last}_share": asdict(record[f"{last}_share"])} for record in records]
+        data = [{**record, f"{last}_fraction": asdict(record[f"{last}_fraction"])} for record in records]
         return [Block(figures=[svg_figure(figure, key, caption)]), Block(grid=Grid(head, rows), note=self.note)], {
             "rows": data
         }

@@ -145,7 +145,7 @@ def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> F
     g = np.float32(air.asymmetry)
     base = np.float32(1.0) + g * g - np.float32(2.0) * g * cosine
     phase = (np.float32(1.0) - g * g) / (base * np.sqrt(base))
-    sky = air.sky_share(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
+    sky = air.sky_fraction(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
     ambient = np.float32(0.5 * (sky + float(frame.radiance.mean())))
     source = np.float32(air.single_scattering_albedo) * (np.float32(0.25) * phase + ambient)
     hazy = transmission * frame.radiance + (np.float32(1.0) - transmission) * source
@@ -154,7 +154,7 @@ def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> F
 
 def sunlight_ratio(air: Environment, elevation_rad: float, detector: DetectorParameters) -> float:
     """Return direct sunlight at the ground divided by the reference sunlight of the detector's responsivity."""
-    return air.direct_share(elevation_rad) * air.solar_irradiance / detector.sunlight
+    return air.direct_fraction(elevation_rad) * air.solar_irradiance / detector.sunlight
 
 
 def pixel_sample(

@@ -1,4 +1,4 @@
-"""What a camera sees near the horizon: hills beyond the terrain, and rocks too small to be drawn one by one."""
+"""Distant hills, and occlusion of the ground at grazing view by rocks below the rendering resolution."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from marsyard.sim.render import Frame, Objects, Scene
 from marsyard.sim.terrain import RockField
 from marsyard.sim.terrain.sites import Hill
 
-#: Name of the hills' bodies (`Objects.names`): no rock has it.
+#: Identifier of hills in `Objects.names`; identifiers of rocks are not negative.
 HILL_NAME = -4
-#: Lines of the hills' mesh in azimuth and in distance, and azimuth lines per body.
+#: Number of mesh lines of the hills in azimuth and in distance, and of azimuth lines per body.
 _AZIMUTHS, _DISTANCES, _LINES_PER_BODY = 1440, 64, 60
 #: Sizes of the ridges in lines of the mesh, and their RMS height relative to the hill's; assumed.
 _RIDGE_SIZES, _RIDGES = (12.0, 6.0, 3.0), 0.25
@@ -26,7 +26,7 @@ _SILHOUETTE = 0.85
 
 
 def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objects:
-    """Build the hills around the origin of a site's terrain, without the part that the planet's curvature hides.
+    """Build the mesh of the hills around the origin of a site's terrain, without the part below the curved horizon.
 
     The hills are Gaussian domes with ridges of three sizes, on a mesh of lines of azimuth and distance; `ground_m` is
     the mean height of the terrain, `albedo` that of the plain.
@@ -53,7 +53,7 @@ def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objec
     corner = np.arange(height.size, dtype=np.int32).reshape(height.shape)
     right = np.roll(corner, -1, axis=1)
     quads = np.stack([corner[:-1], right[:-1], right[1:], corner[1:]], axis=-1)
-    # parts as low as the terrain's own relief would intersect it; bodies are sectors of azimuth
+    # omit faces below `_BASE_M`: they would intersect the terrain; bodies are sectors of azimuth
     row, column = np.nonzero(np.all(above_plain.reshape(-1)[quads] > _BASE_M, axis=-1))
     order = np.argsort(column // _LINES_PER_BODY, kind="stable")
     quad, body = quads[row, column][order], (column // _LINES_PER_BODY)[order]
@@ -66,7 +66,7 @@ def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objec
 def add_unresolved_rocks(
     frame: Frame, scene: Scene, rocks: RockField | None, smallest_rad: float, rms_slope: float
 ) -> Frame:
-    """Blend the mean radiance of the drawn rocks into ground whose smaller rocks are not drawn.
+    """Blend the mean radiance of the rendered rocks into ground pixels that rocks below the resolution occlude.
 
     Rocks below ``smallest_rad x range`` are not drawn. At grazing view they hide the ground: with frontal areas a per
     square metre, the visible fraction of the ground is ``exp(-sum a / t)`` with ``t**2 = tan(e)**2 + rms_slope**2``,

@@ -76,12 +76,12 @@ class SiteGround:
         """Return the photometry of this ground under a sun and the sky of the site's atmosphere."""
         law = self.site.photometry
         air = self.site.environment
-        sky = air.sky_share(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
+        sky = air.sky_fraction(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
         return Photometry(
             lunar_fraction=law.lunar_fraction,
             surge_amplitude=law.surge_amplitude,
             surge_width=law.surge_width,
-            sky_share=sky,
+            sky_fraction=sky,
             sky_radiance=sky,
             surrounding_albedo=self.terrain.albedo,
             # a uniform sky without scattering, or with backward scattering

@@ -21,7 +21,7 @@ from marsyard.sim.render import CloudLayer, CloudParameters, DustySky, Photometr
 from marsyard.sim.terrain import Surface
 
 #: Brightness is albedo times the cosine of incidence in sunlight, and 0 in shadow.
-LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
+LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 FLAT_ALBEDO = 0.2
 MAX_MAST_RANGE_M = 40.0
 #: Reflectance laws of the check, by name.
@@ -41,7 +41,7 @@ def _make_flat_surface(albedo: float = FLAT_ALBEDO) -> Surface:
 
 def run_opposition(quick: bool) -> Iterator[Measure]:
     """Compare the centre of the opposition peak in images with the antisolar point."""
-    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
     rng = np.random.default_rng(3)
     surface = _make_flat_surface()
     for name, camera in cameras().items():
@@ -172,7 +172,7 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
     rng = np.random.default_rng(9)
     pairs = 10 if quick else 40
     for name, law in LAWS.items():
-        sun_only = replace(law, sky_share=0.0, surrounding_albedo=0.0)
+        sun_only = replace(law, sky_fraction=0.0, surrounding_albedo=0.0)
         reciprocity_errors, formula_errors = [], []
         for _ in range(pairs):
             first, second = (
@@ -261,7 +261,7 @@ def run_sun(quick: bool) -> Iterator[Measure]:
         ((90.0, 12.0), (97.0, 16.0)) if quick else ((90.0, 12.0), (97.0, 16.0), (80.0, 5.0))
     ):
         sun = Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)))
-        law = Photometry(sky_share=0.3, sky=DustySky(0.5, 0.95, 0.65))
+        law = Photometry(sky_fraction=0.3, sky=DustySky(0.5, 0.95, 0.65))
         pose = rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5]))
         scene = Scene(_make_flat_surface(), (0.0, 0.0), sun, law, mesh_finest_m=0.5, mesh_reach_m=2000.0)
         rays = PixelRays.of(camera)

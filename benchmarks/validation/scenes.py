@@ -24,12 +24,12 @@ SEED = 20
 HAZCAM_LABEL = Path(__file__).parents[3] / "shared/data/mer_opportunity/1F483288473EFFCMUFP1214L0M1.IMG"
 #: HiRISE tile in Gale: 1 m posts, 0.5 m orthoimage.
 TILE = Path(__file__).parents[3] / "shared/data/gale_hirise/gale_1m_dem_0p5m_ortho.npz"
-#: Horizontal position of the descents on the terrain (arbitrary), metres.
+#: Horizontal position (x, y) of the camera in all descent views, m (arbitrary), metres.
 DESCENT_POSITION = (1000.0, 1200.0)
 #: Position and diameter of the large rock, and height of the mast camera, metres.
 ROCK_POSITION, ROCK_DIAMETER_M, MAST_M = (50.0, 50.0), 2.5, 1.6
 #: Lambertian ground without skylight.
-LAMBERTIAN = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
+LAMBERTIAN = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
 OVERHEAD_SUN = Sun(np.array([0.0, 0.0, 1.0]))
 
 
@@ -132,7 +132,7 @@ def crop_centre(camera: CameraModel, size: tuple[int, int]) -> CameraModel:
 
 
 def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
-    """View of the centre of a descent image of the HiRISE tile in Gale with orthoimage; None without the data."""
+    """Central crop of a nadir descent image of the HiRISE tile in Gale with its orthoimage; None without the data."""
     if not TILE.exists():
         return None
     # the orthoimage is shifted by about 2 m east and 1 m south; detail below the 1 m posts is synthetic
@@ -154,7 +154,7 @@ def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
 
 
 def descent_view(name: str, height_m: float, size: tuple[int, int]) -> View:
-    """View of the centre of a descent image of a site, from a height above ground, slightly tilted."""
+    """Central crop of a slightly tilted descent image of a site, from a height above the ground."""
     site_parameters, surface = site(name), descent_surface(name)
     camera = crop_centre(preset("mer-descent-flown").cameras()[0], size)
     scene = Scene(

@@ -24,9 +24,9 @@ Result = TypeVar("Result")
 _OOM_SCORE = 800
 #: Seconds for loading a campaign's code, in addition to the time limit of the case.
 LOADING_S = 300.0
-#: Maximum duration, seconds, of a group of items whose process state is checked together; a check takes 0.1 ms.
-_CHECKED_TOGETHER_S = 0.005
-#: Exit status of a worker whose files were closed by an item.
+#: Maximum duration, seconds, of a group of items after which the process state is checked once; a check takes 0.1 ms.
+_MAX_GROUP_DURATION_S = 0.005
+#: Exit status of a worker after an item closed file descriptors that the worker needs.
 FILES_CLOSED = 97
 #: Layout of the status board: item number (`_NO_ITEM` between items), and start time in seconds.
 _BOARD_LAYOUT = struct.Struct("=qd")
@@ -203,7 +203,7 @@ def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResul
             process_state.seed_generators(item)
         group.append(_run_item(task, item))
         must_check = _context is not None and (_context.checks_each_item or _context.crashed)
-        if not must_check and index + 1 < len(items) and time.perf_counter() - checked_s <= _CHECKED_TOGETHER_S:
+        if not must_check and index + 1 < len(items) and time.perf_counter() - checked_s <= _MAX_GROUP_DURATION_S:
             continue
         must_replace, changed = _check_state([result.item for result in group])
         if changed is None:
@@ -236,7 +236,7 @@ def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
 
 
 def _run_item(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
-    """Empty the output file, so that its size is the size of the item's output, and run a task on one item."""
+    """Run a task on one item; the output file is truncated first, so that its size is that of the item's output."""
     previous_item = None
     if _context is not None:
         for stream in (sys.stdout, sys.stderr):
@@ -275,7 +275,7 @@ def record_note(text: str) -> None:
 def accept_process_state() -> None:
     """Use the current process state as the reference that items must preserve.
 
-    Loaded objects are excluded from garbage collection, which would take 5 % of short cases.
+    Loaded objects are excluded from garbage collection, which would take 5 % of the run time of short cases.
     """
     gc.collect()
     gc.freeze()

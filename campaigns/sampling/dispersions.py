@@ -50,7 +50,7 @@ class _Levels(base.Dispersion):
 class Choice(_Levels):
     """One of `values`, with equal probabilities or with probabilities proportional to `weights`.
 
-    If the parameter is a table, each value is a table; keys that are missing in the table have default values.
+    If the parameter is a table, each value is a table; missing keys take their default values.
     """
 
     distribution: Literal["choice"]
@@ -79,7 +79,7 @@ class Choice(_Levels):
 
 
 class Fixed(_Levels):
-    """The same value in every case; the parameter and its source are listed together with dispersed parameters."""
+    """The same value in every case; the report lists the parameter and its source with the dispersed parameters."""
 
     distribution: Literal["fixed"]
     value: base.LiteralValue
@@ -247,8 +247,8 @@ class Integer(_WholeNumbers):
 class InTurn(_WholeNumbers):
     """The whole numbers from `low` to `high`, both included, in sequence over the cases, then from `low` again.
 
-    No number repeats before all numbers have occurred, so that a campaign uses as many terrains as possible. If the
-    number only selects one of many independent terrains, cases with different numbers are independent.
+    No number repeats before all numbers have occurred; for example, a campaign then uses as many terrains as possible.
+    If the number only selects one of many independent terrains, cases with different numbers are independent.
     """
 
     distribution: Literal["in-turn"]

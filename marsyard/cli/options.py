@@ -42,7 +42,7 @@ JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
 DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign run.")]
 BitsOption = Annotated[
     float | None,
-    Option(metavar="BITS", min=0.1, max=16.0, help="Compress images with loss to this size per pixel (JPEG 2000)."),
+    Option(metavar="BITS", min=0.1, max=16.0, help="Lossy JPEG 2000 compression of the images, bits per pixel."),
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -79,7 +79,7 @@ Options = TypeVar("Options")
 
 
 def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
-    """Decorate a command: its options are the fields of the dataclass `kind`, and its argument one instance of it."""
+    """Return a decorator that turns the fields of the dataclass `kind` into options and passes the command one instance."""
     hints = get_type_hints(kind, include_extras=True)
     fields = [field.replace(annotation=hints[name]) for name, field in inspect.signature(kind).parameters.items()]
 
@@ -96,7 +96,7 @@ def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], C
 
 
 def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
-    """Decorate a command: a user error, a full or a read-only disk prints one message and exits with status 2."""
+    """Decorate a command: on a user error or a full or read-only disk, print one message and exit with status 2."""
 
     @functools.wraps(command)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:

@@ -201,7 +201,7 @@ def _expose(
     position = np.asarray(frame.world_from_body.translation)
     height = float(position[2]) - float(ground.surface.height(*position[:2]))
     hazy = add_haze(frame, environment, sun, environment.mean_extinction_m(height))
-    radiance = hazy * np.float32(environment.direct_share(math.radians(request.sun_elevation_deg)))
+    radiance = hazy * np.float32(environment.direct_fraction(math.radians(request.sun_elevation_deg)))
     auto_exposure = sensor.auto_expose(
         detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
     )
@@ -218,7 +218,7 @@ def truth_layers(image: RenderedImage) -> dict[str, Any]:
     phase = np.degrees(np.arccos(np.clip(-(directions @ scene.sun.direction), -1.0, 1.0)))
     ground = np.isfinite(frame.range_m)
     # Render again without diffuse light: pixels with zero radiance are in shadow.
-    direct_light = replace(scene.photometry, sky_share=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
+    direct_light = replace(scene.photometry, sky_fraction=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
     direct_frame = process_renderer(default_backend()).render(
         replace(scene, photometry=direct_light, edge_rays=1), frame.rays, frame.world_from_body
     )

@@ -147,18 +147,18 @@ def map_rows(subject: Subject) -> pd.DataFrame | None:
     if frame is None or not (rates.varies(frame, "texture") and rates.varies(frame, "baseline_fraction")):
         return None
     fractions = {
-        "rms_share": numbers(frame, "elevation_rms_m") / numbers(frame, "height_m"),
-        "noise_share": numbers(frame, "elevation_noise_m") / numbers(frame, "height_m"),
-        "altimeter_share": np.abs(numbers(frame, "range_error_m")) / numbers(frame, "range_m"),
+        "rms_fraction": numbers(frame, "elevation_rms_m") / numbers(frame, "height_m"),
+        "noise_fraction": numbers(frame, "elevation_noise_m") / numbers(frame, "height_m"),
+        "altimeter_fraction": np.abs(numbers(frame, "range_error_m")) / numbers(frame, "range_m"),
     }
-    rows_with_map = pd.DataFrame(frame.assign(**fractions)[np.isfinite(fractions["rms_share"])])
+    rows_with_map = pd.DataFrame(frame.assign(**fractions)[np.isfinite(fractions["rms_fraction"])])
     return rows_with_map if len(rows_with_map) >= MIN_MAPS else None
 
 
 #: Errors of the map; columns of `map_rows`.
 _MAP_ERRORS = (
-    kinds.Quantity("rms_share", "elevation error rms (% of height)", 100.0),
-    kinds.Quantity("noise_share", "elevation error rms without its plane (% of height)", 100.0),
+    kinds.Quantity("rms_fraction", "elevation error rms (% of height)", 100.0),
+    kinds.Quantity("noise_fraction", "elevation error rms without its plane (% of height)", 100.0),
     kinds.Quantity("slope_error_rms_deg", "slope error rms (deg)"),
 )
 #: Dependence of the map errors on conditions.
@@ -168,7 +168,7 @@ MAP_EFFECTS = kinds.Scatter(
         kinds.Quantity("texture", "texture relative to the site"),
         kinds.Quantity("grid_px", "grid spacing (px)"),
         kinds.Quantity("level_error_deg", "error of the vertical (deg)"),
-        kinds.Quantity("altimeter_share", "altimeter error (% of range)", 100.0),
+        kinds.Quantity("altimeter_fraction", "altimeter error (% of range)", 100.0),
     ),
     y=_MAP_ERRORS,
     heading="Dependence on conditions",

@@ -123,7 +123,7 @@ class RunWorld:
         """Compute the direct sunlight on the ground relative to 1 AU."""
         air = self.ground.site.environment
         elevation = float(np.arcsin(self.scene(time_s).sun.direction[2]))
-        return air.direct_share(elevation) * air.solar_irradiance
+        return air.direct_fraction(elevation) * air.solar_irradiance
 
 
 def place_rocks(p: RoverScenarioParameters, base: SiteGround, rng: np.random.Generator) -> tuple[SiteGround, RockField]:

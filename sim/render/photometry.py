@@ -46,7 +46,7 @@ class DustySky:
     scattering angle, and the sines of elevation mu of the view and mu0 of the sun. The extinction depth is
     ``t = (1 - w g**2) tau``: the forward peak, a fraction g**2 of the scattered light, is part of the direct sunlight
     (Joseph et al. 1976). Multiple scattering adds a uniform radiance, so that the irradiance of level ground without
-    the peak is `Photometry.sky_share`. If single scattering exceeds this irradiance, it is scaled down.
+    the peak is `Photometry.sky_fraction`. If single scattering exceeds this irradiance, it is scaled down.
     """
 
     optical_depth: float
@@ -63,13 +63,13 @@ class DustySky:
                 "allowed: above 0, above 0 and at most 1, at least 0 and below 1"
             )
 
-    def coefficients(self, sun_z: float, sky_share: float) -> tuple[float, float, float, float]:
+    def coefficients(self, sun_z: float, sky_fraction: float) -> tuple[float, float, float, float]:
         """Coefficients of `sky_brightness`: uniform radiance; factor, depth and asymmetry of single scattering."""
         depth = (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
         scale = self.single_scattering_albedo * self.optical_depth / (4.0 * depth)
         without_peak = 1.0 - self.asymmetry**2
         single = without_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
-        return max(sky_share - single, 0.0), scale * min(sky_share / single, 1.0), depth, self.asymmetry
+        return max(sky_fraction - single, 0.0), scale * min(sky_fraction / single, 1.0), depth, self.asymmetry
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Photometry:
 
     - lunar_fraction: L, between 0 (Lambert) and 1 (Lommel-Seeliger). About 0.55 for Mars at small phase (McEwen 1991)
     - surge_amplitude, surge_width: B0 and h
-    - sky_share: D, diffuse irradiance from the sky divided by that of direct sunlight on a plane facing the sun
+    - sky_fraction: D, diffuse irradiance from the sky divided by that of direct sunlight on a plane facing the sun
     - sky_radiance: radiance factor of a uniform sky in pixels without ground
     - sky: model that replaces the uniform sky in these pixels
     - surrounding_albedo: albedo of the ground that scatters light onto slopes and into shadows; B is this albedo times
@@ -97,7 +97,7 @@ class Photometry:
     lunar_fraction: float = 0.55
     surge_amplitude: float = 0.7
     surge_width: float = 0.06
-    sky_share: float = 0.15
+    sky_fraction: float = 0.15
     sky_radiance: float = 0.1
     surrounding_albedo: float = 0.2
     sky: DustySky | None = None
@@ -108,15 +108,15 @@ class Photometry:
 
     def law(self, sun: Sun, caster_diameter_m: float) -> Float64[np.ndarray, "8"]:
         """Coefficients of the reflectance kernel (`marsyard.sim.render.kernels.structs.Light`)."""
-        ground_light = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_share)
+        ground_light = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_fraction)
         law = (self.lunar_fraction, self.surge_amplitude, self.surge_width, self.normalisation())
-        return np.array([*law, self.sky_share, ground_light, caster_diameter_m, sun.angular_radius_rad])
+        return np.array([*law, self.sky_fraction, ground_light, caster_diameter_m, sun.angular_radius_rad])
 
     def sky_coefficients(self, sun: Sun) -> Float64[np.ndarray, "4"]:
         """Coefficients of the sky kernel."""
         if self.sky is None:
             return np.array([self.sky_radiance, 0.0, 0.0, 0.0])
-        return np.array(self.sky.coefficients(float(sun.direction[2]), self.sky_share))
+        return np.array(self.sky.coefficients(float(sun.direction[2]), self.sky_fraction))
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,7 @@ class Scene:
         photometry, clouds = self.photometry, NO_CLOUDS
         if self.clouds is not None:
             cloud_light = self.clouds.parameters.sky_light(self.sun)
-            photometry = replace(photometry, sky_share=photometry.sky_share + cloud_light)
+            photometry = replace(photometry, sky_fraction=photometry.sky_fraction + cloud_light)
             clouds = (self.clouds.cover, self.clouds.coefficients(self.sun, time_s))
         # clouds are not rendered, so they do not change the brightness of the sky
         sky = self.photometry.sky_coefficients(self.sun)

@@ -36,7 +36,7 @@ class Environment(Parameters):
         """Angular radius of the sun's disc, proportional to the square root of the irradiance."""
         return float(SUN_RADIUS_AT_1_AU_RAD * np.sqrt(self.solar_irradiance))
 
-    def direct_share(self, sun_elevation_rad: float) -> float:
+    def direct_fraction(self, sun_elevation_rad: float) -> float:
         """Fraction of sunlight that reaches a plane facing the sun, including light scattered by a few degrees.
 
         ``exp(-tau' / sin elevation)``, where tau' is the optical depth without the forward peak of scattering (delta
@@ -44,7 +44,7 @@ class Environment(Parameters):
         """
         return float(np.exp(-self._delta_scaled()[0] / max(np.sin(sun_elevation_rad), MIN_SUN_SINE)))
 
-    def sky_share(self, sun_elevation_rad: float) -> float:
+    def sky_fraction(self, sun_elevation_rad: float) -> float:
         """Diffuse irradiance of level ground, divided by that of direct sunlight on a plane facing the sun.
 
         Delta-Eddington approximation (Joseph, Wiscombe & Weinman 1976) over black ground, without light that the ground

@@ -34,7 +34,7 @@ def test_rank_correlations_have_intervals_and_need_enough_cases(make_rows: Rows)
 def test_rank_correlations_of_maps_have_intervals(maps: int, has_interval: bool) -> None:
     rng = np.random.default_rng(1)
     texture = rng.uniform(0.1, 1.0, maps)
-    frame = pd.DataFrame({"texture": texture, "rms_share": rng.uniform(0.0, 0.1, maps) / texture})
+    frame = pd.DataFrame({"texture": texture, "rms_fraction": rng.uniform(0.0, 0.1, maps) / texture})
     effect = next(entry for entry in MAP_EFFECTS.effects(frame) if entry["error"].startswith("elevation error"))
     assert (" to " in correlation_text(effect)) == has_interval
     assert has_interval or correlation_text(effect) == NOTHING

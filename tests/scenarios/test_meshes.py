@@ -64,7 +64,7 @@ def test_rocks_have_smooth_normals(tmp_path: Path, surface: Surface) -> None:
     assert np.min(np.sum(radial * body.normals.reshape(-1, 3), axis=1)) > 0.999
 
 
-def test_mesh_is_moved_to_the_terrain_period_next_to_the_scene(tmp_path: Path, surface: Surface) -> None:
+def test_mesh_is_placed_in_the_terrain_period_nearest_to_the_scene(tmp_path: Path, surface: Surface) -> None:
     parameters = MeshParameters(file=write_box(tmp_path), east_m=2.0, north_m=60.0)
     corners = parameters.place_on_ground(surface, (65.0, 3.0)).triangles.reshape(-1, 3)
     assert np.allclose((corners.min(axis=0) + corners.max(axis=0))[:2] / 2.0, [66.0, -4.0])
@@ -72,7 +72,7 @@ def test_mesh_is_moved_to_the_terrain_period_next_to_the_scene(tmp_path: Path, s
 
 def test_mesh_raises_the_true_heights_of_a_landing(tmp_path: Path, surface: Surface) -> None:
     ground = SiteGround(site("heli-benign"), TerrainParameters(samples=64), surface, None)
-    # The edges lie between grid points.
+    # The edges of the box lie between grid points.
     parameters = MeshParameters(file=write_box(tmp_path), east_m=20.02, north_m=30.02)
     low, high = np.array([15.0, 25.0]), np.array([25.0, 35.0])
     without_mesh, with_mesh = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (parameters,)))

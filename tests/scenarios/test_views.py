@@ -136,7 +136,7 @@ def test_ground_without_rocks_has_no_objects() -> None:
 
 def test_photometry_has_the_sky_radiance_of_the_environment(ground: SiteGround) -> None:
     photometry = ground.photometry(SUN)
-    assert photometry.sky_share == photometry.sky_radiance == ground.site.environment.sky_share(np.radians(35.0))
+    assert photometry.sky_fraction == photometry.sky_radiance == ground.site.environment.sky_fraction(np.radians(35.0))
     assert photometry.surrounding_albedo == ground.terrain.albedo
 
 

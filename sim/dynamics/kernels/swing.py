@@ -1,6 +1,6 @@
 """Compiled equations of motion of the two-stage pendulum; `marsyard.sim.dynamics.swing` defines equations and symbols.
 
-A state vector has 22 components: position and velocity of the canopy, direction of the line and its rate, direction of
+A state vector has 22 components: position and velocity of the canopy, unit vector along the line (downwards) and its time derivative, direction of
 the lander's axis and its rate, and the lander's x axis (three components each, world axes), then the lander's spin.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 #: Index of the first component of each vector in a state, and the size of a state.
-CANOPY, CANOPY_RATE, LINE, LINE_RATE, AXIS, AXIS_RATE, SIDE, SPIN, SIZE = 0, 3, 6, 9, 12, 15, 18, 21, 22
+CANOPY, CANOPY_VELOCITY, LINE, LINE_RATE, AXIS, AXIS_RATE, SIDE, SPIN, SIZE = 0, 3, 6, 9, 12, 15, 18, 21, 22
 
 
 class Chain(NamedTuple):
@@ -118,7 +118,7 @@ def _vector(y: Array, first: int) -> Array:
 def compute_aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array:
     """Compute the force F of the air on the canopy, N, world axes."""
     height, line = y[CANOPY + 2], _vector(y, LINE)
-    velocity = _vector(y, CANOPY_RATE) - np.array(compute_wind(height, field))  # relative to the air
+    velocity = _vector(y, CANOPY_VELOCITY) - np.array(compute_wind(height, field))  # relative to the air
     speed = math.sqrt(_dot(velocity, velocity))
     axial = _dot(velocity, line)
     density = math.exp((chain.reference_height_m - height) / chain.scale_height_m)
@@ -128,7 +128,7 @@ def compute_aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array
 
 @njit(cache=True)
 def state_derivative(_t: float, y: Array, constants: Array, waves: Array) -> Array:
-    """Call `compute_derivatives` from an integrator, with arrays of `pack_constants`: numba converts tuples slowly."""
+    """Right-hand side for the integrator, with the arrays of `pack_constants`: numba converts named tuples slowly."""
     chain = Chain(*to_fixed_tuple(constants[:CHAIN_SIZE], CHAIN_SIZE))
     mean = to_fixed_tuple(constants[CHAIN_SIZE:], FIELD_SIZE)
     rates: Array = compute_derivatives(y, chain, WindField(mean[0], mean[1], mean[2], mean[3], mean[4], waves))
@@ -195,16 +195,16 @@ def compute_derivatives(y: Array, chain: Chain, field: WindField) -> Array:
     q = (axis_source - c * (p - _dot(p, axis) * axis)) / b
 
     rates = np.empty(SIZE)
-    rates[CANOPY : CANOPY + 3] = _vector(y, CANOPY_RATE)
+    rates[CANOPY : CANOPY + 3] = _vector(y, CANOPY_VELOCITY)
     rates[LINE : LINE + 3] = line_rate
     rates[AXIS : AXIS + 3] = axis_rate
     line_acceleration, axis_acceleration = p - line_speed2 * line, q - axis_speed2 * axis
     rates[LINE_RATE : LINE_RATE + 3] = line_acceleration
     rates[AXIS_RATE : AXIS_RATE + 3] = axis_acceleration
-    rates[CANOPY_RATE : CANOPY_RATE + 3] = (
+    rates[CANOPY_VELOCITY : CANOPY_VELOCITY + 3] = (
         force - chain.first_moment * line_acceleration - lander_moment * axis_acceleration
     ) / chain.mass_kg
-    rates[CANOPY_RATE + 2] -= chain.gravity_m_s2
+    rates[CANOPY_VELOCITY + 2] -= chain.gravity_m_s2
     rates[SIDE : SIDE + 3] = _cross(lander_rotation + spin * axis, _vector(y, SIDE))
     rates[SPIN] = -chain.hinge_damping * _dot(hinge_rate, axis) / chain.axial_inertia
     return rates
@@ -212,7 +212,7 @@ def compute_derivatives(y: Array, chain: Chain, field: WindField) -> Array:
 
 @njit(cache=True)
 def compute_truth(states: Array, chain: Chain, field: WindField) -> tuple[Array, Array, Array, Array, Array]:
-    """Compute position, velocity, rotation matrix from body to world, body rate and specific force of many states."""
+    """Compute true position, velocity, attitude (body to world), body rate and specific force of the camera for states."""
     count = states.shape[0]
     positions, velocities = np.empty((count, 3)), np.empty((count, 3))
     body_rates, forces = np.empty((count, 3)), np.empty((count, 3))
@@ -222,9 +222,9 @@ def compute_truth(states: Array, chain: Chain, field: WindField) -> tuple[Array,
         rates = compute_derivatives(y, chain, field)
         axis, axis_rate, side = _vector(y, AXIS), _vector(y, AXIS_RATE), _vector(y, SIDE)
         positions[k] = _vector(y, CANOPY) + chain.line_m * _vector(y, LINE) + chain.camera_m * axis
-        velocities[k] = _vector(y, CANOPY_RATE) + chain.line_m * _vector(y, LINE_RATE) + chain.camera_m * axis_rate
+        velocities[k] = _vector(y, CANOPY_VELOCITY) + chain.line_m * _vector(y, LINE_RATE) + chain.camera_m * axis_rate
         force = (
-            _vector(rates, CANOPY_RATE)
+            _vector(rates, CANOPY_VELOCITY)
             + chain.line_m * _vector(rates, LINE_RATE)
             + chain.camera_m * _vector(rates, AXIS_RATE)
         )

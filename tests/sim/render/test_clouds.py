@@ -15,7 +15,7 @@ from marsyard.sim.terrain import Surface
 ALBEDO = 0.3
 SUN = Sun(direction(np.radians(130.0), np.radians(50.0)))
 #: Brightness is then albedo times the cosine of incidence times the transmittance of the clouds.
-LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
+LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 
 
 def _make_flat_ground() -> Surface:

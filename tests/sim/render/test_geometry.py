@@ -21,7 +21,7 @@ from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
 #: Ground whose brightness equals its albedo from any direction.
-ALBEDO_ONLY = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
+ALBEDO_ONLY = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
 #: Tilted by 25 deg and rolled.
 TILTED = Rotation.from_euler("zxy", [30.0, 20.0, 15.0], degrees=True)
 STRONG_DISTORTION = (0.01, -0.25, 0.08)

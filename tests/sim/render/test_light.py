@@ -33,7 +33,7 @@ def _render(
 
 def test_lambert_plane_follows_the_cosine_law(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     sun = Sun(direction(np.radians(70.0), np.radians(35.0)))
-    law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
     radiance = _render(renderer, descent_camera(128), FLAT, sun, law)
     np.testing.assert_allclose(radiance, 0.2 * np.sin(np.radians(35.0)), rtol=1e-5)
 
@@ -41,7 +41,9 @@ def test_lambert_plane_follows_the_cosine_law(renderer: Renderer, descent_camera
 def test_lunar_lambert_matches_the_formula(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     camera = descent_camera(64)
     sun = Sun(direction(np.radians(200.0), np.radians(50.0)))
-    law = Photometry(lunar_fraction=0.6, surge_amplitude=0.8, surge_width=0.05, sky_share=0.2, surrounding_albedo=0.0)
+    law = Photometry(
+        lunar_fraction=0.6, surge_amplitude=0.8, surge_width=0.05, sky_fraction=0.2, surrounding_albedo=0.0
+    )
     _, to_ground = camera.rays(camera.pixel_grid())
     cos_i, cos_e = sun.direction[2], -to_ground[..., 2]
     phase = np.arccos(-to_ground @ sun.direction)
@@ -57,7 +59,7 @@ def test_lunar_lambert_matches_the_formula(renderer: Renderer, descent_camera: C
 def test_opposition_spot_is_at_the_antisolar_point(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     camera = descent_camera()
     sun = Sun(direction(np.radians(30.0), np.radians(80.0)))
-    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
     radiance = _render(renderer, camera, FLAT, sun, law)
     expected, visible = camera.transform(NADIR).project(NADIR.translation - 500.0 * sun.direction)
     assert visible
@@ -69,7 +71,7 @@ def test_opposition_spot_is_at_the_antisolar_point(renderer: Renderer, descent_c
 def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     x = np.arange(256) * 8.0
     heights = np.broadcast_to(20.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
-    law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
     camera = descent_camera(256)
     # The ground faces the eastern sun where its height decreases with x.
     east = Sun(direction(np.radians(90.0), np.radians(40.0)))
@@ -84,10 +86,10 @@ def test_ground_facing_away_receives_only_sky_light(renderer: Renderer, descent_
     heights = np.broadcast_to(40.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
     low = Sun(direction(np.radians(90.0), np.radians(5.0)))
     without_sky = _render(
-        renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_share=0.0, surrounding_albedo=0.0)
+        renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_fraction=0.0, surrounding_albedo=0.0)
     )
     assert without_sky.min() == 0.0
-    with_sky = _render(renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_share=0.15))
+    with_sky = _render(renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_fraction=0.15))
     assert with_sky.min() > 0.15 * 0.2 * 0.9
 
 
@@ -97,7 +99,7 @@ def test_distant_ground_is_averaged(renderer: Renderer, descent_camera: Callable
     samples[..., 1] = 0.2
     samples[:, ::2, 1] = 0.4
     stripes = Surface.from_samples(samples, 1.0)
-    law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
     overhead = Sun(np.array([0.0, 0.0, 1.0]))
     high = rigid(Rotation.from_euler("z", 33.0, degrees=True), np.array([0.0, 0.0, 1200.0]))
     radiance = _render(renderer, descent_camera(128), stripes, overhead, law, high)

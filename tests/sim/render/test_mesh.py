@@ -1,4 +1,4 @@
-"""Tests of the ground mesh: extent, closure and partial meshes."""
+"""Tests of the ground mesh: extent, absence of cracks, and partial meshes."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_too_many_grid_lines_are_rejected() -> None:
         graded_offsets(100.0, 10.0, 101)
 
 
-def test_mesh_is_closed_faces_up_and_follows_the_ground(rough: Surface) -> None:
+def test_mesh_has_no_cracks_and_upward_normals_and_follows_the_ground(rough: Surface) -> None:
     offsets = graded_offsets(2000.0, 6.0, 65)
     mesh = ground_mesh(rough, 120.0 + offsets, -40.0 + offsets)
     assert len(mesh.faces) == 2 * 64 * 64
@@ -40,7 +40,7 @@ def test_mesh_is_closed_faces_up_and_follows_the_ground(rough: Surface) -> None:
 
 @given(st.lists(st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0)), min_size=3, max_size=9), st.integers(0, 9))
 def test_cell_spans_cover_the_hull(corners: list[tuple[float, float]], seed: int) -> None:
-    """Includes hulls that extend beyond the grid or lie between two grid lines."""
+    """Some of the random hulls extend beyond the grid or lie between two grid lines."""
     positions = np.array(corners) + np.array([[0.0, 0.0], [0.3, 0.1], [0.1, 0.4], *[[0.0, 0.0]] * (len(corners) - 3)])
     assume(np.linalg.matrix_rank(positions - positions[0], tol=1e-3) == 2)
     lines = graded_offsets(20.0, 0.2, 61)
@@ -50,7 +50,7 @@ def test_cell_spans_cover_the_hull(corners: list[tuple[float, float]], seed: int
     inside = inside[np.abs(inside).max(axis=1) < 20.0]
     column, row = (np.searchsorted(lines, inside) - 1).T
     assert np.all((spans[row, 0] <= column) & (column < spans[row, 1]))
-    # Each drawn cell overlaps the box around the positions.
+    # Each selected cell overlaps the bounding box of the positions.
     low, high = positions.min(axis=0), positions.max(axis=0)
     for strip in np.flatnonzero(spans[:, 1] > spans[:, 0]):
         assert lines[strip] <= high[1]
@@ -60,7 +60,7 @@ def test_cell_spans_cover_the_hull(corners: list[tuple[float, float]], seed: int
 
 
 def test_partial_mesh_equals_the_cells_of_the_full_mesh(rough: Surface) -> None:
-    """The spans include empty strips, strips that share a corner, and separate strips."""
+    """The spans include empty rows, adjacent rows with disjoint and with common columns, and an isolated row."""
     lines = graded_offsets(300.0, 5.0, 17)
     spans = np.zeros((16, 2), dtype=int)
     spans[3:6] = [[2, 5], [7, 9], [0, 16]]

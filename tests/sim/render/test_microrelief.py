@@ -27,7 +27,7 @@ from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.microrelief import octave_heights
 
-LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
+LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 UNIFORM = np.ones((1, 1), dtype=np.float32)
 POSE = rigid(Rotation.identity(), np.array([30.0, 40.0, 20.0]))
 

@@ -39,7 +39,7 @@ def _brightness(renderer: Renderer, flat: Surface, law: Photometry, to_sun: np.n
         right=np.array([1.0, 0.0, 0.0]),
     )
     pose = rigid(Rotation.align_vectors(-to_eye[None], np.array([[0.0, 0.0, -1.0]]))[0], 100.0 * to_eye)
-    scene = Scene(flat, (0.0, 0.0), Sun(to_sun), replace(law, sky_share=0.0, surrounding_albedo=0.0))
+    scene = Scene(flat, (0.0, 0.0), Sun(to_sun), replace(law, sky_fraction=0.0, surrounding_albedo=0.0))
     return float(renderer.render(scene, PixelRays.of(camera), pose).radiance[4, 4])
 
 
@@ -83,7 +83,7 @@ def test_opposition_peak_is_at_the_antisolar_point(
 ) -> None:
     """The centre of the peak in the image is within half a pixel."""
     camera = _hazcam() if is_fisheye else descent_camera(512)
-    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
     pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
     for antisolar in np.array([[150.3, 201.8], [330.6, 255.1]]):
         _, ray = camera.transform(pose).rays(antisolar)

@@ -26,7 +26,7 @@ from marsyard.sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
 from marsyard.sim.terrain import Surface
 from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
 
-LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
+LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 EAST = 0.5 * np.pi
 
 

@@ -25,7 +25,7 @@ from marsyard.sim.terrain.rocks import RockField, RockParameters
 
 ALBEDO = 0.2
 #: Brightness is then albedo times the cosine of incidence in sunlight, and 0 in shadow.
-LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
+LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 #: Required fraction of equal pixels, from docs/validation.md.
 MIN_AGREEMENT = 0.995
 

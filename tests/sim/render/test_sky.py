@@ -13,7 +13,7 @@ from marsyard.sim.render import DustySky, Frame, Photometry, PixelRays, Renderer
 from marsyard.sim.render.kernels.photometry import sky_brightness
 from marsyard.sim.terrain import Surface
 
-DUSTY = Photometry(sky_share=0.25, sky=DustySky(0.5, 0.95, 0.65))
+DUSTY = Photometry(sky_fraction=0.25, sky=DustySky(0.5, 0.95, 0.65))
 
 
 def _make_flat_ground() -> Surface:

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from marsyard.sim.sensor import DetectorChoice, DetectorParameters, preset, read_datasheet
 
 CHOICE: TypeAdapter[DetectorParameters] = TypeAdapter(DetectorChoice)
-#: Sony IMX265 as specified by a camera manufacturer by EMVA 1288 (rounded), behind 16 mm f/4.
+#: Sony IMX265: rounded EMVA 1288 values from a camera manufacturer, with a 16 mm f/4 lens.
 SHEET = """name = "Sony IMX265, f/4"
 pixel_pitch_um = 3.45
 full_well_e = 10500
@@ -57,7 +57,7 @@ def test_responsivity_counts_solar_photons(tmp_path: Path) -> None:
     p = read_datasheet(write_sheet(tmp_path, "sun_au = 1.0\n" + SHEET)).parameters()
     photons = 475.0 / (6.62607015e-34 * 2.99792458e8 / 550e-9)
     expected = 0.65 * 0.9 * (3.45e-6) ** 2 * photons / (4.0 * 4.0**2)
-    # The sun is modelled as a black body, which is up to 9 % fainter in the green.
+    # The sun is modelled as a black body, whose irradiance is up to 9 % below ASTM E490 in green light.
     assert p.responsivity_e_s == pytest.approx(expected, rel=0.1)
     # `sunlight` is the solar irradiance at `sun_au`, relative to 1 au.
     assert p.sunlight == 1.0
@@ -65,7 +65,7 @@ def test_responsivity_counts_solar_photons(tmp_path: Path) -> None:
     assert far_from_sun.responsivity_e_s / far_from_sun.sunlight == pytest.approx(p.responsivity_e_s)
 
 
-def test_flat_curve_equals_the_mean(tmp_path: Path) -> None:
+def test_constant_efficiency_curve_equals_scalar_efficiency(tmp_path: Path) -> None:
     curve = SHEET.replace("quantum_efficiency = 0.65\n", "").replace(
         "[lens]", "[quantum_efficiency]\nwavelength_nm = [300.0, 900.0]\nefficiency = [0.65, 0.65]\n\n[lens]"
     )
@@ -74,7 +74,7 @@ def test_flat_curve_equals_the_mean(tmp_path: Path) -> None:
 
 
 def test_mer_ccd_from_datasheet_matches_the_preset(tmp_path: Path) -> None:
-    """The preset's detector calculated from Maki et al. 2003 and the assumed quantum efficiency curve."""
+    """Values of Maki et al. 2003 and the assumed quantum efficiency curve reproduce the preset's detector."""
     efficiency_percent = [15, 22, 28, 33, 38, 42, 43, 40, 34, 27, 19, 11, 5, 2, 0]
     text = f"""pixel_pitch_um = 12.0
 full_well_e = 170000
@@ -103,18 +103,18 @@ band_nm = [600.0, 800.0]
     assert actual.dark_e_s * actual.dark_growth == pytest.approx(expected.dark_e_s * expected.dark_growth)
 
 
-def test_campaign_stores_the_datasheet(tmp_path: Path) -> None:
+def test_stored_parameters_do_not_need_the_datasheet_file(tmp_path: Path) -> None:
     path = write_sheet(tmp_path)
     parameters = CHOICE.validate_python(str(path))
     assert parameters == read_datasheet(path).parameters().model_copy(update={"file": str(path)})
-    # The stored datasheet of the campaign folder is not read again.
+    # Stored parameters are validated without reading the datasheet file again.
     path.write_text("")
     assert CHOICE.validate_python(parameters.model_dump(mode="json")) == parameters
     path.write_text(SHEET)
     changed = CHOICE.validate_python({"file": str(path), "temperature_c": -10.0, "optics": {"dust_discs": 3}})
     assert (changed.temperature_c, changed.optics.dust_discs) == (-10.0, 3)
     assert changed.full_well_e == parameters.full_well_e
-    # The stored values replace the file.
+    # The stored values suffice after the file is deleted.
     stored = changed.model_dump(mode="json")
     path.unlink()
     assert CHOICE.validate_python(stored) == changed

@@ -132,16 +132,16 @@ def test_contrast_of_checkered_level_ground_equals_albedo_contrast() -> None:
 
 def test_sky_light_increases_with_dust() -> None:
     high = np.radians(45.0)
-    fractions = [Environment(optical_depth=tau).sky_share(high) for tau in (0.0, 0.2, 0.5, 0.9)]
+    fractions = [Environment(optical_depth=tau).sky_fraction(high) for tau in (0.0, 0.2, 0.5, 0.9)]
     assert fractions[0] == 0.0
     assert all(a < b for a, b in pairwise(fractions))
-    assert Environment(optical_depth=0.0).direct_share(high) == 1.0
+    assert Environment(optical_depth=0.0).direct_fraction(high) == 1.0
     # Without absorption and with isotropic scattering Eddington's approximation has a closed form. Over black ground
     # the transmitted fraction is (2 + 3 mu + (2 - 3 mu) exp(-tau / mu)) / (4 + 3 tau) (Shettle & Weinman 1970).
     conservative = Environment(optical_depth=1.0, single_scattering_albedo=0.9999999, asymmetry=0.0)
     for mu in (1.0, 0.5):
         sun = np.arcsin(mu)
-        total = conservative.direct_share(sun) * (mu + conservative.sky_share(sun)) / mu
+        total = conservative.direct_fraction(sun) * (mu + conservative.sky_fraction(sun)) / mu
         expected = (2 + 3 * mu + (2 - 3 * mu) * np.exp(-1.0 / mu)) / (4 + 3)
         assert total == pytest.approx(expected, abs=1e-4)
 
