@@ -79,7 +79,7 @@ Options = TypeVar("Options")
 
 
 def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
-    """Return a decorator that turns the fields of the dataclass `kind` into options and passes the command one instance."""
+    """Return a decorator that makes the fields of the dataclass `kind` options, and passes one instance to the command."""
     hints = get_type_hints(kind, include_extras=True)
     fields = [field.replace(annotation=hints[name]) for name, field in inspect.signature(kind).parameters.items()]
 

@@ -1,7 +1,8 @@
 """Compiled equations of motion of the two-stage pendulum; `marsyard.sim.dynamics.swing` defines equations and symbols.
 
-A state vector has 22 components: position and velocity of the canopy, unit vector along the line (downwards) and its time derivative, direction of
-the lander's axis and its rate, and the lander's x axis (three components each, world axes), then the lander's spin.
+A state vector has 22 components: position and velocity of the canopy, unit vector along the line (downwards) and its
+time derivative, direction of the lander's axis and its time derivative, and the lander's x axis (three components each,
+world axes), then the lander's spin.
 """
 
 from __future__ import annotations
@@ -212,7 +213,7 @@ def compute_derivatives(y: Array, chain: Chain, field: WindField) -> Array:
 
 @njit(cache=True)
 def compute_truth(states: Array, chain: Chain, field: WindField) -> tuple[Array, Array, Array, Array, Array]:
-    """Compute true position, velocity, attitude (body to world), body rate and specific force of the camera for states."""
+    """Compute true position, velocity, attitude (body to world), body rate and specific force of the camera."""
     count = states.shape[0]
     positions, velocities = np.empty((count, 3)), np.empty((count, 3))
     body_rates, forces = np.empty((count, 3)), np.empty((count, 3))

@@ -15,7 +15,7 @@ N_IMAGES = 4
 
 @pytest.fixture
 def products() -> dict[str, Any]:
-    """Four images; each image after the first has an estimate for the preceding interval, with an error of 0.5 m/s in x."""
+    """Four images; each one after the first has an estimate for the preceding interval, 0.5 m/s too large in x."""
     numbers = np.arange(1.0, N_IMAGES)
     no_value = np.full((1, 2), np.nan)
     true = np.concatenate([no_value, np.stack([10.0 + numbers, -numbers], axis=1)])
