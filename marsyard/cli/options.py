@@ -79,7 +79,7 @@ Options = TypeVar("Options")
 
 
 def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
-    """Return a decorator that makes the fields of the dataclass `kind` options, and passes one instance to the command."""
+    """Return a decorator that makes the fields of the dataclass `kind` options and passes the command an instance."""
     hints = get_type_hints(kind, include_extras=True)
     fields = [field.replace(annotation=hints[name]) for name, field in inspect.signature(kind).parameters.items()]
 

@@ -46,15 +46,15 @@ def parse_percent(text: str) -> float:
 @pytest.mark.parametrize("column", [1, 2, 3])
 def test_quoted_bounds_on_wrong_velocities_are_correct(column: int) -> None:
     wrong, answers = parse_counts(find_cells("dimes.md", "wrong answers (error above 5 m/s)")[column])
-    quoted = find_cells("dimes.md", "upper bound of their rate for independent cases, at 90 % confidence")[column]
+    quoted = find_cells("dimes.md", "upper 90 % confidence bound of the rate of wrong answers")[column]
     assert parse_percent(quoted) == round(100.0 * proportion_upper(wrong, answers, 0.9), 2)
 
 
 def test_quoted_intervals_of_wrong_answers_are_correct() -> None:
     page = read_page("dimes.md")
-    for (wrong, answers), quoted in (((1, 5), "between 0.5 and 71.6 %"), ((3, 10), "between 6.7 and 65.2 %")):
+    for (wrong, answers), quoted in (((1, 5), "0.5 to 71.6 %"), ((3, 10), "6.7 to 65.2 %")):
         low, high = proportion_interval(wrong, answers, 0.95)
-        assert quoted == f"between {100.0 * low:.1f} and {100.0 * high:.1f} %"
+        assert quoted == f"{100.0 * low:.1f} to {100.0 * high:.1f} %"
         assert quoted in page
     assert "one in 300" not in page
 
@@ -62,7 +62,9 @@ def test_quoted_intervals_of_wrong_answers_are_correct() -> None:
 def test_bound_of_landings_counts_terrains() -> None:
     terrains = int(load_campaign("dimes-landing").configuration.parameters["location"]["bank"])
     bound = f"{100.0 * proportion_lower(terrains, terrains, 0.9):.1f} %"
-    assert f"Counting terrains, this shows {bound} at 90 % confidence" in read_page("dimes.md")
+    assert f"With terrains as the independent unit, the lower 90 % confidence bound of the success rate is {bound}" in (
+        read_page("dimes.md")
+    )
 
 
 @pytest.mark.parametrize(
