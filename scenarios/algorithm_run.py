@@ -201,3 +201,12 @@ class AlgorithmSelection(BaseModel):
         if self.algorithm in self.compared:
             raise ValueError(f"the algorithm '{self.algorithm}' is listed twice")
         return self
+
+    @model_validator(mode="after")
+    def _check_options(self) -> AlgorithmSelection:
+        """Create the algorithms of Marsyard once, which checks their options."""
+        options = next((value for _, value in self if isinstance(value, self.task.options)), self.task.options())
+        for name in self.algorithms:
+            if name in self.task.shipped:
+                self.task.shipped[name](options)
+        return self

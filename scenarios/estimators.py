@@ -26,10 +26,12 @@ from marsyard.algorithms import exchange
 from marsyard.algorithms.answers import STREAM_METHODS, StreamedEstimator
 from marsyard.algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
+from marsyard.algorithms.dimes import options as dimes_options
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
+from marsyard.algorithms.vtt import options as vtt_options
 from marsyard.scenarios.offline import (
     SITE_FORMAT,
     VELOCITY_FORMAT,
@@ -47,6 +49,30 @@ GROUP = "marsyard.algorithms"
 
 Algorithm = TypeVar("Algorithm")
 Options = TypeVar("Options")
+
+
+def configurations(
+    name: str, create: Callable[[Any], Any], improvements: Mapping[str, Any]
+) -> dict[str, Callable[[Any], Any]]:
+    """Return the configurations of an algorithm of a paper, by name.
+
+    - `name`: the published algorithm; ValueError if one of its improvements is selected
+    - `name`-plus: with all improvements; ValueError if one of them is set explicitly
+    - `name`-custom: with the improvements that the options select
+    """
+
+    def create_published(options: Any) -> Any:
+        defaults = type(options)()
+        for key in improvements:
+            if getattr(options, key) != getattr(defaults, key):
+                raise ValueError(f"'{name}' and '{name}-plus' define the option {key}; '{name}-custom' accepts it")
+        return create(options)
+
+    def create_improved(options: Any) -> Any:
+        create_published(options)
+        return create(replace(options, **improvements))
+
+    return {name: create_published, f"{name}-plus": create_improved, f"{name}-custom": create}
 
 
 @dataclass(frozen=True)
@@ -162,7 +188,7 @@ VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
     what="velocity estimator",
     methods=("estimate",),
     shipped={
-        "dimes": DimesEstimator,
+        **configurations("dimes", DimesEstimator, dimes_options.IMPROVEMENTS),
         "phase-correlation": lambda _: PhaseCorrelationEstimator(),
         "homography": lambda _: HomographyEstimator(),
     },
@@ -182,12 +208,12 @@ TRACKING: Task[TargetTracker, VttOptions] = Task(
     what="target tracker",
     methods=("designate", "aim", "update", "clear", "state"),
     shipped={
-        "vtt": VisualTargetTracker,
-        # the paper's baseline: without scale, roll and warp
+        **configurations("vtt", VisualTargetTracker, vtt_options.IMPROVEMENTS),
+        # the paper's baseline: without scale and roll
         "pure-ncc": lambda options: VisualTargetTracker(
             replace(options, scale=PURE_NCC.scale, roll=PURE_NCC.roll, warp=PURE_NCC.warp)
         ),
-        "lucas-kanade": lucas_kanade_tracker,
+        "lucas-kanade": lambda options: lucas_kanade_tracker(replace(options, **vtt_options.IMPROVEMENTS)),
     },
     executable=exchange.ExecutableTargetTracker,
     options=VttOptions,

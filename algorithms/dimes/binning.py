@@ -229,13 +229,36 @@ def _pixel_range(smallest: float, largest: float, size: int) -> slice:
     return slice(min(low, size - 1), max(high, 1))
 
 
-def rectify_patch(view: View, centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndarray, "side side"]:
+def homography_lattice(
+    view: View, lattice: Float[np.ndarray, "side side 2"]
+) -> tuple[Float[np.ndarray, "side side 2"], Bool[np.ndarray, "side side"]]:
+    """Map a lattice of ground points to pixels by the homography of its corners, which are projected exactly.
+
+    Returns pixels and flags of visibility as `pixels_from_ground` does; all are invisible if a corner is.
+    """
+    corners, visible = pixels_from_ground(view, lattice[[0, 0, -1, -1], [0, -1, 0, -1]])
+    flags = np.full(lattice.shape[:2], bool(visible.all()))
+    if not visible.all():
+        return np.zeros(lattice.shape), flags
+    last = lattice.shape[0] - 1.0
+    square = np.array([[0.0, 0.0], [last, 0.0], [0.0, last], [last, last]], dtype=np.float32)
+    homography = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
+    steps = np.arange(lattice.shape[0], dtype=np.float64)
+    positions = np.stack(np.meshgrid(steps, steps), axis=-1)
+    return cv2.perspectiveTransform(positions, homography), flags
+
+
+def rectify_patch(
+    view: View, centre: Vector2, side_px: int, gsd_m: float, *, full_camera: bool = True
+) -> Float[np.ndarray, "side side"]:
     """Rectify and correct a patch of `side_px` pixels around the ground point `centre` (east, north), counts.
 
+    Each pixel is projected with the full camera model, or mapped by the homography of the patch's corners.
     Points outside the image get the value at its border. Points that the optics cannot image get the value of its upper
     left pixel. Template candidates have neither.
     """
-    pixels, visible = pixels_from_ground(view, ground_lattice(centre, side_px, gsd_m))
+    lattice = ground_lattice(centre, side_px, gsd_m)
+    pixels, visible = pixels_from_ground(view, lattice) if full_camera else homography_lattice(view, lattice)
     columns, rows = view.size
     left, right, top, bottom = kernels.clamp(pixels, visible, columns, rows)
     row_range, column_range = _pixel_range(top, bottom, rows), _pixel_range(left, right, columns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import final
 
 import numpy as np
@@ -51,11 +52,12 @@ def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, opt
     geometry = overlap.search_geometry(first, second, options)
     candidates = overlap.template_candidates(first, second, geometry, sun_direction, options)
     selection, contrasts = overlap.select_templates(first, candidates, options)
+    rectify = partial(rectify_patch, full_camera=options.full_camera)
     tracks = []
     for index, (candidate, contrast) in enumerate(zip(selection, contrasts, strict=True)):
         ground = candidates.ground[candidate]
-        template = rectify_patch(first, ground, geometry.template_px, geometry.gsd_m)
-        window = rectify_patch(second, ground, geometry.window_px, geometry.gsd_m)
+        template = rectify(first, ground, geometry.template_px, geometry.gsd_m)
+        window = rectify(second, ground, geometry.window_px, geometry.gsd_m)
         surface = pseudo_normalized_correlation(template, window)
         peak = highest_peak(surface)
         corner = match_corner(template, window, surface, peak, options)

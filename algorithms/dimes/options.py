@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +13,8 @@ import numpy as np
 @dataclass(frozen=True)
 class DimesOptions:
     """Options of the DIMES estimator (paper: section II of 'Field Testing of the MER DIMES').
+
+    The defaults are the published algorithm, with assumed values where the paper gives none.
 
     - binned_size: Columns and rows of the binned image (paper: 256 x 256)
     - max_speed_m_s: Largest horizontal speed expected (paper: 30 m/s). The search range is this speed times the time
@@ -29,7 +34,11 @@ class DimesOptions:
     - templates_per_pair: Templates selected in each pair of images (paper: 2)
     - exclusion_px: Minimum distance (in column or row, binned pixels) between template centres, so that the templates
       do not overlap and fail independently.
-    - subpixel: Whether the correlation peak is refined to sub-pixel accuracy (not specified for DIMES in the paper)
+    - full_camera: Whether each pixel of a rectified patch is projected with the full camera model. Otherwise a
+      homography rectifies the patch, as in the paper: it maps the patch's corners exactly, and neglects the lens
+      distortion between them.
+    - subpixel: Whether the correlation peak is refined to sub-pixel accuracy by a quadratic fit (not specified for
+      DIMES in the paper; the hazard detection of the same authors has this fit)
     - align: Whether the peak fit is refined by Gauss-Newton alignment, which removes its bias towards whole pixels
     - min_contrast: Minimum Harris interest of a template divided by its mean signal, per binned pixel. Images of noise
       only, at the flight camera's signal-to-noise ratio of 102, have 0.0022 to 0.0029.
@@ -61,8 +70,9 @@ class DimesOptions:
     grid_step_px: int = 8
     templates_per_pair: int = 2
     exclusion_px: float = 31.0
+    full_camera: bool = False
     subpixel: bool = True
-    align: bool = True
+    align: bool = False
     min_contrast: float = 0.003
     min_peak: float = 0.45
     max_peak_width_px: float = 16.0
@@ -79,3 +89,7 @@ class DimesOptions:
             raise ValueError("grid_step_px and templates_per_pair must be at least 1")
         if not 0.0 < self.max_off_nadir_rad < np.pi / 2:
             raise ValueError(f"max_off_nadir_rad is {self.max_off_nadir_rad}; it must lie between 0 and pi/2")
+
+
+#: Options of `dimes-plus` that differ from the published algorithm.
+IMPROVEMENTS: Mapping[str, Any] = MappingProxyType({"full_camera": True, "align": True})

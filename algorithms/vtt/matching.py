@@ -74,7 +74,7 @@ class Match:
 
 
 #: Registrations after the pure shift, in this order, for each option `warp`.
-_WARPS: dict[Warp, tuple[Warp, ...]] = {"shift": (), "stretch": ("stretch",), "bend": ("stretch", "bend")}
+_WARPS: dict[str, tuple[Warp, ...]] = {"none": (), "shift": (), "stretch": ("stretch",), "bend": ("stretch", "bend")}
 #: Function that matches the target in a new image near a full-frame pixel; None if the window does not fit.
 Matcher = Callable[[Sighting, MastImage, Vector2, ViewChange, VttOptions], Match | None]
 
@@ -131,16 +131,20 @@ def refine_match(
 ) -> Refinement:
     """Refine a match by registration: a pure shift, then the affine and quadratic warps that the options select.
 
-    `corner` is the match at the integer peak, `offset` the sub-pixel offset from the peak fit. If the shift cannot be
-    registered, `corner + offset` is returned; if a warp cannot, the result of the previous model.
+    `corner` is the match at the integer peak, `offset` the sub-pixel offset from the peak fit. Without registration
+    (`warp` is ``none``), or if the shift cannot be registered, `corner + offset` is returned; if a warp cannot be
+    registered, the result of the previous model.
     """
+    fitted = Refinement(corner + offset, integer_peak.value, integer_peak.value)
+    if options.warp == "none":
+        return fitted
     start = np.maximum(corner.astype(int) - MARGIN_PX - 2, 0)
     end = corner.astype(int) + len(template) + MARGIN_PX + 2
     region = image.counts[start[0] : end[0], start[1] : end[1]].astype(np.float64)
     part = build_spline(region, corner + offset - start, len(template))
     shifted = register_template(template, part, corner + offset - start, "shift")
     if shifted is None:
-        return Refinement(corner + offset, integer_peak.value, integer_peak.value)
+        return fitted
     best = shifted
     for warp in _WARPS[options.warp]:
         part = build_spline(region, best.corner, len(template), previous=part)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,6 +15,8 @@ from marsyard.algorithms.image.registration import Warp
 @dataclass(frozen=True)
 class VttOptions:
     """Options of the visual target tracker (paper: sections 4 and 5 of 'Targeted Driving Using Visual Tracking').
+
+    The defaults are the published algorithm, with assumed values where the paper gives none.
 
     - template_px: Side of the template, odd (paper: 21, "it provided the best result for natural rock images")
     - search_px: Side of the search window, full-frame pixels (paper: 161; 200 and 600 in section 5.2)
@@ -23,10 +28,11 @@ class VttOptions:
     - subpixel: Whether the left and right matches are refined to sub-pixel accuracy (not specified in the paper). The
       following steps magnify the error of a step: with whole pixels, whose error is 0.3 px, 16 steps from 10 m to 2 m
       cause an error of 3 px.
-    - warp: Model of the refinement: a shift (``shift``), also an affine distortion (``stretch``), or also a quadratic
-      distortion (``bend``). The paper's tracker had no warp. In an approach, a slanted surface is distorted affinely
-      and a round surface also quadratically. A simpler model has the same bias at each step (docs/adr/0010). The match
-      score is that of the shifted template.
+    - warp: Refinement of the sub-pixel match by registration: none (``none``; a quadratic fit of the correlation peak
+      only), a shift (``shift``), also an affine distortion (``stretch``), or also a quadratic distortion (``bend``).
+      The paper's tracker had no warp: its authors removed an affine stage for reliability. In an approach, a slanted
+      surface is distorted affinely and a round surface also quadratically. A simpler model has the same bias at each
+      step (docs/adr/0010). The match score is that of the shifted template.
     - epipolar_tolerance_px: Search range perpendicular to the epipolar curve of the right image (paper: 2, default)
     - stereo_search_fraction: Range of searched disparities around the prediction, as a fraction of `search_px` (paper:
       one half)
@@ -54,7 +60,7 @@ class VttOptions:
     coarse_levels: int = 1
     coarse_candidates: int = 6
     subpixel: bool = True
-    warp: Warp = "bend"
+    warp: Warp | Literal["none"] = "none"
     epipolar_tolerance_px: float = 2.0
     stereo_search_fraction: float = 0.5
     seed_range_m: tuple[float, float] = (1.0, 100.0)
@@ -94,4 +100,6 @@ class VttOptions:
 
 
 #: The paper's baseline: normalised correlation of the unwarped template (section 5.1).
-PURE_NCC = VttOptions(scale=False, roll=False, warp="shift")
+PURE_NCC = VttOptions(scale=False, roll=False)
+#: Options of `vtt-plus` that differ from the published algorithm.
+IMPROVEMENTS: Mapping[str, Any] = MappingProxyType({"warp": "bend"})

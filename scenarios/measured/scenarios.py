@@ -86,7 +86,7 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
 
     @model_validator(mode="after")
     def _check_binning(self) -> MeasuredVelocityParameters:
-        if "dimes" in self.algorithms:
+        if any(name.startswith("dimes") for name in self.algorithms):
             for image in self.case.pictures:
                 check_binning(self.dimes.binned_size, image.size)
         return self

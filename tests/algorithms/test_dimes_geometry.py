@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from marsyard.algorithms.dimes.binning import (
     build_view,
     ground_from_pixels,
     ground_lattice,
+    homography_lattice,
     inside_frame,
     pixel_angle_rad,
     pixels_from_ground,
@@ -32,6 +35,7 @@ from marsyard.algorithms.dimes.overlap import (
     template_contrasts,
     zero_phase_pixel,
 )
+from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import (
@@ -274,3 +278,26 @@ def _estimate_shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray
     design = np.column_stack([slopes[0].ravel(), slopes[1].ravel(), np.ones(patch.size)])
     solution, *_ = np.linalg.lstsq(design, (patch - expected).ravel())
     return np.asarray(solution[:2])
+
+
+def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
+    view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
+    lattice = ground_lattice(np.array([-150.0, 200.0]), 31, 5.5)
+    exact, visible = pixels_from_ground(view, lattice)
+    pixels, flags = homography_lattice(view, lattice)
+    assert visible.all()
+    assert flags.all()
+    np.testing.assert_allclose(pixels[[0, 0, -1, -1], [0, -1, 0, -1]], exact[[0, 0, -1, -1], [0, -1, 0, -1]], atol=1e-4)
+    differences_px = np.hypot(*np.moveaxis(pixels - exact, -1, 0))
+    # 31 px span a seventh of the image; the lens shifts its corners by 5 % of a pixel more than its centre.
+    assert 1e-4 < differences_px.max() < 0.1
+    pinhole = replace(view, camera=Cahv(view.camera.c, view.camera.a, view.camera.h, view.camera.v, view.camera.size))
+    np.testing.assert_allclose(
+        homography_lattice(pinhole, lattice)[0], pixels_from_ground(pinhole, lattice)[0], atol=2e-4
+    )
+
+
+def test_homography_of_an_invisible_corner_is_invisible() -> None:
+    view = make_blank_view(tilt_body(75.0, 0.0, 0.0), 1500.0)
+    _, flags = homography_lattice(view, ground_lattice(np.array([0.0, -40000.0]), 5, 5.5))
+    assert not flags.any()

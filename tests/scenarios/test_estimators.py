@@ -1,7 +1,9 @@
 """Tests of algorithm selection by name, import path and entry point, and of several algorithms in one case."""
 
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios import estimators
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, check_algorithms, labels
+from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, Task, check_algorithms, labels
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.velocity import consistency_row
 
@@ -47,7 +49,7 @@ def test_entry_point_is_an_algorithm_name_unless_it_is_built_in(monkeypatch: pyt
     monkeypatch.setattr(estimators, "list_installed", lambda: installed)
     assert isinstance(VELOCITY.make("installed", DimesOptions(), LIMITS), HomographyEstimator)
     assert not isinstance(VELOCITY.make("dimes", DimesOptions(), LIMITS), HomographyEstimator)
-    with pytest.raises(ValueError, match=r"did you mean 'installed'.*dimes, phase-correlation, homography, installed"):
+    with pytest.raises(ValueError, match=r"did you mean 'installed'.*dimes-plus.*homography, installed"):
         VELOCITY.check("installedd")
 
 
@@ -63,6 +65,26 @@ def test_programs_are_accepted_as_algorithms() -> None:
 def test_labels_are_unique_column_names() -> None:
     names = labels(["dimes", "phase-correlation", "a.b:Mine", "exec:./x/mine-1 --fast", "c:Mine", "exec:./7"])
     assert names == ("dimes", "phase_correlation", "Mine", "mine_1", "Mine_2", "a_7")
+
+
+@pytest.mark.parametrize(
+    ("task", "name", "key", "improved"), [(VELOCITY, "dimes", "align", True), (TRACKING, "vtt", "warp", "bend")]
+)
+def test_published_improved_and_custom_configurations(task: Task[Any, Any], name: str, key: str, improved: Any) -> None:
+    defaults = task.options()
+    changed = replace(defaults, **{key: improved})
+    assert task.make(name, defaults, LIMITS).options == defaults
+    assert getattr(task.make(f"{name}-plus", defaults, LIMITS).options, key) == improved
+    assert task.make(f"{name}-custom", changed, LIMITS).options == changed
+    for fixed in (name, f"{name}-plus"):
+        with pytest.raises(ValueError, match=f"define the option {key}; '{name}-custom' accepts it"):
+            task.make(fixed, changed, LIMITS)
+
+
+def test_improvement_of_a_published_algorithm_is_rejected_before_the_campaign() -> None:
+    with pytest.raises(ValueError, match="'dimes' and 'dimes-plus' define the option align; 'dimes-custom' accepts it"):
+        DescentScenarioParameters.model_validate({"dimes": {"align": True}})
+    DescentScenarioParameters.model_validate({"dimes": {"align": True}, "algorithm": "dimes-custom"})
 
 
 def test_duplicate_algorithm_is_rejected() -> None:

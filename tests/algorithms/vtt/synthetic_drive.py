@@ -211,7 +211,7 @@ class Drive:
 
 
 #: A smaller window than the paper's reduces the computed image parts.
-SMALL = VttOptions(search_px=101)
+SMALL = VttOptions(search_px=101, warp="bend")
 
 Body = Callable[[int, np.ndarray], Plane | Sphere]
 

@@ -64,6 +64,19 @@ def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, body: Bo
     assert np.max(np.linalg.norm(drifts, axis=1)) < 2.5
 
 
+def test_published_tracker_drifts_by_a_few_pixels() -> None:
+    """The quadratic fit of the correlation peak has an error of a tenth of a pixel, which later steps magnify."""
+    drifts = []
+    for seed in range(3):
+        target = np.array([10.0, 0.2 - 0.1 * seed, 0.2])
+        tracker = VisualTargetTracker(replace(SMALL, warp="none"))
+        drive = Drive(make_scene(make_boulder(seed, target), target, seed), navcam(), tracker)
+        true_pose, last = approach(drive, target, 0.1)[-1]
+        assert last.found
+        drifts.append(np.linalg.norm(pixel_of(last) - drive.true_pixel(true_pose, target)))
+    assert 0.3 < np.sqrt(np.mean(np.square(drifts))) < 10.0
+
+
 def test_track_drifts_without_subpixel_matching() -> None:
     # Each of 32 steps has an error of up to half a pixel, magnified by later steps: 0.4 px rms times 15.
     drifts = []

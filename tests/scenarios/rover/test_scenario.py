@@ -107,7 +107,9 @@ def test_ideal_instruments_have_only_match_errors() -> None:
         ),
         "pointing": dict.fromkeys(("zero_deg", "backlash_deg", "settling_deg", "count_deg"), 0.0),
     }
-    row: Mapping[str, Any] = RoverScenario().run(make_parameters(**exact_instruments), make_streams(2)).row
+    row: Mapping[str, Any] = (
+        RoverScenario().run(make_parameters(algorithm="vtt-plus", **exact_instruments), make_streams(2)).row
+    )
     assert row["disparity_error_goal_px"] == 0.0
     # Tolerance: a tenth of a pixel of disparity and of lateral position.
     assert row["position_error_m"] < 0.008
