@@ -29,6 +29,8 @@ def format_number(value: float) -> str:
 
 def format_value(measure: Measure, value: float) -> str:
     """Format a value with its unit; fractions with a lower limit are formatted in per cent."""
+    if measure.unit == "1":
+        return f"{value:.3g}"
     if measure.sense == "at least":
         return f"{100.0 * value:.2f} %"
     return f"{format_number(value)} {measure.unit}".strip()

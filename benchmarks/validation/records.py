@@ -16,7 +16,7 @@ class Measure:
     claim
         Validated property.
     measured, unit
-        Measured value and its unit; "" for a fraction.
+        Measured value and its unit; "" for a fraction, "1" for another number without a unit.
     limit, sense
         Limit (None for values without a limit), and whether it is an upper or lower limit.
     how

@@ -128,4 +128,4 @@ def run_reference(quick: bool) -> Iterator[Measure]:
         yield from _compare(name, descent_view(site, height_m, size), sun)
 
 
-CHECKS = (Check("reference", "An independent renderer: Mitsuba", run_reference),)
+CHECKS = (Check("reference", "Independent renderer", run_reference),)
