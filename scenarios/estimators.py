@@ -28,6 +28,7 @@ from marsyard.algorithms.baselines import HomographyEstimator, PhaseCorrelationE
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.dimes import options as dimes_options
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions
+from marsyard.algorithms.hda import options as hda_options
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
@@ -223,7 +224,12 @@ LANDING: Task[SiteEstimator, HdaOptions] = Task(
     name="landing",
     what="estimator of landing sites",
     methods=("estimate",),
-    shipped={"hda": HdaEstimator, "essential-matrix": EssentialMatrixEstimator, "semi-global": SemiGlobalEstimator},
+    shipped={
+        **configurations("hda", HdaEstimator, hda_options.IMPROVEMENTS),
+        # the baselines replace stages of the improved algorithm
+        "essential-matrix": lambda options: EssentialMatrixEstimator(replace(options, **hda_options.IMPROVEMENTS)),
+        "semi-global": lambda options: SemiGlobalEstimator(replace(options, **hda_options.IMPROVEMENTS)),
+    },
     executable=exchange.ExecutableSiteEstimator,
     options=HdaOptions,
     offline=SITE_FORMAT,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +37,8 @@ class TrackSeed(Choice):
 @dataclass(frozen=True)
 class HdaOptions:
     """Options of the hazard detection and avoidance (sections are those of 'Vision Guided Landing').
+
+    The defaults are the published algorithm, with assumed values where the paper gives none.
 
     - template_half_px: Half width t of the sparse tracker's templates and of the interest window: 2 t + 1 pixels (Table
       I: 11 x 11)
@@ -94,7 +99,7 @@ class HdaOptions:
     min_track_correlation: float = 0.6
     min_aligned_correlation: float = 0.88
     track_seed: TrackSeed = TrackSeed.NOTHING
-    align: bool = True
+    align: bool = False
     min_tracks: int = 12
     robust_px: float = 0.1
     max_residual_px: float = 1.0
@@ -109,7 +114,7 @@ class HdaOptions:
     surface_frame: SurfaceFrame = SurfaceFrame.INCLINOMETER
     lander_diameter_m: float = 2.0
     plane_trials: int = 30
-    refine_planes: bool = True
+    refine_planes: bool = False
     max_slope_rad: float = float(np.deg2rad(15.0))
     max_roughness_m: float = 0.2
     hazard_growth: float = 1.0
@@ -149,4 +154,10 @@ _NAMES_BY_MINIMUM = {
 _POSITIVE = (
     *("robust_px", "max_return_px", "narrowest_hazard", "max_residual_px"),
     *("lander_diameter_m", "max_slope_rad", "max_roughness_m"),
+)
+
+
+#: Options of `hda-plus` that differ from the published algorithm.
+IMPROVEMENTS: Mapping[str, Any] = MappingProxyType(
+    {"track_seed": TrackSeed.POSE, "align": True, "max_return_px": 1.5, "refine_planes": True, "check_footprints": True}
 )

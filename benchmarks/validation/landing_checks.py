@@ -25,7 +25,7 @@ SITES = ("heli-benign", "heli-hazardous")
 ROTATION_LIMIT_DEG, BASELINE_LIMIT, ELEVATION_LIMIT = 0.05, 0.0075, 0.005
 #: 160 x 120 structure pixels, with about 59 features as in the paper and with about 200. The number of features limits
 #: the accuracy of motion over rocks, because affine warps do not fit the sides of rocks.
-PAPER = HdaOptions(track_seed=TrackSeed.POSE, grid_px=4)
+PAPER = HdaOptions(track_seed=TrackSeed.POSE, align=True, refine_planes=True, grid_px=4)
 OPTIONS = replace(PAPER, block_px=32)
 
 

@@ -143,8 +143,8 @@ def choose_pair(
     """Choose the pair with the highest score; among equal scores, the earliest pair (landing paper, section V).
 
     The choice uses on-board data: poses of the filter, ranges of the laser, and the calibrated camera; level ground is
-    assumed. The commanded height replaces a missing range. Pairs with an overlap below `min_overlap` are used only if
-    there are no other pairs.
+    assumed. The commanded height replaces a missing range. Pairs with an overlap below `min_overlap`, or with a motion
+    of the ground in the image above `max_shift_px`, are used only if there are no other pairs.
 
     Raises ValueError if there are fewer than two images.
     """
@@ -152,6 +152,7 @@ def choose_pair(
         raise ValueError(f"cannot choose a pair from {len(poses)} images; at least 2 are needed")
     views = [_ImageView.from_pose(camera, pose) for pose in poses]
     best, best_score = None, (False, -np.inf)
+    max_shift_px = np.inf if parameters.max_shift_px is None else parameters.max_shift_px
     for i, first in enumerate(views[:-1]):
         distance = float(ranges_m[i]) if np.isfinite(ranges_m[i]) else height_m
         level = float(first.centre_m[2] + distance * first.axis[2])
@@ -160,13 +161,16 @@ def choose_pair(
             step = second.centre_m - first.centre_m
             baseline = float(np.linalg.norm(step - (step @ first.axis) * first.axis))
             second_footprint = second.footprint(level, first.centre_m)
-            overlap = 0.0
+            overlap, shift_px = 0.0, np.inf
             if first_footprint is not None and second_footprint is not None:
                 shared_area = cv2.intersectConvexConvex(first_footprint, second_footprint)[0]
                 overlap = float(shared_area / cv2.contourArea(first_footprint))
+                pixel_m = np.sqrt(cv2.contourArea(first_footprint) / np.prod(camera.size))
+                shift_px = float(np.linalg.norm(second_footprint - first_footprint, axis=1).max() / pixel_m)
+            is_usable = overlap >= parameters.min_overlap and shift_px <= max_shift_px
             score = overlap * min(baseline / (parameters.max_baseline_fraction * distance), 1.0)
-            if (overlap >= parameters.min_overlap, score) > best_score:
-                best_score = (overlap >= parameters.min_overlap, score)
+            if (is_usable, score) > best_score:
+                best_score = (is_usable, score)
                 best = PairChoice(i, j, baseline, overlap)
     if best is None:
         raise ValueError("no pair of images has finite poses")

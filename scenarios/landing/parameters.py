@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from pydantic import Field, field_validator, model_validator
 
-from marsyard.algorithms.hda import HdaOptions, TrackSeed
+from marsyard.algorithms.hda import HdaOptions
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.conditions import SizedFaults
 from marsyard.scenarios.descent.parameters import DustOpacity, Location, RenderParameters, SunParameters
@@ -21,7 +21,7 @@ from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
+from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.sensor import (
     PRESETS,
     AutoExposureParameters,
@@ -149,6 +149,9 @@ class PairParameters(Parameters):
 
     max_baseline_fraction: float = Field(default=0.2, gt=0.0, le=2.0, description="limit of baseline divided by range")
     min_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="fraction of the first image's ground")
+    max_shift_px: Annotated[
+        Positive | None, Field(description="maximum predicted motion of level ground in the image; default: no limit")
+    ] = None
 
 
 class LanderParameters(Parameters):
@@ -192,9 +195,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     lander: LanderParameters = LanderParameters()
     faults: Faults = Faults()
     algorithm: str = Field(default="hda", description="hda, essential-matrix, semi-global, or a custom 'module:Class'")
-    hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions(
-        track_seed=TrackSeed.POSE
-    )
+    hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions()
     render: RenderParameters = Field(default_factory=RenderParameters)
 
     @field_validator("site")

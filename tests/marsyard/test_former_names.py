@@ -74,7 +74,7 @@ def test_campaign_with_former_names_equals_the_current_one(files: tuple[Path, Pa
 def test_former_value_of_an_option_is_its_current_value() -> None:
     former = "where level ground at the measured range would move it by the on-board poses"
     with pytest.warns(DeprecatedNameWarning, match="is now 'poses'"):
-        campaign = load_campaign("hda-benign", [f'hda.track_seed="{former}"'])
+        campaign = load_campaign("hda-benign", ["algorithm=hda-custom", f'hda.track_seed="{former}"'])
     assert campaign.configuration.parameters["hda"]["track_seed"] == "poses"
     with pytest.raises(ConfigurationError, match="input should be 'unchanged' or 'poses'"):
         load_campaign("hda-benign", ["hda.track_seed=nothing"])

@@ -68,7 +68,8 @@ def test_labels_are_unique_column_names() -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "name", "key", "improved"), [(VELOCITY, "dimes", "align", True), (TRACKING, "vtt", "warp", "bend")]
+    ("task", "name", "key", "improved"),
+    [(VELOCITY, "dimes", "align", True), (TRACKING, "vtt", "warp", "bend"), (LANDING, "hda", "check_footprints", True)],
 )
 def test_published_improved_and_custom_configurations(task: Task[Any, Any], name: str, key: str, improved: Any) -> None:
     defaults = task.options()

@@ -23,7 +23,7 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
 from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_plane, make_pose, measure_pass
 
-OPTIONS = HdaOptions(block_px=32, grid_px=8)
+OPTIONS = HdaOptions(block_px=32, grid_px=8, align=True, refine_planes=True)
 
 
 def make_scene(second: tuple[float, ...] = (0.25, -0.65, 10.1, 23.0, 1.0, -1.5)) -> Pass:

@@ -28,7 +28,13 @@ from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_plane, make
 
 #: Options for images of 320 x 240 pixels; a lander of 1 m diameter among boulders of 0.3 m.
 OPTIONS = HdaOptions(
-    block_px=32, grid_px=4, lander_diameter_m=1.0, max_roughness_m=0.12, max_slope_rad=float(np.deg2rad(12.0))
+    align=True,
+    refine_planes=True,
+    block_px=32,
+    grid_px=4,
+    lander_diameter_m=1.0,
+    max_roughness_m=0.12,
+    max_slope_rad=float(np.deg2rad(12.0)),
 )
 #: Boulders in the left half of the image; the ground on the right is clear.
 BOULDERS = ((-1.2, 1.5, 0.35, 0.12), (1.6, 1.6, 0.35, 0.12), (0.3, 0.6, 0.35, 0.12), (-2.0, 0.3, 0.35, 0.12))

@@ -23,7 +23,9 @@ from marsyard.algorithms.hda.hazards import (
 from marsyard.algorithms.hda.kernels.elevation import robust_plane
 
 CELL_M = 0.1
-OPTIONS = HdaOptions(lander_diameter_m=1.0, max_roughness_m=0.2, max_slope_rad=float(np.deg2rad(15.0)))
+OPTIONS = HdaOptions(
+    refine_planes=True, lander_diameter_m=1.0, max_roughness_m=0.2, max_slope_rad=float(np.deg2rad(15.0))
+)
 
 
 def make_ground(rows: int = 80, columns: int = 100, slope_x: float = 0.0, slope_y: float = 0.0) -> ElevationMap:
@@ -267,7 +269,7 @@ SHARP = Resolution(window_m=0.0, noise_m=0.0)
 
 def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
     """The mean of 1 - 4 r^2 / D^2 over a centred window with side w, computed on a grid."""
-    options = HdaOptions(max_roughness_m=0.2, narrowest_hazard=2.0)
+    options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
     x = np.linspace(-0.05, 0.05, 401)
     mean = float(np.mean(1.0 - 4.0 * (x[:, None] ** 2 + x**2) / 0.4**2))
     assert roughness_limit_m(Resolution(0.1, 0.0), 1e-9, options) == pytest.approx(0.2 * mean, rel=1e-2)
@@ -280,7 +282,9 @@ def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
     x = 0.05 * (np.arange(121) - 60)
     ground = ElevationMap(np.tile(-0.3 * np.abs(x), (121, 1)), np.zeros(2), 0.05)
     all_safe = np.full((121, 121), Safety.SAFE, dtype=np.uint8)
-    options = HdaOptions(max_roughness_m=0.1, narrowest_hazard=100.0, max_slope_rad=float(np.radians(20.0)))
+    options = HdaOptions(
+        refine_planes=True, max_roughness_m=0.1, narrowest_hazard=100.0, max_slope_rad=float(np.radians(20.0))
+    )
     result = check_footprints(all_safe, ground, SHARP, options)
     assert np.all(result[40:80, 58:63] == Safety.HAZARD)
     # A footprint on one flank is on a plane.
@@ -290,7 +294,7 @@ def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
 def test_coarse_map_has_no_safe_cells() -> None:
     ground = ElevationMap(np.zeros((60, 60)), np.zeros(2), 0.1)
     all_safe = np.full((60, 60), Safety.SAFE, dtype=np.uint8)
-    options = HdaOptions(max_roughness_m=0.2, narrowest_hazard=2.0)
+    options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
     coarse = Resolution(window_m=1.0, noise_m=0.0)
     # At the corners most of a footprint is outside the map.
     inside = (slice(10, 50), slice(10, 50))

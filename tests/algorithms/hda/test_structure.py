@@ -25,7 +25,7 @@ from marsyard.algorithms.hda.structure import (
 from marsyard.sim.frames import rigid
 from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_plane, make_pose, measure_pass
 
-OPTIONS = HdaOptions(block_px=32, grid_px=8)
+OPTIONS = HdaOptions(block_px=32, grid_px=8, align=True, refine_planes=True)
 RELIEF = make_bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=make_plane(0.05, 0.02))
 
 

@@ -21,7 +21,7 @@ from marsyard.algorithms.hda.tracking import (
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, pseudo_normalized_correlation
 from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_camera, make_plane, make_pose, render_image
 
-OPTIONS = HdaOptions(block_px=32)
+OPTIONS = HdaOptions(block_px=32, align=True)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_straight_edges_and_uniform_images_have_no_features() -> None:
 
 def test_best_feature_of_each_block_is_selected() -> None:
     counts = np.random.default_rng(3).integers(0, 256, (150, 200)).astype(np.uint16)
-    options = HdaOptions(block_px=40, window_half_px=8)
+    options = HdaOptions(block_px=40, window_half_px=8, align=True)
     features = select_features(counts, options)
     border = feature_border_px(options)
     interest = eigenvalue_test(counts.astype(np.float32), 11, options.min_eigenvalue)

@@ -59,6 +59,15 @@ def test_rotation_reduces_overlap() -> None:
         assert overlap == pytest.approx(1.0 - abs(0.5 + sign * 1.76) / 8.0, abs=0.03)
 
 
+def test_motion_of_the_ground_in_the_image_is_limited() -> None:
+    """At 10 m a pixel is 12.5 mm wide: 38 px are 0.475 m, which three steps of 0.125 m do not exceed, but four do."""
+    choice = choose_pair(_make_poses(0.125), RANGES, CAMERA, PairParameters(max_shift_px=38.0), HEIGHT)
+    assert choice.baseline_m == pytest.approx(0.375)
+    rotated = choose_pair(_make_poses(0.125, yaw_deg=10.0), RANGES, CAMERA, PairParameters(max_shift_px=38.0), HEIGHT)
+    assert rotated.first > 0  # a rotation of 10 deg after the first image moves the corners by 70 px
+    assert rotated.baseline_m == pytest.approx(0.375)
+
+
 def test_missing_range_uses_commanded_height() -> None:
     choice = choose_pair(_make_poses(0.125), np.full(40, np.nan), CAMERA, PairParameters(), HEIGHT)
     assert (choice.first, choice.second) == (0, 16)
