@@ -27,6 +27,7 @@ WIDER = {
     "false PASS": "the guaranteed error rate",
     "false FAIL": "the guaranteed error rate",
     "nights with a false alarm": "the guaranteed rate",
+    "refused templates": "the 95 % interval of one of four flown templates",
 }
 
 
