@@ -25,7 +25,7 @@ _WIDTH_IN, _HEIGHT_IN, _HEADING_HEIGHT_IN, _MARGIN_IN, _MIN_PER_ROW = 3.0, 1.9, 
 #: Side of the cell of a pair, inches, and maximum number of parameters in the pairs.
 _CELL_SIDE_IN, MAX_PAIRED = 0.95, 24
 _CENTERED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "color": INK}
-#: Maximum number of labelled bars, and of bins.
+#: Maximum number of bars with labels; maximum number of histogram bins.
 _MAX_LABELS, _BINS = 8, 24
 
 

@@ -32,7 +32,7 @@ _FOLDERS = ("sim", "algorithms", "scenarios")
 
 
 def set_cache_folder() -> None:
-    """Set numba's cache folder by a hash of the kernel sources, unless the user sets it; numba is not imported."""
+    """Set NUMBA_CACHE_DIR to a folder named by the hash of the kernel sources, unless set; does not import numba."""
     if "NUMBA_CACHE_DIR" in os.environ:
         return
     root, digest = Path(__file__).parents[1], hashlib.sha256(sys.version.encode())
@@ -55,7 +55,7 @@ def kernels_are_ready(user: str) -> bool:
 
 
 def mark_ready(user: str) -> None:
-    """Record that all kernels of a scenario (`user`) are compiled, by a marker file."""
+    """Create a marker file: all kernels of a scenario (`user`) are compiled."""
     if (marker := _marker_path(user)) is not None:
         with suppress(OSError):
             marker.parent.mkdir(parents=True, exist_ok=True)

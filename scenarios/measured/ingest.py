@@ -44,7 +44,7 @@ _MAX_SUMMED_ROWS, _RATIO_TOLERANCE = 64, 0.05
 _DESCRIPTIONS = {
     "velocity": "Real descents: horizontal velocity from three images.",
     "landing": "Real flights: landing sites from two images.",
-    "matching": "Real images against their measured poses.",
+    "matching": "Real images, compared with their measured poses.",
 }
 
 
@@ -221,7 +221,7 @@ class _FolderReader:
     ) -> tuple[Rotation, Float64[np.ndarray, "3"] | None]:
         poses = self.file.poses
         if poses is None:
-            raise row.error(f"quaternions need [poses] in {INGEST_FILE}, which defines their axes")
+            raise row.error(f"quaternions require the table [poses] in {INGEST_FILE}, which defines their axes")
         vehicle = poses.world * rotation
         if position is None:
             return poses.body_attitudes(vehicle), None

@@ -57,7 +57,7 @@ def test_verdict_table_is_complete_at_any_width(make_rows: Rows, velocity: dict[
     assert "…" not in text
 
 
-def test_verdict_table_without_requirements_is_marked() -> None:
+def test_verdict_table_reports_missing_requirements() -> None:
     assert "no requirement" in _print_table(verdict_table([]), 80)
 
 
@@ -98,13 +98,13 @@ def test_axis_columns_are_the_components_of_an_error(make_rows: Rows) -> None:
     assert axis_columns("score", columns) == []
 
 
-def test_drivers_exclude_error_and_run_columns(make_rows: Rows) -> None:
+def test_driver_columns_exclude_errors_and_bookkeeping_columns(make_rows: Rows) -> None:
     drivers = driver_columns(make_rows(50), "velocity_error_m_s", max_columns=20)
     assert drivers[:3] == ["off_nadir_max_deg", "attitude_rate_max_deg_s", "altitude_1_m"]
     assert not {"case", "wall_time_s", "velocity_error_x_m_s", "terrain", "answered"} & set(drivers)
 
 
-def test_category_column_is_site_or_terrain(make_rows: Rows) -> None:
+def test_category_column_has_few_distinct_values(make_rows: Rows) -> None:
     frame = make_rows(100)
     assert category_column(frame) == "terrain"
     assert category_column(frame.assign(site=["Gusev", "Meridiani"] * 50)) == "site"
@@ -130,7 +130,7 @@ def test_primary_metric_is_an_existing_column(make_rows: Rows, velocity: dict[st
         (1.000673416, "100.07 %"),
     ],
 )
-def test_rates_below_1_are_not_rounded_to_100_percent(fraction: float, text: str) -> None:
+def test_percent_format_keeps_significant_digits(fraction: float, text: str) -> None:
     assert percent(fraction) == text
 
 

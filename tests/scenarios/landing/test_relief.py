@@ -30,7 +30,7 @@ def test_plane_has_exact_slope_and_no_roughness() -> None:
 def test_block_is_a_hazard_only_inside_the_footprint() -> None:
     relief = _make_relief(slope=0.1, block=0.3)
     footprints = relief.footprints(np.array([[0.0, 0.0], [1.0, 0.0], [1.2, 0.0]]), LIMITS)
-    # The fitted plane is the ground, as the block covers only 0.2 % of the footprint. The cost of deviations below
+    # The fitted plane is nearly the ground, because the block is small. The cost of deviations below
     # 0.1 mm is quadratic, so the block tilts the plane slightly.
     np.testing.assert_allclose(footprints.roughness_m, [0.3, 0.3, 0.0], atol=1e-5)
     np.testing.assert_array_equal(footprints.safe, [False, False, True])

@@ -38,8 +38,8 @@ def test_body_is_parallel_to_a_plane(rover: RoverParameters, azimuth_deg: float)
     assert [stance.differential_rad, *stance.bogies_rad] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
 
 
-def test_slope_causes_pitch_uphill_and_roll_across() -> None:
-    # Uphill the slope is the pitch. For a heading to the north on ground that rises to the east, the left side is low.
+def test_slope_causes_pitch_if_heading_uphill_and_roll_if_heading_across() -> None:
+    # Heading uphill, the pitch equals the slope. Heading north on ground that rises to the east, the left side is low.
     uphill = settle(MER, uphill_east(12.0), 0.0, 0.0, EAST)
     across_slope = settle(MER, uphill_east(12.0), 0.0, 0.0, NORTH)
     assert np.degrees([uphill.pitch_rad, uphill.roll_rad]) == pytest.approx([12.0, 0.0], abs=1e-6)
@@ -47,7 +47,7 @@ def test_slope_causes_pitch_uphill_and_roll_across() -> None:
     assert np.degrees(across_slope.tilt_rad) == pytest.approx(12.0, abs=1e-6)
 
 
-def test_body_pitches_by_the_mean_of_its_rockers() -> None:
+def test_chassis_pitch_is_the_mean_of_the_rocker_angles() -> None:
     # The left front wheel is on a block of 10 cm: its rocker and bogie rotate, those of the other side rotate in the
     # opposite direction. For a heading to the east, the left front wheel is at (0.705, 0.53).
     block_m = 0.10
@@ -59,7 +59,7 @@ def test_body_pitches_by_the_mean_of_its_rockers() -> None:
     # To first order one block causes half the pitch of two.
     assert one_block.pitch_rad == pytest.approx(0.5 * two_blocks.pitch_rad, rel=0.06)
     assert -one_block.differential_rad == pytest.approx(one_block.pitch_rad, rel=0.06)
-    # The front wheel rises by h; the arm is from the bogie pivot to the front wheel.
+    # The front wheel rises by h; the lever arm is the distance from the bogie pivot to the front wheel.
     assert two_blocks.pitch_rad == pytest.approx(block_m / (MER.front_m - MER.bogie_pivot_x_m), rel=0.06)
 
 
@@ -96,12 +96,12 @@ def _make_block(east: float, north: float, top: float) -> Float64[np.ndarray, "t
     return np.asarray(np.asarray(block.triangles) + np.array([east, north, 0.0]))
 
 
-def test_bodies_raise_the_ground() -> None:
+def test_rocks_raise_the_ground() -> None:
     slope = uphill_east(5.0)
     ground = RockyGround.of(slope, _make_block(1.0, 2.0, 0.3), (1.0, 2.0), 1.0)
     x, y = np.array([1.0, 1.19, 1.25, 1.0, 9.0]), np.array([2.0, 2.19, 2.0, 1.75, 9.0])
     assert ground.height(x, y) == pytest.approx([0.3, 0.3, *slope.height(x[2:], y[2:])], abs=1e-9)
-    # Bodies are buried where the slope is higher than their tops.
+    # A rock below the sloping ground has no effect on the height.
     assert RockyGround.of(slope, _make_block(1.0, 2.0, 0.05), (1.0, 2.0), 1.0).height(x, y) == pytest.approx(
         slope.height(x, y), abs=1e-9
     )
@@ -109,7 +109,7 @@ def test_bodies_raise_the_ground() -> None:
     assert without_bodies.height(x, y) == pytest.approx(slope.height(x, y))
 
 
-def test_wheel_on_a_block_is_raised_as_on_a_mound() -> None:
+def test_block_gives_the_same_stance_as_a_mound_of_equal_height() -> None:
     # Equal to a mound of the same height with a top wide enough for a wheel.
     height_m = 0.10
     ground = RockyGround.of(Plane(), _make_block(0.705, 0.53, height_m), (0.0, 0.0), 1.5)
