@@ -12,6 +12,7 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
+from enum import Enum
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -266,6 +267,8 @@ def _plain_options(options: object) -> dict[str, Any]:
         elif is_dataclass(options) and not isinstance(options, type):
             options = asdict(options)
         values = {str(key): value for key, value in options.items()} if isinstance(options, Mapping) else {}
-        return dict(json.loads(json.dumps(values, default=str)))
+        return dict(
+            json.loads(json.dumps(values, default=lambda value: value.value if isinstance(value, Enum) else str(value)))
+        )
     except Exception:  # custom values may raise anything, and the record must not stop a campaign
         return {}

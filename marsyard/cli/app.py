@@ -55,7 +55,7 @@ app = typer.Typer(
     help="A virtual Mars Yard: run vision software on rendered cases with ground truth, and report whether it "
     "meets its requirements at a given confidence level.",
     epilog="Exit status: 0 all requirements met, or no requirements; 1 a requirement failed, or a case crashed; "
-    "2 the command or a file is invalid; 3 not enough cases for a verdict, or no independent random draws.",
+    "2 the command or a file is invalid; 3 no verdict: too few cases, or cases that are not independent random draws.",
 )
 
 

@@ -127,7 +127,7 @@ def conformance(
     time_limit: Annotated[float, Option(metavar="S", help="Time limit of one answer in seconds.", min=0.1)] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Check an algorithm, or a custom motion, instrument or score, against its protocol: types, inputs and run time."""
+    """Check that an algorithm, motion, instrument or score follows its interface: data types, inputs and run time."""
     from marsyard.campaigns.running.replay import create_subject, run_conformance_checks
     from marsyard.scenarios.parts.named import KINDS
 

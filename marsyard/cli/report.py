@@ -91,7 +91,9 @@ def dashboard(
     requirements: Annotated[
         Path | None, Option(metavar="FILE", help="Requirements file to use instead of the built-in requirements.")
     ] = None,
-    serve: Annotated[int | None, Option(metavar="PORT", help="Serve it on this machine only.", min=0)] = None,
+    serve: Annotated[
+        int | None, Option(metavar="PORT", help="Also serve the dashboard over HTTP on this port.", min=0)
+    ] = None,
     host: Annotated[str, Option(metavar="ADDRESS", help="With --serve: address to listen on.")] = LOOPBACK_ADDRESS,
 ) -> None:
     """Write a dashboard of stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
