@@ -225,7 +225,7 @@ def landing_fractions(landed: kinds.Rows) -> dict[str, rates.CaseFraction]:
         f"faster by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(change > MIN_SPEED_CHANGE_M_S, landed),
     }
     if rates.is_flag(landed, "in_time_assumed"):
-        name = "answer available before ignition (of all landings)"
+        name = "computation finished before ignition (of all landings)"
         fractions[name] = rates.fraction_of(rates.flag_mask(landed, "in_time_assumed"), landed)
     return fractions
 
