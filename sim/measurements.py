@@ -202,6 +202,19 @@ class MastImage:
 
 
 @dataclass(frozen=True)
+class StereoMeasurement:
+    """A stereo pair of the rover's navigation, taken at one stop.
+
+    - left, right: counts of both images
+    - cameras: calibrated models of the left and the right camera in the rover frame, at the measured mast angles
+    """
+
+    left: UInt16[np.ndarray, "rows columns"]
+    right: UInt16[np.ndarray, "rows columns"]
+    cameras: tuple[CameraModel, CameraModel]
+
+
+@dataclass(frozen=True)
 class RoverMeasurements:
     """Measurements available to the rover's computer at a stop: a stereo pair of the mast cameras.
 

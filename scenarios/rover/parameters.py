@@ -139,7 +139,7 @@ class LegParameters(Parameters):
     )
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
     visual_odometry_step_m: Positive = Field(default=0.75, description="maximum drive between images (60 % overlap)")
-    autonav: bool = Field(default=False, description="whether a navigator avoids the rocks in its map")
+    autonav: bool = Field(default=False, description="whether a navigator avoids the hazards in its map")
     maps_first: Annotated[bool, Field(description="whether the navigator maps before the first step")] = False
     map_by: Annotated[Literal["body", "mast"], Field(description="cameras of the navigator's map")] = "mast"
     wedges: Annotated[int, Field(ge=1, le=4, description="number of mapped wedges at each step, for the mast")] = 2
@@ -270,6 +270,21 @@ class ScoreParameters(Parameters):
     stored_updates: int = Field(default=0, ge=0, le=100, description="number of first updates stored in columns")
 
 
+class NavigationParameters(Parameters):
+    """Visual odometry and terrain map of the navigator; values `oracle-...` use the truth instead of images."""
+
+    odometry: Annotated[
+        Literal["stereo", "oracle-motion"],
+        Field(description="stereo: rendered pairs; oracle-motion: true motion with the errors of odometry.visual"),
+    ] = "stereo"
+    terrain: Annotated[
+        Literal["stereo", "oracle-heights"],
+        Field(description="stereo: rendered pairs; oracle-heights: true heights, without occlusion"),
+    ] = "stereo"
+    binning: Annotated[int, Field(ge=1, le=8, description="pixels summed along each side (MER: 256 x 256 images)")] = 4
+    elevation_deg: Annotated[float, bounded_field(-60.0, 0.0, "elevation of the mast for these images")] = -30.0
+
+
 class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     """All parameters of the rover scenario."""
 
@@ -282,6 +297,7 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     start: StartParameters = StartParameters()
     legs: Annotated[tuple[LegParameters, ...], Field(min_length=1, description="legs, in order")] = (LegParameters(),)
     slip: SlipParameters = SlipParameters()
+    navigation: NavigationParameters = NavigationParameters()
     odometry: OdometryParameters = OdometryParameters()
     pointing: PointingParameters = PointingParameters()
     stereo: StereoCalibrationParameters = StereoCalibrationParameters()

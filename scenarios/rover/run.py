@@ -1,13 +1,15 @@
 """Simulate the closed loop of a run: at each stop visual odometry, tracking, navigation and drive, as in Fig. 12.
 
-A guide points the mast at each stop and estimates the target's position. `TrackerGuide` uses a tracker; `TruthGuide`
-uses the true position, for drives whose images are used by many trackers.
+A guide points the mast at each stop and estimates the target's position. `TrackerGuide` uses a tracker;
+`DesignationGuide` uses the position designated at the start and odometry, for drives whose images are used by many
+trackers. Visual odometry and the navigator's map use rendered stereo pairs. Parameters with values `oracle-...` replace
+them by the truth with errors, which is faster and isolates causes.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,104 +18,47 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.answers import check_aim, check_update
 from marsyard.algorithms.interface import MastAim, TargetTracker, TrackingState
-from marsyard.algorithms.navigation import NavigationOptions, NavigationOutcome, Obstacle, TerrainMap, Wedge, navigate
+from marsyard.algorithms.navigation.planner import NavigationOutcome
+from marsyard.algorithms.navigation.visual_odometry import VisualOdometry, estimate_motion
 from marsyard.algorithms.vtt import GoalCriterion, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.pointing import bounding_box, mast_angles
 from marsyard.scenarios.algorithm_run import InputCopy, answer_time_s
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.estimators import TRACKING
+from marsyard.scenarios.rover.flight_software import (
+    GOAL_TOLERANCE_M,
+    Navigator,
+    TargetEstimate,
+    goal_position,
+    is_finished,
+    plan_step,
+)
+from marsyard.scenarios.rover.navigation_cameras import ODOMETRY_EDGE_RAYS, NavigationCameras, oracle_heights
 from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import cast_rover_shadow
-from marsyard.scenarios.rover.stops import DesignatedTarget, RunOutcome, StereoCamera, Stop, View, choose_target
-from marsyard.scenarios.rover.world import TARGET, Rig, RunWorld, Vehicle
+from marsyard.scenarios.rover.stops import (
+    DesignatedTarget,
+    RunOutcome,
+    StereoCamera,
+    Stop,
+    View,
+    choose_target,
+    triangulate_point,
+)
+from marsyard.scenarios.rover.world import Rig, RunWorld, Vehicle
 from marsyard.scenarios.views import SiteGround
-from marsyard.sim.dynamics import Drive
+from marsyard.sim.dynamics import Drive, Stance
 from marsyard.sim.frames import compose
-from marsyard.sim.measurements import DriveCommand, MastCalibration, RoverMeasurements
+from marsyard.sim.measurements import DriveCommand, MastCalibration, RoverMeasurements, StereoMeasurement
 from marsyard.sim.streams import Streams
 
 #: Radius of the ground in a subframe around the target, divided by the target's distance: 8 deg, more than half the
 #: diagonal of the subframe of a navcam's right camera.
 SUBFRAME_RADIUS_FRACTION = 0.14
-#: Maximum distance from the goal at the end of an approach or back-off, metres.
-GOAL_TOLERANCE_M = 0.03
-#: Maximum angle of the goal from straight ahead for an arc; for a larger angle the rover first turns in place.
-MAX_ARC_RAD = np.radians(15.0)
-#: Mapped wedges of the mast's cameras: half a navcam's field of view of 45 deg, from the end of the rover's deck to the
-#: maximum stereo range of rocks; neighbours overlap by 5 deg.
-MAST_HALF_RAD, MAST_MIN_M, MAST_MAX_M, MAST_SPACING_RAD = float(np.radians(22.5)), 1.4, 12.0, np.radians(40.0)
-#: Mapped wedge of the body cameras (hazcams): half the field of view of 120 deg, from the front wheels.
-BODY_HALF_RAD, BODY_MIN_M, BODY_MAX_M = float(np.radians(60.0)), 0.3, 4.0
-
-
-@dataclass(frozen=True)
-class TargetEstimate:
-    """On-board estimate of the target's position, used to plan a step."""
-
-    position_rover: Float64[np.ndarray, "3"]  #: latest estimate in the rover frame, metres
-    range_m: float  #: distance from the camera
-
-    @property
-    def distance_m(self) -> float:
-        """Horizontal distance from the rover's origin."""
-        return float(np.hypot(*self.position_rover[:2]))
-
-
-def goal_position(leg: LegParameters, target: TargetEstimate) -> Float64[np.ndarray, "2"]:
-    """Compute the goal of the rover's origin, forward and left of its current position, metres.
-
-    The goal is on the line to the target, `goal_m` in front of the target, shifted to the right by `offset_right_m`.
-    """
-    ahead = target.position_rover[:2] / target.distance_m
-    right = np.array([ahead[1], -ahead[0]])
-    return np.asarray((target.distance_m - leg.goal_m) * ahead + leg.offset_right_m * right)
-
-
-def step_length_m(leg: LegParameters, target: TargetEstimate) -> float:
-    """Return the maximum step length: a fraction of the target's distance from the camera, or a fixed length."""
-    return leg.step_fraction * target.range_m if leg.step_m is None else leg.step_m
-
-
-def is_finished(leg: LegParameters, step_count: int, target: TargetEstimate) -> bool:
-    """Return whether the leg is finished after this number of steps."""
-    if step_count >= leg.steps:
-        return True
-    if leg.motion == "approach":
-        return target.distance_m <= leg.goal_m + GOAL_TOLERANCE_M
-    return leg.motion == "back-off" and target.distance_m >= leg.goal_m - GOAL_TOLERANCE_M
-
-
-def plan_step(leg: LegParameters, step_count: int, target: TargetEstimate) -> Iterator[DriveCommand]:
-    """Plan the commands of the next step; two commands if the rover turns in place before it drives."""
-    if leg.motion == "turn":
-        yield DriveCommand(turn_left_rad=-float(np.radians(leg.step_deg)))
-        if leg.shuffle_m:
-            yield DriveCommand(forward_m=leg.shuffle_m if step_count % 2 == 0 else -leg.shuffle_m)
-    elif leg.motion == "circle":
-        # a rotation about the target moves the origin perpendicular to the line to the target
-        angle = -float(np.radians(leg.step_deg))
-        x, y, _ = target.position_rover
-        yield DriveCommand(forward_m=angle * float(y), left_m=-angle * float(x), turn_left_rad=angle)
-    elif leg.motion == "straight":
-        yield DriveCommand(forward_m=step_length_m(leg, target))
-    elif leg.motion == "back-off":
-        yield DriveCommand(forward_m=-min(step_length_m(leg, target), leg.goal_m - target.distance_m))
-    elif leg.motion == "approach":
-        yield from plan_drive(goal_position(leg, target), step_length_m(leg, target))
-
-
-def plan_drive(position: Float64[np.ndarray, "2"], max_length_m: float) -> Iterator[DriveCommand]:
-    """Plan a step to a position (forward, left): an arc, or a turn in place and a straight drive."""
-    angle = float(np.arctan2(position[1], position[0]))
-    chord = float(np.hypot(*position))
-    if abs(angle) > MAX_ARC_RAD:
-        yield DriveCommand(turn_left_rad=angle)
-        yield DriveCommand(forward_m=min(chord, max_length_m))
-        return
-    # an arc that starts straight ahead turns by twice the angle of its chord
-    arc = chord / float(np.sinc(angle / np.pi))
-    length = min(arc, max_length_m)
-    yield DriveCommand(forward_m=length, turn_left_rad=2.0 * angle * length / arc)
+#: Maximum turn in place between two stereo pairs of visual odometry (MER: Maimone, Cheng & Matthies 2007).
+VISUAL_TURN_RAD = np.radians(18.0)
+#: Mapped depths of the mast's cameras and of the body cameras, metres, and angle between two pairs of the mast.
+MAST_RANGES_M, BODY_RANGES_M, MAST_SPACING_RAD = (1.4, 8.0), (0.35, 3.0), np.radians(40.0)
 
 
 @dataclass
@@ -124,6 +69,7 @@ class Setup:
     rig: Rig
     vehicle: Vehicle
     camera: StereoCamera
+    navigation_cameras: NavigationCameras
 
     @staticmethod
     def draw(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround) -> Setup:
@@ -131,7 +77,8 @@ class Setup:
         rig = Rig.draw(p, streams)
         world = RunWorld.from_parameters(p, rig.pixel_rad, streams, load_ground)
         camera = StereoCamera.draw(p, streams)
-        return Setup(world, rig, Vehicle.at_start(p, world, rig, streams), camera)
+        navigation_cameras = NavigationCameras.draw(p, rig, streams)
+        return Setup(world, rig, Vehicle.at_start(p, world, rig, streams), camera, navigation_cameras)
 
 
 @dataclass
@@ -143,15 +90,17 @@ class Run(Setup):
     outcome: RunOutcome = RunOutcome.STUCK
     handed_over: bool = False  #: whether the target was handed over to the arm at the end
     visual_odometry_updates: int = 0
+    visual_odometry_failures: int = 0  #: updates without an estimate; wheel odometry was used
     autonav_updates: int = 0
-    terrain: TerrainMap = field(default_factory=TerrainMap)  #: the navigator's map
+    navigator: Navigator = field(default_factory=Navigator)
+    odometry_pair: tuple[Stance, StereoMeasurement] | None = None  #: last pair of visual odometry, and its stance
     time_s: float = 0.0  #: time since the start
     pending: list[Drive] = field(default_factory=list)  #: drives since the last stop
 
     @classmethod
     def from_setup(cls, setup: Setup, target: DesignatedTarget) -> Run:
         """Create a run with a target, at its start."""
-        return cls(setup.world, setup.rig, setup.vehicle, setup.camera, target)
+        return cls(setup.world, setup.rig, setup.vehicle, setup.camera, setup.navigation_cameras, target)
 
     def estimate_at(self, position_rover: Float64[np.ndarray, "3"]) -> TargetEstimate:
         """Create a target estimate from a position in the rover frame; add its range from the camera."""
@@ -206,18 +155,23 @@ class TrackerGuide:
 
 
 @dataclass(frozen=True)
-class TruthGuide:
-    """The true target position as guide; stores the views of all stops."""
+class DesignationGuide:
+    """A designated position as guide, without tracking: odometry carries it along. Stores the views of all stops.
+
+    `position_world` is the designated point in the estimated world frame, or None: the true point (an oracle). The
+    subframes contain the visible rock and a margin: they stand for full images, of which only this part is rendered.
+    """
 
     margin_px: float
+    position_world: Float64[np.ndarray, "3"] | None
     views: list[View] = field(default_factory=list)
 
     def aim(self, run: Run) -> MastAim | None:
-        """Return an aim at the target; its boxes contain the visible rock above its foot, and a margin."""
+        """Return an aim at the estimated target; None if the mast cannot point there or a camera misses the rock."""
         stance, rig = run.vehicle.stance, run.rig
         angles = mast_angles(self.target(run).position_rover, rig.calibrated, use_both=False)
         if angles is None:
-            raise ValueError("the mast cannot point at the target's rock from every stop of this drive")
+            return None
         rig.point(*angles)
         corners = run.world.target_triangles.reshape(-1, 3)
         corners = corners[corners[:, 2] > run.world.rocks.position_m[run.world.target_number, 2]]
@@ -228,7 +182,7 @@ class TruthGuide:
             in_frame = pixels[camera.in_frame(pixels)]
             box = bounding_box(in_frame, self.margin_px, camera) if len(in_frame) else None
             if box is None:
-                raise ValueError("the camera does not see the target's rock")
+                return None
             boxes.append(box)
         # the mast does not move if its encoders already read these angles
         return MastAim(*rig.state.readings_rad, *boxes)
@@ -239,11 +193,30 @@ class TruthGuide:
         return None
 
     def target(self, run: Run) -> TargetEstimate:
-        """Return the true target position."""
-        return run.estimate_at(run.vehicle.stance.world_from_rover.inv().apply(run.target.point_world.copy()))
+        """Return the designated position in the rover frame of the estimated pose, or the true target position."""
+        if self.position_world is None:
+            return run.estimate_at(run.vehicle.stance.world_from_rover.inv().apply(run.target.point_world.copy()))
+        return run.estimate_at(run.vehicle.estimated.inv().apply(self.position_world.copy()))
+
+    @classmethod
+    def designate(cls, run: Run, margin_px: float, oracle: bool) -> DesignationGuide:
+        """Create the guide at the start; operators triangulate the point in images of the start.
+
+        Raises ValueError if the mast cannot point at the target or the point cannot be triangulated.
+        """
+        if oracle:
+            return cls(margin_px, None)
+        stance, rig = run.vehicle.stance, run.rig
+        point = run.target.point_world
+        angles = mast_angles(np.asarray(stance.world_from_rover.inv().apply(point.copy())), rig.calibrated, False)
+        if angles is None:
+            raise ValueError("the mast cannot point at the target's rock from the start of this drive")
+        rig.point(*angles)
+        position = triangulate_point(rig, stance, point)
+        return cls(margin_px, np.asarray(run.vehicle.estimated.apply(position)))
 
 
-Guide = TrackerGuide | TruthGuide
+Guide = TrackerGuide | DesignationGuide
 
 
 def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
@@ -319,50 +292,71 @@ def drive_step(
     commands: Iterable[DriveCommand] = plan_step(leg, step_count, target)
     if leg.autonav:
         map_terrain(p, run, leg, target)
-        estimated, step_m = run.vehicle.estimated, step_length_m(leg, target)
-        goal = estimated.translation + estimated.rotation.as_matrix() @ np.array([*goal_position(leg, target), 0.0])
-        ignored_rock = TARGET if leg.target_is_no_obstacle else None
-        options = NavigationOptions(half_width_m=0.6)
-        plan = navigate(run.terrain, estimated, np.asarray(goal[:2]), step_m, options, ignored_rock)
+        plan = run.navigator.plan(leg, target, run.vehicle.estimated)
         if plan.outcome not in (NavigationOutcome.PATH, NavigationOutcome.AT_GOAL):
             return RunOutcome.NO_PATH
         commands = plan.commands
     for command in commands:
         count = 1
         if leg.visual_odometry:
-            count = max(1, int(np.ceil(command.length_m / leg.visual_odometry_step_m - 1e-9)))
+            parts = max(command.length_m / leg.visual_odometry_step_m, abs(command.turn_left_rad) / VISUAL_TURN_RAD)
+            count = max(1, int(np.ceil(parts - 1e-9)))
             run.visual_odometry_updates += count
             run.time_s += count * p.timing.visual_odometry_s
-        run.pending += [run.vehicle.drive(command.part(1.0 / count), leg.visual_odometry) for _ in range(count)]
+        run.pending += [drive_part(p, run, leg, command.part(1.0 / count)) for _ in range(count)]
         run.time_s += p.timing.drive_s
     return None
 
 
-def map_terrain(p: RoverScenarioParameters, run: Run, leg: LegParameters, target: TargetEstimate) -> None:
-    """Add the wedges of a navigation update, and the rocks at their estimated positions, to the navigator's map.
+def drive_part(p: RoverScenarioParameters, run: Run, leg: LegParameters, command: DriveCommand) -> Drive:
+    """Execute a drive command; with visual odometry, correct the estimated position by the motion between two pairs."""
+    vehicle, is_oracle = run.vehicle, p.navigation.odometry == "oracle-motion"
+    if not leg.visual_odometry or is_oracle:
+        drive = vehicle.drive(command, leg.visual_odometry)
+        run.visual_odometry_failures += vehicle.estimate.visual_failed
+        return drive
+    first, before = take_odometry_pair(p, run), vehicle.estimated
+    drive = vehicle.drive(command, False)
+    second = take_odometry_pair(p, run)
+    result: VisualOdometry = estimate_motion(first, second, compose(before.inv(), vehicle.estimated))
+    if result.first_from_second is None:
+        run.visual_odometry_failures += 1
+    else:
+        vehicle.correct_position(np.asarray(before.apply(result.first_from_second.translation)))
+    return drive
 
-    The first update also adds a disc around the rover.
+
+def take_odometry_pair(p: RoverScenarioParameters, run: Run) -> StereoMeasurement:
+    """Take the stereo pair of visual odometry, straight ahead; reuse the last one if the rover has not moved since."""
+    stance = run.vehicle.stance
+    if run.odometry_pair is None or run.odometry_pair[0] is not stance:
+        cameras, time_s = run.navigation_cameras, run.time_s
+        pair = cameras.take_mast_pair(p, run.world, run.rig, run.vehicle, 0.0, time_s, ODOMETRY_EDGE_RAYS)
+        run.odometry_pair = stance, pair
+    return run.odometry_pair[1]
+
+
+def map_terrain(p: RoverScenarioParameters, run: Run, leg: LegParameters, target: TargetEstimate) -> None:
+    """Add the stereo pairs of a navigation update to the navigator's map.
+
+    The first update also adds the ground under the rover.
     """
     run.autonav_updates += 1
     run.time_s += p.timing.autonav_s
-    rover, estimated, rocks = run.vehicle.rover, run.vehicle.estimated, run.world.rocks
-    estimated_from_true = estimated * run.vehicle.stance.world_from_rover.inv()
-    obstacles = []
-    for name, number in rocks.names.items():
-        centre = np.asarray(estimated_from_true.apply(rocks.position_m[number].copy()))[:2]
-        obstacles.append(Obstacle(name, centre, 0.5 * float(rocks.diameter_m[number]), float(rocks.height_m[number])))
-    position, forward = estimated.translation[:2], estimated.rotation.as_matrix()[:2, 0]
-    heading = float(np.arctan2(forward[0], forward[1]))
-    radius_m = rover.enclosing_radius_m + 0.3
-    wedges = [] if run.terrain.wedges else [Wedge(position.copy(), 0.0, float(np.pi), 0.0, radius_m)]
-    if leg.map_by == "body":
-        apex = np.asarray(position + rover.front_m * forward)
-        wedges.append(Wedge(apex, heading, BODY_HALF_RAD, BODY_MIN_M, BODY_MAX_M))
+    vehicle, cameras, time_s = run.vehicle, run.navigation_cameras, run.time_s
+    estimated = vehicle.estimated
+    run.navigator.map_start(estimated, vehicle.rover.enclosing_radius_m)
+    ahead = goal_position(leg, target)
+    azimuth = -float(np.arctan2(ahead[1], ahead[0]))
+    azimuths = [azimuth + (number - 0.5 * (leg.wedges - 1)) * MAST_SPACING_RAD for number in range(leg.wedges)]
+    if p.navigation.terrain == "oracle-heights":
+        ranges_m, azimuths = (BODY_RANGES_M, [0.0]) if leg.map_by == "body" else (MAST_RANGES_M, azimuths)
+        points = [oracle_heights(run.world, vehicle, azimuth, ranges_m, leg.map_by == "body") for azimuth in azimuths]
+        estimated_from_true = estimated * vehicle.stance.world_from_rover.inv()
+        run.navigator.map_points(np.asarray(estimated_from_true.apply(np.concatenate(points))))
+    elif leg.map_by == "body":
+        run.navigator.map_pair(cameras.take_body_pair(run.world, run.rig, vehicle, time_s), estimated, BODY_RANGES_M)
     else:
-        ahead = goal_position(leg, target)
-        azimuth = heading - float(np.arctan2(ahead[1], ahead[0]))
-        for number in range(leg.wedges):
-            wedge_azimuth = float(azimuth + (number - 0.5 * (leg.wedges - 1)) * MAST_SPACING_RAD)
-            wedges.append(Wedge(position.copy(), wedge_azimuth, MAST_HALF_RAD, MAST_MIN_M, MAST_MAX_M))
-    for wedge in wedges:
-        run.terrain = run.terrain.add_wedge(wedge, tuple(obstacles))
+        for azimuth in azimuths:
+            pair = cameras.take_mast_pair(p, run.world, run.rig, vehicle, azimuth, time_s)
+            run.navigator.map_pair(pair, estimated, MAST_RANGES_M)

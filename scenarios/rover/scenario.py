@@ -1,9 +1,10 @@
 """Rover scenarios: one run of the closed loop, or one target tracked over the images of a shared drive.
 
-A shared drive is open-loop tracking (paper, 5.1 to 5.3): the tracker's answers do not move the rover. The true position
-of the point at the centre of all targets guides the rover and its mast. At every stop, both cameras take subframes that
-contain the rock and the search windows around it. A case tracks one target over the images of every (skip + 1)-th stop;
-skipping stops makes the steps larger. A drive depends only on the parameters, the campaign's seed and the run's index.
+A shared drive is open-loop tracking (paper, 5.1 to 5.3): the tracker's answers do not move the rover. The point at the
+centre of all targets is designated in images of the start; the rover and its mast follow it by odometry. At every stop,
+both cameras take subframes that contain the rock and the search windows around it. A case tracks one target over the
+images of every (skip + 1)-th stop; skipping stops makes the steps larger. A drive depends only on the parameters, the
+campaign's seed and the run's index.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
-from typing import Annotated, cast
+from typing import Annotated, Literal, cast
 
 import numpy as np
 from jaxtyping import Float64
@@ -31,7 +32,15 @@ from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.scenarios.rover import score
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run import Run, Setup, TrackerGuide, TruthGuide, drive_legs, prepare_run, track_target
+from marsyard.scenarios.rover.run import (
+    DesignationGuide,
+    Run,
+    Setup,
+    TrackerGuide,
+    drive_legs,
+    prepare_run,
+    track_target,
+)
 from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, evaluate_visibility, pick_target
 from marsyard.scenarios.rover.world import terrain_parameters
 from marsyard.scenarios.views import SiteGround
@@ -82,6 +91,10 @@ class SharedDriveParameters(Parameters):
     target: Annotated[int, Field(ge=0, description="index of the target")] = 0
     skip: Annotated[int, Field(ge=0, le=100, description="stops skipped between two updates")] = 0
     margin_px: Annotated[float, Field(gt=0.0, description="margin around the rock in the images")] = 110.0
+    steering: Annotated[
+        Literal["estimate", "oracle-target"],
+        Field(description="position that guides the drive: designated and carried by odometry, or the true one"),
+    ] = "estimate"
     bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps")] = ()
     face_deg: float | None = Field(default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`")
 
@@ -109,6 +122,7 @@ class DriveKey:
 
     drive: RoverScenarioParameters
     margin_px: float
+    steering: str
     seed: int
     campaign: str
     run: int
@@ -129,7 +143,7 @@ class DriveKey:
             "compared": (),
             "vtt": VttOptions(),
         }
-        return cls(drive.model_copy(update=changes), p.margin_px, streams.seed, streams.campaign, p.run)
+        return cls(drive.model_copy(update=changes), p.margin_px, p.steering, streams.seed, streams.campaign, p.run)
 
 
 @dataclass(frozen=True)
@@ -161,8 +175,10 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
     mast = setup.vehicle.stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
     position = p.target.across, p.target.up
     run = Run.from_setup(setup, pick_target(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_eye(mast)))
-    guide = TruthGuide(key.margin_px)
+    guide = DesignationGuide.designate(run, key.margin_px, key.steering == "oracle-target")
     drive_legs(p, run, guide)
+    if not guide.views:
+        raise ValueError("the cameras cannot show the target's rock from the start of this drive")
     return SharedDrive(run, tuple(guide.views), compute_eye(guide.views[0].world_from_head))
 
 

@@ -107,6 +107,7 @@ def tracking_row(run: Run) -> dict[str, Scalar]:
         "updates": len(run.stops),
         "lost_updates": len(run.stops) - len(tracked_stops),
         "visual_odometry_updates": run.visual_odometry_updates,
+        "visual_odometry_failures": run.visual_odometry_failures,
         "autonav_updates": run.autonav_updates,
         **{
             column: float(reduce(quantities[name])) if np.any(np.isfinite(quantities[name])) else NAN

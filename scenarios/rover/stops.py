@@ -242,20 +242,29 @@ def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance:
     if angles is None:
         raise ValueError("the mast cannot point at the target's rock from the start; change start.target_azimuth_deg")
     rig.point(*angles)
-    head, readings, calibrated = stance.world_from_rover * rig.rover_from_head, rig.state.readings_rad, rig.calibrated
+    head, readings = stance.world_from_rover * rig.rover_from_head, rig.state.readings_rad
     target = pick_target(world, rig, head, readings, (p.target.across, p.target.up), p.vtt)
     if p.target.designation == "pixel":
         return target
-    in_head = np.asarray(head.inv().apply(target.point_world.copy()))
-    left, right = (np.asarray(camera.project(in_head)[0]) for camera in (rig.left, rig.right))
-    position = triangulate(calibrated.left, calibrated.right, left, right)
-    if position is None:
-        raise ValueError("the target cannot be triangulated from the start")
-    in_rover = np.asarray(calibrated.geometry.rover_from_head(*readings).apply(position))
+    in_rover = triangulate_point(rig, stance, target.point_world)
     if p.target.designation == "rover":
         return replace(target, designation=RoverTarget(in_rover))
     in_site = np.asarray(SITE_FROM_WORLD.apply(stance.world_from_rover.apply(in_rover)))
     return replace(target, designation=SiteTarget(in_site))
+
+
+def triangulate_point(rig: Rig, stance: Stance, point_world: Vector) -> Vector:
+    """Triangulate a point from its true pixels in both cameras with the calibrated cameras, rover frame.
+
+    Raises ValueError if the lines of sight have no nearest point.
+    """
+    head, calibrated = stance.world_from_rover * rig.rover_from_head, rig.calibrated
+    in_head = np.asarray(head.inv().apply(point_world.copy()))
+    left, right = (np.asarray(camera.project(in_head)[0]) for camera in (rig.left, rig.right))
+    position = triangulate(calibrated.left, calibrated.right, left, right)
+    if position is None:
+        raise ValueError("the target cannot be triangulated from the start")
+    return np.asarray(calibrated.geometry.rover_from_head(*rig.state.readings_rad).apply(position))
 
 
 def pick_target(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,12 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
 from marsyard.scenarios.rover.points import RockOutline
-from marsyard.scenarios.views import Eye, SiteGround, site_scene
+from marsyard.scenarios.views import Eye, SiteGround, select_rocks, site_scene
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import MER, ROCKY_8, Drive, Ground, RockyGround, RoverParameters, Soil, Stance, drive, settle
+from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand, MastCalibration
-from marsyard.sim.render import CloudLayer, Scene
+from marsyard.sim.render import CloudLayer, PixelRays, Scene
 from marsyard.sim.sensor import Mast, MastState, StereoHead
 from marsyard.sim.sensor.odometry import Odometer, PoseEstimate
 from marsyard.sim.streams import Streams
@@ -39,6 +41,8 @@ RAMP_FRACTION = 0.4
 CLEARANCE_M = 2.0
 #: Minimum gap between the terrain's rocks and a placed rock, m.
 MIN_GAP_M = 0.05
+#: Maximum distances of rocks and of the ground in images of the navigation, m.
+NAVIGATION_ROCKS_M, NAVIGATION_REACH_M = 25.0, 60.0
 #: Margin beyond the start in which wheels roll over rocks, metres.
 ROUTE_MARGIN_M = 1.5
 
@@ -64,6 +68,8 @@ class RunWorld:
     ground: SiteGround
     rocks: RockField  #: rocks of the ground; the target's rock has the name `TARGET`, obstacles `obstacle-1`, ...
     base: Scene  #: scene at the start, without the rover
+    eye: Eye  #: position of the target and resolution of the cameras
+    start_distance_m: float
     sun: SunParameters
     target_number: int  #: index of the target's rock
     target_triangles: Float64[np.ndarray, "triangles 3 3"]  #: rendered mesh of the target's rock, used as truth
@@ -89,7 +95,7 @@ class RunWorld:
             site_scene(ground, eye, p.sun.sun_in_interval(0, ground.site.environment.sun_radius_rad)),
             mesh_finest_m=MESH_FINEST_M,
             mesh_reach_m=radius,
-            mesh_lines=2 * int(np.ceil(np.arcsinh(radius / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1,
+            mesh_lines=_mesh_lines(radius),
             clouds=clouds,
         )
         # a periodic scene may contain copies of the target's rock: use the copy nearest to the rock's position
@@ -98,7 +104,7 @@ class RunWorld:
         offsets = objects.spheres[bodies, :2] - rocks.position_m[number][:2]
         nearest = bodies[np.argmin(np.linalg.norm(offsets, axis=1))]
         first, end = objects.first_triangle[nearest : nearest + 2]
-        return cls(ground, rocks, scene, p.sun, number, objects.triangles[first:end])
+        return cls(ground, rocks, scene, eye, p.start.distance_m, p.sun, number, objects.triangles[first:end])
 
     def face_distance_m(self, p: RoverScenarioParameters) -> float:
         """Compute the horizontal distance of the designated point from the rock's centre towards the start, metres.
@@ -119,11 +125,37 @@ class RunWorld:
             self._cached_scene = (interval, self.base.with_light(sun, self.ground.photometry(sun)))
         return self._cached_scene[1]
 
+    def navigation_scene(self, rays: PixelRays, world_from_camera: RigidTransform, time_s: float) -> Scene:
+        """Build the scene for a camera anywhere on the route, with the rocks that it resolves, without the rover."""
+        eye = Eye.of(rays, world_from_camera, self.ground.surface)
+        eye = replace(eye, reach_m=min(eye.reach_m, NAVIGATION_ROCKS_M))
+        return replace(
+            site_scene(self.ground, eye, self.scene(time_s).sun),
+            mesh_finest_m=MESH_FINEST_M,
+            mesh_reach_m=NAVIGATION_REACH_M,
+            mesh_lines=_mesh_lines(NAVIGATION_REACH_M),
+            clouds=self.base.clouds,
+        )
+
+    @cached_property
+    def route_ground(self) -> RockyGround:
+        """Ground with the rocks of the route, from the target to behind the start."""
+        centre = (self.eye.east_m, self.eye.north_m)
+        half_side_m = self.start_distance_m + ROUTE_MARGIN_M
+        reach_m = float(np.sqrt(2.0)) * half_side_m
+        rocks = select_rocks(self.ground, replace(self.eye, half_width_rad=np.pi, reach_m=reach_m))
+        return RockyGround.of(self.ground.surface, rocks.triangles, centre, half_side_m)
+
     def brightness(self, time_s: float) -> float:
         """Compute the direct sunlight on the ground relative to 1 AU."""
         air = self.ground.site.environment
         elevation = float(np.arcsin(self.scene(time_s).sun.direction[2]))
         return air.direct_fraction(elevation) * air.solar_irradiance
+
+
+def _mesh_lines(reach_m: float) -> int:
+    """Return the number of lines of a ground mesh with a half width of `reach_m`."""
+    return 2 * int(np.ceil(np.arcsinh(reach_m / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1
 
 
 def place_rocks(p: RoverScenarioParameters, base: SiteGround, rng: np.random.Generator) -> tuple[SiteGround, RockField]:
@@ -232,8 +264,7 @@ class Vehicle:
         )
         ground: Ground = world.ground.surface
         if p.world.rocks_underfoot:
-            half_side = p.start.distance_m + ROUTE_MARGIN_M
-            ground = RockyGround.of(ground, world.base.objects.triangles, (p.world.east_m, p.world.north_m), half_side)
+            ground = world.route_ground
         stance = settle(rover, ground, float(position[0]), float(position[1]), float(azimuth))
         odometer = Odometer.draw(p.odometry, stance.world_from_rover, streams.generator("odometry"))
         soil = Soil.draw(p.slip, streams.generator("soil"))
@@ -245,8 +276,13 @@ class Vehicle:
         """World pose of the rover as estimated on board."""
         return self.estimate.world_from_rover
 
+    def correct_position(self, position_m: Float64[np.ndarray, "3"]) -> None:
+        """Replace the estimated position by that of visual odometry, world; the attitude remains that of the IMU."""
+        pose = rigid(self.estimated.rotation, position_m)
+        self.estimate = replace(self.estimate, world_from_rover=pose)
+
     def drive(self, command: DriveCommand, visual: bool) -> Drive:
-        """Execute a drive command and update the estimated pose; `visual`: with visual odometry."""
+        """Execute a drive command and update the estimated pose; `visual`: by the true motion with errors."""
         result = drive(self.rover, self.ground, self.soil, self.stance, command, self.slip_stream)
         self.estimate = self.odometer.step(self.estimate, result, self.odometry_stream, visual)
         self.stance = result.end

@@ -85,6 +85,25 @@ class DetectorParameters(Parameters):
         """Return the datasheet that the values were read from, if any."""
         return () if self.file is None else (self.file,)
 
+    def bin(self, side: int) -> DetectorParameters:
+        """Return the parameters of a detector whose pixels are the sums of blocks of side x side pixels.
+
+        One count is then `side`**2 times as many electrons, so that the counts of a uniform scene are unchanged. The
+        blur of the lens is a smaller fraction of a pixel. Defects are omitted.
+        """
+        pixels = side * side
+        factors = {
+            "responsivity_e_s": pixels, "full_well_e": pixels, "gain_e_dn": pixels, "dark_e_s": pixels,
+            "read_noise_e": side, "transfer_row_s": side, "clear_row_s": side, "readout_row_s": side,
+            "response_spread": 1.0 / side, "calibration_error": 1.0 / side,
+        }  # fmt: skip
+        scaled = {name: getattr(self, name) * factor for name, factor in factors.items()}
+        lengths = ("diffraction_px", "diffusion_px", "defocus_px", "dust_radius_px")
+        optics = {name: getattr(self.optics, name) / side for name in lengths}
+        return self.model_copy(
+            update=scaled | {"optics": self.optics.model_copy(update=optics), "defects": DefectParameters()}
+        )
+
     @property
     def sunlight(self) -> float:
         """Solar irradiance at `sun_au`, relative to 1 AU."""

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from marsyard.scenarios.rover.parameters import LegParameters
-from marsyard.scenarios.rover.run import (
+from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
     TargetEstimate,
     goal_position,
@@ -12,6 +11,7 @@ from marsyard.scenarios.rover.run import (
     plan_drive,
     plan_step,
 )
+from marsyard.scenarios.rover.parameters import LegParameters
 from marsyard.sim.measurements import DriveCommand
 
 

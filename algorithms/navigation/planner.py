@@ -1,13 +1,14 @@
-"""Local path planner similar to Autonav (GESTALT): arcs to a goal around obstacles, over mapped ground.
+"""Local path planner similar to Autonav (GESTALT): arcs to a goal over ground that is mapped and good.
 
 The planner drives the simulated rover while a target tracker is tested (tracking paper, sections 6 and 7; GESTALT:
-Maimone, Leger & Biesiadecki 2007). It is not under test. As flight software it uses estimated poses and sensed rocks,
-never the ground truth:
+Maimone, Leger & Biesiadecki 2007). It is not under test. It uses estimated poses and the terrain map of stereo images
+(`marsyard.algorithms.navigation.terrain_map`), never the ground truth:
 
-- It plans only over ground that stereo images have mapped (wedges). A single navcam wedge, 45 deg wide, is too narrow
-  to pass a near obstacle; two wedges are enough (section 6). The ground directly in front of the cameras is not imaged:
-  the rover drives the first metres of a map over unmapped ground (section 7.3).
-- Rocks that wheels can climb are not obstacles. A large rock with the target on it is excluded by name (section 6).
+- A single navcam pair, 45 deg wide, is too narrow to pass a near obstacle; two pairs are enough (section 6). The ground
+  directly in front of the cameras is not imaged: the rover drives the first metres of a map over unmapped ground
+  (section 7.3).
+- Rocks that wheels can climb are not hazards. The ground around the target is excluded if the target is on a large rock
+  (section 6).
 
 Each step searches new paths: an optional turn in place, an arc, and a second arc to the goal. The rover follows the
 path of minimum cost that is clear and mapped up to the lookahead distance, for one step. The swept area is that of a
@@ -16,20 +17,17 @@ disc, which contains the rover's footprint at any heading.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.algorithms.navigation.terrain_map import Goodness, GroundLimits, TerrainMap
 from marsyard.sim.measurements import DriveCommand
 
-#: Points at which the map is tested for a disc of unit radius: its centre and 12 points of its circle.
-_FOOTPRINT_POINTS = np.concatenate(
-    [np.zeros((1, 2)), [(np.cos(a), np.sin(a)) for a in np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)]]
-)
 #: Distance to the goal below which it is reached, metres.
 AT_GOAL_M = 0.02
 #: Largest angle between the heading at the start of the second arc and the direction to the goal.
@@ -39,71 +37,14 @@ _TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0, 80.0, -80.0, 100.0, -1
 
 
 @dataclass(frozen=True)
-class Wedge:
-    """Ground mapped by one stereo pair, in the estimated world frame.
-
-    - apex_m: Position of the cameras, east and north
-    - azimuth_rad: Direction of the wedge's centre line, clockwise from north
-    - nearest_m, farthest_m: Limits of the stereo range
-    """
-
-    apex_m: Float[np.ndarray, "2"]
-    azimuth_rad: float
-    half_width_rad: float
-    nearest_m: float
-    farthest_m: float
-
-    def covers(self, positions_m: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether positions (east, north) are mapped."""
-        offset = positions_m - self.apex_m
-        distance = np.hypot(offset[..., 0], offset[..., 1])
-        angle = np.arctan2(offset[..., 0], offset[..., 1]) - self.azimuth_rad
-        angle = np.abs((angle + np.pi) % (2.0 * np.pi) - np.pi)
-        return np.asarray((angle <= self.half_width_rad) & (distance >= self.nearest_m) & (distance <= self.farthest_m))
-
-
-@dataclass(frozen=True)
-class Obstacle:
-    """Sensed rock: unique name, centre (east, north) in the estimated world frame, radius and height."""
-
-    name: str
-    position_m: Float[np.ndarray, "2"]
-    radius_m: float
-    height_m: float
-
-
-@dataclass(frozen=True)
-class TerrainMap:
-    """Mapped wedges, and the rocks sensed in them."""
-
-    wedges: tuple[Wedge, ...] = ()
-    obstacles: tuple[Obstacle, ...] = ()
-
-    def add_wedge(self, wedge: Wedge, rocks: Iterable[Obstacle]) -> TerrainMap:
-        """Return the map with a new wedge, and with the rocks that the wedge covers at least in part.
-
-        Occlusion is neglected. The latest measurement of a rock replaces its earlier measurements.
-        """
-        rock_points = ((rock, rock.position_m + rock.radius_m * _FOOTPRINT_POINTS) for rock in rocks)
-        visible_rocks = {rock.name: rock for rock, points in rock_points if wedge.covers(points).any()}
-        remaining_rocks = tuple(rock for rock in self.obstacles if rock.name not in visible_rocks)
-        return TerrainMap((*self.wedges, wedge), remaining_rocks + tuple(visible_rocks.values()))
-
-    def contains(self, positions_m: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether positions (east, north) lie in any wedge."""
-        covered = np.zeros(positions_m.shape[:-1], dtype=np.bool_)
-        for wedge in self.wedges:
-            covered |= wedge.covers(positions_m)
-        return covered
-
-
-@dataclass(frozen=True)
 class NavigationOptions:
     """Parameters of the planner; all except those of the wheels (`half_width_m`, `climb_m`) are assumed.
 
     - half_width_m: Radius of the swept disc: a MER's outer wheels are 0.69 m from its centre line
-    - margin_m: Clearance between disc and obstacle
-    - climb_m: Maximum height of a rock that wheels climb (MER: about a wheel's radius)
+    - margin_m: Clearance between disc and hazard
+    - climb_m: Maximum height of a rock to drive over; MER climbed rocks of a wheel's diameter, 0.25 m
+    - tilt_deg: Maximum tilt of the ground
+    - roughness_m: Maximum standard deviation of the ground's height from a plane
     - lookahead_m: Length of the path that must be mapped and clear
     - curvature_m: Largest curvature, 1/m
     - turn_cost_m: Cost of a turn in place, metres of path per radian
@@ -112,7 +53,9 @@ class NavigationOptions:
 
     half_width_m: float = 0.75
     margin_m: float = 0.1
-    climb_m: float = 0.13
+    climb_m: float = 0.2
+    tilt_deg: float = 30.0
+    roughness_m: float = 0.06
     lookahead_m: float = 4.0
     curvature_m: float = 0.6
     turn_cost_m: float = 0.5
@@ -120,10 +63,19 @@ class NavigationOptions:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if name in ("half_width_m", "lookahead_m", "curvature_m") and not 0.0 < value < np.inf:
+            if (
+                name in ("half_width_m", "climb_m", "tilt_deg", "roughness_m", "lookahead_m", "curvature_m")
+                and not 0.0 < value < np.inf
+            ):
                 raise ValueError(f"{name} is {value}; it must be positive")
             if not 0.0 <= value < np.inf:
                 raise ValueError(f"{name} is {value}; it must not be negative")
+
+    @property
+    def limits(self) -> GroundLimits:
+        """Limits of the ground under the disc with its margin."""
+        radius_m = self.half_width_m + self.margin_m
+        return GroundLimits(radius_m, self.climb_m, float(np.radians(self.tilt_deg)), self.roughness_m)
 
 
 class NavigationOutcome(Enum):
@@ -154,14 +106,12 @@ def navigate(
     goal_m: Float[np.ndarray, "2"],
     step_m: float,
     options: NavigationOptions,
-    target: str | None = None,
     backwards: bool = False,
 ) -> NavigationPlan:
     """Plan the next step to a goal.
 
     - goal_m: Position (east, north) for the rover's origin, in the estimated world frame
     - step_m: Maximum path length to drive in this step
-    - target: Name of a rock that is not avoided; None: all rocks are avoided
     - backwards: Whether to drive backwards
     """
     forward = world_from_rover.rotation.as_matrix()[:2, 0] * (-1.0 if backwards else 1.0)
@@ -170,13 +120,12 @@ def navigate(
     no_path = np.empty((0, 2))
     if float(np.hypot(*goal)) < AT_GOAL_M:
         return NavigationPlan(NavigationOutcome.AT_GOAL, (), no_path)
-    if not bool(terrain.contains(position + options.half_width_m * _FOOTPRINT_POINTS).all()):
+    goodness = terrain.goodness(options.limits)
+    if np.isnan(goodness.at(position[None])[0]):
         return NavigationPlan(NavigationOutcome.NOT_MAPPED, (), no_path)
-    obstacles = [rock for rock in terrain.obstacles if rock.name != target and rock.height_m > options.climb_m]
     for path in _generate_paths(goal, options):
         lookahead = position + path.points(np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)) @ heading.T
-        footprint_points = lookahead[:, None] + options.half_width_m * _FOOTPRINT_POINTS
-        if _is_clear(lookahead, obstacles, options) and bool(terrain.contains(footprint_points).all()):
+        if _is_clear(lookahead, goodness, options):
             path_points = np.asarray(position + path.points(np.linspace(0.0, path.length_m, 60)) @ heading.T)
             return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), path_points)
     return NavigationPlan(NavigationOutcome.NO_PATH, (), no_path)
@@ -256,11 +205,17 @@ def _generate_paths(goal: Float[np.ndarray, "2"], options: NavigationOptions) ->
         yield _Path(float(turn[k]), curvatures_m, (float(length_1[k]), float(length_2[k])))
 
 
-def _is_clear(positions_m: Float[np.ndarray, "n 2"], rocks: Iterable[Obstacle], options: NavigationOptions) -> bool:
-    """Whether the swept disc avoids all rocks; it may overlap a rock at the start if the distance then increases."""
-    for rock in rocks:
-        distances = np.hypot(*(positions_m - rock.position_m).T)
-        clearance = options.half_width_m + options.margin_m + rock.radius_m
-        if float(distances.min()) < min(clearance, float(distances[0])):
-            return False
-    return True
+def _is_clear(positions_m: Float[np.ndarray, "n 2"], goodness: Goodness, options: NavigationOptions) -> bool:
+    """Return whether the swept disc is mapped and avoids all hazards.
+
+    It may overlap a hazard at the start if the distance then increases.
+    """
+    values, distances = goodness.at(positions_m), goodness.hazard_distances_m(positions_m)
+    if np.any(np.isnan(values)):
+        return False
+    clearance = options.half_width_m + options.margin_m
+    if np.any(distances < min(clearance, float(distances[0]))):
+        return False
+    # tilt and roughness: bad ground may only be left, not entered
+    is_bad = (values <= 0.0) & (distances >= clearance)
+    return not np.any(is_bad[1:] & ~is_bad[:-1])

@@ -1,0 +1,223 @@
+"""Visual odometry: motion of the rover between two stereo pairs (as on MER: Cheng, Maimone & Matthies 2005).
+
+Features of the first pair are matched between its images and triangulated. They are tracked to the second pair from
+where the motion of wheel odometry and gyros predicts them, and are triangulated there again. A robust pose estimate
+rejects outliers; the motion then minimizes the distances between both sets of points, weighted by their covariances.
+The estimate is rejected if it has too few features, is inaccurate, or contradicts the prediction: wheel odometry then
+remains in use. Features, windows and limits of the flight software are not published in detail; they are assumed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import cv2
+import numpy as np
+from jaxtyping import Float64
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from marsyard.algorithms.arrays import Flags, Points2, Points3
+from marsyard.algorithms.navigation.stereo import RectifiedPair, track_features
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import StereoMeasurement
+
+
+@dataclass(frozen=True)
+class VisualOdometryOptions:
+    """Parameters of visual odometry.
+
+    - features, spacing_px: maximum number of features, and their minimum distance
+    - quality: minimum corner strength of a feature divided by that of the strongest
+    - min_range_m: minimum depth of matched points
+    - match_error_px: error of a matched coordinate, 1 sigma
+    - inlier_px: maximum reprojection error of an inlier
+    - min_features, min_inliers: minimum numbers of tracked features and of inliers
+    - max_sigma_m: maximum standard deviation of the position along any axis
+    - max_excess: maximum distance from the predicted position, divided by the predicted path; wheels that slip
+      completely differ by 1
+    - max_turn_error_rad: maximum angle from the rotation that the gyros measured
+    """
+
+    features: int = 300
+    spacing_px: float = 6.0
+    quality: float = 0.003
+    min_range_m: float = 1.0
+    match_error_px: float = 0.25
+    inlier_px: float = 1.5
+    min_features: int = 20
+    min_inliers: int = 12
+    max_sigma_m: float = 0.03
+    max_excess: float = 1.3
+    max_turn_error_rad: float = float(np.radians(2.0))
+
+
+class VisualOdometryOutcome(Enum):
+    """Outcome of visual odometry. All members except CONVERGED are expected failures."""
+
+    CONVERGED = "the motion was estimated"
+    TOO_FEW_FEATURES = "too few features were tracked"
+    TOO_FEW_INLIERS = "too few features agree with one motion"
+    INACCURATE = "the estimated motion is too uncertain"
+    INCONSISTENT = "the motion contradicts wheel odometry and gyros"
+
+
+@dataclass(frozen=True)
+class VisualOdometry:
+    """Result of `estimate_motion`.
+
+    - first_from_second: pose of the second rover frame in the first; None unless the outcome is CONVERGED
+    - sigma_m: largest standard deviation of the position; NaN without an estimate
+    """
+
+    outcome: VisualOdometryOutcome
+    first_from_second: RigidTransform | None
+    features: int
+    inliers: int
+    sigma_m: float
+
+
+#: Iterations and confidence of the robust pose estimate.
+_RANSAC_ITERATIONS, _RANSAC_CONFIDENCE = 300, 0.999
+#: Number of adjustments, each followed by a rejection of outliers, and largest normalised distance of an inlier.
+_ADJUSTMENTS, _GATE = 3, 3.5
+#: Additional distance from the predicted position that is accepted, metres.
+_EXCESS_M = 0.05
+
+
+def estimate_motion(
+    first: StereoMeasurement,
+    second: StereoMeasurement,
+    predicted: RigidTransform,
+    options: VisualOdometryOptions | None = None,
+) -> VisualOdometry:
+    """Estimate the rover's motion between two stereo pairs.
+
+    `predicted` is the pose of the second rover frame in the first, from wheel odometry and gyros.
+    """
+    o = VisualOdometryOptions() if options is None else options
+    before, after = RectifiedPair.of(first), RectifiedPair.of(second)
+    pixels = _detect_features(before, o)
+    disparities, valid = before.feature_disparities(pixels, o.min_range_m)
+    pixels, disparities = pixels[valid], disparities[valid]
+    points = before.triangulate(pixels, disparities)
+    expected, visible = after.camera.project(np.asarray(predicted.inv().apply(points.copy())).reshape(-1, 3))
+    inside = visible & after.camera.in_frame(expected)
+    pixels, disparities, points, expected = (values[inside] for values in (pixels, disparities, points, expected))
+    tracked, valid = track_features(before.left, after.left, pixels, expected)
+    second_disparities, matched = after.feature_disparities(tracked, o.min_range_m)
+    valid &= matched
+    count = int(np.count_nonzero(valid))
+    if count < o.min_features:
+        return VisualOdometry(VisualOdometryOutcome.TOO_FEW_FEATURES, None, count, 0, float("nan"))
+    pixels, disparities, points = pixels[valid], disparities[valid], points[valid]
+    tracked, second_disparities = tracked[valid], second_disparities[valid]
+    second_points = after.triangulate(tracked, second_disparities)
+    inliers = _find_inliers(after, points, tracked, predicted, o)
+    covariances = (
+        before.covariances(pixels, disparities, o.match_error_px),
+        after.covariances(tracked, second_disparities, o.match_error_px),
+    )
+    motion, sigma_m = predicted, float("nan")
+    for _ in range(_ADJUSTMENTS):
+        if np.count_nonzero(inliers) < o.min_inliers:
+            return VisualOdometry(
+                VisualOdometryOutcome.TOO_FEW_INLIERS, None, count, int(np.count_nonzero(inliers)), float("nan")
+            )
+        whitening = _whitening(covariances, motion)
+        motion, sigma_m = _adjust(points, second_points, whitening, inliers, motion)
+        distances = np.linalg.norm(_residuals(points, second_points, whitening, motion), axis=1)
+        inliers = distances <= _GATE
+    number = int(np.count_nonzero(inliers))
+    outcome = _check(motion, sigma_m, predicted, o)
+    is_valid = outcome is VisualOdometryOutcome.CONVERGED
+    return VisualOdometry(outcome, motion if is_valid else None, count, number, sigma_m)
+
+
+def _detect_features(pair: RectifiedPair, o: VisualOdometryOptions) -> Points2:
+    mask = cv2.erode((pair.left > 0).astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0)
+    corners = cv2.goodFeaturesToTrack(pair.left, o.features, o.quality, o.spacing_px, mask=mask)
+    return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
+
+
+def _find_inliers(
+    pair: RectifiedPair, points: Points3, pixels: Points2, predicted: RigidTransform, o: VisualOdometryOptions
+) -> Flags:
+    """Find the points whose pixels in the second image agree with one motion (RANSAC over poses from three points)."""
+    axes = np.stack([pair.camera.right, pair.camera.down, pair.camera.a])
+    focal, (column, row) = pair.camera.focal_lengths[0], pair.camera.image_centre
+    matrix = np.array([[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]])
+    # pose of the first rover frame in the second camera's axes
+    rotation = Rotation.from_matrix(axes) * predicted.inv().rotation
+    translation = axes @ (predicted.inv().translation - pair.camera.c)
+    found, _, _, inliers = cv2.solvePnPRansac(
+        points, pixels, matrix, None, rotation.as_rotvec().reshape(3, 1), translation.reshape(3, 1), True,
+        _RANSAC_ITERATIONS, o.inlier_px, _RANSAC_CONFIDENCE, flags=cv2.SOLVEPNP_ITERATIVE,
+    )  # fmt: skip
+    flags = np.zeros(len(points), dtype=np.bool_)
+    if found and inliers is not None:
+        flags[inliers.ravel()] = True
+    return flags
+
+
+def _whitening(
+    covariances: tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3 3"]], motion: RigidTransform
+) -> Float64[np.ndarray, "n 3 3"]:
+    """Compute the matrices that normalise the differences of both sets of points."""
+    rotation = motion.rotation.as_matrix()
+    total = covariances[0] + rotation @ covariances[1] @ rotation.T
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(total)))
+
+
+def _residuals(
+    points: Points3, second_points: Points3, whitening: Float64[np.ndarray, "n 3 3"], motion: RigidTransform
+) -> Points3:
+    difference = points - motion.apply(second_points.copy())
+    return np.asarray((whitening @ difference[..., None])[..., 0])
+
+
+def _adjust(
+    points: Points3,
+    second_points: Points3,
+    whitening: Float64[np.ndarray, "n 3 3"],
+    inliers: Flags,
+    start: RigidTransform,
+) -> tuple[RigidTransform, float]:
+    """Minimize the normalised distances of the inliers; return the motion and the position's standard deviation."""
+    first, second, weights = points[inliers], second_points[inliers], whitening[inliers]
+
+    def apply(x: Float64[np.ndarray, "6"]) -> RigidTransform:
+        return rigid(start.rotation * Rotation.from_rotvec(x[:3]), start.translation + x[3:])
+
+    def compute_residuals(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "n"]:
+        return _residuals(first, second, weights, apply(x)).ravel()
+
+    def compute_jacobian(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "n 6"]:
+        # a small rotation w moves a point q by w x q
+        axes = apply(x).rotation.as_matrix()
+        crosses = np.cross(np.eye(3)[None], second[:, None])
+        turned = (axes @ crosses.transpose(0, 2, 1)).astype(np.float64)
+        columns = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2)
+        return np.asarray(-(weights @ columns).reshape(-1, 6))
+
+    solution = least_squares(compute_residuals, np.zeros(6), jac=compute_jacobian, loss="huber")
+    jacobian = np.asarray(solution.jac)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian)
+    # residuals larger than the assumed match error increase the uncertainty
+    variance = max(float(np.mean(_residuals(first, second, weights, apply(solution.x)) ** 2)), 1.0)
+    sigma = np.sqrt(variance * np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+    return apply(solution.x), float(sigma)
+
+
+def _check(
+    motion: RigidTransform, sigma_m: float, predicted: RigidTransform, o: VisualOdometryOptions
+) -> VisualOdometryOutcome:
+    if not sigma_m <= o.max_sigma_m:
+        return VisualOdometryOutcome.INACCURATE
+    path_m = float(np.linalg.norm(predicted.translation))
+    excess_m = float(np.linalg.norm(motion.translation - predicted.translation))
+    turn_error_rad = (predicted.rotation.inv() * motion.rotation).magnitude()
+    if excess_m > o.max_excess * path_m + _EXCESS_M or turn_error_rad > o.max_turn_error_rad:
+        return VisualOdometryOutcome.INCONSISTENT
+    return VisualOdometryOutcome.CONVERGED

@@ -1,0 +1,154 @@
+"""Stereo pairs of the navigation: the mast's navcams and the body's hazcams, binned as on the rover (256 x 256)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from marsyard.algorithms.interface import PixelBox
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.points import cast_rover_shadow
+from marsyard.scenarios.rover.stops import StereoCamera
+from marsyard.scenarios.rover.world import Rig, RunWorld, Vehicle
+from marsyard.scenarios.views import STANCES
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.frames import compose, rigid
+from marsyard.sim.measurements import MastCalibration, StereoMeasurement
+from marsyard.sim.render import PixelRays
+from marsyard.sim.sensor import Detector, StereoHead, natural_fall_off, preset, stereo_mast
+from marsyard.sim.streams import Streams
+
+#: Camera presets of the navigation on the mast, by the preset of the tracking cameras; and those on the body.
+NAVCAMS = {"mer-navcam": "mer-navcam", "research-navcam": "research-navcam", "research-pancam": "research-navcam"}
+HAZCAM = "mer-hazcam"
+#: Rays along each side of a pixel at an edge, for odometry and for the map: block matching needs no smooth edges.
+ODOMETRY_EDGE_RAYS, MAP_EDGE_RAYS = 2, 1
+#: Distance ahead and radius of the ground in these images that the rover's shadow may reach, metres.
+_SHADOW_AHEAD_M, _SHADOW_RADIUS_M = 4.0, 4.0
+#: Spacing of the points of the oracle's heights, metres, and half angles of a navcam and a hazcam.
+_ORACLE_SPACING_M, _MAST_HALF_RAD, _BODY_HALF_RAD = 0.05, float(np.radians(22.5)), float(np.radians(60.0))
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A binned stereo pair: detectors, and true and calibrated cameras in the frame of the mast's head or the rover."""
+
+    camera: StereoCamera
+    true: tuple[CameraModel, CameraModel]
+    calibrated: tuple[CameraModel, CameraModel]
+
+    @classmethod
+    def draw(cls, p: RoverScenarioParameters, name: str, head: StereoHead, streams: Streams) -> _Pair:
+        """Draw the detectors of a pair with these true and calibrated cameras."""
+        factor = 1.0 / p.navigation.binning
+        binned = [(mast.left.scale(factor), mast.right.scale(factor)) for mast in (head.true, head.calibrated)]
+        settings, rng = preset(name).detector.bin(p.navigation.binning), streams.generator(f"{name} response")
+        left, right = (Detector.draw(natural_fall_off(camera), settings, rng) for camera in binned[0])
+        exposure = p.exposure.model_copy(update={"of": "subframe"})
+        parameters = p.model_copy(update={"exposure": exposure})
+        camera = StereoCamera(parameters, (left, right), streams.generator(f"{name} noise"))
+        return cls(camera, binned[0], binned[1])
+
+    def take(
+        self,
+        world: RunWorld,
+        rig: Rig,
+        vehicle: Vehicle,
+        mounts: tuple[RigidTransform, RigidTransform],
+        time_s: float,
+        edge_rays: int,
+    ) -> StereoMeasurement:
+        """Take a pair; `mounts` are the true and the measured pose of the pair's frame in the rover frame."""
+        world_from_mount = compose(vehicle.stance.world_from_rover, mounts[0])
+        rays = PixelRays.of(self.true[0])
+        scene = replace(world.navigation_scene(rays, world_from_mount, time_s), edge_rays=edge_rays)
+        ahead = np.asarray(vehicle.stance.world_from_rover.apply(np.array([_SHADOW_AHEAD_M, 0.0, 0.0])))
+        geometry, sun = rig.calibrated.geometry, scene.sun.direction
+        shadow = None
+        if self.camera.parameters.rover_shadow:
+            shadow = cast_rover_shadow(
+                vehicle.rover, vehicle.stance, geometry, rig.state.true_rad, ahead, _SHADOW_RADIUS_M, sun
+            )
+        boxes = tuple(PixelBox((0, 0), camera.size) for camera in self.true)
+        images = self.camera.take(
+            scene, shadow, world_from_mount, self.true, (boxes[0], boxes[1]), world.brightness(time_s), time_s
+        )
+        left, right = (camera.transform(mounts[1]) for camera in self.calibrated)
+        return StereoMeasurement(images.left.counts, images.right.counts, (left, right))
+
+
+@dataclass(frozen=True)
+class NavigationCameras:
+    """The stereo pairs of a run; None if no leg uses them."""
+
+    mast: _Pair | None
+    body: _Pair | None
+    rover_from_body: RigidTransform  #: pose of the body pair's frame, known without error
+
+    @classmethod
+    def draw(cls, p: RoverScenarioParameters, rig: Rig, streams: Streams) -> NavigationCameras:
+        """Draw the calibration errors and detectors of the pairs that the legs use."""
+        maps = p.navigation.terrain == "stereo"
+        sees = p.navigation.odometry == "stereo" and any(leg.visual_odometry for leg in p.legs)
+        mast = body = None
+        if sees or (maps and any((leg.autonav or leg.maps_first) and leg.map_by == "mast" for leg in p.legs)):
+            name, head = NAVCAMS[p.camera.preset], rig.head
+            if name != p.camera.preset or p.camera.custom is not None:
+                head = StereoHead.draw(stereo_mast(name), p.stereo, streams.generator("navcam calibration"))
+            mast = _Pair.draw(p, name, head, streams)
+        if maps and any((leg.autonav or leg.maps_first) and leg.map_by == "body" for leg in p.legs):
+            left, right = preset(HAZCAM).cameras()
+            design = MastCalibration(rig.calibrated.geometry, left, right)
+            head = StereoHead.draw(design, p.stereo, streams.generator("hazcam calibration"))
+            body = _Pair.draw(p, HAZCAM, head, streams)
+        stance = STANCES[HAZCAM]
+        tilt = Rotation.from_rotvec([0.0, -np.radians(stance.elevation_deg), 0.0])
+        return cls(mast, body, rigid(tilt, np.array(stance.on_rover_m)))
+
+    def take_mast_pair(
+        self,
+        p: RoverScenarioParameters,
+        world: RunWorld,
+        rig: Rig,
+        vehicle: Vehicle,
+        azimuth_rad: float,
+        time_s: float,
+        edge_rays: int = MAP_EDGE_RAYS,
+    ) -> StereoMeasurement:
+        """Point the mast down at an azimuth, positive to the right, and take a pair; ValueError without navcams."""
+        if self.mast is None:
+            raise ValueError("no leg of this run uses the mast's navigation cameras")
+        rig.point(azimuth_rad, float(np.radians(p.navigation.elevation_deg)))
+        measured = rig.calibrated.geometry.rover_from_head(*rig.state.readings_rad)
+        return self.mast.take(world, rig, vehicle, (rig.rover_from_head, measured), time_s, edge_rays)
+
+    def take_body_pair(self, world: RunWorld, rig: Rig, vehicle: Vehicle, time_s: float) -> StereoMeasurement:
+        """Take a pair with the body cameras. Raises ValueError without hazcams."""
+        if self.body is None:
+            raise ValueError("no leg of this run uses the body cameras")
+        mounts = self.rover_from_body, self.rover_from_body
+        return self.body.take(world, rig, vehicle, mounts, time_s, MAP_EDGE_RAYS)
+
+
+def oracle_heights(
+    world: RunWorld, vehicle: Vehicle, azimuth_rad: float, ranges_m: tuple[float, float], by_body: bool
+) -> Float64[np.ndarray, "n 3"]:
+    """Sample the true ground with its rocks in a wedge, world axes: a map without occlusion and errors.
+
+    `azimuth_rad` is that of the wedge's centre line, positive to the right of the rover's heading.
+    """
+    rover, stance = vehicle.rover, vehicle.stance
+    half_rad = _BODY_HALF_RAD if by_body else _MAST_HALF_RAD
+    ahead = np.array([rover.front_m if by_body else 0.0, 0.0, 0.0])
+    east, north, _ = (float(value) for value in stance.world_from_rover.apply(ahead))
+    offsets = np.arange(-ranges_m[1], ranges_m[1] + _ORACLE_SPACING_M, _ORACLE_SPACING_M)
+    x, y = (values.ravel() for values in np.meshgrid(offsets, offsets))
+    angle = np.arctan2(x, y) - (stance.azimuth_rad + azimuth_rad)
+    angle = np.abs((angle + np.pi) % (2.0 * np.pi) - np.pi)
+    distance = np.hypot(x, y)
+    inside = (angle <= half_rad) & (distance >= ranges_m[0]) & (distance <= ranges_m[1])
+    x, y = east + x[inside], north + y[inside]
+    return np.column_stack([x, y, world.route_ground.height(x, y)])

@@ -1,0 +1,88 @@
+"""Tests of visual odometry and terrain maps from rendered stereo pairs in a closed loop, and of their oracles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import Run, map_terrain, prepare_run, run_case
+from marsyard.sim.streams import Streams
+from tests.scenarios.rover.short_run import SHORT_RUN
+
+#: A rover that loses three tenths of its path, on ground with stones.
+SLIPPING: dict[str, Any] = {
+    **SHORT_RUN,
+    "world": {"samples": 1024, "bank": 1},
+    "start": {"distance_m": 5.0},
+    "slip": {"flat": 0.3, "soil_spread": 0.0, "step_spread": 0.0},
+}
+OBSTACLE = {"towards_start_m": 3.0, "right_m": 0.4, "diameter_m": 0.5, "height_m": 0.3}
+
+
+def _run(**changes: Any) -> Run:
+    return run_case(RoverScenarioParameters.model_validate({**SLIPPING, **changes}), Streams(4, "rover tests", 0))
+
+
+def _position_error_m(run: Run) -> float:
+    vehicle = run.vehicle
+    return float(np.linalg.norm((vehicle.estimated.translation - vehicle.stance.world_from_rover.translation)[:2]))
+
+
+def test_visual_odometry_measures_slip_and_wheel_odometry_does_not() -> None:
+    leg = {"motion": "approach", "goal_m": 3.6, "step_fraction": 0.1}
+    errors = {visual: _position_error_m(_run(legs=[leg | {"visual_odometry": visual}])) for visual in (False, True)}
+    # the rover drives 1.4 m: its wheels turn by about 2 m
+    assert errors[False] > 0.4
+    # 2 % of the distance, as in the paper (section 4.2), and the floor of a step
+    assert errors[True] < 0.02 * 1.4 + 0.03
+
+
+def test_visual_odometry_without_overlap_falls_back_to_the_wheels() -> None:
+    leg = {"motion": "straight", "step_m": 3.0, "steps": 1, "visual_odometry": True, "visual_odometry_step_m": 3.0}
+    run = _run(legs=[leg], slip={"flat": 0.01})
+    assert run.visual_odometry_updates == run.visual_odometry_failures == 1
+    assert _position_error_m(run) < 0.15
+
+
+@pytest.mark.parametrize("map_by", ["mast", "body"])
+def test_map_of_images_agrees_with_true_heights(map_by: str) -> None:
+    leg = {"motion": "approach", "goal_m": 2.0, "autonav": True, "map_by": map_by}
+    maps = {}
+    for terrain in ("stereo", "oracle-heights"):
+        changes = {"legs": [leg], "navigation": {"terrain": terrain}, "obstacles": [OBSTACLE]}
+        p = RoverScenarioParameters.model_validate({**SLIPPING, **changes})
+        run = prepare_run(p, Streams(4, "rover tests", 0))
+        target = run.vehicle.stance.world_from_rover.inv().apply(run.target.point_world.copy())
+        map_terrain(p, run, p.legs[0], run.estimate_at(target))
+        assert run.navigator.terrain is not None
+        maps[terrain] = run.navigator.terrain
+    stereo, oracle = maps["stereo"].median_m, maps["oracle-heights"].median_m
+    both = np.isfinite(stereo) & np.isfinite(oracle)
+    assert np.count_nonzero(both) > 100
+    error_m = stereo[both] - oracle[both]
+    assert abs(np.median(error_m)) < 0.02
+    assert np.percentile(np.abs(error_m), 80.0) < 0.06
+    # images do not show all of the ground within the oracle's range
+    assert np.count_nonzero(np.isfinite(oracle) & ~np.isfinite(stereo)) > 0
+
+
+def test_rover_drives_around_an_obstacle_in_its_images() -> None:
+    leg = {"motion": "approach", "goal_m": 2.0, "autonav": True}
+    run = _run(legs=[leg], obstacles=[OBSTACLE], slip={"flat": 0.01}, start={"distance_m": 6.0})
+    rocks = run.world.rocks
+    rock_m = rocks.position_m[rocks.names["obstacle-1"], :2]
+    path = [stance for stop in run.stops for drive in stop.drives for stance in drive.stances]
+    closest_m = min(float(np.hypot(*(stance.world_from_rover.translation[:2] - rock_m))) for stance in path)
+    assert run.outcome.name == "COMPLETED"
+    # the disc of the wheels passes the rock's side
+    assert closest_m > 0.6 + 0.5 * OBSTACLE["diameter_m"] - 0.05
+
+
+def test_oracles_need_no_navigation_cameras() -> None:
+    leg = {"motion": "approach", "goal_m": 4.5, "autonav": True, "visual_odometry": True}
+    run = _run(legs=[leg], navigation={"odometry": "oracle-motion", "terrain": "oracle-heights"})
+    assert run.navigation_cameras.mast is run.navigation_cameras.body is None
+    assert _position_error_m(run) < 0.05
