@@ -88,7 +88,7 @@ class DetectorParameters(Parameters):
     def bin(self, side: int) -> DetectorParameters:
         """Return the parameters of a detector whose pixels are the sums of blocks of side x side pixels.
 
-        One count is then `side`**2 times as many electrons, so that the counts of a uniform scene are unchanged. The
+        One count is then that many times more electrons, so that the counts of a uniform scene are unchanged. The
         blur of the lens is a smaller fraction of a pixel. Defects are omitted.
         """
         pixels = side * side
