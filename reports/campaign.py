@@ -71,10 +71,12 @@ def write_evaluation(evaluation: Evaluation) -> Path:
     report_data = summary(evaluation, subject, extra_sections)
     algorithms = tested_algorithms(run.record)
     write_atomic(directory / REPORT_JSON, json.dumps(report_data, indent=2, allow_nan=False) + "\n")
-    write_atomic(directory / VERIFICATION_FILE, verification_csv(requirement_evidence(run.name, verdicts, algorithms)))
+    rows = requirement_evidence(run.name, verdicts, algorithms, evaluation.evidence.title)
+    write_atomic(directory / VERIFICATION_FILE, verification_csv(rows))
     write_atomic(directory / JUNIT_FILE, junit_xml(run.name, verdicts, overall_verdict, algorithms))
     page = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
+    context["evidence"] = evaluation.evidence
     write_atomic(page, page_environment().get_template("report.html.j2").render(context))
     return page
 
@@ -176,6 +178,11 @@ def summary(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[S
         "algorithms": _unique_values(run.frame, "algorithm"),
         "algorithm_details": [asdict(algorithm) for algorithm in tested_algorithms(run.record)],
         "sampling": {**asdict(sampling), "independent": sampling.independent, "text": sampling.text},
+        "evidence": {
+            **evaluation.evidence.table(),
+            "title": evaluation.evidence.title,
+            "text": evaluation.evidence.text,
+        },
         "verdict": overall_verdict.word,
         "sentence": overall_verdict.sentence,
         "exit_code": evaluation.exit_code,

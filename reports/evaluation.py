@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.reports.rates import engine_failed
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import (
@@ -20,7 +21,8 @@ from marsyard.reports.statistics.proportions import (
 )
 from marsyard.reports.stored import StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, evaluate_requirements
-from marsyard.reports.wording import count
+from marsyard.reports.wording import count, format_fraction, percent
+from marsyard.scenarios.systems import RowColumns, row_columns
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,10 @@ class OverallVerdict:
 
 
 def combine_verdicts(
-    verdicts: Sequence[Verdict], frame: pd.DataFrame, sampling: SamplingDesign = INDEPENDENT
+    verdicts: Sequence[Verdict],
+    frame: pd.DataFrame,
+    sampling: SamplingDesign = INDEPENDENT,
+    evidence: Evidence | None = None,
 ) -> OverallVerdict:
     """Combine the verdicts to the worst of them, in the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
     crashed = int(engine_failed(frame).sum())
@@ -53,6 +58,11 @@ def combine_verdicts(
         met_text = f"{by_rate.count(Status.MET_BY_RATE)} of {count(len(by_rate), 'requirement')}"
         rate_text = f"{met_text} met by the rate of these cases. " if by_rate else ""
         return OverallVerdict(worst, crashed, rate_text + sampling.no_probability + crash_text)
+    withheld = sum(verdict.withheld_status is not None for verdict in verdicts)
+    if withheld and worst is Status.INSUFFICIENT:
+        would_be_met = f"{withheld} of {count(len(statuses), 'requirement')} would be met."
+        reason = "" if evidence is None else f" {evidence.text}"
+        return OverallVerdict(worst, crashed, f"{would_be_met}{reason}{crash_text}")
     fraction = f"{statuses.count(worst)} of {count(len(statuses), 'requirement')}"
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
@@ -90,10 +100,11 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A stored campaign with its sampling design and its verdicts."""
+    """A stored campaign with its sampling design, its kind of evidence and its verdicts."""
 
     run: StoredRun
     sampling: SamplingDesign
+    evidence: Evidence
     verdicts: Sequence[Verdict]
     overall_verdict: OverallVerdict
 
@@ -107,8 +118,66 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     """Evaluate the campaign in a folder, or other requirements on its rows. Raises StoreError without rows."""
     run = read_run(directory, requirements)
     sampling = read_sampling_design(run.configuration)
-    verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling)
-    return Evaluation(run, sampling, verdicts, combine_verdicts(verdicts, run.all_cases, sampling))
+    evidence = read_evidence(run.record, own_requirements=requirements is None)
+    columns = _shipped_columns(str(run.configuration.get("scenario") or ""))
+    from_truth = () if columns is None else columns.from_truth
+    verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling, from_truth)
+    verdicts = [withhold(verdict, evidence) for verdict in verdicts]
+    if evidence.kind is EvidenceKind.CONFIRMATION and evidence.of_algorithm > 1:
+        verdicts = _add_joint_verdicts(verdicts, run, sampling, evidence.of_algorithm)
+    overall = combine_verdicts(verdicts, run.all_cases, sampling, evidence)
+    return Evaluation(run, sampling, evidence, verdicts, overall)
+
+
+def _shipped_columns(scenario: str) -> RowColumns | None:
+    """Return the columns of a scenario; None if they are unknown or their file is invalid."""
+    try:
+        return row_columns(scenario)
+    except ValueError:
+        return None
+
+
+def read_evidence(record: Mapping[str, Any], *, own_requirements: bool = True) -> Evidence:
+    """Read the kind of evidence of a run from its record.
+
+    A confirmation is void if the program changed during the run. With requirements other than the campaign's own, which
+    were frozen, its results are not a confirmation either.
+    """
+    evidence = Evidence.read(record.get("evidence"))
+    if evidence.kind is not EvidenceKind.CONFIRMATION:
+        return evidence
+    stored_changes = record.get("changes")
+    changes = [str(text) for change in stored_changes or () for text in change.get("in") or ()]
+    if not own_requirements:
+        changes.append("requirements other than those of the campaign")
+    return replace(evidence, kind=EvidenceKind.CHANGED, changes=tuple(changes)) if changes else evidence
+
+
+def withhold(verdict: Verdict, evidence: Evidence) -> Verdict:
+    """Replace PASS and MET BY RATE by INSUFFICIENT if the algorithm was not frozen before its cases were seen."""
+    if not evidence.withheld or verdict.status not in (Status.PASS, Status.MET_BY_RATE):
+        return verdict
+    reason = f"The verdict would be {verdict.status}. {evidence.text}"
+    return replace(
+        verdict, status=Status.INSUFFICIENT, withheld_status=verdict.status, reason=reason, further_cases=None
+    )
+
+
+def _add_joint_verdicts(
+    verdicts: Sequence[Verdict], run: StoredRun, sampling: SamplingDesign, confirmations: int
+) -> list[Verdict]:
+    """Add the verdicts at the confidence of all confirmations of an algorithm together (Bonferroni)."""
+    stricter = [
+        {**item, "confidence": 1.0 - (1.0 - verdict.confidence) / confirmations}
+        for item, verdict in zip(run.requirements, verdicts, strict=True)
+    ]
+    joint = evaluate_requirements(run.all_cases, stricter, sampling)
+    texts = [
+        f"At {format_fraction(verdict.confidence)} confidence for all {confirmations} confirmations together (each at "
+        f"{percent(other.confidence)}): {other.status}."
+        for verdict, other in zip(verdicts, joint, strict=True)
+    ]
+    return [replace(verdict, joint_text=text) for verdict, text in zip(verdicts, texts, strict=True)]
 
 
 def next_look(verdicts: Sequence[Verdict], sampling: SamplingDesign, cases: int) -> int | None:

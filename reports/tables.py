@@ -1,8 +1,9 @@
-"""Tables of verdicts (for the terminal; texts are `Text` objects, not markup), outcomes and error statistics."""
+"""Tables of verdicts (terminal; texts are `Text` objects, not markup), confirmations, outcomes, error statistics."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 
 import pandas as pd
@@ -10,6 +11,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from marsyard.campaigns.definition.evidence import Confirmation
 from marsyard.reports.rates import ENGINE_FAILURES, is_flag, population_mask, terrain_groups
 from marsyard.reports.section import Grid
 from marsyard.reports.statistics.samples import ErrorSummary, summarize
@@ -116,3 +118,15 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
         rows.append([name, *(number(q.estimate) for q in quantiles)])
         rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in quantiles)])
     return [*rows, ["maximum magnitude", *(number(s.largest) for s in summaries)]]
+
+
+def confirmations_grid(entries: Sequence[Confirmation]) -> Grid:
+    """Create a table of confirmations; `of` counts those of the algorithm on the campaign up to each."""
+    rows, counts = [], Counter[tuple[str, str]]()
+    for entry in entries:
+        key = (entry.campaign, entry.frozen.algorithm)
+        counts[key] += 1
+        results = "not finished" if entry.results is None else ", ".join(f"{k}: {v}" for k, v in entry.results.items())
+        date = entry.started_utc[:10]
+        rows.append([*key, str(counts[key]), str(entry.seed), date, str(entry.cases), results or "no requirement"])
+    return Grid(["Campaign", "Algorithm", "Confirmation", "Seed", "Date", "Cases", "Results"], rows)

@@ -109,17 +109,21 @@ _EVIDENCE = {
     "rate": "estimate", "lower_bound": "lower", "upper_bound": "upper", "design_effect": "design_effect",
     "consumer_risk": "consumer_risk", "further_cases": "further_cases", "note": "note",
 }  # fmt: skip
-COLUMNS = (*_REQUIREMENT, "campaign", *algorithm_cells(()), *_EVIDENCE)
+#: Columns of the result on all cases, and its fields.
+_ALL_CASES = {"all_cases": "n", "all_failures": "failures", "all_rate": "estimate", "all_verdict": "status"}
+COLUMNS = (*_REQUIREMENT, "campaign", *algorithm_cells(()), *_EVIDENCE, *_ALL_CASES, "evidence")
 
 
 def requirement_evidence(
-    campaign: str, verdicts: Iterable[Verdict], algorithms: Sequence[Algorithm] = ()
+    campaign: str, verdicts: Iterable[Verdict], algorithms: Sequence[Algorithm] = (), evidence_kind: str = ""
 ) -> list[dict[str, Any]]:
-    """Create the rows of the traceability matrix: the evidence of a campaign for each requirement."""
-    cells = {"campaign": campaign, **algorithm_cells(algorithms)}
+    """Create the rows of the traceability matrix: the evidence of a campaign, of a kind, for each requirement."""
+    cells = {"campaign": campaign, **algorithm_cells(algorithms), "evidence": evidence_kind}
     rows = []
     for verdict in verdicts:
         evidence = {column: getattr(verdict, name) for column, name in _EVIDENCE.items()}
+        if verdict.all_cases is not None:
+            evidence |= {column: getattr(verdict.all_cases, name) for column, name in _ALL_CASES.items()}
         evidence["verdict"] = str(verdict.status)
         evidence["metric"] = verdict.metric if verdict.scale == 1.0 else f"{verdict.scale:g} * ({verdict.metric})"
         rows.append({column: getattr(verdict, name) for column, name in _REQUIREMENT.items()} | cells | evidence)

@@ -47,6 +47,26 @@ class Status(StrEnum):
 
 
 @dataclass(frozen=True)
+class AllCases:
+    """The same requirement on all cases instead of its population; numbers as in `Verdict`.
+
+    Cases without the metric are failures.
+    """
+
+    status: Status
+    n: int
+    failures: int
+    estimate: float
+    lower: float
+    upper: float
+
+    @property
+    def text(self) -> str:
+        """The result in a sentence."""
+        return f"Over all cases: {self.failures:,} of {self.n:,} failed ({percent(self.estimate)}), {self.status}."
+
+
+@dataclass(frozen=True)
 class Verdict:
     """One requirement with its verdict; numbers that the requirement does not define are NaN.
 
@@ -59,6 +79,9 @@ class Verdict:
     - reason: why the requirement is not evaluated, or why the verdict is withheld
     - advice: why more cases cannot lead to PASS, and which change of the campaign can
     - accept_rate: whether MET BY RATE results in the exit status 0
+    - withheld_status: status without regard to the kind of evidence, if it was replaced by INSUFFICIENT; otherwise None
+    - all_cases: result of the same requirement on all cases; None if its population is all cases
+    - joint_text: verdict at the confidence of all confirmations of the algorithm together, as a sentence; may be empty
     - terrains: number of distinct terrains of the population; None if unknown
     - clustered: evidence from shared terrains; None if no terrain is shared
     - plain_lower, plain_upper: bounds for independent cases
@@ -89,6 +112,9 @@ class Verdict:
     upper_confidence: float = math.nan
     advice: str = ""
     accept_rate: bool = False
+    withheld_status: Status | None = None
+    all_cases: AllCases | None = None
+    joint_text: str = ""
     source: str = ""
     kind: str = ""
     scale: float = 1.0
@@ -129,9 +155,11 @@ class Verdict:
     @property
     def note(self) -> str:
         """Limits of the verdict in words; may be empty."""
-        if self.reason:
-            return self.reason
-        texts = (self._decision_text(), self._terrain_text(), self._look_text(), self.advice)
+        all_cases_text = "" if self.all_cases is None or self.all_cases.n == self.n else self.all_cases.text
+        texts: tuple[str, ...] = (self.reason, all_cases_text)
+        if not self.reason:
+            decision, terrains = self._decision_text(), self._terrain_text()
+            texts = (decision, all_cases_text, terrains, self._look_text(), self.advice, self.joint_text)
         return " ".join(text for text in texts if text)
 
     def _decision_text(self) -> str:
@@ -246,13 +274,38 @@ def _cases_needed(first_n: int, n: int, failures: int, probability: float, confi
 
 
 def evaluate_requirements(
-    frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], sampling: SamplingDesign = INDEPENDENT
+    frame: pd.DataFrame,
+    requirements: Sequence[Mapping[str, Any]],
+    sampling: SamplingDesign = INDEPENDENT,
+    from_truth: Sequence[str] = (),
 ) -> list[Verdict]:
     """Evaluate each requirement on all rows of a campaign; missing columns or numbers result in INSUFFICIENT.
 
-    sampling: the sampling design; without independent random samples, verdicts have no bounds
+    - sampling: the sampling design; without independent random samples, verdicts have no bounds
+    - from_truth: columns that the flight system cannot know; statements about populations with them say so
     """
-    return [_evaluate(sampling.exclude_nominal_case(frame), requirement, sampling) for requirement in requirements]
+    frame = sampling.exclude_nominal_case(frame)
+    verdicts = []
+    for requirement in requirements:
+        verdict = _evaluate(frame, requirement, sampling)
+        names = [name for name in verdict.population.split(" and ") if name in from_truth]
+        if names:
+            title = f"Given truth ({', '.join(name.replace('_', ' ') for name in names)}): "
+            verdict = replace(verdict, statement=f"{title}{verdict.statement}")
+        verdicts.append(replace(verdict, all_cases=_evaluate_all_cases(frame, verdict, requirement, sampling)))
+    return verdicts
+
+
+def _evaluate_all_cases(
+    frame: pd.DataFrame, verdict: Verdict, requirement: Mapping[str, Any], sampling: SamplingDesign
+) -> AllCases | None:
+    """Evaluate a requirement on all cases; None if its population is all cases, or there is no case."""
+    if verdict.population == "all":
+        return None
+    result = _evaluate(frame, {**requirement, "population": "all"}, sampling)
+    if not result.n:
+        return None
+    return AllCases(result.status, result.n, result.failures, result.estimate, result.lower, result.upper)
 
 
 def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign) -> Verdict:

@@ -238,11 +238,13 @@ class RowColumns:
     - numbers: numeric columns
     - named_flags: path of a list among the parameters; the `name` of each entry is a further boolean column; empty for
       none
+    - from_truth: boolean columns that the flight system cannot know, because they are computed from the truth
     """
 
     flags: tuple[str, ...]
     numbers: tuple[str, ...]
     named_flags: str = ""
+    from_truth: tuple[str, ...] = ()
 
     def has_flag(self, name: str) -> bool:
         """Return whether a boolean column may have this name."""
@@ -263,7 +265,12 @@ def row_columns(scenario: str) -> RowColumns | None:
         columns = tomllib.loads(system.columns.read_text(encoding="utf-8")).get(scenario)
         if columns is None:
             return None
-        return RowColumns(tuple(columns["flags"]), tuple(columns["numbers"]), columns.get("named_flags", ""))
+        return RowColumns(
+            tuple(columns["flags"]),
+            tuple(columns["numbers"]),
+            columns.get("named_flags", ""),
+            tuple(columns.get("from_truth", ())),
+        )
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise ValueError(f"{system.columns}: invalid columns: {type(error).__name__}: {error}") from error
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,9 @@ from marsyard.scenarios.interface import Scenario
 from marsyard.sim.parameters import stream_name
 from marsyard.sim.streams import Streams
 
+#: Name of the record of confirmations in the current folder.
+CONFIRMATIONS_FILE = "confirmations.jsonl"
+
 
 @dataclass(frozen=True)
 class Campaign:
@@ -33,11 +37,15 @@ class Campaign:
     - configuration: contents of the campaign file, changed by command-line options, with complete parameters
     - scenario: scenario of the campaign's cases
     - command: words of the command that repeats the campaign; empty if no command started it
+    - confirms: whether the run is a confirmation (`marsyard.campaigns.definition.evidence`)
+    - confirmations: record of confirmations
     """
 
     configuration: CampaignConfiguration
     scenario: Scenario
     command: tuple[str, ...] = ()
+    confirms: bool = False
+    confirmations: Path = Path(CONFIRMATIONS_FILE)
 
     def streams(self, case: int) -> Streams:
         """Create the random streams of a case."""

@@ -114,6 +114,27 @@ class Limits(Parameters):
     output_mb: _PositiveNumber = Field(default=10.0, description="maximum size of a case's standard output and error")
 
 
+class CalibrationRun(Parameters):
+    """Options that were set by looking at the results of a run."""
+
+    options: Annotated[tuple[_Text, ...], Field(strict=False, min_length=1)] = Field(
+        description="parameters that were set, as dotted paths"
+    )
+    campaign: _Text = Field(description="campaign of the results")
+    seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = Field(description="seed of the results")
+    note: str = ""
+
+
+class Calibration(Parameters):
+    """Results that determined options of the algorithm; results on the same campaign and seed cannot be PASS.
+
+    The seeds of confirmations (`marsyard run --confirm`) are drawn from `namespace`.
+    """
+
+    namespace: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)] = "confirmation"
+    runs: Annotated[tuple[CalibrationRun, ...], Field(strict=False)] = ()
+
+
 class CampaignConfiguration(Parameters):
     """All inputs that determine a campaign's rows, apart from the program and the machine."""
 
@@ -129,6 +150,7 @@ class CampaignConfiguration(Parameters):
     requirements: tuple[Requirement, ...] = ()
     retain: Retain = Retain()
     limits: Limits = Limits()
+    calibration: Calibration | None = None
     max_cases: _Cases | None = Field(
         default=None,
         description="cases at the last planned evaluation of a campaign that stops when its verdicts are decided; set "

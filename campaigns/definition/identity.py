@@ -34,7 +34,9 @@ from marsyard.scenarios.user_files import import_object, input_files, relative_t
 #: Folders of the packages whose code determines rows; reports and commands do not affect rows.
 _CODE_FOLDERS = ("sim", "algorithms", "scenarios", "campaigns")
 #: Keys of a configuration that do not affect the row of a finished case.
-_KEYS_WITHOUT_EFFECT = frozenset({"appended", "description", "limits", "max_cases", "requirements", "retain"})
+_KEYS_WITHOUT_EFFECT = frozenset(
+    {"appended", "calibration", "description", "limits", "max_cases", "requirements", "retain"}
+)
 _PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
 

@@ -242,7 +242,7 @@ def _validate(source: str, tables: Mapping[str, Any], overridden: Mapping[tuple[
         raise ConfigurationError(problems)
     complete = parameters.model_dump(mode="json", round_trip=True)
     campaign = Campaign(configuration.model_copy(update={"parameters": complete}), selected)
-    add_problems([*_check_sampling(campaign), *_check_metrics(campaign)])
+    add_problems([*_check_sampling(campaign), *_check_metrics(campaign), *_check_calibration(campaign)])
     if problems:
         raise ConfigurationError(problems)
     return campaign
@@ -261,6 +261,18 @@ def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
         if error_text:
             return [(("dispersions",), f"the sampled values of case {case} are invalid in combination: {error_text}")]
     return []
+
+
+def _check_calibration(campaign: Campaign) -> list[tuple[Key, str]]:
+    """List unknown parameters among the calibrated options: keys, and messages with the allowed parameters."""
+    calibration, problems = campaign.configuration.calibration, []
+    parameters = dict(leaves(campaign.configuration.parameters))
+    for index, run in enumerate(() if calibration is None else calibration.runs):
+        for number, path in enumerate(run.options):
+            if path not in parameters and not any(leaf.startswith(f"{path}.") for leaf in parameters):
+                key: Key = ("calibration", "runs", index, "options", number)
+                problems.append((key, _describe_unknown(path, parameters)))
+    return problems
 
 
 def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
+from marsyard.campaigns.definition.evidence import classify, freeze
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.definition.loading import NUMBERS, find_unknown_columns
 from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, ConfigurationError, Problem, StoreError
@@ -23,6 +24,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.running.preparation import plan_inputs, report_compilation
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.confirmations import read_confirmations, reserve
 from marsyard.campaigns.store.products import ProductStore, select_kept_cases
 from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
@@ -68,7 +70,19 @@ def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, 
         algorithms = describe_algorithms(campaign)
         create_store(directory / ROWS_FILE, {"identity": identity.configuration})
         words, configuration = campaign.command, campaign.configuration
-        record.begin(directory, configuration, identity, executor.describe(), command=words, algorithms=algorithms)
+        if campaign.confirms:
+            evidence = reserve(campaign, directory)
+        else:
+            evidence = classify(campaign, read_confirmations(campaign.confirmations), freeze(campaign))
+        record.begin(
+            directory,
+            configuration,
+            identity,
+            executor.describe(),
+            command=words,
+            algorithms=algorithms,
+            evidence=evidence.table(),
+        )
         with RowStore(directory / ROWS_FILE) as store:
             _execute(_Run(campaign, directory, executor, watch), store, ())
 

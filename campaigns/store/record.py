@@ -64,12 +64,14 @@ def begin(
     *,
     command: Sequence[str] = (),
     algorithms: Sequence[Mapping[str, Any]] = (),
+    evidence: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the record of a new campaign.
 
     - executor: description of the workers
     - command: words of the command that repeats the campaign in the current folder
     - algorithms: see `marsyard.campaigns.definition.identity.describe_algorithms`
+    - evidence: see `marsyard.campaigns.definition.evidence.Evidence`
     """
     contents = configuration.model_dump(mode="json")
     write(
@@ -90,6 +92,7 @@ def begin(
             "identity": asdict(identity),
             "command": {"words": list(command), "folder": str(Path.cwd())} if command else None,
             "algorithms": list(algorithms),
+            "evidence": None if evidence is None else dict(evidence),
             "sessions": [describe_session("run", executor, 0)],
             "changes": [],
             "showcase": None,

@@ -7,7 +7,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,6 +41,11 @@ class RunOptions:
     ] = False
     override: options.SetOption = None
     algorithm: options.AlgorithmOption = None
+    confirm: Annotated[
+        bool,
+        Option("--confirm", help="Draw a new seed, and enter the run in the record of confirmations before it starts."),
+    ] = False
+    confirmations: options.ConfirmationsOption = options.CONFIRMATIONS
 
 
 @options.handle_user_errors
@@ -53,6 +58,14 @@ def run(arguments: RunOptions) -> None:
     if arguments.case_time is not None:
         changes.append(f"limits.case_time_s={arguments.case_time}")
     campaign = load_campaign(arguments.campaign, changes, arguments.cases, arguments.seed, arguments.algorithm or [])
+    campaign = replace(campaign, confirmations=arguments.confirmations)
+    if arguments.confirm:
+        from marsyard.campaigns.errors import CampaignError
+        from marsyard.campaigns.store.confirmations import select_confirmation_seed
+
+        if arguments.seed is not None:
+            raise CampaignError("--confirm and --seed cannot be combined: a confirmation draws its seed")
+        campaign = select_confirmation_seed(campaign)
     # imported after loading, so that an error in the file is reported without delay
     from marsyard.campaigns.running.engine import run_campaign
     from marsyard.cli import outcome

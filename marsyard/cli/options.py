@@ -38,6 +38,10 @@ MaxHolesOption = Annotated[
 ]
 CasesOption = Annotated[int | None, Option("-n", "--cases", metavar="N", help="Number of cases.")]
 SeedOption = Annotated[int | None, Option(metavar="S", help="Root seed of the random draws.")]
+CONFIRMATIONS = Path("confirmations.jsonl")
+ConfirmationsOption = Annotated[
+    Path, Option(metavar="FILE", help="Record of confirmations; keep it under version control.")
+]
 JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
 DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign run.")]
 BitsOption = Annotated[

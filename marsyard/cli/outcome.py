@@ -10,6 +10,7 @@ import socket
 import subprocess
 import tempfile
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -24,12 +25,14 @@ from rich.table import Table
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import find_renamed_columns
+from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
 from marsyard.campaigns.running.preparation import estimate
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.confirmations import add_result
 from marsyard.campaigns.store.products import case_directory, save_packed
 from marsyard.campaigns.store.record import is_locked, stored_configuration
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
@@ -68,7 +71,10 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     console.print(verdict_table(verdicts))
     for table in _comparison_tables(evaluation.sampling.exclude_nominal_case(run.frame), run.requirements, verdicts):
         console.print(table)
-    lines = [f"verdict: {evaluation.overall_verdict.word}", evaluation.overall_verdict.sentence, f"report: {page}"]
+    lines = [f"verdict: {evaluation.overall_verdict.word}", evaluation.overall_verdict.sentence]
+    if not any(verdict.withheld_status for verdict in verdicts):
+        lines.append(f"evidence: {evaluation.evidence.text}")
+    lines.append(f"report: {page}")
     if not finished:
         state = "killed" if stored["state"] == "running" else stored["state"]
         reason = f"the campaign was {state}; to continue: marsyard resume {directory}"
@@ -89,6 +95,9 @@ def evaluate_and_store(directory: Path, requirements: Requirements | None = None
     evaluation = evaluate_run(directory, requirements)
     if requirements is None and evaluation.run.recorded("state") == "finished":
         record.update(directory, {"exit_code": evaluation.exit_code})
+        if evaluation.evidence.kind is EvidenceKind.CONFIRMATION:
+            results = {verdict.requirement_id: str(verdict.status) for verdict in evaluation.verdicts}
+            add_result(evaluation.evidence, evaluation.run.name, len(evaluation.run.all_cases), results)
     with report_write_errors("the report"):
         return evaluation, write_evaluation(evaluation)
 
@@ -251,7 +260,7 @@ def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorCon
         update={"cases": planned_looks(max_cases)[0].cases, "appended": (), "max_cases": max_cases}
     )
     command = (*campaign.command, "--until-decided")
-    run_campaign(Campaign(first_block, campaign.scenario, command), directory, executor, watch)
+    run_campaign(replace(campaign, configuration=first_block, command=command), directory, executor, watch)
     continue_until_decided(directory, executor, watch)
 
 

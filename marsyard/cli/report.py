@@ -1,8 +1,9 @@
-"""Commands `marsyard report`, `compare`, `dashboard` and `nightly`: evaluate, compare, publish and schedule runs."""
+"""Commands `marsyard report`, `confirmations`, `compare`, `dashboard`, `nightly`: evaluate, publish, schedule runs."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,15 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli.campaign import make_executor, stop_on_signals
-from marsyard.cli.options import DirectoryArgument, Exit, JobsOption, JsonOption, console, handle_user_errors
+from marsyard.cli.options import (
+    CONFIRMATIONS,
+    DirectoryArgument,
+    Exit,
+    JobsOption,
+    JsonOption,
+    console,
+    handle_user_errors,
+)
 
 LOOPBACK_ADDRESS = "127.0.0.1"
 
@@ -51,6 +60,25 @@ def report(
     if pdf:
         typer.echo(f"pdf: {outcome.print_page(directory)}")
     raise typer.Exit(status)
+
+
+@handle_user_errors
+def confirmations(
+    file: Annotated[Path, Argument(metavar="[FILE]", help="The record.")] = CONFIRMATIONS, as_json: JsonOption = False
+) -> None:
+    """List the confirmations of algorithms with their results, from the record of `run --confirm`."""
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.store.confirmations import read_confirmations
+    from marsyard.cli.showing import grid_table
+    from marsyard.reports.tables import confirmations_grid
+
+    if not file.is_file():
+        raise CampaignError(f"{file}: no such file; `marsyard run CAMPAIGN --confirm` creates it")
+    entries = read_confirmations(file)
+    if as_json:
+        typer.echo(json.dumps([asdict(entry) for entry in entries], indent=2))
+    else:
+        console().print(grid_table("Confirmations", confirmations_grid(entries)))
 
 
 @handle_user_errors

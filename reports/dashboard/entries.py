@@ -41,6 +41,7 @@ class RequirementVerdict:
     confidence: float
     decide_by: str
     note: str
+    all_cases: str
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class Entry:
     """A stored campaign, from its record and its report; fields are empty if not recorded.
 
     - slug: name of the campaign's folder in the site: letters, digits and hyphens, with a hash of the campaign's path
+    - evidence: kind of evidence of the run (`marsyard.campaigns.definition.evidence`)
     - tested: algorithms with versions, options and source hashes: those under test first, then those only compared
     - showcases, worst: numbers of the cases with stored products, and of the cases with the largest errors
     """
@@ -60,6 +62,7 @@ class Entry:
     algorithms: tuple[str, ...]
     tested: tuple[Algorithm, ...]
     commit: str
+    evidence: str
     started: str
     state: str
     cases: int
@@ -133,6 +136,7 @@ def _read_entry(path: Path) -> Entry:
         algorithms=_read_names(report, "algorithms", parameters, "algorithm"),
         tested=tuple(tested_algorithms(record)),
         commit=str(report.get("git_commit") or "")[:10],
+        evidence=str(table(report.get("evidence")).get("title") or ""),
         started=str(report.get("started_utc") or ""),
         state=str(report.get("state") or ""),
         cases=int(report.get("cases") or 0),
@@ -152,6 +156,10 @@ def _read_verdict(verdict: Mapping[str, Any]) -> RequirementVerdict:
     }
     for name in ("estimate", "lower", "probability", "margin", "confidence"):
         values[name] = _number(verdict.get(name))
+    all_cases = table(verdict.get("all_cases"))
+    values["all_cases"] = f"over all cases {all_cases['failures']:,} of {all_cases['n']:,}" if all_cases else ""
+    if all_cases and all_cases["n"] == verdict.get("n"):
+        values["all_cases"] = ""
     for name in ("n", "failures"):
         values[name] = int(verdict.get(name) or 0)
     return RequirementVerdict(requirement=str(verdict.get("requirement_id") or "?"), **values)
@@ -284,7 +292,10 @@ def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
 
 def evidence_text(verdict: RequirementVerdict) -> str:
     """Describe the number of cases of a verdict."""
-    return f"{verdict.failures:,} of {verdict.n:,} failed" if verdict.n else "no case yet"
+    if not verdict.n:
+        return "no case yet"
+    text = f"{verdict.failures:,} of {verdict.n:,} failed"
+    return f"{text}; {verdict.all_cases}" if verdict.all_cases else text
 
 
 def basis_text(verdict: RequirementVerdict) -> str:

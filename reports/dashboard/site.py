@@ -57,6 +57,7 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
         "Site": {site for entry in entries for site in entry.sites},
         "Algorithm": {algorithm for entry in entries for algorithm in entry.algorithms},
         "Commit": {entry.commit for entry in entries},
+        "Evidence": {entry.evidence for entry in entries},
     }
     index = _render(
         "dashboard.html.j2",
@@ -130,6 +131,7 @@ def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
                 "slug": cell.entry.slug,
                 "name": cell.entry.name,
                 "algorithm": cell.entry.tested_names,
+                "kind": cell.entry.evidence,
                 "status": cell.verdict.status,
                 "margin": margin_text(cell.verdict),
                 "date": cell.entry.started[:10],
@@ -157,7 +159,8 @@ def _create_traceability_csv(rows: Sequence[RequirementRow]) -> str:
             exported.append({**head, "verdict": "NO CAMPAIGN"})
         for cell in row.cells:
             verdict = {column: getattr(cell.verdict, name) for column, name in fields.items()}
-            exported.append({**head, "campaign": cell.entry.name, **algorithm_cells(cell.entry.tested), **verdict})
+            cells = {"campaign": cell.entry.name, "evidence": cell.entry.evidence}
+            exported.append({**head, **cells, **algorithm_cells(cell.entry.tested), **verdict})
     return verification_csv(exported)
 
 

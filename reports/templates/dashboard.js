@@ -7,7 +7,7 @@
   const badges = new Map();
   for (const node of document.querySelectorAll(".badge")) badges.set(node.textContent.trim(), node);
   const fits = (row, asked) =>
-    ["system", "site", "algorithm", "commit"].every(
+    ["system", "site", "algorithm", "commit", "evidence"].every(
       (key) => !asked[key] || row.dataset[key].split("\n").includes(asked[key])) &&
     (!asked.from || row.dataset.date >= asked.from) && (!asked.until || row.dataset.date <= asked.until) &&
     (!asked.text || row.dataset.text.toLowerCase().includes(asked.text.toLowerCase()));
@@ -64,7 +64,7 @@
       link.textContent = one.name;
       date.className = "date";
       date.textContent = one.date;
-      about.append(...(names.size > 1 ? [word, " "] : []), link, ", ", date, one.algorithm ? `, ${one.algorithm}` : "", one.finished ? "" : ", not finished");
+      about.append(...(names.size > 1 ? [word, " "] : []), link, ", ", date, one.algorithm ? `, ${one.algorithm}` : "", one.kind ? `, ${one.kind}` : "", one.finished ? "" : ", not finished");
       item.append(about);
       list.append(item);
     }

@@ -10,7 +10,17 @@ from typer.core import TyperCommand, TyperGroup
 from marsyard.cli.app import app
 
 #: Commands that only print, and commands that write files; each command is in one of the two sets.
-PRINTING = {"list", "show", "clean", "conformance", "doctor", "compare", "terrain list", "terrain stats"}
+PRINTING = {
+    "list",
+    "show",
+    "clean",
+    "conformance",
+    "confirmations",
+    "doctor",
+    "compare",
+    "terrain list",
+    "terrain stats",
+}
 WRITING = {
     "run", "resume", "append", "replay", "report", "dashboard", "nightly", "gallery", "render", "dataset", "new",
     "ingest", "export", "score", "compile",

@@ -12,7 +12,7 @@ from marsyard.cli.app import app
 
 @pytest.mark.parametrize(
     ("words", "index", "completions"),
-    [("marsyard con", 1, {"conformance"}), ("marsyard clean --y", 2, {"--yes"}), ("marsyard terrain l", 2, {"list"})],
+    [("marsyard confo", 1, {"conformance"}), ("marsyard clean --y", 2, {"--yes"}), ("marsyard terrain l", 2, {"list"})],
 )
 def test_words_are_completed(words: str, index: int, completions: set[str]) -> None:
     environment = {"_MARSYARD_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(index)}

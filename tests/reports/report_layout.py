@@ -28,6 +28,37 @@ class ClusterEvidence(_Part):
     upper: float
 
 
+class AllCases(_Part):
+    """The same requirement on all cases."""
+
+    status: VerdictWord
+    n: int
+    failures: int
+    estimate: float | None
+    lower: float | None
+    upper: float | None
+
+
+class Evidence(_Part):
+    """Kind of evidence of the run, by its seed and its frozen algorithm."""
+
+    kind: Literal[
+        "confirmation",
+        "repetition of a confirmation",
+        "calibration",
+        "exploration",
+        "reused confirmation seed",
+        "not the frozen evaluation",
+    ]
+    namespace: str = Field(description="namespace of the seeds of confirmations")
+    number: int = Field(description="number of the confirmation; 0 for other kinds")
+    of_algorithm: int = Field(description="number of confirmations of the algorithm up to this one")
+    record: str = Field(description="file of the record of confirmations")
+    changes: list[str]
+    title: str
+    text: str
+
+
 class RequirementVerdict(_Part):
     """Verdict on one requirement."""
 
@@ -62,6 +93,11 @@ class RequirementVerdict(_Part):
     reason: str
     advice: str = Field(description="reason why more cases do not help, and the necessary change")
     accept_rate: bool = Field(description="true if MET BY RATE has exit status 0")
+    withheld_status: VerdictWord | None = Field(
+        description="status without regard to the kind of evidence, if it was replaced by INSUFFICIENT"
+    )
+    all_cases: AllCases | None = Field(description="the requirement on all cases; null if its population is all cases")
+    joint_text: str = Field(description="verdict at the confidence of all confirmations of the algorithm together")
     note: str
 
 
@@ -143,6 +179,7 @@ class CampaignReport(_Part):
         default=[], description="from campaign.json, the algorithm under test first"
     )
     sampling: SamplingDescription
+    evidence: Evidence
     verdict: VerdictWord | Literal["NO REQUIREMENT"]
     sentence: str
     exit_code: Literal[0, 1, 3]

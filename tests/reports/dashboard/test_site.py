@@ -155,7 +155,19 @@ def test_pages_of_unchanged_campaigns_are_not_rewritten(make_rows: Rows, make_ru
 
 def _make_verdict(estimate: float, margin: float = -0.05) -> RequirementVerdict:
     return RequirementVerdict(
-        "R", "", "PASS", estimate, 0.9, 0.95, margin, n=10, failures=1, confidence=0.9, decide_by="", note=""
+        "R",
+        "",
+        "PASS",
+        estimate,
+        0.9,
+        0.95,
+        margin,
+        n=10,
+        failures=1,
+        confidence=0.9,
+        decide_by="",
+        note="",
+        all_cases="",
     )
 
 

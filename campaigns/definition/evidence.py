@@ -1,0 +1,235 @@
+"""Kind of evidence of a run: calibration, confirmation or exploration, by its seed and its frozen algorithm.
+
+Options that were set by looking at results fit the cases of these results. Only cases that were drawn afterwards, once,
+can confirm the algorithm. `marsyard run --confirm` draws the seed of such a run from a namespace, and enters the run in
+a record of confirmations (`marsyard.campaigns.store.confirmations`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any, Self
+
+from marsyard.campaigns.definition.campaign import Campaign, leaves
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.identity import create_identity, describe_algorithms
+
+#: Namespace of the seeds of confirmations without a table `[calibration]` in the campaign file.
+NAMESPACE = "confirmation"
+#: Keys of a configuration that a confirmation does not freeze: the seed, the number of cases, texts, limits of the run.
+_KEYS_NOT_FROZEN = frozenset(
+    {"appended", "calibration", "cases", "description", "limits", "max_cases", "requirements", "retain", "seed"}
+)
+#: Numbers of confirmations whose seeds are recognised without an entry in the record.
+_RESERVED_NUMBERS = 1000
+
+
+class EvidenceKind(StrEnum):
+    """Kind of evidence of a run; the results of kinds in `WITHHELD` cannot be PASS."""
+
+    CONFIRMATION = "confirmation"
+    REPETITION = "repetition of a confirmation"
+    CALIBRATION = "calibration"
+    EXPLORATION = "exploration"
+    REUSED_SEED = "reused confirmation seed"
+    CHANGED = "not the frozen evaluation"
+
+
+#: Kinds of evidence whose cases were known before the algorithm was frozen.
+WITHHELD = frozenset({EvidenceKind.CALIBRATION, EvidenceKind.REUSED_SEED, EvidenceKind.CHANGED})
+
+
+@dataclass(frozen=True)
+class FrozenAlgorithm:
+    """All choices that a confirmation freezes.
+
+    - algorithm: name of the algorithm under test
+    - options: options of all algorithms of the campaign, under the algorithm's name, and values under `parameters`
+    - hashes: SHA-256 (16 digits) of `sources` (of the algorithms), `configuration` (parameters, dispersions, sampling
+      design, input files), `requirements`, and `code` (of the simulation)
+    """
+
+    algorithm: str
+    options: Mapping[str, Any]
+    hashes: Mapping[str, str]
+
+    @classmethod
+    def read(cls, stored: Mapping[str, Any]) -> Self:
+        """Read from the record of confirmations."""
+        return cls(str(stored["algorithm"]), dict(stored["options"]), dict(stored["hashes"]))
+
+    def differences(self, other: FrozenAlgorithm) -> list[str]:
+        """Describe the differences from another frozen algorithm, each in a few words."""
+        texts = []
+        if self.algorithm != other.algorithm:
+            texts.append(f"algorithm ({self.algorithm}, now {other.algorithm})")
+        for name in sorted({*self.options, *other.options}):
+            old, new = self.options.get(name), other.options.get(name)
+            if old != new:
+                texts.append(f"{name} ({json.dumps(old)}, now {json.dumps(new)})")
+        names = sorted({*self.hashes, *other.hashes})
+        changed = [name for name in names if self.hashes.get(name) != other.hashes.get(name)]
+        if texts and "configuration" in changed:
+            changed.remove("configuration")  # it includes the named parameters
+        return [*texts, *changed]
+
+
+def freeze(campaign: Campaign) -> FrozenAlgorithm:
+    """Describe the choices that a confirmation of a campaign freezes."""
+    configuration = campaign.configuration
+    algorithms = describe_algorithms(campaign)
+    tested = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), configuration.scenario)
+    options = {f"{entry['spec']}.{name}": value for entry in algorithms for name, value in entry["options"].items()}
+    values = configuration.model_dump(mode="json")
+    options |= dict(leaves(values["parameters"], "parameters"))
+    frozen = {name: value for name, value in values.items() if name not in _KEYS_NOT_FROZEN}
+    identity = create_identity(configuration)
+    contents = {
+        "sources": [(entry["spec"], entry["source_hash"]) for entry in algorithms],
+        "configuration": [frozen, identity.inputs],
+        "requirements": values["requirements"],
+        "code": identity.code,
+    }
+    return FrozenAlgorithm(tested, options, {name: _hash(content) for name, content in contents.items()})
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def namespace(configuration: CampaignConfiguration) -> str:
+    """Return the namespace of the seeds of a campaign's confirmations."""
+    return NAMESPACE if configuration.calibration is None else configuration.calibration.namespace
+
+
+def confirmation_seed(namespace_text: str, campaign: str, number: int) -> int:
+    """Compute the seed of a campaign's confirmation, numbered from 1: 48 bits of a SHA-256.
+
+    >>> confirmation_seed("confirmation", "dimes-gusev", 1)
+    86360033277001
+    """
+    digest = hashlib.sha256(f"{namespace_text}\0{campaign}\0{number}".encode()).digest()
+    return int.from_bytes(digest[:6])
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """One entry of the record of confirmations.
+
+    - number: number of the confirmation of this campaign and namespace, from 1; it determines the seed
+    - results: status of each requirement; None while the run is not finished
+    """
+
+    campaign: str
+    namespace: str
+    number: int
+    seed: int
+    frozen: FrozenAlgorithm
+    started_utc: str
+    git_commit: str | None = None
+    folder: str = ""
+    cases: int = 0
+    results: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Kind of evidence of a run, stored in its record.
+
+    - number: number of the confirmation; 0 for other kinds
+    - of_algorithm: number of confirmations of the algorithm (by name) on this campaign up to this one
+    - record: file of the record of confirmations; empty for other kinds
+    - changes: differences from the frozen algorithm, if the seed was reused; or the options set on these cases
+    """
+
+    kind: EvidenceKind = EvidenceKind.EXPLORATION
+    namespace: str = ""
+    number: int = 0
+    of_algorithm: int = 0
+    record: str = ""
+    changes: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, stored: object) -> Self:
+        """Read from the record of a run; runs of earlier versions are explorations."""
+        if not isinstance(stored, Mapping):
+            return cls()
+        values = {name: stored[name] for name in ("namespace", "number", "of_algorithm", "record") if name in stored}
+        try:
+            return cls(
+                EvidenceKind(str(stored.get("kind"))), changes=tuple(map(str, stored.get("changes") or ())), **values
+            )
+        except ValueError:
+            return cls()
+
+    def table(self) -> dict[str, Any]:
+        """Return the fields as JSON types."""
+        return {**asdict(self), "kind": str(self.kind), "changes": list(self.changes)}
+
+    @property
+    def withheld(self) -> bool:
+        """Whether the results cannot be PASS."""
+        return self.kind in WITHHELD
+
+    @property
+    def title(self) -> str:
+        """The kind of evidence with its number, in a few words."""
+        if self.kind is EvidenceKind.CALIBRATION:
+            return "calibrated on these cases"
+        return f"{self.kind} {self.number}" if self.number and self.kind is not EvidenceKind.CHANGED else str(self.kind)
+
+    @property
+    def text(self) -> str:
+        """Meaning of the kind of evidence for the verdicts, in a sentence or two."""
+        changes = "; ".join(self.changes)
+        return {
+            EvidenceKind.CONFIRMATION: f"Confirmation {self.number} in the namespace '{self.namespace}': the seed was "
+            f"drawn after the algorithm was frozen. {self._multiplicity_text()}",
+            EvidenceKind.REPETITION: f"The run repeats confirmation {self.number} without a change; it is no new "
+            "evidence.",
+            EvidenceKind.CALIBRATION: f"Calibrated on these cases: options were set by looking at their results "
+            f"({changes}). PASS needs a run with --confirm.",
+            EvidenceKind.EXPLORATION: "Exploration: the seed was chosen freely. A confirmation is a run with "
+            "--confirm, on cases that nobody has seen.",
+            EvidenceKind.REUSED_SEED: f"The seed belongs to confirmation {self.number}, and the run differs from it: "
+            f"{changes}. PASS needs a run with --confirm, which draws a new seed.",
+            EvidenceKind.CHANGED: f"Not the frozen evaluation: {changes}. PASS needs a run with --confirm.",
+        }[self.kind]
+
+    def _multiplicity_text(self) -> str:
+        if self.of_algorithm <= 1:
+            return "It is the first confirmation of this algorithm on this campaign."
+        return (
+            f"It is confirmation {self.of_algorithm} of this algorithm on this campaign, counting all its options: "
+            f"the probability that at least one of them is wrongly PASS is up to {self.of_algorithm} times that of one."
+        )
+
+
+def classify(campaign: Campaign, confirmations: Sequence[Confirmation], frozen: FrozenAlgorithm) -> Evidence:
+    """Determine the kind of evidence of a run that was not started as a confirmation.
+
+    confirmations: entries of the record of confirmations
+    """
+    configuration = campaign.configuration
+    name, seed = configuration.name, configuration.seed
+    used = [entry for entry in confirmations if (entry.campaign, entry.seed) == (name, seed)]
+    if used:
+        entry = used[0]
+        changes = entry.frozen.differences(frozen)
+        kind = EvidenceKind.REUSED_SEED if changes else EvidenceKind.REPETITION
+        return Evidence(kind, entry.namespace, entry.number, changes=tuple(changes))
+    runs = () if configuration.calibration is None else configuration.calibration.runs
+    looked_at = [run for run in runs if (run.campaign, run.seed) == (name, seed)]
+    if looked_at:
+        options = dict.fromkeys(option for run in looked_at for option in run.options)
+        return Evidence(EvidenceKind.CALIBRATION, changes=tuple(options))
+    own_namespace = namespace(configuration)
+    for number in range(1, _RESERVED_NUMBERS + 1):
+        if confirmation_seed(own_namespace, name, number) == seed:
+            reason = "it was run without --confirm, so the seed is not in the record of confirmations"
+            return Evidence(EvidenceKind.REUSED_SEED, own_namespace, number, changes=(reason,))
+    return Evidence()

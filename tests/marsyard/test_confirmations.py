@@ -1,0 +1,192 @@
+"""Tests of calibration, confirmation and reused seeds: `marsyard run --confirm`, record, verdicts, dashboard."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind, confirmation_seed
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.confirmations import read_confirmations
+from marsyard.cli import app as cli
+from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, write_campaign
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
+]
+Command = Callable[..., tuple[int, str, str]]
+REQUIREMENT = """
+[[requirements]]
+id = "VELOCITY"
+statement = "The error is small."
+metric = "velocity_error_m_s"
+bound = 1000.0
+probability = 0.75
+confidence = 0.9
+"""
+CALIBRATION = """
+[calibration]
+namespace = "board"
+
+[[calibration.runs]]
+options = ["error_scale"]
+campaign = "fake"
+seed = 5
+note = "the scale was set on these cases"
+"""
+
+
+@pytest.fixture
+def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    """Return a function that runs the command line in an empty folder: exit code, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_command(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
+        with pytest.raises(SystemExit) as raised:
+            cli.main()
+        captured = capfd.readouterr()
+        return int(raised.value.code or 0), captured.out, captured.err
+
+    return run_command
+
+
+@pytest.fixture
+def campaign(tmp_path: Path) -> Path:
+    """Write a campaign of 10 cases that all meet the requirement, calibrated with seed 5."""
+    return write_campaign(
+        tmp_path,
+        top_level_keys=TOP_LEVEL_KEYS.replace("cases = 12", "cases = 10"),
+        dispersions='[dispersions]\nterrain = { distribution = "in-turn", low = 0, high = 9 }\n',
+        requirement=REQUIREMENT,
+        extra_tables=CALIBRATION,
+    )
+
+
+def _evidence(directory: Path) -> Evidence:
+    return Evidence.read(json.loads((directory / "campaign.json").read_text())["evidence"])
+
+
+def _statuses(directory: Path) -> list[str]:
+    return [verdict["status"] for verdict in json.loads((directory / "report.json").read_text())["verdicts"]]
+
+
+def test_a_calibration_seed_cannot_pass(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+    status, out, _ = marsyard("run", campaign, "--out", tmp_path / "calibration", "--jobs", 1)
+    assert (status, _statuses(tmp_path / "calibration")) == (3, ["INSUFFICIENT"])
+    assert "The verdict would be PASS. Calibrated on these cases" in " ".join(out.split())
+    assert "error_scale" in out
+    assert _evidence(tmp_path / "calibration").kind is EvidenceKind.CALIBRATION
+    # another seed, which no option was set on, can pass
+    status, out, _ = marsyard("run", campaign, "--seed", 6, "--out", tmp_path / "free", "--jobs", 1)
+    assert (status, _statuses(tmp_path / "free")) == (0, ["PASS"])
+    assert "evidence: Exploration" in out
+
+
+def test_a_failure_on_a_calibration_seed_stays_a_failure(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    arguments = ("run", campaign, "--set", "error_scale=1e9", "--out", out, "--jobs", 1)
+    assert (marsyard(*arguments)[0], _statuses(out)) == (1, ["FAIL"])
+
+
+def test_a_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
+    campaign: Path, marsyard: Command, tmp_path: Path
+) -> None:
+    folders = {name: tmp_path / name for name in ("first", "changed", "repeated", "second", "voided")}
+    seed = confirmation_seed("board", "fake", 1)
+    status, out, _ = marsyard("run", campaign, "--confirm", "--out", folders["first"], "--jobs", 1)
+    assert (status, _statuses(folders["first"])) == (0, ["PASS"])
+    assert "evidence: Confirmation 1 in the namespace 'board'" in out
+    assert json.loads((folders["first"] / "campaign.json").read_text())["seed"] == seed
+    (entry,) = read_confirmations(tmp_path / "confirmations.jsonl")
+    assert (entry.seed, entry.number, entry.cases, entry.results) == (seed, 1, 10, {"VELOCITY": "PASS"})
+
+    # the bar of the verdict: another option on the same seed is marked and cannot be PASS
+    arguments = ("run", campaign, "--set", "error_scale=0.5")
+    status, out, _ = marsyard(*arguments, "--seed", seed, "--out", folders["changed"], "--jobs", 1)
+    assert (status, _statuses(folders["changed"])) == (3, ["INSUFFICIENT"])
+    assert "parameters.error_scale (1.0, now 0.5)" in " ".join(out.split())
+    assert _evidence(folders["changed"]).kind is EvidenceKind.REUSED_SEED
+    page = (folders["changed"] / "report.html").read_text()
+    assert "reused confirmation seed 1" in page
+    assert "parameters.error_scale (1.0, now 0.5)" in page
+
+    # the same run again is a repetition
+    assert marsyard("run", campaign, "--seed", seed, "--out", folders["repeated"], "--jobs", 1)[0] == 0
+    assert _evidence(folders["repeated"]).kind is EvidenceKind.REPETITION
+
+    # the changed option needs another seed, and the record states the multiplicity
+    status, out, _ = marsyard(*arguments, "--confirm", "--out", folders["second"], "--jobs", 1)
+    text = " ".join(out.split())
+    assert (status, _evidence(folders["second"]).of_algorithm) == (0, 2)
+    assert "up to 2 times that of one" in text
+    assert "for all 2 confirmations together (each at 95.00 %): INSUFFICIENT" in text
+    second = json.loads((folders["second"] / "campaign.json").read_text())
+    assert second["seed"] == confirmation_seed("board", "fake", 2)
+    status, out, _ = marsyard("confirmations", "--json")
+    assert (status, [entry["results"] for entry in json.loads(out)]) == (0, [{"VELOCITY": "PASS"}] * 2)
+    assert marsyard("confirmations")[1].count("PASS") == 2
+
+    # other requirements were not frozen
+    requirements = tmp_path / "requirements.toml"
+    requirements.write_text(REQUIREMENT.replace("0.75", "0.7") + 'campaigns = ["fake"]\n')
+    status, out, _ = marsyard("report", folders["second"], "--requirements", requirements)
+    assert (status, "requirements other than those of the campaign" in " ".join(out.split())) == (3, True)
+
+    # the dashboard shows the kind of evidence
+    assert marsyard("dashboard", tmp_path, "--out", tmp_path / "site")[0] == 0
+    index = (tmp_path / "site" / "index.html").read_text()
+    assert all(
+        title in index for title in ("confirmation 1", "not the frozen evaluation", "reused confirmation seed 1")
+    )
+    assert "not the frozen evaluation" in (tmp_path / "site" / "verification.csv").read_text()
+
+
+def test_a_seed_of_the_namespace_is_recognised_before_its_confirmation(
+    campaign: Path, marsyard: Command, tmp_path: Path
+) -> None:
+    seed = confirmation_seed("board", "fake", 3)
+    status, out, _ = marsyard("run", campaign, "--seed", seed, "--out", tmp_path / "peek", "--jobs", 1)
+    assert (status, "run without --confirm" in " ".join(out.split())) == (3, True)
+
+
+def test_a_changed_program_voids_a_confirmation(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+    directory = tmp_path / "run"
+    marsyard("run", campaign, "--confirm", "--out", directory, "--jobs", 1)
+    path = directory / "campaign.json"
+    record = json.loads(path.read_text())
+    record["changes"] = [{"utc": "", "cases_before": 3, "in": ["code (abc, now def)"]}]
+    path.write_text(json.dumps(record))
+    status, out, _ = marsyard("report", directory)
+    assert (status, "code (abc, now def)" in " ".join(out.split())) == (3, True)
+
+
+def test_errors_are_reported_before_the_first_case(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+    status, _, err = marsyard("run", campaign, "--confirm", "--seed", 3)
+    assert (status, "--confirm and --seed cannot be combined" in err) == (2, True)
+    (tmp_path / "confirmations.jsonl").write_text("{}\n")
+    status, _, err = marsyard("run", campaign, "--confirm", "--out", tmp_path / "run")
+    assert (status, "confirmations.jsonl:1 is not an entry" in err) == (2, True)
+    with pytest.raises(StoreError, match="not an entry"):
+        read_confirmations(tmp_path / "confirmations.jsonl")
+    status, _, err = marsyard("confirmations", tmp_path / "none.jsonl")
+    assert (status, "no such file" in err) == (2, True)
+    text = campaign.read_text().replace('options = ["error_scale"]', 'options = ["eror_scale"]')
+    campaign.write_text(text)
+    status, _, err = marsyard("run", campaign)
+    assert (status, "calibration.runs[0].options[0]" in err, "error_scale" in err) == (2, True, True)
+
+
+def test_a_confirmation_that_was_killed_stays_in_the_record(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+    """A run that reserved its seed and stopped counts for the next confirmation."""
+    marsyard("run", campaign, "--confirm", "--out", tmp_path / "first", "--jobs", 1)
+    path = tmp_path / "confirmations.jsonl"
+    path.write_text(path.read_text().splitlines()[0] + "\n")
+    marsyard("run", campaign, "--confirm", "--out", tmp_path / "second", "--jobs", 1)
+    first, second = read_confirmations(path)
+    assert (first.results, second.number, _evidence(tmp_path / "second").of_algorithm) == (None, 2, 2)
