@@ -1,5 +1,9 @@
 """Estimate the attitude at the images of a flight from surveyed targets and gyros (paper, III.D.2).
 
+Directions are related in an inertial frame that coincides with the surface-fixed world axes at time 0, because gyros
+measure the rotation relative to inertial space: 15 deg/h more than relative to the ground. The Earth's rotation rate
+maps the directions from survey and GPS into this frame, and the estimated attitudes back.
+
 The helicopter passes over the targets at the start and at the end of the flight. The gyros map the target directions of
 all images of a pass to one instant. The directions in the images, and those from survey and GPS, determine the attitude
 at this instant: Wahba's problem. The paper solves it by QUEST. Here SciPy's `align_vectors` (singular value
@@ -21,16 +25,58 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.fieldtest.parameters import DriftParameters, TargetParameters
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.dynamics import Motion
+from marsyard.sim.dynamics import Motion, Trajectory
 from marsyard.sim.dynamics.helicopter import HelicopterFlight
 from marsyard.sim.sensor.imu import DEG_H, ImuIncrements
 from marsyard.sim.sensor.inertial import InertialSolution
 from marsyard.sim.terrain import Surface
 
+#: Rotation rate of the Earth, rad/s (WGS 84).
+EARTH_RATE_RAD_S = 7.292115e-5
 #: Gauss-Newton iterations of attitude and bias.
 _ITERATIONS = 3
 #: Minimum distance of a measured target from the edge of the image, pixels.
 _BORDER_PX = 4.0
+
+
+@dataclass(frozen=True)
+class EarthRotation:
+    """Rotation of the surface-fixed world axes (east, north, up) in inertial space.
+
+    - rate_rad_s: rotation vector per second, world axes
+    """
+
+    rate_rad_s: Float64[np.ndarray, "3"]
+
+    @classmethod
+    def at_latitude(cls, latitude_deg: float) -> EarthRotation:
+        """Create the rotation at a geodetic latitude."""
+        latitude = np.radians(latitude_deg)
+        return cls(EARTH_RATE_RAD_S * np.array([0.0, np.cos(latitude), np.sin(latitude)]))
+
+    def to_inertial(self, times_s: Float64[np.ndarray, "n"]) -> Rotation:
+        """Compute the rotations from world axes at times to the inertial axes, which are the world axes at time 0."""
+        return Rotation.from_rotvec(np.outer(times_s, self.rate_rad_s))
+
+
+@dataclass(frozen=True)
+class InertialTrajectory(Trajectory):
+    """A trajectory with attitudes relative to inertial axes, as gyros measure it; positions, forces are unchanged."""
+
+    trajectory: Trajectory
+    earth: EarthRotation
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last time of the trajectory."""
+        return self.trajectory.span_s
+
+    def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
+        """Compute the true states; see `Trajectory.motion`."""
+        motion = self.trajectory.motion(times_s)
+        rates = motion.body_rates_rad_s + motion.attitudes.inv().apply(self.earth.rate_rad_s)
+        attitudes = self.earth.to_inertial(times_s) * motion.attitudes
+        return replace(motion, attitudes=attitudes, body_rates_rad_s=rates)
 
 
 @dataclass(frozen=True)
@@ -56,7 +102,7 @@ class Sightings:
 
     - times_s: time tag of the image
     - camera: unit vector to the target in body axes, from its centroid in the image
-    - world: unit vector to the target in world axes, from the survey and the helicopter's GPS position
+    - world: unit vector to the target in inertial axes, from the survey and the helicopter's GPS position
     """
 
     times_s: Float64[np.ndarray, "n"]
@@ -71,6 +117,7 @@ def sight_targets(
     tags_s: Float64[np.ndarray, "images"],
     gps_m: Float64[np.ndarray, "images 3"],
     centroid_px: float,
+    earth: EarthRotation,
     rng: np.random.Generator,
 ) -> Sightings:
     """Project the targets into the images of a pass and add centroid errors; these images are not rendered.
@@ -79,6 +126,7 @@ def sight_targets(
     - motion: true motion at the exposures
     - tags_s, gps_m: time tags of the images and measured positions of the camera
     - centroid_px: standard deviation of a centroid per axis
+    - earth: rotation that maps directions at the time tags to inertial axes
     """
     columns, rows = camera.size
     times, camera_directions, world_directions = [], [], []
@@ -88,7 +136,8 @@ def sight_targets(
         is_inside = (centroids >= _BORDER_PX) & (centroids <= np.array([columns, rows]) - 1.0 - _BORDER_PX)
         is_measured = visible & is_inside.all(axis=1)
         camera_directions.append(camera.rays(centroids[is_measured])[1])
-        world_directions.append(_normalize(targets.surveyed_m[is_measured] - gps_m[index]))
+        surveyed = _normalize(targets.surveyed_m[is_measured] - gps_m[index])
+        world_directions.append(earth.to_inertial(tags_s[index : index + 1]).apply(surveyed))
         times.append(np.full(int(is_measured.sum()), tags_s[index]))
     camera_vectors = _normalize(np.concatenate(camera_directions))
     return Sightings(np.concatenate(times), camera_vectors, np.concatenate(world_directions))
@@ -117,7 +166,12 @@ def add_thermal_drift(
 
 
 def solve_attitude(
-    increments: ImuIncrements, first: Sightings, second: Sightings, sighting_sd_rad: float, bias_sd_rad_s: float
+    increments: ImuIncrements,
+    first: Sightings,
+    second: Sightings,
+    sighting_sd_rad: float,
+    bias_sd_rad_s: float,
+    earth: EarthRotation,
 ) -> InertialSolution:
     """Estimate the attitude during a flight from its gyros and both passes over the targets.
 
@@ -125,6 +179,7 @@ def solve_attitude(
     - first, second: sightings of the two passes
     - sighting_sd_rad: standard deviation of a measured direction
     - bias_sd_rad_s: standard deviation of the gyro bias for the IMU's class
+    - earth: rotation that maps the attitudes from inertial axes to world axes
     """
     times = np.concatenate([first.times_s, second.times_s])
     camera, world = np.concatenate([first.camera, second.camera]), np.concatenate([first.world, second.world])
@@ -150,7 +205,8 @@ def solve_attitude(
         start = Rotation.from_rotvec(change[:3]) * start
         bias = bias + change[3:]
     propagated = _propagate(increments, bias)
-    return replace(propagated, attitudes=start * propagated.attitudes)
+    to_world = earth.to_inertial(increments.times_s).inv()
+    return replace(propagated, attitudes=to_world * start * propagated.attitudes)
 
 
 def _propagate(increments: ImuIncrements, bias_rad_s: Float64[np.ndarray, "3"]) -> InertialSolution:

@@ -18,7 +18,14 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.fieldtest.attitude import Targets, add_thermal_drift, sight_targets, solve_attitude
+from marsyard.scenarios.fieldtest.attitude import (
+    EarthRotation,
+    InertialTrajectory,
+    Targets,
+    add_thermal_drift,
+    sight_targets,
+    solve_attitude,
+)
 from marsyard.scenarios.fieldtest.parameters import (
     CAMERA,
     ElevationParameters,
@@ -245,7 +252,8 @@ def simulate_run(key: RunKey) -> Run:
     clock = Clock.draw(p.pictures.clock, generator("camera clock"))
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
     position = gps.measure(flight, times, generator("gps noise")).values
-    solution = _estimate_attitudes(p, surface, flight, clock, gps, generator)
+    earth = EarthRotation.at_latitude(run.latitude_deg)
+    solution = _estimate_attitudes(p, surface, flight, clock, gps, earth, generator)
     attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
     elevation_model = survey_ground(p.elevation, surface, horizontal, generator("elevation model"))
@@ -275,7 +283,13 @@ def simulate_run(key: RunKey) -> Run:
 
 
 def _estimate_attitudes(
-    p: FieldTestParameters, surface: Surface, flight: HelicopterFlight, clock: Clock, gps: Gps, generator: _Generators
+    p: FieldTestParameters,
+    surface: Surface,
+    flight: HelicopterFlight,
+    clock: Clock,
+    gps: Gps,
+    earth: EarthRotation,
+    generator: _Generators,
 ) -> InertialSolution:
     """Simulate both passes over the targets and the gyros, and estimate the attitude over the flight."""
     camera, noise, sightings = field_camera(), generator("sightings"), []
@@ -285,16 +299,16 @@ def _estimate_attitudes(
         tags = clock.tags(times, noise)
         fixes = gps.measure(flight, times, noise).values
         motion = flight.motion(times)
-        sightings.append(sight_targets(targets, camera, motion, tags, fixes, p.targets.centroid_px, noise))
+        sightings.append(sight_targets(targets, camera, motion, tags, fixes, p.targets.centroid_px, earth, noise))
     unit = Imu.draw(p.imu, flight.span_s, generator("imu errors"))
-    increments = unit.increments(flight, *flight.span_s, generator("imu noise"))
+    increments = unit.increments(InertialTrajectory(flight, earth), *flight.span_s, generator("imu noise"))
     centre = np.array(camera.size) / 2.0
     _, directions = camera.rays(np.stack([centre, centre + np.array([1.0, 0.0])]))
     pixel_rad = float(np.linalg.norm(directions[1] - directions[0]))
     # the larger of a centroid's error and the remaining GPS error, as angles
     sd = max(p.targets.centroid_px * pixel_rad, p.gps.horizontal_wander_m / p.helicopter.fly_over_m)
     increments = add_thermal_drift(increments, p.drift, flight, flight.span_s[0])
-    return solve_attitude(increments, sightings[0], sightings[1], sd, p.imu.gyro_bias_deg_h * DEG_H)
+    return solve_attitude(increments, sightings[0], sightings[1], sd, p.imu.gyro_bias_deg_h * DEG_H, earth)
 
 
 def field_camera() -> CameraModel:

@@ -48,8 +48,10 @@ class HelicopterParameters(Parameters):
     )
     climb_m_s: Annotated[float, bounded_field(0.0, 10.0, "rate of climb on a pass")] = 1.0
     wander_m: Annotated[float, bounded_field(0.0, 200.0, "RMS distance from the line (assumed)")] = 8.0
-    pointing_deg: Annotated[Angle, Field(description="RMS tilt along and across the line (assumed)")] = 9.0
-    max_tilt_deg: Annotated[Angle, Field(description="maximum tilt along and across the line")] = 30.0
+    pointing_deg: Annotated[
+        Angle, Field(description="RMS tilt along and across the line (assumed: flights reach the maximum)")
+    ] = 12.0
+    max_tilt_deg: Annotated[Angle, Field(description="maximum angle off nadir of pointing and swing")] = 45.0
     swinging_fraction: Annotated[Fraction, Field(description="fraction of passes with a swinging camera (assumed)")] = (
         0.5
     )
@@ -193,6 +195,7 @@ def draw_helicopter_flight(
         heights += [(flown.start_s, height, p.climb_m_s), (flown.end_s, height + climb_m, p.climb_m_s)]
         angle = np.pi if flown.direction < 0 and p.turns_with_flight else 0.0
         angles += [(flown.start_s, angle), (flown.end_s, angle)]
+    tilt_along, tilt_across = _draw_tilts(p, passes, times, rng)
     return HelicopterFlight(
         origin_m=origin_m,
         azimuth_rad=azimuth_rad,
@@ -200,8 +203,8 @@ def draw_helicopter_flight(
         across=_fit_stationary(times, p.wander_m * rng.standard_normal(times.size)),
         up=_fit_moving(sorted(heights)),
         platform=_fit_stationary(*np.array(sorted(angles)).T),
-        tilt_along=_draw_tilt(p, passes, times, rng),
-        tilt_across=_draw_tilt(p, passes, times, rng),
+        tilt_along=tilt_along,
+        tilt_across=tilt_across,
         passes=passes,
         fly_overs_s=fly_overs,
         gravity_m_s2=gravity_m_s2,
@@ -209,23 +212,33 @@ def draw_helicopter_flight(
     )
 
 
-def _draw_tilt(
+def _draw_tilts(
     p: HelicopterParameters, passes: Sequence[FlownPass], times: Float64[np.ndarray, "n"], rng: np.random.Generator
-) -> Tilt:
-    """Draw an angle of the gimbal over time: pointing and swing on the passes; elsewhere only residual motion."""
+) -> tuple[Tilt, Tilt]:
+    """Draw the gimbal's angles over time: pointing and swing on the passes; elsewhere only residual motion.
+
+    Pointing that would exceed the maximum angle off nadir together with the swing is reduced to it.
+    """
     on_pass = np.any([(times > flown.start_s) & (times < flown.end_s) for flown in passes], axis=0)
-    limit = p.max_tilt_deg
-    pointing = np.clip(p.pointing_deg * rng.standard_normal(times.size), -limit, limit) * on_pass
-    pointing = pointing + p.platform_deg * rng.standard_normal(times.size)
     swing_rad_s = 2.0 * np.pi * p.swing_hz
     # both axes swing: the maximum rate of each is the parameter divided by sqrt(2)
     max_amplitude = np.radians(p.swing_rate_deg_s) / np.sqrt(2.0) / swing_rad_s
-    amplitudes = np.zeros(times.size)
+    amplitudes = np.zeros((2, times.size))
     for flown in passes:
-        has_swing = rng.uniform() < p.swinging_fraction
-        amplitude = max_amplitude * rng.uniform(0.2, 1.0)
-        amplitudes[(times > flown.start_s) & (times < flown.end_s)] = amplitude if has_swing else 0.0
-    return Tilt(_fit_stationary(times, np.radians(pointing)), _fit_stationary(times, amplitudes), swing_rad_s)
+        is_inside = (times > flown.start_s) & (times < flown.end_s)
+        for axis in range(2):
+            has_swing = rng.uniform() < p.swinging_fraction
+            amplitude = max_amplitude * rng.uniform(0.2, 1.0)
+            amplitudes[axis, is_inside] = amplitude if has_swing else 0.0
+    pointing = np.radians(p.pointing_deg * rng.standard_normal((2, times.size)) * on_pass)
+    limit = np.maximum(np.radians(p.max_tilt_deg) - np.linalg.norm(amplitudes, axis=0), 0.0)
+    pointing *= np.minimum(1.0, limit / np.maximum(np.linalg.norm(pointing, axis=0), 1e-9))
+    pointing += np.radians(p.platform_deg) * rng.standard_normal((2, times.size))
+    along, across = (
+        Tilt(_fit_stationary(times, angles), _fit_stationary(times, swing), swing_rad_s)
+        for angles, swing in zip(pointing, amplitudes, strict=True)
+    )
+    return along, across
 
 
 def _fit_moving(points: Sequence[tuple[float, float, float]]) -> BPoly:

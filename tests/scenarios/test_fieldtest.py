@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from marsyard import scenarios
 from marsyard.algorithms.interface import VelocityOutcome
 from marsyard.scenarios.exposure import camera_optics
+from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters
 from marsyard.scenarios.fieldtest.run import (
     Category,
@@ -34,6 +37,9 @@ from marsyard.scenarios.fieldtest.scenario import (
 )
 from marsyard.scenarios.parts import ScoredFlight
 from marsyard.scenarios.views import Eye, site_scene
+from marsyard.sim.dynamics import Resting
+from marsyard.sim.dynamics.helicopter import HelicopterParameters, draw_helicopter_flight
+from marsyard.sim.sensor.imu import true_increments
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
@@ -78,6 +84,51 @@ def test_attitude_error_without_drift_is_below_0_15_deg() -> None:
     """A random walk of 0.07 deg/sqrt(h) over 40 min with known ends has 0.03 deg rms at the middle; bound: 5 sigma."""
     run = make_ivanpah_run(drift={"change_k": 0.0})
     assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
+
+
+def test_gyros_at_rest_measure_the_rotation_of_the_earth() -> None:
+    """A sidereal day has 86,164.1 s; at 35 deg of latitude the horizontal component points north."""
+    earth = EarthRotation.at_latitude(35.0)
+    resting = InertialTrajectory(Resting(np.zeros(3), Rotation.from_euler("z", 90.0, degrees=True), 9.8), earth)
+    angles, _ = true_increments(resting, np.linspace(0.0, 3600.0, 11))
+    degrees_per_hour = np.degrees(angles.sum(axis=0))
+    assert np.linalg.norm(degrees_per_hour) == pytest.approx(360.0 * 3600.0 / 86164.1, rel=1e-4)
+    # x of the body points north, z up
+    assert degrees_per_hour == pytest.approx(15.041 * np.array([0.819, 0.0, 0.574]), abs=0.01)
+
+
+def test_attitudes_would_be_wrong_without_the_rotation_of_the_earth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The axes turn by 10 deg between the passes over the targets.
+
+    A constant bias can represent this rotation only on a platform that does not turn with the helicopter.
+    """
+    rotating = {"turns_with_flight": True}
+    run = make_ivanpah_run(drift={"change_k": 0.0}, helicopter=rotating)
+    assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
+    to_inertial = EarthRotation.to_inertial
+    monkeypatch.setattr(EarthRotation, "to_inertial", lambda self, times: to_inertial(self, 0.0 * times))
+    monkeypatch.setattr(
+        InertialTrajectory,
+        "motion",
+        lambda self, times: replace(
+            (motion := self.trajectory.motion(times)), attitudes=to_inertial(self.earth, times) * motion.attitudes
+        ),
+    )
+    run = make_ivanpah_run(drift={"change_k": 0.0}, helicopter=rotating)
+    assert np.abs(compute_attitude_errors_deg(run)).max() > 0.3
+
+
+def test_camera_looks_up_to_45_deg_off_nadir() -> None:
+    maxima = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        flight = draw_helicopter_flight(HelicopterParameters(), np.zeros(3), 0.3, 9.8, rng)
+        times = np.concatenate([np.arange(leg.start_s, leg.end_s, 0.5) for leg in flight.passes])
+        axes = flight.motion(times).attitudes.apply(np.array([0.0, 0.0, -1.0]))
+        maxima.append(float(np.degrees(np.arccos(-axes[:, 2])).max()))
+    # residual motion of the platform: 0.2 deg
+    assert max(maxima) == pytest.approx(45.0, abs=1.5)
+    assert min(maxima) > 30.0
 
 
 def test_fit_removes_a_constant_bias() -> None:
