@@ -44,6 +44,7 @@ def draw_exact_parameters(number: int, camera: str) -> RoverScenarioParameters:
         settings
         | NO_ERRORS
         # error-free visual odometry measures the slip; it takes no time, so that the sun moves as in the campaign
+        | {"navigation": settings["navigation"] | {"odometry": "oracle-motion"}}
         | {"legs": [leg | {"visual_odometry": True}], "timing": settings["timing"] | {"visual_odometry_s": 0.0}}
         | {"camera": settings["camera"] | {"detector_noise": False}}
     )

@@ -35,11 +35,10 @@ from marsyard.sim.sensor import (
     ImuParameters,
     RadarParameters,
 )
+from marsyard.sim.sensor.detector import BURST_DN, BURST_PX
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.landforms import Dunes
 
-#: Amplitude of an interference burst, a third of the image's signal, and its length, two delivered rows.
-BURST_DN, BURST_PX = 300.0, 2048.0
 #: Regular dunes of the dune fault.
 REGULAR_DUNES = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regularity=12.0)
 #: Downward speed of the released heat shield relative to the lander, m/s (assumed).

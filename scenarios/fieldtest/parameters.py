@@ -16,6 +16,7 @@ from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.render import CloudParameters
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import DetectorChoice, preset
+from marsyard.sim.sensor.detector import BURST_DN, BURST_PX, BurstParameters, DetectorParameters
 from marsyard.sim.sensor.imu import ImuParameters
 from marsyard.sim.sensor.instrument import ClockParameters
 from marsyard.sim.sensor.satellite_navigation import POST_PROCESSED, GpsParameters
@@ -39,6 +40,9 @@ class RunParameters(Parameters):
     same_direction: Annotated[Count, Field(description="triples at three altitudes, one flight direction")] = 0
     opposite_direction: Annotated[Count, Field(description="triples at three altitudes, both directions")] = 0
     clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the site")] = None
+    cable_bursts: Annotated[
+        NonNegative, Field(le=1e4, description="mean interference bursts per image, from a faulty camera cable")
+    ] = 0.0
 
     @property
     def triples(self) -> int:
@@ -146,6 +150,14 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
     def site_names(self) -> tuple[str, ...]:
         """Names of the runs' sites without duplicates; their indices are those of the shared terrains."""
         return tuple(dict.fromkeys(run.site for run in self.runs))
+
+    def run_detector(self, number: int) -> DetectorParameters:
+        """Return the parameters of the detector in a run: with its interference bursts on the cable."""
+        bursts = self.runs[number].cable_bursts
+        if not bursts:
+            return self.detector
+        interference = BurstParameters(bursts=bursts, length_px=BURST_PX, amplitude_dn=BURST_DN)
+        return self.detector.model_copy(update={"bursts": interference})
 
     def terrain(self, site_name: str) -> TerrainParameters:
         """Parameters of a site's terrain."""

@@ -86,7 +86,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         case = Case(run, triple, (first, second, third))
         # the same detector takes the images of all cases
         response = Streams(streams.seed, streams.campaign, 0).generator("detector response")
-        detector = Detector.draw(camera_optics(field_camera()).fall_off, p.detector, response)
+        detector = Detector.draw(camera_optics(field_camera()).fall_off, p.run_detector(number), response)
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
         exposures = [take_image(run, scene, ground, state, detector, noise) for state in case.states]
         images = [counts for counts, _ in exposures]

@@ -43,6 +43,10 @@ class DefectParameters(Parameters):
     listed: Annotated[bool, Field(description="whether the camera has a list of them and interpolates them")] = False
 
 
+#: Amplitude of an interference burst, a third of the image's signal, and its length, two delivered rows.
+BURST_DN, BURST_PX = 300.0, 2048.0
+
+
 class BurstParameters(Parameters):
     """Bursts of noise on the cable during the readout; none by default."""
 

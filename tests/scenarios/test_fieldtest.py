@@ -131,6 +131,15 @@ def test_camera_looks_up_to_45_deg_off_nadir() -> None:
     assert min(maxima) > 30.0
 
 
+def test_lost_runs_have_bursts_of_noise() -> None:
+    parameters = tomllib.loads(CATALOGUE.with_name("dimes-fieldtest-noise.toml").read_text(encoding="utf-8"))
+    lost = FieldTestParameters.model_validate(parameters["parameters"])
+    assert [run.name for run in lost.runs] == ["Pisgah Run 1", "Kelso Run 1", "Ivanpah Run 1", "Ivanpah Run 2"]
+    assert all(lost.run_detector(number).bursts.bursts == 10.0 for number in range(4))
+    flown = make_parameters()
+    assert flown.run_detector(0) == flown.detector
+
+
 def test_fit_removes_a_constant_bias() -> None:
     run = make_ivanpah_run(drift={"change_k": 0.0}, imu={**IMU, "gyro_bias_deg_h": 5.0})
     assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
