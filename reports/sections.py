@@ -78,13 +78,13 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
         lowest = min(verdict.lower, verdict.probability)
         # the scale starts below the lower bound and the required rate, and ends at 100 %
         start = max(0.0, lowest - 0.25 * (1.0 - lowest))
-        rates = {"estimate": verdict.estimate, "asked": verdict.probability}
+        rates = {"estimate": verdict.estimate, "required": verdict.probability}
         rates |= {"lower": verdict.lower, "upper": verdict.upper}
         scale = 100.0 / max(1.0 - start, 1e-12)
         strip = {"left": f"{100.0 * start:.3g} %"} | {name: scale * (rate - start) for name, rate in rates.items()}
     return {
         "verdict": verdict,
-        "asked": requirement_text(verdict),
+        "requirement": requirement_text(verdict),
         "evidence": [count(verdict.n, "case"), f"{verdict.failures:,} failed"],
         "bounds": bounds_text,
         "risk": "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}",
@@ -316,7 +316,7 @@ def explorer_data(run: StoredRun, metric: str, bound: float | None, with_images:
         "cases": [int(case) for case in cases],
         "outcomes": [str(outcome) for outcome in distinct_outcomes],
         "outcome": [distinct_outcomes.index(outcome) for outcome in outcomes],
-        "pictured": sorted(int(case) for case in with_images),
+        "with_images": sorted(int(case) for case in with_images),
         "replay": replay_command(run, "CASE"),
         "shown": len(points),
         "all": len(run.all_cases),

@@ -203,7 +203,7 @@ class MastImage:
 
 @dataclass(frozen=True)
 class StereoMeasurement:
-    """A stereo pair of the rover's navigation, taken at one stop.
+    """A stereo pair of the rover's navigation cameras, taken at one stop.
 
     - left, right: counts of both images
     - cameras: calibrated models of the left and the right camera in the rover frame, at the measured mast angles

@@ -136,7 +136,7 @@ class ClusteredEvidence:
 def clustered_evidence(
     success: Bool[np.ndarray, " n"], terrain: Int[np.ndarray, " n"], confidence: float
 ) -> ClusteredEvidence:
-    """Compute bounds of a success rate, each at `confidence`, for at least one case; `terrain`: number of its terrain.
+    """Compute one-sided bounds of a success rate, each at `confidence`; `terrain`: terrain number of each case.
 
     For few terrains with failures or with successes, terrains are counted instead of cases. Otherwise the bounds are
     those of Clopper and Pearson with the effective sample size of Korn & Graubard 1998, limited to n.

@@ -7,7 +7,7 @@
   const plot = root.querySelector(".explorer-plot"), tip = root.querySelector(".explorer-tip");
   const detail = root.querySelector(".explorer-detail"), number = root.querySelector("input");
   const [xs, ys] = root.querySelectorAll("select");
-  const pictured = new Set(data.pictured);
+  const withImages = new Set(data.with_images);
   const known = (v) => v !== null && v !== undefined;
   const text = (v) => (known(v) ? String(v).replace("-", "\u2212") : "\u2013");
   const make = (parent, name, attributes, content) => {
@@ -118,7 +118,7 @@
     detail.appendChild(list);
     const command = line(detail, "p", "Run it again: ");
     line(command, "code", data.replay.replace(/CASE$/, data.cases[k]));
-    if (pictured.has(data.cases[k])) {
+    if (withImages.has(data.cases[k])) {
       const link = line(line(detail, "p", ""), "a", "Images of the case");
       link.href = `#case-${data.cases[k]}`;
     }

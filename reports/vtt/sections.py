@@ -40,15 +40,15 @@ def table_1_section(subject: Subject) -> Section | None:
     if not accuracy:
         return None
     computed = {row.name: row for row in table_1()}
-    pairs = [(source, row[name]) for name in PRINTED for source, row in (("printed", PRINTED), ("computed", computed))]
+    pairs = [(source, row[name]) for name in PRINTED for source, row in (("paper", PRINTED), ("computed", computed))]
     grid = build_grid(
         pairs,
         {
             "Camera": lambda pair: pair[1].name,
             "": lambda pair: pair[0],
-            "Designation (cm)": lambda pair: f"{pair[1].designation_cm:g}",
-            "Error at the goal without tracking (cm)": lambda pair: f"{pair[1].untracked_cm:.1f}",
-            "Approach with a drift of N px (cm)": lambda pair: pair[1].tracked_formula,
+            "3 sigma at the designation (cm)": lambda pair: f"{pair[1].designation_cm:g}",
+            "3 sigma at the goal without tracking (cm)": lambda pair: f"{pair[1].untracked_cm:.1f}",
+            "3 sigma at the goal with tracking, drift N px (cm)": lambda pair: pair[1].tracked_formula,
         },
     )
     measured_note = note_text("vtt.table_1_measured", start=f"{START_M:g}", goal=f"{GOAL_M:g}")
@@ -61,7 +61,9 @@ def table_1_section(subject: Subject) -> Section | None:
         "printed": {name: asdict(row) for name, row in PRINTED.items()},
         "measured": accuracy,
     }
-    return Section("table-1", "Table I", "Table I: accuracy of a target's position", blocks, data)
+    return Section(
+        "table-1", "Position accuracy", "Accuracy of a target's position (Table I of the paper)", blocks, data
+    )
 
 
 def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
@@ -94,7 +96,13 @@ def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
 
 
 def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
-    head = ["Camera", "Runs", "Designation (cm)", "Paper: designation (cm)", "Disparity error, 1 sigma (px)"]
+    head = [
+        "Camera",
+        "Runs",
+        "3 sigma at the designation (cm)",
+        "Paper: designation (cm)",
+        "Disparity error, 1 sigma (px)",
+    ]
     head += ["Without tracking (cm)", "Paper (cm)", "With tracking (cm)", "Paper's formula (cm)"]
     rows = []
     for row in accuracy:
@@ -173,7 +181,7 @@ def updates_section(subject: Subject) -> Section | None:
     note = note_text("vtt.updates")
     blocks, title = [Block(grid=grid, note=note)], "All updates"
     if subject.run.name == CHECKOUT_1:
-        title = "Table III: the first checkout's updates"
+        title = "Updates of the first checkout (Table III of the paper)"
         comparison_rows = []
         for heading, suffix, digits in QUANTITIES:
             printed = PAPER["table_3"].get(suffix)
@@ -326,8 +334,8 @@ def terrains_section(subject: Subject) -> Section | None:
     head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{format_fraction(CONFIDENCE)} interval"]
     head += ["Cause, ours", "Failures, all targets", "Maximum slip"]
     note = note_text("vtt.table_2", limit=f"{EXCESSIVE_DEG:g}")
-    title = "Table II: tracking with visual odometry on four kinds of ground"
-    return Section("table-2", "Table II", title, [Block(grid=Grid(head, rows), note=note)], {"terrains": data})
+    title = "Tracking with visual odometry on four kinds of ground (Table II of the paper)"
+    return Section("table-2", "Kinds of ground", title, [Block(grid=Grid(head, rows), note=note)], {"terrains": data})
 
 
 def failure_cause(row: pd.Series) -> str:

@@ -64,9 +64,13 @@ class Faults(SizedFaults):
         NonNegative, Field(le=2000.0, description="radar locked on the heat shield at this range in image 1; 0: none")
     ] = 0.0
     altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0
-    altitude_error_once: Annotated[NonNegative, Field(le=0.9, description="added, second altitude only")] = 0.0
+    altitude_error_once: Annotated[
+        NonNegative, Field(le=0.9, description="additional relative error of the second altitude")
+    ] = 0.0
     attitude_error_deg: Annotated[NonNegative, Field(le=90.0, description="tilt error of all attitudes")] = 0.0
-    attitude_error_once_deg: Annotated[NonNegative, Field(le=90.0, description="added, second attitude only")] = 0.0
+    attitude_error_once_deg: Annotated[
+        NonNegative, Field(le=90.0, description="additional tilt error of the second attitude")
+    ] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Return the detector parameters that the faults change, including interference bursts on the camera cable."""
@@ -238,7 +242,9 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     sun: SunParameters = SunParameters()
     dust_opacity: DustOpacity = None
     descent: SwingParameters = SwingParameters()
-    pictures: Annotated[int, bounded_field(2, 100, "number, every descent.interval_s; streams use all")] = TRIPLE_SIZE
+    pictures: Annotated[int, bounded_field(2, 100, "number of images; only stream estimators use more than three")] = (
+        TRIPLE_SIZE
+    )
     #: Default: the last image and two earlier ones, at the longest possible equal intervals.
     triple: Annotated[tuple[int, int, int] | None, Field(description="image numbers of the triple, from 1")] = None
     flight: Annotated[Flight | None, Field(description="recorded flight or custom motion")] = None
@@ -258,7 +264,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     exact_instruments: Annotated[
         bool,
         Field(
-            description="true attitudes, altitudes, times and camera for estimators; shows the error from the images"
+            description="estimators receive true attitudes, altitudes, times, camera; shows the error from the images"
         ),
     ] = False
     landing: LandingParameters = LandingParameters()

@@ -197,24 +197,24 @@ def test_hanging_program_is_terminated(tmp_path: Path) -> None:
 def test_tracker_inputs_round_trip(tmp_path: Path) -> None:
     mast = trackers.mast()
     write_mast(tmp_path, mast)
-    camera_pair = read_mast(tmp_path)
-    assert camera_pair.geometry.azimuth_limits_rad == mast.geometry.azimuth_limits_rad
-    np.testing.assert_array_equal(camera_pair.geometry.head_m, mast.geometry.head_m)
-    for reference, actual in ((mast.left, camera_pair.left), (mast.right, camera_pair.right)):
+    restored_mast = read_mast(tmp_path)
+    assert restored_mast.geometry.azimuth_limits_rad == mast.geometry.azimuth_limits_rad
+    np.testing.assert_array_equal(restored_mast.geometry.head_m, mast.geometry.head_m)
+    for reference, actual in ((mast.left, restored_mast.left), (mast.right, restored_mast.right)):
         np.testing.assert_array_equal(reference.h, actual.h)
         assert reference.size == actual.size
-    aim = VisualTargetTracker(VttOptions())
-    aim.designate(trackers.designation(), trackers.pose(0.0))
-    reported = aim.aim(trackers.pose(0.0), mast)
+    tracker = VisualTargetTracker(VttOptions())
+    tracker.designate(trackers.designation(), trackers.pose(0.0))
+    reported = tracker.aim(trackers.pose(0.0), mast)
     assert reported is not None
     rotated = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, -0.2, 0.3]))
     stop = replace(trackers.take_images(reported, trackers.pose(0.0)), world_from_rover=rotated)
     write_stop(tmp_path, stop)
-    back = read_stop(tmp_path, camera_pair)
-    np.testing.assert_array_equal(back.left.counts, stop.left.counts)
-    assert (back.left.corner, back.right.corner) == (stop.left.corner, stop.right.corner)
-    assert (back.azimuth_rad, back.elevation_rad) == (stop.azimuth_rad, stop.elevation_rad)
-    np.testing.assert_allclose(back.world_from_rover.as_matrix(), rotated.as_matrix(), atol=1e-15)
+    restored_stop = read_stop(tmp_path, restored_mast)
+    np.testing.assert_array_equal(restored_stop.left.counts, stop.left.counts)
+    assert (restored_stop.left.corner, restored_stop.right.corner) == (stop.left.corner, stop.right.corner)
+    assert (restored_stop.azimuth_rad, restored_stop.elevation_rad) == (stop.azimuth_rad, stop.elevation_rad)
+    np.testing.assert_allclose(restored_stop.world_from_rover.as_matrix(), rotated.as_matrix(), atol=1e-15)
     assert "true" not in (tmp_path / "stop.json").read_text()
     for path in ("mast.json", "stop.json"):
         (tmp_path / path).write_text("{}")

@@ -37,7 +37,7 @@ def test_explorer_data_contain_labels_outcomes_and_values(make_rows: Rows, make_
         "east velocity error (m/s)",
         "north velocity error (m/s)",
     ]
-    assert (data["cases"], data["pictured"], data["shown"], data["all"]) == (list(range(30)), [3], 30, 30)
+    assert (data["cases"], data["with_images"], data["shown"], data["all"]) == (list(range(30)), [3], 30, 30)
     assert data["outcomes"][data["outcome"][29]] == "CRASHED"
     assert data["columns"][data["metric"]][29] is None
     first_error = frame[METRIC].iloc[0]

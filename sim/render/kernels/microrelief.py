@@ -10,8 +10,10 @@ from numba import njit
 from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.terrain.kernels import Array
 
-#: As `marsyard.sim.render.kernels.photometry.FADING`, for slopes with a median frequency of 0.61 cycles per cell.
+#: Coefficient of the loss of contrast with (footprint / cell)^2, as in `marsyard.sim.render.kernels.photometry`, for
+#: slopes with a median frequency of 0.61 cycles per cell.
 FADING = 0.306
+#: Octaves with smaller cells, in footprints, are not resolved at all.
 MIN_CELLS = math.sqrt(FADING)
 #: Mean squares of `relief_noise` and of its derivative along one axis.
 HEIGHT_VARIANCE, SLOPE_VARIANCE = 0.0464, 0.3886
@@ -52,9 +54,9 @@ def relief_noise(x: float, y: float, seed: int) -> tuple[float, float, float]:
     difference_y = cx * x + cy * (y - 1.0) - a
     twist = dx * (x - 1.0) + dy * (y - 1.0) - a - difference_x - difference_y
     value = a + u * difference_x + v * difference_y + u * v * twist
-    by_x = ax + u * (bx - ax) + v * (cx - ax) + u * v * (ax - bx - cx + dx) + du * (difference_x + v * twist)
-    by_y = ay + u * (by - ay) + v * (cy - ay) + u * v * (ay - by - cy + dy) + dv * (difference_y + u * twist)
-    return value, by_x, by_y
+    d_dx = ax + u * (bx - ax) + v * (cx - ax) + u * v * (ax - bx - cx + dx) + du * (difference_x + v * twist)
+    d_dy = ay + u * (by - ay) + v * (cy - ay) + u * v * (ay - by - cy + dy) + dv * (difference_y + u * twist)
+    return value, d_dx, d_dy
 
 
 @njit(cache=True, error_model="numpy")
@@ -90,9 +92,9 @@ def add_relief_slopes(
                 ratio = footprint[k] / cell
                 fade = max(1.0 - FADING * ratio * ratio, 0.0)
                 fade *= fade
-                _value, by_x, by_y = relief_noise(x[k] / cell, y[k] / cell, octave)
-                slope_x[k] += gain * fade * by_x
-                slope_y[k] += gain * fade * by_y
+                _value, d_dx, d_dy = relief_noise(x[k] / cell, y[k] / cell, octave)
+                slope_x[k] += gain * fade * d_dx
+                slope_y[k] += gain * fade * d_dy
                 resolved[k] += variance * fade * fade
                 unresolved[k] += variance * (1.0 - fade * fade)
         cell *= 0.5

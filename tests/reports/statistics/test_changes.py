@@ -80,7 +80,7 @@ def test_large_counts_agree_with_the_exact_test() -> None:
     )
 
 
-def test_different_fractions_of_terrains_are_not_a_change() -> None:
+def test_different_mix_of_terrains_is_not_a_change() -> None:
     # terrain 1 is difficult and has more cases in the new campaign: pooled rates change
     rng = np.random.default_rng(2)
 
@@ -103,7 +103,7 @@ def test_different_fractions_of_terrains_are_not_a_change() -> None:
 
 @pytest.mark.parametrize("is_rate", [True, False])
 def test_correlated_cases_are_compared_by_terrain(is_rate: bool) -> None:
-    # each campaign has new terrains with correlated cases: independent cases would give many false alarms
+    # each campaign has new terrains with correlated cases: treating them as independent would give many false alarms
     rng = np.random.default_rng(3)
 
     def draw_campaign(first: int) -> Sample:

@@ -30,10 +30,10 @@ from tests.reports.vtt.tracking_rows import make_rows, make_subject, read_table,
 def test_table_1_agrees_with_the_printed_digits() -> None:
     table_rows = read_table(table_1_section(make_subject(make_rows(4))))
     for printed_row, computed_row in (table_rows[:2], table_rows[2:]):
-        assert (printed_row.pop(""), computed_row.pop("")) == ("printed", "computed")
+        assert (printed_row.pop(""), computed_row.pop("")) == ("paper", "computed")
         assert computed_row == printed_row
-    assert table_rows[0]["Designation (cm)"] == "9.7"
-    assert table_rows[2]["Error at the goal without tracking (cm)"] == "42.0"
+    assert table_rows[0]["3 sigma at the designation (cm)"] == "9.7"
+    assert table_rows[2]["3 sigma at the goal without tracking (cm)"] == "42.0"
 
 
 def test_measured_accuracy_is_3_sigma_per_camera() -> None:

@@ -28,7 +28,7 @@ def _fields_of_view_deg(name: str) -> tuple[float, float]:
         ("mer-descent-flown", 45.0, 45.0, 1.0),
         ("mer-descent-field", 45.0, 45.0, 1.0),
         ("mer-navcam", 45.0, 45.0, 1.0),
-        # 1024 pixels of 12 um behind 5.58 mm are 126 deg for an equidistant lens.
+        # 1024 pixels of 12 um, focal length 5.58 mm: 126 deg for an equidistant lens.
         ("mer-hazcam", 124.0, 124.0, 3.0),
         # The fields of view of the tracking paper are those of 4.8 mm x 3.6 mm; the preset has pixels of 4.65 um.
         ("research-navcam", 49.0, 37.0, 6.0),
@@ -40,7 +40,7 @@ def test_presets_have_the_specified_fields_of_view(name: str, h_deg: float, v_de
 
 
 def test_helicopter_camera_has_lens_distortion() -> None:
-    """640 x 480 pixels of 7.4 um behind 6 mm, CAHVOR: the distortion at the corners is 1.8 % of 400 px."""
+    """640 x 480 pixels of 7.4 um, focal length 6 mm, CAHVOR: the distortion at the corners is 1.8 % of 400 px."""
     camera = preset("xc-55").cameras()[0]
     assert isinstance(camera, Cahvor)
     ideal = Cahv.from_focal_length(
@@ -71,7 +71,7 @@ def test_stereo_presets_have_the_specified_baseline(name: str, baseline_m: float
 
 
 def test_pancam_has_toe_in() -> None:
-    """2 deg between the cameras are 120 of the 516 px of disparity at 2 m."""
+    """The toe-in of 2 deg reduces the disparity at 2 m, 516 px, by 120 px."""
     left, right = preset("research-pancam").cameras()
     point = np.array([2.0, 0.0, 0.0])
     disparity = left.project(point)[0][0] - right.project(point)[0][0]

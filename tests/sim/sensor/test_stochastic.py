@@ -18,7 +18,7 @@ def test_process_is_stationary_from_the_start() -> None:
         assert np.corrcoef(early[0, channels], later[0, channels])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.08)
 
 
-def test_process_is_defined_only_within_its_samples() -> None:
+def test_process_rejects_times_outside_its_span() -> None:
     process = GaussMarkov.draw(np.ones(3), 100.0, (0.0, 10.0), np.random.default_rng(0))
     with pytest.raises(ValueError, match=r"outside the drawn errors, 0\.000 s"):
         process.at(np.array([-1.0]))
