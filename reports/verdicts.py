@@ -33,6 +33,8 @@ from marsyard.reports.statistics.proportions import (
 )
 from marsyard.reports.wording import count, format_fraction, percent
 
+#: Beginning of the statement of a requirement whose population the flight system cannot know.
+GIVEN_TRUTH = "Given truth"
 #: Value of a requirement's `decide_by`: compare the observed rate with the required probability.
 ESTIMATE = "estimate"
 
@@ -290,7 +292,7 @@ def evaluate_requirements(
         verdict = _evaluate(frame, requirement, sampling)
         names = [name for name in verdict.population.split(" and ") if name in from_truth]
         if names:
-            title = f"Given truth ({', '.join(name.replace('_', ' ') for name in names)}): "
+            title = f"{GIVEN_TRUTH} ({', '.join(name.replace('_', ' ') for name in names)}): "
             verdict = replace(verdict, statement=f"{title}{verdict.statement}")
         verdicts.append(replace(verdict, all_cases=_evaluate_all_cases(frame, verdict, requirement, sampling)))
     return verdicts

@@ -17,7 +17,7 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.reports.campaign import REPORT_JSON, SCHEMA, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.traceability import Algorithm, format_tested_algorithms, tested_algorithms
-from marsyard.reports.verdicts import ESTIMATE
+from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH
 from marsyard.reports.wording import NOTHING, percent
 from marsyard.scenarios.systems import find_system
 
@@ -256,7 +256,8 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
         requirement, kind, source = shared.get(name), "", ""
         statement = latest[0].verdict.statement if latest else ""
         if requirement:
-            statement, kind, source = requirement.statement, requirement.kind or "", requirement.source
+            statement = statement if statement.startswith(GIVEN_TRUTH) else requirement.statement
+            kind, source = requirement.kind or "", requirement.source
         rows.append(RequirementRow(name, statement, kind, source, latest, sorted_cells, sparkline(history[::-1])))
     return rows
 

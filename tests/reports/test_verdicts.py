@@ -442,3 +442,18 @@ def test_crashed_cases_are_counted_in_the_summary(make_rows: Rows) -> None:
     summary = combine_verdicts([], make_rows(24, crashed=2))
     assert summary.crashed == 2
     assert "2 cases crashed" in summary.sentence
+
+
+def test_subset_is_shown_next_to_all_cases_and_named_if_only_truth_defines_it(velocity: dict[str, Any]) -> None:
+    frame = _make_rows(20, 2)
+    frame["lit"] = np.arange(20) >= 10
+    requirement = {**velocity, "population": "lit", "statement": "The error is small."}
+    (verdict,) = evaluate_requirements(frame, [requirement], from_truth=("lit",))
+    assert verdict.statement == "Given truth (lit): The error is small."
+    assert verdict.all_cases is not None
+    assert (verdict.n, verdict.all_cases.n, verdict.all_cases.failures) == (10, 20, 2)
+    assert f"Over all cases: 2 of 20 failed (90.00 %), {verdict.all_cases.status}." in verdict.note
+    (known,) = evaluate_requirements(frame, [requirement])
+    assert known.statement == "The error is small."
+    (everything,) = evaluate_requirements(frame, [{**requirement, "population": "all"}], from_truth=("lit",))
+    assert (everything.all_cases, everything.statement) == (None, "The error is small.")
