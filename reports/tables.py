@@ -120,13 +120,20 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
     return [*rows, ["maximum magnitude", *(number(s.largest) for s in summaries)]]
 
 
-def confirmations_grid(entries: Sequence[Confirmation]) -> Grid:
-    """Create a table of confirmations; `of` counts those of the algorithm on the campaign up to each."""
-    rows, counts = [], Counter[tuple[str, str]]()
+def confirmations_table(entries: Sequence[Confirmation]) -> Table:
+    """Create a table of confirmations for terminals; numbers count those of an algorithm on a campaign."""
+    table = Table(title="Confirmations", box=box.SIMPLE_HEAD, title_justify="left")
+    for heading in ("Campaign", "Algorithm"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("Number", "Date", "Cases"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("Results", min_width=14)
+    counts = Counter[tuple[str, str]]()
     for entry in entries:
         key = (entry.campaign, entry.frozen.algorithm)
         counts[key] += 1
-        results = "not finished" if entry.results is None else ", ".join(f"{k}: {v}" for k, v in entry.results.items())
-        date = entry.started_utc[:10]
-        rows.append([*key, str(counts[key]), str(entry.seed), date, str(entry.cases), results or "no requirement"])
-    return Grid(["Campaign", "Algorithm", "Confirmation", "Seed", "Date", "Cases", "Results"], rows)
+        results = "not finished"
+        if entry.results is not None:
+            results = "\n".join(f"{name}: {status}" for name, status in entry.results.items()) or "no requirement"
+        table.add_row(*map(Text, (*key, str(counts[key]), entry.started_utc[:10], str(entry.cases), results)))
+    return table

@@ -69,8 +69,7 @@ def confirmations(
     """List the confirmations of algorithms with their results, from the record of `run --confirm`."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.confirmations import read_confirmations
-    from marsyard.cli.showing import grid_table
-    from marsyard.reports.tables import confirmations_grid
+    from marsyard.reports.tables import confirmations_table
 
     if not file.is_file():
         raise CampaignError(f"{file}: no such file; `marsyard run CAMPAIGN --confirm` creates it")
@@ -78,7 +77,7 @@ def confirmations(
     if as_json:
         typer.echo(json.dumps([asdict(entry) for entry in entries], indent=2))
     else:
-        console().print(grid_table("Confirmations", confirmations_grid(entries)))
+        console().print(confirmations_table(entries))
 
 
 @handle_user_errors
