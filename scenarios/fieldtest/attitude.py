@@ -23,20 +23,17 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.fieldtest.parameters import DriftParameters, TargetParameters
-from marsyard.sim.camera import CameraModel
+from marsyard.scenarios.fieldtest.parameters import DriftParameters
+from marsyard.scenarios.fieldtest.targets import Sightings
 from marsyard.sim.dynamics import Motion, Trajectory
 from marsyard.sim.dynamics.helicopter import HelicopterFlight
 from marsyard.sim.sensor.imu import DEG_H, ImuIncrements
 from marsyard.sim.sensor.inertial import InertialSolution
-from marsyard.sim.terrain import Surface
 
 #: Rotation rate of the Earth, rad/s (WGS 84).
 EARTH_RATE_RAD_S = 7.292115e-5
 #: Gauss-Newton iterations of attitude and bias.
 _ITERATIONS = 3
-#: Minimum distance of a measured target from the edge of the image, pixels.
-_BORDER_PX = 4.0
 
 
 @dataclass(frozen=True)
@@ -79,74 +76,6 @@ class InertialTrajectory(Trajectory):
         return replace(motion, attitudes=attitudes, body_rates_rad_s=rates)
 
 
-@dataclass(frozen=True)
-class Targets:
-    """True and surveyed positions of the targets, world axes, metres."""
-
-    true_m: Float64[np.ndarray, "targets 3"]
-    surveyed_m: Float64[np.ndarray, "targets 3"]
-
-    @classmethod
-    def draw(
-        cls, p: TargetParameters, surface: Surface, centre_m: Float64[np.ndarray, "2"], rng: np.random.Generator
-    ) -> Targets:
-        """Draw targets on the ground around a position; the first `used` of them are used."""
-        points = centre_m + rng.uniform(-p.within_m, p.within_m, (p.placed, 2))[: p.used]
-        true = np.column_stack([points, surface.height(points[:, 0], points[:, 1])])
-        return cls(true, true + p.survey_m * rng.standard_normal(true.shape))
-
-
-@dataclass(frozen=True)
-class Sightings:
-    """Target directions measured in the images of a pass: one row per target and image.
-
-    - times_s: time tag of the image
-    - camera: unit vector to the target in body axes, from its centroid in the image
-    - world: unit vector to the target in inertial axes, from the survey and the helicopter's GPS position
-    """
-
-    times_s: Float64[np.ndarray, "n"]
-    camera: Float64[np.ndarray, "n 3"]
-    world: Float64[np.ndarray, "n 3"]
-
-
-def sight_targets(
-    targets: Targets,
-    camera: CameraModel,
-    motion: Motion,
-    tags_s: Float64[np.ndarray, "images"],
-    gps_m: Float64[np.ndarray, "images 3"],
-    centroid_px: float,
-    earth: EarthRotation,
-    rng: np.random.Generator,
-) -> Sightings:
-    """Project the targets into the images of a pass and add centroid errors; these images are not rendered.
-
-    - camera: the camera in the body frame, at its origin
-    - motion: true motion at the exposures
-    - tags_s, gps_m: time tags of the images and measured positions of the camera
-    - centroid_px: standard deviation of a centroid per axis
-    - earth: rotation that maps directions at the time tags to inertial axes
-    """
-    columns, rows = camera.size
-    times, camera_directions, world_directions = [], [], []
-    for index, (attitude, position) in enumerate(zip(motion.attitudes, motion.positions_m, strict=True)):
-        pixels, visible = camera.project(attitude.inv().apply(targets.true_m - position))
-        centroids = pixels + centroid_px * rng.standard_normal(pixels.shape)
-        is_inside = (centroids >= _BORDER_PX) & (centroids <= np.array([columns, rows]) - 1.0 - _BORDER_PX)
-        is_measured = visible & is_inside.all(axis=1)
-        camera_directions.append(camera.rays(centroids[is_measured])[1])
-        surveyed = _normalize(targets.surveyed_m[is_measured] - gps_m[index])
-        world_directions.append(earth.to_inertial(tags_s[index : index + 1]).apply(surveyed))
-        times.append(np.full(int(is_measured.sum()), tags_s[index]))
-    camera_vectors = _normalize(np.concatenate(camera_directions))
-    return Sightings(np.concatenate(times), camera_vectors, np.concatenate(world_directions))
-
-
-def _normalize(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
-
-
 def add_thermal_drift(
     increments: ImuIncrements, p: DriftParameters, flight: HelicopterFlight, start_s: float
 ) -> ImuIncrements:
@@ -182,12 +111,12 @@ def solve_attitude(
     - earth: rotation that maps the attitudes from inertial axes to world axes
     """
     times = np.concatenate([first.times_s, second.times_s])
-    camera, world = np.concatenate([first.camera, second.camera]), np.concatenate([first.world, second.world])
+    camera = np.concatenate([first.camera, second.camera])
+    world = earth.to_inertial(times).apply(np.concatenate([first.world, second.world]))
     bias = np.zeros(3)
     # attitude at the start of the flight
-    start, _ = Rotation.align_vectors(
-        first.world, _propagate(increments, bias).attitude(first.times_s).apply(first.camera)
-    )
+    sighted = _propagate(increments, bias).attitude(first.times_s).apply(first.camera)
+    start, _ = Rotation.align_vectors(world[: len(sighted)], sighted)
     for _ in range(_ITERATIONS):
         propagated = _propagate(increments, bias)
         predicted = (start * propagated.attitude(times)).apply(camera)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import AwareDatetime, Field, model_validator
 
@@ -72,7 +72,18 @@ class TargetParameters(Parameters):
     used: Annotated[int, Field(ge=3, le=1000, description="targets used for attitude")] = 9
     within_m: Annotated[Positive, Field(description="half the side length of the targets' square, m (assumed)")] = 90.0
     pictures: Annotated[int, Field(ge=1, le=1000, description="images of a pass over the targets")] = 20
-    centroid_px: Annotated[NonNegative, Field(description="error of a centroid per axis, px (assumed)")] = 0.15
+    side_m: Annotated[Positive, Field(description="side length of a target, m")] = 1.0
+    albedo: Annotated[Positive, Field(le=1.0, description="albedo of the white targets (assumed)")] = 0.8
+    sightings: Annotated[
+        Literal["rendered", "oracle-projection"],
+        Field(description="detected in rendered images, or true pixels with errors of `centroid_px`"),
+    ] = "rendered"
+    centroid_px: Annotated[
+        NonNegative, Field(description="standard deviation of a centroid per axis for the attitude fit, px (assumed)")
+    ] = 0.15
+    prior_deg: Annotated[
+        Positive, Field(le=5.0, description="error of the platform's attitude per axis, deg, before the fit (assumed)")
+    ] = 1.0
     survey_m: Annotated[NonNegative, Field(description="error of the survey per axis, m (assumed)")] = 0.02
 
     @model_validator(mode="after")
@@ -94,7 +105,7 @@ class ElevationParameters(Parameters):
 class PictureParameters(Parameters):
     """Times of the images: the paper takes 20 images in less than 2 min (III.D.2)."""
 
-    interval_s: Annotated[Positive, Field(le=60.0, description="time between images, s (assumed)")] = 3.0
+    interval_s: Annotated[Positive, Field(le=60.0, description="time between images, s (assumed)")] = 2.0
     clock: Annotated[ClockParameters, Field(description="time tag errors (assumed)")] = ClockParameters(
         offset_sd_s=0.0005, jitter_sd_s=0.0005
     )
@@ -109,7 +120,7 @@ class TripleParameters(Parameters):
     max_speed_m_s: Annotated[Positive, Field(description="maximum speed over a virtual interval, as in DIMES")] = 30.0
     overlap_fraction: Annotated[
         Positive, Field(description="maximum distance between two image centres divided by the altitude (assumed)")
-    ] = 0.3
+    ] = 0.35
     min_step_m: Annotated[Positive, Field(description="minimum height step between images, m (assumed)")] = 150.0
     max_step_m: Annotated[Positive, Field(description="maximum height step between images, m (assumed)")] = 390.0
 

@@ -1,15 +1,8 @@
-"""Simulate and process a run of the field test: flight, sun, attitudes, altitudes and triples (paper, III.D and IV).
-
-The sun's direction is computed by the method of low accuracy in Meeus, "Astronomical Algorithms" (1998), chapter 25.
-The error is 0.01 deg in this century. Refraction (0.02 deg at 45 deg of elevation) and parallax (0.002 deg) are
-neglected.
-"""
+"""Simulate and process a run of the field test: flight, attitudes, altitudes and triples (paper, III.D and IV)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -18,43 +11,38 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.fieldtest.attitude import (
-    EarthRotation,
-    InertialTrajectory,
-    Targets,
-    add_thermal_drift,
-    sight_targets,
-    solve_attitude,
+from marsyard.scenarios.base import LoadGround
+from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory, add_thermal_drift, solve_attitude
+from marsyard.scenarios.fieldtest.imaging import (
+    FlownRun,
+    RunKey,
+    build_start_scene,
+    field_camera,
+    run_ground,
+    take_image,
 )
-from marsyard.scenarios.fieldtest.parameters import (
-    CAMERA,
-    ElevationParameters,
-    FieldTestParameters,
-    RunParameters,
-    TripleParameters,
-)
-from marsyard.sim.camera import CameraModel
+from marsyard.scenarios.fieldtest.parameters import ElevationParameters, RunParameters, TripleParameters
+from marsyard.scenarios.fieldtest.targets import Sightings, Targets, detect_targets, project_targets
+from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import Motion
-from marsyard.sim.dynamics.helicopter import HelicopterFlight, draw_helicopter_flight
-from marsyard.sim.frames import direction
-from marsyard.sim.render import CloudLayer
-from marsyard.sim.sensor import preset
+from marsyard.sim.dynamics.helicopter import draw_helicopter_flight
+from marsyard.sim.render import CloudLayer, Objects
 from marsyard.sim.sensor.imu import DEG_H, Imu
 from marsyard.sim.sensor.inertial import InertialSolution
 from marsyard.sim.sensor.instrument import Clock
 from marsyard.sim.sensor.satellite_navigation import Gps
-from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import Surface, TerrainBank, site
-
-_Generators = Callable[[str], np.random.Generator]
+from marsyard.sim.terrain import Surface, site
 
 #: Number of points on the flight line whose mean ground height is the reference of the flight's heights.
 _GROUND_POINTS = 256
 #: Margin of the elevation model around the requested points, posts.
 _MARGIN = 2
-#: Noon of 1 January 2000, and terrestrial time minus universal time in 2002, s.
-_J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
-_TT_MINUS_UT_S = 64.3
+#: Rays along each side of a pixel at the edges of the targets.
+_TARGET_EDGE_RAYS = 4
+#: Minimum number of sightings of a pass.
+_MIN_SIGHTINGS = 3
+#: Spacing of the mesh below the targets, in posts of the terrain.
+_MESH_POSTS = 0.67
 
 
 class Category(StrEnum):
@@ -137,76 +125,20 @@ def _pairwise_distances(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarra
     return np.asarray(np.linalg.norm(points[:, None] - points, axis=-1))
 
 
-def sun_direction(time: datetime, latitude_deg: float, longitude_deg: float) -> Float64[np.ndarray, "3"]:
-    """Compute the unit vector to the sun's centre in the local level frame (east, north, up).
-
-    Latitude is geodetic, longitude positive to the east. Raises ValueError for a time without a time zone.
-    """
-    if time.tzinfo is None:
-        raise ValueError(f"the time {time} has no time zone; it needs one, as in 2002-10-15T12:00-07:00")
-    days = (time - _J2000).total_seconds() / 86400.0
-    t = (days + _TT_MINUS_UT_S / 86400.0) / 36525.0  # Julian centuries since J2000
-    # Meeus 25.2 to 25.8: mean longitude and anomaly, equation of centre, apparent longitude (nutation, aberration)
-    mean_longitude = 280.46646 + 36000.76983 * t + 0.0003032 * t**2
-    anomaly = np.radians(357.52911 + 35999.05029 * t - 0.0001537 * t**2)
-    equation_of_centre = (
-        (1.914602 - 0.004817 * t) * np.sin(anomaly)
-        + (0.019993 - 0.000101 * t) * np.sin(2.0 * anomaly)
-        + 0.000289 * np.sin(3.0 * anomaly)
-    )
-    node = np.radians(125.04 - 1934.136 * t)
-    longitude = np.radians(mean_longitude + equation_of_centre - 0.00569 - 0.00478 * np.sin(node))
-    obliquity = np.radians(23.4392911 - 0.0130042 * t + 0.00256 * np.cos(node))
-    right_ascension = np.arctan2(np.cos(obliquity) * np.sin(longitude), np.cos(longitude))
-    declination = np.arcsin(np.sin(obliquity) * np.sin(longitude))
-    # mean sidereal time at Greenwich (Meeus 12.4); nutation, at most 0.005 deg, is neglected
-    sidereal = np.radians((280.46061837 + 360.98564736629 * days + longitude_deg) % 360.0)
-    hour = sidereal - right_ascension
-    latitude = np.radians(latitude_deg)
-    elevation = np.arcsin(
-        np.sin(latitude) * np.sin(declination) + np.cos(latitude) * np.cos(declination) * np.cos(hour)
-    )
-    east = -np.cos(declination) * np.sin(hour)
-    north = np.sin(declination) * np.cos(latitude) - np.cos(declination) * np.sin(latitude) * np.cos(hour)
-    return direction(float(np.arctan2(east, north)), float(elevation))
-
-
 @dataclass(frozen=True)
-class RunKey:
-    """Inputs that determine a run: the field test, the run's index in it, the campaign's seed and name."""
-
-    field_test: FieldTestParameters
-    number: int
-    seed: int
-    campaign: str
-
-
-@dataclass(frozen=True)
-class Run:
+class Run(FlownRun):
     """A simulated and processed run.
 
-    - clouds: clouds that drift with the flight's time; None for a clear sky
-    - flight: the true motion
     - truth: true motion at the images of the passes
     - images: measurements at the images
     - attitudes: estimated attitudes at the images' time tags
     - triples: triples of the run, one per case
     """
 
-    key: RunKey
-    parameters: RunParameters
-    clouds: CloudLayer | None
-    flight: HelicopterFlight
     truth: Motion
     images: ImageMeasurements
     attitudes: Rotation
     triples: tuple[Triple, ...]
-
-    def sun(self, time_s: float) -> Float64[np.ndarray, "3"]:
-        """Return the unit vector to the sun at a time of the flight, world axes."""
-        p = self.parameters
-        elapsed = timedelta(seconds=time_s - self.flight.passes[0].start_s)
-        return sun_direction(p.begins + elapsed, p.latitude_deg, p.longitude_deg)
 
 
 def survey_ground(
@@ -229,15 +161,11 @@ def survey_ground(
     return RegularGridInterpolator((x, y), ground + error)
 
 
-def simulate_run(key: RunKey) -> Run:
+def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> Run:
     """Simulate and process a run; the result depends only on the key."""
-    p, run = key.field_test, key.field_test.runs[key.number]
-
-    def generator(name: str) -> np.random.Generator:
-        """Create a generator that is the same for all cases of the run."""
-        return Streams(key.seed, key.campaign, 0).generator(f"run {run.name}: {name}")
-
-    surface = TerrainBank(p.terrain(run.site), p.bank_seed).terrain(0)
+    p, run, generator = key.field_test, key.parameters, key.generator
+    ground = run_ground(key, load_ground)
+    surface = ground.surface
     # flight line with random position and azimuth; heights refer to the mean ground below it
     rng = generator("flight")
     centre, azimuth = rng.uniform(0.0, surface.period_m, 2), float(rng.uniform(0.0, 2.0 * np.pi))
@@ -245,6 +173,10 @@ def simulate_run(key: RunKey) -> Run:
     line_heights = surface.height(centre[0] + offsets * np.sin(azimuth), centre[1] + offsets * np.cos(azimuth))
     origin = np.array([*centre, float(line_heights.mean())])
     flight = draw_helicopter_flight(p.helicopter, origin, azimuth, site(run.site).environment.gravity_m_s2, rng)
+    clouds = None
+    if run.clouds is not None:
+        clouds = CloudLayer.draw(run.clouds, generator("clouds"), ground_m=float(flight.origin_m[2]))
+    flown = FlownRun(key, clouds, flight)
     interval = p.pictures.interval_s
     pass_times = [np.arange(leg.start_s + 0.5 * interval, leg.end_s, interval) for leg in flight.passes]
     times = np.concatenate(pass_times)
@@ -252,8 +184,7 @@ def simulate_run(key: RunKey) -> Run:
     clock = Clock.draw(p.pictures.clock, generator("camera clock"))
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
     position = gps.measure(flight, times, generator("gps noise")).values
-    earth = EarthRotation.at_latitude(run.latitude_deg)
-    solution = _estimate_attitudes(p, surface, flight, clock, gps, earth, generator)
+    solution = _estimate_attitudes(flown, ground, clock, gps)
     attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
     elevation_model = survey_ground(p.elevation, surface, horizontal, generator("elevation model"))
@@ -267,12 +198,8 @@ def simulate_run(key: RunKey) -> Run:
         altitude_m=altitude,
         centre_m=horizontal + (altitude / -down[:, 2])[:, None] * down[:, :2],
     )
-    clouds = None
-    if run.clouds is not None:
-        clouds = CloudLayer.draw(run.clouds, generator("clouds"), ground_m=float(flight.origin_m[2]))
     return Run(
         key=key,
-        parameters=run,
         clouds=clouds,
         flight=flight,
         truth=flight.motion(times),
@@ -282,36 +209,57 @@ def simulate_run(key: RunKey) -> Run:
     )
 
 
-def _estimate_attitudes(
-    p: FieldTestParameters,
-    surface: Surface,
-    flight: HelicopterFlight,
-    clock: Clock,
-    gps: Gps,
-    earth: EarthRotation,
-    generator: _Generators,
-) -> InertialSolution:
+def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gps) -> InertialSolution:
     """Simulate both passes over the targets and the gyros, and estimate the attitude over the flight."""
-    camera, noise, sightings = field_camera(), generator("sightings"), []
-    targets = Targets.draw(p.targets, surface, flight.origin_m[:2], generator("targets"))
+    p, flight, generator = run.key.field_test, run.flight, run.key.generator
+    targets = Targets.draw(p.targets, ground.surface, flight.origin_m[:2], generator("targets"))
+    camera, noise, sightings = run.key.calibrated_camera(), generator("sightings"), []
     for start, end in flight.fly_overs_s:
         times = np.linspace(start, end, p.targets.pictures + 2)[1:-1]
         tags = clock.tags(times, noise)
         fixes = gps.measure(flight, times, noise).values
-        motion = flight.motion(times)
-        sightings.append(sight_targets(targets, camera, motion, tags, fixes, p.targets.centroid_px, earth, noise))
+        if p.targets.sightings == "rendered":
+            centroids = photograph_targets(run, ground, targets, times, fixes)
+        else:
+            true_camera = field_camera().bin(columns=1, rows=p.detector.rows_summed)
+            centroids = project_targets(targets, true_camera, flight.motion(times), p.targets.centroid_px, noise)
+        sightings.append(Sightings.of_images(targets, camera, tags, fixes, centroids))
+        if (count := len(sightings[-1].times_s)) < _MIN_SIGHTINGS:
+            raise ValueError(
+                f"{run.parameters.name}: {count} sightings of targets in a pass; the attitude needs {_MIN_SIGHTINGS}"
+            )
+    first, second = sightings
+    earth = EarthRotation.at_latitude(run.parameters.latitude_deg)
     unit = Imu.draw(p.imu, flight.span_s, generator("imu errors"))
     increments = unit.increments(InertialTrajectory(flight, earth), *flight.span_s, generator("imu noise"))
-    centre = np.array(camera.size) / 2.0
-    _, directions = camera.rays(np.stack([centre, centre + np.array([1.0, 0.0])]))
-    pixel_rad = float(np.linalg.norm(directions[1] - directions[0]))
-    # the larger of a centroid's error and the remaining GPS error, as angles
-    sd = max(p.targets.centroid_px * pixel_rad, p.gps.horizontal_wander_m / p.helicopter.fly_over_m)
     increments = add_thermal_drift(increments, p.drift, flight, flight.span_s[0])
-    return solve_attitude(increments, sightings[0], sightings[1], sd, p.imu.gyro_bias_deg_h * DEG_H, earth)
+    # the larger of a centroid's error and the remaining GPS error, as angles
+    pixel_rad = 1.0 / camera.focal_lengths[0]
+    sd = max(p.targets.centroid_px * pixel_rad, p.gps.horizontal_wander_m / p.helicopter.fly_over_m)
+    return solve_attitude(increments, first, second, sd, p.imu.gyro_bias_deg_h * DEG_H, earth)
 
 
-def field_camera() -> CameraModel:
-    """Return the field test's camera in the body frame."""
-    (camera,) = preset(CAMERA).cameras()
-    return camera
+def photograph_targets(
+    run: FlownRun,
+    ground: SiteGround,
+    targets: Targets,
+    times_s: Float64[np.ndarray, "images"],
+    gps_m: Float64[np.ndarray, "images 3"],
+) -> list[Float64[np.ndarray, "targets 2"]]:
+    """Render the images of a pass over the targets and detect the targets in them; see `detect_targets`."""
+    p, key = run.key.field_test, run.key
+    scene = build_start_scene(run, ground, p.helicopter.fly_over_m)
+    objects = Objects.join([scene.objects, targets.panels(p.targets.albedo)])
+    # more rays at edges than for rocks, as a side of a target is 2 pixels; lines of the mesh at most a post apart, as
+    # coarser ground would hide some of the targets
+    scene = replace(
+        scene, objects=objects, edge_rays=_TARGET_EDGE_RAYS, mesh_finest_m=_MESH_POSTS * ground.surface.spacing_m
+    )
+    camera, detector, noise = key.calibrated_camera(), key.detector(), key.generator(f"targets at {times_s[0]:.0f} s")
+    prior_error = np.radians(p.targets.prior_deg) * key.generator("platform alignment").standard_normal(3)
+    prior = Rotation.from_rotvec(prior_error) * Rotation.from_euler("z", 0.5 * np.pi - run.flight.azimuth_rad)
+    centroids = []
+    for time, position in zip(times_s.tolist(), gps_m, strict=True):
+        image, _ = take_image(run, scene, ground, run.flight.state(time), detector, noise)
+        centroids.append(detect_targets(image, targets, camera, position, prior, np.radians(p.targets.prior_deg)))
+    return centroids

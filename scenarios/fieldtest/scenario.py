@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -13,24 +13,22 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
-from marsyard.scenarios.base import LoadGround, TerrainScenario, algorithm_result
+from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, image_columns, off_nadir_deg, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
-from marsyard.scenarios.exposure import add_haze, camera_optics, draw_calibrated, render_state, sunlight_ratio
+from marsyard.scenarios.fieldtest.imaging import RunKey, build_start_scene, run_ground, sun_at, take_image
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
-from marsyard.scenarios.fieldtest.run import Category, Run, RunKey, Triple, field_camera, simulate_run
+from marsyard.scenarios.fieldtest.run import Category, Run, Triple, simulate_run
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.scores import ScoredFlight, compute_scores
 from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
-from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
-from marsyard.sim.render import Scene, Sun
 from marsyard.sim.sensor import Detector
 from marsyard.sim.sensor.ranging import height_above_ground
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import Surface, TerrainBank, site
+from marsyard.sim.terrain import Surface, TerrainBank
 
 #: Spacing of the grid on which cloud transmittance is evaluated, pixels.
 CLOUD_GRID_PX = 32
@@ -56,7 +54,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
 
     def __init__(self) -> None:
         super().__init__(_CACHED_GROUNDS)
-        self._simulate_run = lru_cache(maxsize=_CACHED_RUNS)(simulate_run)
+        self._simulate_run = lru_cache(maxsize=_CACHED_RUNS)(lambda key: simulate_run(key, self.load_ground))
         self._start_scene = lru_cache(maxsize=_CACHED_SCENES)(
             lambda key: build_start_scene(self._simulate_run(key), run_ground(key, self.load_ground))
         )
@@ -84,16 +82,15 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         triple = run.triples[index]
         first, second, third = (run.flight.state(float(time)) for time in run.truth.times_s[list(triple.image_indices)])
         case = Case(run, triple, (first, second, third))
-        # the same detector takes the images of all cases
-        response = Streams(streams.seed, streams.campaign, 0).generator("detector response")
-        detector = Detector.draw(camera_optics(field_camera()).fall_off, p.run_detector(number), response)
+        detector = key.detector()
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
         exposures = [take_image(run, scene, ground, state, detector, noise) for state in case.states]
         images = [counts for counts, _ in exposures]
+        ground_points = exposures[1][1].points_world(CLOUD_GRID_PX)
         truth = truth_velocities(p, case)[1, :2]
-        measurements = measure(p, case, images, detector, calibrated_camera(p, streams))
+        measurements = measure(p, case, images, detector, key.calibrated_camera())
         # cloud transmittance on the ground of the second image, at the time of each image, and its changes
-        transmittances = cloud_transmittances(run, exposures[1][1], [state.time_s for state in case.states])
+        transmittances = cloud_transmittances(run, ground_points, [state.time_s for state in case.states])
         changes = np.abs(np.diff(transmittances, axis=0))
         conditions = {
             **_conditions(p, case, measurements, ground.surface),
@@ -119,12 +116,6 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             return algorithm_result(algorithm_run, velocity is not None, row, products)
 
         return case_result(p.algorithms, evaluate, conditions)
-
-
-def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:
-    """Return the calibrated camera of the delivered images, the same in all cases."""
-    rng = Streams(streams.seed, streams.campaign, 0).generator("camera calibration")
-    return draw_calibrated(field_camera(), p.calibration, rng).bin(columns=1, rows=p.detector.rows_summed)
 
 
 def _find_triple(p: FieldTestParameters, case: int) -> tuple[int, int]:
@@ -213,19 +204,6 @@ def _conditions(
     return row
 
 
-def take_image(
-    run: Run, start_scene: Scene, ground: SiteGround, state: State, detector: Detector, rng: np.random.Generator
-) -> tuple[UInt16[np.ndarray, "rows columns"], Float64[np.ndarray, "m n 3"]]:
-    """Render and expose an image; return its counts and the ground points of a coarse pixel grid, world axes."""
-    p, scene = run.key.field_test, scene_at(run, start_scene, ground, state.time_s)
-    frame, motion = render_state(p.backend, scene, camera_optics(field_camera()), state)
-    brightness = sunlight_ratio(ground.site.environment, float(np.arcsin(scene.sun.direction[2])), p.detector)
-    air = ground.site.environment
-    height = float(state.position_m[2]) - float(ground.surface.height(*state.position_m[:2]))
-    radiance = add_haze(frame, air, scene.sun, air.mean_extinction_m(height))
-    return detector.expose(radiance * np.float32(brightness), rng, motion), frame.points_world(CLOUD_GRID_PX)
-
-
 def cloud_transmittances(
     run: Run, ground_m: Float64[np.ndarray, "m n 3"], times_s: Sequence[float]
 ) -> Float64[np.ndarray, "times m n"]:
@@ -233,33 +211,3 @@ def cloud_transmittances(
     if run.clouds is None:
         return np.ones((len(times_s), *ground_m.shape[:2]))
     return np.stack([run.clouds.transmittance(ground_m, sun_at(run, time), time) for time in times_s])
-
-
-def sun_at(run: Run, time_s: float) -> Sun:
-    """Return the sun at a run's site at a time of the flight."""
-    return Sun(run.sun(time_s), site(run.parameters.site).environment.sun_radius_rad)
-
-
-def scene_at(run: Run, start_scene: Scene, ground: SiteGround, time_s: float) -> Scene:
-    """Return the run's scene with the sun at a given time.
-
-    The sun is updated for every image, because its motion moves the shadows of clouds at 2.5 km height by a third of a
-    metre per second.
-    """
-    sun = sun_at(run, time_s)
-    return replace(start_scene, sun=sun, photometry=ground.photometry(sun))
-
-
-def run_ground(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> SiteGround:
-    """Load the ground of a run."""
-    p = key.field_test
-    name = p.runs[key.number].site
-    return load_ground(site(name), p.terrain(name), p.bank_seed, 0)
-
-
-def build_start_scene(run: Run, ground: SiteGround) -> Scene:
-    """Build a run's scene with the sun at its start; later images use the same objects with a new sun."""
-    east, north, _ = run.flight.origin_m.tolist()
-    pixel_rad = camera_optics(field_camera()).rays.pixel_rad
-    eye = Eye(east, north, run.key.field_test.helicopter.lowest_m, pixel_rad)
-    return replace(site_scene(ground, eye, sun_at(run, 0.0)), clouds=run.clouds)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.scenario import DescentScenario
-from marsyard.scenarios.fieldtest.run import field_camera
+from marsyard.scenarios.fieldtest.imaging import field_camera
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters

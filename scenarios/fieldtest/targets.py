@@ -1,0 +1,221 @@
+"""Surveyed targets of the attitude reference: panels on the ground, detected in the images of a pass (paper, III.D.2).
+
+The panels are rendered as objects of the scene. They are detected as small bright spots: a white top-hat removes the
+ground, and a connected region above a threshold is a candidate. The prior attitude predicts the targets' pixels. The
+common displacement with the most pairs of candidates and targets determines which candidates are targets; a rotation
+fitted to the pairs rejects the others. The paper states that the centroids were extracted, not how: all parameters of
+the detection are assumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt16
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from marsyard.scenarios.fieldtest.parameters import TargetParameters
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import Motion
+from marsyard.sim.render import Objects
+from marsyard.sim.terrain import Surface
+
+#: Minimum distance of a measured target from the edge of the image, pixels.
+_BORDER_PX = 4.0
+#: Side lengths of the structuring element of the top-hat, divided by those of a target in the image, and their minimum.
+_TOP_HAT_SIDES, _MIN_TOP_HAT_PX = 3.0, 3
+#: Threshold of candidates: standard deviations of the top-hat image, estimated from its quantiles.
+_THRESHOLD_SD = 5.0
+#: Half side of the window of a centroid, divided by the side length of a target in the image.
+_WINDOW_SIDES = 1.5
+#: Maximum distance of a candidate from a predicted target, in metres on the ground: in the vote, and after the fit.
+_VOTE_M, _FIT_M = 3.0, 1.2
+#: Iterations of assignment and fit, and minimum number of detected targets in a valid image.
+_ITERATIONS, _MIN_TARGETS = 3, 5
+#: Height of a panel above the ground, metres.
+_CLEARANCE_M = 0.03
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Targets on the ground: true corners of the panels and surveyed positions of their centres, world axes, metres."""
+
+    corners_m: Float64[np.ndarray, "targets 4 3"]
+    surveyed_m: Float64[np.ndarray, "targets 3"]
+    side_m: float
+
+    @classmethod
+    def draw(
+        cls, p: TargetParameters, surface: Surface, centre_m: Float64[np.ndarray, "2"], rng: np.random.Generator
+    ) -> Targets:
+        """Draw panels on the ground around a position; the first `used` of them are used."""
+        points = centre_m + rng.uniform(-p.within_m, p.within_m, (p.placed, 2))[: p.used]
+        error = p.survey_m * rng.standard_normal((p.used, 3))
+        # corners of squares of any azimuth, counterclockwise
+        angles = rng.uniform(0.0, 0.5 * np.pi, p.used)[:, None] + np.radians([0.0, 90.0, 180.0, 270.0])
+        offsets = p.side_m * np.sqrt(0.5) * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        corners = points[:, None] + offsets
+        heights = surface.height(corners[..., 0], corners[..., 1]) + _CLEARANCE_M
+        corners = np.concatenate([corners, heights[..., None]], axis=-1)
+        return cls(corners, corners.mean(axis=1) + error, p.side_m)
+
+    @property
+    def true_m(self) -> Float64[np.ndarray, "targets 3"]:
+        """True positions of the centres."""
+        return np.asarray(self.corners_m.mean(axis=1))
+
+    def panels(self, albedo: float) -> Objects:
+        """Build the panels as objects for the renderer."""
+        corners, count = self.corners_m, len(self.corners_m)
+        normals = _normalize(np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]))
+        faces = (4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+        names = np.repeat(np.arange(count, dtype=np.int32), 2)
+        return Objects.of_mesh(
+            corners.reshape(-1, 3), np.repeat(normals, 4, axis=0), faces.astype(np.int32), names, albedo
+        )
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Target directions measured in the images of a pass: one row per target and image.
+
+    - times_s: time tag of the image
+    - camera: unit vector to the target in body axes, from its centroid in the image
+    - world: unit vector to the target in world axes, from the survey and the helicopter's GPS position
+    """
+
+    times_s: Float64[np.ndarray, "n"]
+    camera: Float64[np.ndarray, "n 3"]
+    world: Float64[np.ndarray, "n 3"]
+
+    @classmethod
+    def of_images(
+        cls,
+        targets: Targets,
+        camera: CameraModel,
+        tags_s: Float64[np.ndarray, "images"],
+        gps_m: Float64[np.ndarray, "images 3"],
+        centroids_px: Sequence[Float64[np.ndarray, "targets 2"]],
+    ) -> Sightings:
+        """Compute the directions from the centroids in each image (columns, rows); NaN for targets not detected."""
+        parts = []
+        for tag, position, centroids in zip(tags_s, gps_m, centroids_px, strict=True):
+            measured = np.isfinite(centroids).all(axis=1)
+            directions = camera.rays(centroids[measured])[1]
+            surveyed = targets.surveyed_m[measured] - position
+            parts.append((np.full(len(surveyed), tag), _normalize(directions), _normalize(surveyed)))
+        times, camera_vectors, world_vectors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        return cls(times, camera_vectors, world_vectors)
+
+
+def _normalize(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def project_targets(
+    targets: Targets, camera: CameraModel, motion: Motion, centroid_px: float, rng: np.random.Generator
+) -> list[Float64[np.ndarray, "targets 2"]]:
+    """Project the true targets into the images of a pass and add centroid errors, without rendering.
+
+    - camera: the true camera in the body frame, with the pixels of a delivered image
+    - motion: true motion at the exposures
+    - centroid_px: standard deviation of a centroid per axis
+    """
+    centroids = []
+    for attitude, position in zip(motion.attitudes, motion.positions_m, strict=True):
+        pixels, visible = camera.project(attitude.inv().apply(targets.true_m - position))
+        pixels = pixels + centroid_px * rng.standard_normal(pixels.shape)
+        centroids.append(np.where((visible & _is_inside(pixels, camera))[:, None], pixels, np.nan))
+    return centroids
+
+
+def _is_inside(pixels: Float64[np.ndarray, "n 2"], camera: CameraModel) -> np.ndarray:
+    high = np.array(camera.size) - 1.0 - _BORDER_PX
+    return np.asarray(((pixels >= _BORDER_PX) & (pixels <= high)).all(axis=1))
+
+
+def detect_targets(
+    image: UInt16[np.ndarray, "rows columns"],
+    targets: Targets,
+    camera: CameraModel,
+    position_m: Float64[np.ndarray, "3"],
+    prior: Rotation,
+    prior_sd_rad: float,
+) -> Float64[np.ndarray, "targets 2"]:
+    """Detect the targets in an image; return their centroids (column, row), NaN for targets not detected.
+
+    - camera: the calibrated camera in the body frame
+    - position_m: measured position of the camera, world axes
+    - prior: approximate attitude from the platform, world from body
+    - prior_sd_rad: standard deviation of the prior per axis
+    """
+    none = np.full((len(targets.surveyed_m), 2), np.nan)
+    height = float(position_m[2] - targets.surveyed_m[:, 2].mean())
+    px_per_m = np.array(camera.focal_lengths) / height
+    candidates = find_bright_spots(image, targets.side_m * px_per_m)
+    offsets = targets.surveyed_m - position_m
+    if len(candidates) < _MIN_TARGETS:
+        return none
+    # distances in metres on the ground, as pixels need not be square
+    tree = cKDTree(candidates / px_per_m)
+    predicted = camera.project(prior.inv().apply(offsets))[0] / px_per_m
+    displacement = _vote(tree, predicted, 4.0 * prior_sd_rad * height)
+    attitude, limit_m = prior, _VOTE_M
+    predicted = predicted + displacement
+    for _ in range(_ITERATIONS):
+        distances, nearest = tree.query(predicted)
+        matched = np.flatnonzero(distances < limit_m)
+        if len(matched) < _MIN_TARGETS:
+            return none
+        seen = camera.rays(candidates[np.asarray(nearest)[matched]])[1]
+        attitude = Rotation.align_vectors(_normalize(offsets[matched]), _normalize(seen))[0]
+        predicted, limit_m = camera.project(attitude.inv().apply(offsets))[0] / px_per_m, _FIT_M
+    distances, nearest = tree.query(predicted)
+    is_target = (distances < limit_m) & _is_inside(predicted * px_per_m, camera)
+    if is_target.sum() < _MIN_TARGETS:
+        return none
+    return np.where(is_target[:, None], candidates[nearest], np.nan)
+
+
+def find_bright_spots(
+    image: UInt16[np.ndarray, "rows columns"], side_px: Float64[np.ndarray, "2"]
+) -> Float64[np.ndarray, "spots 2"]:
+    """Find spots that are brighter than the ground around them; return their centroids (column, row).
+
+    - side_px: side lengths of a target in the image (columns, rows)
+    """
+    size = 2 * np.ceil(0.5 * np.maximum(_TOP_HAT_SIDES * side_px, _MIN_TOP_HAT_PX)).astype(int) + 1
+    spots = ndimage.white_tophat(image.astype(np.float32), size=(int(size[1]), int(size[0])))
+    median, high = np.percentile(spots, (50.0, 84.13))
+    labels, count = ndimage.label(spots > median + _THRESHOLD_SD * (high - median), np.ones((3, 3)))
+    peaks = np.array(ndimage.maximum_position(spots, labels, np.arange(1, count + 1)), dtype=np.int64).reshape(-1, 2)
+    return _centroids(spots, peaks, np.ceil(_WINDOW_SIDES * side_px[::-1]).astype(np.int64))
+
+
+def _centroids(
+    spots: np.ndarray, peaks: Int64[np.ndarray, "spots 2"], half: Int64[np.ndarray, "2"]
+) -> Float64[np.ndarray, "spots 2"]:
+    """Compute the centroids (column, row) of intensity in windows around peaks (row, column)."""
+    inside = ((peaks >= half) & (peaks < np.array(spots.shape) - half)).all(axis=1)
+    rows, columns = np.mgrid[-half[0] : half[0] + 1, -half[1] : half[1] + 1]
+    windows = spots[peaks[inside, 0, None, None] + rows, peaks[inside, 1, None, None] + columns].astype(np.float64)
+    # the top-hat of noise is positive: without this, it would draw all centroids to the middle of their windows
+    windows = np.maximum(windows - np.median(spots), 0.0)
+    total = windows.sum(axis=(1, 2))
+    shift = np.stack([(windows * axis).sum(axis=(1, 2)) / total for axis in (columns, rows)], axis=-1)
+    return np.asarray(peaks[inside, ::-1] + shift)
+
+
+def _vote(tree: cKDTree, predicted_m: Float64[np.ndarray, "targets 2"], radius_m: float) -> Float64[np.ndarray, "2"]:
+    """Find the displacement of the predicted targets that brings most of them to a candidate."""
+    near = tree.query_ball_point(predicted_m, radius_m)
+    displacements = np.concatenate([tree.data[found] - point for found, point in zip(near, predicted_m, strict=True)])
+    if len(displacements) == 0:
+        return np.zeros(2)
+    distances, _ = tree.query(predicted_m + displacements[:, None])
+    votes = np.count_nonzero(distances < _VOTE_M, axis=1)
+    return np.asarray(displacements[np.argmax(votes)])
