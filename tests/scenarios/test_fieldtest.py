@@ -26,6 +26,7 @@ from marsyard.scenarios.fieldtest.imaging import (
     scene_at,
     sun_at,
     sun_direction,
+    take_image,
 )
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters, TargetParameters
 from marsyard.scenarios.fieldtest.run import Category, Run, simulate_run, survey_ground
@@ -177,9 +178,13 @@ def test_targets_are_detected_in_the_images_of_a_pass(number: int, monkeypatch: 
         return centroids
 
     states = []
-    take_image = run_module.take_image
+
+    def record_state(*arguments: Any) -> Any:
+        states.append(arguments[3])
+        return take_image(*arguments)
+
     monkeypatch.setattr(run_module, "detect_targets", record)
-    monkeypatch.setattr(run_module, "take_image", lambda *args: (states.append(args[3]), take_image(*args))[1])
+    monkeypatch.setattr(run_module, "take_image", record_state)
     p = make_parameters(drift={"change_k": 0.0}, targets={"pictures": 3})
     key = RunKey(p, number, 6, "test")
     run = simulate_run(key)
