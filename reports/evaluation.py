@@ -64,10 +64,12 @@ def combine_verdicts(
         reason = "" if evidence is None else f" {evidence.text}"
         return OverallVerdict(worst, crashed, f"{would_be_met}{reason}{crash_text}")
     fraction = f"{statuses.count(worst)} of {count(len(statuses), 'requirement')}"
+    undecided = sum(status in (Status.INSUFFICIENT, Status.MET_BY_RATE) for status in statuses)
+    undecided_text = f", {undecided} undecided" if undecided else ""
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",
-        Status.FAIL: f"{fraction} not met.",
+        Status.FAIL: f"{fraction} not met{undecided_text}.",
         Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {fraction}.{_remedy_text(verdicts)}",
     }[worst]
     return OverallVerdict(worst, crashed, sentence + crash_text)
@@ -95,7 +97,7 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
     largest = max(needed, key=lambda verdict: verdict.further_cases or 0)
     counts_terrains = largest.clustered is not None and largest.clustered.method is ClusterMethod.TERRAIN_COUNT
     terrain_text = ", each on a new terrain," if counts_terrains else ""
-    return f" {count(largest.further_cases or 0, 'additional case')} without a failure{terrain_text} would be enough."
+    return f" {count(largest.further_cases or 0, 'additional case')} of the limiting requirement{terrain_text} without a failure would be enough."
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,8 @@ class AllCases:
     @property
     def text(self) -> str:
         """The result in a sentence."""
-        return f"Over all cases: {self.failures:,} of {self.n:,} failed ({percent(self.estimate)}), {self.status}."
+        met = f"{self.n - self.failures:,} of {self.n:,} ({percent(self.estimate)})"
+        return f"Over all cases of the campaign {met} satisfy the criterion: {self.status}."
 
 
 @dataclass(frozen=True)

@@ -191,8 +191,8 @@ class Evidence:
             f"drawn after the algorithm was frozen. {self._multiplicity_text()}",
             EvidenceKind.REPETITION: f"The run repeats confirmation {self.number} without a change; it is no new "
             "evidence.",
-            EvidenceKind.CALIBRATION: f"Calibrated on these cases: options were set by looking at their results "
-            f"({changes}). PASS needs a run with --confirm.",
+            EvidenceKind.CALIBRATION: f"Calibrated on these cases: options of {changes} were set by looking at their "
+            f"results. PASS needs a run with --confirm.",
             EvidenceKind.EXPLORATION: "Exploration: the seed was chosen freely. A confirmation is a run with "
             "--confirm, on cases that nobody has seen.",
             EvidenceKind.REUSED_SEED: f"The seed belongs to confirmation {self.number}, and the run differs from it: "

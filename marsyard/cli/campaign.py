@@ -43,7 +43,10 @@ class RunOptions:
     algorithm: options.AlgorithmOption = None
     confirm: Annotated[
         bool,
-        Option("--confirm", help="Draw a new seed, and enter the run in the record of confirmations before it starts."),
+        Option(
+            "--confirm",
+            help="Evaluate a frozen algorithm on unseen cases: draw a new seed, and record the run before it starts.",
+        ),
     ] = False
     confirmations: options.ConfirmationsOption = options.CONFIRMATIONS
 
@@ -147,7 +150,7 @@ def replay(
         bool, Option("--save-stages", help="Also write the result of each processing stage to stages/.")
     ] = False,
 ) -> None:
-    """Rerun one case, write and plot its intermediate results, and compare its results with the stored row."""
+    """Rerun one case, write and plot its intermediate results, and compare its results with the stored ones."""
     from marsyard.campaigns.running.replay import replay as rerun_case
     from marsyard.campaigns.store.products import (
         case_directory,

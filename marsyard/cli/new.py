@@ -31,14 +31,20 @@ class NewOptions:
 
     name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
     system: Annotated[
-        str | None, Option(help="System under test, such as velocity; an unknown name prints the list.")
+        str | None, Option(help="Kind of the system under test, such as velocity; an unknown name prints the list.")
     ] = None
     site: Annotated[str | None, Option(help="A site from `marsyard terrain list`.")] = None
     camera: Annotated[str | None, Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")] = None
     detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
     flight: Annotated[str | None, Option(metavar="FILE", help="Trajectory file instead of simulated dynamics.")] = None
     axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
-    bound: Annotated[float | None, Option(metavar="X", help="Requirement: maximum error, or minimum fraction.")] = None
+    bound: Annotated[
+        float | None,
+        Option(
+            metavar="X",
+            help="Limit of the requirement: the maximum error, or the minimum of a quantity that must be large.",
+        ),
+    ] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
     out: Annotated[Path | None, Option(metavar="FILE", help="File to write; by default NAME.toml.")] = None
     overwrite: OverwriteOption = False
@@ -158,7 +164,9 @@ def ingest(
         Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and images (docs/real-pictures.md).")
     ],
     out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
-    system: Annotated[str | None, Option(help="System under test; by default `measured`.")] = None,
+    system: Annotated[
+        str | None, Option(help="Kind of system; by default `measured` (measured results, no rendering).")
+    ] = None,
 ) -> None:
     """Create a campaign from recorded images with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign

@@ -31,7 +31,7 @@ def export(
     override: options.SetOption = None,
     bits_per_pixel: options.BitsOption = None,
 ) -> None:
-    """Export images, measurements and camera models for an external algorithm; repeat the command to continue."""
+    """Export images, measurements and camera models for an external algorithm. Cases already exported are kept."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.running.offline import export_campaign, truth_folder
     from marsyard.campaigns.store import record
@@ -102,7 +102,7 @@ def dataset(
 ) -> None:
     """Write images with range, normals, rock masks, hazard maps and poses as WebDataset shards.
 
-    Landing campaigns have two images per case. Existing shards are not written again: repeat the command to continue.
+    Landing campaigns have two images per case. Existing shards are not written again.
     """
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.dataset import write_dataset
@@ -115,7 +115,12 @@ def dataset(
 @handle_user_errors
 def conformance(
     algorithm: Annotated[
-        str, Argument(metavar="ALGORITHM", help="A name, module:Class, exec:PROGRAM or serve:PROGRAM.")
+        str,
+        Argument(
+            metavar="ALGORITHM",
+            help="Algorithm, dynamics, instrument or score: a name, module:Class, exec:PROGRAM (started per case) or "
+            "serve:PROGRAM (keeps running).",
+        ),
     ],
     task: Annotated[
         str | None,
@@ -127,7 +132,7 @@ def conformance(
     time_limit: Annotated[float, Option(metavar="S", help="Time limit of one answer in seconds.", min=0.1)] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that an algorithm, motion, instrument or score follows its interface: data types, inputs and run time."""
+    """Check that an algorithm, dynamics, instrument or score follows its interface: data types, inputs, run time."""
     from marsyard.campaigns.running.replay import create_subject, run_conformance_checks
     from marsyard.scenarios.parts.named import KINDS
 

@@ -60,7 +60,8 @@ AlgorithmOption = Annotated[
     list[str] | None,
     Option(
         metavar="NAME",
-        help="The algorithm under test: a name, module:Class, exec:PROGRAM or serve:PROGRAM. If repeated, all "
+        help="The algorithm under test: a name, module:Class, exec:PROGRAM (started per case) or serve:PROGRAM (keeps running). "
+        "If repeated, all "
         "algorithms run on the same cases and are compared; the first is under test.",
     ),
 ]

@@ -34,10 +34,13 @@ def report(
     csv: Annotated[bool, Option("--csv", help="Also write all rows to cases.csv.")] = False,
     gallery: Annotated[
         bool,
-        Option("--gallery", help="First rerun the worst, some unanswered and some random cases to store their images."),
+        Option(
+            "--gallery",
+            help="First rerun the cases with the largest errors, some without answer and some random, to store images.",
+        ),
     ] = False,
 ) -> None:
-    """Evaluate a campaign from its stored rows, complete or not, and write its report.
+    """Evaluate a campaign from its stored results, complete or not, and write its report.
 
     Cases are rerun for --gallery only.
     """
@@ -66,7 +69,7 @@ def report(
 def confirmations(
     file: Annotated[Path, Argument(metavar="[FILE]", help="The record.")] = CONFIRMATIONS, as_json: JsonOption = False
 ) -> None:
-    """List the confirmations of algorithms with their results, from the record of `run --confirm`."""
+    """List confirmations: evaluations of frozen algorithms on unseen seeds (`run --confirm`), with their results."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.confirmations import read_confirmations
     from marsyard.reports.tables import confirmations_table
@@ -162,7 +165,8 @@ def nightly(
 ) -> None:
     """Run the planned campaigns, compare each metric with previous nightly runs, write nightly.md and the dashboard.
 
-    Exit status: the most severe of all campaigns; 1 if a metric regressed or a campaign could not be run.
+    Exit status: 1 if a requirement failed, a case crashed, a metric regressed or a campaign could not be run; otherwise
+    3 if a requirement is undecided; otherwise 0.
     """
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.record import folder_lock, git_commit

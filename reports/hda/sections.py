@@ -158,14 +158,14 @@ def map_rows(subject: Subject) -> pd.DataFrame | None:
 #: Errors of the map; columns of `map_rows`.
 _MAP_ERRORS = (
     kinds.Quantity("rms_fraction", "elevation error rms (% of height)", 100.0),
-    kinds.Quantity("noise_fraction", "elevation error rms without its plane (% of height)", 100.0),
+    kinds.Quantity("noise_fraction", "elevation error rms after removal of its mean plane (% of height)", 100.0),
     kinds.Quantity("slope_error_rms_deg", "slope error rms (deg)"),
 )
 #: Dependence of the map errors on conditions.
 MAP_EFFECTS = kinds.Scatter(
     x=(
         kinds.Quantity("baseline_fraction", "baseline / height"),
-        kinds.Quantity("texture", "texture relative to the site"),
+        kinds.Quantity("texture", "texture contrast divided by that of the terrain preset"),
         kinds.Quantity("grid_px", "grid spacing (px)"),
         kinds.Quantity("level_error_deg", "error of the vertical (deg)"),
         kinds.Quantity("altimeter_fraction", "altimeter error (% of range)", 100.0),
@@ -263,7 +263,11 @@ TOUCHDOWN = kinds.SectionDeclaration(
         kinds.RateTable(
             (
                 kinds.Rate("touchdown", "touchdown on safe ground", kinds.flag_rate("touchdown_safe")),
-                kinds.Rate("site", "target site is truly safe", kinds.flag_rate("site_safe")),
+                kinds.Rate(
+                    "site",
+                    "target of the descent (reported or a-priori site) is truly safe",
+                    kinds.flag_rate("site_safe"),
+                ),
             ),
             cases="Landings",
             heading="Safety of the touchdown point",
@@ -339,7 +343,17 @@ def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
             bound = quantile_bounds(values, 0.05, CONFIDENCE)[0]
             texts = [number(float(value)) for value in (values.min(), *np.quantile(values, (0.05, 0.5)))]
             rows.append([name, f"{values.size:,}", *texts, NOTHING if math.isinf(bound) else number(bound)])
-    return Grid(["Distance (m)", "Cases", "Minimum", "5 % quantile", "Median", "Bound of the 5 % quantile"], rows)
+    return Grid(
+        [
+            "Distance (m)",
+            "Cases",
+            "Minimum",
+            "5 % quantile",
+            "Median",
+            f"Lower bound of the 5 % quantile ({format_fraction(CONFIDENCE)})",
+        ],
+        rows,
+    )
 
 
 def run_times_section(subject: Subject) -> Section | None:

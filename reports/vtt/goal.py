@@ -23,7 +23,7 @@ MAX_ERROR_M, QUANTILE = 0.03, 0.99
 #: Names of the rates of a camera's runs at selectable targets, and their keys in `summarize_cameras`.
 _RATES: Mapping[str, str] = {
     "Completed": "completed",
-    "Tracked at the goal": "tracked",
+    "Within 10 px of the true projection at the goal": "tracked",
     f"Within {100.0 * MAX_ERROR_M:g} cm (of completed runs)": "within",
     "False track": "false_tracks",
 }
@@ -128,8 +128,8 @@ def _expected_errors() -> str:
         drift = drift_error_m(GOAL_M, design.focal_px, 1.0)
         errors.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
     return (
-        f"By Eqs. 1 and 4, one pixel of disparity error and one pixel of drift correspond to these errors along and "
-        f"across the line of sight at {GOAL_M:g} m for the paper's cameras: {'; '.join(errors)}. The bound of the "
+        f"By Eqs. 1 and 4, at {GOAL_M:g} m one pixel of disparity error corresponds to an error along the line of sight, and "
+        f"one pixel of drift to an error across it; for the paper's cameras: {'; '.join(errors)}. The bound of the "
         f"{format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence needs at least 230 runs."
     )
 

@@ -423,7 +423,7 @@ def test_overall_verdict_is_the_worst_verdict(velocity: dict[str, Any]) -> None:
     assert combine_verdicts([passing, undecided], frame).word == "INSUFFICIENT"
     assert combine_verdicts([passing, undecided, failing], frame).word == "FAIL"
     assert combine_verdicts([], frame).status is None
-    assert "1 of 3 requirements not met" in combine_verdicts([passing, undecided, failing], frame).sentence
+    assert "1 of 3 requirements not met, 1 undecided" in combine_verdicts([passing, undecided, failing], frame).sentence
 
 
 def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
@@ -452,7 +452,10 @@ def test_subset_is_shown_next_to_all_cases_and_named_if_only_truth_defines_it(ve
     assert verdict.statement == "Given truth (lit): The error is small."
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.failures) == (10, 20, 2)
-    assert f"Over all cases: 2 of 20 failed (90.00 %), {verdict.all_cases.status}." in verdict.note
+    assert (
+        f"Over all cases of the campaign 18 of 20 (90.00 %) satisfy the criterion: {verdict.all_cases.status}."
+        in verdict.note
+    )
     (known,) = evaluate_requirements(frame, [requirement])
     assert known.statement == "The error is small."
     (everything,) = evaluate_requirements(frame, [{**requirement, "population": "all"}], from_truth=("lit",))

@@ -191,7 +191,7 @@ def test_map_errors_have_the_expected_rank_correlations() -> None:
     mapped_rows = map_rows(_make_subject(frame))
     assert mapped_rows is not None
     effects = {(effect["driver"], effect["error"]): effect for effect in MAP_EFFECTS.effects(mapped_rows)}
-    noise = effects["baseline / height", "elevation error rms without its plane (% of height)"]
+    noise = effects["baseline / height", "elevation error rms after removal of its mean plane (% of height)"]
     assert noise["rank_correlation"] == pytest.approx(-1.0)
     assert np.all(np.diff(noise["medians"]) < 0.0)
     scale_error = effects["altimeter error (% of range)", "elevation error rms (% of height)"]
