@@ -144,9 +144,17 @@ def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]
     }
 
 
+#: Names of the world axes.
+_AXIS_NAMES = {"x": "east", "y": "north", "z": "up"}
+
+
 def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -> Grid:
     columns = _signed_parts(frame, metric)
-    axes = [""] if columns == [metric] else [f" {split_unit(part)[0].rsplit('_', 1)[-1]}" for part in columns]
+    axes = (
+        [""]
+        if columns == [metric]
+        else [f", {_AXIS_NAMES[split_unit(part)[0].rsplit('_', 1)[-1]]}" for part in columns]
+    )
     unit = split_unit(metric)[1]
     head = ["", "Cases", "Answered", f"{format_fraction(CONFIDENCE)} interval"]
     head += [f"{statistic}{axis} ({unit})" for axis in axes for statistic in ("Mean", "SD")]

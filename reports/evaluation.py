@@ -97,7 +97,8 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
     largest = max(needed, key=lambda verdict: verdict.further_cases or 0)
     counts_terrains = largest.clustered is not None and largest.clustered.method is ClusterMethod.TERRAIN_COUNT
     terrain_text = ", each on a new terrain," if counts_terrains else ""
-    return f" {count(largest.further_cases or 0, 'additional case')} of the limiting requirement{terrain_text} without a failure would be enough."
+    cases = count(largest.further_cases or 0, "additional case")
+    return f" {cases} of the limiting requirement{terrain_text} without a failure would be enough."
 
 
 @dataclass(frozen=True)

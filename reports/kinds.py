@@ -324,11 +324,12 @@ class Statistics:
 
     column: str
     heading: str = ""
+    note: str = ""
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
         """Create the table."""
         data = {name: asdict(summary) for name, summary in error_summaries(frame, self.column)}
-        return [Block(heading=self.heading, grid=statistics_grid(frame, self.column))], data
+        return [Block(heading=self.heading, grid=statistics_grid(frame, self.column), note=self.note)], data
 
 
 @dataclass(frozen=True)

@@ -60,9 +60,8 @@ AlgorithmOption = Annotated[
     list[str] | None,
     Option(
         metavar="NAME",
-        help="The algorithm under test: a name, module:Class, exec:PROGRAM (started per case) or serve:PROGRAM (keeps running). "
-        "If repeated, all "
-        "algorithms run on the same cases and are compared; the first is under test.",
+        help="The algorithm under test: a name, module:Class, exec:PROGRAM (started per case) or serve:PROGRAM "
+        "(keeps running). If repeated, all algorithms run on the same cases and are compared; the first is under test.",
     ),
 ]
 JobsOption = Annotated[int | None, Option(metavar="J", help="Worker processes; by default one per core.")]

@@ -48,7 +48,10 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Format the estimated and the true velocity, if the products contain them."""
     facts = []
-    for key, name in (("velocity_estimated_m_s", "Estimated velocity"), ("velocity_true_m_s", "True velocity")):
+    for key, name in (
+        ("velocity_estimated_m_s", "Estimated velocity, mean between images 2 and 3"),
+        ("velocity_true_m_s", "True velocity, same interval"),
+    ):
         velocity = numeric_product(products.get(key))
         if velocity is not None and velocity.size >= 2 and np.isfinite(velocity.ravel()[:2]).all():
             east, north = velocity.ravel()[:2]

@@ -184,6 +184,10 @@ def _draw_scatter(rows: kinds.Rows, parts: Sequence[str], subject: Subject, axis
 
 
 _FIRING = "firing_velocity_error_m_s"
+_FIRING_NOTE = (
+    "The reported velocity is the mean between the second and the third image. The IMU propagates it to the time of "
+    "ignition. The error is relative to the true camera velocity at that time, including pendulum motion."
+)
 #: Error of the velocity that the inertial unit propagates to thruster ignition at a height near 100 m (section I).
 FIRING = kinds.SectionDeclaration(
     "firing",
@@ -192,7 +196,7 @@ FIRING = kinds.SectionDeclaration(
     rows=lambda subject: None if subject.metric == _FIRING else subject.frame,
     requires=(_FIRING,),
     parts=(
-        kinds.Statistics(_FIRING),
+        kinds.Statistics(_FIRING, note=_FIRING_NOTE),
         kinds.Quantiles(
             # time available for the computation
             [kinds.Quantity("firing_after_s")],
@@ -200,8 +204,6 @@ FIRING = kinds.SectionDeclaration(
             heading="Time from the last image to thruster ignition",
         ),
     ),
-    note="The reported velocity is the mean between the second and the third image. The IMU propagates it to the time "
-    "of ignition. The error is relative to the true camera velocity at that time, including pendulum motion.",
 )
 
 SPEED_CORRECTED, SPEED_UNCORRECTED = "touchdown_speed_corrected_m_s", "touchdown_speed_uncorrected_m_s"
@@ -241,7 +243,7 @@ def _draw_speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Blocks
             bound = quantile_bounds(values, probability, CONFIDENCE, groups)[1]
             bound_text = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
             texts.append(f"{number(float(np.quantile(values, probability)))}{bound_text}")
-        rows.append([f"{format_fraction(probability)} quantile (upper bound)", *texts])
+        rows.append([f"{format_fraction(probability)} quantile ({format_fraction(CONFIDENCE)} upper bound)", *texts])
     rows += [
         [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
         for speed in SPEEDS_M_S
@@ -259,7 +261,7 @@ def _draw_speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Blocks
     gain, loss = number(data["largest_gain_m_s"]), number(data["largest_loss_m_s"])
     note = note_text("dimes.landing", confidence=format_fraction(CONFIDENCE), gain=gain, loss=loss)
     grid = Grid(["", "With correction", "Without correction"], rows)
-    return [Block(heading="Horizontal speed at touchdown", grid=grid, note=note)], data
+    return [Block(heading="Speeds with and without the correction", grid=grid, note=note)], data
 
 
 #: Horizontal speed at touchdown with and without the correction by the estimated velocity.
@@ -272,7 +274,7 @@ LANDING = kinds.SectionDeclaration(
         kinds.Distribution(
             [kinds.Quantity(SPEED_CORRECTED, "corrected"), kinds.Quantity(SPEED_UNCORRECTED, "uncorrected")],
             ("horizontal speed at touchdown (m/s)", "fraction of landings above this speed"),
-            "Fraction of landings with a higher horizontal speed at touchdown.",
+            "Fraction of landings whose horizontal speed at touchdown is above the value on the axis.",
             complementary=True,
         ),
         kinds.RateTable(landing_fractions, cases="Landings", heading="Improved and degraded landings", data="shares"),

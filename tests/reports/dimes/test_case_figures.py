@@ -123,7 +123,10 @@ def test_case_without_tracks_shows_only_images(dimes_products: dict[str, Any]) -
     assert (case_view.head, case_view.rows) == ([], [])
     assert case_view.legend is not None
     assert "squares mark" not in case_view.legend
-    assert [name for name, _ in case_view.facts] == ["Estimated velocity", "True velocity"]
+    assert [name for name, _ in case_view.facts] == [
+        "Estimated velocity, mean between images 2 and 3",
+        "True velocity, same interval",
+    ]
 
 
 def test_figure_omits_empty_rows(dimes_products: dict[str, Any]) -> None:
