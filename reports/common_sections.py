@@ -221,7 +221,13 @@ def convergence_section(subject: Subject) -> Section | None:
     if not svg_figures:
         return None
     note = note_text("common.convergence")
-    return Section("convergence", "Convergence", "Convergence", [Block(figures=svg_figures, note=note)], data)
+    return Section(
+        "convergence",
+        "Convergence",
+        "Estimates against the number of cases",
+        [Block(figures=svg_figures, note=note)],
+        data,
+    )
 
 
 def curve_sizes(cases: int) -> list[int]:

@@ -98,7 +98,7 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
     counts_terrains = largest.clustered is not None and largest.clustered.method is ClusterMethod.TERRAIN_COUNT
     terrain_text = ", each on a new terrain," if counts_terrains else ""
     cases = count(largest.further_cases or 0, "additional case")
-    return f" {cases} of the limiting requirement{terrain_text} without a failure would be enough."
+    return f" {cases} that count for {largest.requirement_id}{terrain_text}, without a failure, would be enough."
 
 
 @dataclass(frozen=True)

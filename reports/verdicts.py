@@ -66,7 +66,7 @@ class AllCases:
     def text(self) -> str:
         """The result in a sentence."""
         met = f"{self.n - self.failures:,} of {self.n:,} ({percent(self.estimate)})"
-        return f"Over all cases of the campaign {met} satisfy the criterion: {self.status}."
+        return f"Over all cases of the campaign, where a case without a value fails, {met} satisfy it: {self.status}."
 
 
 @dataclass(frozen=True)

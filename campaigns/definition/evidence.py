@@ -186,13 +186,14 @@ class Evidence:
     def text(self) -> str:
         """Meaning of the kind of evidence for the verdicts, in a sentence or two."""
         changes = "; ".join(self.changes)
+        groups = ", ".join(name if "." in name else f"{name}.*" for name in self.changes)
         return {
             EvidenceKind.CONFIRMATION: f"Confirmation {self.number} in the namespace '{self.namespace}': the seed was "
             f"drawn after the algorithm was frozen. {self._multiplicity_text()}",
             EvidenceKind.REPETITION: f"The run repeats confirmation {self.number} without a change; it is no new "
             "evidence.",
-            EvidenceKind.CALIBRATION: f"Calibrated on these cases: options of {changes} were set by looking at their "
-            f"results. PASS needs a run with --confirm.",
+            EvidenceKind.CALIBRATION: f"Calibrated on these cases: the parameters {groups} were set by "
+            f"looking at their results. PASS needs a run with --confirm.",
             EvidenceKind.EXPLORATION: "Exploration: the seed was chosen freely. A confirmation is a run with "
             "--confirm, on cases that nobody has seen.",
             EvidenceKind.REUSED_SEED: f"The seed belongs to confirmation {self.number}, and the run differs from it: "

@@ -95,7 +95,7 @@ def cache_usage(kind: str) -> dict[str, Any]:
 
 @handle_user_errors
 def compile_kernels() -> None:
-    """Compile the numeric kernels before the first run, by running a small case of each system.
+    """Compile the numeric kernels before the first run, by running a small descent, drive and landing.
 
     The compiled code is cached and valid until the source code changes.
     """

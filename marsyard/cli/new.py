@@ -40,10 +40,7 @@ class NewOptions:
     axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
     bound: Annotated[
         float | None,
-        Option(
-            metavar="X",
-            help="Limit of the requirement: the maximum error, or the minimum of a quantity that must be large.",
-        ),
+        Option(metavar="X", help="Limit of the requirement, in the unit of its metric, such as 5 for 5 m/s."),
     ] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
     out: Annotated[Path | None, Option(metavar="FILE", help="File to write; by default NAME.toml.")] = None
@@ -165,7 +162,7 @@ def ingest(
     ],
     out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
     system: Annotated[
-        str | None, Option(help="Kind of system; by default `measured` (measured results, no rendering).")
+        str | None, Option(help="Kind of system, see `marsyard new`; by default `measured`, data of real cameras.")
     ] = None,
 ) -> None:
     """Create a campaign from recorded images with measured attitude and altitude."""

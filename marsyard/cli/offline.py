@@ -64,7 +64,12 @@ def export(
 @options.handle_user_errors
 def score(
     directory: Annotated[Path, Argument(metavar="DIR", help="Folder written by `marsyard export`.")],
-    answers: Annotated[Path, Argument(metavar="ANSWERS", help="CSV file with the answers of the external algorithm.")],
+    answers: Annotated[
+        Path,
+        Argument(
+            metavar="ANSWERS", help="CSV file with the answers of the external algorithm (docs/custom-algorithms.md)."
+        ),
+    ],
     truth: TruthOption = None,
     out: options.OutOption = None,
     jobs: options.JobsOption = None,
@@ -118,7 +123,8 @@ def conformance(
         str,
         Argument(
             metavar="ALGORITHM",
-            help="Algorithm, dynamics, instrument or score: a name, module:Class, exec:PROGRAM (started per case) or "
+            help="Algorithm, dynamics, instrument or custom score: a name, module:Class, exec:PROGRAM (started "
+            "per case) or "
             "serve:PROGRAM (keeps running).",
         ),
     ],

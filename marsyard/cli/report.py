@@ -91,7 +91,7 @@ def compare(
 ) -> None:
     """Compare two stored campaigns: success rate, availability and errors, with significance tests of the differences.
 
-    The exit status is 0 even if the campaigns differ: a difference is not a verdict.
+    The exit status is 0 even if the campaigns differ.
     """
     from marsyard.cli.showing import grid_table
     from marsyard.reports import comparison

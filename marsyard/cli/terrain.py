@@ -67,7 +67,7 @@ def stats(
     max_holes: MaxHolesOption = None,
     picture: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir image; filled holes are red.")] = None,
 ) -> None:
-    """Print albedo, slopes, relief and image contrast of a site's terrain, and the values in the DIMES paper."""
+    """Print albedo, slopes, relief and image contrast of a site's terrain, and those in the DIMES field test paper."""
     import numpy as np
 
     from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, grid_north_deg, load_site

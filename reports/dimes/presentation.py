@@ -49,7 +49,7 @@ def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Format the estimated and the true velocity, if the products contain them."""
     facts = []
     for key, name in (
-        ("velocity_estimated_m_s", "Estimated velocity, mean between images 2 and 3"),
+        ("velocity_estimated_m_s", "Reported velocity, mean over the time between images 2 and 3"),
         ("velocity_true_m_s", "True velocity, same interval"),
     ):
         velocity = numeric_product(products.get(key))

@@ -191,7 +191,7 @@ _FIRING_NOTE = (
 #: Error of the velocity that the inertial unit propagates to thruster ignition at a height near 100 m (section I).
 FIRING = kinds.SectionDeclaration(
     "firing",
-    "Firing",
+    "Ignition",
     "Velocity error at thruster ignition",
     rows=lambda subject: None if subject.metric == _FIRING else subject.frame,
     requires=(_FIRING,),

@@ -39,6 +39,11 @@ class HazardClass:
     unflagged: PooledRate
 
     @property
+    def is_hazard(self) -> bool:
+        """Whether the footprints exceed the limit."""
+        return self.low >= 1.0
+
+    @property
     def name(self) -> str:
         """Text of the bounds."""
         if self.low == 0.0:
@@ -84,8 +89,10 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
             "Size divided by limit": lambda item: item.name,
             "Footprints in flights": lambda item: f"{item.called_safe.of:,} in {item.called_safe.flights:,}",
             "Classified as safe": lambda item: rate_text(item.called_safe),
-            "Not detected": lambda item: rate_text(item.unflagged),
-            "Flights with an undetected hazard": lambda x: f"{x.unflagged.flights_hit:,} of {x.unflagged.flights:,}",
+            "Not detected": lambda item: rate_text(item.unflagged) if item.is_hazard else NOTHING,
+            "Flights with an undetected hazard": lambda x: (
+                f"{x.unflagged.flights_hit:,} of {x.unflagged.flights:,}" if x.is_hazard else NOTHING
+            ),
         },
     )
     rows = [[name, f"{item.hits:,} of {item.of:,}", rate_text(item)] for name, item in rates.items()]

@@ -165,7 +165,7 @@ _MAP_ERRORS = (
 MAP_EFFECTS = kinds.Scatter(
     x=(
         kinds.Quantity("baseline_fraction", "baseline / height"),
-        kinds.Quantity("texture", "texture contrast divided by that of the terrain preset"),
+        kinds.Quantity("texture", "texture contrast divided by its nominal value"),
         kinds.Quantity("grid_px", "grid spacing (px)"),
         kinds.Quantity("level_error_deg", "error of the vertical (deg)"),
         kinds.Quantity("altimeter_fraction", "altimeter error (% of range)", 100.0),
@@ -280,7 +280,7 @@ TOUCHDOWN = kinds.SectionDeclaration(
 #: Classes of the true ground in both images, best first, and outcomes of the search. All positions within one lander
 #: radius of a wide safe site are also safe.
 GROUNDS = ("wide safe site", "narrow safe site", "no safe site")
-ANSWERS = ("truly safe site", "unsafe site", "'no safe site'", "not converged", "not finished")
+ANSWERS = ("truly safe site", "unsafe site", "'no safe site'", "not converged", "crashed")
 
 
 def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:

@@ -124,7 +124,7 @@ def test_case_without_tracks_shows_only_images(dimes_products: dict[str, Any]) -
     assert case_view.legend is not None
     assert "squares mark" not in case_view.legend
     assert [name for name, _ in case_view.facts] == [
-        "Estimated velocity, mean between images 2 and 3",
+        "Reported velocity, mean over the time between images 2 and 3",
         "True velocity, same interval",
     ]
 

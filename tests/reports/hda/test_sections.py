@@ -104,7 +104,7 @@ def test_crashed_flights_are_counted_as_not_finished() -> None:
     frame = frame.astype(dict.fromkeys([*unknown, "wide_site_exists"], object))
     frame.loc[0, unknown] = None
     frame.loc[0, "wide_site_exists"] = True
-    assert sum(row["not finished"] for row in outcome_counts(frame).values()) == 1
+    assert sum(row["crashed"] for row in outcome_counts(frame).values()) == 1
 
 
 def test_hazard_classes_have_their_limits_and_rates() -> None:
