@@ -186,7 +186,8 @@ def _draw_scatter(rows: kinds.Rows, parts: Sequence[str], subject: Subject, axis
 _FIRING = "firing_velocity_error_m_s"
 _FIRING_NOTE = (
     "The reported velocity is the mean between the second and the third image. The IMU propagates it to the time of "
-    "ignition. The error is relative to the true camera velocity at that time, including pendulum motion."
+    "ignition. The error is relative to the true camera velocity at that time, including pendulum motion. It can be "
+    "smaller than that of the reported velocity: the attitude error acts on both, with opposite signs."
 )
 #: Error of the velocity that the inertial unit propagates to thruster ignition at a height near 100 m (section I).
 FIRING = kinds.SectionDeclaration(
