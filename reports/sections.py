@@ -282,8 +282,8 @@ def rank_text(result: Driver) -> str:
 def outcome_figures(frame: pd.DataFrame) -> list[SvgFigure]:
     """Draw the number of cases by outcome."""
     caption = (
-        "Solid bars: cases with an answer. Hatched bars: cases without an answer. Cross-hatched bars: cases in which the "
-        "program failed (crashed cases)."
+        "Solid bars: cases with an answer. Hatched bars: cases without an answer. Cross-hatched bars: cases in which "
+        "the program failed (crashed cases)."
     )
     return _svg_figures([("outcomes", figures.outcome_bars(frame), caption)])
 
