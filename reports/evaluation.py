@@ -64,7 +64,7 @@ def combine_verdicts(
         reason = "" if evidence is None else f" {evidence.text}"
         return OverallVerdict(worst, crashed, f"{would_be_met}{reason}{crash_text}")
     fraction = f"{statuses.count(worst)} of {count(len(statuses), 'requirement')}"
-    undecided = sum(status in (Status.INSUFFICIENT, Status.MET_BY_RATE) for status in statuses)
+    undecided = statuses.count(Status.INSUFFICIENT)
     undecided_text = f", {undecided} undecided" if undecided else ""
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",

@@ -40,7 +40,10 @@ class NewOptions:
     axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
     bound: Annotated[
         float | None,
-        Option(metavar="X", help="Limit of the requirement, in the unit of its metric, such as 5 for 5 m/s."),
+        Option(
+            metavar="X",
+            help="Limit of the requirement: the maximum error in its unit, or the minimum fraction of cases.",
+        ),
     ] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
     out: Annotated[Path | None, Option(metavar="FILE", help="File to write; by default NAME.toml.")] = None

@@ -124,8 +124,7 @@ def conformance(
         Argument(
             metavar="ALGORITHM",
             help="Algorithm, dynamics, instrument or custom score: a name, module:Class, exec:PROGRAM (started "
-            "per case) or "
-            "serve:PROGRAM (keeps running).",
+            "per case) or serve:PROGRAM (keeps running).",
         ),
     ],
     task: Annotated[

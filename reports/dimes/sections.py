@@ -187,7 +187,8 @@ _FIRING = "firing_velocity_error_m_s"
 _FIRING_NOTE = (
     "The reported velocity is the mean between the second and the third image. The IMU propagates it to the time of "
     "ignition. The error is relative to the true camera velocity at that time, including pendulum motion. It can be "
-    "smaller than that of the reported velocity: the attitude error acts on both, with opposite signs."
+    "smaller than that of the reported velocity: the attitude error causes errors of opposite signs in the reported "
+    "velocity and in its propagation."
 )
 #: Error of the velocity that the inertial unit propagates to thruster ignition at a height near 100 m (section I).
 FIRING = kinds.SectionDeclaration(

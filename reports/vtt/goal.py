@@ -129,9 +129,8 @@ def _expected_errors() -> str:
         errors.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
     return (
         f"By Eqs. 1 and 4, one pixel of disparity error at {GOAL_M:g} m corresponds to an error along the line of "
-        "sight, and "
-        f"one pixel of drift to an error across it; for the paper's cameras: {'; '.join(errors)}. The bound of the "
-        f"{format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence needs at least 230 runs."
+        f"sight, and one pixel of drift to an error across it; for the paper's cameras: {'; '.join(errors)}. The "
+        f"bound of the {format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence needs at least 230 runs."
     )
 
 

@@ -39,7 +39,7 @@ _GROUND_POINTS = 256
 _MARGIN = 2
 #: Rays along each side of a pixel at the edges of the targets.
 _TARGET_EDGE_RAYS = 4
-#: Minimum number of sightings of a pass.
+#: Minimum number of sightings of a pass: two directions determine an attitude, one more checks it.
 _MIN_SIGHTINGS = 3
 #: Spacing of the mesh below the targets, in posts of the terrain.
 _MESH_POSTS = 0.67
