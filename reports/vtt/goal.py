@@ -130,8 +130,8 @@ def _expected_errors() -> str:
     return (
         f"By Eqs. 1 and 4, one pixel of disparity error at {GOAL_M:g} m corresponds to an error along the line of "
         f"sight, and one pixel of drift to an error across it; for the paper's cameras: {'; '.join(errors)}. The "
-        f"bound of the {format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence needs at least 230 "
-        "runs."
+        f"bound of the {format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence needs at least "
+        "230 runs."
     )
 
 
