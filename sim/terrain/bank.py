@@ -71,19 +71,20 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
 
 
 @cache
-def _code_version() -> str:
+def _code_version(*, has_tails: bool) -> str:
     """Hash of the code that makes a terrain: after a change of it, cached terrains are built again."""
     digest = hashlib.sha256(np.__version__.encode())
     folder = Path(__file__).parent
     for path in sorted(folder.rglob("*.py")):
-        if path.relative_to(folder).parts[0] not in MODULES_WITHOUT_SAMPLES:
+        part = path.relative_to(folder).parts[0]
+        if part not in MODULES_WITHOUT_SAMPLES or (has_tails and part == "rocks"):
             digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
 @dataclass(frozen=True)
 class TerrainBank:
-    """Numbered terrains of one kind, cached on disk.
+    """Numbered terrains of one kind, cached on disk. Wind tails of rocks are part of the surface.
 
     Terrain k is a pure function of the parameters, the seed and k. On disk it is one array of all levels, which workers
     memory-map, so they share its pages. The cache's size is bounded: see `marsyard.sim.cache.evict_files`.
@@ -99,7 +100,7 @@ class TerrainBank:
         if flat is not None and flat.size == self._size():
             touch(path)
         else:
-            built = synthesise(self.parameters, self._rng(number))
+            built = self._build(number)
             flat = np.concatenate([one.reshape(-1) for one in (*built.levels, built.cover)])
             try:
                 evict_files(path.parent, 4 * self._size(), set(_IN_USE))
@@ -113,6 +114,13 @@ class TerrainBank:
         levels = tuple(part.reshape(side, side, 2) for part, side in zip(parts, sides, strict=True))
         side = self._cover_side()
         return Surface(levels, self.parameters.spacing_m, cover.reshape(side, side, 3))
+
+    def _build(self, number: int) -> Surface:
+        surface, rocks = synthesise(self.parameters, self._rng(number)), self.parameters.rocks
+        if rocks is None or rocks.tails is None:
+            return surface
+        field = RockField.on(surface, rocks, substream(self._rng(number), "rocks"))
+        return rocks.tails.apply(surface, field, substream(self._rng(number), "wind tails"))
 
     def missing_bytes(self, number: int) -> int:
         """Return the bytes that a terrain would add on disk, except for some hundred; 0 where it is stored."""
@@ -129,10 +137,12 @@ class TerrainBank:
 
     def _path(self, number: int) -> Path:
         # with hashes of the real terrain's files, whose content may change under the same name
-        source, parameters = self.parameters.source, self.parameters.model_dump_json(exclude={"rocks"})
+        source, rocks = self.parameters.source, self.parameters.rocks
+        has_tails = rocks is not None and rocks.tails is not None
+        parameters = self.parameters.model_dump_json(exclude=None if has_tails else {"rocks"})
         paths = [Path(name) for name in source.input_files()] if source else []
         hashes = " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.exists())
-        identity = f"{parameters} {self.seed} {number} {_code_version()} {hashes}"
+        identity = f"{parameters} {self.seed} {number} {_code_version(has_tails=has_tails)} {hashes}"
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
 
     def _sides(self) -> list[int]:

@@ -19,6 +19,7 @@ from marsyard.sim.terrain.landforms.ground import substream
 from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.kernels import Placements, assemble, place_discs
 from marsyard.sim.terrain.rocks.shapes import FINEST, SHAPES_OF_FORM, max_pixels, rock_shapes
+from marsyard.sim.terrain.rocks.tails import WindTails
 from marsyard.sim.terrain.surface import ROCKS, Surface
 
 MAX_ROCKS = 2_000_000  #: Maximum number of rocks on one terrain.
@@ -92,6 +93,7 @@ class RockParameters(Parameters):
         0.0
     )
     placed: Annotated[tuple[PlacedRock, ...], Field(description="rocks at given positions")] = ()
+    tails: Annotated[WindTails | None, Field(description="wind tails of rocks")] = None
 
     @model_validator(mode="after")
     def _check_consistency(self) -> RockParameters:

@@ -1,4 +1,4 @@
-"""Compiled kernels of the rocks: placement without overlap, and assembly of their triangles."""
+"""Compiled kernels of the rocks: placement without overlap, wind tails, and assembly of their triangles."""
 
 from __future__ import annotations
 
@@ -103,6 +103,45 @@ def place_discs(
                 used += 1
         count += 1
     return placed
+
+
+@njit(cache=True)
+def stamp_tails(
+    samples: NDArray[np.float32], spacing: float, tails: Array, downwind_x: float, downwind_y: float, tone: float
+) -> None:
+    """Raise ridges in the lee of rocks; `samples` are heights and albedos on a periodic square, changed in place.
+
+    `tails` has rows (x, y, half width, distance of the tip, height). The ridge rises from the centre of the rock to the
+    rock's edge, where it is widest and highest, and decreases linearly to its tip. Its cross section is
+    ``(1 - (t / half width)**2)**2``, whose steepest slope is 1.54 times height over half width.
+    """
+    mask = samples.shape[0] - 1
+    for n in range(tails.shape[0]):
+        x, y, half_width, tip, height = tails[n]
+        x_end, y_end = x + tip * downwind_x, y + tip * downwind_y
+        for i in range(
+            math.floor((min(y, y_end) - half_width) / spacing), math.ceil((max(y, y_end) + half_width) / spacing) + 1
+        ):
+            for j in range(
+                math.floor((min(x, x_end) - half_width) / spacing),
+                math.ceil((max(x, x_end) + half_width) / spacing) + 1,
+            ):
+                dx, dy = j * spacing - x, i * spacing - y
+                along, across = dx * downwind_x + dy * downwind_y, dy * downwind_x - dx * downwind_y
+                if along <= 0.0 or along >= tip:
+                    continue
+                if along < half_width:
+                    rise = along / half_width
+                    taper, amplitude = 1.0, rise * rise * (3.0 - 2.0 * rise)
+                else:
+                    taper = (tip - along) / (tip - half_width)
+                    amplitude = taper
+                t = across / (half_width * taper)
+                if abs(t) >= 1.0:
+                    continue
+                shape = amplitude * (1.0 - t * t) ** 2
+                samples[i & mask, j & mask, 0] += height * shape
+                samples[i & mask, j & mask, 1] *= math.exp(tone * shape)
 
 
 @njit(cache=True)

@@ -1,0 +1,45 @@
+"""Wind tails: ridges of sand and dust in the lee of rocks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from numpy.random import Generator
+from pydantic import Field
+
+from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
+from marsyard.sim.terrain.rocks.kernels import stamp_tails
+from marsyard.sim.terrain.surface import Surface
+
+if TYPE_CHECKING:
+    from marsyard.sim.terrain.rocks.field import RockField
+
+SAMPLES_ACROSS = 4.0  #: Minimum width of a tail in samples of the terrain; narrower tails are omitted.
+
+
+class WindTails(Parameters):
+    """Ridges in the lee of rocks, as Spirit and Opportunity saw them (Greeley et al. 2004; Sullivan et al. 2005).
+
+    Hesp (1981), shadow dunes: the ridge begins at the obstacle with its width, narrows to a point, and is as high as the
+    angle of repose allows over half of the width. Here it is also at most a fraction of the rock's height.
+    """
+
+    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth the wind comes from")] = 330.0
+    length_heights: Annotated[Positive, Field(description="median length, heights of the rock; assumed")] = 4.0
+    length_spread: Annotated[NonNegative, Field(description="SD of the logarithm of the length; assumed")] = 0.4
+    height_fraction: Annotated[float, bounded_field(0.0, 1.0, "maximum height, heights of the rock; assumed")] = 0.4
+    repose_deg: Annotated[float, Field(ge=5.0, le=36.0, description="slope of the ridge's sides; assumed")] = 20.0
+    tone: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of the ridge's albedo over the ground's")] = 0.0
+
+    def apply(self, surface: Surface, rocks: RockField, rng: Generator) -> Surface:
+        """Return the surface with the tails of all rocks; tails narrower than `SAMPLES_ACROSS` samples are omitted."""
+        width = rocks.diameter_m
+        length = self.length_heights * rocks.height_m * np.exp(self.length_spread * rng.standard_normal(width.size))
+        height = np.minimum(self.height_fraction * rocks.height_m, 0.5 * width * np.tan(np.radians(self.repose_deg)))
+        tails = np.column_stack([rocks.position_m[:, :2], 0.5 * width, 0.5 * width + length, height])
+        downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
+        samples = np.array(surface.levels[0])
+        visible = tails[width >= SAMPLES_ACROSS * surface.spacing_m]
+        stamp_tails(samples, surface.spacing_m, visible, float(np.cos(downwind)), float(np.sin(downwind)), self.tone)
+        return Surface.from_samples(samples, surface.spacing_m, surface.cover)
