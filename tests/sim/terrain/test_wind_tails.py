@@ -65,7 +65,8 @@ def test_bank_includes_tails_and_keeps_the_positions_of_rocks(tmp_path: Path, mo
     assert rise.min() == 0.0
     assert rise.max() > 0.02
     rocks, rocks_of_plain = ridged.rocks(0), plain.rocks(0)
-    assert rocks is not None and rocks_of_plain is not None
+    assert rocks is not None
+    assert rocks_of_plain is not None
     np.testing.assert_array_equal(rocks.position_m[:, :2], rocks_of_plain.position_m[:, :2])
     # rocks stand on the ridged surface
     x, y, z = rocks.position_m.T
@@ -76,7 +77,7 @@ def test_rocks_identify_a_terrain_only_if_they_have_tails(tmp_path: Path, monkey
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
     rocks = RockParameters(abundance=0.05, smallest_m=0.2)
     parameters = TerrainParameters(samples=64, spacing_m=0.05, rocks=rocks)
-    for tails in (None, {}):
+    for tails in (None, WindTails()):
         for abundance in (0.05, 0.1):
             TerrainBank(parameters.with_changes({"rocks": {"abundance": abundance, "tails": tails}}), 1).terrain(0)
     terrains = [path for path in (tmp_path / "terrain").glob("*.npy") if not path.name.startswith("rocks-")]
