@@ -80,13 +80,12 @@ def add_relief_slopes(
     for k in range(footprint.size):
         finest = min(finest, footprint[k])
         slope_x[k] = slope_y[k] = resolved[k] = unresolved[k] = 0.0
-    cell = relief.coarsest
+    cell, invisible = relief.coarsest, 0.0
     for octave in range(relief.heights.size):
         gain = relief.heights[octave] / cell
         variance = gain * gain * SLOPE_VARIANCE
         if cell <= MIN_CELLS * finest:
-            for k in range(footprint.size):
-                unresolved[k] += variance
+            invisible += variance
         else:
             for k in range(footprint.size):
                 ratio = footprint[k] / cell
@@ -98,6 +97,8 @@ def add_relief_slopes(
                 resolved[k] += variance * fade * fade
                 unresolved[k] += variance * (1.0 - fade * fade)
         cell *= 0.5
+    for k in range(footprint.size):
+        unresolved[k] += invisible
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -107,12 +108,8 @@ def smith_shadowing(cosine: float, variance: float) -> float:
     `cosine` is that of the incidence angle, `variance` that of the slope along one axis. The rational approximation of
     Walter et al. (2007, section 5.2) is at least 0.996 of the exact value.
     """
-    if variance <= 0.0 or cosine >= 1.0:
-        return 1.0
-    a = cosine / math.sqrt(2.0 * variance * (1.0 - cosine * cosine))
-    if a >= 1.6:
-        return 1.0
-    if a <= 1e-6:
-        return 0.0
-    hidden = (1.0 - 1.259 * a + 0.396 * a * a) / (3.535 * a + 2.181 * a * a)
-    return 1.0 / (1.0 + hidden)
+    # without branches, for vector instructions; a is infinite without roughness or at normal incidence
+    a = min(cosine / math.sqrt(max(2.0 * variance * (1.0 - cosine * cosine), 1e-300)), 1.6)
+    masked = 1.0 - 1.259 * a + 0.396 * a * a
+    facing = 3.535 * a + 2.181 * a * a
+    return facing / (facing + masked) if a < 1.6 else 1.0

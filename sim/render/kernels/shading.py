@@ -65,9 +65,9 @@ X, Y, Z, DX, DY, DZ, FOOTPRINT, HEIGHT, SLOPE_X, SLOPE_Y, ALBEDO, NX, NY, NZ, CH
 SCALE, BLEND, COARSE_HEIGHT, COARSE_SLOPE_X, COARSE_SLOPE_Y, COARSE_ALBEDO = (ROW * n for n in range(19, 25))
 #: Rows of the pixels with objects: position, footprint and logarithm of the relative albedo.
 OBJECT_X, OBJECT_Y, OBJECT_Z, OBJECT_FOOTPRINT, OBJECT_CHANGE = (ROW * n for n in range(25, 30))
-#: Rows of the micro-relief: slopes, resolved and unresolved variance of slope, and strength of texture.
-FINE_X, FINE_Y, RESOLVED, UNRESOLVED, STRENGTH = (ROW * n for n in range(30, 35))
-ROWS = 35
+#: Rows of the micro-relief: slopes, resolved and unresolved variance of slope, strength of texture, and roughness.
+FINE_X, FINE_Y, RESOLVED, UNRESOLVED, STRENGTH, ROUGHNESS = (ROW * n for n in range(30, 36))
+ROWS = 36
 
 
 class Occluders(NamedTuple):
@@ -275,24 +275,29 @@ def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
     resolved, unresolved = work[RESOLVED : RESOLVED + width], work[UNRESOLVED : UNRESOLVED + width]
     add_relief_slopes(x, y, footprint, relief, fine_x, fine_y, resolved, unresolved)
     for k in range(width):
-        if footprint[k] == math.inf:
-            resolved[k] = unresolved[k] = 0.0
-            continue
-        factor = interpolate_bilinear(relief.roughness, relief.per_metre, x[k], y[k])[0]
-        work[STRENGTH + k] = interpolate_bilinear(relief.texture, relief.per_metre, x[k], y[k])[0]
-        resolved[k] *= factor * factor
-        unresolved[k] *= factor * factor
-        slope_x, slope_y = work[SLOPE_X + k] + factor * fine_x[k], work[SLOPE_Y + k] + factor * fine_y[k]
+        factor = 0.0
+        if footprint[k] < math.inf:
+            factor = interpolate_bilinear(relief.roughness, relief.per_metre, x[k], y[k])[0]
+            work[STRENGTH + k] = interpolate_bilinear(relief.texture, relief.per_metre, x[k], y[k])[0]
+        work[ROUGHNESS + k] = factor
+    for k in range(min(width, STRIP)):
+        factor, is_ground = work[ROUGHNESS + k], work[FOOTPRINT + k] < math.inf
+        work[RESOLVED + k] *= factor * factor
+        work[UNRESOLVED + k] *= factor * factor
+        slope_x = work[SLOPE_X + k] + factor * work[FINE_X + k]
+        slope_y = work[SLOPE_Y + k] + factor * work[FINE_Y + k]
         nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
-        work[NX + k], work[NY + k], work[NZ + k] = -slope_x * nz, -slope_y * nz, nz
+        work[NX + k] = -slope_x * nz if is_ground else work[NX + k]
+        work[NY + k] = -slope_y * nz if is_ground else work[NY + k]
+        work[NZ + k] = nz if is_ground else work[NZ + k]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _shade_roughness(width: int, work: Array) -> None:
     """Restore the mean radiance after the normals were tilted, and darken by shadows of unresolved relief."""
-    for k in range(width):
-        if work[COS_I + k] > 0.0 and work[UNRESOLVED + k] + work[RESOLVED + k] > 0.0:
-            work[LIT + k] *= (1.0 + work[RESOLVED + k]) * smith_shadowing(work[COS_I + k], work[UNRESOLVED + k])
+    for k in range(min(width, STRIP)):
+        cosine = min(max(work[COS_I + k], 1e-6), 1.0)
+        work[LIT + k] *= (1.0 + work[RESOLVED + k]) * smith_shadowing(cosine, work[UNRESOLVED + k])
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
