@@ -117,11 +117,12 @@ def scatter_section(subject: Subject) -> Section | None:
     groups = rates.terrain_groups(subject.all_cases)
     circles = [circular_error(errors, probability, CONFIDENCE, groups) for probability in PROBABILITIES]
     unit = split_unit(metric)[1]
+    first, second = (label(part).removesuffix(f" ({unit})") for part in parts)
     x, y = (number(value) for value in ellipse.centre)
     text = (
         f"{format_fraction(ELLIPSE)} ellipse, assuming normally distributed errors: centre {x}, {y} {unit}, semi-axes "
         f"{number(ellipse.semi_major)} and {number(ellipse.semi_minor)} {unit}, major axis at "
-        f"{number(ellipse.angle_deg)} deg from {label(parts[0])} towards {label(parts[1])}. "
+        f"{number(ellipse.angle_deg)} deg from the {first} towards the {second}. "
         f"{percent(ellipse.inside)} of these errors lie inside."
     )
     rows = [[format_fraction(c.probability), number(c.estimate), interval(c.lower, c.upper)] for c in circles]

@@ -37,7 +37,7 @@ class Part(Protocol):
     """A part of a declared section."""
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
-        """Create blocks of the page and their numbers; `key` prefixes the figures' identifiers."""
+        """Create the blocks of the page and the data for `report.json`; `key` is the prefix of figure identifiers."""
 
 
 @dataclass(frozen=True)
@@ -103,21 +103,21 @@ class Quantity:
         return np.asarray(self.scale * numbers(frame, self.column))
 
 
-def flag_rate(name: str, *among: str, wanted: bool = True) -> RateOf:
-    """Create a function: fraction of rows whose flag equals `wanted`, of the rows where all flags `among` are true."""
+def flag_rate(name: str, *given: str, value: bool = True) -> RateOf:
+    """Return a function: fraction of rows with flag == `value`, of the rows where all flags `given` are true."""
 
     def compute_rate(frame: Rows) -> CaseFraction:
         all_rows = np.ones(len(frame), dtype=np.bool_)
-        masks = (rates.flag_mask(frame, condition) for condition in among)
+        masks = (rates.flag_mask(frame, condition) for condition in given)
         selected = frame[np.logical_and.reduce([all_rows, *masks])]
-        return rates.fraction_of(rates.flag_mask(selected, name) == wanted, selected)
+        return rates.fraction_of(rates.flag_mask(selected, name) == value, selected)
 
     return compute_rate
 
 
-def pooled_fraction(hits: str, of: str) -> RateOf:
-    """Create a function: sum of the counts `hits` divided by the sum of the counts `of`, pooled over the rows."""
-    return lambda frame: rates.pooled_rate(frame, hits, of)
+def pooled_fraction(numerator: str, denominator: str) -> RateOf:
+    """Return a function that divides the sum of one column of counts by that of another, over all rows."""
+    return lambda frame: rates.pooled_rate(frame, numerator, denominator)
 
 
 @dataclass(frozen=True)
@@ -225,14 +225,15 @@ def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _BINS) -> 
 
 @dataclass(frozen=True)
 class OutcomesBySize:
-    """Outcomes of cases by a kind and its size (a fault and its severity): a table and stacked bars.
+    """Outcomes of cases by fault type and severity: a table and stacked bars.
 
-    - outcomes: function that returns masks of the rows by key of `report.json`; the last outcome has an interval
-    - styles: name on the page and style of `marsyard.reports.section.BARS` by outcome, in the order of the bars
+    - outcomes: function that returns a mask of the rows for each outcome, by its key in `report.json`; the table shows
+      a confidence interval for the last outcome
+    - styles: for each outcome, its label and the style of its bars (`marsyard.reports.section.BARS`), in order
     - cases: heading of the number of rows
-    - wording: function that returns kind and size in words; an unknown size is empty
+    - wording: function that returns fault type and severity in words; an unknown severity is empty
     - extra_columns: heading, key of `report.json`, function of the rows, and function that formats its value
-    - kind, size, none: columns of kind and size, and name of the kind of cases without a fault
+    - kind, size, none: columns of fault type and severity, and the type of cases without a fault
     """
 
     outcomes: Callable[[Rows, Subject], Mapping[str, Bool[np.ndarray, " n"]]]
@@ -247,7 +248,7 @@ class OutcomesBySize:
     caption: str = ""
 
     def records(self, frame: Rows, subject: Subject) -> list[dict[str, Any]]:
-        """Count the outcomes of each kind and size; cases without a fault come first."""
+        """Count the outcomes for each fault type and severity; cases without a fault come first."""
         records = []
         for kind, size, rows in rates.group_by_size(frame, self.kind, self.size, self.none):
             masks = self.outcomes(rows, subject)
@@ -303,6 +304,7 @@ class Distribution:
     bound: float | None = None
     limits: Mapping[str, Sequence[float]] = field(default_factory=dict)
     table: Callable[[Mapping[str, Float[np.ndarray, " n"]]], Grid] | None = None
+    note: str = ""
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
         """Create the curves and their table; nothing if no curve has a value."""
@@ -315,7 +317,9 @@ class Distribution:
         style: dict[str, Any] = {"complementary": self.complementary, "bound": self.bound, "limits": self.limits}
         figure = cumulative_figure(curves, self.labels, **style)
         grid = None if self.table is None else self.table(curves)
-        return [Block(heading=self.heading, figures=[svg_figure(figure, key, self.caption)], grid=grid)], {}
+        return [
+            Block(heading=self.heading, figures=[svg_figure(figure, key, self.caption)], grid=grid, note=self.note)
+        ], {}
 
 
 @dataclass(frozen=True)

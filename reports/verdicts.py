@@ -15,6 +15,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from marsyard.reports.statistics.proportions import (
     clustered_evidence,
     confidence_at,
 )
-from marsyard.reports.wording import count, format_fraction, percent
+from marsyard.reports.wording import count, format_fraction, percent, population_text
 
 #: Beginning of the statement of a requirement whose population the flight system cannot know.
 GIVEN_TRUTH = "Given truth"
@@ -52,7 +53,8 @@ class Status(StrEnum):
 class AllCases:
     """The same requirement on all cases instead of its population; numbers as in `Verdict`.
 
-    Cases without the metric are failures.
+    Cases without the metric are failures. `configured` are the conditions that remain, because the configuration of a
+    case determines them; empty for all cases of the campaign.
     """
 
     status: Status
@@ -61,12 +63,14 @@ class AllCases:
     estimate: float
     lower: float
     upper: float
+    configured: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
         """The result in a sentence."""
-        met = f"{self.n - self.failures:,} of {self.n:,} ({percent(self.estimate)})"
-        return f"Over all cases of the campaign, where a case without a value fails, {met} satisfy it: {self.status}."
+        cases = f"all {self.n:,} {population_text(' and '.join(self.configured))}"
+        met = f"{self.n - self.failures:,} ({percent(self.estimate)}) meet it"
+        return f"Of {cases}, {met}; a case without a value does not: {self.status}."
 
 
 @dataclass(frozen=True)
@@ -281,11 +285,14 @@ def evaluate_requirements(
     requirements: Sequence[Mapping[str, Any]],
     sampling: SamplingDesign = INDEPENDENT,
     from_truth: Sequence[str] = (),
+    configured: Sequence[str] = (),
 ) -> list[Verdict]:
     """Evaluate each requirement on all rows of a campaign; missing columns or numbers result in INSUFFICIENT.
 
     - sampling: the sampling design; without independent random samples, verdicts have no bounds
     - from_truth: columns that the flight system cannot know; statements about populations with them say so
+    - configured: columns, or patterns of names, that the configuration of a case determines; they remain conditions
+      over all cases
     """
     frame = sampling.exclude_nominal_case(frame)
     verdicts = []
@@ -295,20 +302,23 @@ def evaluate_requirements(
         if names:
             title = f"{GIVEN_TRUTH} ({', '.join(name.replace('_', ' ') for name in names)}): "
             verdict = replace(verdict, statement=f"{title}{verdict.statement}")
-        verdicts.append(replace(verdict, all_cases=_evaluate_all_cases(frame, verdict, requirement, sampling)))
+        verdicts.append(replace(verdict, all_cases=_evaluate_all_cases(frame, requirement, sampling, configured)))
     return verdicts
 
 
 def _evaluate_all_cases(
-    frame: pd.DataFrame, verdict: Verdict, requirement: Mapping[str, Any], sampling: SamplingDesign
+    frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign, configured: Sequence[str]
 ) -> AllCases | None:
-    """Evaluate a requirement on all cases; None if its population is all cases, or there is no case."""
-    if verdict.population == "all":
+    """Evaluate a requirement on all cases with its configuration; None if that is its population, or has no case."""
+    population = str(requirement.get("population", "all"))
+    kept = tuple(name for name in population.split(" and ") if any(fnmatchcase(name, flag) for flag in configured))
+    everything = " and ".join(kept) or "all"
+    if population == everything:
         return None
-    result = _evaluate(frame, {**requirement, "population": "all"}, sampling)
+    result = _evaluate(frame, {**requirement, "population": everything}, sampling)
     if not result.n:
         return None
-    return AllCases(result.status, result.n, result.failures, result.estimate, result.lower, result.upper)
+    return AllCases(result.status, result.n, result.failures, result.estimate, result.lower, result.upper, kept)
 
 
 def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign) -> Verdict:

@@ -43,7 +43,7 @@ def population_text(population: str) -> str:
     parts = population.split(" and ")
     base = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
     phrases = _notes()["populations"]
-    flags = [part for part in parts if part not in _POPULATIONS]
+    flags = [part for part in parts if part and part not in _POPULATIONS]
     texts = [phrases.get(flag, f"with {_words(flag.removeprefix('with_'))}") for flag in flags]
     return f"{base} {', '.join(texts)}" if texts else base
 

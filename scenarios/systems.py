@@ -239,12 +239,14 @@ class RowColumns:
     - named_flags: path of a list among the parameters; the `name` of each entry is a further boolean column; empty for
       none
     - from_truth: boolean columns that the flight system cannot know, because they are computed from the truth
+    - configured: boolean columns that the configuration of a case determines, such as its camera or its driving mode
     """
 
     flags: tuple[str, ...]
     numbers: tuple[str, ...]
     named_flags: str = ""
     from_truth: tuple[str, ...] = ()
+    configured: tuple[str, ...] = ()
 
     def has_flag(self, name: str) -> bool:
         """Return whether a boolean column may have this name."""
@@ -270,6 +272,7 @@ def row_columns(scenario: str) -> RowColumns | None:
             tuple(columns["numbers"]),
             columns.get("named_flags", ""),
             tuple(columns.get("from_truth", ())),
+            tuple(columns.get("configured", ())),
         )
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise ValueError(f"{system.columns}: invalid columns: {type(error).__name__}: {error}") from error

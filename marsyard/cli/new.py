@@ -31,7 +31,8 @@ class NewOptions:
 
     name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
     system: Annotated[
-        str | None, Option(help="Kind of the system under test, such as velocity; an unknown name prints the list.")
+        str | None,
+        Option(help="Type of the system under test, such as velocity, tracking or landing; `list` prints all."),
     ] = None
     site: Annotated[str | None, Option(help="A site from `marsyard terrain list`.")] = None
     camera: Annotated[str | None, Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")] = None
@@ -41,8 +42,7 @@ class NewOptions:
     bound: Annotated[
         float | None,
         Option(
-            metavar="X",
-            help="Limit of the requirement: the maximum error in its unit, or the minimum fraction of cases.",
+            metavar="X", help="Requirement limit: maximum error in its unit, or minimum fraction of successful cases."
         ),
     ] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
@@ -53,7 +53,7 @@ class NewOptions:
 @handle_user_errors
 @with_options(NewOptions)
 def new(arguments: NewOptions) -> None:
-    """Write a commented campaign file; on a terminal, ask for missing options."""
+    """Write a campaign file with comments; ask for missing options when run interactively."""
     from marsyard.campaigns.errors import CampaignError, unknown_name_message
     from marsyard.cli.outcome import evidence_limits
     from marsyard.reports.wording import count

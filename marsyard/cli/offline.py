@@ -124,20 +124,21 @@ def conformance(
         Argument(
             metavar="ALGORITHM",
             help="Algorithm, dynamics, instrument or custom score: a name, module:Class, exec:PROGRAM (started "
-            "per case) or serve:PROGRAM (keeps running).",
+            "per case) or serve:PROGRAM (one process for all cases).",
         ),
     ],
     task: Annotated[
         str | None,
         Option(
             metavar="TASK",
-            help="velocity, tracking, landing, dynamics, instrument or score; by default inferred from the methods.",
+            help="Interface to check: velocity, tracking, landing, dynamics, instrument or score; by default "
+            "inferred from the methods of the class.",
         ),
     ] = None,
-    time_limit: Annotated[float, Option(metavar="S", help="Time limit of one answer in seconds.", min=0.1)] = 60.0,
+    time_limit: Annotated[float, Option(metavar="S", help="Time limit of one call in seconds.", min=0.1)] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that an algorithm, dynamics, instrument or score follows its interface: data types, inputs, run time."""
+    """Check that a custom algorithm, dynamics model, instrument or score follows its interface and time limit."""
     from marsyard.campaigns.running.replay import create_subject, run_conformance_checks
     from marsyard.scenarios.parts.named import KINDS
 

@@ -46,14 +46,19 @@ JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
 DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign run.")]
 BitsOption = Annotated[
     float | None,
-    Option(metavar="BITS", min=0.1, max=16.0, help="Lossy JPEG 2000 compression of the images, bits per pixel."),
+    Option(
+        metavar="BITS",
+        min=0.1,
+        max=16.0,
+        help="Compress the images with lossy JPEG 2000 to this bit rate, bits per pixel.",
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
     Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Override a value, such as render.backend=egl; the parameter then keeps this value in all cases.",
+        help="Override a value, such as render.backend=egl; the parameter is then fixed and not dispersed.",
     ),
 ]
 AlgorithmOption = Annotated[
@@ -61,7 +66,8 @@ AlgorithmOption = Annotated[
     Option(
         metavar="NAME",
         help="The algorithm under test: a name, module:Class, exec:PROGRAM (started per case) or serve:PROGRAM "
-        "(keeps running). If repeated, all algorithms run on the same cases and are compared; the first is under test.",
+        "(one process for all cases). If repeated, all algorithms run on the same cases and are compared; the first is "
+        "under test.",
     ),
 ]
 JobsOption = Annotated[int | None, Option(metavar="J", help="Worker processes; by default one per core.")]

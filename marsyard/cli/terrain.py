@@ -206,7 +206,7 @@ class RenderOptions:
     """Arguments and options of `marsyard render`."""
 
     site: SiteArgument
-    camera: Annotated[str, Option(metavar="NAME", help="Camera such as mer-navcam; an unknown name prints all.")]
+    camera: Annotated[str, Option(metavar="NAME", help="Camera such as mer-navcam; `list` prints all.")]
     out: Annotated[Path, Option(metavar="PREFIX", help="Path of the files without extension.")]
     scale: Annotated[
         str | None,

@@ -79,6 +79,7 @@ SITES = SectionDeclaration(
             heading="Distance to true hazards",
             complementary=True,
             table=sections.distance_grid,
+            note=note_text("hda.distances"),
         ),
         CustomBlocks(draw_classes),
     ),

@@ -20,14 +20,14 @@ from benchmarks.validation.imu_reference import Reference
 from benchmarks.validation.records import Measure
 
 NAN = float("nan")
-#: Start of a claim: reason for a limit of more than four times the measured value.
-WIDER = {
+#: Reasons for limits of more than four times the measured value, by the beginning of the claim.
+REASONS_FOR_WIDE_LIMITS = {
     "discrepancy of correct tracks": "three standard errors of a quantile",
-    "stereo range error": "55 pairs leave the ratio uncertain by 10 %",
+    "stereo range error": "the ratio of 55 pairs has a standard error of 10 %",
     "false PASS": "the guaranteed error rate",
     "false FAIL": "the guaranteed error rate",
     "nights with a false alarm": "the guaranteed rate",
-    "refused templates": "the 95 % interval of one of four flown templates",
+    "refused templates": "the 95 % confidence interval of 1 in 4 templates of flight images",
 }
 
 
@@ -40,7 +40,7 @@ def failed_claims(measures: list[Measure]) -> list[str]:
     return [measure.claim for measure in measures if not measure.passed]
 
 
-def _lose_drifts(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
+def _check_drift_with_lost_targets(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     """Every second target is lost; the others do not drift at all."""
     row = {"selectable": True, "sun_motion_deg": 5.0}
     monkeypatch.setattr(
@@ -49,7 +49,7 @@ def _lose_drifts(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     return list(tracking_checks.check_drift(quick=False))
 
 
-def _lose_stereo_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
+def _check_stereo_with_lost_targets(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     """Every second target is not found; the others have the errors of Eq. 1 of the tracking paper."""
     monkeypatch.setattr(
         tracking_checks, "_simulate_designation", lambda number, camera: (NAN if number % 2 else 0.1, 0.1)
@@ -57,8 +57,8 @@ def _lose_stereo_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     return list(tracking_checks.check_stereo(quick=False))
 
 
-def _lose_landing_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
-    """One pair of a hundred finds no motion; the others are exact."""
+def _check_landing_with_a_failed_pair(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
+    """Motion estimation fails for one image pair in a hundred; the others are exact."""
 
     def errors(number: int) -> dict[str, dict[str, Any]]:
         value = NAN if number == 3 else 0.0
@@ -70,11 +70,13 @@ def _lose_landing_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     return list(landing_checks.check_accuracy(quick=False))
 
 
-@pytest.mark.parametrize("lose", [_lose_drifts, _lose_stereo_pairs, _lose_landing_pairs])
+@pytest.mark.parametrize(
+    "run_check", [_check_drift_with_lost_targets, _check_stereo_with_lost_targets, _check_landing_with_a_failed_pair]
+)
 def test_checks_with_lost_cases_fail(
-    lose: Callable[[pytest.MonkeyPatch], list[Measure]], monkeypatch: pytest.MonkeyPatch
+    run_check: Callable[[pytest.MonkeyPatch], list[Measure]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert failed_claims(lose(monkeypatch))
+    assert failed_claims(run_check(monkeypatch))
 
 
 def test_limits_are_close_to_the_measured_values() -> None:
@@ -82,7 +84,7 @@ def test_limits_are_close_to_the_measured_values() -> None:
         (row.claim, row.measured, row.limit)
         for row in read_measures()
         if row.limit is not None and row.sense == "at most" and row.measured > 1e-12
-        and row.limit > 4.0 * row.measured and not row.claim.startswith(tuple(WIDER))
+        and row.limit > 4.0 * row.measured and not row.claim.startswith(tuple(REASONS_FOR_WIDE_LIMITS))
     ]  # fmt: skip
     assert wide == []
 
@@ -110,7 +112,7 @@ def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch)
     assert "descents with one correct track per pair that pass the IMU check" in failed
 
 
-def test_second_implementation_agrees_without_instrument_errors() -> None:
+def test_reference_implementation_has_the_matching_error_only_without_instrument_errors() -> None:
     # without instrument errors only the matching error remains, 0.1 m/s per axis and track
     inputs = ThresholdInputs(
         altitude_sd=0.0, common_attitude_sd_deg=0.0, attitude_sd_deg=0.0, tag_sd_s=0.0, feature_height_sd_m=0.0

@@ -37,6 +37,7 @@ class AllCases(_Part):
     estimate: float | None
     lower: float | None
     upper: float | None
+    configured: list[str] = Field(description="conditions that remain: columns that the configuration determines")
 
 
 class Evidence(_Part):

@@ -453,7 +453,7 @@ def test_subset_is_shown_next_to_all_cases_and_named_if_only_truth_defines_it(ve
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.failures) == (10, 20, 2)
     assert (
-        f"where a case without a value fails, 18 of 20 (90.00 %) satisfy it: {verdict.all_cases.status}."
+        f"Of all 20 cases, 18 (90.00 %) meet it; a case without a value does not: {verdict.all_cases.status}."
         in verdict.note
     )
     (known,) = evaluate_requirements(frame, [requirement])

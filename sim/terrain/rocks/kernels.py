@@ -33,25 +33,26 @@ def place_discs(
     max_tries: int,
     rng: np.random.Generator,
 ) -> Array:
-    """Draw positions (x, y) of discs on a periodic square, where they do not overlap, by a relative density.
+    """Draw positions (x, y) of discs without overlap on a periodic square, with probability proportional to `density`.
 
-    Discs are placed in order, the largest first, each at the first of its random positions that is free. `occupied` has
-    rows (x, y, radius) of existing discs; `density` covers the square, rows along y. A disc without a free position
-    after `max_tries` gets NaN.
+    Discs are placed in order, the largest first, each at the first of its random positions that is free (rejection
+    sampling). `occupied` has rows (x, y, radius) of existing discs; `density` covers the square, rows along y. A disc
+    without a free position after `max_tries` gets NaN. Neighbours are found in a grid of cells; each cell has a linked
+    list of the discs that touch it.
     """
     rows, densest = density.shape[0], density.max()
     side = max(int(period / cell_m), 1)
     cell = period / side
-    entries = 0
+    n_entries = 0
     for radius in np.concatenate((radii, occupied[:, 2])):
         across = min(int(2.0 * radius / cell) + 2, side)
-        entries += across * across
-    first = np.full(side * side, -1, dtype=np.int32)
-    following = np.empty(entries, dtype=np.int32)
-    member = np.empty(entries, dtype=np.int32)
+        n_entries += across * across
+    first_entry = np.full(side * side, -1, dtype=np.int32)
+    next_entry = np.empty(n_entries, dtype=np.int32)
+    disc_of_entry = np.empty(n_entries, dtype=np.int32)
     discs = np.empty((occupied.shape[0] + radii.size, 3), dtype=np.float64)
     placed = np.full((radii.size, 2), np.nan, dtype=np.float64)
-    used, count = 0, 0
+    n_used, n_discs = 0, 0
     for n in range(occupied.shape[0] + radii.size):
         is_existing = n < occupied.shape[0]
         radius = occupied[n, 2] if is_existing else radii[n - occupied.shape[0]]
@@ -67,22 +68,22 @@ def place_discs(
             if rows > 1 and rng.random() * densest > density[i, j]:
                 free = False
                 continue
-            span = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
-            width = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
-            for di in range(span):
+            cell_rows = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
+            cell_columns = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
+            for di in range(cell_rows):
                 i = (int((y - radius) / cell + side) + di) % side
-                for dj in range(width):
+                for dj in range(cell_columns):
                     j = (int((x - radius) / cell + side) + dj) % side
-                    entry = first[i * side + j]
+                    entry = first_entry[i * side + j]
                     while entry >= 0:
-                        other = member[entry]
+                        other = disc_of_entry[entry]
                         dx, dy = abs(discs[other, 0] - x), abs(discs[other, 1] - y)
                         dx, dy = min(dx, period - dx), min(dy, period - dy)
-                        apart = discs[other, 2] + radius
-                        if dx * dx + dy * dy < apart * apart:
+                        min_distance = discs[other, 2] + radius
+                        if dx * dx + dy * dy < min_distance * min_distance:
                             free = False
                             break
-                        entry = following[entry]
+                        entry = next_entry[entry]
                     if not free:
                         break
                 if not free:
@@ -91,17 +92,17 @@ def place_discs(
             continue
         if not is_existing:
             placed[n - occupied.shape[0], 0], placed[n - occupied.shape[0], 1] = x, y
-        discs[count, 0], discs[count, 1], discs[count, 2] = x, y, radius
-        span = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
-        width = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
-        for di in range(span):
+        discs[n_discs, 0], discs[n_discs, 1], discs[n_discs, 2] = x, y, radius
+        cell_rows = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
+        cell_columns = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
+        for di in range(cell_rows):
             i = (int((y - radius) / cell + side) + di) % side
-            for dj in range(width):
+            for dj in range(cell_columns):
                 j = (int((x - radius) / cell + side) + dj) % side
-                member[used], following[used] = count, first[i * side + j]
-                first[i * side + j] = used
-                used += 1
-        count += 1
+                disc_of_entry[n_used], next_entry[n_used] = n_discs, first_entry[i * side + j]
+                first_entry[i * side + j] = n_used
+                n_used += 1
+        n_discs += 1
     return placed
 
 
@@ -111,7 +112,8 @@ def stamp_tails(
 ) -> None:
     """Raise ridges in the lee of rocks; `samples` are heights and albedos on a periodic square, changed in place.
 
-    `tails` has rows (x, y, half width, distance of the tip, height). The ridge rises from the centre of the rock to the
+    `tails` has rows (x, y, half width, distance of the tip, height). `tone` is the natural logarithm of the albedo of a
+    ridge over that of the ground. The ridge rises from the centre of the rock to the
     rock's edge, where it is widest and highest, and decreases linearly to its tip. Its cross section is
     ``(1 - (t / half width)**2)**2``, whose steepest slope is 1.54 times height over half width.
     """
@@ -152,28 +154,28 @@ def assemble(rocks: Placements, unit_vertices: Array, unit_normals: Array) -> tu
     `up` by the shortest rotation, and moved to `position`.
     """
     shape, position, scale, yaw, up = rocks
-    each = unit_vertices.shape[1]
-    vertices, normals = np.empty((shape.size * each, 3)), np.empty((shape.size * each, 3))
+    vertices_per_rock = unit_vertices.shape[1]
+    vertices, normals = np.empty((shape.size * vertices_per_rock, 3)), np.empty((shape.size * vertices_per_rock, 3))
     for n in range(shape.size):
-        kind = shape[n]
+        unit = shape[n]
         c, s = math.cos(yaw[n]), math.sin(yaw[n])
         ux, uy, uz = up[n, 0], up[n, 1], up[n, 2]
         # the rotation that takes z to up, about the axis z x up
         f = 1.0 / (1.0 + uz)
         r00, r01, r11 = 1.0 - ux * ux * f, -ux * uy * f, 1.0 - uy * uy * f
         sx, sy, sz = scale[n, 0], scale[n, 1], scale[n, 2]
-        for v in range(each):
-            a = unit_vertices[kind, v, 0] * sx
-            b = unit_vertices[kind, v, 1] * sy
-            z = unit_vertices[kind, v, 2] * sz
+        for v in range(vertices_per_rock):
+            a = unit_vertices[unit, v, 0] * sx
+            b = unit_vertices[unit, v, 1] * sy
+            z = unit_vertices[unit, v, 2] * sz
             x, y = c * a - s * b, s * a + c * b
-            row = n * each + v
+            row = n * vertices_per_rock + v
             vertices[row, 0] = position[n, 0] + r00 * x + r01 * y + ux * z
             vertices[row, 1] = position[n, 1] + r01 * x + r11 * y + uy * z
             vertices[row, 2] = position[n, 2] - ux * x - uy * y + uz * z
-            a = unit_normals[kind, v, 0] / sx
-            b = unit_normals[kind, v, 1] / sy
-            z = unit_normals[kind, v, 2] / sz
+            a = unit_normals[unit, v, 0] / sx
+            b = unit_normals[unit, v, 1] / sy
+            z = unit_normals[unit, v, 2] / sz
             length = 1.0 / math.sqrt(a * a + b * b + z * z)
             x = (c * a - s * b) * length
             y = (s * a + c * b) * length

@@ -1,4 +1,4 @@
-"""Tests of visual odometry and terrain maps from rendered stereo pairs in a closed loop, and of their oracles."""
+"""Tests of visual odometry and terrain maps from rendered stereo pairs, and of their variants that use the truth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from marsyard.scenarios.rover.run import Run, map_terrain, prepare_run, run_case
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
 
-#: A rover that loses three tenths of its path, on ground with stones.
+#: A rover with 30 % wheel slip on ground with rocks.
 SLIPPING: dict[str, Any] = {
     **SHORT_RUN,
     "world": {"samples": 1024, "bank": 1},
@@ -36,7 +36,7 @@ def test_visual_odometry_measures_slip_and_wheel_odometry_does_not() -> None:
     errors = {visual: _position_error_m(_run(legs=[leg | {"visual_odometry": visual}])) for visual in (False, True)}
     # the rover drives 1.4 m: its wheels turn by about 2 m
     assert errors[False] > 0.4
-    # 2 % of the distance, as in the paper (section 4.2), and the floor of a step
+    # 2 % of the distance, as in the paper (section 4.2), plus a constant error of each step
     assert errors[True] < 0.02 * 1.4 + 0.03
 
 
@@ -48,7 +48,7 @@ def test_visual_odometry_without_overlap_falls_back_to_the_wheels() -> None:
 
 
 @pytest.mark.parametrize("map_by", ["mast", "body"])
-def test_map_of_images_agrees_with_true_heights(map_by: str) -> None:
+def test_stereo_map_agrees_with_true_heights(map_by: str) -> None:
     leg = {"motion": "approach", "goal_m": 2.0, "autonav": True, "map_by": map_by}
     maps = {}
     for terrain in ("stereo", "oracle-heights"):
@@ -77,7 +77,7 @@ def test_rover_drives_around_an_obstacle_in_its_images() -> None:
     path = [stance for stop in run.stops for drive in stop.drives for stance in drive.stances]
     closest_m = min(float(np.hypot(*(stance.world_from_rover.translation[:2] - rock_m))) for stance in path)
     assert run.outcome.name == "COMPLETED"
-    # the disc of the wheels passes the rock's side
+    # the circle around all wheels has a radius of 0.6 m
     assert closest_m > 0.6 + 0.5 * OBSTACLE["diameter_m"] - 0.05
 
 
