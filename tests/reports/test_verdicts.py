@@ -460,3 +460,16 @@ def test_subset_is_shown_next_to_all_cases_and_named_if_only_truth_defines_it(ve
     assert known.statement == "The error is small."
     (everything,) = evaluate_requirements(frame, [{**requirement, "population": "all"}], from_truth=("lit",))
     assert (everything.all_cases, everything.statement) == (None, "The error is small.")
+
+
+def test_conditions_of_the_configuration_remain_over_all_cases(velocity: dict[str, Any]) -> None:
+    frame = _make_rows(20, 2)
+    frame["lit"], frame["navcam"] = np.arange(20) >= 10, np.arange(20) % 2 == 0
+    requirement = {**velocity, "population": "lit and navcam"}
+    (verdict,) = evaluate_requirements(frame, [requirement], from_truth=("lit",), configured=("nav*",))
+    assert verdict.all_cases is not None
+    assert (verdict.n, verdict.all_cases.n, verdict.all_cases.configured) == (5, 10, ("navcam",))
+    assert verdict.all_cases.text.startswith("Of all 10 cases with the navcam, ")
+    # the population is the configuration itself
+    (configured,) = evaluate_requirements(frame, [{**velocity, "population": "navcam"}], configured=("nav*",))
+    assert configured.all_cases is None
