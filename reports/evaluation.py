@@ -63,14 +63,18 @@ def combine_verdicts(
         would_be_met = f"{withheld} of {count(len(statuses), 'requirement')} would be met."
         reason = "" if evidence is None else f" {evidence.text}"
         return OverallVerdict(worst, crashed, f"{would_be_met}{reason}{crash_text}")
-    fraction = f"{statuses.count(worst)} of {count(len(statuses), 'requirement')}"
+    worst_count, total = statuses.count(worst), count(len(statuses), "requirement")
+    fraction = f"{worst_count} of {total}"
+    few = (
+        "the requirement" if len(statuses) == 1 else f"any of the {total}" if worst_count == len(statuses) else fraction
+    )
     undecided = statuses.count(Status.INSUFFICIENT)
     undecided_text = f", {undecided} undecided" if undecided else ""
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",
         Status.FAIL: f"{fraction} not met{undecided_text}.",
-        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {fraction}.{_remedy_text(verdicts)}",
+        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {few}.{_remedy_text(verdicts)}",
     }[worst]
     return OverallVerdict(worst, crashed, sentence + crash_text)
 
@@ -96,9 +100,10 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
         return ""
     largest = max(needed, key=lambda verdict: verdict.further_cases or 0)
     counts_terrains = largest.clustered is not None and largest.clustered.method is ClusterMethod.TERRAIN_COUNT
-    terrain_text = ", each on a new terrain," if counts_terrains else ""
+    terrain_text = ", each on a new terrain" if counts_terrains else ""
     cases = count(largest.further_cases or 0, "additional case")
-    return f" {cases} that count for {largest.requirement_id}{terrain_text}, without a failure, would be enough."
+    population = f" of the population of {largest.requirement_id}" if largest.population != "all" else ""
+    return f" {cases}{population}{terrain_text}, all without a failure, would decide them."
 
 
 @dataclass(frozen=True)

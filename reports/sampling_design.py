@@ -35,13 +35,15 @@ class TerrainSupply:
     def advice(self, needed: int, probability: float, confidence: float) -> str:
         """Explain that the campaign needs more terrains (`needed`), not more cases, and how to configure them."""
         level = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
-        text = f"The campaign draws from {count(self.terrains, 'terrain')} ({self.key} = {self.terrains}); {level}"
-        text = f"{text} needs at least {count(needed, 'terrain')}"
+        text = (
+            f"To show {level}, the cases must include at least {count(needed, 'different terrain')}; this campaign "
+            f"draws from a set of {count(self.terrains, 'terrain')} ({self.key} = {self.terrains})."
+        )
         if not self.key.endswith(".bank"):
-            return f"{text}: widen the range of {self.key}, and the bank, and run the campaign again."
+            return f"{text} Widen the range of {self.key}, and the bank, and run the campaign again."
         # random draws from ten times as many terrains rarely repeat a terrain, so 1.1 cases per terrain are sufficient
         bank, cases = (needed, needed) if self.in_turn else (10 * needed, math.ceil(1.1 * needed))
-        return f"{text}: run the campaign again with --set {self.key}={bank} -n {cases}."
+        return f"{text} Run the campaign again with --set {self.key}={bank} -n {cases}."
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,10 @@ import pandas as pd
 from jaxtyping import Int
 from markupsafe import Markup
 from matplotlib.figure import Figure
+from pydantic import BaseModel
 
 from marsyard.algorithms.answers import Fault
+from marsyard.campaigns.definition.configuration import description_at
 from marsyard.reports import figures
 from marsyard.reports.presentation import presentations
 from marsyard.reports.rates import CONFIDENCE, engine_failed, population_mask, terrain_groups
@@ -43,6 +45,7 @@ from marsyard.reports.wording import (
     percent,
     requirement_text,
 )
+from marsyard.scenarios.systems import scenario
 
 #: Maximum number of rows of the tables of single cases.
 _MAX_CASES = 10
@@ -146,22 +149,44 @@ _NOT_PARAMETERS = ("distribution", "source", "unit", "description")
 
 def dispersion_grid(run: StoredRun) -> Grid:
     """Create a table of the dispersions, with the values in the rows."""
-    rows = []
+    rows, model = [], _parameters_type(run)
     for path, entry in table(run.recorded("dispersions")).items():
         dispersion, parts = table(entry), str(path).split(".")
         # the column name is the path of the parameter or the end of the path
         names = [str(path), *("_".join(parts[start:]) for start in range(len(parts)))]
         column = next((name for name in names if name in run.frame), None)
-        items = [f"{key}={x}" for key, x in dispersion.items() if key not in _NOT_PARAMETERS and x is not None]
-        distribution = f"{dispersion.get('distribution', '?')}({', '.join(items)})"
         statistics = [NOTHING] * 3
         if column is not None:
             values = pd.to_numeric(run.frame[column], errors="coerce").dropna()
             statistics[1] = f"{run.frame[column].nunique()} values"
             if len(values) and not pd.api.types.is_bool_dtype(run.frame[column].dtype):
                 statistics = [_format_value(float(x)) for x in (values.min(), values.mean(), values.max())]
-        rows.append([str(path), distribution, *statistics, str(dispersion.get("source") or NOTHING)])
-    return Grid(["Parameter", "Distribution", "Minimum", "Mean", "Maximum", "Source"], rows)
+        meaning = str(dispersion.get("description") or (model and description_at(model, str(path))) or NOTHING)
+        source = str(dispersion.get("source") or NOTHING)
+        rows.append([meaning, str(path), _distribution_text(dispersion), *statistics, source])
+    return Grid(["Quantity", "Parameter", "Distribution", "Minimum", "Mean", "Maximum", "Source"], rows)
+
+
+def _distribution_text(dispersion: Mapping[str, Any]) -> str:
+    """Describe a recorded distribution: ``uniform, 0.6 to 1.2``."""
+    name = str(dispersion.get("distribution", "?"))
+    items = {key: x for key, x in dispersion.items() if key not in _NOT_PARAMETERS and x is not None}
+    if name == "choice" and set(items) == {"values"}:
+        return f"one of {', '.join(str(value) for value in items['values'])}"
+    texts = [f"{items.pop('low')} to {items.pop('high')}"] if {"low", "high"} <= set(items) else []
+    limits = items.pop("truncate", None)
+    texts += [f"{'SD' if key == 'sd' else key.replace('_', ' ')} {x}" for key, x in items.items()]
+    if limits is not None:
+        texts.append(f"from {limits[0]} to {limits[1]}")
+    return ", ".join((name, *texts))
+
+
+def _parameters_type(run: StoredRun) -> type[BaseModel] | None:
+    """Return the parameters of the run's scenario; None if the scenario is not installed."""
+    try:
+        return scenario(str(run.recorded("scenario"))).parameters_type
+    except LookupError:
+        return None
 
 
 def list_provenance(run: StoredRun) -> list[tuple[str, str]]:

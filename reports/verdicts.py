@@ -69,8 +69,9 @@ class AllCases:
     def text(self) -> str:
         """The result in a sentence."""
         cases = f"all {self.n:,} {population_text(' and '.join(self.configured))}"
-        met = f"{self.n - self.failures:,} ({percent(self.estimate)}) meet it"
-        return f"Of {cases}, {met}; a case without a value does not: {self.status}."
+        met = f"{self.n - self.failures:,} ({percent(self.estimate)}) meet the criterion"
+        verdict = f"Cases without a value count as failed. The verdict would be {self.status}."
+        return f"For comparison: of {cases}, {met}. {verdict}"
 
 
 @dataclass(frozen=True)
@@ -184,12 +185,11 @@ class Verdict:
         evidence = self.clustered
         if evidence is None:
             return ""
-        effect = f"design effect {evidence.design_effect:.3g}"
-        if math.isnan(evidence.design_effect):
-            effect = f"assumed design effect {self.n / evidence.effective_n:.3g}"
+        is_assumed = math.isnan(evidence.design_effect)
+        effect = self.n / evidence.effective_n if is_assumed else evidence.design_effect
         text = (
-            f"{count(self.n, 'case')} on {count(self.terrains or 0, 'terrain')}: {evidence.method}, "
-            f"effective number of cases {evidence.effective_n:.4g}, {effect}."
+            f"The {count(self.n, 'case')} lie on {count(self.terrains or 0, 'terrain')}: {evidence.method}, effective "
+            f"number of cases {evidence.effective_n:.4g}, {'assumed ' if is_assumed else ''}design effect {effect:.3g}."
         )
         if self.plain_status is not None and self.plain_status is not self.status:
             text += f" For independent cases the lower bound would be {percent(self.plain_lower)}: {self.plain_status}."

@@ -53,11 +53,17 @@ class HazardClass:
 
 #: Rates of footprints over all flights: columns of the counted and of all footprints, by name.
 RATES: Mapping[str, tuple[str, str]] = {
-    "detected hazard, of truly safe footprints (false alarms)": ("false_alarms", "footprints_truly_safe"),
-    "not truly safe, of footprints classified as safe": ("footprints_called_safe_unsafe", "footprints_called_safe"),
-    "large hazard, of footprints classified as safe": ("gross_hazards_called_safe", "footprints_called_safe"),
-    "classified as safe, of footprints with a large hazard": ("gross_hazards_called_safe", "gross_hazards"),
-    "no detected hazard, of footprints with a large hazard": ("gross_hazards_unflagged", "gross_hazards"),
+    "truly safe footprints with a detected hazard (false alarms)": ("false_alarms", "footprints_truly_safe"),
+    "footprints classified as safe that are not truly safe": (
+        "footprints_called_safe_unsafe",
+        "footprints_called_safe",
+    ),
+    "footprints classified as safe that contain a large hazard": (
+        "gross_hazards_called_safe",
+        "footprints_called_safe",
+    ),
+    "footprints with a large hazard that are classified as safe": ("gross_hazards_called_safe", "gross_hazards"),
+    "footprints with a large hazard, but without a detected hazard": ("gross_hazards_unflagged", "gross_hazards"),
 }
 
 

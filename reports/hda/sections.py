@@ -167,7 +167,7 @@ MAP_EFFECTS = kinds.Scatter(
         kinds.Quantity("baseline_fraction", "baseline / height"),
         kinds.Quantity("texture", "texture contrast divided by its nominal value"),
         kinds.Quantity("grid_px", "grid spacing (px)"),
-        kinds.Quantity("level_error_deg", "error of the vertical (deg)"),
+        kinds.Quantity("level_error_deg", "error of the estimated vertical (deg)"),
         kinds.Quantity("altimeter_fraction", "altimeter error (% of range)", 100.0),
     ),
     y=_MAP_ERRORS,

@@ -86,8 +86,8 @@ class DetectorTable(Parameters):
 class SunTable(Parameters):
     """Default direction to the sun."""
 
-    azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")]
-    elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")]
+    azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="azimuth of the sun, clockwise from north")]
+    elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="elevation of the sun above the horizon")]
 
     @property
     def direction(self) -> Float64[np.ndarray, "3"]:

@@ -157,8 +157,8 @@ class LegParameters(Parameters):
 class SunParameters(Parameters):
     """Position of the sun at the start, and motion of the sun."""
 
-    azimuth_deg: Annotated[Azimuth, Field(description="clockwise from north")] = 225.0
-    elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
+    azimuth_deg: Annotated[Azimuth, Field(description="azimuth of the sun, clockwise from north")] = 225.0
+    elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="elevation of the sun above the horizon")] = 45.0
     hour_angle_deg_min: Annotated[float, bounded_field(-1.0, 1.0, "rotation rate: 16 deg in 66 min (Table IV)")] = (
         16.0 / 66.0
     )

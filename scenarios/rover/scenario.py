@@ -62,7 +62,9 @@ class VariantParameters(Parameters):
     height_m: Annotated[float, Field(gt=0.01, le=5.0, description="height of the rock")] = 0.8
     shape: Annotated[int, Field(ge=0, le=31, description="shape of the rock, see PlacedRock")] = 0
     yaw_deg: Annotated[float, Field(description="azimuth of the rock")] = 0.0
-    sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 225.0
+    sun_azimuth_deg: Annotated[
+        float, Field(ge=-360.0, le=720.0, description="azimuth of the sun, clockwise from north")
+    ] = 225.0
     sun_elevation_deg: Annotated[float, Field(gt=3.0, le=90.0)] = 45.0
 
 

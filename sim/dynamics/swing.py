@@ -88,7 +88,9 @@ class SwingParameters(WindParameters):
         11200.0
     )
     cone_angle_deg: Annotated[float, bounded_field(0.0, 45.0, "largest angle of the coning lander from nadir")] = 15.0
-    cone_minor_fraction: Annotated[float, bounded_field(-1.0, 1.0, "minor / major half-axis; sign: sense")] = 0.5
+    cone_minor_fraction: Annotated[
+        float, bounded_field(-1.0, 1.0, "minor / major axis of the cone; sign: sense of rotation")
+    ] = 0.5
     cone_direction_deg: Annotated[Phase, Field(description="azimuth of the cone's major axis")] = 0.0
     cone_phase_deg: Annotated[Phase, Field(description="phase of the coning at the first image")] = 0.0
     cone_damping_ratio: Annotated[float, bounded_field(-0.05, 0.2, "damping of small coning / critical (assumed)")] = (

@@ -181,7 +181,7 @@ def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: Ma
         make_run(make_rows(400, answered=1.0, error_scale=0.1)[[*MIN_COLUMNS, "terrain"]])
     )
     assert (report["verdict"], report["verdicts"][0]["plain_status"]) == ("INSUFFICIENT", "PASS")
-    assert "400 cases on 4 terrains: terrains counted instead of cases" in text
+    assert "400 cases lie on 4 terrains: terrains counted instead of cases" in text
 
 
 def test_texts_from_files_are_escaped(

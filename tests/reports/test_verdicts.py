@@ -365,8 +365,8 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     (verdict,) = evaluate_requirements(frame, [velocity], design)
     assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
     message = (
-        "The campaign draws from 8 terrains (location.bank = 8); 99 % at 90 % confidence needs at least 230 terrains: "
-        "run the campaign again with --set location.bank=2300 -n 254."
+        "To show 99 % at 90 % confidence, the cases must include at least 230 different terrains; this campaign draws "
+        "from a set of 8 terrains (location.bank = 8). Run the campaign again with --set location.bank=2300 -n 254."
     )
     assert message in verdict.note
     assert message in combine_verdicts([verdict], frame).sentence
@@ -453,8 +453,8 @@ def test_subset_is_shown_next_to_all_cases_and_named_if_only_truth_defines_it(ve
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.failures) == (10, 20, 2)
     assert (
-        f"Of all 20 cases, 18 (90.00 %) meet it; a case without a value does not: {verdict.all_cases.status}."
-        in verdict.note
+        "For comparison: of all 20 cases, 18 (90.00 %) meet the criterion. Cases without a value count as failed. "
+        f"The verdict would be {verdict.all_cases.status}." in verdict.note
     )
     (known,) = evaluate_requirements(frame, [requirement])
     assert known.statement == "The error is small."
@@ -469,7 +469,7 @@ def test_conditions_of_the_configuration_remain_over_all_cases(velocity: dict[st
     (verdict,) = evaluate_requirements(frame, [requirement], from_truth=("lit",), configured=("nav*",))
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.configured) == (5, 10, ("navcam",))
-    assert verdict.all_cases.text.startswith("Of all 10 cases with the navcam, ")
+    assert verdict.all_cases.text.startswith("For comparison: of all 10 cases with the navcam, ")
     # the population is the configuration itself
     (configured,) = evaluate_requirements(frame, [{**velocity, "population": "navcam"}], configured=("nav*",))
     assert configured.all_cases is None
