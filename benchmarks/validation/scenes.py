@@ -24,7 +24,7 @@ SEED = 20
 HAZCAM_LABEL = Path(__file__).parents[3] / "shared/data/mer_opportunity/1F483288473EFFCMUFP1214L0M1.IMG"
 #: HiRISE tile in Gale: 1 m posts, 0.5 m orthoimage.
 TILE = Path(__file__).parents[3] / "shared/data/gale_hirise/gale_1m_dem_0p5m_ortho.npz"
-#: Horizontal position (x, y) of the camera in all descent views, m (arbitrary), metres.
+#: Horizontal position (x, y) of the camera in all descent views, m; the choice is arbitrary.
 DESCENT_POSITION = (1000.0, 1200.0)
 #: Position and diameter of the large rock, and height of the mast camera, metres.
 ROCK_POSITION, ROCK_DIAMETER_M, MAST_M = (50.0, 50.0), 2.5, 1.6
@@ -77,10 +77,6 @@ def cameras() -> dict[str, CameraModel]:
         "Sony XC-55": preset("xc-55").cameras()[0],
     }
     return {name: camera for name, camera in by_name.items() if camera is not None}
-
-
-def looks_down(camera: CameraModel) -> bool:
-    return bool(camera.boresight()[2] < -0.9)
 
 
 def level_pose(position: np.ndarray) -> RigidTransform:
