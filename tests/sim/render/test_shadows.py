@@ -95,6 +95,7 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
     samples = np.stack([heights, np.full_like(heights, ALBEDO)], axis=-1).astype(np.float32)
     surface = Surface.from_samples(samples, spacing)
     sun = Sun(direction(np.radians(270.0), elevation))
+    # Elevation of the skyline, which the ridge at x = 30 m forms, seen from ground positions in the east.
     profile = np.arange(28.0, 32.0, 0.01)
     crest = surface.height(profile, 0.0)
     ground = np.linspace(75.0, 95.0, 2001)
@@ -120,8 +121,8 @@ def test_shaded_positions_equal_an_exhaustive_search(elevation: float) -> None:
         -1, 3
     )
     faces = np.arange(len(triangles), dtype=np.int32).reshape(-1, 3)
-    names = np.repeat(np.arange(60, dtype=np.int32), 7)
-    objects = Objects.of_mesh(triangles, np.zeros_like(triangles), faces, names, ALBEDO)
+    body_ids = np.repeat(np.arange(60, dtype=np.int32), 7)
+    objects = Objects.of_mesh(triangles, np.zeros_like(triangles), faces, body_ids, ALBEDO)
     sun = Sun(direction(0.7, elevation))
     positions = rng.uniform(-9.0, 9.0, (3000, 3))
     casters = casters_towards(objects, sun)
