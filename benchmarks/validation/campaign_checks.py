@@ -64,6 +64,7 @@ def check_rows(quick: bool) -> Iterator[Measure]:
 def _compare_executors(
     campaign: str, folder: Path, settings: Sequence[str], kills: int, population: str
 ) -> Iterator[Measure]:
+    """Compare the rows of each executor, of interrupted runs and of replays with those of one worker."""
     folder.mkdir()
     expected = _run_campaign(campaign, folder / "one", ExecutorConfig(1), settings)
     cases = len(expected)

@@ -68,6 +68,7 @@ def _read_stored_median_m_s() -> float:
 
 
 def compare_estimators(quick: bool) -> Iterator[Measure]:
+    """Measure the velocity errors of all estimators on the same descents."""
     descents = record_descents("dimes-smoke", 4 if quick else 48)
     for name, estimator in ESTIMATORS.items():
         results = run_estimator(estimator, descents)

@@ -35,22 +35,26 @@ class HostileParameters(BaseModel):
 
 
 def _leave_thread() -> None:
+    """Leave a sleeping thread."""
     threading.Thread(target=time.sleep, args=(3600,)).start()
 
 
 def _leave_pool() -> None:
+    """Leave the processes of a pool."""
     pool = ProcessPoolExecutor(2, mp_context=get_context("fork"))
     pool.submit(time.sleep, 0.0).result()
     _remaining_objects.append(pool)
 
 
 def _leave_fork() -> None:
+    """Leave a forked process in a separate session."""
     if os.fork() == 0:
         os.setsid()
         time.sleep(3600)
 
 
 def _leave_orphan() -> None:
+    """Leave a process whose parent has ended."""
     middle = os.fork()
     if middle == 0:
         _leave_fork()
@@ -59,18 +63,21 @@ def _leave_orphan() -> None:
 
 
 def _leave_session() -> subprocess.Popen[bytes]:
+    """Leave a child process in a separate session."""
     child = subprocess.Popen(["sleep", "3600"], start_new_session=True, close_fds=False)
     _remaining_objects.append(child)
     return child
 
 
 def _stop_supervisor() -> None:
+    """Leave a process and stop the parent of the worker process by SIGSTOP."""
     _leave_fork()
     os.kill(os.getppid(), signal.SIGSTOP)
     time.sleep(3600)
 
 
 def _kill_supervisor() -> None:
+    """Leave a process and kill the parent of the worker process."""
     _leave_fork()
     os.kill(os.getppid(), signal.SIGKILL)
     time.sleep(60)
@@ -93,6 +100,7 @@ def _allocate() -> None:
 
 
 def _change_state() -> None:
+    """Change OpenCV, rounding, folder, environment, NumPy, warnings and recursion limit of the process."""
     import cv2
 
     cv2.setUseOptimized(False)

@@ -34,6 +34,7 @@ OVERHEAD_SUN = Sun(np.array([0.0, 0.0, 1.0]))
 
 
 def renderer() -> Renderer:
+    """Return the renderer that all checks share."""
     return process_renderer(default_backend())
 
 
@@ -80,10 +81,12 @@ def cameras() -> dict[str, CameraModel]:
 
 
 def level_pose(position: np.ndarray) -> RigidTransform:
+    """Return the pose of a level body at a position."""
     return rigid(Rotation.identity(), position)
 
 
 def create_photometry(site_parameters: Site) -> Photometry:
+    """Return the reflectance law of a site."""
     parameters = site_parameters.photometry
     return Photometry(
         lunar_fraction=parameters.lunar_fraction,
@@ -93,16 +96,19 @@ def create_photometry(site_parameters: Site) -> Photometry:
 
 
 def create_texture(parameters: SiteTexture) -> Texture:
+    """Return the albedo texture of a site."""
     return Texture(parameters.coarsest_m, parameters.amplitudes)
 
 
 @cache
 def descent_surface(name: str) -> Surface:
+    """Return the terrain of a site for descent images."""
     return TerrainBank(site(name).terrain("descent"), SEED).terrain(0)
 
 
 @cache
 def ground_surface(name: str) -> Surface:
+    """Return the terrain of a site for mast images."""
     return TerrainBank(site(name).terrain("ground"), SEED).terrain(0)
 
 

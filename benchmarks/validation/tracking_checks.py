@@ -70,6 +70,7 @@ def check_drift(quick: bool) -> Iterator[Measure]:
 
 
 def _measure_drifts(rows: list[dict[str, Scalar]], name: str, *, has_limit: bool) -> Iterator[Measure]:
+    """Measure the drift in pixels of the tracked targets, and the fraction of lost targets."""
     px = np.array([float(row["drift_px"]) for row in rows])
     how = (
         f"{len(rows)} targets on rendered rocks, 10 m to 2 m in steps of 10 %, no noise, exact pose and cameras, "

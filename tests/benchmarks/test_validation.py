@@ -64,7 +64,7 @@ def _check_landing_with_a_failed_pair(monkeypatch: pytest.MonkeyPatch) -> list[M
         value = NAN if number == 3 else 0.0
         row = {"site": landing_checks.SITES[number % 2], "range_m": 10.0, "tracks": 200.0, "elevation_rms_m": value}
         row |= {"rotation_error_deg": value, "baseline_error_fraction": value}
-        return {"paper": row, "ours": row}
+        return {"paper": row, "many features": row}
 
     monkeypatch.setattr(landing_checks, "simulate_errors", errors)
     return list(landing_checks.check_accuracy(quick=False))

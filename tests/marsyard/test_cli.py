@@ -184,7 +184,7 @@ def _crash_case(case: int) -> str:
     [
         ("", "", 0, "NO REQUIREMENT"),
         (_crash_case(1), "", 1, "NO REQUIREMENT"),
-        # three cases on one terrain count as one: at 90 % confidence it shows a rate of 10 %
+        # three cases on one terrain count as one case, which shows a rate of 10 % at 90 % confidence
         ("", REQUIREMENT.replace("0.99", "0.09"), 0, "PASS"),
         ("error_scale = 1e3", REQUIREMENT, 1, "FAIL"),
         ("", REQUIREMENT, 3, "INSUFFICIENT"),

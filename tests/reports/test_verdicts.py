@@ -183,7 +183,7 @@ def test_unknown_membership_counts_as_failure(outcome: str) -> None:
 
 
 def test_crashed_cases_are_failures_of_availability() -> None:
-    """4 of 20 cases crash before their conditions are not_from_truth; the other 16 succeed."""
+    """4 of 20 cases crash before their conditions are known; the other 16 succeed."""
     frame = _make_rows(20, 0).assign(feasible_overlap=True).astype({"feasible_overlap": object})
     frame.loc[:3, ["outcome", "answered", "feasible_overlap"]] = ["CRASHED", False, None]
     criterion = {
@@ -444,7 +444,7 @@ def test_crashed_cases_are_counted_in_the_summary(make_rows: Rows) -> None:
     assert "2 cases crashed" in summary.sentence
 
 
-def test_subset_is_shown_next_to_all_cases_and_named_if_only_truth_defines_it(velocity: dict[str, Any]) -> None:
+def test_population_defined_by_truth_is_named_and_compared_with_all_cases(velocity: dict[str, Any]) -> None:
     frame = _make_rows(20, 2)
     frame["lit"] = np.arange(20) >= 10
     requirement = {**velocity, "population": "lit", "statement": "The error is small."}
@@ -462,7 +462,7 @@ def test_subset_is_shown_next_to_all_cases_and_named_if_only_truth_defines_it(ve
     assert (over_all_cases.all_cases, over_all_cases.statement) == (None, "The error is small.")
 
 
-def test_conditions_of_the_configuration_remain_over_all_cases(velocity: dict[str, Any]) -> None:
+def test_configured_conditions_also_restrict_the_result_of_all_cases(velocity: dict[str, Any]) -> None:
     frame = _make_rows(20, 2)
     frame["lit"], frame["navcam"] = np.arange(20) >= 10, np.arange(20) % 2 == 0
     requirement = {**velocity, "population": "lit and navcam"}

@@ -388,7 +388,7 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
     assert tracker.update(drive.measurements[-1]).state is TrackingState.NO_TARGET
 
 
-def test_image_without_the_target_is_a_loss() -> None:
+def test_image_without_the_target_is_reported_as_lost() -> None:
     target = np.array([6.0, 0.1, 0.2])
     scene = make_scene(make_face(3, target), target, 3)
     drive = Drive(scene, navcam(), VisualTargetTracker(SMALL))

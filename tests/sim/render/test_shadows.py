@@ -44,7 +44,7 @@ def _compare_with_ray_cast(frame: Frame, scene: Scene, count: int, step: float) 
     to_sun = scene.sun.direction
     facing = frame.normal.reshape(-1, 3)[pixels].astype(np.float64) @ to_sun
     fraction = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(facing, 1e-6))
-    is_shaded = Ground(scene.surface).hides(points, to_sun, step)
+    is_shaded = Ground(scene.surface).is_occluded(points, to_sun, step)
     rays = np.broadcast_to(to_sun, points.shape)
     is_shaded |= np.isfinite(cast_triangles(scene.objects, points, rays, nearest=2e-3))
     actual, expected = (facing > 0.0) & (fraction > 0.5), (facing > 0.0) & ~is_shaded
