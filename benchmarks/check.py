@@ -3,7 +3,7 @@
 Runs of each path alternate with runs of a reference workload (matrix products, filters, sorting, copies), so that a
 slow or busy machine affects both. Welch's test compares the logarithms of the ratios of their processor times with the
 stored logarithms. A path is slower if its mean ratio has grown by more than the factor `ALLOWED_GROWTH`. The false
-alarm rate is `FALSE_ALARMS` for all paths together. Ratios are valid for one type of processor.
+alarm rate is `FALSE_ALARM_RATE` for all paths together. Ratios are valid for one type of processor.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ PAIRS = 15
 #: Accepted factor of growth of a ratio, because memory and caches are shared with other programs.
 ALLOWED_GROWTH = 1.15
 #: Probability that at least one path of an unchanged program is reported.
-FALSE_ALARMS = 0.01
+FALSE_ALARM_RATE = 0.01
 
 
 def _prepare_dimes() -> Callable[[], object]:
@@ -67,7 +67,7 @@ PATHS: Mapping[str, Callable[[], Callable[[], object]]] = {
 
 
 def reference_workload() -> Callable[[], object]:
-    """Return a function that takes about 30 ms."""
+    """Return the reference workload, which takes about 30 ms."""
     rng = np.random.default_rng(0)
     matrix = rng.standard_normal((300, 300))
     image = rng.standard_normal((1024, 1024)).astype(np.float32)
@@ -83,7 +83,7 @@ def reference_workload() -> Callable[[], object]:
 
 
 def log_ratios(path: Callable[[], object], reference: Callable[[], object], pairs: int) -> list[float]:
-    """For each pair, the logarithm of the path's time divided by the mean reference time before and after it."""
+    """Return, for each pair, the log of the path's time divided by the mean reference time before and after it."""
     path()
     ratios, before = [], _processor_seconds(reference)
     for _ in range(pairs):
@@ -108,19 +108,19 @@ class Comparison:
     p_value: float
 
 
-def compare(now: Mapping[str, Sequence[float]], stored: Mapping[str, Sequence[float]]) -> list[Comparison]:
+def compare(measured: Mapping[str, Sequence[float]], stored: Mapping[str, Sequence[float]]) -> list[Comparison]:
     """Compare every path that both records contain."""
     comparisons = []
-    for name in now.keys() & stored.keys():
-        current, before = np.asarray(now[name]), np.asarray(stored[name])
-        test = stats.ttest_ind(current - np.log(ALLOWED_GROWTH), before, equal_var=False, alternative="greater")
-        comparisons.append(Comparison(name, float(np.exp(current.mean() - before.mean())), float(test.pvalue)))
+    for name in measured.keys() & stored.keys():
+        current, earlier = np.asarray(measured[name]), np.asarray(stored[name])
+        test = stats.ttest_ind(current - np.log(ALLOWED_GROWTH), earlier, equal_var=False, alternative="greater")
+        comparisons.append(Comparison(name, float(np.exp(current.mean() - earlier.mean())), float(test.pvalue)))
     return sorted(comparisons, key=lambda comparison: comparison.name)
 
 
 def select_slower(comparisons: Sequence[Comparison]) -> list[Comparison]:
     """Select paths that exceed the accepted growth, with Bonferroni's correction."""
-    return [comparison for comparison in comparisons if comparison.p_value < FALSE_ALARMS / len(comparisons)]
+    return [comparison for comparison in comparisons if comparison.p_value < FALSE_ALARM_RATE / len(comparisons)]
 
 
 def main() -> int:
@@ -139,24 +139,24 @@ def main() -> int:
         return 2
     cv2.setNumThreads(1)
     reference = reference_workload()
-    now = {name: log_ratios(make(), reference, PAIRS) for name, make in PATHS.items()}
+    measured = {name: log_ratios(make(), reference, PAIRS) for name, make in PATHS.items()}
     if keep:
         record = {
             "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
             "processor": processor_features(),
-            "log_ratios": now,
+            "log_ratios": measured,
         }
         RATIOS.write_text(json.dumps(record, indent=2) + "\n")
         print(f"stored in {RATIOS}")
         return 0
     assert stored is not None, "the program ends earlier without stored ratios"
-    return _print_comparison(compare(now, stored["log_ratios"]), stored["measured"])
+    return _print_comparison(compare(measured, stored["log_ratios"]), stored["measured"])
 
 
-def _print_comparison(comparisons: Sequence[Comparison], measured: str) -> int:
+def _print_comparison(comparisons: Sequence[Comparison], stored_on: str) -> int:
     """Print the comparison. Returns 1 if a path is slower."""
     slower = select_slower(comparisons)
-    print(f"{'ratio divided by that of ' + measured[:10]:<40}{'factor':>8}{'p':>10}")
+    print(f"{'ratio divided by that of ' + stored_on[:10]:<40}{'factor':>8}{'p':>10}")
     for comparison in comparisons:
         mark = "  SLOWER" if comparison in slower else ""
         print(f"{comparison.name:<40}{comparison.growth:8.2f}{comparison.p_value:10.2g}{mark}")

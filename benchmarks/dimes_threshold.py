@@ -27,20 +27,19 @@ WRONG_BY_M_S = ((10.0, 10.0), (10.0, 60.0))
 
 
 def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
-    """Derive the threshold, the distribution of discrepancies, and the effect of the check on one wrong track."""
+    """Derive the threshold, the distribution of discrepancies, and the outcomes of the check with one wrong track."""
     rng = np.random.default_rng(inputs.seed)
-    errors = derivation.right_track_errors(inputs, rng)
+    errors = derivation.draw_correct_track_errors(inputs, rng)
     results = derivation.discrepancies(errors, inputs.imu_sd_m_s, rng)
     threshold = derivation.threshold_m_s(results.single, inputs.kept, inputs.step_m_s)
-    wrong_track_effects = [
-        {
-            "tracks_per_pair": tracks,
-            "wrong_by_m_s": error_range_m_s,
-            **asdict(derivation.harm(errors[:, :, :tracks], error_range_m_s, threshold, inputs.imu_sd_m_s, rng)),
-        }
-        for tracks in (1, 2)
-        for error_range_m_s in WRONG_BY_M_S
-    ]
+    wrong_track_outcomes = []
+    for tracks in (1, 2):
+        for error_range_m_s in WRONG_BY_M_S:
+            outcomes = derivation.simulate_wrong_track(
+                errors[:, :, :tracks], error_range_m_s, threshold, inputs.imu_sd_m_s, rng
+            )
+            fractions = {"right": outcomes.correct, "refused": outcomes.rejected, "wrong": outcomes.wrong}
+            wrong_track_outcomes.append({"tracks_per_pair": tracks, "wrong_by_m_s": error_range_m_s, **fractions})
     return {
         "derivation": "benchmarks.threshold_derivation",
         "derivation_version": VERSION,
@@ -58,7 +57,7 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
         "kept_quantile_m_s": float(np.quantile(results.single, inputs.kept)),
         "kept_quantile_90_percent_bounds_m_s": quantile_bounds(results.single, inputs.kept, 0.95),
         "threshold_m_s": threshold,
-        "one_wrong_track": wrong_track_effects,
+        "one_wrong_track": wrong_track_outcomes,
     }
 
 

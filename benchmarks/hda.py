@@ -1,4 +1,7 @@
-"""Run times of hazard detection: the stages of Table I of the paper (400 MHz R12000), dense maps and complete cases."""
+"""Run times of hazard detection: stages of Table I of the landing paper, dense maps and complete cases.
+
+The times of the paper are for a MIPS R12000 processor at 400 MHz.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from marsyard.sim.measurements import DetectorCalibration, DetectorImage, Landin
 
 #: XC-55 camera.
 CAMERA = Cahv.from_focal_length(0.006, 7.4e-6, (640, 480), axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0))
-#: As in the paper: blocks of 73 px give about 59 tracks, a grid of 20 px gives 600 points.
+#: As in the landing paper: blocks of 73 px give about 59 tracks, a grid of 20 px gives 600 points.
 PAPER = HdaOptions(block_px=73, grid_px=20)
 #: Grid of 160 x 120 structure points.
 DENSE = HdaOptions(grid_px=4)
@@ -70,7 +73,7 @@ def measure(repeats: int) -> list[Measurement]:
 
 
 def measure_stages(measurements: LandingMeasurements, repeats: int) -> list[Measurement]:
-    """Measure the four stages of Table I; the scale is part of structure from motion."""
+    """Measure the four stages of Table I of the landing paper; the scale is part of structure from motion."""
     scene = build_scene(measurements)
     details = HdaEstimator(PAPER).estimate(measurements).details
     assert isinstance(details, HdaDetails)

@@ -49,6 +49,7 @@ def _measure_first_run() -> list[Measurement]:
 
 
 def _wall_s(*arguments: str, variables: dict[str, str] | None = None, allowed: tuple[int, ...] = (0,)) -> float:
+    """Measure the wall-clock time of a command."""
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | (variables or {})
     start = time.perf_counter()
     result = subprocess.run(

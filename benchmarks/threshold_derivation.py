@@ -1,9 +1,10 @@
-"""Monte Carlo derivation of the threshold of the IMU check: discrepancy of correct tracks from the IMU (section II.B).
+"""Monte Carlo derivation of the threshold of the IMU check: discrepancy of correct tracks from the IMU.
 
-The paper uses "a velocity threshold established through Monte Carlo simulation". This simulation is geometric. It draws
-attitudes, altitudes and features. The true cameras project a feature into the images, the measured cameras intersect
-its rays with the ground, and the resulting velocities are compared as in DIMES. Image content is modelled only as an
-error of the match. Errors of altitude and attitude are independent between images, except the common attitude error.
+The field test paper (section II.B) uses "a velocity threshold established through Monte Carlo simulation". This
+simulation is geometric. It draws attitudes, altitudes and features. The true cameras project a feature into the images,
+the measured cameras intersect its rays with the ground, and the resulting velocities are compared as in DIMES. Image
+content is modelled only as an error of the match. Errors of altitude and attitude are independent between images,
+except the common attitude error.
 
 The threshold is the smallest multiple of `step_m_s` that accepts the fraction `kept` of descents with one correct track
 in each pair, the minimum for DIMES. `benchmarks.dimes_threshold` stores the result.
@@ -37,7 +38,7 @@ class ThresholdInputs:
     seed
         Seed of the generator.
     altitudes_m, interval_s
-        Altitudes of the three images and time between them (paper, section III.C: near 2000, 1700 and 1400 m).
+        Altitudes of the three images and time between them (field test paper, section III.C: 2000, 1700 and 1400 m).
     max_speed_m_s
         Horizontal velocities are uniform over the disc of this radius (paper: 30 m/s).
     max_cone_deg, max_nod_deg
@@ -99,8 +100,8 @@ def descent_camera() -> CameraModel:
     )
 
 
-def right_track_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> TrackErrors:
-    """Draw velocity errors of two correct tracks in each pair of `inputs.descents` descents with feasible overlap."""
+def draw_correct_track_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> TrackErrors:
+    """Draw the velocity errors of two correct tracks per pair for `inputs.descents` descents with feasible overlap."""
     camera, options = descent_camera(), DimesOptions()
     tracks: list[Float[np.ndarray, "2 2 2"]] = []
     while len(tracks) < inputs.descents:
@@ -215,37 +216,37 @@ def threshold_m_s(single: Float[np.ndarray, " descents"], kept: float, step_m_s:
 
 
 @dataclass(frozen=True)
-class Harm:
-    """Outcomes of the check for descents with one wrong track, as fractions of the descents.
+class WrongTrackOutcomes:
+    """Outcomes of the IMU check for descents with one wrong track, as fractions of the descents.
 
     Attributes
     ----------
-    right
+    correct
         Reported velocity within the requirement.
-    refused
+    rejected
         No reported velocity.
     wrong
         Reported velocity outside the requirement.
     """
 
-    right: float
-    refused: float
+    correct: float
+    rejected: float
     wrong: float
 
 
-def harm(
+def simulate_wrong_track(
     errors: Float[np.ndarray, "descents 2 templates 2"],
     wrong_by_m_s: tuple[float, float],
     threshold_m_s: float,
     imu_sd_m_s: float,
     rng: np.random.Generator,
     required_m_s: float = 5.0,
-) -> Harm:
-    """Simulate the check with one wrong track: its error is uniform between `wrong_by_m_s`, in a random direction.
+) -> WrongTrackOutcomes:
+    """Simulate the check with one wrong track, whose error has a random direction and a size within `wrong_by_m_s`.
 
     The wrong track is drawn at random. With one template per pair in `errors`, it is the only track of its pair.
     """
-    outcomes = np.zeros(3)
+    counts = np.zeros(3)
     for tracks in errors:
         changed = tracks.copy()
         changed[rng.integers(2), rng.integers(tracks.shape[1])] += rng.uniform(*wrong_by_m_s) * _draw_direction(rng)
@@ -253,8 +254,8 @@ def harm(
         imu_change[1, :2] = imu_sd_m_s * rng.standard_normal(2)
         best = rank_combinations(list(enumerate(changed[0])), list(enumerate(changed[1])), imu_change)[0]
         if not best.discrepancy_m_s < threshold_m_s:
-            outcomes[1] += 1
+            counts[1] += 1
         else:
-            outcomes[0 if np.hypot(*changed[1, best.second]) <= required_m_s else 2] += 1
-    right, refused, wrong = outcomes / len(errors)
-    return Harm(float(right), float(refused), float(wrong))
+            counts[0 if np.hypot(*changed[1, best.second]) <= required_m_s else 2] += 1
+    correct, rejected, wrong = counts / len(errors)
+    return WrongTrackOutcomes(float(correct), float(rejected), float(wrong))

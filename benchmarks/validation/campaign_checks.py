@@ -54,7 +54,7 @@ def check_rows(quick: bool) -> Iterator[Measure]:
     faulty, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
     with TemporaryDirectory() as name:
         folder = Path(name)
-        settings = [f"share={faulty}", f"cases={cases}"]
+        settings = [f"faulty_fraction={faulty}", f"cases={cases}"]
         population = f"cases, {100 * faulty:g} % of which misbehave"
         yield from _compare_executors(str(_write_campaign(folder)), folder / "chaos", settings, kills, population)
         rendered = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
@@ -64,6 +64,7 @@ def check_rows(quick: bool) -> Iterator[Measure]:
 def _compare_executors(
     campaign: str, folder: Path, settings: Sequence[str], kills: int, population: str
 ) -> Iterator[Measure]:
+    """Compare the rows of each executor, of interrupted runs and of replays with those of one worker."""
     folder.mkdir()
     expected = _run_campaign(campaign, folder / "one", ExecutorConfig(1), settings)
     cases = len(expected)
@@ -94,10 +95,13 @@ def check_survival(quick: bool) -> Iterator[Measure]:
         for fraction in (0.0, faulty):
             began = time.monotonic()
             rows[fraction] = _run_campaign(
-                file, folder / f"{fraction}", ExecutorConfig(2), [f"share={fraction}", f"cases={cases}", "work_s=0.4"]
+                file,
+                folder / f"{fraction}",
+                ExecutorConfig(2),
+                [f"faulty_fraction={fraction}", f"cases={cases}", "work_s=0.4"],
             )
             elapsed_s[fraction] = time.monotonic() - began
-        campaign = load_campaign(str(file), [f"share={faulty}"])
+        campaign = load_campaign(str(file), [f"faulty_fraction={faulty}"])
         faults = [_draw_fault(campaign, case) for case in range(cases)]
         wrong = sum(
             row["outcome"] != FAULTS.get(fault, "VALID") for row, fault in zip(rows[faulty], faults, strict=True)

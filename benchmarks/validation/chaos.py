@@ -1,4 +1,4 @@
-"""A scenario with random faults (exception, endless loop, memory, abort), as a custom algorithm may have."""
+"""A scenario with random faults of a custom algorithm: exception, endless loop, memory overrun, abort."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ class ChaosParameters(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     work_s: float = Field(default=0.05, ge=0.0, description="processor time of a case")
-    share: float = Field(default=0.0, ge=0.0, le=1.0, description="fraction of cases that misbehave")
+    faulty_fraction: float = Field(default=0.0, ge=0.0, le=1.0, description="fraction of cases that misbehave")
 
 
 #: Faults of misbehaving cases, and their expected outcomes.
-FAULTS = {"raise": "CRASHED", "loop": "TIMED_OUT", "swell": "OUT_OF_MEMORY", "abort": "CRASHED"}
+FAULTS = {"raise": "CRASHED", "loop": "TIMED_OUT", "allocate": "OUT_OF_MEMORY", "abort": "CRASHED"}
 
 
 def draw_fault(parameters: ChaosParameters, streams: Streams) -> str:
     """Draw the fault of a case; empty for a case without fault."""
     rng = streams.generator("chaos")
-    return str(rng.choice(list(FAULTS))) if rng.random() < parameters.share else ""
+    return str(rng.choice(list(FAULTS))) if rng.random() < parameters.faulty_fraction else ""
 
 
 class ChaosScenario:
@@ -55,7 +55,7 @@ class ChaosScenario:
         if fault == "abort":
             os.abort()
         arrays = []
-        while fault == "swell":
+        while fault == "allocate":
             arrays.append(np.ones(4_000_000))
         number = float(streams.generator("number").normal())
         return CaseResult("VALID", True, {"number": number, "hash": int(streams.generator("hash").integers(2**62))})

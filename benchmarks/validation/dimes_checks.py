@@ -49,14 +49,14 @@ def check_imu_threshold(quick: bool) -> Iterator[Measure]:
     )
     for tracks in (1, 2):
         for low, high in WRONG_BY_M_S:
-            right, refused = reference.right_or_refused_fractions(tracks, (low, high), threshold, rng)
+            correct, rejected = reference.correct_and_rejected_fractions(tracks, (low, high), threshold, rng)
             error_range = f"{low:g} m/s" if low == high else f"{low:g} to {high:g} m/s"
             yield Measure(
                 f"one of {2 * tracks} tracks wrong by {error_range}: correct velocity or none",
-                right + refused,
+                correct + rejected,
                 "",
                 REQUIRED_FRACTION,
-                f"{how}; {100.0 * right:.2f} % correct, {100.0 * refused:.2f} % refused",
+                f"{how}; {100.0 * correct:.2f} % correct, {100.0 * rejected:.2f} % refused",
                 "at least",
             )
 
@@ -68,6 +68,7 @@ def _read_stored_median_m_s() -> float:
 
 
 def compare_estimators(quick: bool) -> Iterator[Measure]:
+    """Measure the velocity errors of all estimators on the same descents."""
     descents = record_descents("dimes-smoke", 4 if quick else 48)
     for name, estimator in ESTIMATORS.items():
         results = run_estimator(estimator, descents)

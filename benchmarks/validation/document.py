@@ -72,6 +72,7 @@ def write_page(checks: Sequence[Check], stored: dict[str, dict]) -> None:
 
 
 def _format_row(measure: Measure) -> str:
+    """Format a measurement as a row of the table."""
     verdict = "" if measure.limit is None else ("met" if measure.passed else "**missed**")
     limit = "reported" if measure.limit is None else f"{measure.sense} {format_value(measure, measure.limit)}"
     return f"| {measure.claim} | {limit} | {format_value(measure, measure.measured)} | {verdict} | {measure.how} |"

@@ -70,8 +70,8 @@ def run_mast(quick: bool) -> Iterator[Measure]:
 
 #: Extremes of the four DIMES templates of Spirit's descent images: peak width, px, and ratio of second to first peak.
 FLOWN_WIDTHS_PX, FLOWN_SECOND_PEAKS = (3.3, 15.6), (0.40, 0.82)
-#: 95 % interval of the fraction of refused templates by Clopper and Pearson: one of four was refused.
-FLOWN_REFUSED = (0.006, 0.806)
+#: 95 % interval of the fraction of rejected templates by Clopper and Pearson: one of four was rejected.
+FLOWN_REJECTED_FRACTION = (0.006, 0.806)
 
 
 def run_templates(quick: bool) -> Iterator[Measure]:
@@ -91,9 +91,11 @@ def run_templates(quick: bool) -> Iterator[Measure]:
         text = f"{how}; median {median:.2g}, 5 to 95 % {low_5:.2g} to {high_95:.2g}"
         yield Measure(f"{name}: minimum", float(values.min()), "1", low, text)
         yield Measure(f"{name}: maximum", float(values.max()), "1", high, text, "at least")
-    refused = float(np.mean(valid == 0.0))
-    yield Measure("refused templates", refused, "1", FLOWN_REFUSED[1], f"{how}, one refused")
-    yield Measure("refused templates, lower limit", refused, "1", FLOWN_REFUSED[0], f"{how}, one refused", "at least")
+    rejected = float(np.mean(valid == 0.0))
+    yield Measure("refused templates", rejected, "1", FLOWN_REJECTED_FRACTION[1], f"{how}, one refused")
+    yield Measure(
+        "refused templates, lower limit", rejected, "1", FLOWN_REJECTED_FRACTION[0], f"{how}, one refused", "at least"
+    )
 
 
 CHECKS = (

@@ -42,6 +42,7 @@ MAX_MAST_RANGE_M = 40.0
 
 
 def _is_available(backend: str) -> bool:
+    """Return whether the library of an OpenGL backend can be loaded."""
     try:
         ctypes.CDLL(LIBRARIES[backend])
     except OSError:
@@ -63,6 +64,7 @@ def _measure_marker_errors(backend: str, count: int) -> dict:
 
 
 def run_markers(quick: bool) -> Iterator[Measure]:
+    """Measure the errors of rendered markers for all cameras and both OpenGL backends."""
     count = 200 if quick else MARKERS
     for backend in LIBRARIES:
         if not _is_available(backend):
@@ -86,6 +88,7 @@ def _tilted_plane(slope: tuple[float, float], side: int, spacing: float) -> Surf
 
 
 def run_planes(quick: bool) -> Iterator[Measure]:
+    """Compare the world points of a tilted plane with its equation, for all cameras."""
     slope, side = (0.15, -0.1), 1024
     upward = np.array([-slope[0], -slope[1], 1.0])
     upward /= np.linalg.norm(upward)
@@ -121,8 +124,8 @@ class Ranges:
         return float(np.mean(np.abs(self.rendered / self.cast - 1.0) < 1e-4))
 
 
-def cast_ranges(view: View, count: int, farthest: float, step: float) -> Ranges:
-    """Compute the ranges at random pixels, up to the range `farthest`.
+def cast_ranges(view: View, count: int, max_range_m: float, step: float) -> Ranges:
+    """Compute the ranges at random pixels, up to the range `max_range_m`.
 
     The independent ray casting also detects silhouettes: the ranges of a pixel and of opposite neighbours are not
     collinear, or some rays hit an object and some the ground. Oblique pixels that cover many terrain samples are
@@ -133,14 +136,14 @@ def cast_ranges(view: View, count: int, farthest: float, step: float) -> Ranges:
     rng = np.random.default_rng(5)
     pixels = np.stack([rng.integers(1, columns - 1, count), rng.integers(1, rows - 1, count)], axis=-1)
     rendered = frame.range_m[pixels[:, 1], pixels[:, 0]]
-    pixels, rendered = pixels[rendered < farthest], rendered[rendered < farthest]
+    pixels, rendered = pixels[rendered < max_range_m], rendered[rendered < max_range_m]
     camera, ground = view.camera.transform(view.world_from_body), Ground(view.scene.surface)
 
     def cast(right: float, down: float) -> tuple[np.ndarray, np.ndarray]:
         """Ranges at shifted pixels, and whether the ray hits an object."""
         origins, directions = camera.rays(pixels + np.array([right, down]))
         origins = np.array(origins)
-        hits = ground.cast(origins, directions, 1.3 * farthest, step)
+        hits = ground.cast(origins, directions, 1.3 * max_range_m, step)
         objects = cast_triangles(view.scene.objects, origins, directions)
         return np.minimum(hits, objects), objects < hits
 
@@ -160,8 +163,8 @@ def cast_ranges(view: View, count: int, farthest: float, step: float) -> Ranges:
     return Ranges(rendered[compared], ranges[compared], 1.0 - is_smooth.mean(), 1.0 - is_resolved.mean())
 
 
-def _measure_ranges(name: str, view: View, count: int, farthest: float, step: float) -> Measure:
-    ranges = cast_ranges(view, count, farthest, step)
+def _measure_ranges(name: str, view: View, count: int, max_range_m: float, step: float) -> Measure:
+    ranges = cast_ranges(view, count, max_range_m, step)
     how = (
         f"{ranges.cast.size} random pixels; excluded: {ranges.near_silhouettes:.1%} near silhouettes, "
         f"{ranges.smoothed:.1%} that cover several samples"
@@ -172,6 +175,7 @@ def _measure_ranges(name: str, view: View, count: int, farthest: float, step: fl
 
 
 def run_ranges(quick: bool) -> Iterator[Measure]:
+    """Compare ranges over terrain and rocks with independent ray casting."""
     count = 1000 if quick else 10000
     yield _measure_ranges("pisgah from 2 km, with rocks", descent_view("pisgah", 2000.0, (1024, 1024)), count, 1e5, 0.4)
     yield _measure_ranges("kelso's dunes from 1 km", descent_view("kelso", 1000.0, (1024, 1024)), count, 1e5, 0.4)

@@ -1,4 +1,4 @@
-"""A scenario with faults that damage the process or other cases, as a custom algorithm may have."""
+"""A scenario with faults of a custom algorithm that damage the process or other cases."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from marsyard.scenarios.algorithm_run import InputCopy
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
-#: Objects that survive the end of a case.
-_survivors: list[Any] = []
+#: Objects that remain in the worker process after the end of a case.
+_remaining_objects: list[Any] = []
 
 
 class HostileParameters(BaseModel):
@@ -35,22 +35,26 @@ class HostileParameters(BaseModel):
 
 
 def _leave_thread() -> None:
+    """Leave a sleeping thread."""
     threading.Thread(target=time.sleep, args=(3600,)).start()
 
 
 def _leave_pool() -> None:
+    """Leave the processes of a pool."""
     pool = ProcessPoolExecutor(2, mp_context=get_context("fork"))
     pool.submit(time.sleep, 0.0).result()
-    _survivors.append(pool)
+    _remaining_objects.append(pool)
 
 
 def _leave_fork() -> None:
+    """Leave a forked process in a separate session."""
     if os.fork() == 0:
         os.setsid()
         time.sleep(3600)
 
 
 def _leave_orphan() -> None:
+    """Leave a process whose parent has ended."""
     middle = os.fork()
     if middle == 0:
         _leave_fork()
@@ -59,18 +63,21 @@ def _leave_orphan() -> None:
 
 
 def _leave_session() -> subprocess.Popen[bytes]:
+    """Leave a child process in a separate session."""
     child = subprocess.Popen(["sleep", "3600"], start_new_session=True, close_fds=False)
-    _survivors.append(child)
+    _remaining_objects.append(child)
     return child
 
 
 def _stop_supervisor() -> None:
+    """Leave a process and stop the parent of the worker process by SIGSTOP."""
     _leave_fork()
     os.kill(os.getppid(), signal.SIGSTOP)
     time.sleep(3600)
 
 
 def _kill_supervisor() -> None:
+    """Leave a process and kill the parent of the worker process."""
     _leave_fork()
     os.kill(os.getppid(), signal.SIGKILL)
     time.sleep(60)
@@ -93,6 +100,7 @@ def _allocate() -> None:
 
 
 def _change_state() -> None:
+    """Change OpenCV, rounding, folder, environment, NumPy, warnings and recursion limit of the process."""
     import cv2
 
     cv2.setUseOptimized(False)
@@ -121,7 +129,7 @@ def _change_inputs() -> None:
     input_copy.check()
 
 
-#: Entry of `_survivors` that shows that an earlier case has changed the state of this process.
+#: Entry of `_remaining_objects` that shows that an earlier case has changed the state of this process.
 _CHANGED_STATE = "spoiled"
 
 #: Faults of misbehaving cases and their expected outcomes; a VALID case must have the row of a healthy case.
@@ -144,7 +152,7 @@ FAULTS: Mapping[str, tuple[Callable[[], object], str]] = {
     "close all files": (lambda: os.closerange(3, 1024), "CRASHED"),
     "close standard output": (_close_stream, "VALID"),
     "change the process state": (_change_state, "VALID"),
-    "change state that is not compared": (lambda: _survivors.append(_CHANGED_STATE), "VALID"),
+    "change state that is not compared": (lambda: _remaining_objects.append(_CHANGED_STATE), "VALID"),
     "handle signals": (lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN), "VALID"),
     "print without end": (_print_endlessly, "TOO_MUCH_OUTPUT"),
     "allocate without end": (_allocate, "OUT_OF_MEMORY"),
@@ -162,7 +170,7 @@ def draw_fault(parameters: HostileParameters, streams: Streams) -> str:
 
 
 class HostileScenario:
-    """Scenario that computes numbers which depend on the process state, then applies the fault of the case."""
+    """Scenario that computes numbers from the process state, then executes the fault of the case."""
 
     name = "hostile"
     parameters_type = HostileParameters
@@ -174,7 +182,7 @@ class HostileScenario:
         """There are no shared inputs."""
 
     def run(self, parameters: HostileParameters, streams: Streams) -> CaseResult:
-        if _CHANGED_STATE in _survivors:
+        if _CHANGED_STATE in _remaining_objects:
             raise RuntimeError("an earlier case has changed the state of this process")
         time.sleep(0.02)
         row = _compute_numbers(streams)

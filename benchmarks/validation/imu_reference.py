@@ -66,7 +66,7 @@ class Reference:
         """Minimum discrepancy of two correct tracks in each pair."""
         return np.asarray(_discrepancies(self.tracks, self.imu).min(axis=(1, 2)))
 
-    def right_or_refused_fractions(
+    def correct_and_rejected_fractions(
         self, templates: int, wrong_by_m_s: tuple[float, float], threshold_m_s: float, rng: np.random.Generator
     ) -> tuple[float, float]:
         """Simulate one wrong track; return the fractions of descents with a correct velocity and without a velocity."""
@@ -78,8 +78,8 @@ class Reference:
         discrepancies = _discrepancies(tracks, self.imu).reshape(n, -1)
         second = tracks[np.arange(n), 1, discrepancies.argmin(axis=1) % templates]
         passed = discrepancies.min(axis=1) < threshold_m_s
-        right = passed & (np.linalg.norm(second, axis=1) <= REQUIRED_M_S)
-        return float(right.mean()), float(np.mean(~passed))
+        correct = passed & (np.linalg.norm(second, axis=1) <= REQUIRED_M_S)
+        return float(correct.mean()), float(np.mean(~passed))
 
 
 def _discrepancies(

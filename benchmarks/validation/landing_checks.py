@@ -85,7 +85,7 @@ def simulate_errors(number: int) -> dict[str, dict[str, Scalar]]:
     measurements = measure(p, flight, pair, streams)
     truth = GroundTruth.from_images(world, flight, pair, p.lander.limits)
     rows: dict[str, dict[str, Scalar]] = {}
-    for name, options in (("paper", PAPER), ("ours", OPTIONS)):
+    for name, options in (("paper", PAPER), ("many features", OPTIONS)):
         estimate = HdaEstimator(options).estimate(measurements)
         motion = motion_row(estimate.details, flight, pair)
         rows[name] = {"site": p.site, "range_m": pair.axis_range_m, **motion, **map_row(p, estimate, flight, truth)}
@@ -98,9 +98,10 @@ def _rms(rows: Sequence[dict[str, Scalar]], value: Callable[[dict[str, Scalar]],
 
 
 def check_accuracy(quick: bool) -> Iterator[Measure]:
+    """Measure the errors of motion and elevation map, with many features and with as many as in the landing paper."""
     pairs = [simulate_errors(number) for number in range(6 if quick else 100)]
     for site in (*SITES, ""):
-        rows = [pair["ours"] for pair in pairs if pair["ours"]["site"] == site or not site]
+        rows = [pair["many features"] for pair in pairs if pair["many features"]["site"] == site or not site]
         population = f"{len(rows)} noise-free pairs" + (f" over {site}" if site else "")
         limits = (None, None, None) if site else (ROTATION_LIMIT_DEG, BASELINE_LIMIT, ELEVATION_LIMIT)
         tracks = float(np.median([float(row["tracks"]) for row in rows]))

@@ -87,11 +87,12 @@ def make_uniform(view: View, sun: Sun) -> View:
     return replace(view, scene=scene)
 
 
-def _compare_shadows(name: str, view: View, sun: Sun, count: int, farthest: float, step: float) -> Measure:
+def _compare_shadows(name: str, view: View, sun: Sun, count: int, max_range_m: float, step: float) -> Measure:
+    """Compare cast shadows at random pixels with those of independent ray casting."""
     view = make_uniform(view, sun)
     frame = render(renderer(), view)
     points = frame.points_world().reshape(-1, 3)
-    candidates = np.flatnonzero(frame.range_m.ravel() < farthest)
+    candidates = np.flatnonzero(frame.range_m.ravel() < max_range_m)
     pixels = np.random.default_rng(6).choice(candidates, min(count, candidates.size), replace=False)
     points, normals = points[pixels], frame.normal.reshape(-1, 3)[pixels].astype(np.float64)
     to_sun = np.asarray(sun.direction, dtype=np.float64)
@@ -102,7 +103,7 @@ def _compare_shadows(name: str, view: View, sun: Sun, count: int, farthest: floa
     # the renderer smooths distant ground; exact heights are used, because only shadows are compared
     on_ground = frame.body.ravel()[pixels] < 0
     points[on_ground, 2] = ground.height(points[on_ground, 0], points[on_ground, 1])
-    hidden = ground.hides(points, to_sun, step)
+    hidden = ground.is_occluded(points, to_sun, step)
     rays = np.broadcast_to(to_sun, points.shape)
     hidden |= np.isfinite(cast_triangles(view.scene.objects, points, rays, nearest=2e-3))
     reference_lit = (cos_i > 0.0) & ~hidden
@@ -116,11 +117,12 @@ def _compare_shadows(name: str, view: View, sun: Sun, count: int, farthest: floa
         f"{np.mean(reference_lit & ~rendered_lit):.2%} wrongly dark"
     )
     # about three times the maximum disagreement from the air (0.03 %), and twice that from a mast (0.24 %)
-    limit = 0.999 if farthest > MAX_MAST_RANGE_M else 0.995
+    limit = 0.999 if max_range_m > MAX_MAST_RANGE_M else 0.995
     return Measure(f"shadows equal to those of independent ray casting: {name}", agreement, "", limit, how, "at least")
 
 
 def run_shadows(quick: bool) -> Iterator[Measure]:
+    """Compare cast shadows in images from the air and from a mast with independent ray casting."""
     count = 2000 if quick else 20000
     sun_20_deg, sun_10_deg = (
         Sun(direction(np.radians(110.0), np.radians(20.0))),
@@ -169,6 +171,7 @@ def _reflectance(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: n
 
 
 def run_reflectance(quick: bool) -> Iterator[Measure]:
+    """Check reciprocity, formula and spherical albedo of the reflectance laws."""
     rng = np.random.default_rng(9)
     pairs = 10 if quick else 40
     for name, law in LAWS.items():

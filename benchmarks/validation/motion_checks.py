@@ -64,10 +64,11 @@ def _median_fit_errors(motions: Sequence[Motion]) -> tuple[float, float]:
 
 
 def run_motion(quick: bool) -> Iterator[Measure]:
+    """Measure the bias of image motion for all sites from 2 km and for rocks from a mast."""
     steps = QUICK_STEPS_PX if quick else STEPS_PX
     fits: list[tuple[float, float]] = []
-    for name, where in sites().items():
-        if where.descent is None:
+    for name, site_parameters in sites().items():
+        if site_parameters.descent is None:
             continue
         motions = list(measure(renderer(), descent_view(name, DESCENT_HEIGHT_M, DESCENT_SIZE), steps))
         fits.append(_median_fit_errors(motions))
@@ -85,8 +86,8 @@ def run_motion(quick: bool) -> Iterator[Measure]:
             yield _measure_bias(
                 f"bias of motion, ground at grazing view and rocks around the large rock, {distance:g} m", around, steps
             )
-    raw = replace(rock_view(ROCK_SITE, 10.0), footprint=1.0 / 64.0)
-    errors = [motion.error for motion in measure(renderer(), raw, np.array([0.25, 0.5, 0.75]))]
+    point_sampled = replace(rock_view(ROCK_SITE, 10.0), footprint=1.0 / 64.0)
+    errors = [motion.error for motion in measure(renderer(), point_sampled, np.array([0.25, 0.5, 0.75]))]
     yield Measure(
         "bias of motion with point samples (aliasing), rock and ground from 10 m",
         max_bias(errors),
@@ -102,6 +103,7 @@ def run_motion(quick: bool) -> Iterator[Measure]:
 
 
 def run_tile(quick: bool) -> Iterator[Measure]:
+    """Measure the bias of image motion over a measured HiRISE tile."""
     view = tile_view(TILE_HEIGHT_M, DESCENT_SIZE)
     if view is None:
         return
@@ -111,16 +113,19 @@ def run_tile(quick: bool) -> Iterator[Measure]:
 
 
 def _dominant_rock(motion: Motion) -> int:
+    """Return the number of the rock with most patches."""
     rocks = motion.body[motion.body >= 0]
     return int(np.bincount(rocks).argmax())
 
 
 def _control_views() -> Iterator[tuple[str, View]]:
+    """Yield the views of the control by name."""
     yield "gusev from 2 km", descent_view("gusev", DESCENT_HEIGHT_M, CONTROL_SIZE)
     yield "rock at 5 m", rock_view(ROCK_SITE, 5.0, CONTROL_SIZE)
 
 
 def run_control(quick: bool) -> Iterator[Measure]:
+    """Measure the bias of the estimator itself, on images with many rays per pixel."""
     samples = 4 if quick else CONTROL_SAMPLES
     for name, view in _control_views():
         motions = list(measure(renderer(), view, CONTROL_STEPS_PX, samples))
@@ -137,27 +142,28 @@ def _measure_edge_error(view: View) -> tuple[float, float, int]:
     single = replace(view, scene=replace(view.scene, edge_rays=1))
     one_ray, several_rays = render(renderer(), single), render(renderer(), view)
     edges = edge_pixels(one_ray.radiance, one_ray.range_m, one_ray.body)
-    true = supersample(renderer(), replace(single, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
-    before, after = (
-        float(np.sqrt(np.mean((frame.radiance - true).ravel()[edges] ** 2)) / true.mean())
+    reference = supersample(renderer(), replace(single, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
+    one_ray_error, several_rays_error = (
+        float(np.sqrt(np.mean((frame.radiance - reference).ravel()[edges] ** 2)) / reference.mean())
         for frame in (one_ray, several_rays)
     )
-    return before, after, edges.size
+    return one_ray_error, several_rays_error, edges.size
 
 
 def run_edges(quick: bool) -> Iterator[Measure]:
+    """Measure the error of radiance at outlines against 256 rays per pixel."""
     size = (192, 160) if quick else (384, 320)
     for distance in OUTLINE_DISTANCES_M:
         full_view = rock_view(ROCK_SITE, distance)
         # the upper left part of the image contains an outline in front of distant ground
         view = replace(full_view, camera=full_view.camera.crop(0, 0, size))
-        before, after, count = _measure_edge_error(view)
+        one_ray_error, several_rays_error, count = _measure_edge_error(view)
         yield Measure(
             f"radiance at outlines, rms, {distance:g} m from a rock",
-            after,
+            several_rays_error,
             "of the mean",
             None,
-            f"{count} edge pixels, compared with 256 rays per pixel; with one ray per pixel {before:.2g}",
+            f"{count} edge pixels, compared with 256 rays per pixel; with one ray per pixel {one_ray_error:.2g}",
         )
 
 

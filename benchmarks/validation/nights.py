@@ -1,4 +1,4 @@
-"""Simulated nightly runs of campaigns whose cases share terrains in different ways."""
+"""Simulated nightly runs ("nights") of campaigns whose cases share terrains in different ways."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from marsyard.reports.statistics.changes import Sample
 
 #: Assignments of cases to terrains.
 KINDS = ("a bank of 12 terrains", "20 new terrains every night", "a terrain for each case")
-#: Cases of a campaign in a night.
+#: Cases of a campaign in a nightly run.
 CASES = 100
-#: Nights before a simulated regression, and factor by which it increases the errors.
-BEFORE, WORSE = 7, 2.0
+#: Number of nightly runs before a simulated regression, and factor by which the regression increases the errors.
+EARLIER_NIGHTS, ERROR_FACTOR = 7, 2.0
 #: Limit of the errors, metres.
 _LIMIT_M = 2.0
 
 
 class CampaignSimulator:
-    """Draws the cases of campaigns for successive nights.
+    """Draws the cases of campaigns for successive nightly runs.
 
     Difficult terrains have larger errors and fewer answers. Errors have a heavy-tailed distribution; cases without an
     answer have no error.
@@ -40,20 +40,20 @@ class CampaignSimulator:
         self._bank = self._draw_terrains(12)
         self._number = 0
 
-    def draw_night(self, kind: str, worse: float = 1.0) -> list[NightMetric]:
-        """Draw the metrics of a campaign in one night; every error is multiplied by `worse`."""
+    def draw_metrics(self, kind: str, error_factor: float = 1.0) -> list[NightMetric]:
+        """Draw the metrics of a campaign in the next nightly run; every error is multiplied by `error_factor`."""
         self._number += 1
-        terrains, (scale_m, answer) = self._draw_terrains_of_cases(kind)
-        errors = worse * scale_m[terrains] * np.abs(self._rng.standard_t(4, CASES))
-        answered = self._rng.random(CASES) < answer[terrains]
-        # terrains of a bank have the same numbers every night; other terrains are new
-        names = terrains if kind == KINDS[0] else terrains + 1000 * self._number
+        terrains, (scale_m, answer_probability) = self._draw_terrains_of_cases(kind)
+        errors = error_factor * scale_m[terrains] * np.abs(self._rng.standard_t(4, CASES))
+        answered = self._rng.random(CASES) < answer_probability[terrains]
+        # terrains of a bank have the same numbers in every nightly run; other terrains are new
+        terrain_numbers = terrains if kind == KINDS[0] else terrains + 1000 * self._number
         within = (answered & (errors < _LIMIT_M)).astype(np.float64)
         errors = np.where(answered, errors, np.nan)
         return [
-            NightMetric("within the bound", True, float(within.mean()), Sample(within, names)),
-            NightMetric("answered", True, float(answered.mean()), Sample(answered.astype(np.float64), names)),
-            NightMetric("error (m)", False, float(np.nanmedian(errors)), Sample(errors, names)),
+            NightMetric("within the bound", True, float(within.mean()), Sample(within, terrain_numbers)),
+            NightMetric("answered", True, float(answered.mean()), Sample(answered.astype(np.float64), terrain_numbers)),
+            NightMetric("error (m)", False, float(np.nanmedian(errors)), Sample(errors, terrain_numbers)),
         ]
 
     def _draw_terrains_of_cases(self, kind: str) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
@@ -70,16 +70,16 @@ class CampaignSimulator:
 
 
 def count_false_alarms(nights: int, seed: int) -> int:
-    """Count the nights with a false alarm among successive nights without a change.
+    """Count the nightly runs with a false alarm among successive runs without a change.
 
-    The nights are stored in a history, so that effects of a false alarm on later nights are included.
+    The runs are stored in a history, so that effects of a false alarm on later runs are included.
     """
     simulator, alarms = CampaignSimulator(seed), 0
     with TemporaryDirectory() as folder, History(Path(folder, "history.sqlite")) as history:
         for _ in range(nights):
             night = history.begin(None)
             for kind in KINDS:
-                history.add(night, NightCampaign(kind, "", "", "PASS", 0, ""), simulator.draw_night(kind))
+                history.add(night, NightCampaign(kind, "", "", "PASS", 0, ""), simulator.draw_metrics(kind))
             flagged = find_changes(list_comparisons(history, night))
             history.finish(
                 night, FINISHED, [(change.campaign, change.metric, change.p_value, change.worse) for change in flagged]
@@ -88,15 +88,15 @@ def count_false_alarms(nights: int, seed: int) -> int:
     return alarms
 
 
-def count_detections(worsened: str, nights: int, seed: int) -> int:
-    """Count nights in which a simulated increase of errors is detected for the correct campaign and metric."""
+def count_detections(changed_kind: str, nights: int, seed: int) -> int:
+    """Count nightly runs in which an increase of errors is detected for the correct campaign and metric."""
     simulator, detected = CampaignSimulator(seed), 0
     for _ in range(nights):
         comparisons = []
         for kind in KINDS:
-            before = [simulator.draw_night(kind) for _ in range(BEFORE)]
-            for index, metric in enumerate(simulator.draw_night(kind, WORSE if kind == worsened else 1.0)):
-                comparisons.append(Comparison(kind, metric, [night[index].sample for night in before]))
+            earlier_runs = [simulator.draw_metrics(kind) for _ in range(EARLIER_NIGHTS)]
+            for index, metric in enumerate(simulator.draw_metrics(kind, ERROR_FACTOR if kind == changed_kind else 1.0)):
+                comparisons.append(Comparison(kind, metric, [run[index].sample for run in earlier_runs]))
         changes = {(change.campaign, change.metric) for change in find_changes(comparisons)}
-        detected += (worsened, "error (m)") in changes
+        detected += (changed_kind, "error (m)") in changes
     return detected

@@ -42,13 +42,13 @@ class Ground:
         x, y, z = (origins[:, k] + t * directions[:, k] for k in range(3))
         return z - self.height(x, y)
 
-    def cast(self, origins: np.ndarray, directions: np.ndarray, farthest: float, step: float) -> np.ndarray:
+    def cast(self, origins: np.ndarray, directions: np.ndarray, max_range_m: float, step: float) -> np.ndarray:
         """Distance of each ray to the ground by steps of at most `step` metres and bisection; infinite if none."""
         ranges = np.full(len(directions), np.inf)
         with np.errstate(divide="ignore"):
             above = np.where(directions[:, 2] < 0.0, (self.highest - origins[:, 2]) / directions[:, 2], 0.0)
             below = np.where(directions[:, 2] < 0.0, (self.lowest - origins[:, 2]) / directions[:, 2], np.inf)
-        start, stop = np.clip(above, 0.0, farthest), np.clip(below, 0.0, farthest)
+        start, stop = np.clip(above, 0.0, max_range_m), np.clip(below, 0.0, max_range_m)
         order = np.argsort(stop - start)
         while order.size:
             longest = float((stop - start)[order].max())
@@ -74,7 +74,7 @@ class Ground:
             high, low = np.where(beneath, middle, high), np.where(beneath, low, middle)
         return np.where(hit, 0.5 * (low + high), np.inf)
 
-    def hides(self, points: np.ndarray, towards: np.ndarray, step: float) -> np.ndarray:
+    def is_occluded(self, points: np.ndarray, towards: np.ndarray, step: float) -> np.ndarray:
         """Whether the ground occludes a distant light source in the direction `towards`, for each point."""
         length = max((self.highest - float(points[:, 2].min())) / max(towards[2], 1e-3), step)
         t = np.concatenate([[0.05 * step], np.arange(step, length + step, step)])

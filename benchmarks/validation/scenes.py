@@ -24,7 +24,7 @@ SEED = 20
 HAZCAM_LABEL = Path(__file__).parents[3] / "shared/data/mer_opportunity/1F483288473EFFCMUFP1214L0M1.IMG"
 #: HiRISE tile in Gale: 1 m posts, 0.5 m orthoimage.
 TILE = Path(__file__).parents[3] / "shared/data/gale_hirise/gale_1m_dem_0p5m_ortho.npz"
-#: Horizontal position (x, y) of the camera in all descent views, m (arbitrary), metres.
+#: Horizontal position (x, y) of the camera in all descent views, m; the choice is arbitrary.
 DESCENT_POSITION = (1000.0, 1200.0)
 #: Position and diameter of the large rock, and height of the mast camera, metres.
 ROCK_POSITION, ROCK_DIAMETER_M, MAST_M = (50.0, 50.0), 2.5, 1.6
@@ -34,6 +34,7 @@ OVERHEAD_SUN = Sun(np.array([0.0, 0.0, 1.0]))
 
 
 def renderer() -> Renderer:
+    """Return the renderer that all checks share."""
     return process_renderer(default_backend())
 
 
@@ -79,15 +80,13 @@ def cameras() -> dict[str, CameraModel]:
     return {name: camera for name, camera in by_name.items() if camera is not None}
 
 
-def looks_down(camera: CameraModel) -> bool:
-    return bool(camera.boresight()[2] < -0.9)
-
-
 def level_pose(position: np.ndarray) -> RigidTransform:
+    """Return the pose of a level body at a position."""
     return rigid(Rotation.identity(), position)
 
 
 def create_photometry(site_parameters: Site) -> Photometry:
+    """Return the reflectance law of a site."""
     parameters = site_parameters.photometry
     return Photometry(
         lunar_fraction=parameters.lunar_fraction,
@@ -97,16 +96,19 @@ def create_photometry(site_parameters: Site) -> Photometry:
 
 
 def create_texture(parameters: SiteTexture) -> Texture:
+    """Return the albedo texture of a site."""
     return Texture(parameters.coarsest_m, parameters.amplitudes)
 
 
 @cache
 def descent_surface(name: str) -> Surface:
+    """Return the terrain of a site for descent images."""
     return TerrainBank(site(name).terrain("descent"), SEED).terrain(0)
 
 
 @cache
 def ground_surface(name: str) -> Surface:
+    """Return the terrain of a site for mast images."""
     return TerrainBank(site(name).terrain("ground"), SEED).terrain(0)
 
 

@@ -8,7 +8,14 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from scipy import stats
 
-from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, count_detections, count_false_alarms
+from benchmarks.validation.nights import (
+    CASES,
+    EARLIER_NIGHTS,
+    ERROR_FACTOR,
+    KINDS,
+    count_detections,
+    count_false_alarms,
+)
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.history import WINDOW
 from marsyard.reports.statistics.proportions import (
@@ -36,8 +43,8 @@ def _min_coverage(nominal: float, trials: int) -> float:
     return nominal - 3.0 * math.sqrt(nominal * (1.0 - nominal) / trials)
 
 
-def _fraction(hits: Iterator[bool], trials: int) -> float:
-    return sum(bool(hit) for hit in hits) / trials
+def _fraction(successes: Iterator[bool], trials: int) -> float:
+    return sum(bool(success) for success in successes) / trials
 
 
 def run_intervals(quick: bool) -> Iterator[Measure]:
@@ -139,7 +146,7 @@ def _draw_errors(rng: np.random.Generator, correlation: float, terrains: int) ->
 
 
 def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
-    """Whether each interval contains the true value; the bounds of the quantile are separate."""
+    """Return whether each interval contains the true value; the two bounds of the quantile are checked separately."""
     lower, upper = quantile_bounds(errors, 0.95, CONFIDENCE, terrain)
     covered: dict[str, tuple[bool, ...]] = {
         "95 % quantile": (lower <= truths["95 % quantile"], upper >= truths["95 % quantile"])
@@ -151,7 +158,7 @@ def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, f
 
 
 def run_sequential(quick: bool) -> Iterator[Measure]:
-    """Measure error rates of sequential campaigns whose true rate equals the required rate: every verdict is false."""
+    """Measure error rates of sequential campaigns whose true rate is the required rate: every verdict is an error."""
     trials = 300 if quick else 2000
     rng = np.random.default_rng(3)
     for required, max_cases in ((0.9, 512), (0.99, 1000)):
@@ -190,7 +197,7 @@ def _simulate_decision(
 
 
 def run_nights(quick: bool) -> Iterator[Measure]:
-    """Measure false alarms of nights without a change, and detection of simulated regressions."""
+    """Measure false alarms of nightly runs without a change, and detection of simulated regressions."""
     unchanged, changed = (100, 100) if quick else (2000, 1000)
     alarms = count_false_alarms(unchanged, seed=4)
     campaigns = f"three campaigns of {CASES} cases: {', '.join(KINDS)}"
@@ -203,8 +210,8 @@ def run_nights(quick: bool) -> Iterator[Measure]:
         )
     for kind, nights in ((KINDS[0], changed), (KINDS[1], changed // 4)):
         detected = count_detections(kind, nights, seed=5) / nights
-        claim = f"nights that detect a regression, errors {WORSE:g} times as large, {kind}"
-        how = f"{nights} nights, each compared with {BEFORE} earlier nights; {campaigns}"
+        claim = f"nights that detect a regression, errors {ERROR_FACTOR:g} times as large, {kind}"
+        how = f"{nights} nights, each compared with {EARLIER_NIGHTS} earlier nights; {campaigns}"
         yield Measure(claim, detected, "", 0.95, how, "at least")
 
 

@@ -70,6 +70,7 @@ def check_drift(quick: bool) -> Iterator[Measure]:
 
 
 def _measure_drifts(rows: list[dict[str, Scalar]], name: str, *, has_limit: bool) -> Iterator[Measure]:
+    """Measure the drift in pixels of the tracked targets, and the fraction of lost targets."""
     px = np.array([float(row["drift_px"]) for row in rows])
     how = (
         f"{len(rows)} targets on rendered rocks, 10 m to 2 m in steps of 10 %, no noise, exact pose and cameras, "
@@ -96,7 +97,7 @@ def _median_sun_motion_deg(rows: list[dict[str, Scalar]]) -> float:
 
 
 def check_stereo(quick: bool) -> Iterator[Measure]:
-    """Compare the range error of the first pair at 10 m with Eq. 1, using the true disparity errors."""
+    """Compare the range error of the first pair at 10 m with Eq. 1 (tracking paper) for the true disparity errors."""
     for camera in CAMERAS:
         rows = [_simulate_designation(number, camera) for number in range(10 if quick else 60)]
         pairs = [row for row in rows if row is not None]
@@ -121,9 +122,9 @@ def check_stereo(quick: bool) -> Iterator[Measure]:
 
 
 def _simulate_designation(number: int, camera: str) -> tuple[float, float] | None:
-    """Simulate a first pair: range error (NaN if the target is not found) and its value from Eq. 1, metres.
+    """Simulate a first pair; return its range error and the error by Eq. 1 of the tracking paper, metres.
 
-    None if the target is not selectable.
+    The range error is NaN if the target is not found. The result is None if the target is not selectable.
     """
     campaign = load_campaign("vtt-accuracy")
     # large rock: the template contains only the rock and no ground behind it

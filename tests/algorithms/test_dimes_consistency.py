@@ -105,10 +105,12 @@ def test_invalid_tracks_are_ignored(invalid_pair: int) -> None:
 
 
 def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
-    """Analytic velocity errors of four tracks per case, m/s, shape (cases, pair, template, 2). Errors per image,
-    common to its tracks: altitude 1 % (3 sigma), attitude 0.03 deg (0.5 ms at 60 deg/s); match error 0.1 m/s per
-    track. Features are within 39 deg of the nadir. A feature at distance r from the nadir of a camera at height H,
-    with relative altitude error e and tilt error (a, b), is displaced by at most e r + H (1 + r^2 / H^2) (a, b).
+    """Draw velocity errors of four tracks per case from error formulas, m/s, shape (cases, pair, template, 2).
+
+    The tracks of an image have common errors of altitude, 1 % (3 sigma), and attitude, 0.03 deg (0.5 ms at 60 deg/s).
+    The match error is 0.1 m/s per track. Features are within 39 deg of the nadir. A feature at distance r from the
+    nadir of a camera at height H, with relative altitude error e and tilt error (a, b), is displaced by at most
+    e r + H (1 + r^2 / H^2) (a, b).
     """
     heights = np.array([2000.0, 1719.0, 1438.0])
     scale = rng.normal(0.0, 0.01 / 3.0, (cases, 3))
@@ -129,7 +131,7 @@ def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
 @pytest.mark.parametrize("tracks_per_pair", [1, 2])
 @pytest.mark.parametrize("wrong_by", [10.0, 20.0, 55.0])
 def test_one_wrong_track_rarely_causes_a_wrong_velocity(tracks_per_pair: int, wrong_by: float) -> None:
-    # With one of four tracks wrong by at least 10 m/s, 99.5 % of cases are correct or unsuccessful.
+    # With one of four tracks wrong by at least 10 m/s, 99.5 % of cases report a correct velocity or none.
     rng = np.random.default_rng(12)
     cases = 1000
     errors = track_errors(rng, cases)[:, :, :tracks_per_pair]

@@ -51,7 +51,7 @@ from tests.algorithms.synthetic_descent import (
 
 OPTIONS = DimesOptions()
 LIMIT = OPTIONS.max_off_nadir_rad
-NIGHT = direction(0.0, -1.0)  # the sun below the horizon: no zero-phase spot on the ground
+SUN_BELOW_HORIZON = direction(0.0, -1.0)  # no zero-phase spot on the ground
 
 
 def make_blank_view(
@@ -69,7 +69,7 @@ def make_views(
     return make_blank_view(first, altitudes[0]), make_blank_view(second, altitudes[1], INTERVAL_S)
 
 
-def find_candidates(first: View, second: View, sun: np.ndarray = NIGHT) -> Candidates:
+def find_candidates(first: View, second: View, sun: np.ndarray = SUN_BELOW_HORIZON) -> Candidates:
     return template_candidates(first, second, search_geometry(first, second, OPTIONS), sun, OPTIONS)
 
 
@@ -77,10 +77,10 @@ def test_ground_and_pixel_projections_are_inverse() -> None:
     view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     pixels = grid_pixels(view.size, 16)
     ground, is_within_limit = ground_from_pixels(view, pixels, LIMIT)
-    back, visible = pixels_from_ground(view, ground)
+    reprojected, visible = pixels_from_ground(view, ground)
     assert is_within_limit.sum() > 200
     assert np.all(visible[is_within_limit])
-    np.testing.assert_allclose(back[is_within_limit], pixels[is_within_limit], atol=1e-6)
+    np.testing.assert_allclose(reprojected[is_within_limit], pixels[is_within_limit], atol=1e-6)
 
 
 def test_distant_rays_are_clipped_at_the_off_nadir_limit() -> None:
@@ -173,7 +173,7 @@ def test_zero_phase_pixel_is_at_the_lander_shadow() -> None:
     sun = direction(np.radians(90.0), np.radians(60.0))
     view = make_blank_view(tilt_body(10.0, 200.0, 30.0), 2000.0)
     shadow = np.array([[-2000.0 / np.tan(np.radians(60.0)), 0.0]])
-    # A direction and a ground point in it project equally except for the rounding of 1e7 m.
+    # A direction and a ground point along it project to the same pixel, except for rounding at distances of 1e7 m.
     np.testing.assert_allclose(zero_phase_pixel(view, sun), pixels_from_ground(view, shadow)[0][0], atol=1e-3)
     assert np.all(np.isnan(zero_phase_pixel(view, -sun)))
 
@@ -195,8 +195,8 @@ def test_templates_and_windows_avoid_zero_phase_spot() -> None:
                 cosines = points @ -sun / np.linalg.norm(points, axis=1)
                 # Between lattice points the spot may extend into the window by a fraction of a degree.
                 assert np.degrees(np.arccos(cosines.max())) > np.degrees(radius) - 0.6
-        chosen, _ = select_templates(first, selectable, OPTIONS)
-        assert all(selectable.preferred[k] for k in chosen)
+        selected, _ = select_templates(first, selectable, OPTIONS)
+        assert all(selectable.preferred[k] for k in selected)
 
 
 def test_grid_has_the_given_step_and_is_centred() -> None:
@@ -226,11 +226,11 @@ def test_only_textured_area_is_selected() -> None:
     view = make_blank_view(Rotation.identity(), 2000.0, 0.0, counts)
     pixels = grid_pixels(view.size, OPTIONS.grid_step_px)
     positions = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
-    chosen, contrasts_of_chosen = select_templates(view, positions, OPTIONS)
-    np.testing.assert_allclose(pixels[chosen[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
-    assert contrasts_of_chosen[0] > 0.02
-    assert contrasts_of_chosen[1] < 0.001
-    assert template_contrasts(view, pixels, OPTIONS.template_px)[chosen[0]] == contrasts_of_chosen[0]
+    selected, contrasts_of_selected = select_templates(view, positions, OPTIONS)
+    np.testing.assert_allclose(pixels[selected[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
+    assert contrasts_of_selected[0] > 0.02
+    assert contrasts_of_selected[1] < 0.001
+    assert template_contrasts(view, pixels, OPTIONS.template_px)[selected[0]] == contrasts_of_selected[0]
 
 
 def make_wave_texture() -> Texture:

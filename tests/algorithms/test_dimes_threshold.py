@@ -8,9 +8,15 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-import benchmarks.threshold_derivation as derivation
 from benchmarks import dimes_threshold
-from benchmarks.threshold_derivation import ThresholdInputs, discrepancies, harm, right_track_errors, threshold_m_s
+from benchmarks.threshold_derivation import (
+    ThresholdInputs,
+    WrongTrackOutcomes,
+    discrepancies,
+    draw_correct_track_errors,
+    simulate_wrong_track,
+    threshold_m_s,
+)
 from marsyard.algorithms.dimes.options import DimesOptions
 
 STORED = json.loads(dimes_threshold.STORED.read_text())
@@ -26,7 +32,7 @@ EXACT = ThresholdInputs(
 
 
 def draw_errors(inputs: ThresholdInputs, seed: int = 1) -> np.ndarray:
-    return right_track_errors(inputs, np.random.default_rng(seed))
+    return draw_correct_track_errors(inputs, np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
@@ -60,11 +66,11 @@ def test_one_wrong_track_rarely_causes_a_wrong_velocity(
     # With one track wrong by at least 10 m/s, 99.5 % of cases report a correct velocity or none.
     rng = np.random.default_rng(5)
     tracks = np.concatenate([confirmation_errors[:, :, :tracks_per_pair]] * 8)
-    fractions = harm(tracks, wrong_by_m_s, STORED["threshold_m_s"], ThresholdInputs().imu_sd_m_s, rng)
-    assert fractions.right + fractions.refused >= 0.995
-    assert fractions.right + fractions.refused + fractions.wrong == pytest.approx(1.0)
+    fractions = simulate_wrong_track(tracks, wrong_by_m_s, STORED["threshold_m_s"], ThresholdInputs().imu_sd_m_s, rng)
+    assert fractions.correct + fractions.rejected >= 0.995
+    assert fractions.correct + fractions.rejected + fractions.wrong == pytest.approx(1.0)
     # With a second track in the pair, the correct velocity is almost always reported.
-    assert fractions.right > 0.99 if tracks_per_pair == 2 else fractions.refused > 0.99
+    assert fractions.correct > 0.99 if tracks_per_pair == 2 else fractions.rejected > 0.99
 
 
 def test_error_free_tracks_are_exact() -> None:
@@ -78,8 +84,8 @@ def test_velocity_errors_have_the_match_error_deviation() -> None:
 
 
 def test_common_attitude_error_causes_apparent_drift() -> None:
-    # A tilt b causes an apparent velocity b x v. For 75 m/s down and 0.5 deg per axis it is 0.65 m/s per axis. A
-    # heading error of 0.5 deg adds at most 0.26 m/s at 30 m/s of drift.
+    # A tilt b (rad) at the velocity v causes an apparent velocity b x v. For 75 m/s down and 0.5 deg per axis it is
+    # 0.65 m/s per axis. A heading error of 0.5 deg adds at most 0.26 m/s at 30 m/s of drift.
     errors = draw_errors(replace(EXACT, descents=120, common_attitude_sd_deg=0.5))
     apparent_m_s = np.radians(0.5) * 281.0 / 3.75
     assert 0.8 * apparent_m_s < errors.std() < 1.7 * apparent_m_s
@@ -94,12 +100,12 @@ def test_threshold_is_rounded_up_to_its_step() -> None:
     assert threshold_m_s(values, 0.81, 0.05) == 0.85
 
 
-def test_harm_is_the_fraction_of_reported_wrong_velocities() -> None:
+def test_outcomes_of_one_wrong_track_have_the_expected_fractions() -> None:
     exact = np.zeros((50, 2, 2, 2))
     rng = np.random.default_rng(3)
-    assert harm(exact, (10.0, 10.0), 4.5, 0.0, rng) == derivation.Harm(1.0, 0.0, 0.0)
-    assert harm(exact[:, :, :1], (10.0, 10.0), 4.5, 0.0, rng) == derivation.Harm(0.0, 1.0, 0.0)
+    assert simulate_wrong_track(exact, (10.0, 10.0), 4.5, 0.0, rng) == WrongTrackOutcomes(1.0, 0.0, 0.0)
+    assert simulate_wrong_track(exact[:, :, :1], (10.0, 10.0), 4.5, 0.0, rng) == WrongTrackOutcomes(0.0, 1.0, 0.0)
     # Without a threshold the wrong track is reported if it is in the second pair: half of the cases.
-    unchecked = harm(exact[:, :, :1], (10.0, 10.0), 100.0, 0.0, rng)
+    unchecked = simulate_wrong_track(exact[:, :, :1], (10.0, 10.0), 100.0, 0.0, rng)
     assert unchecked.wrong == pytest.approx(0.5, abs=0.25)
-    assert unchecked.refused == 0.0
+    assert unchecked.rejected == 0.0

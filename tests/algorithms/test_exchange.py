@@ -28,14 +28,14 @@ from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, 
 from tests.algorithms.synthetic_descent import Flight, render, tilt_body
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
-TRUE = np.array([12.0, -7.0])
+TRUE_VELOCITY = np.array([12.0, -7.0])
 
 
 @pytest.fixture(scope="module")
 def measurements() -> DescentMeasurements:
     """Images of a nearly level descent with noise; the inertial velocity has an error of (3, -2) m/s."""
     attitudes = (tilt_body(3.0, 20.0, 40.0), tilt_body(4.0, 60.0, 40.0), tilt_body(5.0, 90.0, 40.0))
-    steps = np.outer([0.0, 3.75, 7.5], [*TRUE, -75.0])
+    steps = np.outer([0.0, 3.75, 7.5], [*TRUE_VELOCITY, -75.0])
     flight = Flight(np.array([1000.0, 1000.0, 2000.0]) + steps, attitudes)
     exact = render(flight, noise=np.random.default_rng(1))
     return dataclasses.replace(exact, interval_velocities_m_s=flight.velocities + np.array([3.0, -2.0, 0.0]))
@@ -57,9 +57,9 @@ def run_program(spec: str, measurements: DescentMeasurements, **limits: float) -
 @pytest.mark.parametrize("image_format", ["pgm", "png"])
 def test_case_files_round_trip(measurements: DescentMeasurements, tmp_path: Path, image_format: str) -> None:
     write_case(tmp_path, measurements, image_format)  # type: ignore[arg-type]
-    back = read_case(tmp_path)
-    assert isinstance(back, DescentMeasurements)
-    for image, copy in zip(measurements.images, back.images, strict=True):
+    restored = read_case(tmp_path)
+    assert isinstance(restored, DescentMeasurements)
+    for image, copy in zip(measurements.images, restored.images, strict=True):
         np.testing.assert_array_equal(image.counts, copy.counts)
         np.testing.assert_array_equal(image.calibration.flat_field, copy.calibration.flat_field)
         assert dataclasses.replace(image.calibration, flat_field=np.zeros((1, 1))) == dataclasses.replace(
@@ -67,10 +67,10 @@ def test_case_files_round_trip(measurements: DescentMeasurements, tmp_path: Path
         )
         for letter in "cahvor":
             np.testing.assert_array_equal(getattr(image.camera, letter), getattr(copy.camera, letter))
-    np.testing.assert_array_equal(measurements.interval_velocities_m_s, back.interval_velocities_m_s)
-    np.testing.assert_array_equal(measurements.sun_direction, back.sun_direction)
-    assert measurements.altitudes == back.altitudes
-    for reference, actual in zip(measurements.attitudes, back.attitudes, strict=True):
+    np.testing.assert_array_equal(measurements.interval_velocities_m_s, restored.interval_velocities_m_s)
+    np.testing.assert_array_equal(measurements.sun_direction, restored.sun_direction)
+    assert measurements.altitudes == restored.altitudes
+    for reference, actual in zip(measurements.attitudes, restored.attitudes, strict=True):
         # normalising the quaternion again changes the last digits
         assert (reference.world_from_body.inv() * actual.world_from_body).magnitude() < 1e-14
     assert len(list(tmp_path.glob("*.f64"))) == 1  # one flat field for three images of one camera
@@ -86,11 +86,11 @@ def test_landing_without_range_round_trips(measurements: DescentMeasurements, tm
         apriori_site_world=np.array([3.0, 4.0, 5.0]),
     )
     write_case(tmp_path, landing)
-    back = read_case(tmp_path)
-    assert isinstance(back, LandingMeasurements)
-    assert np.isnan(back.slant_range_m)
-    np.testing.assert_allclose(back.poses[1].world_from_body.as_matrix(), pose.as_matrix(), atol=1e-15)
-    np.testing.assert_array_equal(back.apriori_site_world, landing.apriori_site_world)
+    restored = read_case(tmp_path)
+    assert isinstance(restored, LandingMeasurements)
+    assert np.isnan(restored.slant_range_m)
+    np.testing.assert_allclose(restored.poses[1].world_from_body.as_matrix(), pose.as_matrix(), atol=1e-15)
+    np.testing.assert_array_equal(restored.apriori_site_world, landing.apriori_site_world)
 
 
 def test_case_files_contain_no_truth(measurements: DescentMeasurements, tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_case_files_contain_no_truth(measurements: DescentMeasurements, tmp_path
     inputs = np.array(list(_iterate_numbers(_to_plain_values(measurements))))
     indices = {float(k) for k in range(max(512, *measurements.images[0].counts.shape) + 1)}
     assert set(numbers) <= set(inputs) | indices
-    assert not np.isclose(numbers[:, None], TRUE, atol=1e-3).any()
+    assert not np.isclose(numbers[:, None], TRUE_VELOCITY, atol=1e-3).any()
 
 
 def _to_plain_values(value: object) -> object:
@@ -330,7 +330,7 @@ def test_c_example_estimates_velocity(measurements: DescentMeasurements, tmp_pat
         result = run_program(spec, measurements)
         assert result.velocity_m_s is not None
         # Whole pixels of 1.6 m (4 rows: 6.5 m) over 3.75 s; the median of 25 has a quarter of that error.
-        assert np.hypot(*(result.velocity_m_s - TRUE)) < 1.0
+        assert np.hypot(*(result.velocity_m_s - TRUE_VELOCITY)) < 1.0
         assert isinstance(result.details, ProgramDetails)
         assert "templates found" in result.details.stderr
     end_idle_programs()
@@ -347,5 +347,5 @@ def test_python_example_estimates_velocity(measurements: DescentMeasurements, mo
     estimator = VELOCITY.make("velocity_estimator:MedianShift", DimesOptions(), ExecutableLimits())
     result = check_velocity(estimator.estimate(measurements))
     assert result.velocity_m_s is not None
-    assert np.hypot(*(result.velocity_m_s - TRUE)) < 1.0
+    assert np.hypot(*(result.velocity_m_s - TRUE_VELOCITY)) < 1.0
     assert result.covariance_m2_s2 is not None

@@ -31,7 +31,7 @@ def draw_natural_image(seed: int, size: int, blur: float = 1.2) -> np.ndarray:
 def test_correlation_equals_its_definition(n: int, m: int, rows: int, columns: int) -> None:
     rng = np.random.default_rng(n * rows)
     template, window = 1000.0 + 30.0 * rng.normal(size=(n, m)), 1500.0 + 50.0 * rng.normal(size=(rows, columns))
-    # Sums of products are float32: 1e-7 of the energy.
+    # Sums of products are computed in float32: relative errors of 1e-7.
     np.testing.assert_allclose(normalized_correlation(template, window), correlate(template, window), atol=1e-5)
 
 
@@ -136,7 +136,7 @@ def test_stretched_image_biases_match_without_stretch_model() -> None:
 
 
 def test_bent_image_biases_match_without_bend_model() -> None:
-    """A round rock bends the image by 0.04 px per step in one direction: the border moves by half a pixel."""
+    """A round rock bends the image: 10 px from the centre, at the template border, the shift is half a pixel."""
     image, offsets = render_blobs(11, pixel_grid(80)), pixel_grid(21) - 10.0
     bent = offsets + 0.005 * np.stack([np.zeros_like(offsets[..., 0]), (offsets**2).sum(axis=-1)], axis=-1)
     errors: dict[Warp, list[float]] = {"stretch": [], "bend": []}

@@ -20,7 +20,7 @@ def _sample_plane(east_slope: float, height: float = 0.0) -> np.ndarray:
 
 def test_plane_has_the_goodness_of_its_tilt() -> None:
     terrain = EMPTY.add_points(_sample_plane(np.tan(np.radians(15.0))))
-    # tilt: 1 - 15 / 30; a cell's quantiles differ from the plane by less than the slope over half a cell
+    # goodness at a tilt of 15 deg and a limit of 30 deg: 1 - 15 / 30; the tolerance covers the slope over half a cell
     assert terrain.goodness(LIMITS).at(ORIGIN)[0] == pytest.approx(0.5, abs=0.01)
     assert np.isnan(EMPTY.goodness(LIMITS).at(ORIGIN)[0])
 

@@ -28,7 +28,7 @@ from marsyard.scenarios.conformance import inputs
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
-NOTHING = VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+NO_VELOCITY = VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 READY = "import json, os, sys, time\nprint(json.dumps({'exchange': 1, 'ready': True}), flush=True)\n"
 
 
@@ -82,13 +82,13 @@ def test_selection_averages_velocities_over_omitted_images() -> None:
     images = tuple(
         replace(image, time_s=tag) for image, tag in zip(measurements.images, (0.0, 1.0, 4.0, 6.0, 7.0), strict=True)
     )
-    chosen = replace(measurements, images=images, interval_velocities_m_s=velocities).select((0, 2, 3))
-    assert chosen.tags_s == (0.0, 4.0, 6.0)
-    # One second at the velocity of the first interval and three at that of the second; the third interval is exact.
-    np.testing.assert_allclose(chosen.interval_velocities_m_s[0], (velocities[0] + 3.0 * velocities[1]) / 4.0)
-    np.testing.assert_array_equal(chosen.interval_velocities_m_s[1], velocities[2])
-    assert chosen.attitudes == (measurements.attitudes[0], measurements.attitudes[2], measurements.attitudes[3])
-    np.testing.assert_array_equal(chosen.inertial_velocities_m_s, measurements.inertial_velocities_m_s[[0, 2, 3]])  # type: ignore[index]
+    selected = replace(measurements, images=images, interval_velocities_m_s=velocities).select((0, 2, 3))
+    assert selected.tags_s == (0.0, 4.0, 6.0)
+    # One second at the velocity of the first interval and three at that of the second; the third interval is unchanged.
+    np.testing.assert_allclose(selected.interval_velocities_m_s[0], (velocities[0] + 3.0 * velocities[1]) / 4.0)
+    np.testing.assert_array_equal(selected.interval_velocities_m_s[1], velocities[2])
+    assert selected.attitudes == (measurements.attitudes[0], measurements.attitudes[2], measurements.attitudes[3])
+    np.testing.assert_array_equal(selected.inertial_velocities_m_s, measurements.inertial_velocities_m_s[[0, 2, 3]])  # type: ignore[index]
     assert len(measurements.select(()).frames()) == 0
 
 
@@ -119,18 +119,18 @@ def test_invalid_spans_are_rejected(span: object, message: str) -> None:
 def test_missing_span_defaults_to_last_interval() -> None:
     assert check_and_set_span(make_estimate(), (0.0, 1.0, 3.0)).span_s == (1.0, 3.0)
     assert check_and_set_span(make_estimate(2.0, 2.0), (0.0, 3.0)).span_s == (2.0, 2.0)
-    assert check_and_set_span(NOTHING, (0.0,)).span_s is None
+    assert check_and_set_span(NO_VELOCITY, (0.0,)).span_s is None
     with pytest.raises(AlgorithmError, match="one image has no last interval"):
         check_and_set_span(make_estimate(), (0.0,))
 
 
-def test_stream_must_not_set_after_pictures() -> None:
-    class StreamWithHistory(RecordingStream):
+def test_answer_of_a_stream_with_after_pictures_is_rejected() -> None:
+    class StreamThatSetsAfterPictures(RecordingStream):
         def finish(self) -> VelocityEstimate:
             return replace(make_estimate(), after_pictures=(make_estimate(),))
 
     with pytest.raises(AlgorithmError, match="after_pictures is given"):
-        StreamedEstimator(StreamWithHistory()).estimate(inputs.descent())
+        StreamedEstimator(StreamThatSetsAfterPictures()).estimate(inputs.descent())
 
 
 @pytest.mark.parametrize("altitude_m", [1500.0, float("nan")])
@@ -140,12 +140,12 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
     write_frame(tmp_path, frame)
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["camera_1.cahvor", "flat_field_1.f64", "frame.json", "image_1.pgm"]
-    back = read_frame(tmp_path)
-    np.testing.assert_array_equal(back.image.counts, frame.image.counts)
+    restored = read_frame(tmp_path)
+    np.testing.assert_array_equal(restored.image.counts, frame.image.counts)
     for name in ("sun_direction", "inertial_velocity_m_s", "interval_velocity_m_s"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(frame, name))
-    assert repr(back.altitude) == repr(frame.altitude)
-    assert (back.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
+        np.testing.assert_array_equal(getattr(restored, name), getattr(frame, name))
+    assert repr(restored.altitude) == repr(frame.altitude)
+    assert (restored.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
     path = tmp_path / "frame.json"
     path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 2'))
     with pytest.raises(ValueError, match="is not a valid descent image file: exchange format version 2"):
@@ -156,13 +156,13 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
 def test_cases_of_any_image_count_round_trip(tmp_path: Path, image_count: int) -> None:
     measurements = inputs.descent(5).select(tuple(range(image_count)))
     write_case(tmp_path, measurements)
-    back = read_case(tmp_path)
-    assert isinstance(back, DescentMeasurements)
-    assert hash_inputs([image.counts for image in back.images]) == hash_inputs(
+    restored = read_case(tmp_path)
+    assert isinstance(restored, DescentMeasurements)
+    assert hash_inputs([image.counts for image in restored.images]) == hash_inputs(
         [image.counts for image in measurements.images]
     )
-    np.testing.assert_array_equal(back.interval_velocities_m_s, measurements.interval_velocities_m_s)
-    np.testing.assert_array_equal(back.inertial_velocities_m_s, measurements.inertial_velocities_m_s)
+    np.testing.assert_array_equal(restored.interval_velocities_m_s, measurements.interval_velocities_m_s)
+    np.testing.assert_array_equal(restored.inertial_velocities_m_s, measurements.inertial_velocities_m_s)
 
 
 def make_stream(spec: str, time_s: float = 60.0) -> StreamedEstimator:
@@ -198,37 +198,41 @@ def test_example_returns_equal_estimates_in_python_and_as_program(monkeypatch: p
 
 
 def format_server(answers: list[str]) -> str:
-    """A program with fixed answers that ignores its requests."""
+    """Return a program that sends fixed answers without evaluating its requests."""
     return f"{READY}for answer in {answers}:\n    sys.stdin.readline()\n    print(answer, flush=True)\n"
 
 
-NONE_YET = '{"exchange": 1, "outcome": null}'
+NO_VELOCITY_YET = '{"exchange": 1, "outcome": null}'
 
 
 @pytest.mark.parametrize(
     ("answers", "message"),
     [
         (['{"exchange": 1, "outcome": "NO_VALID_TRACK"}'], "the answer to 'start' has an outcome"),
-        ([NONE_YET, "3"], "not one JSON object"),
-        ([NONE_YET, '{"exchange": 1}'], "outcome is None; allowed: VALID"),
-        ([NONE_YET, '{"exchange": 1, "outcome": null, "span_s": [1, 2]}'], "unknown key 'span_s'"),
+        ([NO_VELOCITY_YET, "3"], "not one JSON object"),
+        ([NO_VELOCITY_YET, '{"exchange": 1}'], "outcome is None; allowed: VALID"),
+        ([NO_VELOCITY_YET, '{"exchange": 1, "outcome": null, "span_s": [1, 2]}'], "unknown key 'span_s'"),
         (
-            [NONE_YET, NONE_YET, '{"exchange": 1, "outcome": "VALID", "velocity_m_s": [1, 2], "span_s": [0, 1]}'],
+            [
+                NO_VELOCITY_YET,
+                NO_VELOCITY_YET,
+                '{"exchange": 1, "outcome": "VALID", "velocity_m_s": [1, 2], "span_s": [0, 1]}',
+            ],
             r"span_s is \(0.0, 1.0\); allowed: within",
         ),
-        ([NONE_YET] * 5, "the answer to 'finish' has the outcome null"),
-        ([NONE_YET] * 2, "its output ended without an answer|it closed its input"),
+        ([NO_VELOCITY_YET] * 5, "the answer to 'finish' has the outcome null"),
+        ([NO_VELOCITY_YET] * 2, "its output ended without an answer|it closed its input"),
     ],
 )
 def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: list[str], message: str) -> None:
     (tmp_path / "stream.py").write_text(format_server(answers))
     with pytest.raises(AlgorithmError, match=message) as caught:
         make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.descent())
-    assert caught.value.fault is (Fault.CRASHED if answers == [NONE_YET] * 2 else Fault.BAD_ANSWER)
+    assert caught.value.fault is (Fault.CRASHED if answers == [NO_VELOCITY_YET] * 2 else Fault.BAD_ANSWER)
 
 
 def test_program_hanging_at_an_image_is_terminated(tmp_path: Path) -> None:
-    (tmp_path / "stream.py").write_text(format_server([NONE_YET, NONE_YET]) + "time.sleep(60)\n")
+    (tmp_path / "stream.py").write_text(format_server([NO_VELOCITY_YET, NO_VELOCITY_YET]) + "time.sleep(60)\n")
     with pytest.raises(AlgorithmError, match="no answer within 3 s") as caught:
         make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}", 3.0).estimate(inputs.descent())
     assert caught.value.fault is Fault.TIMED_OUT

@@ -35,8 +35,8 @@ def test_slower_path_is_detected(sd: float, factor: float) -> None:
     rng = np.random.default_rng(3)
     detected = 0
     for _ in range(100):
-        now = draw_ratios(rng, sd) | {"three": draw_ratios(rng, sd, factor)["three"]}
-        slower = select_slower(compare(now, draw_ratios(rng, sd)))
+        measured = draw_ratios(rng, sd) | {"three": draw_ratios(rng, sd, factor)["three"]}
+        slower = select_slower(compare(measured, draw_ratios(rng, sd)))
         detected += [comparison.name for comparison in slower] == ["three"]
     assert detected >= 95
 

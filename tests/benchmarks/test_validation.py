@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.minimum_costs import CALLS
 from benchmarks.stages import STAGES
-from benchmarks.threshold_derivation import ThresholdInputs, right_track_errors
+from benchmarks.threshold_derivation import ThresholdInputs, draw_correct_track_errors
 from benchmarks.validation import dimes_checks, landing_checks, tracking_checks
 from benchmarks.validation.document import RESULTS
 from benchmarks.validation.imu_reference import Reference
@@ -64,7 +64,7 @@ def _check_landing_with_a_failed_pair(monkeypatch: pytest.MonkeyPatch) -> list[M
         value = NAN if number == 3 else 0.0
         row = {"site": landing_checks.SITES[number % 2], "range_m": 10.0, "tracks": 200.0, "elevation_rms_m": value}
         row |= {"rotation_error_deg": value, "baseline_error_fraction": value}
-        return {"paper": row, "ours": row}
+        return {"paper": row, "many features": row}
 
     monkeypatch.setattr(landing_checks, "simulate_errors", errors)
     return list(landing_checks.check_accuracy(quick=False))
@@ -102,9 +102,9 @@ def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch)
     # Halved errors of correct tracks, in the derivation only, give half the threshold. A check that reuses the
     # derivation would not detect this.
     def halve_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> np.ndarray:
-        return 0.5 * right_track_errors(inputs, rng)
+        return 0.5 * draw_correct_track_errors(inputs, rng)
 
-    monkeypatch.setattr(dimes_checks, "right_track_errors", halve_errors, raising=False)
+    monkeypatch.setattr(dimes_checks, "draw_correct_track_errors", halve_errors, raising=False)
     real = dimes_checks.DimesOptions
     monkeypatch.setattr(dimes_checks, "DimesOptions", lambda: real(imu_threshold_m_s=2.3))
     failed = failed_claims(list(dimes_checks.check_imu_threshold(quick=True)))

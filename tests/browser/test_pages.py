@@ -111,11 +111,11 @@ def test_case_is_opened_by_keyboard(campaigns: Path, open_page: Open) -> None:
 def test_axes_of_the_explorer_are_selectable(campaigns: Path, open_page: Open) -> None:
     page, log = open_page(_report_path(campaigns))
     axis_select = page.locator("#explorer select").first
-    names = axis_select.locator("option").all_inner_texts()
-    for name in names:
-        axis_select.select_option(label=name)
+    axis_labels = axis_select.locator("option").all_inner_texts()
+    for label in axis_labels:
+        axis_select.select_option(label=label)
         assert page.locator(".explorer-plot .point").count() > 250
-        assert name in (page.locator(".explorer-plot").text_content() or "")
+        assert label in (page.locator(".explorer-plot").text_content() or "")
     assert log.messages == []
 
 
@@ -136,7 +136,7 @@ def test_campaigns_are_filtered(campaigns: Path, open_page: Open) -> None:
     assert "no campaign fits" in page.locator('tr[data-requirement="DIMES-VEL"]').inner_text()
     page.get_by_role("button", name="Clear").click()
     page.wait_for_function("document.getElementById('count').textContent === '3 of 3 campaigns'")
-    # verdicts of other campaigns follow the latest verdict
+    # the verdicts of the other campaigns are listed after the latest verdict
     others = page.locator('tr[data-requirement="DIMES-VEL"] .evidence li b')
     assert (others.count(), page.locator('tr[data-requirement="DIMES-VEL"] .evidence li').count()) == (1, 2)
     assert log.messages == []
@@ -145,17 +145,17 @@ def test_campaigns_are_filtered(campaigns: Path, open_page: Open) -> None:
 def test_trends_follow_the_filtered_campaigns(campaigns: Path, open_page: Open) -> None:
     page, log = open_page(_index_path(campaigns))
     trend = page.locator('tr[data-requirement="DIMES-VEL"] .trend svg')
-    label_of_all = trend.get_attribute("aria-label")
+    label_of_all_campaigns = trend.get_attribute("aria-label")
     page.locator("input[name=until]").fill("2026-01-01")
     assert trend.count() == 0
     page.locator("input[name=until]").fill("")
-    # drawn again, the trend equals the initial one
-    assert (trend.count(), trend.get_attribute("aria-label")) == (1, label_of_all)
+    # without the filter the trend is drawn again and equals the initial one
+    assert (trend.count(), trend.get_attribute("aria-label")) == (1, label_of_all_campaigns)
     assert page.locator(".coverage").inner_text().count("NO CAMPAIGN") == 1
     assert log.messages == []
 
 
-def test_filter_is_consistent_after_going_back(campaigns: Path, open_page: Open) -> None:
+def test_filter_is_consistent_after_browser_back(campaigns: Path, open_page: Open) -> None:
     page, log = open_page(_index_path(campaigns))
     page.locator("select[name=site]").select_option("meridiani")
     page.locator(".campaigns tbody tr:visible a").first.click()

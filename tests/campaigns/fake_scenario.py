@@ -26,7 +26,7 @@ class Wind(BaseModel):
 
 
 class FakeParameters(BaseModel):
-    """Fields `*_cases` contain the numbers of the cases with this fault."""
+    """Fields `*_cases` contain the numbers of the cases with this fault; `shared` is the number of shared inputs."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -38,7 +38,7 @@ class FakeParameters(BaseModel):
     heights_m: tuple[float, float] = (1.0, 2.0)
     raising_cases: frozenset[int] = frozenset()
     aborting_cases: frozenset[int] = frozenset()
-    refusing_cases: frozenset[int] = frozenset()
+    unanswered_cases: frozenset[int] = frozenset()
     looping_cases: frozenset[int] = frozenset()
     allocating_cases: frozenset[int] = frozenset()
     flooding_cases: frozenset[int] = frozenset()
@@ -106,7 +106,7 @@ class FakeScenario:
         if streams.case in parameters.aborting_cases:
             os.abort()
         misbehave(parameters, streams.case)
-        has_answer = streams.case not in parameters.refusing_cases
+        has_answer = streams.case not in parameters.unanswered_cases
         # the environment variable imitates a change of the algorithm's code
         scale = parameters.error_scale * float(os.environ.get("FAKE_ERROR_SCALE", "1"))
         error = scale * streams.generator("noise").normal(size=2) if has_answer else np.full(2, np.nan)

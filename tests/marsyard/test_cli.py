@@ -55,7 +55,7 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a small campaign with the installed command."""
     folder = tmp_path_factory.mktemp("campaign")
-    path = write_campaign(folder, "refusing_cases = [2]", requirement=REQUIREMENT.replace("0.99", "0.9"))
+    path = write_campaign(folder, "unanswered_cases = [2]", requirement=REQUIREMENT.replace("0.99", "0.9"))
     command = [str(Path(sys.executable).with_name("marsyard")), "run", str(path), "--jobs", "2", "-n", "6"]
     result = subprocess.run([*command, "--out", str(folder / "run")], capture_output=True, text=True, timeout=120)
     assert result.returncode == 3, result.stderr
@@ -184,7 +184,7 @@ def _crash_case(case: int) -> str:
     [
         ("", "", 0, "NO REQUIREMENT"),
         (_crash_case(1), "", 1, "NO REQUIREMENT"),
-        # three cases on one terrain count as one: at 90 % confidence it shows a rate of 10 %
+        # three cases on one terrain count as one case, which shows a rate of 10 % at 90 % confidence
         ("", REQUIREMENT.replace("0.99", "0.09"), 0, "PASS"),
         ("error_scale = 1e3", REQUIREMENT, 1, "FAIL"),
         ("", REQUIREMENT, 3, "INSUFFICIENT"),

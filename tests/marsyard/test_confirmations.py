@@ -58,7 +58,7 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 
 @pytest.fixture
 def campaign(tmp_path: Path) -> Path:
-    """Write a campaign of 10 cases that all meet the requirement, calibrated with seed 5."""
+    """Write a campaign of 10 cases that all meet the requirement; the option `error_scale` is calibrated on seed 5."""
     return write_campaign(
         tmp_path,
         top_level_keys=TOP_LEVEL_KEYS.replace("cases = 12", "cases = 10"),
@@ -76,28 +76,28 @@ def _statuses(directory: Path) -> list[str]:
     return [verdict["status"] for verdict in json.loads((directory / "report.json").read_text())["verdicts"]]
 
 
-def test_a_calibration_seed_cannot_pass(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_run_on_a_calibration_seed_cannot_pass(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     status, out, _ = marsyard("run", campaign, "--out", tmp_path / "calibration", "--jobs", 1)
     assert (status, _statuses(tmp_path / "calibration")) == (3, ["INSUFFICIENT"])
     assert "The verdict would be PASS. Calibrated on these cases" in " ".join(out.split())
     assert "error_scale" in out
     assert _evidence(tmp_path / "calibration").kind is EvidenceKind.CALIBRATION
-    # another seed, which no option was set on, can pass
+    # a seed on which no option was calibrated can pass
     status, out, _ = marsyard("run", campaign, "--seed", 6, "--out", tmp_path / "free", "--jobs", 1)
     assert (status, _statuses(tmp_path / "free")) == (0, ["PASS"])
     assert "evidence: Exploration" in out
 
 
-def test_a_failure_on_a_calibration_seed_stays_a_failure(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_run_on_a_calibration_seed_can_fail(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     out = tmp_path / "run"
     arguments = ("run", campaign, "--set", "error_scale=1e9", "--out", out, "--jobs", 1)
     assert (marsyard(*arguments)[0], _statuses(out)) == (1, ["FAIL"])
 
 
-def test_a_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
+def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     campaign: Path, marsyard: Command, tmp_path: Path
 ) -> None:
-    folders = {name: tmp_path / name for name in ("first", "changed", "repeated", "second", "voided")}
+    folders = {name: tmp_path / name for name in ("first", "changed", "repeated", "second")}
     seed = confirmation_seed("board", "fake", 1)
     status, out, _ = marsyard("run", campaign, "--confirm", "--out", folders["first"], "--jobs", 1)
     assert (status, _statuses(folders["first"])) == (0, ["PASS"])
@@ -106,7 +106,7 @@ def test_a_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     (entry,) = read_confirmations(tmp_path / "confirmations.jsonl")
     assert (entry.seed, entry.number, entry.cases, entry.results) == (seed, 1, 10, {"VELOCITY": "PASS"})
 
-    # the bar of the verdict: another option on the same seed is marked and cannot be PASS
+    # a run with another option on the same seed is marked as reuse of the seed and cannot be PASS
     arguments = ("run", campaign, "--set", "error_scale=0.5")
     status, out, _ = marsyard(*arguments, "--seed", seed, "--out", folders["changed"], "--jobs", 1)
     assert (status, _statuses(folders["changed"])) == (3, ["INSUFFICIENT"])
@@ -116,23 +116,23 @@ def test_a_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     assert "reused confirmation seed 1" in page
     assert "parameters.error_scale (1.0, now 0.5)" in page
 
-    # the same run again is a repetition
+    # a second run with the same options is a repetition
     assert marsyard("run", campaign, "--seed", seed, "--out", folders["repeated"], "--jobs", 1)[0] == 0
     assert _evidence(folders["repeated"]).kind is EvidenceKind.REPETITION
 
-    # the changed option needs another seed, and the record states the multiplicity
+    # the changed option needs a new confirmation seed; the output states the correction for two confirmations
     status, out, _ = marsyard(*arguments, "--confirm", "--out", folders["second"], "--jobs", 1)
-    text = " ".join(out.split())
+    output = " ".join(out.split())
     assert (status, _evidence(folders["second"]).of_algorithm) == (0, 2)
-    assert "up to 2 times that of one" in text
-    assert "for all 2 confirmations together (each at 95.00 %): INSUFFICIENT" in text
+    assert "up to 2 times that of one" in output
+    assert "for all 2 confirmations together (each at 95.00 %): INSUFFICIENT" in output
     second = json.loads((folders["second"] / "campaign.json").read_text())
     assert second["seed"] == confirmation_seed("board", "fake", 2)
     status, out, _ = marsyard("confirmations", "--json")
     assert (status, [entry["results"] for entry in json.loads(out)]) == (0, [{"VELOCITY": "PASS"}] * 2)
     assert marsyard("confirmations")[1].count("PASS") == 2
 
-    # other requirements were not frozen
+    # requirements that were not frozen with the confirmation give no PASS
     requirements = tmp_path / "requirements.toml"
     requirements.write_text(REQUIREMENT.replace("0.75", "0.7") + 'campaigns = ["fake"]\n')
     status, out, _ = marsyard("report", folders["second"], "--requirements", requirements)
@@ -147,15 +147,13 @@ def test_a_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     assert "not the frozen evaluation" in (tmp_path / "site" / "verification.csv").read_text()
 
 
-def test_a_seed_of_the_namespace_is_recognised_before_its_confirmation(
-    campaign: Path, marsyard: Command, tmp_path: Path
-) -> None:
+def test_run_on_a_future_confirmation_seed_is_recognised(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     seed = confirmation_seed("board", "fake", 3)
-    status, out, _ = marsyard("run", campaign, "--seed", seed, "--out", tmp_path / "peek", "--jobs", 1)
+    status, out, _ = marsyard("run", campaign, "--seed", seed, "--out", tmp_path / "early", "--jobs", 1)
     assert (status, "run without --confirm" in " ".join(out.split())) == (3, True)
 
 
-def test_a_changed_program_voids_a_confirmation(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_changed_program_invalidates_a_confirmation(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     directory = tmp_path / "run"
     marsyard("run", campaign, "--confirm", "--out", directory, "--jobs", 1)
     path = directory / "campaign.json"
@@ -182,8 +180,8 @@ def test_errors_are_reported_before_the_first_case(campaign: Path, marsyard: Com
     assert (status, "calibration.runs[0].options[0]" in err, "error_scale" in err) == (2, True, True)
 
 
-def test_a_confirmation_that_was_killed_stays_in_the_record(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
-    """A run that reserved its seed and stopped counts for the next confirmation."""
+def test_killed_confirmation_stays_in_the_record(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+    """A run that stopped after it had reserved its seed counts in the correction of the next confirmation."""
     marsyard("run", campaign, "--confirm", "--out", tmp_path / "first", "--jobs", 1)
     path = tmp_path / "confirmations.jsonl"
     path.write_text(path.read_text().splitlines()[0] + "\n")

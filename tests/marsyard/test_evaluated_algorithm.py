@@ -38,7 +38,7 @@ class Mine:
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 """
 CAMPAIGN = """
-name = "own campaign"
+name = "custom-campaign"
 scenario = "tests.campaigns.fake_velocity:FakeVelocityScenario"
 cases = 50
 [[requirements]]
@@ -56,8 +56,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a campaign with a custom algorithm in a folder whose name has a space."""
     path: Path = tmp_path_factory.mktemp("a folder")
     (path / "mine.py").write_text(ALGORITHM)
-    (path / "own file.toml").write_text(CAMPAIGN.replace("own campaign", "own-campaign"))
-    command = [str(Path(sys.executable).with_name("marsyard")), "run", "own file.toml", "-n", "3", "--seed", "9"]
+    (path / "custom file.toml").write_text(CAMPAIGN)
+    command = [str(Path(sys.executable).with_name("marsyard")), "run", "custom file.toml", "-n", "3", "--seed", "9"]
     command += ["--algorithm", "mine:Mine", "--algorithm", "homography", "--set", 'description="it\'s mine"']
     result = subprocess.run(
         [*command, "--jobs", "1", "--out", "run"], cwd=path, capture_output=True, text=True, timeout=120, check=False
@@ -150,7 +150,7 @@ def test_appended_blocks_are_in_the_command(folder: Path) -> None:
     run = read_run(folder / "run")
     configuration = {**run.record["configuration"], "appended": [20]}
     changed = type(run)(run.directory, run.frame, run.all_cases, {**run.record, "configuration": configuration}, ())
-    assert rerun_commands(changed)[-1] == "marsyard append runs/own-campaign-again 20"
+    assert rerun_commands(changed)[-1] == "marsyard append runs/custom-campaign-again 20"
 
 
 def test_records_of_earlier_versions_are_reported(folder: Path, tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_records_of_earlier_versions_are_reported(folder: Path, tmp_path: Path) 
     result = CliRunner().invoke(app, ["report", str(old)])
     assert result.exit_code in (1, 3), result.output
     page = (old / "report.html").read_text()
-    assert "marsyard run own-campaign -n 3 --seed 9" in page
+    assert "marsyard run custom-campaign -n 3 --seed 9" in page
     assert "The original command was not recorded" in page
     (row,) = csv.DictReader(io.StringIO((old / "verification.csv").read_text()))
     assert (row["algorithm"], row["algorithm_version"]) == ("mine:Mine", "")

@@ -1,4 +1,4 @@
-"""Tests of former names of keys, columns and options: they are accepted with a warning."""
+"""Tests of deprecated names of keys, columns and options: they are accepted with a warning."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from marsyard.sim.parameters import DeprecatedNameWarning
 
 TABLE = tomllib.loads(Path(parameters.__file__).with_name("renamed.toml").read_text())
 CAMPAIGN = """
-name = "former"
+name = "deprecated"
 scenario = "descent"
 cases = 2
 seed = 3
@@ -41,46 +41,46 @@ confidence = 0.9
 population = "valid and room"
 """
 
-#: Pairs (former name, current name) in `CAMPAIGN`.
+#: Pairs (deprecated name, current name) in `CAMPAIGN`.
 NAMES = (("place", "location"), ("cone_minor_share", "cone_minor_fraction"), ("room", "feasible_overlap"))
 
 
-def replace_former_names(text: str) -> str:
-    for former, now in NAMES:
-        text = text.replace(former, now)
+def replace_deprecated_names(text: str) -> str:
+    for deprecated, current in NAMES:
+        text = text.replace(deprecated, current)
     return text
 
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
-    paths = tmp_path / "former.toml", tmp_path / "current.toml"
+    paths = tmp_path / "deprecated.toml", tmp_path / "current.toml"
     paths[0].write_text(CAMPAIGN)
-    paths[1].write_text(replace_former_names(CAMPAIGN))
+    paths[1].write_text(replace_deprecated_names(CAMPAIGN))
     return paths
 
 
-def test_campaign_with_former_names_equals_the_current_one(files: tuple[Path, Path]) -> None:
+def test_campaign_with_deprecated_names_equals_the_current_one(files: tuple[Path, Path]) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DeprecatedNameWarning)
-        former = load_campaign(str(files[0]))
+        campaign = load_campaign(str(files[0]))
     expected = load_campaign(str(files[1]))
-    assert former.configuration == expected.configuration
-    assert former.draws(1) == expected.draws(1)
+    assert campaign.configuration == expected.configuration
+    assert campaign.draws(1) == expected.draws(1)
     texts = {str(warning.message) for warning in caught}
     assert "'place' is now 'location'; the former name is accepted until 0.2" in texts
     assert {text.split("'")[1] for text in texts} == {"place", "cone_minor_share", "room"}
 
 
-def test_former_value_of_an_option_is_its_current_value() -> None:
-    former = "where level ground at the measured range would move it by the on-board poses"
+def test_deprecated_value_of_an_option_sets_the_current_value() -> None:
+    deprecated = "where level ground at the measured range would move it by the on-board poses"
     with pytest.warns(DeprecatedNameWarning, match="is now 'poses'"):
-        campaign = load_campaign("hda-benign", ["algorithm=hda-custom", f'hda.track_seed="{former}"'])
+        campaign = load_campaign("hda-benign", ["algorithm=hda-custom", f'hda.track_seed="{deprecated}"'])
     assert campaign.configuration.parameters["hda"]["track_seed"] == "poses"
     with pytest.raises(ConfigurationError, match="input should be 'unchanged' or 'poses'"):
         load_campaign("hda-benign", ["hda.track_seed=nothing"])
 
 
-def test_override_with_a_former_name_sets_the_parameter(files: tuple[Path, Path]) -> None:
+def test_override_with_a_deprecated_name_sets_the_parameter(files: tuple[Path, Path]) -> None:
     with pytest.warns(DeprecatedNameWarning, match="'place' is now 'location'"):
         campaign = load_campaign(str(files[1]), ["place.terrain=1"])
     assert campaign.configuration.parameters["location"]["terrain"] == 1
@@ -97,8 +97,9 @@ def test_stored_campaign_is_read_with_current_names(files: tuple[Path, Path], tm
     expected = load_campaign(str(files[1])).configuration
     record.begin(tmp_path, expected, create_identity(expected), "test")
     text = (tmp_path / "campaign.json").read_text()
-    for former, now in (*NAMES, ("most_cases", "max_cases")):
-        text = text.replace(f'"{now}', f'"{former}').replace(f".{now}", f".{former}").replace(f" {now}", f" {former}")
+    for deprecated, current in (*NAMES, ("most_cases", "max_cases")):
+        for character in '". ':
+            text = text.replace(f"{character}{current}", f"{character}{deprecated}")
     assert "place.terrain" in text
     assert "valid and room" in text
     (tmp_path / "campaign.json").write_text(text)
@@ -110,7 +111,7 @@ def test_stored_campaign_is_read_with_current_names(files: tuple[Path, Path], tm
     assert run.record["requirements"][0]["population"] == "valid and feasible_overlap"
 
 
-def test_former_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_deprecated_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "argv", ["marsyard", "replay", str(tmp_path), "0", "--step"])
     with (
         pytest.warns(DeprecatedNameWarning, match="'--step' is now '--save-stages'"),
@@ -121,14 +122,14 @@ def test_former_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert sys.argv[-1] == "--save-stages"
 
 
-def test_current_names_exist_and_former_names_do_not() -> None:
-    """Each entry of the table is used: a key of some parameters, a column of some scenario."""
+def test_current_names_exist_and_deprecated_names_do_not() -> None:
+    """Each current key of the table is a parameter of a scenario, and each current column a column of a scenario."""
     schemas = " ".join(json.dumps(scenario(name).parameters_type.model_json_schema()) for name in scenario_names())
     schemas += json.dumps(type(load_campaign("dimes-smoke").configuration).model_json_schema())
-    for former, now in TABLE["keys"].items():
-        assert f'"{now}": {{' in schemas, now
-        assert former in ("own", "least", "most") or f'"{former}": {{' not in schemas, former
+    for deprecated, current in TABLE["keys"].items():
+        assert f'"{current}": {{' in schemas, current
+        assert deprecated in ("own", "least", "most") or f'"{deprecated}": {{' not in schemas, deprecated
     column_sets = [columns for name in scenario_names() if (columns := row_columns(name)) is not None]
-    for former, now in TABLE["columns"].items():
-        assert any(now in (*columns.flags, *columns.numbers) for columns in column_sets), now
-        assert not any(former in (*columns.flags, *columns.numbers) for columns in column_sets), former
+    for deprecated, current in TABLE["columns"].items():
+        assert any(current in (*columns.flags, *columns.numbers) for columns in column_sets), current
+        assert not any(deprecated in (*columns.flags, *columns.numbers) for columns in column_sets), deprecated

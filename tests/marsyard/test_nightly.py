@@ -1,4 +1,4 @@
-"""Tests of `marsyard nightly`: plans, regressions, interrupted nights and seeds."""
+"""Tests of `marsyard nightly`: plans, regressions, interrupted runs and seeds."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Nightly = Callable[..., tuple[int, str]]
 
 @pytest.fixture
 def nightly(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Nightly:
-    """Return a function that runs a plan of one campaign and returns exit status and report."""
+    """Return a function that runs a plan of one campaign and returns exit status and report (nightly.md)."""
     (tmp_path / "plan.toml").write_text('[[campaigns]]\ncampaign = "fake.toml"\ncases = 60\n')
 
     def run(**parameters: object) -> tuple[int, str]:
@@ -58,23 +58,23 @@ def test_regression_is_reported_with_its_metric(
     assert "**fake: velocity error (m/s)**" in second_report
     assert (status in (0, 3), second_status) == (True, 1)
     connection = sqlite3.connect(tmp_path / "out" / "history.sqlite")
-    nights = connection.execute("SELECT state FROM nights").fetchall()
+    states = connection.execute("SELECT state FROM nights").fetchall()
     connection.close()
-    assert nights == [("finished",), ("finished",)]
+    assert states == [("finished",), ("finished",)]
 
 
-def test_invalid_campaign_does_not_stop_the_night(nightly: Nightly, tmp_path: Path) -> None:
+def test_invalid_campaign_does_not_stop_the_nightly_run(nightly: Nightly, tmp_path: Path) -> None:
     (tmp_path / "plan.toml").write_text(
         '[[campaigns]]\ncampaign = "nonesuch"\n\n[[campaigns]]\ncampaign = "fake.toml"\ncases = 6\n'
     )
-    status, text = nightly()
+    status, report = nightly()
     assert status == 1
-    assert "NOT RUN" in text
-    assert "nonesuch" in text
-    assert "| fake |" in text
+    assert "NOT RUN" in report
+    assert "nonesuch" in report
+    assert "| fake |" in report
 
 
-def test_killed_night_is_shown_and_not_compared(
+def test_killed_run_is_shown_and_not_compared(
     nightly: Nightly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Killed(BaseException):
@@ -88,18 +88,18 @@ def test_killed_night_is_shown_and_not_compared(
         with pytest.raises(Killed):
             nightly()
     assert (tmp_path / "out" / "nightly.md").read_text().startswith("# Night 1: RUNNING")
-    _, page = nightly()
-    assert page.startswith("# Night 2:")
-    assert "Night 1, begun" in page
-    assert "was interrupted" in page
-    assert "No metric has a history" in page
+    _, report = nightly()
+    assert report.startswith("# Night 2:")
+    assert "Night 1, begun" in report
+    assert "was interrupted" in report
+    assert "No metric has a history" in report
     with monkeypatch.context() as patch:
         patch.setattr(nightly_plan, "run_scheduled_campaign", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        status, page = nightly()
-    assert (status, page.splitlines()[0]) == (130, "# Night 3: INTERRUPTED")
+        status, report = nightly()
+    assert (status, report.splitlines()[0]) == (130, "# Night 3: INTERRUPTED")
 
 
-def test_seeds_differ_between_nights(tmp_path: Path) -> None:
+def test_seeds_differ_between_nightly_runs(tmp_path: Path) -> None:
     assert len({night_seed(seed, night) for seed in range(20) for night in range(50)}) == 1000
     path = write_campaign(tmp_path)
     campaign, other = (load_campaign(str(path), seed=seed) for seed in (1, 2))

@@ -158,13 +158,13 @@ def _find_next_look(n: int, failures: int, max_cases: int, **changes: Any) -> in
 
 
 def test_undecided_campaign_continues() -> None:
-    # looks at 16, 32, 64, 128, 256 and 512 cases
+    # evaluations are planned at 16, 32, 64, 128, 256 and 512 cases
     assert _find_next_look(16, 1, 512) == 32
-    # the look at 128 cases spends 1/8 of the risk: confidence 98.75 %
+    # the evaluation at 128 cases spends 1/8 of the risk: its confidence is 98.75 %
     assert _find_next_look(128, 0, 512) is None
     assert _find_next_look(128, 128, 512) is None
     assert _find_next_look(512, 50, 512) is None
-    # a decision by the estimate needs no further look
+    # a decision by the estimate needs no further evaluation
     assert _find_next_look(16, 1, 512, decide_by="estimate") is None
 
 
@@ -181,7 +181,7 @@ def test_adaptive_campaign_notes_its_end(tmp_path: Path) -> None:
     campaign, watch = load_campaign(str(path), cases=128), RecordingWatch()
     run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), watch)
     stored = record.stored_configuration(tmp_path / "run")
-    # all cases fail on one terrain, which counts as one case: no look refutes a rate of 50 %
+    # all cases fail on one terrain, which counts as one case: no evaluation refutes a rate of 50 %
     assert (stored.total_cases, stored.max_cases) == (128, 128)
     assert watch.notes[-1] == "stopped after 128 of at most 128 cases"
 

@@ -166,7 +166,7 @@ def _walk_paths(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[
 _DOCUMENT = tomllib.loads(CAMPAIGN)
 _PATHS = list(_walk_paths(_DOCUMENT))
 _MISSING = object()
-_junk = st.recursive(
+_random_values = st.recursive(
     st.one_of(
         st.booleans(),
         st.integers(-(2**70), 2**70),
@@ -212,7 +212,7 @@ _REPORTING_KEYS = {
 }
 
 
-@given(path=st.sampled_from(_PATHS), value=_junk)
+@given(path=st.sampled_from(_PATHS), value=_random_values)
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_changes_are_shown_or_reported_by_key(campaign: Path, path: tuple[str | int, ...], value: Any) -> None:
     """One value of a valid file is replaced or removed: the file is shown or the error names that key."""

@@ -1,4 +1,4 @@
-"""Tests of the history of nightly runs and of the detection of regressions."""
+"""Tests of the history of nightly runs ("nights") and of the detection of regressions."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def _make_error_pool(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return np.abs(rng.normal(size=(TERRAINS, 200))) * scale[:, None], rng.uniform(0.85, 1.0, TERRAINS)
 
 
-def _draw_night(
+def _draw_metrics(
     rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], error_factor: float = 1.0
 ) -> list[NightMetric]:
-    """Draw the metrics of one night from the pool; `error_factor` multiplies every error."""
+    """Draw the metrics of one nightly run from the pool; `error_factor` multiplies every error."""
     terrains = rng.integers(0, TERRAINS, CASES)
     errors = error_factor * pool[0][terrains, rng.integers(0, 200, CASES)]
     answered = (rng.random(CASES) < pool[1][terrains]).astype(np.float64)
@@ -49,23 +49,23 @@ def _draw_night(
 def _detect_changes(
     rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], error_factor: float = 1.0
 ) -> list[Change]:
-    """Compare one night with seven earlier nights, for two campaigns; `error_factor` applies to the first campaign."""
+    """Compare one nightly run with seven earlier runs of two campaigns; only the first is changed by `error_factor`."""
     comparisons = []
     for campaign, factor in (("first", error_factor), ("second", 1.0)):
-        earlier_nights = [_draw_night(rng, pool) for _ in range(7)]
-        for index, metric in enumerate(_draw_night(rng, pool, factor)):
-            comparisons.append(Comparison(campaign, metric, [night[index].sample for night in earlier_nights]))
+        earlier_runs = [_draw_metrics(rng, pool) for _ in range(7)]
+        for index, metric in enumerate(_draw_metrics(rng, pool, factor)):
+            comparisons.append(Comparison(campaign, metric, [run[index].sample for run in earlier_runs]))
     return find_changes(comparisons)
 
 
 def test_random_variation_is_not_reported_as_change() -> None:
-    # 200 nights, family-wise error rate of 1 %: P(more than 6 false alarms) = 0.4 %
+    # 200 nightly runs, family-wise error rate of 1 %: P(more than 6 false alarms) = 0.4 %
     rng, pool = np.random.default_rng(1), _make_error_pool(2)
     assert sum(bool(_detect_changes(rng, pool)) for _ in range(200)) <= 6
 
 
 def test_simulated_regression_is_detected() -> None:
-    # errors larger by 75 % must be detected in 95 % of 60 nights of 100 cases
+    # errors larger by 75 % must be detected in 95 % of 60 nightly runs of 100 cases
     rng, pool = np.random.default_rng(3), _make_error_pool(4)
     n_detected = 0
     for _ in range(60):
@@ -80,17 +80,17 @@ def _make_campaign(definition: str = "d") -> NightCampaign:
     return NightCampaign("first", definition, "runs/x", "PASS", 0, "1 requirement met.")
 
 
-def _add_night(history: History, seed: int, error_factor: float = 1.0, definition: str = "d") -> int:
+def _add_run(history: History, seed: int, error_factor: float = 1.0, definition: str = "d") -> int:
     night = history.begin("abc")
     history.add(
-        night, _make_campaign(definition), _draw_night(np.random.default_rng(seed), _make_error_pool(4), error_factor)
+        night, _make_campaign(definition), _draw_metrics(np.random.default_rng(seed), _make_error_pool(4), error_factor)
     )
     return night
 
 
 def test_history_stores_campaigns_and_metrics(tmp_path: Path) -> None:
     with History(tmp_path / "history.sqlite") as history:
-        night = _add_night(history, 1)
+        night = _add_run(history, 1)
         history.finish(night, FINISHED)
     with History(tmp_path / "history.sqlite") as history:
         (stored,) = history.nights()
@@ -98,18 +98,18 @@ def test_history_stores_campaigns_and_metrics(tmp_path: Path) -> None:
         assert history.campaigns(night) == [_make_campaign()]
         metrics = history.metrics(night, "first")
         assert [metric.name for metric in metrics] == ["within 2 m", "answered", "error (m)"]
-        expected = _draw_night(np.random.default_rng(1), _make_error_pool(4))[2]
+        expected = _draw_metrics(np.random.default_rng(1), _make_error_pool(4))[2]
         assert metrics[2].sample.values == pytest.approx(expected.sample.values, rel=1e-6)
         assert metrics[2].sample.terrains.tolist() == expected.sample.terrains.tolist()
 
 
-def test_nights_are_compared_with_finished_nights_of_the_campaign(tmp_path: Path) -> None:
+def test_nightly_runs_are_compared_with_finished_runs_of_the_campaign(tmp_path: Path) -> None:
     with History(tmp_path / "history.sqlite") as history:
         for seed in range(3):
-            history.finish(_add_night(history, seed), FINISHED)
-        _add_night(history, 9, error_factor=5.0)  # the process was killed before `finish`
-        history.finish(_add_night(history, 3, definition="another"), FINISHED)
-        night = _add_night(history, 4)
+            history.finish(_add_run(history, seed), FINISHED)
+        _add_run(history, 9, error_factor=5.0)  # the process was killed before `finish`
+        history.finish(_add_run(history, 3, definition="another"), FINISHED)
+        night = _add_run(history, 4)
         states = {entry.night: entry.state for entry in history.nights()}
         assert states == {1: FINISHED, 2: FINISHED, 3: FINISHED, 4: INTERRUPTED, 5: FINISHED, night: RUNNING}
         comparisons = list_comparisons(history, night)
@@ -120,15 +120,15 @@ def test_nights_are_compared_with_finished_nights_of_the_campaign(tmp_path: Path
 def test_reported_change_restarts_the_history(tmp_path: Path) -> None:
     with History(tmp_path / "history.sqlite") as history:
         for seed in range(4):
-            history.finish(_add_night(history, seed), FINISHED)
-        night = _add_night(history, 5, error_factor=3.0)
+            history.finish(_add_run(history, seed), FINISHED)
+        night = _add_run(history, 5, error_factor=3.0)
         regressions = find_changes(list_comparisons(history, night))
         assert "error (m)" in {entry.metric for entry in regressions}
         history.finish(
             night, FINISHED, [(entry.campaign, entry.metric, entry.p_value, entry.worse) for entry in regressions]
         )
-        # after a reported change, later nights are compared with that night only
-        next_night = _add_night(history, 6, error_factor=3.0)
+        # after a reported change, later runs are compared with that run only
+        next_night = _add_run(history, 6, error_factor=3.0)
         n_compared = {entry.metric.name: len(entry.before) for entry in list_comparisons(history, next_night)}
         assert n_compared["error (m)"] == 1
         assert find_changes(list_comparisons(history, next_night)) == []
@@ -137,9 +137,9 @@ def test_reported_change_restarts_the_history(tmp_path: Path) -> None:
 def test_failed_write_adds_no_metrics(tmp_path: Path) -> None:
     path = tmp_path / "history.sqlite"
     with History(path) as history:
-        night = _add_night(history, 1)
+        night = _add_run(history, 1)
         with pytest.raises(StoreError, match="cannot be written"):
-            history.add(night, _make_campaign(), _draw_night(np.random.default_rng(2), _make_error_pool(4)))
+            history.add(night, _make_campaign(), _draw_metrics(np.random.default_rng(2), _make_error_pool(4)))
         assert len(history.metrics(night, "first")) == 3
 
 
@@ -156,11 +156,11 @@ def test_invalid_history_files_are_rejected(tmp_path: Path) -> None:
         History(newer)
 
 
-def test_page_lists_regressions_and_interrupted_nights(tmp_path: Path) -> None:
+def test_page_lists_regressions_and_interrupted_runs(tmp_path: Path) -> None:
     hostile = "a|b\n# <script>`*"
     with History(tmp_path / "history.sqlite") as history:
-        history.finish(_add_night(history, 1), INTERRUPTED)
-        history.finish(_add_night(history, 2), FINISHED)
+        history.finish(_add_run(history, 1), INTERRUPTED)
+        history.finish(_add_run(history, 2), FINISHED)
         later, earlier = history.nights()
     changes_of_night = [
         Change("first", "DIMES-VEL", True, 0.95, 0.7, 2e-6, 7),

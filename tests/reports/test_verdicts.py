@@ -1,4 +1,4 @@
-"""Tests of verdicts on requirements: populations, bounds, shared terrains, crashes and repeated looks."""
+"""Tests of verdicts on requirements: populations, bounds, shared terrains, crashes and repeated evaluations."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_verdict_passes_at_the_minimum_number_of_cases(velocity: dict[str, Any])
     assert _evaluate(_make_rows(230, 0), velocity).status is Status.PASS
     assert _evaluate(_make_rows(388, 1), velocity).status is Status.PASS
     undecided = _evaluate(_make_rows(229, 0), velocity)
-    # appended cases are a second look, so more than one additional case is needed
+    # a verdict with appended cases is a second evaluation, so more than one additional case is needed
     assert (undecided.status, undecided.further_cases) == (Status.INSUFFICIENT, 297 - 229)
 
 
@@ -151,7 +151,7 @@ def test_boolean_metric_counts_true_as_success() -> None:
     )
     assert (all_cases.n, all_cases.failures, feasible_cases.n, feasible_cases.failures) == (100, 10, 95, 5)
     assert (all_cases.status, feasible_cases.status) == (Status.INSUFFICIENT, Status.PASS)
-    # decided by the estimate: 90 of 100 is 90 %; the bounds do not change
+    # if the estimate decides, 90 of 100 cases meet 90 %; the bounds do not change
     by_estimate = _evaluate(frame, availability, decide_by="estimate")
     assert (by_estimate.status, by_estimate.lower) == (Status.MET_BY_RATE, all_cases.lower)
     assert _evaluate(frame, availability, decide_by="estimate", probability=0.91).status is Status.FAIL
@@ -240,10 +240,10 @@ def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any
 
 
 def test_verdict_by_rate_is_not_pass(velocity: dict[str, Any]) -> None:
-    """8 cases without failure have a rate of 100 %, but a consumer's risk of 97.6 % for 99.7 %."""
+    """8 cases without failure have a rate of 100 %, but a consumer's risk of 97.6 % at a required rate of 99.7 %."""
     probability_997 = {**velocity, "probability": 0.997, "decide_by": "estimate"}
     eight_cases = _evaluate(_make_rows(8, 0), probability_997)
-    # 334 = 1 / 0.003 cases, of which one may fail
+    # a failure rate of 0.003 allows one failure in 1 / 0.003 = 334 cases
     assert (eight_cases.status, eight_cases.further_cases) == (Status.INSUFFICIENT, 334 - 8)
     assert "needs at least 334 cases" in eight_cases.note
     assert _evaluate(_make_rows(333, 0), probability_997).status is Status.INSUFFICIENT
@@ -269,8 +269,8 @@ def test_minimum_cases_of_a_rate_allow_one_failure(
     assert _evaluate(_make_rows(min_cases - 1, 0), criterion).status is Status.INSUFFICIENT
 
 
-def test_appended_cases_share_the_risk_of_two_looks(velocity: dict[str, Any]) -> None:
-    """388 cases with one failure pass at one look, but not at a second look after 230 cases."""
+def test_appended_cases_share_the_risk_of_two_evaluations(velocity: dict[str, Any]) -> None:
+    """388 cases with one failure pass in a single evaluation, but not in a second evaluation after one at 230 cases."""
     design = read_sampling_design({"cases": 230, "appended": [158]})
     frame = _make_rows(388, 1)
     (first,) = evaluate_requirements(frame[:230], [velocity], design)
@@ -282,11 +282,11 @@ def test_appended_cases_share_the_risk_of_two_looks(velocity: dict[str, Any]) ->
     assert first.further_cases == 1049 - 230
     (sufficient,) = evaluate_requirements(_make_rows(1049, 1), [velocity], design)
     assert (sufficient.status, sufficient.n) == (Status.PASS, 1049)
-    # 60 failures also fail at the second look
+    # 388 cases with 60 failures fail also in the second evaluation
     assert evaluate_requirements(_make_rows(388, 60), [velocity], design)[0].status is Status.FAIL
 
 
-def test_appended_terrains_share_the_risk_of_two_looks(velocity: dict[str, Any]) -> None:
+def test_appended_terrains_share_the_risk_of_two_evaluations(velocity: dict[str, Any]) -> None:
     design = SamplingDesign(first_look=460)
     frame = _make_rows(776, 0).assign(terrain=np.arange(776) // 2)
     frame.loc[0, "velocity_error_m_s"] = 6.0
@@ -316,7 +316,7 @@ def test_text_metric_fails_all_cases(velocity: dict[str, Any]) -> None:
 
 def test_shared_terrains_count_as_single_cases(velocity: dict[str, Any]) -> None:
     verdict = _evaluate(_make_rows(400, 0).assign(terrain=np.arange(400) % 8), velocity)
-    # too few failures to estimate the correlation: terrains are counted; 99 % at 90 % needs 230 terrains
+    # without failures the correlation cannot be estimated, so terrains are counted: 99 % at 90 % needs 230 terrains
     assert (verdict.status, verdict.terrains, verdict.plain_status) == (Status.INSUFFICIENT, 8, Status.PASS)
     assert verdict.lower == proportion_lower(8, 8, 0.9)
     assert verdict.plain_lower == proportion_lower(400, 400, 0.9)
@@ -340,11 +340,11 @@ def test_additional_cases_account_for_the_design_effect(velocity: dict[str, Any]
         [frame, _make_rows(verdict.further_cases, 0).assign(terrain=1000 + np.arange(verdict.further_cases) // 5)]
     )
     extended["case"] = np.arange(len(extended))
-    rule = [{**velocity, "probability": 0.82}]
-    (later,) = evaluate_requirements(extended, rule, SamplingDesign(first_look=1000))
+    requirements = [{**velocity, "probability": 0.82}]
+    (later,) = evaluate_requirements(extended, requirements, SamplingDesign(first_look=1000))
     assert later.status is Status.PASS
     (earlier,) = evaluate_requirements(
-        extended.iloc[: 1000 + int(0.9 * verdict.further_cases)], rule, SamplingDesign(first_look=1000)
+        extended.iloc[: 1000 + int(0.9 * verdict.further_cases)], requirements, SamplingDesign(first_look=1000)
     )
     assert earlier.status is Status.INSUFFICIENT
 
@@ -384,8 +384,8 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     assert evaluate_requirements(frame, [velocity], large)[0].further_cases == 289
 
 
-def test_looks_of_an_adaptive_campaign_share_the_risk(velocity: dict[str, Any]) -> None:
-    # looks at 20, 40, 80, 160, 320 and 640 cases; the last look adds half of the cases and spends half of the risk
+def test_evaluations_of_an_adaptive_campaign_share_the_risk(velocity: dict[str, Any]) -> None:
+    # evaluations at 20, 40, 80, 160, 320 and 640 cases; the last has half of the cases and spends half of the risk
     design = SamplingDesign(max_cases=640)
     (early,) = evaluate_requirements(_make_rows(320, 0), [velocity], design)
     assert early.bounds_confidence == pytest.approx(1.0 - 0.1 * 160 / 640)
@@ -444,7 +444,7 @@ def test_crashed_cases_are_counted_in_the_summary(make_rows: Rows) -> None:
     assert "2 cases crashed" in summary.sentence
 
 
-def test_subset_is_shown_next_to_all_cases_and_named_if_only_truth_defines_it(velocity: dict[str, Any]) -> None:
+def test_population_defined_by_truth_is_named_and_compared_with_all_cases(velocity: dict[str, Any]) -> None:
     frame = _make_rows(20, 2)
     frame["lit"] = np.arange(20) >= 10
     requirement = {**velocity, "population": "lit", "statement": "The error is small."}
@@ -456,13 +456,13 @@ def test_subset_is_shown_next_to_all_cases_and_named_if_only_truth_defines_it(ve
         "For comparison: of all 20 cases, 18 (90.00 %) meet the criterion. Cases without a value count as failed. "
         f"The verdict would be {verdict.all_cases.status}." in verdict.note
     )
-    (known,) = evaluate_requirements(frame, [requirement])
-    assert known.statement == "The error is small."
-    (everything,) = evaluate_requirements(frame, [{**requirement, "population": "all"}], from_truth=("lit",))
-    assert (everything.all_cases, everything.statement) == (None, "The error is small.")
+    (not_from_truth,) = evaluate_requirements(frame, [requirement])
+    assert not_from_truth.statement == "The error is small."
+    (over_all_cases,) = evaluate_requirements(frame, [{**requirement, "population": "all"}], from_truth=("lit",))
+    assert (over_all_cases.all_cases, over_all_cases.statement) == (None, "The error is small.")
 
 
-def test_conditions_of_the_configuration_remain_over_all_cases(velocity: dict[str, Any]) -> None:
+def test_configured_conditions_also_restrict_the_result_of_all_cases(velocity: dict[str, Any]) -> None:
     frame = _make_rows(20, 2)
     frame["lit"], frame["navcam"] = np.arange(20) >= 10, np.arange(20) % 2 == 0
     requirement = {**velocity, "population": "lit and navcam"}

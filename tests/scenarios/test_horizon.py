@@ -27,7 +27,7 @@ def test_hill_stands_at_its_azimuth_and_distance() -> None:
     top = points[np.argmax(points[:, 2])]
     assert np.degrees(np.arctan2(top[0], top[1])) == pytest.approx(60.0, abs=4.0)
     assert np.hypot(top[0], top[1]) == pytest.approx(3000.0, abs=200.0)
-    # ridges change the height of the dome by up to their RMS of a quarter, a few times
+    # the ridges have an RMS of a quarter of the height; the top differs from the dome by up to a few times that
     assert 0.5 * 90.0 < top[2] - 5.0 < 2.0 * 90.0
     assert set(hills.names) == {HILL_NAME}
 
@@ -56,13 +56,14 @@ def gusev_image() -> RenderedImage:
 
 def test_navigation_camera_sees_the_hills_of_gusev_above_the_horizon(gusev_image: RenderedImage) -> None:
     image = gusev_image
-    names = np.append(image.scene.objects.names, [-2, -1])[image.frame.body]
-    is_hill = names == HILL_NAME
+    # ids of the objects at the pixels; -2 is the sky, -1 the ground
+    object_ids = np.append(image.scene.objects.names, [-2, -1])[image.frame.body]
+    is_hill = object_ids == HILL_NAME
     up = image.frame.rays.directions.reshape(*is_hill.shape, 3) @ image.frame.world_from_body.rotation.as_matrix()[2]
     assert np.degrees(np.arcsin(up[is_hill].max())) == pytest.approx(np.degrees(85.0 / 2900.0), abs=1.0)
     assert image.frame.range_m[is_hill].min() > 1500.0
     # no pixel below a pixel of a hill shows the sky
-    column = names[:, np.argmax(is_hill.sum(axis=0))]
+    column = object_ids[:, np.argmax(is_hill.sum(axis=0))]
     assert not np.any(column[np.argmax(column == HILL_NAME) :] == -2)
 
 
@@ -77,18 +78,18 @@ def test_rover_is_visible_at_the_sides_of_its_hazard_camera() -> None:
     assert not middle.any()
 
 
-def test_unresolved_rocks_hide_distant_ground_by_their_frontal_area(gusev_image: RenderedImage) -> None:
+def test_unresolved_rocks_occlude_distant_ground_by_their_frontal_area(gusev_image: RenderedImage) -> None:
     image = gusev_image
     frame, ground = image.frame, SiteGround.of(site("gusev"), "ground")
     rocks, limit_rad, rms_slope = ground.rocks, 1.2e-3, 0.02
     assert rocks is not None
-    # black ground and white rocks: the radiance is the hidden fraction
+    # black ground and white rocks: the radiance is the occluded fraction
     is_ground = frame.body == -1
-    painted = replace(frame, radiance=np.where(is_ground, 0.0, 1.0).astype(np.float32))
-    blended = add_unresolved_rocks(painted, image.scene, rocks, limit_rad, rms_slope)
+    black_ground = replace(frame, radiance=np.where(is_ground, 0.0, 1.0).astype(np.float32))
+    blended = add_unresolved_rocks(black_ground, image.scene, rocks, limit_rad, rms_slope)
     row, column = np.argwhere(is_ground & (frame.range_m > 100.0))[0]
-    small = rocks.diameter_m < limit_rad * frame.range_m[row, column]
-    area = 0.85 * np.sum((rocks.diameter_m * rocks.height_m)[small]) / rocks.period_m**2
+    is_unresolved = rocks.diameter_m < limit_rad * frame.range_m[row, column]
+    area = 0.85 * np.sum((rocks.diameter_m * rocks.height_m)[is_unresolved]) / rocks.period_m**2
     ray = frame.rays.directions.reshape(*is_ground.shape, 3)[row, column]
     elevation = np.arcsin(frame.world_from_body.rotation.apply(ray)[2])
     expected = 1.0 - np.exp(-area / np.hypot(np.tan(elevation), rms_slope))
@@ -96,7 +97,7 @@ def test_unresolved_rocks_hide_distant_ground_by_their_frontal_area(gusev_image:
     assert expected > 0.3
     near = is_ground & (frame.range_m < 3.0)
     assert blended.radiance[near].max() < 0.01
-    np.testing.assert_array_equal(blended.radiance[~is_ground], painted.radiance[~is_ground])
+    np.testing.assert_array_equal(blended.radiance[~is_ground], black_ground.radiance[~is_ground])
 
 
 def test_ground_without_rocks_is_unchanged() -> None:

@@ -25,7 +25,7 @@ def _list_files(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_oldest_used_files_are_evicted_first(folder: Path) -> None:
+def test_files_are_evicted_in_order_of_last_use(folder: Path) -> None:
     evict_files(folder, 150)
     assert _list_files(folder) == {"2", "3", "4"}
 

@@ -316,7 +316,7 @@ def test_products_contain_figure_data(scene: Pass, measurements: LandingMeasurem
     products = hda_products(details_of(estimate))
     accepted = products["tracks_accepted"]
     assert products["sparse_points"].shape == (accepted.sum(), 3)
-    # The points of Fig. 2 are on the ground at the pixels of the tracks.
+    # The points of Fig. 2 (landing paper) are on the ground at the pixels of the tracks.
     truth = scene.ground(0, products["features"][accepted])
     first_camera = scene.camera(0)
     depth_errors = products["sparse_points"][:, 2] - (truth - first_camera.c) @ first_camera.a
@@ -324,7 +324,7 @@ def test_products_contain_figure_data(scene: Pass, measurements: LandingMeasurem
     # Aligned tracks with a parallax of 33 px at 10 m: 0.1 m is a third of a pixel.
     assert np.max(np.abs(depth_errors[products["inliers"]])) < 0.1
     assert products["grid"].shape == products["segment_ends"].shape == products["matched"].shape
-    # Fig. 7: cells project to the pixels that show them.
+    # Fig. 7 (landing paper): each cell projects to the pixel that shows it.
     row, column = products["site"].astype(int)
     observed = scene.ground(0, products["map_pixels"][row, column][None])[0]
     np.testing.assert_allclose(observed[:2], site_of(estimate)[:2], atol=0.05)

@@ -62,7 +62,8 @@ def test_roughness_equals_boulder_height_on_a_slope(slopes: tuple[float, float],
 
 
 def test_robust_fit_tolerates_almost_half_outliers() -> None:
-    # Breakdown point: 45 of 100 points are outliers. The probability that 300 trials contain no inlier triple is 1e-24.
+    # Close to the breakdown point of 50 %: 45 of 100 points are outliers. The probability that 300 trials contain no
+    # inlier triple is 1e-24.
     rng = np.random.default_rng(1)
     x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(10), np.arange(10)))
     z = 3.0 + 0.2 * x - 0.1 * y + rng.normal(0.0, 0.01, 100)
@@ -73,7 +74,7 @@ def test_robust_fit_tolerates_almost_half_outliers() -> None:
     assert slope_x == pytest.approx(0.2, abs=2e-3)
     assert slope_y == pytest.approx(-0.1, abs=2e-3)
     assert value == pytest.approx(3.0, abs=0.02)
-    # The ordinary least-squares plane has an error of several tenths.
+    # The slopes of the ordinary least-squares plane are wrong by several tenths.
     least_squares = np.linalg.lstsq(np.column_stack([np.ones(100), x, y]), z, rcond=None)[0]
     assert abs(least_squares[0] - 3.0) > 0.3
 
@@ -203,7 +204,7 @@ def test_slope_and_roughness_hazards_are_combined() -> None:
     assert safety[40, 50] == Safety.SAFE
 
 
-def test_grassfire_equals_distance_to_nearest_seed() -> None:
+def test_grassfire_transform_equals_distance_to_nearest_seed() -> None:
     rng = np.random.default_rng(4)
     is_seed = rng.random((40, 50)) < 0.01
     seeds = np.argwhere(is_seed)
@@ -268,7 +269,7 @@ SHARP = Resolution(window_m=0.0, noise_m=0.0)
 
 
 def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
-    """The mean of 1 - 4 r^2 / D^2 over a centred window with side w, computed on a grid."""
+    """The limit uses the mean of the paraboloid 1 - 4 r^2 / D^2 over a centred square window of side w."""
     options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
     x = np.linspace(-0.05, 0.05, 401)
     mean = float(np.mean(1.0 - 4.0 * (x[:, None] ** 2 + x**2) / 0.4**2))
@@ -278,7 +279,7 @@ def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
 
 
 def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
-    """A ridge is 0.3 m high and 1 m wide on each side: no plane over 2 m fits it within 0.1 m."""
+    """A ridge of 0.3 m height and flanks of 1 m width: no plane over 2 m fits it within 0.1 m."""
     x = 0.05 * (np.arange(121) - 60)
     ground = ElevationMap(np.tile(-0.3 * np.abs(x), (121, 1)), np.zeros(2), 0.05)
     all_safe = np.full((121, 121), Safety.SAFE, dtype=np.uint8)
@@ -287,7 +288,7 @@ def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
     )
     result = check_footprints(all_safe, ground, SHARP, options)
     assert np.all(result[40:80, 58:63] == Safety.HAZARD)
-    # A footprint on one flank is on a plane.
+    # A footprint that lies on one flank is plane.
     assert np.all(result[40:80, 85:95] == Safety.SAFE)
 
 

@@ -99,7 +99,8 @@ def test_outlier_tracks_are_rejected() -> None:
         result = solve_motion(points, second)
         scale = float(np.median(depths[~is_outlier] / result.depths[~is_outlier]))
         correct_count += max(motion_errors(result, true_motion, scale)) < 0.02
-    # 97 % of such motions are correct (`marsyard.algorithms.hda.motion`): fewer than 36 of 40 has probability 1 %.
+    # 97 % of such motions are correct (`marsyard.algorithms.hda.motion`). Fewer than 36 correct motions in 40 trials
+    # have a probability of 1 %.
     assert correct_count >= 36
 
 

@@ -67,7 +67,8 @@ def test_segments_contain_the_exact_match(scene: Pass, landing_scene: LandingSce
 
 
 def test_segment_position_determines_depth(scene: Pass, landing_scene: LandingScene) -> None:
-    # With both depth bounds at the true depth, both ends are the true match: Eqs. 6-8 are exact through the lens.
+    # With both depth bounds at the true depth, both ends are the true match: Eqs. 6-8 of the landing paper are
+    # exact through the lens.
     pixels = np.array([[100.0, 80.0]])
     depth = float(true_depths(scene, pixels)[0])
     true_pixels = scene.camera(1).project(scene.ground(0, pixels))[0]

@@ -1,4 +1,4 @@
-"""Tests of feature selection and tracking: Eqs. 1-5 against direct computation, tracks against the exact scene."""
+"""Tests of feature selection and tracking: Eqs. 1-5 of the landing paper, and tracks against the exact scene."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def test_interest_is_product_of_eigenvalue_excesses(noise: np.ndarray) -> None:
 
 
 def test_two_small_eigenvalues_are_not_a_feature() -> None:
-    # The product of two negative excesses is positive; only the condition a > l distinguishes it from two large
-    # eigenvalues.
+    # Interest P = (a - l)(c - l) - b^2 for the structure tensor [[a, b], [b, c]] and the threshold l (landing paper,
+    # Eq. 2). P is also positive if both eigenvalues are below l; the condition a > l excludes this case.
     low_contrast = np.random.default_rng(2).integers(0, 3, (60, 60)).astype(np.float32)
     assert not np.any(np.isfinite(eigenvalue_test(low_contrast, 11, 50.0)))
 
@@ -77,7 +77,8 @@ def test_best_feature_of_each_block_is_selected() -> None:
 
 
 def test_pyramid_levels_of_the_papers_window() -> None:
-    # Table I: t = 5, w = 40. Eq. 4: log2(40) - 2 = 3.3; Eq. 5: 5 / 8 + 0.5 < 2, 40 / 8 + 0.5 = 5.5.
+    # Landing paper, Table I: half widths of template t = 5 and window w = 40. Eq. 4 gives log2(40) - 2 = 3.3 levels
+    # below full resolution. Half widths on the coarsest level by Eq. 5: 5 / 8 + 0.5 < 2 and 40 / 8 + 0.5 = 5.5.
     assert level_sizes(5, 40) == (LevelSize(5, 2), LevelSize(3, 2), LevelSize(2, 2), LevelSize(2, 5))
     # A window that fits on one level is searched at full resolution.
     assert level_sizes(5, 6) == (LevelSize(5, 6),)
@@ -120,7 +121,7 @@ def test_integer_shifts_within_the_window_are_found(shift: tuple[int, int]) -> N
     first = np.rint(500.0 + 100.0 * values / values.std()).clip(0, 4095).astype(np.uint16)
     second = np.roll(first, shift[::-1], axis=(0, 1))
     features = select_features(first, OPTIONS)
-    # Features that are not affected by the periodic border.
+    # Only features that are not affected by the periodic border.
     features = features[np.all((features > 60) & (features < np.array([260, 180])), axis=1)]
     tracks = track_features(first, second, features, features, replace(OPTIONS, align=False))
     assert len(features) > 10
@@ -148,8 +149,8 @@ def test_tracks_over_relief_match_exact_scene() -> None:
     assert aligned.accepted.sum() >= 40
     is_correct = aligned.accepted & (np.hypot(*(unaligned.second - true_pixels).T) < 1.0)
     assert is_correct.sum() >= 0.95 * aligned.accepted.sum()
-    # The biquadratic fit is biased by up to 0.09 px. After alignment the error comes from rounding to counts and
-    # relief.
+    # The biquadratic fit is biased by up to 0.09 px. After alignment, the remaining errors come from rounding to
+    # counts and from relief.
     assert np.sqrt(np.mean((unaligned.second - true_pixels)[is_correct] ** 2)) < 0.1
     assert np.sqrt(np.mean((aligned.second - true_pixels)[is_correct] ** 2)) < 0.015
 
@@ -166,7 +167,7 @@ def test_tracks_over_relief_match_exact_scene() -> None:
     ids=["lower by 23 %", "higher by 20 %", "rolled by 10 deg", "pitched by 20 deg", "yawed by 20 deg"],
 )
 def test_largest_changes_of_the_paper_are_tracked(second: tuple[float, ...]) -> None:
-    """Changes of pose from Section II.A: at least 90 % of the features visible in the second image are tracked."""
+    """At least 90 % of the features in both images are tracked for the pose changes of section II.A, landing paper."""
     rng = np.random.default_rng(5)
     boulders = [(*rng.uniform(-3.0, 3.0, 2), rng.uniform(0.1, 0.3), rng.uniform(0.1, 0.3)) for _ in range(30)]
     scene = Pass(make_bumps(*boulders), (make_pose(0.0, 0.0, 10.0, 20.0), make_pose(*second)))

@@ -121,7 +121,7 @@ class Scene:
     level_dn: float = 1500.0
 
     def intersect(self, camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
-        """World points at pixels of a camera in the world; NaN for the sky."""
+        """World points at the pixels of a camera that is given in the world frame; NaN for the sky."""
         origins, directions = camera.rays(pixels)
         ranges = np.stack([body.ranges(origins, directions) for body in self.bodies])
         nearest = np.where(np.isnan(ranges), np.inf, ranges).min(axis=0)
@@ -177,7 +177,7 @@ class Drive:
     measurements: list[RoverMeasurements] = field(default_factory=list)
 
     def camera(self, world_from_rover: RigidTransform, angles: tuple[float, float], right: bool = False) -> CameraModel:
-        """A camera in the world at mast angles."""
+        """Camera in the world frame for given mast angles."""
         chosen = self.mast.right if right else self.mast.left
         return chosen.transform(world_from_rover * self.mast.geometry.rover_from_head(*angles))
 
@@ -250,7 +250,10 @@ def pixel_of(update: TargetUpdate) -> np.ndarray:
 def approach(
     drive: Drive, target: np.ndarray, fraction: float, goal_m: float = 2.0, slip: float = 0.0
 ) -> list[tuple[RigidTransform, TargetUpdate]]:
-    """Drive towards the target until it is near or lost; each step is a fraction of the distance. Poses and updates."""
+    """Drive towards the target until it is near or lost; each step is a fraction of the distance.
+
+    Returns the true pose and the update of each stop.
+    """
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     stops, x, estimated_x = [], 0.0, 0.0
     while True:

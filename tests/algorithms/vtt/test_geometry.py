@@ -198,8 +198,8 @@ def test_image_roll_is_opposite_to_camera_roll(roll_deg: float) -> None:
 
 
 def test_passing_a_target_rolls_its_image() -> None:
-    # Fig. 4: a level rover. After the azimuth to the target has changed by t at a depression angle d, a horizontal line
-    # that was perpendicular to the line of sight is inclined by atan(tan t sin d) in the image.
+    # Fig. 4 of the tracking paper, for a level rover: the azimuth to the target changes by t at a depression angle d. A
+    # horizontal line that was perpendicular to the line of sight is then inclined by atan(tan t sin d) in the image.
     mast = replace(navcam(), geometry=MastGeometry(np.array([0.0, 0.0, 1.5]), np.zeros(3), np.zeros(3)))
     mast = replace(mast, left=mast.left.transform(rigid(Rotation.identity(), np.array([0.0, -0.1, 0.0]))))
     target, positions_m = np.array([6.8, 0.0, 0.0]), [(0.0, 0.0), (5.6, 0.9)]
@@ -218,7 +218,7 @@ def test_passing_a_target_rolls_its_image() -> None:
     expected = np.arctan(np.tan(azimuth_change) * np.sin(depression))
     assert abs(np.degrees(roll)) == pytest.approx(np.degrees(expected), abs=0.5)
     assert abs(np.degrees(roll)) > 25.0
-    # The former right-hand side is now farther away and higher in the image: counter-clockwise roll.
+    # The right-hand side of the first image is farther away in the second, so it is higher: counter-clockwise roll.
     assert roll < 0.0
 
 

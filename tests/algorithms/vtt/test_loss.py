@@ -48,8 +48,8 @@ def test_all_violated_criteria_are_reported() -> None:
 
 
 def test_tolerances_match_the_formula() -> None:
-    # MER navcam: dR = R^2 / 244.5 for 1 px: 0.409 m at 10 m, 0.331 m at 9 m. A step of 1 m adds 0.2 m, direction 0.27
-    # m.
+    # Range error of the MER navcam for 1 px of disparity: R^2 / 244.5, which is 0.409 m at 10 m and 0.331 m at 9 m. The
+    # step of 1 m adds 0.2 m, and the direction error 0.27 m.
     result = tolerances(Journey(10.0, 10.0, 9.0, 1.0, 1.0), navcam().left, navcam().right, OPTIONS)
     assert result.distance_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2), abs=1e-3)
     assert result.position_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2 + 0.27**2), abs=1e-3)
@@ -63,14 +63,14 @@ def test_tolerances_decrease_with_target_distance() -> None:
     ]
     assert np.all(np.diff([a.distance_m for a in allowed]) < 0.0)
     assert allowed[-1].distance_m < 0.11
-    # Initial designation uncertainty and rover drift remain: the tolerance is never below either.
+    # The initial designation uncertainty and the rover drift remain: the tolerance is never below either of them.
     assert min(a.position_m for a in allowed) > 0.409
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
 def test_stereo_noise_rarely_loses_a_target(mast: MastCalibration) -> None:
     # 1 px (3 sigma) in two disparities and 20 % (3 sigma) of a 1 m step. Less than 0.3 % exceed the root sum square
-    # before the floor is added.
+    # before the constant term of the tolerance is added.
     rng = np.random.default_rng(1)
     scale = mast.left.focal_lengths[0] * np.linalg.norm(mast.left.c - mast.right.c)
     old, new = (scale / (scale / r + rng.normal(0.0, 1.0 / 3.0, 100_000)) for r in (10.0, 9.0))
@@ -113,7 +113,8 @@ def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
     assert handed_over.outcome is HandOffOutcome.HANDED_OVER
     assert handed_over.target is not None
     np.testing.assert_array_equal(handed_over.target.position_rover, target_m)
-    # Eq. 5 at 1.75 m (from the axis at 0.35, 1.4): 1.25 cm of stereo error, 0.36 cm of drift.
+    # Eq. 5 of the tracking paper at 1.75 m, from the mast axis at (0.35, 1.4) m: 1.25 cm of stereo error, 0.36 cm of
+    # drift.
     assert handed_over.target.error_m == pytest.approx(np.hypot(1.735**2 / 244.5, 2.5 * 1.735 / 1222.5), rel=0.01)
     lost = hand_off(TargetUpdate(LOST, (TargetLoss.LOW_MATCH_SCORE,), target_m), goal, navcam())
     assert (lost.outcome, lost.target) == (HandOffOutcome.NOT_TRACKED, None)

@@ -41,7 +41,7 @@ from tests.algorithms.vtt.synthetic_drive import (
     [(0.1, make_face, range(3)), (0.1, make_boulder, range(3)), (0.05, make_face, range(10, 11))],
 )
 def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, body: Body, seeds: range) -> None:
-    # Requirement: 1 px rms, 2.5 px maximum without noise. A pixel at 10 m is 5 px at 2 m.
+    # Requirement without noise: 1 px rms, 2.5 px maximum. An error of one pixel at 10 m grows to 5 px at 2 m.
     drifts = []
     for seed in seeds:
         target = np.array([10.0, 0.2 - 0.1 * seed, 0.2])
@@ -57,7 +57,8 @@ def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, body: Bo
         for (_, previous), (_, current) in pairwise(stops):
             change = details_of(current).change
             assert change is not None
-            # Predicted by the pose, measured by stereo: a tenth of a pixel of disparity is 0.4 % at 10 m.
+            # The pose predicts the magnification, stereo measures it. 0.1 px of disparity changes the range by 0.4 %
+            # at 10 m.
             measured = details_of(previous).distance_m / details_of(current).distance_m
             assert change.magnification == pytest.approx(measured, abs=0.012)
     assert np.sqrt(np.mean(np.sum(np.square(drifts), axis=1))) < 1.0
@@ -78,7 +79,7 @@ def test_published_tracker_drifts_by_a_few_pixels() -> None:
 
 
 def test_track_drifts_without_subpixel_matching() -> None:
-    # Each of 32 steps has an error of up to half a pixel, magnified by later steps: 0.4 px rms times 15.
+    # Each of 32 steps adds an error of up to half a pixel (0.4 px rms), which later steps magnify: about 6 px in total.
     drifts = []
     for seed in (0, 3):
         target = np.array([10.0, 0.0, 0.2])
@@ -136,14 +137,15 @@ def test_turn_in_place_changes_only_mast_angles() -> None:
     assert result.match is not None
     assert result.match.score > 0.95
     assert result.change is not None
-    # The mast is 0.35 m ahead of the turn axis: 2.5 deg of direction, 0.1 m of 5.6 m.
+    # The mast is 0.35 m ahead of the turn axis: the direction changes by 2.5 deg, the distance of 5.6 m by 0.1 m.
     assert abs(result.change.magnification - 1.0) < 0.03
     assert abs(np.degrees(result.azimuth_change_rad)) < 4.0
     assert np.degrees(result.azimuth_rad) == pytest.approx(45.0, abs=5.0)
 
 
 def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
-    # Table III lists 0.85 to 0.88 at 6 to 9 deg and 0.79 at 15 deg; a flat face has no relief.
+    # Table III of the tracking paper lists scores of 0.85 to 0.88 for azimuth changes of 6 to 9 deg, and 0.79 for 15
+    # deg. The scores of a flat face without relief are higher.
     target = np.array([4.0, 0.0, 0.3])
     scene = make_scene(Plane(target, np.array([-0.96, 0.0, 0.28])), target, 5)
     scores = {}
@@ -202,7 +204,7 @@ def test_all_three_designations_define_the_same_target() -> None:
         assert update is not None
         assert update.found
         assert update.position_rover is not None
-        # A tenth of a pixel of disparity at 7 m: 2 cm.
+        # A tenth of a pixel of disparity is 2 cm of range at 7 m.
         np.testing.assert_allclose(update.position_rover, target, atol=0.02)
         second_update = drive.stop(pose(0.7, 0.0))
         assert second_update is not None
@@ -386,7 +388,7 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
     assert tracker.update(drive.measurements[-1]).state is TrackingState.NO_TARGET
 
 
-def test_image_without_the_target_is_a_loss() -> None:
+def test_image_without_the_target_is_reported_as_lost() -> None:
     target = np.array([6.0, 0.1, 0.2])
     scene = make_scene(make_face(3, target), target, 3)
     drive = Drive(scene, navcam(), VisualTargetTracker(SMALL))

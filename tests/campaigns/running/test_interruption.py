@@ -161,7 +161,7 @@ with stop_on_signals():
 def test_changes_of_the_worker_process_are_reported(
     failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
-    path = campaign_file("state_changing_cases = [1, 7]\nforking_cases = [4]\nrefusing_cases = [2]")
+    path = campaign_file("state_changing_cases = [1, 7]\nforking_cases = [4]\nunanswered_cases = [2]")
     rows = read_case_rows(run(path, tmp_path / "run", watch, "retain.showcase=none"))
     assert sorted(watch.notes) == [
         "case 1 changed its worker process: the working folder",
@@ -186,7 +186,7 @@ def test_hostile_cases_do_not_affect_other_cases(
     }
     parameters = "\n".join(f"{name} = [{case}]" for name, (case, _) in faults.items())
     limits = "[limits]\ncase_time_s = 4\nmemory_gb = 0.25\noutput_mb = 0.1"
-    path = campaign_file(f"{parameters}\nrefusing_cases = [2]", extra_tables=limits)
+    path = campaign_file(f"{parameters}\nunanswered_cases = [2]", extra_tables=limits)
     rows = read_case_rows(run(path, tmp_path / "hostile", watch, "retain.showcase=none"))
     expected = dict(faults.values())
     outcomes = {row["case"]: row["outcome"] for row in rows if row["outcome"] not in ("VALID", "SILENT")}

@@ -93,7 +93,7 @@ def test_unsupported_products_do_not_stop_the_campaign(
 def test_products_of_configured_cases_are_stored(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch, overrides: list[str], cases: list[int] | None
 ) -> None:
-    path = campaign_file("refusing_cases = [1]\nraising_cases = [2]")
+    path = campaign_file("unanswered_cases = [1]\nraising_cases = [2]")
     directory = run(path, tmp_path / "run", watch, "cases=6", "retain.showcase=none", *overrides, jobs=1)
     rows = read_case_rows(directory)
     if cases is None:

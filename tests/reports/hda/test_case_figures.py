@@ -133,7 +133,7 @@ def test_missing_stages_have_no_figure(hda_products: dict[str, Any], missing: tu
     products = {name: value for name, value in hda_products.items() if name not in missing}
     assert len(available_figures(products)) == n_figures
     case_view = view(products, "case7")
-    # Fig. 1 is not on the page; without other figures the page shows the images
+    # the page omits Fig. 1 of the landing paper; without other figures it shows the images
     assert len(case_view.figures) == max(1, n_figures - 1)
     assert is_hda_case(products)
 

@@ -35,15 +35,15 @@ def _make_subject(frame: pd.DataFrame) -> Subject:
 
 
 def test_rates_pool_footprints_over_flights() -> None:
-    frame = pd.DataFrame({"hits": [1, 0, 3, 0], "of": [10, 10, 20, 0]})
-    rate = pooled_rate(frame, "hits", "of")
+    frame = pd.DataFrame({"hazardous": [1, 0, 3, 0], "footprints": [10, 10, 20, 0]})
+    rate = pooled_rate(frame, "hazardous", "footprints")
     assert (rate.hits, rate.of, rate.flights, rate.flights_hit) == (4, 40, 3, 2)
     assert rate.share == pytest.approx(0.1)
     assert rate.lower < 0.1 < rate.upper
 
 
 def test_flights_with_one_footprint_are_pooled() -> None:
-    rate = pooled_rate(pd.DataFrame({"hits": [1, 0, 1, 1], "of": [1, 1, 2, 0]}), "hits", "of")
+    rate = pooled_rate(pd.DataFrame({"hazardous": [1, 0, 1, 1], "footprints": [1, 1, 2, 0]}), "hazardous", "footprints")
     assert (rate.hits, rate.of, rate.flights, rate.flights_hit) == (3, 4, 3, 2)
 
 
@@ -53,13 +53,14 @@ def test_pooled_rate_interval_covers_the_true_rate() -> None:
     n_covered = 0
     for _ in range(60):
         rates = rng.beta(1.0, 9.0, 40)
-        rate = pooled_rate(pd.DataFrame({"hits": rng.binomial(500, rates), "of": np.full(40, 500)}), "hits", "of")
+        frame = pd.DataFrame({"hazardous": rng.binomial(500, rates), "footprints": np.full(40, 500)})
+        rate = pooled_rate(frame, "hazardous", "footprints")
         n_covered += rate.lower <= 0.1 <= rate.upper
     assert n_covered >= 45  # binomial(60, 0.9): mean 54, standard deviation 2.3
 
 
 def test_rate_of_zero_has_no_bootstrap_interval() -> None:
-    rate = pooled_rate(pd.DataFrame({"hits": [0, 0], "of": [10, 10]}), "hits", "of")
+    rate = pooled_rate(pd.DataFrame({"hazardous": [0, 0], "footprints": [10, 10]}), "hazardous", "footprints")
     assert rate.share == 0.0
     assert np.isnan(rate.upper)
 

@@ -1,4 +1,7 @@
-"""Tests of repeated (interim) looks at a campaign: planned looks, fraction of the risk per look, additional cases."""
+"""Tests of sequential evaluation: planned evaluations, fraction of the risk per evaluation, additional cases.
+
+A look is one evaluation of the verdict during a campaign (interim analysis).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from marsyard.reports.statistics.proportions import (
 )
 
 
-def test_planned_looks_are_at_halved_case_numbers() -> None:
+def test_planned_looks_are_at_halved_numbers_of_cases() -> None:
     assert [look.cases for look in planned_looks(1000)] == [31, 62, 125, 250, 500, 1000]
     assert [look.cases for look in planned_looks(64)] == [16, 32, 64]
     assert [look.cases for look in planned_looks(20)] == [20]
@@ -47,7 +50,7 @@ def test_campaign_without_cases_is_rejected() -> None:
 
 @pytest.mark.parametrize("required_rate", [0.9, 0.99])
 def test_probability_of_false_verdicts_is_below_the_risk(required_rate: float) -> None:
-    # exact probability that any look at 512 cases gives a verdict, at a true rate equal to the required rate
+    # exact probability that any evaluation of up to 512 cases gives a verdict; the true rate is the required rate
     looks, risk = planned_looks(512), 0.1
     for wrong_verdict in ("PASS", "FAIL"):
         undecided, p_decided, previous_cases = np.ones(1), 0.0, 0
@@ -68,7 +71,7 @@ def test_probability_of_false_verdicts_is_below_the_risk(required_rate: float) -
 
 
 def test_repeated_looks_at_full_risk_pass_too_often() -> None:
-    # with the full risk at every look, false verdicts are too frequent
+    # with the full risk at every evaluation, false verdicts are too frequent
     rng = np.random.default_rng(4)
     looks = planned_looks(1000)
     n_passed = 0
@@ -78,7 +81,7 @@ def test_repeated_looks_at_full_risk_pass_too_often() -> None:
     assert n_passed / 400 > 0.15
 
 
-def _follow_advice(
+def _append_advised_cases(
     rng: np.random.Generator, first: int, max_cases: int, passes: LaterLook, fails: LaterLook
 ) -> set[str]:
     """Return the verdicts of a campaign with true and required rate 0.99 that appends the advised numbers of cases."""
@@ -99,13 +102,13 @@ def _follow_advice(
 
 @pytest.mark.parametrize("first", [24, 230])
 def test_appending_advised_cases_keeps_the_confidence(first: int) -> None:
-    """At most 5000 cases; with ordinary bounds at each look, 38.6 % of these campaigns would pass."""
+    """Campaigns have at most 5000 cases. With uncorrected bounds at each evaluation, 38.6 % of them would pass."""
     rng = np.random.default_rng(21)
     passes, fails = LaterLook(0.01, 0.1, first), LaterLook(0.99, 0.1, first)
-    for look in (passes, fails):
-        object.__setattr__(look, "risk_of_bound", cache(look.risk_of_bound))
-        object.__setattr__(look, "cases_needed", cache(look.cases_needed))
-    verdicts = [_follow_advice(rng, first, 5000, passes, fails) for _ in range(1500)]
+    for later_look in (passes, fails):
+        object.__setattr__(later_look, "risk_of_bound", cache(later_look.risk_of_bound))
+        object.__setattr__(later_look, "cases_needed", cache(later_look.cases_needed))
+    verdicts = [_append_advised_cases(rng, first, 5000, passes, fails) for _ in range(1500)]
     # standard deviation of a fraction of 10 % of 1500: 0.8 %
     for verdict in ("PASS", "FAIL"):
         assert np.mean([verdict in reached for reached in verdicts]) <= 0.1 + 2 * 0.008
@@ -114,7 +117,7 @@ def test_appending_advised_cases_keeps_the_confidence(first: int) -> None:
 @pytest.mark.parametrize("first", [1, 24, 230, 388])
 @pytest.mark.parametrize(("rate", "confidence"), [(0.01, 0.9), (0.1, 0.95), (0.95, 0.9)])
 def test_frequent_looks_keep_the_risk(first: int, rate: float, confidence: float) -> None:
-    """The exact probability of a verdict at any of the looks, one every 10 cases, is at most the risk."""
+    """The exact probability of a verdict is at most the risk if the campaign is evaluated after every 10 cases."""
     risk, look = 1.0 - confidence, LaterLook(rate, 1.0 - confidence, first)
     counts = np.arange(first + 1)
     undecided = stats.binom.pmf(counts, first, rate)

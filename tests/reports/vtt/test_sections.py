@@ -43,7 +43,7 @@ def test_measured_accuracy_is_3_sigma_per_camera() -> None:
     navcam, pancam = measured_accuracy(frame)
     assert navcam["designation_cm"] == pytest.approx(300.0 * 0.1)
     assert navcam["disparity_px"] == pytest.approx(0.1 / 0.388)
-    # Eq. 3: sqrt(0.1^2 + 0.05^2)
+    # Eq. 3 of the tracking paper: sqrt(0.1^2 + 0.05^2)
     assert navcam["untracked_cm"] == pytest.approx(300.0 * np.hypot(0.1, 0.05))
     assert pancam["drift_px"] == pytest.approx(np.sqrt(12.5))
     table = read_table(table_1_section(make_subject(frame)), 1)
@@ -55,11 +55,14 @@ def test_measured_accuracy_is_3_sigma_per_camera() -> None:
     assert measured_accuracy(frame.assign(position_error_m=np.nan)) == []
 
 
-def _make_two_tracker_rows(skips: int = 5) -> pd.DataFrame:
-    """Return ten targets per tracker and step of 1 - 0.95^(n+1) of the range; pure NCC loses one more at each step."""
+def _make_two_tracker_rows(step_sizes: int = 5) -> pd.DataFrame:
+    """Return ten targets per tracker and step size; pure NCC loses one more target at each larger step.
+
+    With n skipped images the step is 1 - 0.95^(n + 1) of the range.
+    """
     frames = []
     for algorithm in ("vtt", "pure_ncc"):
-        for skip in range(skips):
+        for skip in range(step_sizes):
             tracked = np.arange(10) < (10 if algorithm == "vtt" else 8 - skip)
             frames.append(make_rows(10, algorithm=algorithm, skip=skip, step=1.0 - 0.95 ** (skip + 1), tracked=tracked))
     return pd.concat(frames, ignore_index=True)
@@ -228,7 +231,7 @@ def test_goal_statistics_are_computed_per_camera() -> None:
     set_values(frame, n, losses="MATCH_SCORE", lost_range_m=3.5)
     frame.loc[n + 1, "true_track"] = False
     navcam, pancam = summarize_cameras(frame)
-    assert navcam["within"].hits == 225  # 0.0399 k / 299 stays within 3 cm up to k = 224
+    assert navcam["within"].hits == 225  # the error of case k is 0.0399 k / 299 m: 3 cm is exceeded from k = 225 on
     assert navcam["median_m"] == pytest.approx(0.01995)
     assert navcam["quantile_bound_m"] > navcam["quantile_m"]
     assert (pancam["completed"].hits, pancam["completed"].n) == (n - 1, n)

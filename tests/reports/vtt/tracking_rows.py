@@ -79,8 +79,8 @@ def make_products(stops: int = 3) -> dict[str, Any]:
         case_products[f"stop_{number}_point"] = np.array([481.5, 369.0])
     east = np.linspace(0.0, 8.0, stops)
     rover = np.column_stack([east, np.zeros(stops), np.zeros(stops)])
-    believed = np.full((stops, 3), np.nan)
-    believed[:-1] = np.column_stack([10.0 + 0.03 * np.arange(stops - 1), np.zeros(stops - 1), np.zeros(stops - 1)])
+    estimated = np.full((stops, 3), np.nan)
+    estimated[:-1] = np.column_stack([10.0 + 0.03 * np.arange(stops - 1), np.zeros(stops - 1), np.zeros(stops - 1)])
     return case_products | {
         "figures": {
             "range_m": 10.0 - east,
@@ -92,7 +92,7 @@ def make_products(stops: int = 3) -> dict[str, Any]:
         "rover_believed_m": rover + 0.05,
         "heading_deg": np.full(stops, 90.0),
         "target_m": np.array([10.0, 0.0, 0.2]),
-        "target_believed_m": believed,
+        "target_believed_m": estimated,
         "path_true_m": rover[:, :2],
         "rocks_m": np.array([[10.1, 0.0, 0.4]]),
     }

@@ -215,7 +215,7 @@ def test_imported_terrain_is_rendered(tmp_path: Path) -> None:
 
 
 def test_custom_algorithm_receives_the_measurements() -> None:
-    result = run(algorithm="tests.scenarios.descent.guesses:Inertial")
+    result = run(algorithm="tests.scenarios.descent.inertial_estimators:Inertial")
     assert result.outcome == "VALID"
     assert result.row["velocity_estimated_x_m_s"] == pytest.approx(14.0, abs=8.0)
     assert "tracks" not in result.products
@@ -223,11 +223,11 @@ def test_custom_algorithm_receives_the_measurements() -> None:
 
 def test_slow_algorithm_is_not_in_time_for_the_firing() -> None:
     """The measured time is scaled by the flight computer's factor: 0.1 s become 60 s, but 14 to 24 s are available."""
-    slow = run(algorithm="tests.scenarios.descent.guesses:SlowInertial").row
-    quick = run(algorithm="tests.scenarios.descent.guesses:Inertial").row
+    slow = run(algorithm="tests.scenarios.descent.inertial_estimators:SlowInertial").row
+    fast = run(algorithm="tests.scenarios.descent.inertial_estimators:Inertial").row
     assert float(slow["estimation_time_s"]) >= 0.1
-    assert (slow["in_time_measured"], quick["in_time_measured"]) == (False, True)
-    spec = "tests.scenarios.descent.guesses:SlowInertial"
+    assert (slow["in_time_measured"], fast["in_time_measured"]) == (False, True)
+    spec = "tests.scenarios.descent.inertial_estimators:SlowInertial"
     fast_processor = run(algorithm=spec, landing={"processor_factor": 1.0}).row
     assert fast_processor["in_time_measured"] is True
 

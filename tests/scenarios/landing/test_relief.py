@@ -75,7 +75,7 @@ def test_footprint_plane_is_continuous_in_position() -> None:
     steps = np.arange(-1.5, 1.5, SPACING)
     for x, y in ((steps, np.full_like(steps, 0.2)), (np.full_like(steps, -0.4), steps)):
         footprints = _make_uneven_relief().footprints(np.stack([x, y], axis=-1), LIMITS)
-        # The slope is at most 0.5: one step changes a height, and so the plane, by at most 1.3 cm.
+        # The slope is at most 0.5: one step changes a height, and therefore the plane, by at most 1.3 cm.
         assert np.abs(np.diff(footprints.roughness_m)).max() < 0.02
         assert np.abs(np.diff(np.tan(footprints.slope_rad))).max() < 0.02
 

@@ -25,7 +25,7 @@ from marsyard.sim.sensor import preset
 from marsyard.sim.streams import Streams
 
 SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
-REPORTED, REFUSED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
+SITE_REPORTED, NO_SITE_REPORTED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
 
 
 def make_flight() -> Flight:
@@ -68,24 +68,26 @@ def test_each_flight_is_in_one_population(n_safe: int, population: str) -> None:
 @pytest.mark.parametrize(
     ("outcome", "site", "is_correct"),
     [
-        (REPORTED, SAFE_SITE, True),
-        (REPORTED, UNSAFE_SITE, False),
-        (REFUSED, None, True),
+        (SITE_REPORTED, SAFE_SITE, True),
+        (SITE_REPORTED, UNSAFE_SITE, False),
+        (NO_SITE_REPORTED, None, True),
         # Without convergence the answer is the a-priori site, which is safe by chance.
         (SiteOutcome.NO_MOTION, SAFE_SITE, False),
     ],
 )
-def test_safe_site_or_refusal_is_correct(outcome: SiteOutcome, site: np.ndarray | None, is_correct: bool) -> None:
+def test_safe_site_or_no_site_is_a_correct_answer(
+    outcome: SiteOutcome, site: np.ndarray | None, is_correct: bool
+) -> None:
     row = site_row(SiteEstimate(outcome, site), make_flight(), make_truth(3))
     assert row["safe_or_no_site_reported"] is is_correct
 
 
 def test_flight_without_landing_has_no_touchdown_score() -> None:
     p, streams = LandingScenarioParameters(), Streams(1, "landing", 0)
-    row = landing_row(p, SiteEstimate(REFUSED, None), make_flight(), make_truth(3), streams)
+    row = landing_row(p, SiteEstimate(NO_SITE_REPORTED, None), make_flight(), make_truth(3), streams)
     assert row["landed"] is False
     assert "touchdown_safe" not in row
-    # A first case without a landing does not stop a campaign with touchdown requirements.
+    # A campaign with touchdown requirements accepts a first case without a landing.
     check_metrics(load_campaign("hda-benign").configuration, {**row, "answered": True}, Path())
 
 

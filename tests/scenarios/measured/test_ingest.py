@@ -128,7 +128,7 @@ def test_image_formats_preserve_the_counts(tmp_path: Path, suffix: str) -> None:
 
 
 def test_opportunity_images_agree_with_the_cameras_of_their_labels(tmp_path: Path, shared_data: Path) -> None:
-    """Two frames from one position with different mast angles agree with the cameras of their labels to a pixel."""
+    """Two frames with different mast angles at one position agree to a pixel with the cameras of their labels."""
     folder = tmp_path / "opportunity"
     folder.mkdir()
     frames = shared_data / "mer_opportunity"

@@ -28,12 +28,12 @@ class RotatingDescent:
 
     height_m: float = 2000.0
     east_m_s: float = 11.0
-    lasts_s: float = 26.0
+    duration_s: float = 26.0
     defect: str = ""
 
     def fly(self, place: DescentPlace, rng: np.random.Generator) -> Poses:
         north = float(rng.normal(0.0, 5.0))
-        times = np.arange(place.from_s, self.lasts_s, 0.05)
+        times = np.arange(place.from_s, self.duration_s, 0.05)
         if self.defect == "short":
             times = np.arange(place.from_s, 3.0, 0.1)
         positions = np.column_stack([self.east_m_s * times, north * times, self.height_m - 75.0 * times])
@@ -57,11 +57,11 @@ class OffsetAltimeter:
     quantity: ClassVar[str] = "altitude"
     random: ClassVar[bool] = False
 
-    off_m: float = 0.0
+    bias_m: float = 0.0
 
     def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
         heights = np.array([truth.altitude_m(time) for time in truth.times_s])
-        return InstrumentReadings(truth.times_s, heights + self.off_m, {"applied_m": self.off_m})
+        return InstrumentReadings(truth.times_s, heights + self.bias_m, {"applied_m": self.bias_m})
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ velocity_error = return_existing_column
 
 CUSTOM_PARTS: dict[str, Any] = {
     "flight": {"motion": f"{MODULE}RotatingDescent", "attitude_of": "body"},
-    "altimeter": {"instrument": f"{MODULE}OffsetAltimeter", "options": {"off_m": 6.0}},
+    "altimeter": {"instrument": f"{MODULE}OffsetAltimeter", "options": {"bias_m": 6.0}},
     "attitude_source": {"instrument": f"{MODULE}RotatedAttitude"},
     "scores": [f"{MODULE}record_inputs"],
 }
@@ -121,7 +121,7 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
     for number in (1, 2, 3):
         assert row[f"altitude_error_{number}_m"] == pytest.approx(6.0, abs=1e-6)
         assert row[f"attitude_error_{number}_deg"] == pytest.approx(0.3, abs=1e-6)
-    assert (row["altimeter_off_m"], row["altimeter_applied_m"], row["altimeter_instrument"]) == (
+    assert (row["altimeter_bias_m"], row["altimeter_applied_m"], row["altimeter_instrument"]) == (
         6.0,
         6.0,
         f"{MODULE}OffsetAltimeter",
@@ -161,10 +161,10 @@ def test_invalid_motion_is_reported(defect: str, message: str) -> None:
         create_flight(p, World.from_parameters(p).surface, Streams(1, "test", 0))
 
 
-@pytest.mark.parametrize("lasts_s", [20.0, 20.05, 27.95, 28.0])
-def test_firing_is_at_the_end_of_a_short_motion(lasts_s: float) -> None:
+@pytest.mark.parametrize("duration_s", [20.0, 20.05, 27.95, 28.0])
+def test_firing_is_at_the_end_of_a_short_motion(duration_s: float) -> None:
     """If the motion ends above the firing altitude, the firing is 0.1 s before its end, for any rounding of times."""
-    flight = {**CUSTOM_PARTS["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}
+    flight = {**CUSTOM_PARTS["flight"], "options": {"east_m_s": 0.0, "duration_s": duration_s, "height_m": 5000.0}}
     p = parameters(terrain=FLAT, flight=flight)
     world, streams = World.from_parameters(p), Streams(1, "test", 0)
     created_flight = create_flight(p, world.surface, streams)

@@ -65,7 +65,8 @@ def test_target_is_tracked_with_a_custom_pair(tmp_path: Path) -> None:
     result = RoverScenario().run(p, Streams(1, "own pair", 0))
     row = dict(result.row)
     assert (result.outcome, row["camera"], row["navcam"]) == ("COMPLETED", str(camera), False)
-    # One pixel of disparity is 8 cm of range at 3.5 m (Eq. 1); the calibration error is at most half a pixel.
+    # One pixel of disparity is 8 cm of range at 3.5 m (Eq. 1 of the tracking paper); the calibration error
+    # is at most half a pixel.
     assert 0.0 < float(row["position_error_m"]) < 0.06
     # The exposure uses the range of 10 bits.
     counts = result.products["stop_1_left"]

@@ -16,7 +16,8 @@ def make_run(**changes: Any) -> Run:
 
 
 def test_sun_moves_westwards_with_its_hour_angle() -> None:
-    # A sun in the zenith of the equator moves west by the hour angle: 16 deg in the 66 minutes of Table IV.
+    # A sun in the zenith of the equator moves west by the hour angle: 16 deg in the 66 minutes of Table IV
+    # of the tracking paper.
     sun = SunParameters(azimuth_deg=0.0, elevation_deg=90.0, latitude_deg=0.0)
     for minutes in (0.0, 66.0, 132.0):
         angle = np.radians(16.0 * minutes / 66.0)
@@ -40,7 +41,7 @@ def test_images_use_the_sun_direction_of_their_time() -> None:
 
 
 def test_bright_sky_underexposes_full_frames() -> None:
-    """Section 4.5: with an exposure for the subframe, the sky does not reduce the contrast at the target."""
+    """With an exposure for the subframe, the sky does not reduce the contrast at the target (tracking paper, 4.5)."""
     drive_east = {"start": {"distance_m": 9.0}, "legs": [{"motion": "approach", "goal_m": 8.5, "step_fraction": 0.1}]}
     sun_ahead = {"sun": {"azimuth_deg": 90.0, "elevation_deg": 30.0}}
     first_images = {

@@ -34,9 +34,9 @@ def _position_error_m(run: Run) -> float:
 def test_visual_odometry_measures_slip_and_wheel_odometry_does_not() -> None:
     leg = {"motion": "approach", "goal_m": 3.6, "step_fraction": 0.1}
     errors = {visual: _position_error_m(_run(legs=[leg | {"visual_odometry": visual}])) for visual in (False, True)}
-    # the rover drives 1.4 m: its wheels turn by about 2 m
+    # the rover drives 1.4 m, and the wheel odometry measures about 2 m
     assert errors[False] > 0.4
-    # 2 % of the distance, as in the paper (section 4.2), plus a constant error of each step
+    # 2 % of the distance, as in the tracking paper (section 4.2), plus a constant error per step
     assert errors[True] < 0.02 * 1.4 + 0.03
 
 
@@ -65,7 +65,7 @@ def test_stereo_map_agrees_with_true_heights(map_by: str) -> None:
     error_m = stereo[both] - oracle[both]
     assert abs(np.median(error_m)) < 0.02
     assert np.percentile(np.abs(error_m), 80.0) < 0.06
-    # images do not show all of the ground within the oracle's range
+    # the oracle maps all ground within its range; parts of it are not visible in the images
     assert np.count_nonzero(np.isfinite(oracle) & ~np.isfinite(stereo)) > 0
 
 

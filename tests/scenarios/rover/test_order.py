@@ -1,4 +1,4 @@
-"""Tests of the order of activities in a step (Fig. 12): visual odometry during the drive, tracking, navigation."""
+"""Tests of the activities in a step: mapping, drive with visual odometry, tracking (Fig. 12 of the tracking paper)."""
 
 import re
 
@@ -15,14 +15,14 @@ from tests.scenarios.rover.short_run import SHORT_RUN
 def test_each_step_maps_then_drives_then_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
     activities: list[str] = []
 
-    def record_calls(kind: object, name: str, activity: str) -> None:
-        original = getattr(kind, name)
+    def record_calls(owner: object, name: str, activity: str) -> None:
+        original = getattr(owner, name)
 
         def call_and_record(*args: object, **kwargs: object) -> object:
             activities.append(activity)
             return original(*args, **kwargs)
 
-        monkeypatch.setattr(kind, name, call_and_record)
+        monkeypatch.setattr(owner, name, call_and_record)
 
     record_calls(run_module, "map_terrain", "map")
     record_calls(Vehicle, "drive", "drive with visual odometry")

@@ -44,7 +44,7 @@ def test_step_length_is_limited() -> None:
 
 
 def test_approach_reaches_distance_and_offset() -> None:
-    # A step is 10 % of the camera distance, and the remaining distance at the end.
+    # A step is 10 % of the distance from the camera; the last step is the remaining distance.
     leg = LegParameters(motion="approach", step_fraction=0.1, goal_m=2.0)
     (step,) = plan_step(leg, 0, make_target(8.0, 0.0))
     assert step.forward_m == pytest.approx(0.1 * np.hypot(8.0, 1.2))

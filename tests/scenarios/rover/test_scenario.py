@@ -38,7 +38,8 @@ def test_run_is_tracked_scored_and_deterministic() -> None:
     assert row["tracked"]
     assert row["true_track"]
     assert not row["not_tracked"]
-    # One pixel of disparity is 5 cm of range at 3.5 m (Eq. 1); the calibration error is at most half a pixel.
+    # One pixel of disparity is 5 cm of range at 3.5 m (Eq. 1 of the tracking paper); the calibration error
+    # is at most half a pixel.
     assert 0.0 < row["position_error_m"] < 0.04
     assert row["position_error_m"] ** 2 == pytest.approx(row["range_error_m"] ** 2 + row["cross_error_m"] ** 2)
     assert row["drift_px"] < 1.0
@@ -120,7 +121,8 @@ def test_ideal_instruments_have_only_match_errors() -> None:
 def test_targets_can_be_designated_by_position(designation: str) -> None:
     run = run_case(make_parameters(target={**SHORT_RUN["target"], "designation": designation}), make_streams(3))
     assert run.outcome.name == "COMPLETED"
-    # The mast points at the position: the backlash of 0.1 deg is 2.1 px per axis, half the epipolar error 0.2 px.
+    # The mast points at the position. The backlash of 0.1 deg causes 2.1 px per axis; half the epipolar error is 0.2
+    # px.
     assert np.linalg.norm(run.stops[0].reported_px(run.rig.calibrated) - run.stops[0].point_px) < 3.5
 
 
@@ -180,7 +182,7 @@ def test_trackers_share_the_images_of_a_drive() -> None:
     # A new scenario object without a cached drive gives the same row.
     uncached_row = SharedDriveScenario().run(small_steps, make_streams(0)).row
     assert _drop_times(uncached_row) == _drop_times(results[0].row)
-    # All steps observe the same arc; a target is valid if no stop exceeds the allowed viewing angle.
+    # Small and large steps cover the same arc; a target is valid if no stop exceeds the allowed viewing angle.
     row = results[0].row
     assert [result.row["obliquity_max_deg"] for result in results] == [row["obliquity_max_deg"]] * 2
     assert isinstance(row["obliquity_max_deg"], float)

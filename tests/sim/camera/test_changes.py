@@ -281,7 +281,7 @@ def test_different_cameras_differ(navcam: Cahvor, pinhole: Cahv) -> None:
 
 
 def test_derived_quantities_match_the_formulas_of_cmod(navcam: Cahvor) -> None:
-    """Compare with the formulas of cmod_cahv_internal, which assume a unit vector A (six digits in the label)."""
+    """Compare with cmod_cahv_internal of JPL's cmod library, which assumes a unit vector A (labelled to six digits)."""
     hs, vs = navcam.focal_lengths
     hc, vc = navcam.image_centre
     assert hs == pytest.approx(np.linalg.norm(np.cross(navcam.a, navcam.h)), rel=2e-6)

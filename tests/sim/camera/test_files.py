@@ -61,7 +61,7 @@ END_GROUP                         = INSTRUMENT_STATE_PARMS
 END
 """
 
-# The format of cmod, with comment, covariances and derived lines.
+# The text format of JPL's camera library cmod, with comment, covariances and derived lines.
 TEXT = """# navcam, left
 #
 

@@ -75,8 +75,8 @@ def test_projection_inverts_rays_of_real_cameras(camera: CameraModel, distance: 
     origins, directions = camera.rays(pixels)
     repeated, visible = camera.project(origins + distance * directions)
     assert visible.all()
-    # Requirement: 1e-8 px for CAHVOR and 1e-3 px for CAHVORE. Newton converges to rounding. Pixels near 1000 and points
-    # near 1e4 m leave about 1e3 * 2e-16 * 1e4 / 10 ~ 2e-12 px.
+    # Requirement: 1e-8 px for CAHVOR and 1e-3 px for CAHVORE. Newton converges to rounding errors. Pixels near 1000 and
+    # points near 1e4 m leave about 1e3 * 2e-16 * 1e4 / 10 ~ 2e-12 px.
     assert np.max(np.abs(repeated - pixels)) < 1e-10
 
 

@@ -1,4 +1,4 @@
-"""Analytic grounds for rover tests: planes and single mounds, where the stance of a rover has a closed form."""
+"""Analytic grounds for rover tests: on planes and single mounds, the stance of a rover has a closed form."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Steps:
-    """Level ground with smooth mounds (x, y, height) under single wheels; their tops are flat within 0.2 m."""
+class Mounds:
+    """Level ground with mounds (x, y, height) under single wheels; the tops are flat up to a radius of 0.2 m."""
 
     mounds: tuple[tuple[float, float, float], ...]
 

@@ -33,13 +33,13 @@ def test_motion_without_slip_follows_the_command(command: DriveCommand, slope_de
     # On a plane the motion in body axes is planar for any slope.
     ground = uphill_east(slope_deg)
     start = settle(MER, ground, 1.0, 2.0, 0.4)
-    driven = drive(MER, ground, PERFECT, start, command, _rng())
-    motion = start.world_from_rover.inv() * driven.end.world_from_rover
+    result = drive(MER, ground, PERFECT, start, command, _rng())
+    motion = start.world_from_rover.inv() * result.end.world_from_rover
     assert motion.translation == pytest.approx([*command.displacement_m, 0.0], abs=1e-8)
     assert motion.rotation.as_rotvec() == pytest.approx([0.0, 0.0, command.turn_left_rad], abs=1e-7)
-    assert sum(part.command.length_m for part in driven.parts) == pytest.approx(command.length_m)
-    assert driven.stances[0] is start
-    assert driven.stances[-1] is driven.end
+    assert sum(part.command.length_m for part in result.parts) == pytest.approx(command.length_m)
+    assert result.stances[0] is start
+    assert result.stances[-1] is result.end
 
 
 def test_command_equals_many_small_motions() -> None:
@@ -65,15 +65,15 @@ def test_target_stays_ahead_when_the_rover_circles_it() -> None:
 
 
 def test_slip_of_one_half_halves_the_distance() -> None:
-    # The default curve loses half at 15 deg: s(15 deg) = 0.01 + 0.99 0.75**2.4.
+    # The default slip is one half on a slope of 15 deg: s = 0.01 + 0.99 * 0.75**2.4.
     slip = 0.01 + 0.99 * 0.75**2.4
     assert slip == pytest.approx(0.5, abs=0.01)
     ground = uphill_east(15.0)
     start = settle(MER, ground, 0.0, 0.0, EAST)
-    driven = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=2.0), _rng())
-    distance_m = np.linalg.norm(driven.end.world_from_rover.translation - start.world_from_rover.translation)
+    result = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=2.0), _rng())
+    distance_m = np.linalg.norm(result.end.world_from_rover.translation - start.world_from_rover.translation)
     assert distance_m == pytest.approx(2.0 * (1.0 - slip), rel=1e-9)
-    assert driven.slip == pytest.approx(slip, rel=1e-9)
+    assert result.slip == pytest.approx(slip, rel=1e-9)
 
 
 @pytest.mark.parametrize(("slope_deg", "slip"), [(0.0, 0.01), (10.0, 0.2), (20.0, 1.0), (25.0, 1.0)])
@@ -94,23 +94,23 @@ def test_uphill_slip_increases_to_one(slope_deg: float, slip: float) -> None:
 def test_rover_slides_downhill_across_a_slope(azimuth_rad: float) -> None:
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, azimuth_rad)
-    driven = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=1.0), _rng())
-    motion_m = driven.end.world_from_rover.translation - start.world_from_rover.translation
+    result = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=1.0), _rng())
+    motion_m = result.end.world_from_rover.translation - start.world_from_rover.translation
     sideways = 0.5 * (STEADY.slip_fraction(np.radians(10.0)) - STEADY.flat)
     # The ground falls to the west.
     assert motion_m[0] == pytest.approx(-sideways * np.cos(np.radians(10.0)), abs=1e-9)
-    assert driven.slip == pytest.approx(STEADY.flat, abs=1e-9)
+    assert result.slip == pytest.approx(STEADY.flat, abs=1e-9)
 
 
 def test_slip_reduces_the_turn_angle() -> None:
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
-    driven = drive(MER, Plane(), Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _rng())
-    assert np.degrees(start.azimuth_rad - driven.end.azimuth_rad) == pytest.approx(40.0 * 0.97)
-    assert np.isnan(driven.slip)
+    result = drive(MER, Plane(), Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _rng())
+    assert np.degrees(start.azimuth_rad - result.end.azimuth_rad) == pytest.approx(40.0 * 0.97)
+    assert np.isnan(result.slip)
     steep = uphill_east(15.0)
     start = settle(MER, steep, 0.0, 0.0, EAST)
-    driven = drive(MER, steep, Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _rng())
-    assert 1.0 - driven.turn_left_rad / np.radians(10.0) == pytest.approx(
+    result = drive(MER, steep, Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _rng())
+    assert 1.0 - result.turn_left_rad / np.radians(10.0) == pytest.approx(
         0.03 + 0.5 * (STEADY.slip_fraction(np.radians(15.0)) - 0.01), rel=1e-6
     )
 
@@ -118,14 +118,14 @@ def test_slip_reduces_the_turn_angle() -> None:
 def test_soil_step_and_heading_errors_have_the_specified_deviation() -> None:
     parameters = SlipParameters(soil_spread=0.3, step_spread=0.0, wander_deg_m=0.0)
     factors = np.log([Soil.draw(parameters, np.random.default_rng(n)).factor for n in range(400)])
-    # 0.3 within four standard errors, 0.3 / sqrt(800).
+    # 400 draws determine the deviation of 0.3 to 0.3 / sqrt(800); the tolerance is four times that.
     assert np.std(factors) == pytest.approx(0.3, abs=0.042)
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, EAST)
     slippery = drive(MER, ground, Soil(STEADY, 1.5), start, DriveCommand(forward_m=0.3), _rng())
     nominal = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.3), _rng())
     assert slippery.slip == pytest.approx(1.5 * nominal.slip, rel=1e-9)
-    # 120 draws each: within four standard errors, 1 / sqrt(240) of the deviation.
+    # 120 draws determine each deviation to a fraction of 1 / sqrt(240); the tolerance is four times that.
     rng = np.random.default_rng(1)
     random_steps = Soil(SlipParameters(soil_spread=0.0, step_spread=0.2, wander_deg_m=0.0), 1.0)
     slips = [drive(MER, ground, random_steps, start, DriveCommand(forward_m=0.1), rng).slip for _ in range(120)]

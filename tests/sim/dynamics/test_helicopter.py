@@ -20,15 +20,15 @@ def test_velocity_rate_and_force_are_derivatives(turns: bool) -> None:
     """Central differences over 0.4 ms: the truncation for the vibration of 13 Hz is below 1e-6 m/s."""
     flight, step = make_flight(turns_with_flight=turns), 2e-4
     times = np.linspace(-40.0, 2440.0, 400)
-    before, now, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
+    before, motion, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
     velocity = (after.positions_m - before.positions_m) / (2.0 * step)
-    np.testing.assert_allclose(now.velocities_m_s, velocity, atol=1e-5)
+    np.testing.assert_allclose(motion.velocities_m_s, velocity, atol=1e-5)
     acceleration = (after.velocities_m_s - before.velocities_m_s) / (2.0 * step)
-    specific_force = now.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, 9.8]))
-    np.testing.assert_allclose(now.specific_forces_m_s2, specific_force, atol=1e-4)
+    specific_force = motion.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, 9.8]))
+    np.testing.assert_allclose(motion.specific_forces_m_s2, specific_force, atol=1e-4)
     rate = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2.0 * step)
     # The body axes rotate by up to half a step during the central difference.
-    np.testing.assert_allclose(now.body_rates_rad_s, rate, atol=2e-5)
+    np.testing.assert_allclose(motion.body_rates_rad_s, rate, atol=2e-5)
 
 
 def test_heights_speed_and_tilt_match_the_paper() -> None:

@@ -98,8 +98,9 @@ def _max_spline_errors(spacing_s: float) -> dict[str, float]:
 
 
 def test_splines_converge_to_closed_form_motion() -> None:
-    """Cubic splines have errors of h^4 in value, h^3 in slope and h^2 in curvature: half the step gives factors of 16,
-    8 and 4.
+    """Errors of cubic splines are of order h^4 in value, h^3 in slope and h^2 in curvature.
+
+    Half the step h reduces them by factors of 16, 8 and 4.
     """
     assert isinstance(_record_motion(0.1), Trajectory)
     coarse, fine = _max_spline_errors(0.1), _max_spline_errors(0.05)
@@ -107,7 +108,7 @@ def test_splines_converge_to_closed_form_motion() -> None:
         assert fine[name] < coarse[name] / 2 ** (order - 0.5), name
     assert fine["position"] < 1e-5
     assert fine["rate"] < 1e-4
-    # The curvature of the sway, 5 m x 1.5^4 rad/s^4, times h^2 / 12.
+    # Fourth derivative of the sway, 5 m x 1.5^4 rad^4/s^4, times h^2 / 12.
     assert fine["force"] < 2.0 * 5.0 * 1.5**4 * 0.05**2 / 12.0 + 1e-3
 
 

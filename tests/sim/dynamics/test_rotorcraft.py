@@ -77,15 +77,15 @@ def test_velocity_rate_and_force_are_derivatives() -> None:
     assert isinstance(flight, Trajectory)
     first, last = flight.span_s
     times = np.random.default_rng(0).uniform(first + step, last - step, 2000)
-    before, now, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
+    before, motion, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
     velocity = (after.positions_m - before.positions_m) / (2.0 * step)
-    np.testing.assert_allclose(now.velocities_m_s, velocity, atol=1e-6)
+    np.testing.assert_allclose(motion.velocities_m_s, velocity, atol=1e-6)
     acceleration = (after.velocities_m_s - before.velocities_m_s) / (2.0 * step)
-    specific_force = now.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, GRAVITY]))
+    specific_force = motion.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, GRAVITY]))
     # Third derivatives jump at the knots, by up to 100 m/s3 at the touchdown.
-    np.testing.assert_allclose(now.specific_forces_m_s2, specific_force, atol=5e-3)
+    np.testing.assert_allclose(motion.specific_forces_m_s2, specific_force, atol=5e-3)
     rate = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2.0 * step)
-    np.testing.assert_allclose(now.body_rates_rad_s, rate, atol=1e-5)
+    np.testing.assert_allclose(motion.body_rates_rad_s, rate, atol=1e-5)
 
 
 def test_specific_force_is_rotor_thrust_plus_drag() -> None:
@@ -93,7 +93,7 @@ def test_specific_force_is_rotor_thrust_plus_drag() -> None:
     flight = _fly_transit(_make_air(0, **CALM), SMOOTH).path
     motion = flight.motion(flight.knots_s[1:])
     drag = motion.attitudes.inv().apply(-motion.velocities_m_s / SMOOTH.drag_s)
-    # Thrust angles are predicted one step ahead. A command jump of 1 m/s2 changes them by omega^2 / g h^2 / 6 = 2e-4
+    # Thrust angles are predicted one step h ahead. A command jump of 1 m/s2 changes them by (omega h)^2 / (6 g) = 2e-4
     # rad.
     np.testing.assert_allclose(motion.specific_forces_m_s2[:, :2], drag[:, :2], atol=3e-3)
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from marsyard.sim.dynamics import MER, ROCKY_8, Ground, RockyGround, RoverParameters, settle
 from marsyard.sim.dynamics.rover import WHEELS, compute_wheel_centres
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
-from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
+from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east
 
 EAST, NORTH = 0.5 * np.pi, 0.0
 
@@ -51,9 +51,9 @@ def test_chassis_pitch_is_the_mean_of_the_rocker_angles() -> None:
     # The left front wheel is on a block of 10 cm: its rocker and bogie rotate, those of the other side rotate in the
     # opposite direction. For a heading to the east, the left front wheel is at (0.705, 0.53).
     block_m = 0.10
-    one_block = settle(MER, Steps(((0.705, 0.53, block_m),)), 0.0, 0.0, EAST)
+    one_block = settle(MER, Mounds(((0.705, 0.53, block_m),)), 0.0, 0.0, EAST)
     assert np.abs(one_block.gaps_m).max() < 1e-9
-    two_blocks = settle(MER, Steps(((0.705, 0.53, block_m), (0.705, -0.53, block_m))), 0.0, 0.0, EAST)
+    two_blocks = settle(MER, Mounds(((0.705, 0.53, block_m), (0.705, -0.53, block_m))), 0.0, 0.0, EAST)
     assert two_blocks.roll_rad == pytest.approx(0.0, abs=1e-9)
     assert two_blocks.differential_rad == pytest.approx(0.0, abs=1e-9)
     # To first order one block causes half the pitch of two.
@@ -66,7 +66,7 @@ def test_chassis_pitch_is_the_mean_of_the_rocker_angles() -> None:
 def test_block_under_the_middle_wheel_rotates_the_bogie() -> None:
     # The middle wheel rises by h: the bogie pivot rises by h times its distance from the rear wheel / wheelbase.
     block_m = 0.06
-    stance = settle(MER, Steps(((0.0, 0.61, block_m), (0.0, -0.61, block_m))), 0.0, 0.0, EAST)
+    stance = settle(MER, Mounds(((0.0, 0.61, block_m), (0.0, -0.61, block_m))), 0.0, 0.0, EAST)
     pivot_rise_m = block_m * (MER.rear_m + MER.bogie_pivot_x_m) / MER.rear_m
     nose_down = pivot_rise_m / (MER.front_m - MER.bogie_pivot_x_m)
     assert stance.pitch_rad == pytest.approx(-nose_down, rel=0.05)
@@ -114,7 +114,7 @@ def test_block_gives_the_same_stance_as_a_mound_of_equal_height() -> None:
     height_m = 0.10
     ground = RockyGround.of(Plane(), _make_block(0.705, 0.53, height_m), (0.0, 0.0), 1.5)
     stance = settle(MER, ground, 0.0, 0.0, EAST)
-    mound = settle(MER, Steps(((0.705, 0.53, height_m),)), 0.0, 0.0, EAST)
+    mound = settle(MER, Mounds(((0.705, 0.53, height_m),)), 0.0, 0.0, EAST)
     assert np.abs(stance.gaps_m).max() < 1e-6
     assert stance.world_from_rover.as_matrix() == pytest.approx(mound.world_from_rover.as_matrix(), abs=1e-4)
 
@@ -134,7 +134,7 @@ def test_rock_of_a_field_lifts_the_wheel() -> None:
 
 
 def test_stance_does_not_depend_on_initial_guess() -> None:
-    ground = Steps(((0.705, 0.53, 0.1), (-0.705, -0.53, 0.05)))
+    ground = Mounds(((0.705, 0.53, 0.1), (-0.705, -0.53, 0.05)))
     default = settle(MER, ground, 0.0, 0.0, EAST)
     stance = settle(MER, ground, 0.0, 0.0, EAST, initial=settle(MER, uphill_east(5.0), 0.1, 0.0, EAST))
     assert stance.world_from_rover.as_matrix() == pytest.approx(default.world_from_rover.as_matrix(), abs=1e-8)

@@ -102,7 +102,7 @@ def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
     slip = spinning - (spinning @ n) * n - np.cross(n, dn)
     h = 1e-5
     power = (_energy(y + h * rates, chain, p) - _energy(y - h * rates, chain, p)) / (2.0 * h)
-    # The energy of 1e7 J is rounded to 1e-9 J, over 2e-5 s.
+    # Tolerance: the energy of 1e7 J is rounded to 1e-9 J, and the difference is divided by 2e-5 s.
     assert power == pytest.approx(force @ y[3:6] - chain.hinge_damping * slip @ slip, abs=1e-3)
     torque = (_angular_momentum(y + h * rates, chain, p) - _angular_momentum(y - h * rates, chain, p)) / (2.0 * h)
     weights = sum(np.cross(r, -m * GRAVITY * UP) for m, r, _ in _body_states(y, chain, p))
@@ -117,7 +117,7 @@ def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
         )
     ) / (2.0 * h)
     np.testing.assert_allclose(momentum_rate, force - chain.mass_kg * GRAVITY * UP, atol=1e-4)
-    # Constant lengths: n . n'' = -|n'|^2.
+    # The direction n of each link is a unit vector: n . n'' = -|n'|^2.
     assert rates[9:12] @ n == pytest.approx(-dn @ dn, abs=1e-12)
     assert rates[15:18] @ e == pytest.approx(-de @ de, abs=1e-12)
 

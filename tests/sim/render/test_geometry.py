@@ -112,11 +112,11 @@ def test_world_points_are_on_the_plane_and_on_rays(
 
 
 def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, expected_m: float) -> float:
-    """Distance to the ground near the expected one: march in steps of a fifth of a sample, then bracket the root."""
+    """Distance to the ground near the expected distance: march in steps of a fifth of a sample, then find the root."""
     control = surface.levels[0][..., 0].astype(np.float64)
 
     def clearance(t: np.ndarray) -> np.ndarray:
-        x, y, z = (origin[:, None] + np.outer(ray, np.atleast_1d(t))) / np.array([[1.0], [1.0], [1.0]])
+        x, y, z = origin[:, None] + np.outer(ray, np.atleast_1d(t))
         ground = map_coordinates(
             control, [y / surface.spacing_m, x / surface.spacing_m], order=3, mode="grid-wrap", prefilter=False
         )
@@ -145,14 +145,14 @@ def test_rough_ground_ranges_match_independent_ray_cast(
 
 @pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
 def test_grazing_rays_intersect_the_first_occluding_crest(rough: Surface, bounded: bool) -> None:
-    """Rays that graze rough ground hundreds of samples away, against marching in steps of a thirtieth of a sample."""
+    """Rays graze rough ground hundreds of samples away. The reference marches in steps of a thirtieth of a sample."""
     rng = np.random.default_rng(3)
     count, ground = 400, Ground(rough)
     origins = np.column_stack([rng.uniform(0.0, rough.period_m, (count, 2)), np.full(count, ground.highest + 60.0)])
     rays = np.array([direction(a, -np.radians(e)) for a, e in rng.uniform([-np.pi, 2.5], [np.pi, 5.0], (count, 2))])
     expected = ground.cast(origins, rays, 4000.0, 0.05)
     level = GroundLevel(rough.levels[0], rough.ceilings[0] if bounded else NO_CEILING, 1.0 / rough.spacing_m)
-    # With ceilings the search of the complete ray is fast.
+    # With ceilings the search of the complete ray is fast; without them it starts near the intersection.
     begin = 0.0 if bounded else 0.8
     result = np.array(
         [
@@ -162,7 +162,7 @@ def test_grazing_rays_intersect_the_first_occluding_crest(rough: Surface, bounde
     )
     assert np.median(expected) > 500.0 * rough.spacing_m
     assert np.mean(np.abs(result / expected - 1.0) < 1e-4) > 0.99
-    # Rays end on the ground: a thousandth of a sample, and one Newton step, squared.
+    # Rays end on the ground: the search ends within a thousandth of a sample, and one Newton step squares the error.
     assert np.abs(ground.clearance(origins, rays, result)).max() < 1e-5 * rough.spacing_m
 
 

@@ -38,7 +38,7 @@ def test_nearest_triangle_equals_exhaustive_search(objects: Objects) -> None:
 @pytest.mark.parametrize("axis", [*_draw_rays(np.random.default_rng(8), 12), *np.eye(3), *-np.eye(3)], ids=str)
 @pytest.mark.parametrize("half_angle", [1e-3, 0.05, 0.5])
 def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.ndarray, half_angle: float) -> None:
-    """All triangles that random rays in the beam hit are listed; all listed ones are near the frustum around it."""
+    """The list contains all triangles that random rays in the beam hit, and only triangles near the frustum."""
     max_distance_m = 9.0
     rng = np.random.default_rng(9)
     buffer = np.empty(1500, dtype=np.int64)

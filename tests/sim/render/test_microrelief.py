@@ -64,13 +64,13 @@ def test_noise_has_the_specified_variances_and_derivatives() -> None:
 
 @pytest.mark.parametrize("hurst", [0.5, 0.75, 0.9])
 def test_octaves_continue_the_spectrum_of_the_terrain(hurst: float) -> None:
-    """Differences of height over short lags, against the integral of the terrain's spectrum beyond its samples'."""
+    """Height differences over short lags agree with the integral of the terrain's spectrum beyond its samples."""
     slope_rad, baseline_m, outer_m, spacing_m = np.radians(3.0), 1.0, 15.0, 0.2
     coarsest, heights = octave_heights(hurst, slope_rad, baseline_m, outer_m, spacing_m)
     k0 = 2.0 * np.pi / outer_m
 
     def structure(lag: float, above: float = 0.0) -> float:
-        """Mean square difference over a lag, by waves of wavenumbers above a bound, for heights of unit variance."""
+        """Mean square difference over a lag for unit variance, from waves with wavenumbers greater than `above`."""
         k = np.geomspace(max(above, 1e-4 * k0), 2.0 * np.pi / 0.0005, 200_001)
         power = 2.0 * hurst * k0 ** (2.0 * hurst) * k * (k**2 + k0**2) ** -(hurst + 1.0)
         return float(np.trapezoid(2.0 * power * (1.0 - special.j0(k * lag)), k))

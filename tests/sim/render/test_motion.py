@@ -1,4 +1,4 @@
-"""Tests of image motion between renderings, against the camera model: short versions of those in `make validate`."""
+"""Tests of image motion between renderings, against the camera model: short forms of checks in `make validate`."""
 
 from collections.abc import Callable
 

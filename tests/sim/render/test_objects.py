@@ -10,11 +10,11 @@ COUNTS = (5, 1, 80, 3)
 
 def _make_bodies() -> Objects:
     rng = np.random.default_rng(4)
-    names = np.repeat(np.array([7, 3, 12, 3], dtype=np.int32), COUNTS)
-    faces = np.arange(3 * names.size, dtype=np.int32).reshape(-1, 3)
+    body_ids = np.repeat(np.array([7, 3, 12, 3], dtype=np.int32), COUNTS)
+    faces = np.arange(3 * body_ids.size, dtype=np.int32).reshape(-1, 3)
     positions = np.repeat(50.0 * rng.normal(size=(4, 3)), 3 * np.array(COUNTS), axis=0)
-    vertices = positions + rng.normal(0.0, 1.0, (3 * names.size, 3))
-    return Objects.of_mesh(vertices, rng.normal(size=vertices.shape), faces, names, albedo=0.2)
+    vertices = positions + rng.normal(0.0, 1.0, (3 * body_ids.size, 3))
+    return Objects.of_mesh(vertices, rng.normal(size=vertices.shape), faces, body_ids, albedo=0.2)
 
 
 def test_spheres_enclose_their_bodies_tightly() -> None:
@@ -26,7 +26,7 @@ def test_spheres_enclose_their_bodies_tightly() -> None:
     assert Objects.none().spheres.shape == (0, 4)
 
 
-def test_only_selects_bodies() -> None:
+def test_subset_contains_the_selected_bodies() -> None:
     objects = _make_bodies()
     is_selected = np.array([True, False, False, True])
     subset = objects.only(is_selected)
@@ -40,7 +40,7 @@ def test_only_selects_bodies() -> None:
 
 
 def test_cone_selects_facing_triangles_of_bodies_within_it() -> None:
-    """A triangle faces a position from which its corners are counter-clockwise."""
+    """A triangle faces the eye if its corners appear counter-clockwise from there."""
     objects = _make_bodies()
     eye = objects.spheres[2, :3] + np.array([0.0, 0.0, 200.0])
     result = objects.in_cone(eye, np.array([0.0, 0.0, -1.0]), 1e-3)

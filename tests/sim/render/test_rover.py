@@ -24,7 +24,7 @@ from marsyard.sim.render import (
 from marsyard.sim.render.objects import ROVER_NAME
 from marsyard.sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
 from marsyard.sim.terrain import Surface
-from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
+from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east
 
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 EAST = 0.5 * np.pi
@@ -57,7 +57,7 @@ def test_normals_point_outwards() -> None:
 
 def test_wheels_follow_the_suspension() -> None:
     # With a block under the left front wheel, the lowest rover points there are on the block.
-    stance = settle(MER, Steps(((0.705, 0.53, 0.1),)), 0.0, 0.0, EAST)
+    stance = settle(MER, Mounds(((0.705, 0.53, 0.1),)), 0.0, 0.0, EAST)
     corners = rover_objects(MER, stance, MER_MAST, 0.0, 0.0).triangles.reshape(-1, 3)
     for x, y, height in ((0.705, 0.53, 0.1), (0.705, -0.53, 0.0), (-0.705, 0.53, 0.0)):
         near_wheel = corners[np.hypot(corners[:, 0] - x, corners[:, 1] - y) < 0.15]
@@ -122,7 +122,7 @@ def test_sphere_contains_the_rover_in_any_stance(rover: RoverParameters, mast: M
     rng = np.random.default_rng(2)
     relative_radii = []
     for _ in range(20):
-        blocks = Steps(tuple((float(x), float(y), 0.25) for x, y in rng.uniform(-0.8, 0.8, (3, 2))))
+        blocks = Mounds(tuple((float(x), float(y), 0.25) for x, y in rng.uniform(-0.8, 0.8, (3, 2))))
         stance = settle(rover, blocks, 0.0, 0.0, float(rng.uniform(0.0, 6.0)))
         corners = rover_objects(rover, stance, mast, *rng.uniform(-1.5, 1.5, 2)).triangles.reshape(-1, 3)
         *centre, radius = rover_sphere(rover, stance, mast)[0]

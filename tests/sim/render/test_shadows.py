@@ -44,7 +44,7 @@ def _compare_with_ray_cast(frame: Frame, scene: Scene, count: int, step: float) 
     to_sun = scene.sun.direction
     facing = frame.normal.reshape(-1, 3)[pixels].astype(np.float64) @ to_sun
     fraction = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(facing, 1e-6))
-    is_shaded = Ground(scene.surface).hides(points, to_sun, step)
+    is_shaded = Ground(scene.surface).is_occluded(points, to_sun, step)
     rays = np.broadcast_to(to_sun, points.shape)
     is_shaded |= np.isfinite(cast_triangles(scene.objects, points, rays, nearest=2e-3))
     actual, expected = (facing > 0.0) & (fraction > 0.5), (facing > 0.0) & ~is_shaded
@@ -95,6 +95,7 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
     samples = np.stack([heights, np.full_like(heights, ALBEDO)], axis=-1).astype(np.float32)
     surface = Surface.from_samples(samples, spacing)
     sun = Sun(direction(np.radians(270.0), elevation))
+    # Elevation of the skyline, which the ridge at x = 30 m forms, seen from ground positions in the east.
     profile = np.arange(28.0, 32.0, 0.01)
     crest = surface.height(profile, 0.0)
     ground = np.linspace(75.0, 95.0, 2001)
@@ -120,8 +121,8 @@ def test_shaded_positions_equal_an_exhaustive_search(elevation: float) -> None:
         -1, 3
     )
     faces = np.arange(len(triangles), dtype=np.int32).reshape(-1, 3)
-    names = np.repeat(np.arange(60, dtype=np.int32), 7)
-    objects = Objects.of_mesh(triangles, np.zeros_like(triangles), faces, names, ALBEDO)
+    body_ids = np.repeat(np.arange(60, dtype=np.int32), 7)
+    objects = Objects.of_mesh(triangles, np.zeros_like(triangles), faces, body_ids, ALBEDO)
     sun = Sun(direction(0.7, elevation))
     positions = rng.uniform(-9.0, 9.0, (3000, 3))
     casters = casters_towards(objects, sun)

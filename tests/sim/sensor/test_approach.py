@@ -100,7 +100,7 @@ def test_constant_errors_match_a_full_rate_propagation() -> None:
         imu = Imu.draw(constant, (approach.start_s, 0.0), np.random.default_rng(seed))
         fast = approach.errors(imu, np.random.default_rng(0))
         [(attitude, velocity)] = _propagate_at_full_rate(imu, approach, range(1))
-        # First order in errors of up to 10 mrad, with steps of 2.4 deg of spin.
+        # Tolerance: the fast method is first order in errors of up to 10 mrad, with steps of 2.4 deg of spin.
         np.testing.assert_allclose(fast.attitude_rad, attitude, atol=0.01 * float(np.linalg.norm(attitude)))
         np.testing.assert_allclose(fast.velocity_m_s, velocity, atol=0.01 * float(np.linalg.norm(velocity)))
 

@@ -124,7 +124,7 @@ def test_disparity_error_causes_range_error_of_eq_1(name: str, seed: int) -> Non
     measured = _triangulate_range_m(head.calibrated.left, head.calibrated.right, pixels)
     baseline = float(np.linalg.norm(design.left.c - design.right.c))
     expected = range_m**2 / (design.left.focal_lengths[0] * baseline) * error
-    # Eq. 1 is first order in the ratio of error and disparity (25 px at 10 m for the navcam).
+    # Eq. 1 of the tracking paper is first order in the ratio of error and disparity (25 px at 10 m for the navcam).
     assert measured - np.hypot(range_m, 0.5 * baseline) == pytest.approx(expected, rel=0.03)
 
 

@@ -58,7 +58,10 @@ def _run_filter(
 
 
 def _state_errors(path: FlownPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray) -> np.ndarray:
-    """True minus estimated state, fifteen columns; the effect of gravity on scale and misalignment counts as bias."""
+    """True minus estimated state, fifteen columns.
+
+    The effect of gravity by scale and misalignment errors counts as accelerometer bias.
+    """
     times = imu.boundaries(*path.span_s)[indices]
     truth = path.motion(times)
     gravity_scale_error = imu.accelerometer.sensitivity_error[:, 2] * GRAVITY
@@ -75,8 +78,9 @@ def _state_errors(path: FlownPath, imu: Imu, solution: NavigationSolution, indic
 
 
 def test_errors_are_consistent_with_the_covariance() -> None:
-    """Normalised squared errors over independent flights: chi-square with fifteen degrees of freedom per flight (99.8
-    % band).
+    """The mean normalised squared error over independent flights is within the 99.8 % band of chi-square.
+
+    The state of each flight has fifteen degrees of freedom.
     """
     floating = RtkParameters(float_fraction=0.3, float_s=10.0)
     squares = []
@@ -123,7 +127,7 @@ def test_better_instruments_reduce_the_errors() -> None:
 
 
 def test_outage_errors_are_consistent_with_the_covariance() -> None:
-    """Eight seconds of inertial navigation: the position drifts by decimetres, as for a tilt of 0.2 deg."""
+    """Without fixes for eight seconds the position drifts by decimetres, as for a tilt error of 0.2 deg."""
     with_outage = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_fraction=0.0)
     squares, sizes = [], []
     for seed in range(FLIGHTS):

@@ -116,7 +116,7 @@ def test_scale_errors_are_constant_and_random_walks_are_not() -> None:
     assert np.std(end) == pytest.approx(0.01 * 6.4, rel=0.25)
     middle, end = forward_errors(EXACT.model_copy(update={"walk_m": 0.01}))
     assert np.std(end) == pytest.approx(0.01 * np.sqrt(6.4), rel=0.25)
-    # Half the variance of a walk exists at half the distance: the correlation is the root of one half.
+    # At half the distance a random walk has half of its final variance: the correlation is sqrt(0.5).
     assert np.corrcoef(middle, end)[0, 1] == pytest.approx(np.sqrt(0.5), abs=0.22)
 
 

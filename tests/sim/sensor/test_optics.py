@@ -88,7 +88,7 @@ def test_defocus_has_the_transfer_of_a_uniform_disc(diameter: float) -> None:
     waves = np.cos(2.0 * np.pi * frequency[:, None] * offsets)
     measured = waves @ line_spread(soft) / (waves @ line_spread(sharp))
     x = np.pi * diameter * frequency
-    # J1 by its integral, (1/pi) int cos(t - x sin t) dt
+    # Bessel function J1 by its integral, 1/pi times that of cos(t - x sin t) from 0 to pi
     t = np.linspace(0.0, np.pi, 2001)
     bessel = np.trapezoid(np.cos(t - x[:, None] * np.sin(t)), t, axis=1) / np.pi
     np.testing.assert_allclose(measured, 2.0 * bessel / x, atol=0.02)

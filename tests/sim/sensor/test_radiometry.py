@@ -28,7 +28,7 @@ def test_total_sunlight_equals_the_solar_constant() -> None:
 
 
 def test_neutral_density_filters_match_the_paper() -> None:
-    """Section III.B.2: optical density 0.67 and 22 %, 0.97 and 11 %."""
+    """Field test paper, section III.B.2: optical density 0.67 and 22 %, 0.97 and 11 %."""
     for camera, fraction in ((FLOWN, 0.22), (FIELD, 0.11)):
         without_filter = replace(camera.light, neutral_density=None)
         transmission = camera.light.responsivity_e_s(1.5) / without_filter.responsivity_e_s(1.5)
@@ -41,7 +41,7 @@ def test_neutral_density_filters_match_the_paper() -> None:
 def test_signal_to_noise_and_dark_current_match_the_paper(
     temperature_c: float, ratio: float, dark_fraction: float | None
 ) -> None:
-    """Section III.B.3 with one set of constants: the ratio within 2, fractions within a factor of 1.2."""
+    """Field test paper, section III.B.3, with one set of constants; tolerances: ratio 2, fractions a factor of 1.2."""
     for camera in (FLOWN, FIELD):
         p = camera.detector.model_copy(update={"temperature_c": temperature_c})
         assert _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) == pytest.approx(ratio, abs=2.0)

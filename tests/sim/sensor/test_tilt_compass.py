@@ -83,7 +83,7 @@ def test_iron_causes_one_and_two_cycle_heading_errors() -> None:
             np.testing.assert_allclose(np.angle(np.exp(1j * (read - azimuths - expected))), 0.0, atol=1e-9)
         deviations_deg.append(np.degrees(expected))
     modes = np.fft.rfft(np.array(deviations_deg), axis=1) / azimuths.size
-    # Constant, then each component of one and two cycles: 300 or 600 values.
+    # Deviations of the constant error (300 values) and of the components of one and two cycles (600 values each).
     assert modes[:, 0].real.std() == pytest.approx(0.8, rel=0.12)
     assert np.sqrt(2.0 * np.mean(np.abs(modes[:, 1]) ** 2)) == pytest.approx(0.5, rel=0.09)
     assert np.sqrt(2.0 * np.mean(np.abs(modes[:, 2]) ** 2)) == pytest.approx(0.25, rel=0.09)

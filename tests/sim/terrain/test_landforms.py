@@ -96,8 +96,8 @@ def test_dunes_have_specified_wavelength_height_and_slip_faces() -> None:
     assert np.mean(slope > 0) > 0.7, "the stoss slope is longer than the lee slope"
 
 
-def test_dunes_end_in_defects_without_steps() -> None:
-    """Where crests fork the height is continuous: no slope is much steeper than the slip faces."""
+def test_dune_crests_fork_without_height_steps() -> None:
+    """The height is continuous where crests fork: no slope is much steeper than the slip faces."""
     dunes = Dunes(wavelength_m=60.0, height_m=3.0, crest_length=1.8, regularity=0.9)
     surface = synthesise(make_parameters(samples=1024, spacing_m=1.0, dunes=dunes), np.random.default_rng(3))
     x, y = np.meshgrid(np.arange(0, 1024, 1.0), np.arange(0, 1024, 1.0))

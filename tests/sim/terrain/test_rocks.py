@@ -78,7 +78,7 @@ def test_finest_shapes_have_specified_height_diameter_and_normals() -> None:
         above_ground = vertices[vertices[:, 2] >= 0.0, :2]
         widths = np.ptp(above_ground @ np.stack([np.cos(azimuth), np.sin(azimuth)]), axis=0)
         assert (widths.max() + widths.min()) / 2 == pytest.approx(1.0, abs=0.005 if number < SHAPES_OF_FORM else 0.01)
-        # Triangles cut corners: their mean normals agree except at edges.
+        # Means of triangle normals agree with the stored normals except at the edges of the rock.
         agreement = np.sum(make_mesh(shapes, number).vertex_normals * shapes.normals[number], axis=1)
         assert np.median(agreement) > (0.999 if number < SHAPES_OF_FORM else 0.96)
 

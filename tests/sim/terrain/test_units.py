@@ -1,4 +1,7 @@
-"""Tests of surface units, crater populations, tracks and wind tails."""
+"""Tests of surface units, crater populations, tracks and wind tails.
+
+The tone is the natural logarithm of the albedo relative to the mean albedo.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +53,9 @@ def test_units_have_the_specified_areas_factors_and_tones() -> None:
     assert cover[..., ROCKS].mean() == pytest.approx(1.0, rel=1e-4)
 
 
-def test_areas_vary_from_terrain_to_terrain() -> None:
+def test_unit_areas_vary_between_terrains() -> None:
     dust = [np.mean(_apply(_make_units(), seed, 256)[1][..., TEXTURE] < 0.4) for seed in range(40)]
-    # Dirichlet: variance a (1 - a) / (concentration + 1)
+    # The areas have a Dirichlet distribution: variance a (1 - a) / (concentration + 1)
     assert np.std(dust) == pytest.approx(np.sqrt(0.3 * 0.7 / 9.0), rel=0.35)
     assert np.mean(dust) == pytest.approx(0.3, abs=0.08)
 
@@ -65,7 +68,7 @@ def test_patches_are_longer_along_the_wind() -> None:
     assert along_x > 1.2 * along_y
 
 
-def test_units_make_the_texture_patchy() -> None:
+def test_units_increase_the_patchiness_of_the_albedo() -> None:
     def patchiness(parameters: TerrainParameters) -> float:
         tone = np.log(synthesise(parameters, np.random.default_rng(3)).levels[0][..., 1].astype(float))
         blocks = tone.reshape(32, 16, 32, 16).std(axis=(1, 3))
@@ -86,7 +89,7 @@ def test_sum_of_split_field_equals_the_field() -> None:
 
 
 def test_crater_sizes_follow_saturation_and_production() -> None:
-    """Cumulative numbers fall as D**-1.83 below the knee and as D**-3.2 beyond it."""
+    """Cumulative numbers fall as D**-1.83 below the knee (saturation) and as D**-3.2 beyond it (production)."""
     parameters = _make_parameters(
         samples=4096,
         spacing_m=3.0,
