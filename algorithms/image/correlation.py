@@ -1,4 +1,7 @@
-"""Normalised and pseudo-normalised correlation of a template with a window, and peaks of correlation surfaces."""
+"""Normalised and pseudo-normalised correlation of a template with a window, and peaks of correlation surfaces.
+
+The tracking paper is Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 The mast rotates in azimuth and elevation only. Newton's method determines both angles for which the target's pixel is
 at the image centre, with the calibrated camera models (including lens distortion) and the mast's geometry.
+
+Sections are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Point stereo: match of one point along the epipolar curve of the right image, and triangulation (section 4.4)."""
+"""Point stereo: match of one point along the epipolar curve of the right image, and triangulation (section 4.4).
+
+Sections are those of Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 

@@ -13,6 +13,8 @@ this bias, propagate the attitude to the images between the passes.
 The effects of a horizontal gyro bias on the outbound and the return legs cancel if the camera turns with the flight
 direction: the passes hardly observe this bias. A prior with the standard deviation of the IMU's class therefore limits
 the fitted bias.
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Simulate and process a run of the field test: flight, attitudes, altitudes and triples (paper, III.D and IV)."""
+"""Simulate and process a run of the field test: flight, attitudes, altitudes and triples (paper, III.D and IV).
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
+"""
 
 from __future__ import annotations
 

@@ -5,6 +5,8 @@ ground, and a connected region above a threshold is a candidate. The prior attit
 common displacement with the most pairs of candidates and targets determines which candidates are targets; a rotation
 fitted to the pairs rejects the others. The paper states that the centroids were extracted, not how: all parameters of
 the detection are assumed.
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Compute true states and on-board poses at the two images of a case; choose the pair from a helicopter flight."""
+"""Compute true states and on-board poses at the two images of a case; choose the pair from a helicopter flight.
+
+Section V is that of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,8 @@ A guide points the mast at each stop and estimates the target's position. `Track
 `DesignationGuide` uses the position designated at the start and odometry, for drives whose images are used by many
 trackers. Visual odometry and the navigator's map use rendered stereo pairs. Parameters with values `oracle-...` replace
 them by the truth with errors, which is faster and isolates causes.
+
+Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations
