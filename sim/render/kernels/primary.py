@@ -298,9 +298,9 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
     levels, ceilings, top_level, spacing, extent = ground
     fetched = no_cells()
     work, pixels = np.empty(ROWS * ROW), rays.directions.shape[0]
-    longs = np.empty((4, STRIP), dtype=np.int64)
-    level_of, refined = longs[2], longs[3]
-    strip = _Strip(work, longs[0], longs[1], np.zeros(STRIP, dtype=np.int32), level_of, refined)
+    index_buffers = np.empty((4, STRIP), dtype=np.int64)
+    level_of, refined = index_buffers[2], index_buffers[3]
+    strip = _Strip(work, index_buffers[0], index_buffers[1], np.zeros(STRIP, dtype=np.int32), level_of, refined)
     for first in range(0, pixels, STRIP):
         width = min(STRIP, pixels - first)
         vectors = slice(3 * first, 3 * (first + width))

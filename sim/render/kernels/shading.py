@@ -466,8 +466,10 @@ def shade(
     terrain = levels[occluders.shadow.level]
     fetched = no_cells()
     work = np.empty(ROWS * ROW)
-    longs = np.empty((4, STRIP), dtype=np.int64)
-    strip = _Strip(work, longs[0], longs[1], longs[2], longs[3], np.empty(STRIP, dtype=np.bool_))
+    index_buffers = np.empty((4, STRIP), dtype=np.int64)
+    strip = _Strip(
+        work, index_buffers[0], index_buffers[1], index_buffers[2], index_buffers[3], np.empty(STRIP, dtype=np.bool_)
+    )
     count = rays.directions.shape[0]
     for first in range(0, count, STRIP):
         last = min(first + STRIP, count)
