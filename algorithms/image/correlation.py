@@ -59,8 +59,8 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
 def peak_width(surface: Raster, peak: Peak, level: float = 0.75) -> float:
     """Full width of the peak at `level` times its height along its longest direction, in pixels.
 
-    The width is the major axis of the ellipse with the second moments of the connected region above that value. A sharp
-    peak of one pixel has 1.15, a ridge its length. Without a positive peak the surface's diagonal is returned.
+    The width is the major axis of the ellipse with the second moments of the connected region above that value. It is
+    1.15 for a peak of one pixel, and the length of a ridge. Without a positive peak the surface's diagonal is returned.
     """
     if peak.value <= 0.0:
         return float(np.hypot(*surface.shape))

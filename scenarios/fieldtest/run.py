@@ -253,8 +253,8 @@ def photograph_targets(
     p, key = run.key.field_test, run.key
     scene = build_start_scene(run, ground, p.helicopter.fly_over_m)
     objects = Objects.join([scene.objects, targets.panels(p.targets.albedo)])
-    # more rays at edges than for rocks, as a side of a target is 2 pixels; lines of the mesh at most a post apart, as
-    # coarser ground would hide some of the targets
+    # more rays at edges than for rocks, because a side of a target is 2 pixels; mesh lines at most one post apart,
+    # because coarser ground would hide some of the targets
     scene = replace(
         scene, objects=objects, edge_rays=_TARGET_EDGE_RAYS, mesh_finest_m=_MESH_POSTS * ground.surface.spacing_m
     )

@@ -173,8 +173,8 @@ def detect_targets(
         matched = np.flatnonzero(distances < limit_m)
         if len(matched) < _MIN_TARGETS:
             return none
-        seen = camera.rays(candidates[np.asarray(nearest)[matched]])[1]
-        attitude = Rotation.align_vectors(_normalize(offsets[matched]), _normalize(seen))[0]
+        measured_directions = camera.rays(candidates[np.asarray(nearest)[matched]])[1]
+        attitude = Rotation.align_vectors(_normalize(offsets[matched]), _normalize(measured_directions))[0]
         predicted, limit_m = camera.project(attitude.inv().apply(offsets))[0] / px_per_m, _FIT_M
     distances, nearest = tree.query(predicted)
     is_target = (distances < limit_m) & _is_inside(predicted * px_per_m, camera)

@@ -158,7 +158,7 @@ class TrackerGuide:
 
 @dataclass(frozen=True)
 class DesignationGuide:
-    """A designated position as guide, without tracking: odometry carries it along. Stores the views of all stops.
+    """Guide by a designated position without tracking: odometry propagates the position. Stores all views.
 
     `position_world` is the designated point in the estimated world frame, or None: the true point (an oracle). The
     subframes contain the visible rock and a margin: they stand for full images, of which only this part is rendered.

@@ -176,7 +176,7 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
 def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) -> None:
     """Test whether a triangle occludes the sun at each position; `hidden` is the output.
 
-    All positions are tested in one call, as passing the arrays takes longer than testing most positions.
+    All positions are tested in one call, because passing the arrays takes longer than testing most positions.
     """
     linear, axes, (grid, sides, starts, items), (outlines, shapes, first_items, listed, max_s) = casters
     to_axes = unpack_matrix(axes)
