@@ -102,8 +102,8 @@ def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Ra
     a = template - template.mean(dtype=np.float64)
     b = np.ascontiguousarray(window - window.mean(dtype=np.float64))
     cross = np.ascontiguousarray(cross_sums(a, b))
-    floor = kernels.FLAT_ENERGY * template.size * scale * scale
-    return np.asarray(kernels.pseudo_normalized(cross, b, template.shape, float(np.sum(a * a)), floor))
+    min_energy = kernels.FLAT_ENERGY * template.size * scale * scale
+    return np.asarray(kernels.pseudo_normalized(cross, b, template.shape, float(np.sum(a * a)), min_energy))
 
 
 #: Search radius around a candidate of the coarser level, pixels: one pixel for its error and one for sampling.
@@ -146,8 +146,8 @@ def coarse_to_fine_peak(template: Float[np.ndarray, "n m"], window: Raster, leve
     for level_template, level_window in reversed(pyramid[:-1]):
         a, max_abs = kernels.subtract_mean(np.ascontiguousarray(level_template, dtype=np.float32))
         b = np.ascontiguousarray(level_window, dtype=np.float32)
-        floor = _flat_energy(level_template, max_abs)
-        positions, values = kernels.search_near(a, b, 2 * positions, SEARCH_RADIUS_PX, floor)
+        min_energy = _flat_energy(level_template, max_abs)
+        positions, values = kernels.search_near(a, b, 2 * positions, SEARCH_RADIUS_PX, min_energy)
     best = int(np.argmax(values))
     row, column = (int(i) for i in positions[best])
     last_corner = (window.shape[0] - template.shape[0], window.shape[1] - template.shape[1])

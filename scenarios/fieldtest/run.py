@@ -233,8 +233,8 @@ def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gp
             )
     first, second = sightings
     earth = EarthRotation.at_latitude(run.parameters.latitude_deg)
-    unit = Imu.draw(p.imu, flight.span_s, generator("imu errors"))
-    increments = unit.increments(InertialTrajectory(flight, earth), *flight.span_s, generator("imu noise"))
+    imu = Imu.draw(p.imu, flight.span_s, generator("imu errors"))
+    increments = imu.increments(InertialTrajectory(flight, earth), *flight.span_s, generator("imu noise"))
     increments = add_thermal_drift(increments, p.drift, flight, flight.span_s[0])
     # the larger of a centroid's error and the remaining GPS error, as angles
     pixel_rad = 1.0 / camera.focal_lengths[0]
