@@ -156,8 +156,8 @@ class Verdict:
     @property
     def margin(self) -> float:
         """Lower bound (or rate, if the observed rate decides) minus the required rate; NaN without bounds."""
-        decisive = self.estimate if self.decide_by == ESTIMATE else self.lower
-        return decisive - self.probability
+        decisive_rate = self.estimate if self.decide_by == ESTIMATE else self.lower
+        return decisive_rate - self.probability
 
     @property
     def note(self) -> str:

@@ -146,7 +146,7 @@ class TerrainMap:
         matrices = np.stack([count, sx, sy, sx, sxx, sxy, sy, sxy, syy], axis=-1).reshape(*z.shape, 3, 3)[is_known]
         sides = np.stack([sz, sxz, syz], axis=-1)[is_known]
         planes = np.linalg.solve(matrices, sides[..., None])[..., 0]
-        squares = szz[is_known] - np.sum(planes * sides, axis=-1)
+        squared_residuals = szz[is_known] - np.sum(planes * sides, axis=-1)
         centre = np.full(z.shape, np.nan)
         centre[is_known] = planes[:, 0] + reference
         hazard = is_known & mapped
@@ -155,7 +155,7 @@ class TerrainMap:
             hazard &= step > limits.climb_m
         distance = cv2.distanceTransform((~hazard).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
         tilt = np.arctan(np.hypot(planes[:, 1], planes[:, 2]))
-        roughness = np.sqrt(np.maximum(squares, 0.0) / count[is_known])
+        roughness = np.sqrt(np.maximum(squared_residuals, 0.0) / count[is_known])
         # largest step of any cell in the disc
         steps = np.where(is_known & mapped, np.nan_to_num(step), 0.0)
         worst = cv2.dilate(steps, (disc > 0.0).astype(np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)

@@ -197,8 +197,8 @@ def _adjust(
         # a small rotation w moves a point q by w x q
         axes = apply(x).rotation.as_matrix()
         crosses = np.cross(np.eye(3)[None], second[:, None])
-        turned = (axes @ crosses.transpose(0, 2, 1)).astype(np.float64)
-        columns = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2)
+        rotation_jacobian = (axes @ crosses.transpose(0, 2, 1)).astype(np.float64)
+        columns = np.concatenate([rotation_jacobian, np.broadcast_to(np.eye(3), rotation_jacobian.shape)], axis=2)
         return np.asarray(-(weights @ columns).reshape(-1, 6))
 
     solution = least_squares(compute_residuals, np.zeros(6), jac=compute_jacobian, loss="huber")

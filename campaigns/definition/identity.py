@@ -126,15 +126,15 @@ def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     selected = find_scenario(configuration.scenario)
     if not isinstance(selected, HasParts):
         return ()
-    trees = [configuration.parameters]
+    parameter_trees = [configuration.parameters]
     for path, dispersion in configuration.dispersions.items():
         if any(f"{key}.".startswith(f"{path}.") for key in selected.part_keys):
             for tree in dispersion.extremes():
                 for name in reversed(path.split(".")):
                     tree = {name: tree}
-                trees.append(tree)
+                parameter_trees.append(tree)
     paths: dict[str, None] = {}
-    for tree in trees:
+    for tree in parameter_trees:
         for key, kind in selected.part_keys.items():
             value = find_value(tree, key)
             specs = [value] if isinstance(value, str) else [str(item) for item in value or ()]

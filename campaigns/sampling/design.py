@@ -140,11 +140,11 @@ def build_stratified_design(
     points = np.clip(points, MIN_DRAW, MAX_DRAW)
     for members, factor in groups:
         values = points[:, list(members)]
-        mixed = correlate_uniform(values, np.array(factor))
+        correlated = correlate_uniform(values, np.array(factor))
         if kind == "latin-hypercube":
-            ranks = np.argsort(np.argsort(mixed, axis=0, kind="stable"), axis=0, kind="stable")
-            mixed = np.take_along_axis(np.sort(values, axis=0), ranks, axis=0)
-        points[:, list(members)] = mixed
+            ranks = np.argsort(np.argsort(correlated, axis=0, kind="stable"), axis=0, kind="stable")
+            correlated = np.take_along_axis(np.sort(values, axis=0), ranks, axis=0)
+        points[:, list(members)] = correlated
     points.flags.writeable = False
     return points
 

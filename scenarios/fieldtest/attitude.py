@@ -117,8 +117,8 @@ def solve_attitude(
     world = earth.to_inertial(times).apply(np.concatenate([first.world, second.world]))
     bias = np.zeros(3)
     # attitude at the start of the flight
-    sighted = _propagate(increments, bias).attitude(first.times_s).apply(first.camera)
-    start, _ = Rotation.align_vectors(world[: len(sighted)], sighted)
+    measured_directions = _propagate(increments, bias).attitude(first.times_s).apply(first.camera)
+    start, _ = Rotation.align_vectors(world[: len(measured_directions)], measured_directions)
     for _ in range(_ITERATIONS):
         propagated = _propagate(increments, bias)
         predicted = (start * propagated.attitude(times)).apply(camera)

@@ -216,8 +216,10 @@ def _centroids(
 
 def _vote(tree: cKDTree, predicted_m: Float64[np.ndarray, "targets 2"], radius_m: float) -> Float64[np.ndarray, "2"]:
     """Find the displacement of the predicted targets that brings most of them to a candidate."""
-    near = tree.query_ball_point(predicted_m, radius_m)
-    displacements = np.concatenate([tree.data[found] - point for found, point in zip(near, predicted_m, strict=True)])
+    neighbours = tree.query_ball_point(predicted_m, radius_m)
+    displacements = np.concatenate(
+        [tree.data[found] - point for found, point in zip(neighbours, predicted_m, strict=True)]
+    )
     if len(displacements) == 0:
         return np.zeros(2)
     distances, _ = tree.query(predicted_m + displacements[:, None])

@@ -406,13 +406,13 @@ def photometric_angles(sun: tuple[float, float, float], width: int, work: Array)
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def reflect(law: tuple[float, float, float, float, float, float], width: int, work: Array, radiance: Array32) -> None:
     """Compute the radiance factor under sun and sky: Lunar-Lambert law with an opposition surge."""
-    lunar, amplitude, surge_width, normalisation, sky_fraction, bounced = law
+    lunar, amplitude, surge_width, normalisation, sky_fraction, ground_light = law
     for k in range(min(width, STRIP)):
         nz, cos_i, cos_g = work[NZ + k], work[COS_I + k], work[COS_G + k]
         tan_half = math.sqrt(max(1.0 - cos_g, 0.0) / max(1.0 + cos_g, 1e-9))
         surge = 1.0 + amplitude / (1.0 + tan_half / surge_width)
         brightness = normalisation * surge * (2.0 * lunar * cos_i / (cos_i + work[COS_E + k]) + (1.0 - lunar) * cos_i)
-        value = sky_fraction * 0.5 * (1.0 + nz) + bounced * 0.5 * (1.0 - nz)
+        value = sky_fraction * 0.5 * (1.0 + nz) + ground_light * 0.5 * (1.0 - nz)
         value += work[LIT + k] * brightness if cos_i > 0.0 else 0.0
         radiance[k] = work[ALBEDO + k] * value
 

@@ -108,9 +108,9 @@ class SurfaceUnits(Parameters):
         start = rng.uniform(0.0, period, (count, 2))
         depth = -self.track_tone * rng.uniform(0.3, 1.0, count)
         discs = draw_channels(start, heading, length, width, depth, 0.12, rng)
-        darker = np.zeros_like(tone)
-        cut_channels(darker, spacing, discs, 2.0)
-        tone -= darker
+        track_depth = np.zeros_like(tone)
+        cut_channels(track_depth, spacing, discs, 2.0)
+        tone -= track_depth
 
     def _add_streaks(
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator
