@@ -1,1 +1,1 @@
-"""Algorithms under test: estimators that see measurements only (of `sim`: frames, camera, measurements)."""
+"""Algorithms under test: their input is measurements only; from `sim` they import frames, camera and measurements."""

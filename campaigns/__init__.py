@@ -1,1 +1,1 @@
-"""Sampling, execution, storage and replay of campaigns: knows cases and rows, not what they are about."""
+"""Sampling, execution, storage and replay of campaigns; independent of the content of cases and rows."""

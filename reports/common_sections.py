@@ -54,7 +54,7 @@ from marsyard.reports.wording import (
     split_unit,
 )
 
-#: Column of true and false: whether the geometry allows a feasible overlap for the algorithm.
+#: Boolean column: whether the geometry allows a feasible overlap for the algorithm.
 FEASIBLE_OVERLAP = "feasible_overlap"
 
 

@@ -206,9 +206,9 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
     top = 1.12 * edge
     groups = categories(frame, metric, bound)
     for group in groups:
-        inside, beyond = (group.mask & finite & on_scale for on_scale in (magnitude <= edge, magnitude > edge))
-        _draw_points(axes, x[inside], magnitude[inside], group)
-        _draw_points(axes, x[beyond], np.full(beyond.sum(), 1.06 * edge), group, hollow=True)
+        on_axis, beyond_axis = (group.mask & finite & on_scale for on_scale in (magnitude <= edge, magnitude > edge))
+        _draw_points(axes, x[on_axis], magnitude[on_axis], group)
+        _draw_points(axes, x[beyond_axis], np.full(beyond_axis.sum(), 1.06 * edge), group, hollow=True)
     if len(groups) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
         # otherwise the scatter figure has the legend
         axes.legend(bbox_to_anchor=(0.5, -0.18), **_LEGEND_BELOW)
@@ -282,11 +282,11 @@ def _finite_magnitudes(
 def _draw_points(
     axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], category: Category, *, hollow: bool = False
 ) -> None:
-    many = x.size > section.LARGEST_VECTOR_SAMPLE
+    dense = x.size > section.LARGEST_VECTOR_SAMPLE
     axes.plot(
-        x, y, linestyle="", marker=category.marker, markersize=3.0 if many else 5.5, alpha=0.55 if many else 0.85,
+        x, y, linestyle="", marker=category.marker, markersize=3.0 if dense else 5.5, alpha=0.55 if dense else 0.85,
         markeredgewidth=1.0 if hollow else 0.0, markerfacecolor="none" if hollow else category.colour,
-        color=category.colour, label="_beyond" if hollow else category.name, rasterized=many, zorder=2,
+        color=category.colour, label="_beyond" if hollow else category.name, rasterized=dense, zorder=2,
     )  # fmt: skip
 
 

@@ -42,18 +42,18 @@ def population_and_unknown_masks(
     frame: pd.DataFrame, parts: Sequence[str]
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Create the masks of the intersection of populations, and of its cases with a missing flag."""
-    member, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
-    for part in parts:
-        if part == "completed":
-            member &= ~engine_failed(frame)
-        elif part != "all":
-            column = "answered" if part == "valid" else part
+    is_member, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
+    for population in parts:
+        if population == "completed":
+            is_member &= ~engine_failed(frame)
+        elif population != "all":
+            column = "answered" if population == "valid" else population
             if not is_flag(frame, column):
                 raise ValueError(f"the rows have no column '{column}' of true and false, which defines a population")
             missing = frame[column].isna().to_numpy(dtype=np.bool_)
-            member &= flag_mask(frame, column) | missing
+            is_member &= flag_mask(frame, column) | missing
             unknown |= missing
-    return member, member & unknown
+    return is_member, is_member & unknown
 
 
 def is_flag(frame: pd.DataFrame, column: str) -> bool:

@@ -157,8 +157,8 @@ class Verdict:
     @property
     def margin(self) -> float:
         """Lower bound (or rate, if the observed rate decides) minus the required rate; NaN without bounds."""
-        decisive = self.estimate if self.decide_by == ESTIMATE else self.lower
-        return decisive - self.probability
+        decisive_rate = self.estimate if self.decide_by == ESTIMATE else self.lower
+        return decisive_rate - self.probability
 
     @property
     def note(self) -> str:
@@ -248,7 +248,7 @@ def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks:
     by_level = [clustered_evidence(success, groups, level) for level in levels]
     evidence = replace(by_level[0], upper=by_level[1].upper)
     if evidence.method is ClusterMethod.TERRAIN_COUNT:
-        # the tolerance prevents that a rounding error increases an integer by 1
+        # the tolerance prevents a rounding error from increasing an integer by 1
         size, weight = evidence.terrains, 1.0
         failed = math.ceil(evidence.terrains - evidence.effective_successes - 1e-9)
     else:
@@ -290,7 +290,7 @@ def evaluate_requirements(
     """Evaluate each requirement on all rows of a campaign; missing columns or numbers result in INSUFFICIENT.
 
     - sampling: the sampling design; without independent random samples, verdicts have no bounds
-    - from_truth: columns that the flight system cannot know; statements about populations with them say so
+    - from_truth: columns that the flight system cannot know; mentioned in the statement of a requirement
     - configured: columns, or patterns of names, that the configuration of a case determines; they remain conditions
       over all cases
     """
@@ -311,14 +311,18 @@ def _evaluate_all_cases(
 ) -> AllCases | None:
     """Evaluate a requirement on all cases with its configuration; None if that is its population, or has no case."""
     population = str(requirement.get("population", "all"))
-    kept = tuple(name for name in population.split(" and ") if any(fnmatchcase(name, flag) for flag in configured))
-    everything = " and ".join(kept) or "all"
-    if population == everything:
+    remaining_conditions = tuple(
+        name for name in population.split(" and ") if any(fnmatchcase(name, flag) for flag in configured)
+    )
+    wider_population = " and ".join(remaining_conditions) or "all"
+    if population == wider_population:
         return None
-    result = _evaluate(frame, {**requirement, "population": everything}, sampling)
+    result = _evaluate(frame, {**requirement, "population": wider_population}, sampling)
     if not result.n:
         return None
-    return AllCases(result.status, result.n, result.failures, result.estimate, result.lower, result.upper, kept)
+    return AllCases(
+        result.status, result.n, result.failures, result.estimate, result.lower, result.upper, remaining_conditions
+    )
 
 
 def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign) -> Verdict:

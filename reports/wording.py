@@ -20,7 +20,7 @@ NOTHING = "–"
 #: Magnitudes below this value are rounding errors in all units of the rows (metres, degrees, pixels).
 _ROUNDING = 1e-9
 
-#: Built-in populations in words; other populations are columns of true and false.
+#: Built-in populations in words; other populations are boolean columns.
 _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "valid answers"}
 
 

@@ -81,7 +81,7 @@ def add_unresolved_rocks(
     smaller = np.searchsorted(rocks.diameter_m[order], smallest_rad * np.where(frame.body == -1, frame.range_m, 0.0))
     up = frame.rays.directions.reshape(*frame.range_m.shape, 3) @ frame.world_from_body.rotation.as_matrix()[2]
     tangent = np.maximum(-up, 1e-4) / np.sqrt(np.maximum(1.0 - up**2, 1e-8))
-    hidden = -np.expm1(-area_below[smaller] / np.hypot(tangent, rms_slope)).astype(np.float32)
+    occluded_fraction = -np.expm1(-area_below[smaller] / np.hypot(tangent, rms_slope)).astype(np.float32)
     rock = frame.radiance[is_rock].mean()
-    blended = frame.radiance + hidden * (rock - frame.radiance)
+    blended = frame.radiance + occluded_fraction * (rock - frame.radiance)
     return replace(frame, radiance=np.where(frame.body == -1, blended, frame.radiance))

@@ -19,13 +19,13 @@ Horizontal = Float64[np.ndarray, "2"]
 #: Time tags of the start and end of the interval of a mean velocity; equal for an instantaneous velocity.
 Span = tuple[float, float]
 #: Indices of three images.
-Triple = tuple[int, int, int]
+ImageTriple = tuple[int, int, int]
 
-_FIRST_TRIPLE: Triple = (0, 1, 2)
+_FIRST_TRIPLE: ImageTriple = (0, 1, 2)
 
 
 def run_estimator(
-    make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: Triple | None = _FIRST_TRIPLE
+    make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: ImageTriple | None = _FIRST_TRIPLE
 ) -> AlgorithmRun[VelocityEstimate]:
     """Run an estimator on a descent; the answer contains its span.
 

@@ -195,14 +195,14 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
     vertex_offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     body_offsets = np.cumsum([0] + [int(mesh.body_of_face.max(initial=-1)) + 1 for mesh in meshes])
     offsets = vertex_offsets.astype(np.int32), body_offsets.astype(np.int32)
-    pieces = list(zip(meshes, masks, *offsets, strict=False))
+    mesh_parts = list(zip(meshes, masks, *offsets, strict=False))
     return Objects.of_mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.vertex_normals for mesh in meshes]),
-        np.concatenate([mesh.faces[mask] + offset for mesh, mask, offset, _ in pieces]),
-        np.concatenate([mesh.rock_of_face[mask] for mesh, mask, _, _ in pieces]),
+        np.concatenate([mesh.faces[mask] + offset for mesh, mask, offset, _ in mesh_parts]),
+        np.concatenate([mesh.rock_of_face[mask] for mesh, mask, _, _ in mesh_parts]),
         np.minimum(ground.site.photometry.rock_albedo * field.albedo, 1.0),
-        np.concatenate([mesh.body_of_face[mask] + offset for mesh, mask, _, offset in pieces]),
+        np.concatenate([mesh.body_of_face[mask] + offset for mesh, mask, _, offset in mesh_parts]),
     )
 
 

@@ -1,4 +1,4 @@
-"""The simulated world and its instruments. Truth lives here and nowhere else."""
+"""The simulated world with its ground truth, and its instruments."""
 
 from marsyard.sim.kernel_cache import set_cache_folder
 

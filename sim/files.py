@@ -26,8 +26,8 @@ ArrayHeader = tuple[tuple[int, ...], np.dtype[Any]]  #: Shape and type of an arr
 def check_regular(path: str | Path) -> os.stat_result:
     """Return the status of a regular file or of the target of a link.
 
-    Raises OSError if the file is missing, a folder, a named pipe or a device: opening a pipe can block for ever, and a
-    device can contain infinitely many bytes.
+    Raises OSError if the file is missing, a folder, a named pipe or a device: opening a pipe can block forever, and a
+    device can return infinitely many bytes.
     """
     status = Path(path).stat()
     if stat.S_ISDIR(status.st_mode):

@@ -64,11 +64,15 @@ class HomographyEstimator:
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:
-        opts, points = self.options, match_features(patches, self.options)
+        options, points = self.options, match_features(patches, self.options)
         if points is None:
             return None
         homography, inliers = cv2.findHomography(
-            *points, cv2.USAC_MAGSAC, opts.reprojection_px, maxIters=opts.iterations, confidence=opts.confidence
+            *points,
+            cv2.USAC_MAGSAC,
+            options.reprojection_px,
+            maxIters=options.iterations,
+            confidence=options.confidence,
         )
         if homography is None or not inliers.any():
             return None
@@ -81,7 +85,7 @@ class HomographyEstimator:
         mapped_point = homogeneous[:2] / depth
         count = int(inlier.sum())
         distortion = max_length_change(homography, depth, mapped_point)
-        valid = count >= opts.min_inliers and distortion <= opts.max_distortion
+        valid = count >= options.min_inliers and distortion <= options.max_distortion
         return PairMatch(np.asarray(mapped_point - centroid), float(count), valid)
 
 

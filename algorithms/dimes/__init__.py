@@ -1,4 +1,4 @@
-"""DIMES: horizontal velocity from three descent images (Johnson, Willson, Goguen, Alexander & Meller, section II)."""
+"""DIMES: horizontal velocity from three descent images ("Field Testing of the MER DIMES", section II)."""
 
 from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track, dimes_products
 from marsyard.algorithms.dimes.estimator import DimesEstimator

@@ -234,7 +234,7 @@ def homography_lattice(
 ) -> tuple[Float[np.ndarray, "side side 2"], Bool[np.ndarray, "side side"]]:
     """Map a lattice of ground points to pixels by the homography of its corners, which are projected exactly.
 
-    Returns pixels and flags of visibility as `pixels_from_ground` does; all are invisible if a corner is.
+    Returns pixels and visibility like `pixels_from_ground`; if one corner is invisible, all points are.
     """
     corners, visible = pixels_from_ground(view, lattice[[0, 0, -1, -1], [0, -1, 0, -1]])
     flags = np.full(lattice.shape[:2], bool(visible.all()))
@@ -254,8 +254,8 @@ def rectify_patch(
     """Rectify and correct a patch of `side_px` pixels around the ground point `centre` (east, north), counts.
 
     Each pixel is projected with the full camera model, or mapped by the homography of the patch's corners.
-    Points outside the image get the value at its border. Points that the optics cannot image get the value of its upper
-    left pixel. Template candidates have neither.
+    Points outside the image have the value at its border. Points that the optics cannot image have the value of its
+    upper left pixel. Template candidates contain no such points.
     """
     lattice = ground_lattice(centre, side_px, gsd_m)
     pixels, visible = pixels_from_ground(view, lattice) if full_camera else homography_lattice(view, lattice)

@@ -1,4 +1,7 @@
-"""Template candidates in the overlap region of two views, and their selection (section II.A)."""
+"""Template candidates in the overlap region of two views, and their selection (section II.A).
+
+Sections are those of Johnson et al., "Field Testing of the MER DIMES".
+"""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ def end_idle_programs() -> None:
 class Session:
     """Requests of one algorithm to a program, one JSON line each; the first request starts the program.
 
-    The session's `folder` holds the input files and is removed with it.
+    The session's `folder` contains the input files and is removed with the session.
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:

@@ -1,4 +1,4 @@
-"""Hazard detection and avoidance from one moving camera (Johnson, Montgomery & Matthies, sections II and III)."""
+"""Hazard detection and avoidance from one moving camera (Johnson, Montgomery & Matthies, "Vision Guided Landing")."""
 
 from marsyard.algorithms.hda.details import STAGES, Ground, HdaDetails, hda_products
 from marsyard.algorithms.hda.estimator import HdaEstimator

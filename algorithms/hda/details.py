@@ -1,4 +1,7 @@
-"""Intermediate products of hazard detection (paper: Figs. 1-5 and 7), and their conversion to plain arrays."""
+"""Intermediate products of hazard detection (paper: Figs. 1-5 and 7), and their conversion to plain arrays.
+
+Figures and Table I are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@
 The surface frame is level, with its origin at the first camera: z is up, x is the horizontal direction of increasing
 image columns, y is the cross product of z and x. The options select the source of the vertical. The azimuth of the
 frame in the world comes from the on-board pose.
+
+Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
 from __future__ import annotations

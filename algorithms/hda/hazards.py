@@ -1,4 +1,7 @@
-"""Elevation map (section II.D), hazard maps, safe landing map and selection of the landing site (section III)."""
+"""Elevation map (section II.D), hazard maps, safe landing map and selection of the landing site (section III).
+
+Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Structure from motion: camera motion and feature depths from tracks (section II.B); corrected images and cameras."""
+"""Structure from motion: camera motion and feature depths from tracks (section II.B); corrected images and cameras.
+
+Sections and equations are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Dense structure (points of the ground) by matches along epipolar segments (section II.C), and its scale."""
+"""Dense structure (points of the ground) by matches along epipolar segments (section II.C), and its scale.
+
+Sections and equations are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

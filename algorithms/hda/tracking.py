@@ -1,4 +1,7 @@
-"""Feature selection, and tracking by correlation over an image pyramid (section II.A)."""
+"""Feature selection, and tracking by correlation over an image pyramid (section II.A).
+
+Sections and equations are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Normalised and pseudo-normalised correlation of a template with a window, and peaks of correlation surfaces."""
+"""Normalised and pseudo-normalised correlation of a template with a window, and peaks of correlation surfaces.
+
+The tracking paper is Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 
@@ -56,8 +59,8 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
 def peak_width(surface: Raster, peak: Peak, level: float = 0.75) -> float:
     """Full width of the peak at `level` times its height along its longest direction, in pixels.
 
-    The width is the major axis of the ellipse with the second moments of the connected region above that value. A sharp
-    peak of one pixel has 1.15, a ridge its length. Without a positive peak the surface's diagonal is returned.
+    The width is the major axis of the ellipse with the second moments of the connected region above that value. It is
+    1.15 for a peak of one pixel, and the length of a ridge. Without a positive peak the surface's diagonal is returned.
     """
     if peak.value <= 0.0:
         return float(np.hypot(*surface.shape))
@@ -99,8 +102,8 @@ def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Ra
     a = template - template.mean(dtype=np.float64)
     b = np.ascontiguousarray(window - window.mean(dtype=np.float64))
     cross = np.ascontiguousarray(cross_sums(a, b))
-    floor = kernels.FLAT_ENERGY * template.size * scale * scale
-    return np.asarray(kernels.pseudo_normalized(cross, b, template.shape, float(np.sum(a * a)), floor))
+    min_energy = kernels.FLAT_ENERGY * template.size * scale * scale
+    return np.asarray(kernels.pseudo_normalized(cross, b, template.shape, float(np.sum(a * a)), min_energy))
 
 
 #: Search radius around a candidate of the coarser level, pixels: one pixel for its error and one for sampling.
@@ -143,8 +146,8 @@ def coarse_to_fine_peak(template: Float[np.ndarray, "n m"], window: Raster, leve
     for level_template, level_window in reversed(pyramid[:-1]):
         a, max_abs = kernels.subtract_mean(np.ascontiguousarray(level_template, dtype=np.float32))
         b = np.ascontiguousarray(level_window, dtype=np.float32)
-        floor = _flat_energy(level_template, max_abs)
-        positions, values = kernels.search_near(a, b, 2 * positions, SEARCH_RADIUS_PX, floor)
+        min_energy = _flat_energy(level_template, max_abs)
+        positions, values = kernels.search_near(a, b, 2 * positions, SEARCH_RADIUS_PX, min_energy)
     best = int(np.argmax(values))
     row, column = (int(i) for i in positions[best])
     last_corner = (window.shape[0] - template.shape[0], window.shape[1] - template.shape[1])

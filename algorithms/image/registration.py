@@ -38,7 +38,7 @@ def spline_coefficients(image: Raster) -> Raster:
 
 
 def shifted_patch(coefficients: Raster, corner: Vector2, shape: tuple[int, int]) -> Float[np.ndarray, "3 n m"]:
-    """Sample a patch with its upper left pixel at `corner` (row, column), and its derivatives by row and column.
+    """Sample a patch with its upper left pixel at `corner` (row, column), and its gradient (row, column).
 
     All pixels have the same fractional shift, so that the spline is a separable filter with six taps. The patch must
     have a distance of at least three pixels from the border of `coefficients`.

@@ -1,4 +1,4 @@
-"""Local path planner similar to Autonav (GESTALT): arcs to a goal over ground that is mapped and good.
+"""Local path planner similar to Autonav (GESTALT): arcs to a goal over mapped, traversable ground.
 
 The planner drives the simulated rover while a target tracker is tested (tracking paper, sections 6 and 7; GESTALT:
 Maimone, Leger & Biesiadecki 2007). It is not under test. It uses estimated poses and the terrain map of stereo images
@@ -216,6 +216,6 @@ def _is_clear(positions_m: Float[np.ndarray, "n 2"], goodness: Goodness, options
     clearance = options.half_width_m + options.margin_m
     if np.any(distances < min(clearance, float(distances[0]))):
         return False
-    # tilt and roughness: bad ground may only be left, not entered
+    # tilt and roughness: the path may leave bad ground, but not enter it
     is_bad = (values <= 0.0) & (distances >= clearance)
     return not np.any(is_bad[1:] & ~is_bad[:-1])

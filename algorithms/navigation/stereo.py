@@ -1,7 +1,7 @@
 """Stereo images of the rover's navigation: rectification, dense matching, and matching of single features.
 
-Both cameras are calibrated and in the rover frame, so that images of a panned mast and of body-mounted cameras are
-treated alike. Both images are resampled to parallel pinhole cameras; a point then has the same row in both, and its
+Both cameras are calibrated and in the rover frame: images of a panned mast and of body-mounted cameras are processed
+in the same way. Both images are resampled to parallel pinhole cameras; a point then has the same row in both, and its
 depth is focal length times baseline divided by disparity.
 """
 

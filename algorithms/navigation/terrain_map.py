@@ -92,8 +92,8 @@ class TerrainMap:
         order = np.lexsort((heights, cells))
         cells, heights = cells[order], heights[order]
         numbers, first, counts = np.unique(cells, return_index=True, return_counts=True)
-        enough = counts >= _MIN_POINTS
-        numbers, first, counts = numbers[enough], first[enough], counts[enough]
+        has_enough_points = counts >= _MIN_POINTS
+        numbers, first, counts = numbers[has_enough_points], first[has_enough_points], counts[has_enough_points]
         low, middle, high = (first + np.rint(q * (counts - 1)).astype(int) for q in (_QUANTILES[0], 0.5, _QUANTILES[1]))
         values = heights[low], heights[middle], heights[high]
         layers = [self.lower_m.copy(), self.median_m.copy(), self.upper_m.copy()]
@@ -104,7 +104,7 @@ class TerrainMap:
     def add_plane(
         self, centre_m: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], radius_m: float
     ) -> TerrainMap:
-        """Return the map with a plane disc: the ground under the rover, which operators know, where it is unmapped."""
+        """Return the map with a plane in the unmapped cells of a disc: ground under the rover, known to operators."""
         axis = self.corner_m[:, None] + CELL_M * np.arange(len(self.median_m))
         east, north = np.meshgrid(axis[0] - centre_m[0], axis[1] - centre_m[1])
         heights = centre_m[2] - (normal[0] * east + normal[1] * north) / normal[2]
@@ -113,7 +113,7 @@ class TerrainMap:
         return TerrainMap(self.corner_m, *layers)
 
     def without_hazards(self, centre_m: Vector2, radius_m: float) -> TerrainMap:
-        """Return the map in which no cell of a disc is too high or too low: the ground around the target's rock."""
+        """Return the map with level ground in a disc, so that the target's rock is not a hazard."""
         axis = self.corner_m[:, None] + CELL_M * np.arange(len(self.median_m))
         east, north = np.meshgrid(axis[0] - centre_m[0], axis[1] - centre_m[1])
         inside = np.hypot(east, north) <= radius_m
@@ -146,7 +146,7 @@ class TerrainMap:
         matrices = np.stack([count, sx, sy, sx, sxx, sxy, sy, sxy, syy], axis=-1).reshape(*z.shape, 3, 3)[is_known]
         sides = np.stack([sz, sxz, syz], axis=-1)[is_known]
         planes = np.linalg.solve(matrices, sides[..., None])[..., 0]
-        squares = szz[is_known] - np.sum(planes * sides, axis=-1)
+        squared_residuals = szz[is_known] - np.sum(planes * sides, axis=-1)
         centre = np.full(z.shape, np.nan)
         centre[is_known] = planes[:, 0] + reference
         hazard = is_known & mapped
@@ -155,7 +155,7 @@ class TerrainMap:
             hazard &= step > limits.climb_m
         distance = cv2.distanceTransform((~hazard).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
         tilt = np.arctan(np.hypot(planes[:, 1], planes[:, 2]))
-        roughness = np.sqrt(np.maximum(squares, 0.0) / count[is_known])
+        roughness = np.sqrt(np.maximum(squared_residuals, 0.0) / count[is_known])
         # largest step of any cell in the disc
         steps = np.where(is_known & mapped, np.nan_to_num(step), 0.0)
         worst = cv2.dilate(steps, (disc > 0.0).astype(np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)

@@ -97,27 +97,27 @@ def estimate_motion(
     `predicted` is the pose of the second rover frame in the first, from wheel odometry and gyros.
     """
     o = VisualOdometryOptions() if options is None else options
-    before, after = RectifiedPair.of(first), RectifiedPair.of(second)
-    pixels = _detect_features(before, o)
-    disparities, valid = before.feature_disparities(pixels, o.min_range_m)
+    first_pair, second_pair = RectifiedPair.of(first), RectifiedPair.of(second)
+    pixels = _detect_features(first_pair, o)
+    disparities, valid = first_pair.feature_disparities(pixels, o.min_range_m)
     pixels, disparities = pixels[valid], disparities[valid]
-    points = before.triangulate(pixels, disparities)
-    expected, visible = after.camera.project(np.asarray(predicted.inv().apply(points.copy())).reshape(-1, 3))
-    inside = visible & after.camera.in_frame(expected)
+    points = first_pair.triangulate(pixels, disparities)
+    expected, visible = second_pair.camera.project(np.asarray(predicted.inv().apply(points.copy())).reshape(-1, 3))
+    inside = visible & second_pair.camera.in_frame(expected)
     pixels, disparities, points, expected = (values[inside] for values in (pixels, disparities, points, expected))
-    tracked, valid = track_features(before.left, after.left, pixels, expected)
-    second_disparities, matched = after.feature_disparities(tracked, o.min_range_m)
+    tracked, valid = track_features(first_pair.left, second_pair.left, pixels, expected)
+    second_disparities, matched = second_pair.feature_disparities(tracked, o.min_range_m)
     valid &= matched
     count = int(np.count_nonzero(valid))
     if count < o.min_features:
         return VisualOdometry(VisualOdometryOutcome.TOO_FEW_FEATURES, None, count, 0, float("nan"))
     pixels, disparities, points = pixels[valid], disparities[valid], points[valid]
     tracked, second_disparities = tracked[valid], second_disparities[valid]
-    second_points = after.triangulate(tracked, second_disparities)
-    inliers = _find_inliers(after, points, tracked, predicted, o)
+    second_points = second_pair.triangulate(tracked, second_disparities)
+    inliers = _find_inliers(second_pair, points, tracked, predicted, o)
     covariances = (
-        before.covariances(pixels, disparities, o.match_error_px),
-        after.covariances(tracked, second_disparities, o.match_error_px),
+        first_pair.covariances(pixels, disparities, o.match_error_px),
+        second_pair.covariances(tracked, second_disparities, o.match_error_px),
     )
     motion, sigma_m = predicted, float("nan")
     for _ in range(_ADJUSTMENTS):
@@ -197,8 +197,8 @@ def _adjust(
         # a small rotation w moves a point q by w x q
         axes = apply(x).rotation.as_matrix()
         crosses = np.cross(np.eye(3)[None], second[:, None])
-        turned = (axes @ crosses.transpose(0, 2, 1)).astype(np.float64)
-        columns = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2)
+        rotation_jacobian = (axes @ crosses.transpose(0, 2, 1)).astype(np.float64)
+        columns = np.concatenate([rotation_jacobian, np.broadcast_to(np.eye(3), rotation_jacobian.shape)], axis=2)
         return np.asarray(-(weights @ columns).reshape(-1, 6))
 
     solution = least_squares(compute_residuals, np.zeros(6), jac=compute_jacobian, loss="huber")

@@ -2,6 +2,8 @@
 
 Errors are in metres, and in centimetres in the rows of Table I. They are 3-sigma values if the disparity error is a
 3-sigma value (paper: 1 pixel).
+
+Sections, equations and tables are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Baseline target tracker: `VisualTargetTracker` with OpenCV's pyramidal Lucas-Kanade method as matcher."""
+"""Baseline target tracker: `VisualTargetTracker` with OpenCV's pyramidal Lucas-Kanade method as matcher.
+
+Eq. 11 is that of Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Target tracker: prediction of position, magnification and roll (sections 4.1, 4.3.1); matching (4.3.2, 4.3.3)."""
+"""Target tracker: prediction of position, magnification and roll (sections 4.1, 4.3.1); matching (4.3.2, 4.3.3).
+
+Sections and equations are those of Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 

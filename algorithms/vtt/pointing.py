@@ -2,6 +2,8 @@
 
 The mast rotates in azimuth and elevation only. Newton's method determines both angles for which the target's pixel is
 at the image centre, with the calibrated camera models (including lens distortion) and the mast's geometry.
+
+Sections are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ def mast_angles(position_rover: Vector3, mast: MastCalibration, use_both: bool =
 def _compute_offset(
     position_rover: Vector3, mast: MastGeometry, cameras: tuple[CameraModel, ...], angles: Vector2
 ) -> tuple[Vector2, Float[np.ndarray, "2 2"]]:
-    """Compute the mean offset of the point's pixels from the image centres, and its Jacobian by azimuth and elevation.
+    """Compute the mean offset of the point's pixels from the image centres, and its Jacobian (azimuth, elevation).
 
     If the head rotates about an axis w through a, a point p fixed to the rover moves by -w x (p - a) in the head frame.
     """

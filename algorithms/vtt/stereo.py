@@ -1,4 +1,7 @@
-"""Point stereo: match of one point along the epipolar curve of the right image, and triangulation (section 4.4)."""
+"""Point stereo: match of one point along the epipolar curve of the right image, and triangulation (section 4.4).
+
+Sections are those of Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 
@@ -34,10 +37,12 @@ class StereoMatch:
 
 
 #: Origin and unit direction of a line of sight.
-Sight = tuple[Vector3, Vector3]
+LineOfSight = tuple[Vector3, Vector3]
 
 
-def epipolar_pixels(sight: Sight, left: CameraModel, right: CameraModel, ranges_m: tuple[float, float]) -> Points2:
+def epipolar_pixels(
+    sight: LineOfSight, left: CameraModel, right: CameraModel, ranges_m: tuple[float, float]
+) -> Points2:
     """Project points along a left pixel's line of sight to the right image, from far to near: the epipolar curve.
 
     The points have a spacing of about half a pixel of disparity; points invisible to the right camera are omitted. Both
@@ -102,7 +107,7 @@ def triangulate(left: CameraModel, right: CameraModel, left_pixel: Vector2, righ
     return nearest_point(left.rays(left_pixel), right.rays(right_pixel))
 
 
-def nearest_point(left: Sight, right: Sight) -> Vector3 | None:
+def nearest_point(left: LineOfSight, right: LineOfSight) -> Vector3 | None:
     """Midpoint of the shortest segment between two lines of sight, in their frame, metres.
 
     None if they are parallel or an end of the segment is behind its camera.

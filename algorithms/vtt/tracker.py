@@ -2,6 +2,8 @@
 
 The steps of the loop are functions in `pointing`, `matching`, `stereo` and `accuracy`. The tracker stores its state in
 an immutable `Track` and replaces it in each update. The "seed" is the first update, which extracts the first template.
+
+Sections, equations and figures are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations

@@ -85,8 +85,8 @@ class Campaign:
             uniform = {path: streams.generator(f"dispersion:{stream_name(path)}").random() for path in paths}
             numbers = {path: max(float(value), MIN_DRAW) for path, value in uniform.items()}
             for group in setup.correlations:
-                mixed = correlate_uniform(np.array([numbers[path] for path in group.parameters]), group.factor)
-                numbers.update(zip(group.parameters, mixed.tolist(), strict=True))
+                correlated = correlate_uniform(np.array([numbers[path] for path in group.parameters]), group.factor)
+                numbers.update(zip(group.parameters, correlated.tolist(), strict=True))
         else:
             groups = tuple(
                 (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))

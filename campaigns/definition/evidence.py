@@ -217,16 +217,16 @@ def classify(campaign: Campaign, confirmations: Sequence[Confirmation], frozen: 
     """
     configuration = campaign.configuration
     name, seed = configuration.name, configuration.seed
-    used = [entry for entry in confirmations if (entry.campaign, entry.seed) == (name, seed)]
-    if used:
-        entry = used[0]
+    same_seed_entries = [entry for entry in confirmations if (entry.campaign, entry.seed) == (name, seed)]
+    if same_seed_entries:
+        entry = same_seed_entries[0]
         changes = entry.frozen.differences(frozen)
         kind = EvidenceKind.REUSED_SEED if changes else EvidenceKind.REPETITION
         return Evidence(kind, entry.namespace, entry.number, changes=tuple(changes))
     runs = () if configuration.calibration is None else configuration.calibration.runs
-    looked_at = [run for run in runs if (run.campaign, run.seed) == (name, seed)]
-    if looked_at:
-        options = dict.fromkeys(option for run in looked_at for option in run.options)
+    calibration_runs = [run for run in runs if (run.campaign, run.seed) == (name, seed)]
+    if calibration_runs:
+        options = dict.fromkeys(option for run in calibration_runs for option in run.options)
         return Evidence(EvidenceKind.CALIBRATION, changes=tuple(options))
     own_namespace = namespace(configuration)
     for number in range(1, _RESERVED_NUMBERS + 1):

@@ -42,7 +42,7 @@ _PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True)
 class Identity:
-    """All values that must be equal so that two runs of a case on one machine have the same row.
+    """All values that determine the row of a case; with equal identity, two runs on one machine have equal rows.
 
     - configuration: hash of the keys that determine the cases
     - code: hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of custom code
@@ -67,8 +67,10 @@ class Identity:
         pairs = {name: (getattr(self, name)[:12], getattr(other, name)[:12]) for name in ("configuration", "code")}
         for name in sorted({*self.versions, *other.versions}):
             pairs[name] = (str(self.versions.get(name)), str(other.versions.get(name)))
-        before, now = self.inputs or {}, other.inputs or {}
-        pairs.update({name: (before[name][:12], now[name][:12]) for name in sorted({*before} & {*now})})
+        old_inputs, new_inputs = self.inputs or {}, other.inputs or {}
+        pairs.update(
+            {name: (old_inputs[name][:12], new_inputs[name][:12]) for name in sorted({*old_inputs} & {*new_inputs})}
+        )
         return [f"{name} ({old}, now {new})" for name, (old, new) in pairs.items() if old != new]
 
 
@@ -124,15 +126,15 @@ def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     selected = find_scenario(configuration.scenario)
     if not isinstance(selected, HasParts):
         return ()
-    trees = [configuration.parameters]
+    parameter_trees = [configuration.parameters]
     for path, dispersion in configuration.dispersions.items():
         if any(f"{key}.".startswith(f"{path}.") for key in selected.part_keys):
             for tree in dispersion.extremes():
                 for name in reversed(path.split(".")):
                     tree = {name: tree}
-                trees.append(tree)
+                parameter_trees.append(tree)
     paths: dict[str, None] = {}
-    for tree in trees:
+    for tree in parameter_trees:
         for key, kind in selected.part_keys.items():
             value = find_value(tree, key)
             specs = [value] if isinstance(value, str) else [str(item) for item in value or ()]

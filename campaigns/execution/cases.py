@@ -202,9 +202,9 @@ def _convert_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
 
     Raises ValueError or TypeError if a column cannot be stored.
     """
-    clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(row))
-    if clashes:
-        raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(clashes)}")
+    reserved_names = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(row))
+    if reserved_names:
+        raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(reserved_names)}")
     columns: dict[str, Scalar] = {}
     for name, value in row.items():
         scalar = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value

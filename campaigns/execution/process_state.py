@@ -81,8 +81,17 @@ def _read_umask() -> int:
 
 def _read_decimals() -> tuple[Any, ...]:
     context = decimal.getcontext()
-    traps = [kind for kind, is_enabled in context.traps.items() if is_enabled]
-    return context.prec, context.rounding, context.Emin, context.Emax, context.capitals, context.clamp, [], traps
+    enabled_traps = [kind for kind, is_enabled in context.traps.items() if is_enabled]
+    return (
+        context.prec,
+        context.rounding,
+        context.Emin,
+        context.Emax,
+        context.capitals,
+        context.clamp,
+        [],
+        enabled_traps,
+    )
 
 
 def _read_opencv() -> tuple[bool, int]:

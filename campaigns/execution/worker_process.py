@@ -40,7 +40,7 @@ class TaskResult(Generic[Result]):
     - changed: names of the parts of the process state that the task changed
     - crashed: whether the task requested a fresh worker (`request_fresh_worker`)
     - previous_item: item that ran before this item in the same process; None for the first item of a process
-    - crashed_only_after: earlier item after which this item crashed, although it did not crash in a fresh process
+    - crashed_only_after: predecessor item needed to reproduce the crash; the item does not crash in a fresh process
     """
 
     item: int
@@ -261,7 +261,7 @@ def request_fresh_worker() -> None:
 
 
 def start_clock(grace_s: float = 0.0) -> None:
-    """Start the time of the current item now, or `grace_s` seconds later."""
+    """Start the timer of the current item now, or after `grace_s` seconds."""
     if _context is not None:
         _context.board.write(_context.item, time.monotonic() + grace_s)
 

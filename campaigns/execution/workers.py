@@ -356,14 +356,16 @@ class _Run:
             self._batches.record_time(len(batch_result.results), batch_result.seconds)
         if batch_result.must_replace:
             worker.replace()
-        suspects = [result for result in batch_result.results if result.crashed and result.previous_item is not None]
-        for suspect in suspects:
+        crashed_results = [
+            result for result in batch_result.results if result.crashed and result.previous_item is not None
+        ]
+        for suspect in crashed_results:
             # there is at most one, the last item of the batch; it runs again in the fresh process
             self._suspect_predecessors[suspect.item] = suspect.previous_item
             self._submit(worker, [suspect.item])
-        if not suspects:
+        if not crashed_results:
             self._idle.append(worker)
-        finished = [result for result in batch_result.results if result not in suspects]
+        finished = [result for result in batch_result.results if result not in crashed_results]
         pairs = [(result, self._suspect_predecessors.pop(result.item, None)) for result in finished]
         # an item that does not crash in a fresh process crashed because of the previous item
         return [

@@ -41,13 +41,13 @@ MIN_DRAW = 2.0**-54
 MAX_DRAW = 1.0 - 2.0**-53
 #: Maximum number of cases of one stratified design, which needs eight bytes for each case and dispersion.
 MAX_STRATIFIED = 2**20
-#: Bits of a Sobol point, as many as in a float's fraction.
+#: Bits of a Sobol point: the number of bits of a float's fraction.
 _SOBOL_BITS = 52
 #: Number of designs that a process caches, since successive cases use the same design.
 _CACHED_DESIGNS = 4
 Kind = Literal["random", "latin-hypercube", "sobol"]
 #: Indices of a correlated group's members among the dispersions, and the rows of its factor L.
-Group = tuple[tuple[int, ...], tuple[tuple[float, ...], ...]]
+CorrelatedGroup = tuple[tuple[int, ...], tuple[tuple[float, ...], ...]]
 
 
 class Design(Parameters):
@@ -103,13 +103,19 @@ def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int
 
 @lru_cache(maxsize=_CACHED_DESIGNS)
 def build_stratified_design(
-    kind: Kind, seed: int, campaign: str, first: int, size: int, paths: tuple[str, ...], groups: tuple[Group, ...]
+    kind: Kind,
+    seed: int,
+    campaign: str,
+    first: int,
+    size: int,
+    paths: tuple[str, ...],
+    groups: tuple[CorrelatedGroup, ...],
 ) -> Float64[np.ndarray, "cases dispersions"]:
     """Create the uniform numbers of a stratified design, each above 0 and below 1.
 
     - kind: `latin-hypercube` or `sobol`
     - seed, campaign, first: identify the random streams; `first` is the first case of the design
-    - size: number of cases; paths: dispersions, in the order of their dimensions; groups: see `Group`
+    - size: number of cases; paths: dispersions, in the order of their dimensions; groups: see `CorrelatedGroup`
 
     Each dispersion has its own stream. A Latin hypercube is an independent random permutation of the strata for each
     dispersion. The dimensions of a Sobol sequence follow the order of the file; each dimension is scrambled (Matousek
@@ -134,11 +140,11 @@ def build_stratified_design(
     points = np.clip(points, MIN_DRAW, MAX_DRAW)
     for members, factor in groups:
         values = points[:, list(members)]
-        mixed = correlate_uniform(values, np.array(factor))
+        correlated = correlate_uniform(values, np.array(factor))
         if kind == "latin-hypercube":
-            ranks = np.argsort(np.argsort(mixed, axis=0, kind="stable"), axis=0, kind="stable")
-            mixed = np.take_along_axis(np.sort(values, axis=0), ranks, axis=0)
-        points[:, list(members)] = mixed
+            ranks = np.argsort(np.argsort(correlated, axis=0, kind="stable"), axis=0, kind="stable")
+            correlated = np.take_along_axis(np.sort(values, axis=0), ranks, axis=0)
+        points[:, list(members)] = correlated
     points.flags.writeable = False
     return points
 

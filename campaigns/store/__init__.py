@@ -1,1 +1,1 @@
-"""Folder of a campaign: record, rows, table, kept products, and lock."""
+"""Folder of a campaign: record, rows, table, stored products, and lock."""

@@ -1,1 +1,1 @@
-"""The dashboard: a static site over stored campaigns."""
+"""The dashboard: a static site of stored campaigns."""

@@ -1,4 +1,7 @@
-"""Sections about descents: field test, velocity errors at thruster ignition, landings, influence of conditions."""
+"""Sections about descents: field test, velocity errors at thruster ignition, landings, influence of conditions.
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
+"""
 
 from __future__ import annotations
 

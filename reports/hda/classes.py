@@ -1,4 +1,7 @@
-"""Section parts of hazard detection: missed hazards by size, and tracked features by the change between the images."""
+"""Section parts of hazard detection: missed hazards by size, and tracked features by the change between the images.
+
+"The paper" is Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

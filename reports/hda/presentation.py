@@ -1,4 +1,7 @@
-"""Presentation of hazard detection: report sections, and views of cases as the paper's figures."""
+"""Presentation of hazard detection: report sections, and views of cases as the paper's figures.
+
+The paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

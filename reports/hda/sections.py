@@ -1,4 +1,7 @@
-"""Sections on landings: roughness threshold, faults, map errors, touchdowns, sites, and run times."""
+"""Sections on landings: roughness threshold, faults, map errors, touchdowns, sites, and run times.
+
+Tables, figures and "the paper" refer to Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

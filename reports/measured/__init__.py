@@ -1,1 +1,1 @@
-"""Real cases: how their images and measured poses agree."""
+"""Reports of recorded images: agreement of the images with the measured poses."""

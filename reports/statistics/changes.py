@@ -105,9 +105,9 @@ def _test_rates(pairs: Pairs) -> float:
         excess = max(0.0, abs(observed - float((n * ones / total).sum())) - 0.5)
         return float(2.0 * stats.norm.sf(excess / math.sqrt(variance)))
     distribution, minimum = np.ones(1), 0
-    for _, size, hits, cases in tables:
-        low, high = max(0, size + hits - cases), min(size, hits)
-        distribution = np.convolve(distribution, stats.hypergeom.pmf(np.arange(low, high + 1), cases, hits, size))
+    for _, size, successes, cases in tables:
+        low, high = max(0, size + successes - cases), min(size, successes)
+        distribution = np.convolve(distribution, stats.hypergeom.pmf(np.arange(low, high + 1), cases, successes, size))
         minimum += low
     index = observed - minimum
     return float(min(1.0, 2.0 * min(distribution[: index + 1].sum(), distribution[index:].sum())))

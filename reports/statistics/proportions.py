@@ -258,12 +258,12 @@ class LaterLook:
         if log_ratio < self.log_threshold:
             level = n * math.log1p(-self.rate) + log_ratio - self.log_threshold
             return max(_MIN_RISK, min(self.risk, math.exp(level)))
-        few, many = 0.0, float(n)
-        while many - few > 1e-9 * max(1.0, n):
-            events = 0.5 * (few + many)
+        min_events, max_events = 0.0, float(n)
+        while max_events - min_events > 1e-9 * max(1.0, n):
+            events = 0.5 * (min_events + max_events)
             is_enough = _log_likelihood_ratio(events, n, self.rate) >= self.log_threshold
-            few, many = (events, many) if is_enough else (few, events)
-        return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - few, few + 1.0))))
+            min_events, max_events = (events, max_events) if is_enough else (min_events, events)
+        return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - min_events, min_events + 1.0))))
 
     def cases_needed(self, n: int, events: int) -> int:
         """Return the total number of cases, at least n, that supports the verdict if no more events occur."""

@@ -1,1 +1,1 @@
-"""Reports of visual target tracking: the paper's tables and figures next to ours."""
+"""Reports of visual target tracking: the paper's tables and figures next to those of Marsyard."""

@@ -1,4 +1,7 @@
-"""Selection of rows of tracking campaigns, and the section on the target's position error at the goal by camera."""
+"""Selection of rows of tracking campaigns, and the section on the target's position error at the goal by camera.
+
+Sections and equations are those of Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Sections about visual target tracking: comparisons with the paper's tables and runs, and tracking by step size."""
+"""Sections about visual target tracking: comparisons with the paper's tables and runs, and tracking by step size.
+
+The paper is Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 

@@ -152,7 +152,7 @@ class Suite(ABC):
         return ""
 
     def _check_repeatability(self) -> str:
-        reused = self.make()
+        reused_instance = self.make()
         for case in self.cases():
             fingerprints = []
             for seed in (1, 2):  # of the global generators, for code that uses them by mistake
@@ -162,8 +162,8 @@ class Suite(ABC):
             if fingerprints[0] != fingerprints[1]:
                 raise BreachError("its answers to the same case differ between two calls")
             for other_case in self._other_cases():
-                self._call(reused, copy_inputs(other_case, writable=self.writable_inputs), 2)
-            answer = self._call(reused, copy_inputs(case, writable=self.writable_inputs), 1)
+                self._call(reused_instance, copy_inputs(other_case, writable=self.writable_inputs), 2)
+            answer = self._call(reused_instance, copy_inputs(case, writable=self.writable_inputs), 1)
             if fingerprint(self._check_answer(answer, case)) != fingerprints[0]:
                 raise BreachError(self.dependence)
         return ""

@@ -195,6 +195,6 @@ def aim_ahead() -> MastAim:
     return MastAim(0.0, -0.2, box, box)
 
 
-def _expect_state(tracker: Any, when: str, state: TrackingState) -> None:
+def _expect_state(tracker: Any, moment: str, state: TrackingState) -> None:
     if tracker.state is not state:
-        raise BreachError(f"its state {when} is {tracker.state}; allowed: {state}")
+        raise BreachError(f"its state {moment} is {tracker.state}; allowed: {state}")

@@ -160,7 +160,7 @@ DustOpacity = Annotated[float | None, bounded_field(0.0, 10.0, "optical depth of
 
 
 class LanderParameters(Parameters):
-    """The lander's shadow in its own images: a disc at the camera's position.
+    """The lander's shadow in its own images, modelled as the shadow of a disc at the camera's position.
 
     The parachute's canopy dominates. Its diameter is 15.09 m (nominal) times 0.72 (inflated; Witkowski & Bruno 2003,
     MER parachute); it covers the whole sun. Backshell and lander, 2.65 m in diameter, cover 1/20 of the sun from 2 km;

@@ -13,6 +13,8 @@ this bias, propagate the attitude to the images between the passes.
 The effects of a horizontal gyro bias on the outbound and the return legs cancel if the camera turns with the flight
 direction: the passes hardly observe this bias. A prior with the standard deviation of the IMU's class therefore limits
 the fitted bias.
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
 from __future__ import annotations
@@ -115,8 +117,8 @@ def solve_attitude(
     world = earth.to_inertial(times).apply(np.concatenate([first.world, second.world]))
     bias = np.zeros(3)
     # attitude at the start of the flight
-    sighted = _propagate(increments, bias).attitude(first.times_s).apply(first.camera)
-    start, _ = Rotation.align_vectors(world[: len(sighted)], sighted)
+    measured_directions = _propagate(increments, bias).attitude(first.times_s).apply(first.camera)
+    start, _ = Rotation.align_vectors(world[: len(measured_directions)], measured_directions)
     for _ in range(_ITERATIONS):
         propagated = _propagate(increments, bias)
         predicted = (start * propagated.attitude(times)).apply(camera)

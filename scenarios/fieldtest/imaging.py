@@ -3,6 +3,8 @@
 The sun's direction is computed by the method of low accuracy in Meeus, "Astronomical Algorithms" (1998), chapter 25.
 The error is 0.01 deg in this century. Refraction (0.02 deg at 45 deg of elevation) and parallax (0.002 deg) are
 neglected.
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Parameters of field test campaigns: runs, helicopter, instruments, targets, and selection of triples."""
+"""Parameters of field test campaigns: runs, helicopter, instruments, targets, and selection of triples.
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Simulate and process a run of the field test: flight, attitudes, altitudes and triples (paper, III.D and IV)."""
+"""Simulate and process a run of the field test: flight, attitudes, altitudes and triples (paper, III.D and IV).
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
+"""
 
 from __future__ import annotations
 
@@ -230,8 +233,8 @@ def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gp
             )
     first, second = sightings
     earth = EarthRotation.at_latitude(run.parameters.latitude_deg)
-    unit = Imu.draw(p.imu, flight.span_s, generator("imu errors"))
-    increments = unit.increments(InertialTrajectory(flight, earth), *flight.span_s, generator("imu noise"))
+    imu = Imu.draw(p.imu, flight.span_s, generator("imu errors"))
+    increments = imu.increments(InertialTrajectory(flight, earth), *flight.span_s, generator("imu noise"))
     increments = add_thermal_drift(increments, p.drift, flight, flight.span_s[0])
     # the larger of a centroid's error and the remaining GPS error, as angles
     pixel_rad = 1.0 / camera.focal_lengths[0]
@@ -250,8 +253,8 @@ def photograph_targets(
     p, key = run.key.field_test, run.key
     scene = build_start_scene(run, ground, p.helicopter.fly_over_m)
     objects = Objects.join([scene.objects, targets.panels(p.targets.albedo)])
-    # more rays at edges than for rocks, as a side of a target is 2 pixels; lines of the mesh at most a post apart, as
-    # coarser ground would hide some of the targets
+    # more rays at edges than for rocks, because a side of a target is 2 pixels; mesh lines at most one post apart,
+    # because coarser ground would hide some of the targets
     scene = replace(
         scene, objects=objects, edge_rays=_TARGET_EDGE_RAYS, mesh_finest_m=_MESH_POSTS * ground.surface.spacing_m
     )

@@ -1,4 +1,7 @@
-"""Field test scenario: simulate, measure, estimate and score one triple of images of a run."""
+"""Field test scenario: simulate, measure, estimate and score one triple of images of a run.
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
+"""
 
 from __future__ import annotations
 

@@ -5,6 +5,8 @@ ground, and a connected region above a threshold is a candidate. The prior attit
 common displacement with the most pairs of candidates and targets determines which candidates are targets; a rotation
 fitted to the pairs rejects the others. The paper states that the centroids were extracted, not how: all parameters of
 the detection are assumed.
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
 from __future__ import annotations
@@ -171,8 +173,8 @@ def detect_targets(
         matched = np.flatnonzero(distances < limit_m)
         if len(matched) < _MIN_TARGETS:
             return none
-        seen = camera.rays(candidates[np.asarray(nearest)[matched]])[1]
-        attitude = Rotation.align_vectors(_normalize(offsets[matched]), _normalize(seen))[0]
+        measured_directions = camera.rays(candidates[np.asarray(nearest)[matched]])[1]
+        attitude = Rotation.align_vectors(_normalize(offsets[matched]), _normalize(measured_directions))[0]
         predicted, limit_m = camera.project(attitude.inv().apply(offsets))[0] / px_per_m, _FIT_M
     distances, nearest = tree.query(predicted)
     is_target = (distances < limit_m) & _is_inside(predicted * px_per_m, camera)
@@ -189,31 +191,35 @@ def find_bright_spots(
     - side_px: side lengths of a target in the image (columns, rows)
     """
     size = 2 * np.ceil(0.5 * np.maximum(_TOP_HAT_SIDES * side_px, _MIN_TOP_HAT_PX)).astype(int) + 1
-    spots = ndimage.white_tophat(image.astype(np.float32), size=(int(size[1]), int(size[0])))
-    median, high = np.percentile(spots, (50.0, 84.13))
-    labels, count = ndimage.label(spots > median + _THRESHOLD_SD * (high - median), np.ones((3, 3)))
-    peaks = np.array(ndimage.maximum_position(spots, labels, np.arange(1, count + 1)), dtype=np.int64).reshape(-1, 2)
-    return _centroids(spots, peaks, np.ceil(_WINDOW_SIDES * side_px[::-1]).astype(np.int64))
+    top_hat = ndimage.white_tophat(image.astype(np.float32), size=(int(size[1]), int(size[0])))
+    median, high = np.percentile(top_hat, (50.0, 84.13))
+    labels, count = ndimage.label(top_hat > median + _THRESHOLD_SD * (high - median), np.ones((3, 3)))
+    peaks = np.array(ndimage.maximum_position(top_hat, labels, np.arange(1, count + 1)), dtype=np.int64).reshape(-1, 2)
+    return _centroids(top_hat, peaks, np.ceil(_WINDOW_SIDES * side_px[::-1]).astype(np.int64))
 
 
 def _centroids(
-    spots: np.ndarray, peaks: Int64[np.ndarray, "spots 2"], half: Int64[np.ndarray, "2"]
+    top_hat: np.ndarray, peaks: Int64[np.ndarray, "spots 2"], half_size: Int64[np.ndarray, "2"]
 ) -> Float64[np.ndarray, "spots 2"]:
     """Compute the centroids (column, row) of intensity in windows around peaks (row, column)."""
-    inside = ((peaks >= half) & (peaks < np.array(spots.shape) - half)).all(axis=1)
-    rows, columns = np.mgrid[-half[0] : half[0] + 1, -half[1] : half[1] + 1]
-    windows = spots[peaks[inside, 0, None, None] + rows, peaks[inside, 1, None, None] + columns].astype(np.float64)
-    # the top-hat of noise is positive: without this, it would draw all centroids to the middle of their windows
-    windows = np.maximum(windows - np.median(spots), 0.0)
+    is_inside = ((peaks >= half_size) & (peaks < np.array(top_hat.shape) - half_size)).all(axis=1)
+    rows, columns = np.mgrid[-half_size[0] : half_size[0] + 1, -half_size[1] : half_size[1] + 1]
+    windows = top_hat[peaks[is_inside, 0, None, None] + rows, peaks[is_inside, 1, None, None] + columns].astype(
+        np.float64
+    )
+    # the top-hat of noise is positive; without this subtraction it would bias centroids to the window centres
+    windows = np.maximum(windows - np.median(top_hat), 0.0)
     total = windows.sum(axis=(1, 2))
     shift = np.stack([(windows * axis).sum(axis=(1, 2)) / total for axis in (columns, rows)], axis=-1)
-    return np.asarray(peaks[inside, ::-1] + shift)
+    return np.asarray(peaks[is_inside, ::-1] + shift)
 
 
 def _vote(tree: cKDTree, predicted_m: Float64[np.ndarray, "targets 2"], radius_m: float) -> Float64[np.ndarray, "2"]:
     """Find the displacement of the predicted targets that brings most of them to a candidate."""
-    near = tree.query_ball_point(predicted_m, radius_m)
-    displacements = np.concatenate([tree.data[found] - point for found, point in zip(near, predicted_m, strict=True)])
+    neighbours = tree.query_ball_point(predicted_m, radius_m)
+    displacements = np.concatenate(
+        [tree.data[found] - point for found, point in zip(neighbours, predicted_m, strict=True)]
+    )
     if len(displacements) == 0:
         return np.zeros(2)
     distances, _ = tree.query(predicted_m + displacements[:, None])

@@ -1,4 +1,7 @@
-"""Compute true states and on-board poses at the two images of a case; choose the pair from a helicopter flight."""
+"""Compute true states and on-board poses at the two images of a case; choose the pair from a helicopter flight.
+
+Section V is that of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 
@@ -61,13 +64,13 @@ class Flight:
         received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
         # laser ranges to the ground, without rocks, at all images
         transit_states = [transit.state(number) for number in range(transit.times_s.size)]
-        unit = RangingUnit.draw(p.laser, streams.generator("laser"))
-        axes = [np.asarray(state.attitude.apply(unit.axis)) for state in transit_states]
+        laser = RangingUnit.draw(p.laser, streams.generator("laser"))
+        axes = [np.asarray(state.attitude.apply(laser.axis)) for state in transit_states]
         true_ranges = [
             range_along(surface, state.position_m, axis, 5.0 * height)
             for state, axis in zip(transit_states, axes, strict=True)
         ]
-        readings = unit.readings(transit.times_s, np.array(true_ranges), streams.generator("laser noise, transit"))
+        readings = laser.readings(transit.times_s, np.array(true_ranges), streams.generator("laser noise, transit"))
         ranges = add_range_faults(p.faults, readings.values, height)[received_indices]
         calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
         choice = choose_pair([transit.pose(int(n)) for n in received_indices], ranges, calibrated, p.pair, height)

@@ -1,4 +1,7 @@
-"""Result columns and products of a landing case: errors of motion, map, site and landing; conditions; figure data."""
+"""Result columns and products of a landing case: errors of motion, map, site and landing; conditions; figure data.
+
+Sections, figures and tables are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 It receives estimated poses, the tracker's target position and stereo measurements only; an import contract excludes the
 modules of the simulated truth. A leg's parameters are the operators' commands.
+
+Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations

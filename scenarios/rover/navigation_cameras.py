@@ -91,15 +91,17 @@ class NavigationCameras:
     @classmethod
     def draw(cls, p: RoverScenarioParameters, rig: Rig, streams: Streams) -> NavigationCameras:
         """Draw the calibration errors and detectors of the pairs that the legs use."""
-        maps = p.navigation.terrain == "stereo"
-        sees = p.navigation.odometry == "stereo" and any(leg.visual_odometry for leg in p.legs)
+        uses_map = p.navigation.terrain == "stereo"
+        uses_odometry = p.navigation.odometry == "stereo" and any(leg.visual_odometry for leg in p.legs)
         mast = body = None
-        if sees or (maps and any((leg.autonav or leg.maps_first) and leg.map_by == "mast" for leg in p.legs)):
+        if uses_odometry or (
+            uses_map and any((leg.autonav or leg.maps_first) and leg.map_by == "mast" for leg in p.legs)
+        ):
             name, head = NAVCAMS[p.camera.preset], rig.head
             if name != p.camera.preset or p.camera.custom is not None:
                 head = StereoHead.draw(stereo_mast(name), p.stereo, streams.generator("navcam calibration"))
             mast = _Pair.draw(p, name, head, streams)
-        if maps and any((leg.autonav or leg.maps_first) and leg.map_by == "body" for leg in p.legs):
+        if uses_map and any((leg.autonav or leg.maps_first) and leg.map_by == "body" for leg in p.legs):
             left, right = preset(HAZCAM).cameras()
             design = MastCalibration(rig.calibrated.geometry, left, right)
             head = StereoHead.draw(design, p.stereo, streams.generator("hazcam calibration"))

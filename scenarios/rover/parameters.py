@@ -1,4 +1,7 @@
-"""Parameters of the rover scenario: world, target, route, cameras, timing, and tracker."""
+"""Parameters of the rover scenario: world, target, route, cameras, timing, and tracker.
+
+Sections and tables are those of Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,8 @@ A guide points the mast at each stop and estimates the target's position. `Track
 `DesignationGuide` uses the position designated at the start and odometry, for drives whose images are used by many
 trackers. Visual odometry and the navigator's map use rendered stereo pairs. Parameters with values `oracle-...` replace
 them by the truth with errors, which is faster and isolates causes.
+
+Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations
@@ -156,7 +158,7 @@ class TrackerGuide:
 
 @dataclass(frozen=True)
 class DesignationGuide:
-    """A designated position as guide, without tracking: odometry carries it along. Stores the views of all stops.
+    """Guide by a designated position without tracking: odometry propagates the position. Stores all views.
 
     `position_world` is the designated point in the estimated world frame, or None: the true point (an oracle). The
     subframes contain the visible rock and a margin: they stand for full images, of which only this part is rendered.

@@ -5,6 +5,8 @@ centre of all targets is designated in images of the start; the rover and its ma
 both cameras take subframes that contain the rock and the search windows around it. A case tracks one target over the
 images of every (skip + 1)-th stop; skipping stops makes the steps larger. A drive depends only on the parameters, the
 campaign's seed and the run's index.
+
+The paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations

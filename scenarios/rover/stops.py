@@ -1,4 +1,7 @@
-"""Stops of a run: take stereo images, store poses and the tracker's answer; choose the target and its visibility."""
+"""Stops of a run: take stereo images, store poses and the tracker's answer; choose the target and its visibility.
+
+The paper is Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from __future__ import annotations
 

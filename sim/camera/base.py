@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 Vector = NDArray[np.float64]
-#: Type of a number that may be an integer (the run-time type checks do not accept an integer for a float).
-Real = float | int
+#: A number that may be an integer (the run-time type checks do not accept an integer for a float).
+Number = float | int
 #: Three components, as an array or a tuple.
-Triple = Num[np.ndarray, "3"] | tuple[Real, Real, Real]
+Vector3Like = Num[np.ndarray, "3"] | tuple[Number, Number, Number]
 #: Components x, y and z of n vectors, shape (n,) each.
 Gradient = tuple[Vector, Vector, Vector]
 
@@ -93,7 +93,7 @@ class CameraModel(ABC):
         return pixels.reshape(*points.shape[:-1], 2), visible.reshape(points.shape[:-1])
 
     def projection_jacobian(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 3"]:
-        """Return the derivative of `project`'s pixels by the points, pixels per metre; NaN where not visible."""
+        """Return the Jacobian of the pixels with respect to the points, pixels per metre; NaN for invisible points."""
         flat = points.reshape(-1, 3)
         jacobian = np.empty((len(flat), 2, 3))
         with np.errstate(all="ignore"):
@@ -162,7 +162,7 @@ class CameraModel(ABC):
             (self.size[0] // columns, self.size[1] // rows),
         )
 
-    def scale(self: M, factor: Real) -> M:
+    def scale(self: M, factor: Number) -> M:
         """Return the camera of the resized image: u becomes (u + 0.5) * factor - 0.5; ValueError if factor <= 0."""
         if not (np.isfinite(factor) and factor > 0):
             raise ValueError(f"the factor of an image's scale must be positive and finite, not {factor}")
@@ -177,13 +177,13 @@ class CameraModel(ABC):
             raise ValueError(f"a crop of {crop} pixels at ({column}, {row}) extends beyond the frame of {frame}")
         return self._with_image_map((1.0, 1.0), (-float(column), -float(row)), size)
 
-    def magnify(self: M, factor: Real) -> M:
+    def magnify(self: M, factor: Number) -> M:
         """Return the camera with its focal lengths multiplied by `factor`; its image centre is unchanged."""
         column, row = self.image_centre
         h = self.h + (factor - 1.0) * (self.h - column * self.a)
         return self._with(h=h, v=self.v + (factor - 1.0) * (self.v - row * self.a))
 
-    def recentre(self: M, columns: Real, rows: Real) -> M:
+    def recentre(self: M, columns: Number, rows: Number) -> M:
         """Return the camera whose images are shifted by `columns` pixels to the right and `rows` pixels down."""
         return self._with(h=self.h + columns * self.a, v=self.v + rows * self.a)
 

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.camera.base import CameraModel, Real
+from marsyard.sim.camera.base import CameraModel, Number
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
 from marsyard.sim.files import open_regular
 
@@ -332,7 +332,7 @@ def from_opencv_fisheye(
 def _fit_camera(
     start: C, modify_camera: Callable[[Array], C], samples: tuple[Array, Array], scales: Array, **options: Any
 ) -> tuple[C, Residual]:
-    """Fit the changes of `modify_camera` to samples (directions, pixels); `scales` are typical sizes of the changes."""
+    """Fit the changes of `modify_camera` to samples (directions, pixels); `scales`: typical sizes of changes."""
     directions, pixels = samples
     residual = _compute_residual(_project_directions(start, directions) - pixels)
     if residual.max_px <= _EXACT_PX:
@@ -428,11 +428,11 @@ def _apply_pinhole_distortion(points: Array, coefficients: Array) -> tuple[Array
 
 
 def _compute_fisheye_gain(theta: Array, coefficients: Array) -> tuple[Array, Array]:
-    """Compute the distance divided by theta of OpenCV's fisheye model, and the derivative of the distance by theta."""
+    """Compute d(theta) / theta for the image distance d of OpenCV's fisheye model, and the derivative of d."""
     k1, k2, k3, k4 = coefficients
-    square = theta * theta
-    gain = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
-    return gain, 1 + square * (3 * k1 + square * (5 * k2 + square * (7 * k3 + square * 9 * k4)))
+    theta2 = theta * theta
+    gain = 1 + theta2 * (k1 + theta2 * (k2 + theta2 * (k3 + theta2 * k4)))
+    return gain, 1 + theta2 * (3 * k1 + theta2 * (5 * k2 + theta2 * (7 * k3 + theta2 * 9 * k4)))
 
 
 def _compute_residual(differences: Array) -> Residual:
@@ -479,7 +479,7 @@ class Source:
         return first_bytes
 
 
-def linearity_of_type(kind: Real | None, parameter: float | None, field: str, source: Source) -> float:
+def linearity_of_type(kind: Number | None, parameter: float | None, field: str, source: Source) -> float:
     """Return CAHVORE's linearity: 1 for type 1 (perspective), 0 for type 2 (fish-eye), `parameter` for type 3."""
     if kind in (1, 2):
         return 1.0 if kind == 1 else 0.0

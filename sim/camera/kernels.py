@@ -9,9 +9,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Triple = tuple[float, float, float]
+Vector3 = tuple[float, float, float]
 
-#: Maximum number of Newton steps, and the relative step at which they end; the remaining error is of its square.
+#: Maximum number of Newton steps, and relative step that ends the iteration; the remaining error is about step**2.
 NEWTON_STEPS, TOLERANCE = 12, 1e-9
 #: Steps of the bisection if Newton's method fails: more than the 53 bits of a float's mantissa.
 BISECTION_STEPS = 70
@@ -28,7 +28,7 @@ def project_radial(
     points: tuple[Array, Array, Array],
     axis: Array,
     image_plane: tuple[Array, Array, Array],
-    axis_image: Triple,
+    axis_image: Vector3,
     r: Array,
     tau_limit: float,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -59,14 +59,14 @@ def project_radial(
 
 
 @njit(cache=True, inline="always")
-def _compute_residual(polynomial: Triple, tau: float, ratio: float) -> float:
+def _compute_residual(polynomial: Vector3, tau: float, ratio: float) -> float:
     """Compute the residual of the equation of `_invert_distortion`; it grows with the ratio while f grows."""
     s = tau * ratio * ratio
     return ratio * (polynomial[0] + s * (polynomial[1] + s * polynomial[2])) - 1.0
 
 
 @njit(cache=True, error_model="numpy")
-def _bisect(polynomial: Triple, tau: float, upper: float) -> float:
+def _bisect(polynomial: Vector3, tau: float, upper: float) -> float:
     """Solve the equation of `_invert_distortion` by bisection between 0 and `upper`, which may be infinite."""
     low, high = 0.0, upper
     if upper == math.inf:
@@ -83,7 +83,7 @@ def _bisect(polynomial: Triple, tau: float, upper: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def _invert_distortion(polynomial: Triple, limits: tuple[float, float], tau: float) -> float:
+def _invert_distortion(polynomial: Vector3, limits: tuple[float, float], tau: float) -> float:
     """Solve g (k1 + s (k3 + s k5)) = 1 with s = tau g^2 for the ratio g = chi / f(chi); tau is f(chi)^2.
 
     The ratio is finite on the axis. Newton's method starts at g = 1 / k1; bisection follows if it fails.
@@ -106,7 +106,7 @@ def _invert_distortion(polynomial: Triple, limits: tuple[float, float], tau: flo
 
 
 @njit(cache=True, error_model="numpy")
-def compute_undistortion_ratios(polynomial: Triple, limits: tuple[float, float], distorted_tau: Array) -> Array:
+def compute_undistortion_ratios(polynomial: Vector3, limits: tuple[float, float], distorted_tau: Array) -> Array:
     """Compute the ratio chi / f(chi) for each f(chi)^2; NaN beyond the range of f.
 
     - polynomial: k1, k3 and k5 of f(chi) = k1 chi + k3 chi^3 + k5 chi^5
@@ -124,7 +124,7 @@ def compute_ray_directions(
     v: Array,
     direction_from_pixel: NDArray[np.float64],
     axis: Array,
-    polynomial: Triple,
+    polynomial: Vector3,
     limits: tuple[float, float],
 ) -> tuple[Array, Array, Array]:
     """Compute ray directions of pixels for `Cahvor`: of any length, NaN beyond the range of the distortion.

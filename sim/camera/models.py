@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from marsyard.sim.camera import kernels
-from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel, Gradient, Real, Triple, Vector, dot
+from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel, Gradient, Number, Vector, Vector3Like, dot
 
 _ORIGIN = (0.0, 0.0, 0.0)
 #: A chi^2 above this is treated as infinite.
@@ -55,13 +55,13 @@ class Cahv(CameraModel):
     @classmethod
     def from_axes(
         cls,
-        focal_lengths: tuple[Real, Real],
+        focal_lengths: tuple[Number, Number],
         size: tuple[int, int],
         *,
-        axis: Triple,
-        right: Triple,
-        centre: Triple = _ORIGIN,
-        image_centre: tuple[Real, Real] | None = None,
+        axis: Vector3Like,
+        right: Vector3Like,
+        centre: Vector3Like = _ORIGIN,
+        image_centre: tuple[Number, Number] | None = None,
     ) -> Cahv:
         """Create a camera whose H' and V' are perpendicular from its focal lengths (hs, vs) in pixels.
 
@@ -98,14 +98,14 @@ class Cahv(CameraModel):
     @classmethod
     def from_focal_length(
         cls,
-        focal_m: Real,
-        pixel_pitch_m: Real | tuple[Real, Real],
+        focal_m: Number,
+        pixel_pitch_m: Number | tuple[Number, Number],
         size: tuple[int, int],
         *,
-        axis: Triple,
-        right: Triple,
-        centre: Triple = _ORIGIN,
-        image_centre: tuple[Real, Real] | None = None,
+        axis: Vector3Like,
+        right: Vector3Like,
+        centre: Vector3Like = _ORIGIN,
+        image_centre: tuple[Number, Number] | None = None,
     ) -> Cahv:
         """Create a camera from its focal length and pixel pitch (one number, or width and height); see `from_axes`."""
         column_m, row_m = pixel_pitch_m if isinstance(pixel_pitch_m, tuple) else (pixel_pitch_m, pixel_pitch_m)
@@ -117,13 +117,13 @@ class Cahv(CameraModel):
     @classmethod
     def from_field_of_view(
         cls,
-        horizontal_rad: Real,
+        horizontal_rad: Number,
         size: tuple[int, int],
         *,
-        axis: Triple,
-        right: Triple,
-        vertical_rad: Real | None = None,
-        centre: Triple = _ORIGIN,
+        axis: Vector3Like,
+        right: Vector3Like,
+        vertical_rad: Number | None = None,
+        centre: Vector3Like = _ORIGIN,
     ) -> Cahv:
         """Create a camera from its full field of view; pixels are square if `vertical_rad` is None; see `from_axes`."""
         for angle in (horizontal_rad, vertical_rad):
@@ -250,7 +250,7 @@ class Cahvor(RadialModel):
     size: tuple[int, int]
 
     @classmethod
-    def from_cahv(cls, cahv: Cahv, r: Triple, o: Triple | None = None) -> Cahvor:
+    def from_cahv(cls, cahv: Cahv, r: Vector3Like, o: Vector3Like | None = None) -> Cahvor:
         """Add distortion `r` (rho0, rho1, rho2) about the unit vector `o` (A by default) to a pinhole camera."""
         axis = cahv.a if o is None else np.asarray(o, dtype=np.float64)
         return cls(cahv.c, cahv.a, cahv.h, cahv.v, axis, np.asarray(r, dtype=np.float64), cahv.size)
@@ -310,7 +310,7 @@ class Cahvore(RadialModel):
     o: Float[np.ndarray, "3"]
     r: Float[np.ndarray, "3"]
     e: Float[np.ndarray, "3"]
-    linearity: Real = field(kw_only=True)
+    linearity: Number = field(kw_only=True)
     size: tuple[int, int] = field(kw_only=True)
 
     def __post_init__(self) -> None:
@@ -321,7 +321,13 @@ class Cahvore(RadialModel):
 
     @classmethod
     def from_cahv(
-        cls, cahv: Cahv, r: Triple, e: Triple = (0.0, 0.0, 0.0), *, linearity: Real, o: Triple | None = None
+        cls,
+        cahv: Cahv,
+        r: Vector3Like,
+        e: Vector3Like = (0.0, 0.0, 0.0),
+        *,
+        linearity: Number,
+        o: Vector3Like | None = None,
     ) -> Cahvore:
         """Add a wide-angle lens about the unit vector `o` (A by default) to a pinhole camera."""
         axis = cahv.a if o is None else np.asarray(o, dtype=np.float64)
@@ -347,10 +353,10 @@ class Cahvore(RadialModel):
         return np.arcsin(np.maximum(scale * chi, -1)) / scale if scale < -_ZERO_LINEARITY else chi
 
     def _pupil_series(self, theta: Vector) -> tuple[Vector, Vector]:
-        """Compute e0 + e1 theta^2 + e2 theta^4, metres, and its derivative by theta."""
-        square = theta * theta
-        series = self.e[0] + square * (self.e[1] + square * self.e[2])
-        return series, theta * (2 * self.e[1] + 4 * self.e[2] * square)
+        """Compute e0 + e1 theta^2 + e2 theta^4, metres, and its derivative with respect to theta."""
+        theta2 = theta * theta
+        series = self.e[0] + theta2 * (self.e[1] + theta2 * self.e[2])
+        return series, theta * (2 * self.e[1] + 4 * self.e[2] * theta2)
 
     def _solve_theta(self, axial: Vector, radius: Vector) -> tuple[Vector, Vector]:
         """Compute the angle theta of the ray through a point (NaN if there is none), and upsilon.
@@ -367,7 +373,7 @@ class Cahvore(RadialModel):
             upsilon = axial * cosine + radius * sine - (1 - cosine) * series - theta_minus_sine * slope
             step = (axial * sine - radius * cosine - theta_minus_sine * series) / upsilon
             theta = theta - step
-            if not np.any(np.abs(step) > 1e-9):  # the remaining error is of the step's square
+            if not np.any(np.abs(step) > 1e-9):  # the remaining error is of the order of step**2
                 break
         is_solved = (np.abs(step) <= 1e-9) & (upsilon > 0) & (theta >= 0) & (theta < self._theta_limit)
         return np.where(is_solved, theta, np.nan), upsilon

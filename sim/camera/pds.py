@@ -41,11 +41,11 @@ _PDS3_METRES = ("METER", "METERS", "METRE", "METRES", "M", "N/A")
 #: Groups of the rover's pose; the second is Curiosity's.
 _POSE_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
 #: The ^IMAGE line with one of `9`, `20481 <BYTES>`, `("A.IMG", 9)`, `("A.IMG", 20481 <BYTES>)`, `"A.IMG"`: the image's
-#: first record or byte, counted from 1, and its file.
+#: first record or byte (counted from 1), and its file. Groups: `file...` with both, `file_only`, `position`.
 _POINTER = re.compile(
     r"^[ \t]*\^IMAGE[ \t]*=[ \t]*"
-    r"(?:\([ \t]*\"(?P<detached>[^\"\n]+)\"[ \t]*,[ \t]*(?P<at>\d+)[ \t]*(?P<at_bytes><BYTES>)?[ \t]*\)"
-    r"|\"(?P<alone>[^\"\n]+)\"|(?P<number>\d+)[ \t]*(?P<bytes><BYTES>)?)[ \t]*\r?$",
+    r"(?:\([ \t]*\"(?P<file>[^\"\n]+)\"[ \t]*,[ \t]*(?P<file_position>\d+)[ \t]*(?P<file_in_bytes><BYTES>)?[ \t]*\)"
+    r"|\"(?P<file_only>[^\"\n]+)\"|(?P<position>\d+)[ \t]*(?P<in_bytes><BYTES>)?)[ \t]*\r?$",
     re.MULTILINE,
 )
 _RECORD = re.compile(r"^[ \t]*RECORD_BYTES[ \t]*=[ \t]*(\d+)", re.MULTILINE)
@@ -181,8 +181,8 @@ def _parse_blocks(text: str, names: Sequence[str], source: Source) -> Any:
             grammar = PDSGrammar()
             parser = ODLParser(grammar=grammar, decoder=PDSLabelDecoder(grammar=grammar))
             return parser.parse("\n".join(block[0] for block in blocks.finditer(text)) + "\nEND\n")
-    except Exception as fault:  # pvl raises many types, its own and Python's
-        raise source.error("label", f"cannot be parsed ({fault})", "a PDS3 label") from fault
+    except Exception as error:  # pvl raises many types, its own and Python's
+        raise source.error("label", f"cannot be parsed ({error})", "a PDS3 label") from error
 
 
 def _read_size(label: Any, source: Source) -> tuple[int, int]:
@@ -250,28 +250,28 @@ def _read_counts(text: str, image: Any, size: tuple[int, int], source: Source) -
     pointer = _POINTER.search(text)
     if pointer is None:
         raise source.error("^IMAGE", "missing or not readable", 'a record, bytes, or ("FILE", record)')
-    name = pointer["detached"] or pointer["alone"]
+    name = pointer["file"] or pointer["file_only"]
     path = Path(source.path)
     if name is not None:
         if Path(name).name != name:
             raise source.error("^IMAGE", f"{name!r} is in another folder", "a file next to the label")
-        # some archives write the file's name in the other case
+        # some archives write the file name in lower or upper case
         paths = [path.parent / name, path.parent / name.lower(), path.parent / name.upper()]
         path = next((path for path in paths if path.exists()), paths[0])
-    offset = int(pointer["at"] or pointer["number"] or 1) - 1
-    if offset > 0 and not (pointer["at_bytes"] or pointer["bytes"]):
+    offset = int(pointer["file_position"] or pointer["position"] or 1) - 1
+    if offset > 0 and not (pointer["file_in_bytes"] or pointer["in_bytes"]):
         record = _RECORD.search(text)
         if record is None:
             raise source.error("RECORD_BYTES", "missing", "the number of bytes of a record")
         offset *= int(record[1])
-    bits, kind = image.get("SAMPLE_BITS"), str(image.get("SAMPLE_TYPE", ""))
-    order = _BYTE_ORDERS.get(kind.split("_")[0])
-    if bits not in (8, 16) or order is None or not kind.endswith("INTEGER"):
-        raise source.error("IMAGE.SAMPLE_TYPE, SAMPLE_BITS", f"{kind}, {bits}", "integers of 8 or 16 bits")
+    bits, type_name = image.get("SAMPLE_BITS"), str(image.get("SAMPLE_TYPE", ""))
+    order = _BYTE_ORDERS.get(type_name.split("_")[0])
+    if bits not in (8, 16) or order is None or not type_name.endswith("INTEGER"):
+        raise source.error("IMAGE.SAMPLE_TYPE, SAMPLE_BITS", f"{type_name}, {bits}", "integers of 8 or 16 bits")
     for field, allowed in (("BANDS", 1), ("LINE_PREFIX_BYTES", 0), ("LINE_SUFFIX_BYTES", 0)):
         if image.get(field, allowed) != allowed:
             raise source.error(f"IMAGE.{field}", f"{image.get(field)}", f"{allowed}")
-    is_signed = bits == 16 and "UNSIGNED" not in kind
+    is_signed = bits == 16 and "UNSIGNED" not in type_name
     sample_type = np.dtype(f"{order}{'i' if is_signed else 'u'}{bits // 8}")
     columns, rows = size
     required_bytes = columns * rows * sample_type.itemsize
@@ -281,8 +281,8 @@ def _read_counts(text: str, image: Any, size: tuple[int, int], source: Source) -
         with path.open("rb") as file:
             file.seek(offset)
             data = file.read(available_bytes)
-    except OSError as fault:
-        raise source.error("^IMAGE", f"{path} cannot be read ({fault.strerror})", "the image's file") from fault
+    except OSError as error:
+        raise source.error("^IMAGE", f"{path} cannot be read ({error.strerror})", "the image's file") from error
     if len(data) < required_bytes:
         raise source.error("IMAGE", f"ends after {len(data)} bytes", f"{columns} x {rows} samples of {bits} bits")
     counts = np.frombuffer(data, dtype=sample_type).reshape(rows, columns)
@@ -309,8 +309,8 @@ def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
         raise source.error("label", "declares entities", "a PDS4 label, which has none")
     try:
         root = ElementTree.fromstring(text.encode("latin-1"))  # noqa: S314  (entities are refused above)
-    except (ElementTree.ParseError, ValueError, LookupError) as fault:
-        raise source.error("label", f"cannot be parsed ({fault})", "a PDS4 label, which is XML") from fault
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise source.error("label", f"cannot be parsed ({error})", "a PDS4 label, which is XML") from error
     models = [model for model in _find_elements(root, _PARAMETERS) if _find_child(model, "model_type") is not None]
     if not models:
         raise source.error(_PARAMETERS, "missing", "a PDS4 label with at least one such class with a model_type")
@@ -381,8 +381,10 @@ def _create_pds4_camera(element: ElementTree.Element, size: tuple[int, int], sou
     if name != "CAHVORE":
         return create_camera(name, vectors, size, None, source)
     field = f"{class_name}.cahvore_model_type, cahvore_model_parameter"
-    kind, parameter = (_parse_number(model, f"cahvore_model_{part}", field, source) for part in ("type", "parameter"))
-    return create_camera(name, vectors, size, linearity_of_type(kind, parameter, field, source), source)
+    model_type, parameter = (
+        _parse_number(model, f"cahvore_model_{part}", field, source) for part in ("type", "parameter")
+    )
+    return create_camera(name, vectors, size, linearity_of_type(model_type, parameter, field, source), source)
 
 
 def _parse_number(element: ElementTree.Element, name: str, field: str, source: Source) -> float | None:

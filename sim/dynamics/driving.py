@@ -7,6 +7,8 @@ The default slip on dry sand is 20 % on a slope of 10 deg, 50 % on 15 deg and 10
 paper reports up to 100 % on 15 to 20 deg (section 5.5), as do MER's tests on loose sand (Lindemann & Voorhees 2005).
 Opportunity lost half of its path on Eagle crater's slope of about 15 deg (JPL, March 2004). The division of the slip
 into longitudinal, lateral and heading slip is assumed.
+
+The tracking paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations

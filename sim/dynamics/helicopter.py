@@ -7,6 +7,8 @@ tilts the camera along and across the line, and swings it on some passes.
 
 Every coordinate is a piecewise quintic polynomial, or such a polynomial times a sine. It is twice continuously
 differentiable: velocity, rates and specific force are exact derivatives of position and attitude.
+
+The field test paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
 from __future__ import annotations

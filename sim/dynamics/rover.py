@@ -31,7 +31,7 @@ from marsyard.sim.frames import rigid, rotation_matrix
 from marsyard.sim.parameters import Parameters, bounded_field
 
 Metres = Annotated[float, Field(gt=0.0, le=5.0)]
-Six = Float64[np.ndarray, "6"]
+Vector6 = Float64[np.ndarray, "6"]
 WheelPoints = Float64[np.ndarray, "6 3"]
 
 #: Names of the wheels, in the order of all arrays.
@@ -214,7 +214,7 @@ class Stance:
     world_from_rover: RigidTransform
     differential_rad: float
     bogies_rad: tuple[float, float]
-    gaps_m: Six
+    gaps_m: Vector6
 
     @cached_property
     def _yaw_pitch_roll(self) -> tuple[float, float, float]:
@@ -295,7 +295,7 @@ class _StanceEquations:
     position_m: Float64[np.ndarray, "2"]
     yaw_rad: float
 
-    def solve(self, start: Six) -> tuple[Six, Six]:
+    def solve(self, start: Vector6) -> tuple[Vector6, Vector6]:
         """Solve for the unknowns with gaps of zero; return the unknowns and the remaining gaps.
 
         Newton's method needs few iterations on most ground. It can diverge where a wheel's lowest point jumps along the
@@ -311,22 +311,22 @@ class _StanceEquations:
             except np.linalg.LinAlgError:
                 break
 
-        def compute_gaps(x: Six) -> Six:
+        def compute_gaps(x: Vector6) -> Vector6:
             return self._find_lowest_points(x)[0]
 
-        def compute_jacobian(x: Six) -> Float64[np.ndarray, "6 6"]:
+        def compute_jacobian(x: Vector6) -> Float64[np.ndarray, "6 6"]:
             return self._compute_jacobian(x, self._find_lowest_points(x)[1])
 
         solution = least_squares(compute_gaps, start, jac=compute_jacobian, method="lm", xtol=1e-8, ftol=1e-12)
         return solution.x, solution.fun
 
-    def _compute_jacobian(self, unknowns: Six, points: WheelPoints) -> Float64[np.ndarray, "6 6"]:
+    def _compute_jacobian(self, unknowns: Vector6, points: WheelPoints) -> Float64[np.ndarray, "6 6"]:
         """Compute the derivatives of the gaps by finite differences, at the lowest point of each tread only."""
         step = _DIFFERENCE * np.eye(6)
         heights = self._compute_heights(np.concatenate([unknowns - step, unknowns + step]), points[:, None])[..., 0]
         return np.asarray(((heights[6:] - heights[:6]) / (2.0 * _DIFFERENCE)).T)
 
-    def _find_lowest_points(self, unknowns: Six) -> tuple[Six, WheelPoints]:
+    def _find_lowest_points(self, unknowns: Vector6) -> tuple[Vector6, WheelPoints]:
         """Find each tread's smallest height above the ground, and the point there, relative to the wheel's centre."""
         heights = self._compute_heights(unknowns[None], self._tread[None])[0]
         lowest = heights.argmin(axis=1)

@@ -61,13 +61,13 @@ Constants = tuple[kernels.Array, kernels.Array]
 Phase = Annotated[float, Field(ge=-360.0, le=720.0)]
 Gyration = Annotated[float, Field(ge=0.05, le=5.0)]
 
-#: The integration ends with the camera this far below the height of the thrusters' firing: more than a second later.
+#: Distance of the camera below the thrusters' firing height at which the integration ends: more than a second later.
 BELOW_FIRING_M = 90.0
 #: Maximum time of backward integration, in which damped swings grow: in 30 s a nod of 60 deg/s doubles its rate.
 MAX_LEAD_S = 30.0
-#: With these relative and absolute tolerances finite differences of the flight reproduce its derivatives to 1e-6.
+#: Relative and absolute tolerance of the integration: finite differences of the flight equal its derivatives to 1e-6.
 TOLERANCE = 1e-9
-#: Largest ratio of the coning lander's tilt to the line's for which the linear theory gives an initial state.
+#: Maximum ratio of the coning lander's tilt to the line's for which the linear theory defines an initial state.
 MAX_LANDER_TILT_RATIO = 1.5
 DOWN = np.array([0.0, 0.0, -1.0])
 

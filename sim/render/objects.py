@@ -14,7 +14,7 @@ from marsyard.sim.dynamics.rover import RoverParameters, Stance, compute_bogie_p
 from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render.kernels.hierarchy import Hierarchy, body_spheres, morton_codes, node_boxes, select_facing
 
-#: Triangle numbers are drawn as colours of 24 bits, of which 0 is the ground.
+#: Triangle numbers are rendered as 24-bit colours; 0 is the ground.
 MAX_TRIANGLES = 2**24 - 2
 
 
@@ -25,7 +25,7 @@ class Objects:
     - normals: unit normals of the smooth surface at the triangles' corners
     - body_of_triangle: number of each triangle's body: row of `albedo`
     - first_triangle: first triangle of each body, and the number of triangles at the end
-    - names: number by which the creator of each body identifies it, as a rock's number in its field
+    - names: number that identifies each body for its creator, such as the number of a rock in its field
     """
 
     triangles: Float64[np.ndarray, "triangles 3 3"]
@@ -47,14 +47,13 @@ class Objects:
     ) -> Objects:
         """Build bodies from a mesh: contiguous faces of one name, or of one `body_of_face`, are one body.
 
-        The albedo is one for all bodies, or one for each name.
-
-        Raises ValueError for more triangles than a picture can number.
+        `albedo` is common to all bodies, or has one value for each name. Raises ValueError for more than
+        `MAX_TRIANGLES` triangles.
         """
         changes = np.flatnonzero(np.diff(name_of_face if body_of_face is None else body_of_face)) + 1
         first = np.concatenate([[0], changes]) if len(faces) else np.empty(0, dtype=np.int64)
         names = np.asarray(name_of_face, dtype=np.int64)[first]
-        # np.take is several times faster than indexing for a scene's million triangles
+        # np.take is several times faster than indexing for a million triangles
         return cls._of_bodies(
             np.take(np.asarray(vertices, dtype=np.float64), faces, axis=0),
             np.take(np.asarray(vertex_normals, dtype=np.float64), faces, axis=0),
@@ -80,7 +79,7 @@ class Objects:
         names: Int64[np.ndarray, "bodies"],
         spheres: Float64[np.ndarray, "bodies 4"] | None = None,
     ) -> Objects:
-        """Number bodies of so many triangles; known spheres are not computed again for thousands of rocks."""
+        """Create bodies with `counts` triangles each; known bounding `spheres` save their computation."""
         if len(triangles) > MAX_TRIANGLES:
             raise ValueError(f"{len(triangles)} triangles; at most {MAX_TRIANGLES} can be drawn at once")
         body_of_triangle = np.repeat(np.arange(counts.size, dtype=np.int32), counts)
@@ -101,18 +100,18 @@ class Objects:
 
     @cached_property
     def spheres(self) -> Float64[np.ndarray, "bodies 4"]:
-        """Centre and radius of a sphere around each body, about the centre of its bounding box."""
+        """Bounding sphere of each body, centred at the centre of its bounding box: centre and radius."""
         return np.asarray(body_spheres(self.triangles, self.first_triangle))
 
     def in_cone(
         self, apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_angle_rad: float
     ) -> Int64[np.ndarray, "kept"]:
-        """Numbers of the triangles that face a cone's apex, of all bodies whose spheres reach into the cone."""
+        """Numbers of the triangles that face a cone's apex, for bodies whose bounding spheres intersect the cone."""
         kept = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
         return np.asarray(select_facing(self.triangles, self._triangles_of(kept), *apex))
 
     def only(self, kept: Bool[np.ndarray, "bodies"]) -> Objects:
-        """Select some of the bodies, which are numbered again."""
+        """Return the selected bodies, renumbered."""
         triangles = self._triangles_of(kept)
         return self._of_bodies(
             np.take(self.triangles, triangles, axis=0),
@@ -139,26 +138,26 @@ def spheres_in_cone(
     axis: Float64[np.ndarray, "3"],
     half_angle_rad: float,
 ) -> Bool[np.ndarray, "bodies"]:
-    """Select the spheres that reach into a cone."""
-    away, radius = spheres[:, :3] - apex, spheres[:, 3]
-    distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
-    off_axis = np.arccos(np.clip(away @ axis / distance, -1.0, 1.0))
+    """Select the spheres that intersect a cone."""
+    offset, radius = spheres[:, :3] - apex, spheres[:, 3]
+    distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+    off_axis = np.arccos(np.clip(offset @ axis / distance, -1.0, 1.0))
     widening = np.where(distance <= radius, np.pi, np.arcsin(np.clip(radius / distance, 0.0, 1.0)))
     return np.asarray(off_axis <= half_angle_rad + widening)
 
 
-#: Albedo of everything: bright metal and glass under dust. Assumed.
+#: Albedo of all rover parts, assumed: dusty bright metal and glass.
 ALBEDO = 0.25
 #: Name of the rover's body: rocks have numbers from 0, and truth layers use -1 for ground and -2 for sky.
 ROVER_NAME = -3
-#: Sizes that matter to shadows only, assumed: widths of legs and mast, thickness of the deck, m, and the body's
-#: fraction of the deck's length and width.
+#: Dimensions that affect shadows only, assumed: width of the legs, radius of the mast and thickness of the deck, m;
+#: length and width of the body as fractions of those of the deck.
 _LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
-#: The head: depth, height, how much wider than the cameras' baseline, and how far behind their centres it ends, m.
+#: The head: depth, height, width minus the cameras' baseline; distance of its front behind the cameras' centres, m.
 _HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
 _SIDES = 24
-#: The stowed instrument arm: joints relative to the front edge of the body at the height of the deck, m (x forward, y
-#: left, z up); radii of its links and of the turret that carries the instruments, and length of the turret, m. Assumed.
+#: The stowed instrument arm, assumed: joints relative to the front edge of the body at the height of the deck, m (x
+#: forward, y left, z up); radii of the links and of the instrument turret, and length of the turret, m.
 _ARM_JOINTS_M = ((0.06, 0.30, -0.02), (0.20, -0.30, 0.0), (0.22, 0.06, -0.01))
 _ARM_RADIUS_M, _TURRET_RADIUS_M, _TURRET_M = 0.025, 0.06, 0.18
 
@@ -173,10 +172,10 @@ def rover_objects(
     elevation_rad: float,
     baseline_m: float = 0.3,
 ) -> Objects:
-    """Build the rover as one body in its stance, its mast at its true angles.
+    """Build the rover as one body, in its stance and with its mast at these true angles.
 
-    Join it with a scene's rocks: ``Objects.joined([scene.objects, rover_objects(...)])``. `baseline_m` is the distance
-    of the widest pair of cameras: the head is a little wider.
+    To add it to the rocks of a scene: ``Objects.join([scene.objects, rover_objects(...)])``. `baseline_m` is the
+    baseline of the widest stereo pair; the head is slightly wider.
     """
     length, width = _BODY_FRACTION[0] * rover.body_length_m, _BODY_FRACTION[1] * rover.body_width_m
     x, y, z = mast.base_m
@@ -198,17 +197,17 @@ def rover_objects(
         parts += [_rod(start, end, 0.5 * _LEG_M) for start, end in legs]
     half = np.array([0.0, 0.5 * rover.wheel_width_m, 0.0])
     parts += [_rod(centre - half, centre + half, rover.wheel_radius_m) for centre in centres]
-    # the bar that carries the cameras, behind their centres, which lie on the y axis of the head's frame
-    depth, height, wider = _HEAD_M
+    # camera bar behind the cameras' centres, which lie on the y axis of the head's frame
+    depth, height, extra_width = _HEAD_M
     rover_from_head = mast.rover_from_head(azimuth_rad, elevation_rad)
     middle_of_head = (-_BEHIND_M - 0.5 * depth, 0.0, 0.0)
-    parts.append(_transform(_box((depth, baseline_m + wider, height), middle_of_head), rover_from_head))
+    parts.append(_transform(_box((depth, baseline_m + extra_width, height), middle_of_head), rover_from_head))
     # the elevation axis, from the mast's elbow to the head's middle
     top, end = rover_from_head.apply(np.array([-mast.head_m, middle_of_head]))
     parts.append(_rod(top, end, _MAST_RADIUS_M))
     triangles = _transform(np.concatenate(parts), stance.world_from_rover)
-    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    normals = across / np.linalg.norm(across, axis=1, keepdims=True)
+    face_normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = face_normals / np.linalg.norm(face_normals, axis=1, keepdims=True)
     faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
     names = np.full(len(triangles), ROVER_NAME, dtype=np.int32)
     return Objects.of_mesh(triangles.reshape(-1, 3), np.repeat(normals, 3, axis=0), faces, names, ALBEDO)
@@ -217,18 +216,18 @@ def rover_objects(
 def rover_sphere(
     rover: RoverParameters, stance: Stance, mast: MastGeometry, baseline_m: float = 0.3
 ) -> Float64[np.ndarray, "1 4"]:
-    """Centre and radius of a sphere that contains `rover_objects` for all angles of suspension and mast.
+    """Bounding sphere of `rover_objects` for all angles of suspension and mast: centre and radius.
 
-    Joints rotate about axes, so no part is farther away than the sum of the links that carry it.
+    Its radius is the maximum length of a chain of links, which bounds the distance of each part.
     """
     front, middle, rear = compute_wheel_centres(rover, 0.0, (0.0, 0.0))[:3]
     bogie = compute_bogie_pivots(rover, 0.0)[0]
     rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
     wheel = rover.wheel_radius_m + 0.5 * rover.wheel_width_m + _LEG_M
-    behind = _length(bogie - rocker) + max(_length(middle - bogie), _length(rear - bogie))
-    legs = _length(rocker) + max(_length(front - rocker), behind) + wheel
-    depth, height, wider = _HEAD_M
-    head = _length(_BEHIND_M + depth, 0.5 * (baseline_m + wider), 0.5 * height)
+    rear_chain = _length(bogie - rocker) + max(_length(middle - bogie), _length(rear - bogie))
+    legs = _length(rocker) + max(_length(front - rocker), rear_chain) + wheel
+    depth, height, extra_width = _HEAD_M
+    head = _length(_BEHIND_M + depth, 0.5 * (baseline_m + extra_width), 0.5 * height)
     top = _length(mast.base_m) + _length(mast.elbow_m) + _length(mast.head_m) + head + _MAST_RADIUS_M
     body = _length(0.5 * rover.body_length_m, 0.5 * rover.body_width_m, rover.deck_m + _DECK_M)
     return np.array([[*stance.world_from_rover.translation, max(legs, top, body)]])
@@ -240,12 +239,12 @@ def may_cast_shadow(
     position_m: Float64[np.ndarray, "3"],
     radius_m: float,
 ) -> bool:
-    """Whether bodies in spheres may hide the sun from a point within a radius of a position; False is exact."""
-    away = spheres[:, :3] - position_m
-    along = away @ sun_direction
-    distance = spheres[:, 3] + radius_m
-    across = np.linalg.norm(away - along[:, None] * sun_direction, axis=1)
-    return bool(np.any((across <= distance) & (along >= -distance)))
+    """Whether bodies in spheres may hide the sun from a point within a radius of a position; False is certain."""
+    offset = spheres[:, :3] - position_m
+    along_sun = offset @ sun_direction
+    max_distance = spheres[:, 3] + radius_m
+    perpendicular = np.linalg.norm(offset - along_sun[:, None] * sun_direction, axis=1)
+    return bool(np.any((perpendicular <= max_distance) & (along_sun >= -max_distance)))
 
 
 def _length(*parts: float | Float64[np.ndarray, "3"]) -> float:
@@ -258,7 +257,7 @@ def _box(size_m: tuple[float, float, float], middle_m: tuple[float, float, float
 
 @cache
 def _unit_box() -> Triangles:
-    import trimesh  # here and below, as it is slow to import
+    import trimesh  # imported late, here and below, because the import is slow
 
     return np.asarray(trimesh.creation.box().triangles, dtype=np.float64)
 
@@ -276,11 +275,11 @@ def _rod(
     end: Float64[np.ndarray, "3"] | tuple[float, float, float],
     radius_m: float,
 ) -> Triangles:
-    along = np.subtract(end, start)
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(along)))], along)
+    axis = np.subtract(end, start)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(axis)))], axis)
     x /= np.linalg.norm(x)
-    y = np.cross(along / float(np.linalg.norm(along)), x)
-    axes = np.stack([radius_m * x, radius_m * y, along], axis=1)
+    y = np.cross(axis / float(np.linalg.norm(axis)), x)
+    axes = np.stack([radius_m * x, radius_m * y, axis], axis=1)
     return np.asarray(np.asarray(start) + _unit_rod() @ axes.T)
 
 

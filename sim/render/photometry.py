@@ -190,7 +190,7 @@ class CloudParameters(Parameters):
 
         The transmittance of a cloud without absorption is ``2 / (2 + (1 - g) tau)`` (two-stream approximation; Bohren,
         Am. J. Phys. 55, 1987). The part `direct_transmittance` is not scattered. The scattered light is assumed uniform
-        over the ground, as the height of the clouds is similar to their distances.
+        over the ground, because the height of the clouds is similar to their distances.
         """
         transmittance = 2.0 / (2.0 + (1.0 - self.asymmetry) * self.optical_depth)
         scattered = max(transmittance - self.direct_transmittance(sun), 0.0)

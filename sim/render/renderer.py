@@ -298,7 +298,7 @@ def ground_mesh(
     To avoid aliasing, each vertex takes its height from the terrain level with about the same spacing as the grid.
     `spans` contains the first cell and the end of the cells in each strip between two lines of y; by default all cells.
     """
-    import trimesh  # imported late, as the import is slow
+    import trimesh  # imported late, because the import is slow
 
     if spans is None:
         spans = np.tile([0, x.size - 1], (y.size - 1, 1))

@@ -171,21 +171,21 @@ class Detector:
         names = ("exposure_s", "transfer_row_s", "clear_row_s", "rows_summed", "offset_dn", "full_scale_dn")
         settings = {name: getattr(p, name) for name in names}
         calibration = DetectorCalibration(flat_field=measured_response.astype(np.float64), **settings)
-        bad, hot = np.zeros(fall_off.shape, dtype=np.bool_), None
+        is_bad, hot = np.zeros(fall_off.shape, dtype=np.bool_), None
         if p.defects.hot_fraction > 0.0:
             # the dark current of hot pixels is exponentially distributed
             is_hot = rng.random(fall_off.shape, dtype=np.float32) < p.defects.hot_fraction
             hot = np.zeros(fall_off.shape, dtype=np.float32)
             hot[is_hot] = p.defects.hot_e_s * rng.standard_exponential(int(is_hot.sum()), dtype=np.float32)
-            bad |= hot > 0.0
+            is_bad |= hot > 0.0
         if p.defects.dead_fraction > 0.0:
-            dead = rng.random(fall_off.shape, dtype=np.float32) < p.defects.dead_fraction
-            response = np.where(dead, np.float32(0.0), response)
-            bad |= dead
+            is_dead = rng.random(fall_off.shape, dtype=np.float32) < p.defects.dead_fraction
+            response = np.where(is_dead, np.float32(0.0), response)
+            is_bad |= is_dead
         if p.optics.dust_discs > 0:
             response = response * dust_transmission(fall_off.shape, p.optics, rng)
         has_list = p.defects.listed and (p.defects.hot_fraction > 0.0 or p.defects.dead_fraction > 0.0)
-        listed = _sum_rows(bad.astype(np.float32), p.rows_summed) > 0.0 if has_list else None
+        listed = _sum_rows(is_bad.astype(np.float32), p.rows_summed) > 0.0 if has_list else None
         return cls(p, response.astype(np.float32), calibration, hot, listed)
 
     def with_exposure(self, exposure_s: float) -> Detector:

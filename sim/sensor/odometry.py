@@ -14,6 +14,8 @@ odometry does not converge, wheel odometry is used for that drive.
 
 Constant errors of a run are drawn once (`Odometer.draw`), the other errors with each drive. The estimate is exact at
 the start by definition. It assumes flat ground between stops: climbing over rocks has the effect of slip.
+
+The paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations

@@ -13,6 +13,8 @@ the fraction of the noise due to dark current, at -34, 0 and +23 deg C. Two cons
 (signal) and `DARK_E_S` (dark current). The fraction is 1 - SNR / (SNR without dark current), averaged over the image
 rows, which have different readout delays. From 0 to 23 deg C a dark current that doubles every 6 deg C grows by a
 factor of 14.3, but the fraction in the paper by 9.1. `DARK_E_S` is chosen such that both fractions have equal errors.
+
+The field-test paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
 from __future__ import annotations

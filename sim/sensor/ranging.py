@@ -131,12 +131,14 @@ def range_along(surface: Surface, position_m: Vector, axis: Vector, max_range_m:
         return np.asarray(points[:, 2] - surface.height(points[:, 0], points[:, 1]))
 
     distances = np.linspace(0.0, max_range_m, count)
-    hits = np.flatnonzero(clearance(distances) <= 0.0)
-    if hits.size == 0:
+    below_ground = np.flatnonzero(clearance(distances) <= 0.0)
+    if below_ground.size == 0:
         return np.inf
-    if hits[0] == 0:
+    if below_ground[0] == 0:
         return 0.0
-    return float(brentq(lambda d: float(clearance(np.array([d]))[0]), distances[hits[0] - 1], distances[hits[0]]))
+    return float(
+        brentq(lambda d: float(clearance(np.array([d]))[0]), distances[below_ground[0] - 1], distances[below_ground[0]])
+    )
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 An RTK (real-time kinematic) receiver compares carrier phases with a base station. Its solution is *fixed* while the
 integer phase ambiguities are resolved, and *floating* otherwise; each type has its own time-correlated and white
 errors. The type changes at random times. There are no solutions during an outage. Antennas are at the body's origin.
+
+The landing paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
 from __future__ import annotations

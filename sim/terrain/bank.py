@@ -1,4 +1,4 @@
-"""Synthesis of terrains from seeds, and the bank that keeps them on disk for a campaign's workers."""
+"""Synthesis of terrains from seeds, and the bank that caches them on disk for a campaign's workers."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _IN_USE: WeakValueDictionary[Path, np.ndarray] = WeakValueDictionary()
 
 
 def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surface:
-    """Synthesise a terrain from parameters and a random stream; the same stream gives the same bytes.
+    """Synthesise a terrain from parameters and a random stream; the same stream gives bit-identical samples.
 
-    Every part draws from its own named substream: adding or changing a landform changes no other. Single-threaded, so
-    the bytes do not depend on the number of threads.
+    Each landform has its own named substream: a new or changed landform does not change the others. The synthesis is
+    single-threaded, so that the samples do not depend on the number of threads.
     """
     p = parameters
     relief = Spectrum.power_law(p.samples, p.spacing_m, p.hurst, p.outer_scale_m)
@@ -52,18 +52,18 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
         cover = p.units.apply(ground, craters, substream(rng, "units"))
         height += rough * refine(np.ascontiguousarray(cover[..., ROUGHNESS]), ground.side)
         tone += fine * refine(np.ascontiguousarray(cover[..., TEXTURE]), ground.side)
-    real = None
+    dtm = None
     if p.source is not None:
-        real = embed(p.source, ground.side, ground.spacing_m)
-        detail = detail_below_posting(ground, real) if p.source.roughen else None
+        dtm = embed(p.source, ground.side, ground.spacing_m)
+        detail = detail_below_posting(ground, dtm) if p.source.roughen else None
     for name in LANDFORMS:
         landform = getattr(p, name)
         if landform is not None:
             landform.apply(ground, substream(rng, name))
     if len(craters):
         stamp_craters(ground.height, ground.tone, ground.spacing_m, craters, EJECTA_REACH_RADII)
-    if real is not None:
-        blend_into_ground(ground, real, detail)
+    if dtm is not None:
+        blend_into_ground(ground, dtm, detail)
     relative = np.exp(ground.tone, out=ground.tone)
     samples = np.empty((ground.side, ground.side, 2), dtype=np.float32)
     pack(ground.height, relative, p.albedo / float(relative.mean(dtype=np.float64)), samples)
@@ -72,7 +72,7 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
 
 @cache
 def _code_version(*, has_tails: bool) -> str:
-    """Hash of the code that makes a terrain: after a change of it, cached terrains are built again."""
+    """Hash of the code that synthesises terrains: after a change of the code, cached terrains are built again."""
     digest = hashlib.sha256(np.__version__.encode())
     folder = Path(__file__).parent
     for path in sorted(folder.rglob("*.py")):
@@ -86,22 +86,23 @@ def _code_version(*, has_tails: bool) -> str:
 class TerrainBank:
     """Numbered terrains of one kind, cached on disk. Wind tails of rocks are part of the surface.
 
-    Terrain k is a pure function of the parameters, the seed and k. On disk it is one array of all levels, which workers
-    memory-map, so they share its pages. The cache's size is bounded: see `marsyard.sim.cache.evict_files`.
+    Terrain k is a pure function of the parameters, the seed and k. The file of a terrain is one array of all levels.
+    Workers memory-map it and therefore share its pages. The size of the cache is limited (see
+    `marsyard.sim.cache.evict_files`).
     """
 
     parameters: TerrainParameters
     seed: int
 
     def terrain(self, number: int) -> Surface:
-        """Load a terrain from disk, or build and store it; where it cannot be written, it is kept in memory only."""
+        """Load a terrain from disk, or build and store it; if it cannot be written, it is kept in memory only."""
         path = self._path(number)
         flat = load_array(path)
         if flat is not None and flat.size == self._size():
             touch(path)
         else:
             built = self._build(number)
-            flat = np.concatenate([one.reshape(-1) for one in (*built.levels, built.cover)])
+            flat = np.concatenate([array.reshape(-1) for array in (*built.levels, built.cover)])
             try:
                 evict_files(path.parent, 4 * self._size(), set(_IN_USE))
                 flat = save_array(path, flat)
@@ -123,11 +124,11 @@ class TerrainBank:
         return rocks.tails.apply(surface, field, substream(self._rng(number), "wind tails"))
 
     def missing_bytes(self, number: int) -> int:
-        """Return the bytes that a terrain would add on disk, except for some hundred; 0 where it is stored."""
+        """Return the bytes that a terrain would add on disk, without the header of the file; 0 if it is stored."""
         return 0 if self._path(number).exists() else 4 * self._size()
 
     def rocks(self, number: int) -> RockField | None:
-        """Build the rocks of a terrain, at each call; None where the parameters have none."""
+        """Build the rocks of a terrain; they are not cached. None if the parameters have no rocks."""
         if self.parameters.rocks is None:
             return None
         return RockField.on(self.terrain(number), self.parameters.rocks, substream(self._rng(number), "rocks"))
@@ -136,7 +137,7 @@ class TerrainBank:
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
 
     def _path(self, number: int) -> Path:
-        # with hashes of the real terrain's files, whose content may change under the same name
+        # the name contains hashes of the DTM's files, because their content may change under the same name
         source, rocks = self.parameters.source, self.parameters.rocks
         has_tails = rocks is not None and rocks.tails is not None
         parameters = self.parameters.model_dump_json(exclude=None if has_tails else {"rocks"})

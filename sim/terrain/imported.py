@@ -16,8 +16,8 @@ from marsyard.sim.parameters import Parameters
 from marsyard.sim.terrain.landforms.ground import Ground, refine
 
 Grid = Float64[np.ndarray, "rows columns"]
-Line = Float64[np.ndarray, "n"]
-Part = Float32[np.ndarray, "rows columns"]
+Coordinates = Float64[np.ndarray, "n"]
+GridPatch = Float32[np.ndarray, "rows columns"]
 Mask = Bool[np.ndarray, "rows columns"]
 
 
@@ -184,9 +184,9 @@ class EmbeddedDtm:
 
     rows: slice
     columns: slice
-    height: Part
-    tone: Part | None
-    weight: Part
+    height: GridPatch
+    tone: GridPatch | None
+    weight: GridPatch
     has_data: Mask
     extent: RealExtent
 
@@ -244,7 +244,9 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
     return EmbeddedDtm(slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, tone, weight, has_data, extent)
 
 
-def _log_brightness(source: RealTerrain, raster: Raster, ortho: Raster, x: Line, y: Line) -> tuple[Part, int]:
+def _log_brightness(
+    source: RealTerrain, raster: Raster, ortho: Raster, x: Coordinates, y: Coordinates
+) -> tuple[GridPatch, int]:
     """Logarithm of the orthoimage's brightness divided by its mean, and the number of missing pixels.
 
     Positions are relative to the DTM's south-western post, metres. Shading in the image is not removed: it becomes part
@@ -278,7 +280,7 @@ def choose_grid(source: RealTerrain) -> tuple[int, float]:
 
 
 #: Height and tone detail below a DTM's posting.
-Detail = tuple[Part, Part]
+Detail = tuple[GridPatch, GridPatch]
 
 
 def detail_below_posting(ground: Ground, dtm: EmbeddedDtm) -> Detail:

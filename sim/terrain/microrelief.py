@@ -1,4 +1,4 @@
-"""Relief finer than a terrain's samples: its spectrum continued to a millimetre, as octaves of height noise."""
+"""Relief finer than a terrain's samples: its spectrum is extended to 1 mm by octaves of height noise."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.special import gamma, kv
 
-#: Waves of the coarsest octave per Nyquist wave of the samples, and size of the finest lattice cells, metres.
+#: Frequency of the coarsest octave divided by the Nyquist frequency of the samples; size of the finest cells, metres.
 _FIRST_WAVE, FINEST_M = 1.0, 0.001
-#: Waves per lattice cell of the noise, in the median of its power, and its mean square.
+#: Median frequency of the noise power, cycles per lattice cell; mean square of the noise.
 WAVES_PER_CELL, NOISE_VARIANCE = 0.61, 0.0464
 
 
@@ -18,11 +18,12 @@ WAVES_PER_CELL, NOISE_VARIANCE = 0.61, 0.0464
 def octave_heights(
     hurst: float, slope_rad: float, baseline_m: float, outer_scale_m: float, spacing_m: float
 ) -> tuple[float, Float64[np.ndarray, "octaves"]]:
-    """Cell size of the coarsest octave, metres, and the amplitude of each octave of height noise, metres.
+    """Compute the cell size of the coarsest octave and the amplitude of each octave of height noise, metres.
 
-    The ground's power spectral density is ``(k**2 + k0**2)**-(H + 1)`` (`landforms.ground.Spectrum`), whose correlation
-    is Matérn's; its slope over the baseline gives its variance. An octave around the wavenumber k has the fraction
-    ``(1 + (k1 / k0)**2)**-H - (1 + (k2 / k0)**2)**-H`` of it, k1 and k2 a factor sqrt(2) below and above k.
+    The ground's power spectral density is ``(k**2 + k0**2)**-(H + 1)`` (`landforms.ground.Spectrum`) with the Hurst
+    exponent H and the wavenumber k0 of the outer scale. Its correlation function is Matérn's. Its variance follows from
+    the slope over the baseline. An octave from k1 = k / sqrt(2) to k2 = k sqrt(2) around the wavenumber k has the
+    fraction ``(1 + (k1 / k0)**2)**-H - (1 + (k2 / k0)**2)**-H`` of this variance.
     """
     k0 = 2.0 * np.pi / outer_scale_m
     lag = k0 * baseline_m
@@ -30,8 +31,10 @@ def octave_heights(
     variance = (np.tan(slope_rad) * baseline_m) ** 2 / (2.0 * (1.0 - correlation))
     coarsest = WAVES_PER_CELL * 2.0 * spacing_m / _FIRST_WAVE
     octaves = max(int(np.log2(coarsest / FINEST_M)) + 1, 0)
-    middle = 2.0 * np.pi * WAVES_PER_CELL / (coarsest * 0.5 ** np.arange(octaves))
-    below, above = ((1.0 + (middle * factor / k0) ** 2) ** -hurst for factor in (np.sqrt(0.5), np.sqrt(2.0)))
-    heights = np.sqrt(variance * (below - above) / NOISE_VARIANCE)
+    wavenumber = 2.0 * np.pi * WAVES_PER_CELL / (coarsest * 0.5 ** np.arange(octaves))
+    fraction_above_k1, fraction_above_k2 = (
+        (1.0 + (wavenumber * factor / k0) ** 2) ** -hurst for factor in (np.sqrt(0.5), np.sqrt(2.0))
+    )
+    heights = np.sqrt(variance * (fraction_above_k1 - fraction_above_k2) / NOISE_VARIANCE)
     heights.setflags(write=False)
     return coarsest, heights

@@ -15,7 +15,7 @@ from marsyard.sim.terrain.rocks.field import RockParameters
 
 
 class TerrainParameters(Parameters):
-    """A synthetic terrain: fractal ground and craters, and landforms where asked for. Lengths in metres."""
+    """A synthetic terrain: fractal ground, craters and optional landforms. Lengths in metres."""
 
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side, a power of two")] = 4096
     spacing_m: Annotated[float, Field(gt=0.0, le=100.0, description="distance between samples, m")] = 1.5
@@ -66,32 +66,32 @@ class TerrainParameters(Parameters):
         return samples
 
     def with_changes(self, changes: Mapping[str, Any]) -> TerrainParameters:
-        """Return these parameters with some changed, validated.
+        """Return a copy with changes, validated.
 
         Changes are nested as in a file: ``{"samples": 2048, "rocks": {"abundance": 0.1}}`` keeps all other values of
-        the rocks. None removes a landform, the rocks or a source; a new landform takes its defaults. Raises ValueError,
-        naming the first invalid parameter.
+        the rocks. None removes a landform, the rocks or a source. A new landform has its default values. Raises
+        ValueError; the message contains the first invalid parameter.
         """
         _check_names(TerrainParameters, changes, "")
         try:
             return TerrainParameters.model_validate(merge_settings(self.model_dump(), changes))
         except ValidationError as error:
             first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise ValueError(f"terrain.{where}: {first['msg']}; given: {first['input']!r}") from None
+            location = ".".join(str(part) for part in first["loc"])
+            raise ValueError(f"terrain.{location}: {first['msg']}; given: {first['input']!r}") from None
 
 
 #: The landforms in the order in which they are added to the fractal ground.
 LANDFORMS = ("fans", "playa", "lava", "swell", "ramp", "gullies", "dunes", "ripples")
 
 
-def _check_names(model: type[BaseModel], changes: Mapping[str, Any], where: str) -> None:
-    """Raise ValueError for the first unknown name, naming the allowed ones."""
+def _check_names(model: type[BaseModel], changes: Mapping[str, Any], prefix: str) -> None:
+    """Raise ValueError for the first unknown name; the message contains the allowed names."""
     for name, value in changes.items():
         if name not in model.model_fields:
             allowed = ", ".join(model.model_fields)
-            raise ValueError(f"terrain{where} has no parameter '{name}'; allowed: {allowed}")
+            raise ValueError(f"terrain{prefix} has no parameter '{name}'; allowed: {allowed}")
         if isinstance(value, Mapping):
-            for kind in get_args(model.model_fields[name].annotation):
-                if isinstance(kind, type) and issubclass(kind, BaseModel):
-                    _check_names(kind, value, f"{where}.{name}")
+            for alternative in get_args(model.model_fields[name].annotation):
+                if isinstance(alternative, type) and issubclass(alternative, BaseModel):
+                    _check_names(alternative, value, f"{prefix}.{name}")

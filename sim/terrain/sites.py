@@ -131,7 +131,7 @@ class Site(Parameters):
     hills: tuple[Hill, ...] = ()
 
     def with_dust(self, optical_depth: float | None) -> Site:
-        """Return the site with another optical depth of its air; None keeps it."""
+        """Return the site with another optical depth of its air; None: no change."""
         if optical_depth is None:
             return self
         air = self.environment.model_copy(update={"optical_depth": optical_depth})

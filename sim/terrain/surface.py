@@ -1,8 +1,8 @@
 """The ground as a smooth, periodic surface with albedo, and statistics of its slopes and relief.
 
-A terrain is *defined* as the uniform cubic B-spline whose control values are the stored samples: twice continuously
-differentiable, evaluated exactly with its gradient, and reproduced independently by
-``scipy.ndimage.map_coordinates(samples, order=3, mode="grid-wrap", prefilter=False)``. It repeats in x and y.
+A terrain is *defined* as the uniform cubic B-spline whose control values are the stored samples. It is twice
+continuously differentiable, and periodic in x and y. Value and gradient are exact. An independent evaluation is
+``scipy.ndimage.map_coordinates(samples, order=3, mode="grid-wrap", prefilter=False)``.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from marsyard.sim.terrain.kernels import block_ceilings, evaluate_field, reduce_
 
 HEIGHT, ALBEDO = 0, 1  #: Channels of the stored samples.
 Coordinate = Float[np.ndarray, "*batch"] | float  #: One coordinate or many, metres.
-SMALLEST_LEVEL = 16  #: Samples along each side of the coarsest level kept.
+SMALLEST_LEVEL = 16  #: Samples along each side of the coarsest level.
 ROUGHNESS, TEXTURE, ROCKS = 0, 1, 2  #: Channels of a cover.
-UNIFORM = np.ones((1, 1, 3), dtype=np.float32)  #: Cover of ground that is alike everywhere.
+UNIFORM = np.ones((1, 1, 3), dtype=np.float32)  #: Cover of uniform ground.
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A periodic terrain surface with a pyramid of levels, coarser ones for pixels that cover many samples.
+    """A periodic terrain surface with a pyramid of levels; coarse levels are for pixels that cover many samples.
 
     - levels: read-only control values of height (metres) and albedo. Level l has samples every ``spacing_m * 2**l``
       metres: row i lies at y = i * spacing, column j at x = j * spacing
     - spacing_m: distance between samples at level 0
-    - cover: factors of fine relief, fine albedo contrast and rock density on a grid of the same extent; one sample of
-      ones where the ground is alike everywhere
+    - cover: factors of fine relief, fine albedo contrast and rock density on a grid of the same extent; for uniform
+      ground a single sample with the factors 1
     """
 
     levels: tuple[Float32[np.ndarray, "rows columns 2"], ...]
@@ -45,7 +45,7 @@ class Surface:
         spacing_m: float,
         cover: Float32[np.ndarray, "side side 3"] = UNIFORM,
     ) -> Surface:
-        """Build the pyramid over level 0, a square whose side is a power of two of at least 16; else ValueError."""
+        """Build the pyramid from level 0; ValueError unless level 0 is a square of 2**k samples per side, k >= 4."""
         side = samples.shape[0]
         if samples.shape[1] != side or side < SMALLEST_LEVEL or side & (side - 1):
             needed = "a square with a power of two of at least 16 is needed"
@@ -111,7 +111,7 @@ class TerrainStatistics:
 
 
 def terrain_statistics(surface: Surface, samples: Samples | None = None) -> TerrainStatistics:
-    """Compute the statistics over all samples or some; a slope is NaN where they are too few for its baseline."""
+    """Compute the statistics over all or selected samples; a slope is NaN if they are too few for its baseline."""
     heights, selection = _heights(surface), samples if samples is not None else np.s_[:]
     return TerrainStatistics(
         albedo=float(surface.levels[0][..., ALBEDO][selection].mean(dtype=np.float64)),
@@ -133,10 +133,10 @@ def _heights(surface: Surface) -> Heights:
 def mean_slope_deg(surface: Surface, baseline_m: float, samples: Samples | None = None) -> float:
     """Compute the mean bidirectional slope: absolute slope along lines to the east and north over a baseline.
 
-    ``atan(|z(x + L) - z(x)| / L)`` from posts a baseline apart, as in the MER landing site studies (Golombek et al.
-    2003; Kirk et al. 2003). A plane's steepest slope is larger, on average by a factor of pi / 2 for small slopes in
-    random directions. Lines begin and end at `samples`. NaN where the terrain, or the part of it that holds the
-    samples, is not twice as wide as the baseline.
+    ``atan(|z(x + L) - z(x)| / L)`` for the baseline L, as in the MER landing site studies (Golombek et al. 2003; Kirk
+    et al. 2003). The steepest slope of a plane is larger, on average by a factor of pi / 2 for small slopes in random
+    directions. Lines begin and end at `samples`. NaN if the terrain, or the bounding box of the samples, is narrower
+    than two baselines.
     """
     return _slope_deg(_heights(surface), surface.spacing_m, baseline_m, samples)
 
@@ -149,7 +149,7 @@ def _slope_deg(heights: Heights, spacing_m: float, baseline_m: float, samples: S
     if mask is not None:
         # within the bounding box of the samples
         occupied = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
-        box = tuple(slice(int(some[0]), int(some[-1]) + 1) if some.size else slice(0) for some in occupied)
+        box = tuple(slice(int(indices[0]), int(indices[-1]) + 1) if indices.size else slice(0) for indices in occupied)
         z, mask = z[box], mask[box]
     lag = round(baseline_m / (spacing_m * step))
     if lag < 1 or 2 * lag > min(z.shape):
@@ -168,10 +168,11 @@ def _slope_deg(heights: Heights, spacing_m: float, baseline_m: float, samples: S
 
 
 def image_contrast(surface: Surface, pixel_m: float, samples: Samples | None = None) -> float:
-    """Compute RMS over mean of a nadir image's brightness, over all samples or some; NaN where no pixel has any.
+    """Compute the RMS contrast (standard deviation / mean) of a nadir image, over all or selected samples.
 
-    Each pixel takes slope and albedo of the pyramid's level whose samples are about as far apart as pixels. The
-    reflectance is Lunar-Lambert, the sun 45 deg high in the west, the sky even; shadows and detector are omitted.
+    NaN if no pixel contains a selected sample. Each pixel has the slope and albedo of the pyramid level whose spacing
+    is nearest to the pixel size. The reflectance is Lunar-Lambert, with the sun at an elevation of 45 deg in the west
+    and a uniform sky; shadows and detector are omitted.
     """
     level = min(max(round(np.log2(pixel_m / surface.spacing_m)), 0), len(surface.levels) - 1)
     image = nadir_picture(surface, level, np.radians(270.0), np.radians(CONTRAST_SUN_ELEVATION_DEG)).reshape(-1)

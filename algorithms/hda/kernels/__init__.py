@@ -1,1 +1,1 @@
-"""Compiled kernels of the hazard detection; the typed functions around them say what they compute."""
+"""Compiled kernels of the hazard detection; the typed functions that call them document their inputs and outputs."""

@@ -1,4 +1,7 @@
-"""Kernels of hazard detection: elevation map of points (section II.D) and least-median-of-squares planes (III)."""
+"""Kernels of hazard detection: elevation map of points (section II.D) and least-median-of-squares planes (III).
+
+Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

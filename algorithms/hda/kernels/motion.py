@@ -1,4 +1,7 @@
-"""Kernel of structure from motion (section II.B): robust Levenberg-Marquardt with the inverse depths eliminated."""
+"""Kernel of structure from motion (section II.B): robust Levenberg-Marquardt with the inverse depths eliminated.
+
+Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ def sample_with_derivatives(
     """Evaluate a patch of the spline and its two derivatives; the upper left pixel is (row, column) plus a fraction.
 
     `row_taps` and `column_taps` are the six filter taps for values and for slopes, shape (2, 6), from two pixels before
-    the pixel. Values, derivatives by row and by column are stored in `output`, shape (3, rows, columns).
+    the pixel. Values and derivatives with respect to row and column are stored in `output`, (3, rows, columns).
     """
     _, height, width = output.shape
     values, slopes = np.empty(width + 5), np.empty(width + 5)

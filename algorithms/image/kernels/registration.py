@@ -18,7 +18,7 @@ UNKNOWNS = (4, 8, 14)
 
 @njit(cache=True)
 def build_design_matrix(template: Array, unknowns: int) -> Array:
-    """Build the design matrix, one row per pixel: template, 1, derivatives by shift (2), affine (4), quadratic (6)."""
+    """Build the design matrix, one row per pixel: template, 1, derivatives for shift (2), affine (4), quadratic (6)."""
     side = template.shape[0]
     half = 0.5 * (side - 1)
     mean = template.mean()

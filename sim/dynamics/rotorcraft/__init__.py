@@ -11,6 +11,8 @@ flare height the autopilot controls the velocity to zero, but not the position, 
 
 Not modelled: inflow near the ground, wind that depends on position, and sliding or tipping after the touchdown. The
 skids stay at the point of first contact, and the tilt decays to zero.
+
+The landing paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
 from __future__ import annotations

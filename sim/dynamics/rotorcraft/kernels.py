@@ -162,13 +162,15 @@ def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float
         roll_command - tilt_error[2] - c.gust_tilt_s_m * gust_left,
     )
     for i in range(3):
-        natural = c.heading_rad_s if i == 0 else c.attitude_rad_s
+        natural_frequency = c.heading_rad_s if i == 0 else c.attitude_rad_s
         angle = row[ANGLE + i] + step * row[RATE + i] + 0.5 * step * step * row[ANGULAR_ACCELERATION + i]
         rate = row[RATE + i] + step * row[ANGULAR_ACCELERATION + i]
         error = targets[i] - angle
         if i == 0:
             error = math.atan2(math.sin(error), math.cos(error))
-        after[ANGULAR_ACCELERATION + i] = natural * natural * error - 2.0 * c.attitude_damping * natural * rate
+        after[ANGULAR_ACCELERATION + i] = (
+            natural_frequency * natural_frequency * error - 2.0 * c.attitude_damping * natural_frequency * rate
+        )
         after[ANGLE + i] = angle
     yaw, pitch, roll = after[ANGLE], after[ANGLE + 1], after[ANGLE + 2]
     forward = math.cos(roll) * math.sin(pitch)
@@ -187,10 +189,12 @@ def _step_on_ground(row: Array, after: Array, step: float, c: Craft) -> None:
     """Compute the next row on the ground: velocity and tilt decay to zero with the time constant `contact_s`."""
     for i in range(3):
         after[ACCELERATION + i] = -(row[VELOCITY + i] + step * row[ACCELERATION + i]) / c.contact_s
-        natural = 0.5 / c.contact_s
+        natural_frequency = 0.5 / c.contact_s
         angle = 0.0 if i == 0 else row[ANGLE + i] + step * row[RATE + i]
         rate = row[RATE + i] + step * row[ANGULAR_ACCELERATION + i]
-        after[ANGULAR_ACCELERATION + i] = -natural * natural * angle - 2.0 * natural * rate
+        after[ANGULAR_ACCELERATION + i] = (
+            -natural_frequency * natural_frequency * angle - 2.0 * natural_frequency * rate
+        )
     _integrate(row, after, step)
 
 

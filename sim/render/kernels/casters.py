@@ -28,7 +28,7 @@ BodyGrids = tuple[Array, Longs, Longs, Longs, Array]
 #: corner, and s of its plane; unit vectors u and v perpendicular to the sun's direction, and s along it; grids.
 Casters = tuple[Array, Array, Grid, BodyGrids]
 #: Minimum u and v, maximum u, v and s; or minimum u and v, cells per metre along u and v, and maximum s.
-Rect = tuple[float, float, float, float, float]
+BoundsUVS = tuple[float, float, float, float, float]
 #: Average number of triangles per cell of a body's grid, and the maximum number of cells along a side.
 TRIANGLES_PER_CELL, MAX_CELLS = 4, 1024
 #: Margin of all bounds, metres; larger than rounding errors.
@@ -42,34 +42,34 @@ def _project_along_sun(triangles: Array, axes: Array) -> tuple[Array, Array]:
     """Bounds of each triangle (minimum u and v, maximum u, v and s), and its linear coefficients (`Casters`)."""
     bounds = np.empty((triangles.shape[0], 5))
     linear = np.empty((triangles.shape[0], 9))
-    at = np.empty((3, 3))
+    projected = np.empty((3, 3))
     for n in range(triangles.shape[0]):
         for corner in range(3):
             x, y, z = triangles[n, corner, 0], triangles[n, corner, 1], triangles[n, corner, 2]
             for k in range(3):
-                at[k, corner] = axes[k, 0] * x + axes[k, 1] * y + axes[k, 2] * z
+                projected[k, corner] = axes[k, 0] * x + axes[k, 1] * y + axes[k, 2] * z
         for k in range(3):
             if k < 2:
-                bounds[n, k] = min(min(at[k, 0], at[k, 1]), at[k, 2]) - SLACK_M
-            bounds[n, k + 2] = max(max(at[k, 0], at[k, 1]), at[k, 2]) + SLACK_M
-        u, v, s = at[0, 0], at[1, 0], at[2, 0]
-        u2, v2, s2 = at[0, 1] - u, at[1, 1] - v, at[2, 1] - s
-        u3, v3, s3 = at[0, 2] - u, at[1, 2] - v, at[2, 2] - s
+                bounds[n, k] = min(min(projected[k, 0], projected[k, 1]), projected[k, 2]) - SLACK_M
+            bounds[n, k + 2] = max(max(projected[k, 0], projected[k, 1]), projected[k, 2]) + SLACK_M
+        u, v, s = projected[0, 0], projected[1, 0], projected[2, 0]
+        u2, v2, s2 = projected[0, 1] - u, projected[1, 1] - v, projected[2, 1] - s
+        u3, v3, s3 = projected[0, 2] - u, projected[1, 2] - v, projected[2, 2] - s
         area = u2 * v3 - u3 * v2
         if abs(area) < MIN_DOUBLE_AREA_M2:
             linear[n] = math.nan
             continue
-        second_u, second_v = v3 / area, -u3 / area
-        third_u, third_v = -v2 / area, u2 / area
-        slope_u, slope_v = second_u * s2 + third_u * s3, second_v * s2 + third_v * s3
-        linear[n, 0], linear[n, 1], linear[n, 2] = -(second_u * u + second_v * v), second_u, second_v
-        linear[n, 3], linear[n, 4], linear[n, 5] = -(third_u * u + third_v * v), third_u, third_v
+        weight2_u, weight2_v = v3 / area, -u3 / area
+        weight3_u, weight3_v = -v2 / area, u2 / area
+        slope_u, slope_v = weight2_u * s2 + weight3_u * s3, weight2_v * s2 + weight3_v * s3
+        linear[n, 0], linear[n, 1], linear[n, 2] = -(weight2_u * u + weight2_v * v), weight2_u, weight2_v
+        linear[n, 3], linear[n, 4], linear[n, 5] = -(weight3_u * u + weight3_v * v), weight3_u, weight3_v
         linear[n, 6], linear[n, 7], linear[n, 8] = s - slope_u * u - slope_v * v, slope_u, slope_v
     return bounds, linear
 
 
 @njit(cache=True)
-def _joint_bounds(bounds: Array, first: int, end: int) -> Rect:
+def _joint_bounds(bounds: Array, first: int, end: int) -> BoundsUVS:
     """Joint bounds of the rows from `first` to before `end`."""
     u0, v0, u1, v1, s1 = math.inf, math.inf, -math.inf, -math.inf, -math.inf
     for n in range(first, end):
@@ -135,7 +135,7 @@ def _list_in_cells(
 
 
 @njit(cache=True)
-def _grid_rect(rect: Rect, side: int) -> Rect:
+def _grid_rect(rect: BoundsUVS, side: int) -> BoundsUVS:
     """Minimum u and v, cells per metre along u and v, and maximum s of a grid over these bounds."""
     return rect[0], rect[1], side / (rect[2] - rect[0]), side / (rect[3] - rect[1]), rect[4]
 
@@ -145,7 +145,7 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     """Build the grids of bodies' triangles, in contiguous ranges, for a sun in the direction of the third axis."""
     bodies = first_triangle.size - 1
     bounds, linear = _project_along_sun(triangles, axes)
-    rects = np.empty((bodies, 5))
+    body_bounds = np.empty((bodies, 5))
     outlines = np.empty((bodies, 5))
     shapes = np.empty((bodies, 2), dtype=np.int64)
     cells = 0
@@ -153,30 +153,32 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
         first, end = first_triangle[body], first_triangle[body + 1]
         side = _cells_per_side((end - first) / TRIANGLES_PER_CELL)
         rect = _joint_bounds(bounds, first, end)
-        rects[body], outlines[body] = rect, _grid_rect(rect, side)
+        body_bounds[body], outlines[body] = rect, _grid_rect(rect, side)
         shapes[body, 0], shapes[body, 1] = side, cells
         cells += side * side
     starts, items = _list_in_cells(bounds, first_triangle, outlines, shapes[:, 0].copy(), shapes[:, 1].copy())
-    tops = np.empty(items.size)
+    max_s = np.empty(items.size)
     for k in range(items.size):
-        tops[k] = bounds[items[k], 4]
+        max_s[k] = bounds[items[k], 4]
     # one grid over all bodies
     sides = np.array([_cells_per_side(float(bodies))])
-    joint = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
+    joint_grid = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
     if bodies > 0:
-        joint[0] = _grid_rect(_joint_bounds(rects, 0, bodies), sides[0])
-    first_items, bodies_listed = _list_in_cells(rects, np.array([0, bodies]), joint, sides, np.zeros(1, dtype=np.int64))
-    grid: Grid = (joint[0, :4].copy(), sides, first_items, bodies_listed)
-    return linear, axes, grid, (outlines, shapes, starts, items, tops)
+        joint_grid[0] = _grid_rect(_joint_bounds(body_bounds, 0, bodies), sides[0])
+    first_items, bodies_listed = _list_in_cells(
+        body_bounds, np.array([0, bodies]), joint_grid, sides, np.zeros(1, dtype=np.int64)
+    )
+    grid: Grid = (joint_grid[0, :4].copy(), sides, first_items, bodies_listed)
+    return linear, axes, grid, (outlines, shapes, starts, items, max_s)
 
 
 @njit(cache=True)
 def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) -> None:
     """Test whether a triangle occludes the sun at each position; `hidden` is the output.
 
-    All positions are tested in one call, as passing the arrays takes longer than testing most positions.
+    All positions are tested in one call, because passing the arrays takes longer than testing most positions.
     """
-    linear, axes, (grid, sides, starts, items), (outlines, shapes, first_items, listed, tops) = casters
+    linear, axes, (grid, sides, starts, items), (outlines, shapes, first_items, listed, max_s) = casters
     to_axes = unpack_matrix(axes)
     side = sides[0]
     west, south, per_u, per_v = grid[0], grid[1], grid[2], grid[3]
@@ -202,7 +204,7 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
                 continue
             body_cell = shapes[body, 1] + int(row) * body_side + int(column)
             for m in range(first_items[body_cell], first_items[body_cell + 1]):
-                if tops[m] < s:
+                if max_s[m] < s:
                     continue
                 n = listed[m]
                 second = linear[n, 0] + linear[n, 1] * u + linear[n, 2] * v

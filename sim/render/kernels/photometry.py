@@ -15,13 +15,14 @@ HORIZON = 1e-3
 
 @njit(cache=True)
 def single_scattering(cos_zenith: float, cos_sun_zenith: float, cos_g: float, depth: float, asymmetry: float) -> float:
-    """Single-scattering brightness of a plane layer of air seen from below over the sun's there, up to a constant.
+    """Single-scattering radiance of a plane air layer from below, relative to direct sunlight, up to a factor.
 
-    ``P(g) mu0 / (mu0 - mu) (1 - exp(tau / mu0 - tau / mu))`` with the Henyey-Greenstein phase function P.
+    ``P(g) mu0 / (mu0 - mu) (1 - exp(tau / mu0 - tau / mu))`` with the Henyey-Greenstein phase function P and
+    the optical depth tau. mu and mu0 are the sines of the elevations of the direction and of the sun.
     """
     mu = max(cos_zenith, HORIZON)
     mu0 = max(cos_sun_zenith, HORIZON)
-    # exact also where both elevations are equal
+    # the limit for equal elevations avoids 0 / 0
     difference = depth / mu - depth / mu0
     path = 1.0 - 0.5 * difference if abs(difference) < 1e-6 else -math.expm1(-difference) / difference
     phase = (1.0 - asymmetry * asymmetry) / (1.0 + asymmetry * asymmetry - 2.0 * asymmetry * cos_g) ** 1.5

@@ -138,7 +138,7 @@ def _project(
 def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None:
     """First guesses of distance, and footprints, from the four samples around each ray; 0 if depth is discontinuous.
 
-    Inverse depth is interpolated, as the inverse depth of a plane is linear in the image.
+    Inverse depth is interpolated, because the inverse depth of a plane is linear in the image.
     """
     for k in range(min(width, STRIP)):
         a, b, c, d = work[UPPER_LEFT + k], work[UPPER_RIGHT + k], work[LOWER_LEFT + k], work[LOWER_RIGHT + k]
@@ -163,7 +163,7 @@ def _take_newton_step(fetched: FetchedCells, width: int, work: Array) -> None:
         rate = dz - slope_x * scale * work[DX + k] - slope_y * scale * work[DY + k]
         step = clearance / rate
         has_failed = rate > MAX_NEWTON_RATE or abs(t - step - start) > MAX_CHANGE * start
-        # after a shorter step the error is below 1e-6 of the distance, as curvature is at most about 1 / spacing
+        # after a shorter step the error is below 1e-6 of the distance: curvature is at most about 1 / spacing
         is_far = step * step >= 2e-6 * start / scale
         is_active = work[ACTIVE + k] > 0.0
         work[DISTANCE + k] = (start if has_failed else t - step) if is_active else t
@@ -298,9 +298,9 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
     levels, ceilings, top_level, spacing, extent = ground
     fetched = no_cells()
     work, pixels = np.empty(ROWS * ROW), rays.directions.shape[0]
-    longs = np.empty((4, STRIP), dtype=np.int64)
-    level_of, refined = longs[2], longs[3]
-    strip = _Strip(work, longs[0], longs[1], np.zeros(STRIP, dtype=np.int32), level_of, refined)
+    index_buffers = np.empty((4, STRIP), dtype=np.int64)
+    level_of, refined = index_buffers[2], index_buffers[3]
+    strip = _Strip(work, index_buffers[0], index_buffers[1], np.zeros(STRIP, dtype=np.int32), level_of, refined)
     for first in range(0, pixels, STRIP):
         width = min(STRIP, pixels - first)
         vectors = slice(3 * first, 3 * (first + width))

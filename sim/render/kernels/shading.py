@@ -406,13 +406,13 @@ def photometric_angles(sun: tuple[float, float, float], width: int, work: Array)
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def reflect(law: tuple[float, float, float, float, float, float], width: int, work: Array, radiance: Array32) -> None:
     """Compute the radiance factor under sun and sky: Lunar-Lambert law with an opposition surge."""
-    lunar, amplitude, surge_width, normalisation, sky_fraction, bounced = law
+    lunar, amplitude, surge_width, normalisation, sky_fraction, ground_light = law
     for k in range(min(width, STRIP)):
         nz, cos_i, cos_g = work[NZ + k], work[COS_I + k], work[COS_G + k]
         tan_half = math.sqrt(max(1.0 - cos_g, 0.0) / max(1.0 + cos_g, 1e-9))
         surge = 1.0 + amplitude / (1.0 + tan_half / surge_width)
         brightness = normalisation * surge * (2.0 * lunar * cos_i / (cos_i + work[COS_E + k]) + (1.0 - lunar) * cos_i)
-        value = sky_fraction * 0.5 * (1.0 + nz) + bounced * 0.5 * (1.0 - nz)
+        value = sky_fraction * 0.5 * (1.0 + nz) + ground_light * 0.5 * (1.0 - nz)
         value += work[LIT + k] * brightness if cos_i > 0.0 else 0.0
         radiance[k] = work[ALBEDO + k] * value
 
@@ -466,8 +466,10 @@ def shade(
     terrain = levels[occluders.shadow.level]
     fetched = no_cells()
     work = np.empty(ROWS * ROW)
-    longs = np.empty((4, STRIP), dtype=np.int64)
-    strip = _Strip(work, longs[0], longs[1], longs[2], longs[3], np.empty(STRIP, dtype=np.bool_))
+    index_buffers = np.empty((4, STRIP), dtype=np.int64)
+    strip = _Strip(
+        work, index_buffers[0], index_buffers[1], index_buffers[2], index_buffers[3], np.empty(STRIP, dtype=np.bool_)
+    )
     count = rays.directions.shape[0]
     for first in range(0, count, STRIP):
         last = min(first + STRIP, count)

@@ -12,6 +12,8 @@ standard deviation of its position. Each RTK solution is propagated from its tim
 navigation. The assumed noise of inclinometers and compass grows with acceleration. Readings outside the gate and
 readings of stuck instruments are rejected. After `max_rejected_fixes` rejected solutions the filter restarts at the
 next solution.
+
+The landing paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
 from __future__ import annotations

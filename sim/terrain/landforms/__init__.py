@@ -1,4 +1,4 @@
-"""Landforms, each with parameters and a random substream of its own, that compose into one height and albedo grid."""
+"""Landforms, each with its own parameters and random substream; their sum is one grid of heights and albedos."""
 
 from marsyard.sim.terrain.landforms.ground import Ground
 from marsyard.sim.terrain.landforms.relief import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell

@@ -59,7 +59,7 @@ class Ground:
 
 
 def refine(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[np.ndarray, "side side"]:
-    """Refine the control values of a surface to a grid with `side` samples: the coarse side times a power of two."""
+    """Refine the control values of a surface to `side` samples per side: the coarse side times a power of two."""
     while coarse.shape[0] < side:
         doubled = np.zeros((2 * coarse.shape[0], 2 * coarse.shape[0]), dtype=np.float32)
         add_refined(doubled, np.ascontiguousarray(coarse))
@@ -85,11 +85,11 @@ def draw_smooth_fields(
     side = SMALLEST_SIDE
     while period_m / side > shortest and side < 2048:
         side *= 2
-    wave = 2.0 * np.pi * np.fft.fftfreq(side, period_m / side)
-    kx, ky = wave[None, :], wave[:, None]
-    along = kx * np.cos(azimuth_rad) + ky * np.sin(azimuth_rad)
-    across = ky * np.cos(azimuth_rad) - kx * np.sin(azimuth_rad)
-    amplitude = np.exp(-0.5 * ((along * length_along_m) ** 2 + (across * length_across_m) ** 2))
+    wavenumbers = 2.0 * np.pi * np.fft.fftfreq(side, period_m / side)
+    kx, ky = wavenumbers[None, :], wavenumbers[:, None]
+    k_along = kx * np.cos(azimuth_rad) + ky * np.sin(azimuth_rad)
+    k_across = ky * np.cos(azimuth_rad) - kx * np.sin(azimuth_rad)
+    amplitude = np.exp(-0.5 * ((k_along * length_along_m) ** 2 + (k_across * length_across_m) ** 2))
     noise = rng.standard_normal((side, side, 2)) @ np.array([1.0, 1.0j])
     field = np.fft.ifft2(noise * amplitude) * side**2 / np.sqrt(2.0 * np.sum(amplitude**2))
     return np.stack([field.real, field.imag], axis=-1).astype(np.float32)

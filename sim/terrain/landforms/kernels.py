@@ -1,4 +1,4 @@
-"""Compiled kernels of the landforms. Grids are periodic squares whose side is a power of two; all work in place."""
+"""Compiled kernels of the landforms. Grids are periodic squares with a power of two as side; changed in place."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 from marsyard.sim.terrain.kernels import Array, Level, bspline_weights, collapse
 
 Grid = NDArray[np.float32]
-Line = NDArray[np.float32]
-#: Depth of the notches in a crater's rim over its height, per relative displacement of its outline.
+GridRow = NDArray[np.float32]
+#: Depth of the notches in a crater's rim divided by the rim's height, per relative displacement of the outline.
 NOTCHES = 8.0
 
 
 class Bedforms(NamedTuple):
-    """A train of dunes: wavenumbers of the plane wave, rad/m, RMS height of crest over trough, slope of the slip face,
-    logarithm of crests' albedo over troughs'.
+    """A train of dunes.
+
+    - wave_x, wave_y: wavenumbers of the plane wave, rad/m
+    - crest_m: RMS height of crests above troughs, metres
+    - steepest: slope of the slip face
+    - contrast: natural logarithm of the crests' albedo divided by the troughs'
     """
 
     wave_x: float
@@ -31,27 +35,27 @@ class Bedforms(NamedTuple):
 
 @njit(cache=True)
 def add_refined(fine: Grid, coarse: Grid) -> None:
-    """Add a cubic B-spline from a grid of half as many samples along each side, exactly."""
+    """Add a cubic B-spline of half as many samples along each side, by exact refinement of its control values."""
     side = coarse.shape[0]
     row = np.empty(side, dtype=np.float32)
-    eighth, six_eighths, half = np.float32(0.125), np.float32(0.75), np.float32(0.5)
+    one_eighth, six_eighths, half = np.float32(0.125), np.float32(0.75), np.float32(0.5)
     for i in range(2 * side):
         k = i // 2
-        here = coarse[k]
-        after = coarse[(k + 1) % side]
+        current = coarse[k]
+        following = coarse[(k + 1) % side]
         if i % 2 == 0:
-            before = coarse[k - 1]
+            previous = coarse[k - 1]
             for j in range(side):
-                row[j] = eighth * (before[j] + after[j]) + six_eighths * here[j]
+                row[j] = one_eighth * (previous[j] + following[j]) + six_eighths * current[j]
         else:
             for j in range(side):
-                row[j] = half * (here[j] + after[j])
-        out = fine[i]
+                row[j] = half * (current[j] + following[j])
+        fine_row = fine[i]
         for j in range(side - 1):
-            out[2 * j] += eighth * (row[j - 1] + row[j + 1]) + six_eighths * row[j]
-            out[2 * j + 1] += half * (row[j] + row[j + 1])
-        out[2 * side - 2] += eighth * (row[side - 2] + row[0]) + six_eighths * row[side - 1]
-        out[2 * side - 1] += half * (row[side - 1] + row[0])
+            fine_row[2 * j] += one_eighth * (row[j - 1] + row[j + 1]) + six_eighths * row[j]
+            fine_row[2 * j + 1] += half * (row[j] + row[j + 1])
+        fine_row[2 * side - 2] += one_eighth * (row[side - 2] + row[0]) + six_eighths * row[side - 1]
+        fine_row[2 * side - 1] += half * (row[side - 1] + row[0])
 
 
 @njit(cache=True)
@@ -64,14 +68,14 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
     """
     mask = height.shape[0] - 1
     for n in range(craters.shape[0]):
-        x, y, radius, depth, rim, rounding, fill, bright, floor = craters[n, :9]
+        x, y, radius, depth, rim, rounding, fill, ejecta_tone, floor_tone = craters[n, :9]
         c2, s2, c3, s3, c5, s5, phase = craters[n, 9:]
         extent = reach * radius * 1.1
-        cos_7, sin_7 = math.cos(phase), math.sin(phase)
-        cos_12, sin_12 = math.cos(2.3 * phase), math.sin(2.3 * phase)
-        # the bowl before it was filled
+        cos_phase_7, sin_phase_7 = math.cos(phase), math.sin(phase)
+        cos_phase_12, sin_phase_12 = math.cos(2.3 * phase), math.sin(2.3 * phase)
+        # depth of the bowl before its fill
         bottom = depth / (1.0 - fill)
-        soft_floor = 0.25 * fill * bottom + 1e-9
+        blend_width = 0.25 * fill * bottom + 1e-9
         for i in range(math.ceil((y - extent) / spacing), math.floor((y + extent) / spacing) + 1):
             dy = i * spacing - y
             for j in range(math.ceil((x - extent) / spacing), math.floor((x + extent) / spacing) + 1):
@@ -81,10 +85,10 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                     continue
                 c, s = dx / max(d, 1e-9), dy / max(d, 1e-9)
                 # cosines and sines of twice, three and five times the azimuth
-                cc, ss = c * c - s * s, 2.0 * c * s
-                ccc, sss = cc * c - ss * s, ss * c + cc * s
-                c5t, s5t = ccc * cc - sss * ss, sss * cc + ccc * ss
-                lobes = c2 * cc + s2 * ss + c3 * ccc + s3 * sss + c5 * c5t + s5 * s5t
+                cos_2, sin_2 = c * c - s * s, 2.0 * c * s
+                cos_3, sin_3 = cos_2 * c - sin_2 * s, sin_2 * c + cos_2 * s
+                cos_5, sin_5 = cos_3 * cos_2 - sin_3 * sin_2, sin_3 * cos_2 + cos_3 * sin_2
+                lobes = c2 * cos_2 + s2 * sin_2 + c3 * cos_3 + s3 * sin_3 + c5 * cos_5 + s5 * sin_5
                 r = d / (radius * (1.0 + lobes))
                 if r >= reach:
                     continue
@@ -94,28 +98,30 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                 rays = 0.0
                 if r > 1.0:
                     # seven and twelve rays: cosines of 7 and 12 times the azimuth, each with a phase
-                    c7t, s7t = c5t * cc - s5t * ss, s5t * cc + c5t * ss
-                    rays = c7t * cos_7 - s7t * sin_7
-                    rays += (c7t * c5t - s7t * s5t) * cos_12 - (s7t * c5t + c7t * s5t) * sin_12
+                    cos_7, sin_7 = cos_5 * cos_2 - sin_5 * sin_2, sin_5 * cos_2 + cos_5 * sin_2
+                    rays = cos_7 * cos_phase_7 - sin_7 * sin_phase_7
+                    rays += (cos_7 * cos_5 - sin_7 * sin_5) * cos_phase_12 - (
+                        sin_7 * cos_5 + cos_7 * sin_5
+                    ) * sin_phase_12
                     blanket *= 1.0 + 0.25 * rays * min(2.0 * (r - 1.0), 1.0)
                 change = blanket
-                # outside, the bowl's wall continues so steeply that it soon rises above the blanket
+                # outside, the extended wall of the bowl soon rises above the ejecta blanket: the lower one is used
                 if r <= 1.0 or (rim + bottom) * r * r - bottom < blanket + rounding:
                     bowl = (rim + bottom) * r**2.2 - bottom
                     if fill > 0.0:
-                        # the higher of bowl and floor, rounded where they meet
-                        meeting = max(soft_floor - abs(bowl + depth), 0.0)
-                        bowl = max(bowl, -depth) + meeting * meeting / (4.0 * soft_floor)
+                        # smooth maximum of bowl and floor
+                        blend = max(blend_width - abs(bowl + depth), 0.0)
+                        bowl = max(bowl, -depth) + blend * blend / (4.0 * blend_width)
                     overlap = max(rounding - abs(bowl - blanket), 0.0)
                     change = min(bowl, blanket) - overlap * overlap / (4.0 * max(rounding, 1e-9))
                 row, column = i & mask, j & mask
                 height[row, column] += change
-                if bright != 0.0:
+                if ejecta_tone != 0.0:
                     light = fade * fade * (1.0 + 0.5 * rays) if r > 1.0 else 1.0
-                    tone[row, column] += bright * max(light, 0.0)
-                if floor != 0.0 and r < 1.1:
-                    # even over the floor, gone at the rim
-                    tone[row, column] += floor * min(max((1.1 - r) / 0.5, 0.0), 1.0)
+                    tone[row, column] += ejecta_tone * max(light, 0.0)
+                if floor_tone != 0.0 and r < 1.1:
+                    # constant over the floor, zero at the rim
+                    tone[row, column] += floor_tone * min(max((1.1 - r) / 0.5, 0.0), 1.0)
 
 
 @njit(cache=True)
@@ -147,35 +153,37 @@ def stamp_streaks(tone: Grid, spacing: float, streaks: Array) -> None:
     """
     mask = tone.shape[0] - 1
     for n in range(streaks.shape[0]):
-        x, y, half, length, c, s, colour = streaks[n]
-        wide = 1.6 * half
-        reach_x = max(c * length, 0.0) + wide, max(-c * length, 0.0) + wide
-        reach_y = max(s * length, 0.0) + wide, max(-s * length, 0.0) + wide
+        x, y, half_width, length, c, s, streak_tone = streaks[n]
+        max_half_width = 1.6 * half_width
+        reach_x = max(c * length, 0.0) + max_half_width, max(-c * length, 0.0) + max_half_width
+        reach_y = max(s * length, 0.0) + max_half_width, max(-s * length, 0.0) + max_half_width
         for i in range(math.ceil((y - reach_y[1]) / spacing), math.floor((y + reach_y[0]) / spacing) + 1):
             dy = i * spacing - y
             for j in range(math.ceil((x - reach_x[1]) / spacing), math.floor((x + reach_x[0]) / spacing) + 1):
                 dx = j * spacing - x
-                p = (c * dx + s * dy) / length
-                if p <= 0.0 or p >= 1.0:
+                along = (c * dx + s * dy) / length
+                if along <= 0.0 or along >= 1.0:
                     continue
-                q = (c * dy - s * dx) / (half * (0.8 + 0.8 * p))
-                if abs(q) < 1.0:
-                    side = 1.0 - q * q
-                    tone[i & mask, j & mask] += colour * side * side * (1.0 - p) * min(p * length / half, 1.0)
+                across = (c * dy - s * dx) / (half_width * (0.8 + 0.8 * along))
+                if abs(across) < 1.0:
+                    side = 1.0 - across * across
+                    tone[i & mask, j & mask] += (
+                        streak_tone * side * side * (1.0 - along) * min(along * length / half_width, 1.0)
+                    )
 
 
 @njit(cache=True, inline="always")
 def _arctan2(x: float, y: float) -> float:
     """Arctangent of y / x in its quadrant to 1e-7, by the polynomial of Cephes' atanf; without branches or calls."""
-    wide, high = abs(x), abs(y)
-    larger = max(wide, high, 1e-30)
-    ratio = min(wide, high) / larger
+    abs_x, abs_y = abs(x), abs(y)
+    larger = max(abs_x, abs_y, 1e-30)
+    ratio = min(abs_x, abs_y) / larger
     is_reduced = ratio > 0.41421356237309503
     a = (ratio - 1.0) / (ratio + 1.0) if is_reduced else ratio
     b = a * a
     angle = (((8.05374449538e-2 * b - 1.38776856032e-1) * b + 1.99777106478e-1) * b - 3.33329491539e-1) * b * a + a
     angle += 0.25 * math.pi if is_reduced else 0.0
-    angle = 0.5 * math.pi - angle if high > wide else angle
+    angle = 0.5 * math.pi - angle if abs_y > abs_x else angle
     angle = math.pi - angle if x < 0.0 else angle
     return -angle if y < 0.0 else angle
 
@@ -183,92 +191,97 @@ def _arctan2(x: float, y: float) -> float:
 # Without Python's check for a division by zero, and without calls, the loop is compiled to vector instructions.
 @njit(cache=True, error_model="numpy")
 def _add_row_of_dunes(
-    height: Line, tone: Line, real: Array, imaginary: Array, first_phase: float, spacing: float, dunes: Bedforms
+    height: GridRow, tone: GridRow, real: Array, imaginary: Array, first_phase: float, spacing: float, dunes: Bedforms
 ) -> None:
-    """Add dunes along a row, given the modulation at its samples and the plane wave's phase at the first."""
+    """Add dunes along a row from the complex modulation at its samples and the plane wave's phase at the first one."""
     phase_step, crest, contrast = dunes.wave_x * spacing, dunes.crest_m, dunes.contrast
     wave = math.sqrt(dunes.wave_x * dunes.wave_x + dunes.wave_y * dunes.wave_y)
-    # the face falls along a line over its first half, then levels out: 4/3 as long as were it straight
+    # the slip face is straight over its first half, then flattens: it is 4/3 as long as a straight face
     slip_of_height = 4.0 / 3.0 * wave / (2.0 * math.pi * dunes.steepest)
     for j in range(height.shape[0]):
         strength = math.sqrt(real[j] * real[j] + imaginary[j] * imaginary[j])
-        high = crest * min(strength, 1.6)
-        turns = (first_phase + j * phase_step + _arctan2(real[j], imaginary[j])) / (2.0 * math.pi)
-        u = turns - np.floor(turns)
-        slip = min(max(slip_of_height * high, 0.01), 0.5)
+        crest_height = crest * min(strength, 1.6)
+        cycles = (first_phase + j * phase_step + _arctan2(real[j], imaginary[j])) / (2.0 * math.pi)
+        u = cycles - np.floor(cycles)
+        slip = min(max(slip_of_height * crest_height, 0.01), 0.5)
         v = u / (1.0 - slip)
         stoss = 0.25 * v + 0.75 * v * v * (3.0 - 2.0 * v)
         w = (1.0 - u) / slip
         face = 4.0 / 3.0 * w - 1.0 / 3.0 if w > 0.5 else 4.0 / 3.0 * w * w
         shape = stoss if u < 1.0 - slip else face
-        height[j] += high * shape
+        height[j] += crest_height * shape
         tone[j] += contrast * (shape - 0.5) * min(strength, 1.0)
 
 
 @njit(cache=True)
 def add_dunes(height: Grid, tone: Grid, spacing: float, modulation: Level, dunes: Bedforms) -> None:
-    """Add transverse dunes: a gentle stoss up to the crest, a slip face, a concave apron.
+    """Add transverse dunes: a gentle stoss slope up to the crest, a slip face, a concave apron.
 
-    The phase is that of the plane wave times a smooth complex modulation of unit mean square: control values of the
-    same extent as the grid, on one no finer. Where the modulation vanishes crests end and fork, and the dunes have no
-    height.
+    The phase of the dunes is that of the plane wave times a smooth complex modulation of unit mean square. `modulation`
+    contains control values on a grid of the same extent that is not finer. At zeros of the modulation the dunes have no
+    height, and crests end and fork.
     """
     side, cells = height.shape[0], modulation.shape[0]
     step = side // cells
     weights = np.empty((step, 4))
     for k in range(step):
         weights[k] = bspline_weights(k / step)[:4]
-    along, real, imaginary = np.empty((cells, 2)), np.empty(side), np.empty(side)
+    row_spline, real, imaginary = np.empty((cells, 2)), np.empty(side), np.empty(side)
     for i in range(side):
-        # on one row the modulation is a spline of x alone
-        collapse(modulation, i / step, along)
+        # along one row the modulation is a spline in x only
+        collapse(modulation, i / step, row_spline)
         for j in range(cells):
-            before, here, after, beyond = along[j - 1], along[j], along[(j + 1) % cells], along[(j + 2) % cells]
+            value0, value1, value2, value3 = (
+                row_spline[j - 1],
+                row_spline[j],
+                row_spline[(j + 1) % cells],
+                row_spline[(j + 2) % cells],
+            )
             for k in range(step):
                 a, b, c, d = weights[k]
-                real[j * step + k] = a * before[0] + b * here[0] + c * after[0] + d * beyond[0]
-                imaginary[j * step + k] = a * before[1] + b * here[1] + c * after[1] + d * beyond[1]
+                real[j * step + k] = a * value0[0] + b * value1[0] + c * value2[0] + d * value3[0]
+                imaginary[j * step + k] = a * value0[1] + b * value1[1] + c * value2[1] + d * value3[1]
         _add_row_of_dunes(height[i], tone[i], real, imaginary, dunes.wave_y * i * spacing, spacing, dunes)
 
 
 @njit(cache=True)
 def stamp_lobes(height: Grid, tone: Grid, spacing: float, lobes: Array, warp_x: Grid, warp_y: Grid) -> None:
-    """Stack lava lobes: each a plateau with a steep, crenulated margin and a slightly sunken middle.
+    """Stack lava lobes: plateaus with a steep, crenulated margin and a slightly lower middle.
 
-    `lobes` has rows (x, y, half length, half width, thickness, cosine and sine of its direction, tone). The warps are
-    displacements in half widths that make the outlines irregular. Every lobe covers the tone of those below.
+    `lobes` has rows (x, y, half length, half width, thickness, cosine and sine of the direction, tone). The warps are
+    displacements in half widths; they make the outlines irregular. The tone of a lobe replaces that of the lobes below.
     """
     mask = height.shape[0] - 1
     for n in range(lobes.shape[0]):
-        x, y, along, across, thick, c, s, colour = lobes[n]
-        reach_x = 1.3 * (along * abs(c) + across * abs(s)) + 0.5 * across
-        reach_y = 1.3 * (along * abs(s) + across * abs(c)) + 0.5 * across
+        x, y, half_length, half_width, thickness, c, s, lobe_tone = lobes[n]
+        reach_x = 1.3 * (half_length * abs(c) + half_width * abs(s)) + 0.5 * half_width
+        reach_y = 1.3 * (half_length * abs(s) + half_width * abs(c)) + 0.5 * half_width
         for i in range(math.ceil((y - reach_y) / spacing), math.floor((y + reach_y) / spacing) + 1):
             row = i & mask
             for j in range(math.ceil((x - reach_x) / spacing), math.floor((x + reach_x) / spacing) + 1):
                 column = j & mask
-                dx = j * spacing - x + warp_x[row, column] * across
-                dy = i * spacing - y + warp_y[row, column] * across
-                p = (c * dx + s * dy) / along
-                q = (c * dy - s * dx) / across
-                far = p * p + q * q
-                if far >= 1.0:
+                dx = j * spacing - x + warp_x[row, column] * half_width
+                dy = i * spacing - y + warp_y[row, column] * half_width
+                p = (c * dx + s * dy) / half_length
+                q = (c * dy - s * dx) / half_width
+                radius2 = p * p + q * q
+                if radius2 >= 1.0:
                     continue
-                edge = 1.0 - (far * far) * (far * far)
-                height[row, column] += thick * edge * (0.65 + 0.35 * far)
-                tone[row, column] += (colour - tone[row, column]) * edge
+                edge = 1.0 - (radius2 * radius2) * (radius2 * radius2)
+                height[row, column] += thickness * edge * (0.65 + 0.35 * radius2)
+                tone[row, column] += (lobe_tone - tone[row, column]) * edge
 
 
 @njit(cache=True)
 def add_cracks(
     height: Grid, tone: Grid, spacing: float, points: Array, cell: float, width: float, depth: float, contrast: float
 ) -> None:
-    """Add polygonal cracks: the borders between the Voronoi cells of one point in each square of a periodic grid.
+    """Add polygonal cracks along the borders of Voronoi cells, with one point in each square of a periodic grid.
 
     `points` has shape (count, count, 2): the position of each point within its square, from 0 to 1.
     """
     count = points.shape[0]
-    # the points' positions, with those beyond the border
+    # positions of the points, with a margin of one square for the periodic border
     positions = np.empty((count + 2, count + 2, 2))
     for row in range(-1, count + 1):
         for column in range(-1, count + 1):
@@ -280,20 +293,20 @@ def add_cracks(
         for j in range(height.shape[0]):
             x = j * spacing / cell
             column = int(x)
-            nearest, nx, ny = 1e9, 0.0, 0.0
-            second, sx, sy = 1e9, 0.0, 0.0
+            nearest2, nearest_x, nearest_y = 1e9, 0.0, 0.0
+            second2, second_x, second_y = 1e9, 0.0, 0.0
             for di in range(3):
                 for dj in range(3):
                     dx = positions[row + di, column + dj, 0] - x
                     dy = positions[row + di, column + dj, 1] - y
-                    far = dx * dx + dy * dy
-                    if far < nearest:
-                        second, sx, sy = nearest, nx, ny
-                        nearest, nx, ny = far, dx, dy
-                    elif far < second:
-                        second, sx, sy = far, dx, dy
-            apart = math.sqrt((sx - nx) ** 2 + (sy - ny) ** 2)
-            border = 0.5 * (second - nearest) / max(apart, 1e-6) * cell
+                    distance2 = dx * dx + dy * dy
+                    if distance2 < nearest2:
+                        second2, second_x, second_y = nearest2, nearest_x, nearest_y
+                        nearest2, nearest_x, nearest_y = distance2, dx, dy
+                    elif distance2 < second2:
+                        second2, second_x, second_y = distance2, dx, dy
+            separation = math.sqrt((second_x - nearest_x) ** 2 + (second_y - nearest_y) ** 2)
+            border = 0.5 * (second2 - nearest2) / max(separation, 1e-6) * cell
             if border < width:
                 strength = 1.0 - border / width
                 height[i, j] -= depth * strength
@@ -302,28 +315,29 @@ def add_cracks(
 
 @njit(cache=True)
 def cut_channels(cut: Grid, spacing: float, discs: Array, sharpness: float) -> None:
-    """Cut channels, rows of discs (x, y, half width, depth), each ``depth (1 - (d / w)**sharpness)`` deep."""
+    """Cut channels: discs with rows (x, y, half width w, depth) and the profile ``depth (1 - (r / w)**sharpness)``."""
     mask = cut.shape[0] - 1
     for n in range(discs.shape[0]):
-        x, y, half, depth = discs[n]
-        for i in range(math.ceil((y - half) / spacing), math.floor((y + half) / spacing) + 1):
+        x, y, half_width, depth = discs[n]
+        for i in range(math.ceil((y - half_width) / spacing), math.floor((y + half_width) / spacing) + 1):
             dy = i * spacing - y
-            for j in range(math.ceil((x - half) / spacing), math.floor((x + half) / spacing) + 1):
+            for j in range(math.ceil((x - half_width) / spacing), math.floor((x + half_width) / spacing) + 1):
                 dx = j * spacing - x
-                far = math.sqrt(dx * dx + dy * dy) / half
-                if far < 1.0:
-                    deep = depth * (1.0 - far**sharpness)
-                    if deep > cut[i & mask, j & mask]:
-                        cut[i & mask, j & mask] = deep
+                ratio = math.sqrt(dx * dx + dy * dy) / half_width
+                if ratio < 1.0:
+                    local_depth = depth * (1.0 - ratio**sharpness)
+                    if local_depth > cut[i & mask, j & mask]:
+                        cut[i & mask, j & mask] = local_depth
 
 
 @njit(cache=True)
 def raise_cones(
     height: Grid, cover: Grid, spacing: float, apexes: Array, slope: float, concavity: float, rounding: float
 ) -> None:
-    """Add the union of cones with rows (x, y, radius) that flatten towards their toes; `cover` is 1 on them.
+    """Add the union of concave cones with rows (x, y, radius R) in `apexes`; `cover` is 1 on the cones.
 
-    A cone is ``slope R / concavity (1 - r / R)**concavity`` high: `slope` steep at its apex, which is rounded.
+    The height at the distance r from the apex is ``slope R / concavity (1 - r / R)**concavity``. The apex is rounded,
+    with the slope `slope` next to it.
     """
     side = height.shape[0]
     period = side * spacing
@@ -333,11 +347,11 @@ def raise_cones(
             for n in range(apexes.shape[0]):
                 dx, dy = abs(j * spacing - apexes[n, 0]), abs(i * spacing - apexes[n, 1])
                 dx, dy = min(dx, period - dx), min(dy, period - dy)
-                far = math.sqrt(dx * dx + dy * dy + rounding * rounding) - rounding
-                rest = 1.0 - far / apexes[n, 2]
-                if rest > 0.0:
-                    z = slope * apexes[n, 2] / concavity * rest**concavity
-                    # the highest, rounded where two meet
+                distance = math.sqrt(dx * dx + dy * dy + rounding * rounding) - rounding
+                remaining = 1.0 - distance / apexes[n, 2]
+                if remaining > 0.0:
+                    z = slope * apexes[n, 2] / concavity * remaining**concavity
+                    # smooth maximum of all cones: norm of order 8
                     total += z**8
             if total > 0.0:
                 z = total**0.125

@@ -25,20 +25,20 @@ from marsyard.sim.terrain.landforms.kernels import (
 if TYPE_CHECKING:
     from marsyard.sim.terrain.parameters import TerrainParameters
 
-SAMPLES_ON_SLIP_FACE = 2.1  #: Samples a slip face should have along its slope.
+SAMPLES_ON_SLIP_FACE = 2.1  #: Minimum number of samples along the slope of a slip face.
 CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.
-#: RMS of a cubic B-spline over that of its control values, where these are independent: 151/315.
+#: RMS of a cubic B-spline divided by that of its control values, if these are independent: 151/315.
 SPLINE_OF_NOISE_RMS = 151.0 / 315.0
 EJECTA_REACH_RADII = 3.0
-#: Depth from the rim crest to the floor over diameter: 0.2 for fresh simple craters (Pike 1977; Robbins & Hynek 2012
-#: for Mars), down to what is barely visible. Small Martian craters are mostly degraded (Golombek et al. 2014).
+#: Depth from the rim crest to the floor, divided by the diameter: 0.2 for fresh simple craters (Pike 1977; Robbins &
+#: Hynek 2012 for Mars); 0.04 is barely visible. Small Martian craters are mostly degraded (Golombek et al. 2014).
 FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
-#: Height of the rim crest above the surroundings over diameter: 0.04 fresh (Pike 1977); diffusion lowers it faster
-#: than the bowl.
+#: Height of the rim crest above the surroundings, divided by the diameter: 0.04 if fresh (Pike 1977). Diffusion lowers
+#: the rim faster than it fills the bowl.
 FRESH_RIM, DEGRADED_RIM = 0.04, 0.004
 SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
 DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
-BRIGHT_ABOVE = 0.75  #: Freshness above which ejecta keep their own brightness.
+BRIGHT_ABOVE = 0.75  #: Freshness above which ejecta differ from the ground in brightness.
 APEX_ROUNDING = 0.06  #: Rounding of a fan's apex, as a fraction of its radius.
 CONE_DETAIL = 1.0 / 50.0  #: Scale of the smallest detail of the fans' broad shape, as a fraction of their radius.
 Channels = Float64[np.ndarray, "channels"]  #: One value per channel.
@@ -46,11 +46,11 @@ Points = Float64[np.ndarray, "channels 2"]
 
 
 class Dunes(Parameters):
-    """A train of transverse bedforms: gentle towards the wind, a slip face with an apron at its foot away from it.
+    """A train of transverse bedforms: a gentle windward slope, and a leeward slip face with an apron at its foot.
 
-    Dunes and ripples differ in size, and ripples of wind, which do not avalanche, fall at about 20 deg where dunes rest
-    at the angle of repose (Sharp 1963). Crests wander and end in defects, as they do where bedforms of a range of
-    wavelengths interact (Werner & Kocurek 1999). Dry sand rests at 30-34 deg (Bagnold 1941).
+    Dunes and ripples differ in size. Wind ripples do not avalanche: their lee slope is about 20 deg (Sharp 1963). The
+    slip face of a dune has the angle of repose, 30-34 deg for dry sand (Bagnold 1941). Crests wander and end in
+    defects, as in interacting bedforms of different wavelengths (Werner & Kocurek 1999).
     """
 
     wavelength_m: Annotated[Positive, Field(description="distance from crest to crest, m")] = 110.0
@@ -62,8 +62,8 @@ class Dunes(Parameters):
     albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of crests' albedo over troughs'")] = 0.05
 
     def apply(self, ground: Ground, rng: Generator) -> None:
-        """Add the dunes. The wave is the nearest one, in length and direction, that fits into the period."""
-        # the wave travels downwind; azimuth is clockwise from north, x is east
+        """Add the dunes, with the wave vector that is periodic on the terrain and nearest to the parameters."""
+        # the wave vector points downwind; azimuth is clockwise from north, x is east
         downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
         waves = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
         cycles = np.round(waves)
@@ -71,8 +71,10 @@ class Dunes(Parameters):
             side = f"{ground.period_m:g} m"
             raise ValueError(f"dunes.wavelength_m is {self.wavelength_m:g}; the terrain's side is {side}")
         wave = 2.0 * np.pi * cycles / ground.period_m
-        across, along = (length * self.wavelength_m / np.sqrt(2.0) for length in (self.crest_length, self.regularity))
-        modulation = draw_smooth_fields(ground.period_m, across, along, float(downwind), rng)
+        crest_scale, wave_scale = (
+            length * self.wavelength_m / np.sqrt(2.0) for length in (self.crest_length, self.regularity)
+        )
+        modulation = draw_smooth_fields(ground.period_m, crest_scale, wave_scale, float(downwind), rng)
         step = max(modulation.shape[0] // ground.side, 1)
         modulation = np.ascontiguousarray(modulation[::step, ::step])
         steepest = float(np.tan(np.radians(self.repose_deg)))
@@ -84,9 +86,9 @@ class Dunes(Parameters):
 
 
 class Lava(Parameters):
-    """Numerous thin flows, as at Pisgah: rough at a few metres, gentle beyond (Wood & Kienle 1990; field test III.A).
+    """Thin lava flows as at Pisgah (Wood & Kienle 1990; field test paper, III.A): rough over a few metres, else smooth.
 
-    Lobes of 1-3 m thickness overlap; a'a covers patches with blocks and pinnacles of a few metres.
+    Lobes of 1-3 m thickness overlap. Patches of a'a lava have blocks and pinnacles of a few metres.
     """
 
     layers: Annotated[float, Field(gt=0.0, le=10.0, description="lobes lying over one another, on average")] = 3.0
@@ -105,7 +107,7 @@ class Lava(Parameters):
         part = ground.coarser(max(self.lobe_length_m / 36.0, self.lobe_thickness_m))
         crenulation = self.lobe_length_m / 12.0
         warp = np.float32(CRENULATION) * draw_smooth_fields(ground.period_m, crenulation, crenulation, 0.0, rng)
-        # log-normal lengths, two to four times as long as wide, in random order
+        # log-normal lengths; widths are a half to a quarter of the lengths; random order
         spread = 0.5
         mean_area = np.pi / 4.0 * self.lobe_length_m**2 * np.exp(2.0 * spread**2) * 0.38
         count = int(rng.poisson(self.layers * ground.period_m**2 / mean_area))
@@ -123,7 +125,7 @@ class Lava(Parameters):
         self._add_blocks(ground, rng)
 
     def _add_blocks(self, ground: Ground, rng: Generator) -> None:
-        """Add noise of the blocks' size, strong in patches bounded by a level line of a smooth field."""
+        """Add noise with the wavelength of the blocks, in patches where a smooth random field exceeds a threshold."""
         blocks = ground.coarser(self.aa_block_m / 2.0)
         patches = np.zeros((blocks.side, blocks.side), dtype=np.float32)
         for scale, strength in ((1.0, 1.0), (0.35, 0.45), (0.12, 0.2)):
@@ -141,7 +143,7 @@ class Lava(Parameters):
 
 
 class Swell(Parameters):
-    """Broad relief of a stated height: a few waves of the order of the terrain's side, as the mass of a dune field."""
+    """Broad relief of a specified height, such as a dune field: a few waves about as long as the terrain's side."""
 
     relief_m: Annotated[Positive, Field(description="lowest to highest, m")] = 200.0
     waves: Annotated[int, Field(ge=1, le=8, description="most waves along a side")] = 1
@@ -208,7 +210,7 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     period = p.samples * p.spacing_m
     count = int(rng.poisson(p.craters_per_km2 * (period / 1000.0) ** 2))
     knee = min(max(p.crater_knee_m, min_m), max_m)
-    knee_fraction = (knee / min_m) ** -p.crater_exponent  # of the craters that are larger than the knee
+    knee_fraction = (knee / min_m) ** -p.crater_exponent  # fraction of craters larger than the knee
     fraction = rng.uniform(knee_fraction * (max_m / knee) ** -p.crater_steep_exponent, 1.0, count)
     below_knee = min_m * fraction ** (-1.0 / p.crater_exponent)
     above_knee = knee * (fraction / knee_fraction) ** (-1.0 / p.crater_steep_exponent)
@@ -254,7 +256,7 @@ def draw_channels(
 
 
 class Gullies(Parameters):
-    """Steep-walled gullies, hazards to a landing: trunks with tributaries, walls at a stated slope."""
+    """Steep-walled gullies, which are landing hazards: trunks with tributaries, and walls with a specified slope."""
 
     per_km2: Annotated[NonNegative, Field(description="trunks per square kilometre")] = 200.0
     width_m: Annotated[Positive, Field(description="median width of a trunk from rim to rim, m")] = 6.0
@@ -273,7 +275,7 @@ class Gullies(Parameters):
         length = self.length_m * rng.uniform(0.6, 1.4, count)
         start = rng.uniform(0.0, ground.period_m, (count, 2))
         trunks = draw_channels(start, heading, length, width, width * self._depth(1.0), 0.15, rng)
-        # depth (1 - (d / w)**1.5) is steepest at the rim: 1.5 depth / w
+        # the profile depth (1 - (r / w)**1.5) has its maximum slope at the rim: 1.5 depth / w
         cut_channels(part.tone, part.spacing_m, trunks, 1.5)
         if self.tributaries and trunks.size:
             mouths = rng.integers(0, trunks.shape[0], count * self.tributaries)
@@ -292,10 +294,10 @@ class Gullies(Parameters):
 
 
 class Playa(Parameters):
-    """Desiccation polygons: fissures of a stated spacing, dark or bright, and a finer net between them.
+    """Desiccation polygons: dark or bright fissures with a specified spacing, and a finer net between them.
 
-    Giant polygons, tens to hundreds of metres wide with fissures about a metre wide whose fills look different from
-    above, are known from many playas of the Great Basin (Neal, Langer & Kerr 1968).
+    Giant polygons are known from many playas of the Great Basin (Neal, Langer & Kerr 1968). They are tens to hundreds
+    of metres wide. Their fissures are about a metre wide, with fills of another brightness.
     """
 
     polygon_m: Annotated[Positive, Field(description="width of the polygons, m")] = 60.0
@@ -304,7 +306,7 @@ class Playa(Parameters):
     contrast: Annotated[float, Field(ge=-2.0, le=2.0, description="log albedo of fissures over the plates'")] = -0.12
 
     def apply(self, ground: Ground, rng: Generator) -> None:
-        """Add fissures to all of the ground."""
+        """Add fissures to the whole terrain."""
         ground.add(self.fissures(ground, rng))
 
     def fissures(self, ground: Ground, rng: Generator) -> Ground:
@@ -323,10 +325,10 @@ class Playa(Parameters):
 class Fans(Parameters):
     """Alluvial fans that run down from a divide to an almost level playa.
 
-    One divide lies along y = 0, so fans face north and south and the playa lies around y = period / 2; further divides
-    are spaced evenly. Radial profiles flatten towards the toe; slopes of 1-5 deg are usual (Blair & McPherson 1994).
-    Washes spread from the apexes. Existing relief is unchanged on the fans, and multiplied by `playa_relief` on the
-    playa, which can have polygons.
+    The divides run from west to east with equal spacing, the first along y = 0. Fans face north and south of each
+    divide, and a playa lies midway between two divides. Radial profiles flatten towards the toe; slopes of 1-5 deg are
+    usual (Blair & McPherson 1994). Washes spread from the apexes. Existing relief is unchanged on the fans, and
+    multiplied by `playa_relief` on the playa, which can have polygons.
     """
 
     slope_deg: Annotated[float, Field(gt=0.0, le=15.0, description="slope at the apex")] = 4.5
@@ -346,12 +348,12 @@ class Fans(Parameters):
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the fans and their washes; flatten the playa."""
         count = max(round(ground.period_m / self.apex_spacing_m), 1)
-        along = (np.tile(np.arange(count), self.divides) + rng.uniform(-0.3, 0.3, count * self.divides)) / count
-        across = np.repeat(np.arange(self.divides), count) / self.divides
-        offset = rng.uniform(-0.06, 0.06, along.size) * self.radius_m
-        radius = self.radius_m * rng.uniform(0.85, 1.15, along.size)
-        y = (across * ground.period_m + offset) % ground.period_m
-        apexes = np.column_stack([along * ground.period_m, y, radius])
+        apex_x = (np.tile(np.arange(count), self.divides) + rng.uniform(-0.3, 0.3, count * self.divides)) / count
+        divide_y = np.repeat(np.arange(self.divides), count) / self.divides
+        offset = rng.uniform(-0.06, 0.06, apex_x.size) * self.radius_m
+        radius = self.radius_m * rng.uniform(0.85, 1.15, apex_x.size)
+        y = (divide_y * ground.period_m + offset) % ground.period_m
+        apexes = np.column_stack([apex_x * ground.period_m, y, radius])
         broad = ground.coarser(CONE_DETAIL * self.radius_m)
         slope = float(np.tan(np.radians(self.slope_deg)))
         rounding = APEX_ROUNDING * self.radius_m
@@ -378,11 +380,11 @@ class Fans(Parameters):
         for apex in apexes:
             # on both sides of the divide, within 30 deg of the steepest descent
             heading = rng.choice([-1.0, 1.0], count) * np.pi / 2.0 + rng.uniform(-0.52, 0.52, count)
-            begin = apex[2] * rng.uniform(0.02, 0.5, count)
+            start_radius = apex[2] * rng.uniform(0.02, 0.5, count)
             width = self.wash_width_m * np.exp(0.5 * rng.standard_normal(count))
             depth = self.wash_depth_m * np.exp(0.4 * rng.standard_normal(count))
-            start = apex[:2] + begin[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-            length = apex[2] * rng.uniform(0.9, 1.05, count) - begin
+            start = apex[:2] + start_radius[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+            length = apex[2] * rng.uniform(0.9, 1.05, count) - start_radius
             discs = draw_channels(start, heading, np.maximum(length, width), width, depth, 0.06, rng)
             cut_channels(part.tone, part.spacing_m, discs, 2.0)
         part.height[...] = -part.tone

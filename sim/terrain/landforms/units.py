@@ -72,19 +72,19 @@ class SurfaceUnits(Parameters):
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], rng: Generator
     ) -> Float32[np.ndarray, "cover cover 3"]:
         """Add the tones of the units, dust devil tracks and wind tails of craters; return the cover (see `Surface`)."""
-        kinds = self.kinds
-        expected = np.array([kind.fraction for kind in kinds])
+        units = self.kinds
+        expected = np.array([unit.fraction for unit in units])
         areas = rng.dirichlet(self.concentration * expected / expected.sum())
         side = ground.side // COVER_STEP
         spacing = ground.period_m / side
         downwind = np.radians(270.0 - self.wind_from_deg - self.wind_spread_deg * rng.standard_normal())
         spectrum = Spectrum.power_law(side, spacing, OUTLINE_HURST, self.largest_m, self.elongation, downwind)
         spectrum = spectrum.apply_low_pass(self.smallest_m)
-        fields = np.stack([spectrum.draw_field(rng, 1.0) for _ in kinds], axis=-1)
+        fields = np.stack([spectrum.draw_field(rng, 1.0) for _ in units], axis=-1)
         membership = self._membership(fields, areas)
-        values = np.array([(kind.roughness, kind.texture, kind.rocks) for kind in kinds])
+        values = np.array([(unit.roughness, unit.texture, unit.rocks) for unit in units])
         factors = np.exp(membership @ np.log(np.maximum(values, 1e-3)).astype(np.float32))
-        tone = np.ascontiguousarray(membership @ np.array([kind.tone for kind in kinds], dtype=np.float32))
+        tone = np.ascontiguousarray(membership @ np.array([unit.tone for unit in units], dtype=np.float32))
         self._add_tracks(tone, spacing, downwind, rng)
         ground.add(Ground(np.zeros_like(tone), tone, spacing))
         self._add_streaks(ground, craters, downwind, rng)
@@ -108,9 +108,9 @@ class SurfaceUnits(Parameters):
         start = rng.uniform(0.0, period, (count, 2))
         depth = -self.track_tone * rng.uniform(0.3, 1.0, count)
         discs = draw_channels(start, heading, length, width, depth, 0.12, rng)
-        darker = np.zeros_like(tone)
-        cut_channels(darker, spacing, discs, 2.0)
-        tone -= darker
+        track_depth = np.zeros_like(tone)
+        cut_channels(track_depth, spacing, discs, 2.0)
+        tone -= track_depth
 
     def _add_streaks(
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator

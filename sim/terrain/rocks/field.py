@@ -28,10 +28,8 @@ MAX_TRIES = 20000  #: Maximum number of random positions that are tried for a ro
 #: Arrays of a `RockField` with one row per rock.
 ROCK_ARRAYS = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up", "albedo")
 Positions = Float64[np.ndarray, "selected 3"]
-Sizes = Float64[np.ndarray, "rocks"]
+PerRock = Float64[np.ndarray, "rocks"]
 Numbers = Int64[np.ndarray, "selected"]
-
-
 Form = Literal["block", "clinker", "vesicular", "slab", "ventifact"]
 
 
@@ -117,22 +115,24 @@ def draw_diameters(parameters: RockParameters, area_m2: float, rng: Generator) -
     """
     p, q = parameters, decay_per_m(parameters.abundance or 1.0)
 
-    def per_log(d: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+    def density_per_log(d: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         return np.asarray(p.abundance * q * np.exp(-q * d) / (np.pi * d / 4.0))
 
-    # the number of smaller rocks per square metre, by Simpson's rule in the logarithm of the diameter
+    # cumulative number of rocks per square metre up to each diameter, by Simpson's rule in the logarithm of diameter
     diameter, step = np.geomspace(p.smallest_m, p.largest_m, 2001), np.log(p.largest_m / p.smallest_m) / 2000
     middle = np.sqrt(diameter[1:] * diameter[:-1])
-    pieces = step / 6.0 * (per_log(diameter[:-1]) + 4.0 * per_log(middle) + per_log(diameter[1:]))
-    number = np.concatenate([[0.0], np.cumsum(pieces)])
-    expected = number[-1] * area_m2
+    interval_counts = (
+        step / 6.0 * (density_per_log(diameter[:-1]) + 4.0 * density_per_log(middle) + density_per_log(diameter[1:]))
+    )
+    cumulative_count = np.concatenate([[0.0], np.cumsum(interval_counts)])
+    expected = cumulative_count[-1] * area_m2
     if expected > MAX_ROCKS:
         raise ValueError(
             f"{expected:.3g} rocks of at least {p.smallest_m:g} m on {area_m2:.3g} m2; at most "
             f"{MAX_ROCKS:g} are allowed: choose a larger rocks.smallest_m"
         )
     quantile = rng.random(int(rng.poisson(expected)))
-    drawn = np.exp(np.interp(quantile * number[-1], number, np.log(diameter)))
+    drawn = np.exp(np.interp(quantile * cumulative_count[-1], cumulative_count, np.log(diameter)))
     return np.asarray(np.sort(drawn)[::-1])
 
 
@@ -172,11 +172,11 @@ class RockField:
     period_m: float
     shape: Int32[np.ndarray, "rocks"]
     position_m: Float64[np.ndarray, "rocks 3"]
-    diameter_m: Sizes
-    height_m: Sizes
-    yaw_rad: Sizes
+    diameter_m: PerRock
+    height_m: PerRock
+    yaw_rad: PerRock
     up: Float64[np.ndarray, "rocks 3"]
-    albedo: Sizes
+    albedo: PerRock
     names: Mapping[str, int]
 
     @classmethod
@@ -309,7 +309,7 @@ class RockField:
 
 
 def _draw_positions(
-    parameters: RockParameters, radius: Sizes, diameter: Sizes, surface: Surface, rng: Generator
+    parameters: RockParameters, radius: PerRock, diameter: PerRock, surface: Surface, rng: Generator
 ) -> Float64[np.ndarray, "rocks 2"]:
     """Return the positions of placed rocks, and draw positions without overlap for the others by decreasing size."""
     period_m, density = surface.period_m, np.ascontiguousarray(surface.cover[..., ROCKS])

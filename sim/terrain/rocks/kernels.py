@@ -40,33 +40,33 @@ def place_discs(
     without a free position after `max_tries` gets NaN. Neighbours are found in a grid of cells; each cell has a linked
     list of the discs that touch it.
     """
-    rows, densest = density.shape[0], density.max()
+    rows, max_density = density.shape[0], density.max()
     side = max(int(period / cell_m), 1)
     cell = period / side
     n_entries = 0
     for radius in np.concatenate((radii, occupied[:, 2])):
-        across = min(int(2.0 * radius / cell) + 2, side)
-        n_entries += across * across
+        cells_across = min(int(2.0 * radius / cell) + 2, side)
+        n_entries += cells_across * cells_across
     first_entry = np.full(side * side, -1, dtype=np.int32)
     next_entry = np.empty(n_entries, dtype=np.int32)
     disc_of_entry = np.empty(n_entries, dtype=np.int32)
     discs = np.empty((occupied.shape[0] + radii.size, 3), dtype=np.float64)
     placed = np.full((radii.size, 2), np.nan, dtype=np.float64)
-    n_used, n_discs = 0, 0
-    for n in range(occupied.shape[0] + radii.size):
-        is_existing = n < occupied.shape[0]
-        radius = occupied[n, 2] if is_existing else radii[n - occupied.shape[0]]
+    n_listed, n_discs = 0, 0
+    for disc in range(occupied.shape[0] + radii.size):
+        is_existing = disc < occupied.shape[0]
+        radius = occupied[disc, 2] if is_existing else radii[disc - occupied.shape[0]]
         x, y = 0.0, 0.0
-        free = is_existing
+        is_free = is_existing
         if is_existing:
-            x, y = occupied[n, 0] % period, occupied[n, 1] % period
+            x, y = occupied[disc, 0] % period, occupied[disc, 1] % period
         tries = 0
-        while not free and tries < max_tries:
+        while not is_free and tries < max_tries:
             tries += 1
-            x, y, free = rng.random() * period, rng.random() * period, True
+            x, y, is_free = rng.random() * period, rng.random() * period, True
             i, j = int(y / period * rows) % rows, int(x / period * rows) % rows
-            if rows > 1 and rng.random() * densest > density[i, j]:
-                free = False
+            if rows > 1 and rng.random() * max_density > density[i, j]:
+                is_free = False
                 continue
             cell_rows = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
             cell_columns = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
@@ -81,17 +81,17 @@ def place_discs(
                         dx, dy = min(dx, period - dx), min(dy, period - dy)
                         min_distance = discs[other, 2] + radius
                         if dx * dx + dy * dy < min_distance * min_distance:
-                            free = False
+                            is_free = False
                             break
                         entry = next_entry[entry]
-                    if not free:
+                    if not is_free:
                         break
-                if not free:
+                if not is_free:
                     break
-        if not free:
+        if not is_free:
             continue
         if not is_existing:
-            placed[n - occupied.shape[0], 0], placed[n - occupied.shape[0], 1] = x, y
+            placed[disc - occupied.shape[0], 0], placed[disc - occupied.shape[0], 1] = x, y
         discs[n_discs, 0], discs[n_discs, 1], discs[n_discs, 2] = x, y, radius
         cell_rows = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
         cell_columns = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
@@ -99,9 +99,9 @@ def place_discs(
             i = (int((y - radius) / cell + side) + di) % side
             for dj in range(cell_columns):
                 j = (int((x - radius) / cell + side) + dj) % side
-                disc_of_entry[n_used], next_entry[n_used] = n_discs, first_entry[i * side + j]
-                first_entry[i * side + j] = n_used
-                n_used += 1
+                disc_of_entry[n_listed], next_entry[n_listed] = n_discs, first_entry[i * side + j]
+                first_entry[i * side + j] = n_listed
+                n_listed += 1
         n_discs += 1
     return placed
 
@@ -113,9 +113,9 @@ def stamp_tails(
     """Raise ridges in the lee of rocks; `samples` are heights and albedos on a periodic square, changed in place.
 
     `tails` has rows (x, y, half width, distance of the tip, height). `tone` is the natural logarithm of the albedo of a
-    ridge over that of the ground. The ridge rises from the centre of the rock to the
-    rock's edge, where it is widest and highest, and decreases linearly to its tip. Its cross section is
-    ``(1 - (t / half width)**2)**2``, whose steepest slope is 1.54 times height over half width.
+    ridge divided by that of the ground. The ridge rises from the centre of the rock to its edge, where its width and
+    height are largest, and decreases linearly to its tip. Its cross section at the offset t is
+    ``(1 - (t / half width)**2)**2``; the maximum slope is 1.54 times the height divided by the half width.
     """
     mask = samples.shape[0] - 1
     for n in range(tails.shape[0]):
@@ -160,7 +160,7 @@ def assemble(rocks: Placements, unit_vertices: Array, unit_normals: Array) -> tu
         unit = shape[n]
         c, s = math.cos(yaw[n]), math.sin(yaw[n])
         ux, uy, uz = up[n, 0], up[n, 1], up[n, 2]
-        # the rotation that takes z to up, about the axis z x up
+        # rotation from z to up about the axis z x up
         f = 1.0 / (1.0 + uz)
         r00, r01, r11 = 1.0 - ux * ux * f, -ux * uy * f, 1.0 - uy * uy * f
         sx, sy, sz = scale[n, 0], scale[n, 1], scale[n, 2]

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.kernel_cache import processor_features
 
-SHAPES_OF_FORM = 16  #: Shapes of each form; the first are angular, the last rounded.
+SHAPES_OF_FORM = 16  #: Number of shapes of each form, from angular to rounded.
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class RockForm:
     """Distributions of the shapes of one form.
 
     - cuts, cut_distances: ranges of the number of planes that cut an ellipsoid, and of their distances from its centre
-    - sharpness: exponents of the cuts' union, which rounds their edges, of the first and the last shape
-    - bumps: RMS height of bumps over the radius, in each band of wavenumber
-    - depths: range of the shortest axis over the longest; the middle one is 0.65 to 0.95
-    - buried: range of the fraction of the height that is under the ground
-    - flatness: height over diameter, relative to that of a terrain's rocks
+    - sharpness: exponents of the first and the last shape in the norm that combines the cuts and rounds their edges
+    - bumps: RMS height of bumps divided by the radius, in each wavenumber band
+    - depths: range of the ratio of the shortest to the longest axis; the ratio of the middle axis is 0.65 to 0.95
+    - buried: range of the fraction of the height that is below the ground
+    - flatness: factor of the ratio of height to diameter of a terrain's rocks
     - folded: whether bumps meet in ridges
     - bedding: whether two of the cuts are almost horizontal, and the others steep
     - pits: number of vesicles, open at the surface
@@ -47,8 +47,8 @@ class RockForm:
     pits: int = 0
 
 
-#: Forms in the order of their shapes' numbers: blocks, the rough clinker of a'a, vesicular basalt, slabs of bedrock
-#: and wind-faceted ventifacts (all seen from Spirit and Opportunity: Grotzinger et al. 2005, Greeley et al. 2006).
+#: Forms in the order of their shape numbers: blocks, rough clinker of a'a lava, vesicular basalt, slabs of bedrock and
+#: wind-faceted ventifacts (all in images of Spirit and Opportunity: Grotzinger et al. 2005, Greeley et al. 2006).
 FORMS = {
     "block": RockForm(),
     "clinker": RockForm(bumps=(0.1, 0.045, 0.022, 0.0), buried=(0.3, 0.5), folded=True),
@@ -73,28 +73,28 @@ FORMS = {
     ),
 }
 SHAPES = SHAPES_OF_FORM * len(FORMS)
-#: Angular radii of vesicles, radians, and their depth over their radius.
+#: Range of the angular radii of vesicles, radians, and ratio of their depth to their radius.
 _PIT_RADII, _PIT_DEPTH = (0.07, 0.2), 0.5
-#: Half thickness of slabs in their own axes, and the largest tilt of their bedding planes, radians.
+#: Range of the half thickness of slabs in their own axes, and maximum tilt of their bedding planes, radians.
 _BED_HALF, _BED_TILT = (0.35, 0.55), 0.1
 #: Subdivisions of the icosahedron at each level of detail: 20, 80, 320, 1280 and 5120 triangles.
 SUBDIVISIONS = (0, 1, 2, 3, 4)
 COARSEST, COARSE, MEDIUM, FINE, FINEST = range(5)
 DEVIATION_PX = 0.25  #: Allowed RMS deviation of a rock's image from its finest shape, pixels.
-UNIT_HEIGHT = 0.5  #: Height above the ground over diameter of the unit shapes. Each rock is stretched to its own.
-#: Bands of wavenumber of bumps, radians per radius, and number of waves in each.
+UNIT_HEIGHT = 0.5  #: Ratio of height above ground to diameter of the unit shapes; each rock is scaled to its own.
+#: Wavenumbers of the bands of bumps, radians per radius, and number of waves in each band.
 _BUMP_WAVENUMBERS, _BUMP_WAVES = (3.0, 6.5, 13.0, 24.0), (10, 16, 24, 32)
 Points = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True)
 class ShapeSet:
-    """All shapes at one level of detail; each is a displaced icosphere, so all have the same triangles.
+    """All shapes at one level of detail: displaced icospheres with the same triangles.
 
-    A unit shape stands on the ground plane z = 0, part of it below; seen from above, the mean of its longest and its
-    shortest diameter is 1, and it is `UNIT_HEIGHT` high.
+    The ground is the plane z = 0; part of a unit shape is below it. In top view the mean of the longest and the
+    shortest diameter is 1. The height above ground is `UNIT_HEIGHT`.
 
-    - normals: those of the smooth shape, not of the triangles
+    - normals: normals of the smooth shape at the vertices
     - faces: vertex numbers of each triangle, counter-clockwise seen from outside
     - reach: largest horizontal distance of each shape's surface from its origin
     """
@@ -107,7 +107,7 @@ class ShapeSet:
 
 @cache
 def rock_shapes(detail: int) -> ShapeSet:
-    """Return the shapes at a level of detail, 0 (`COARSEST`) to 4 (`FINEST`); coarser ones are fitted to the finest."""
+    """Return the shapes at a level of detail, 0 (`COARSEST`) to 4 (`FINEST`); other levels are fitted to the finest."""
     directions, faces = _icosphere(detail)
     normals = _load_or_build(f"normals-{detail}", lambda: np.stack([block.normals(directions) for block in _blocks()]))
     return ShapeSet(_vertices(detail), normals, faces, _reach())
@@ -115,9 +115,10 @@ def rock_shapes(detail: int) -> ShapeSet:
 
 @cache
 def max_pixels(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes levels"]:
-    """Largest size in pixels at which each shape may be drawn at each level except the finest.
+    """Compute the maximum size in pixels up to which each level except the finest is accurate, for each shape.
 
-    The deviation is the distance from the finest shape along its normals, RMS over the part above the ground.
+    The deviation is the distance from the finest shape along its normals, RMS over the part above the ground. It must
+    not exceed `bound_px`.
     """
     return bound_px * _load_or_build("pixels", _max_pixels_per_deviation)
 
@@ -137,7 +138,7 @@ def _max_pixels_per_deviation() -> Float64[np.ndarray, "shapes levels"]:
 
 @cache
 def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarray, "faces 3"]]:
-    import trimesh  # here, as it is slow to import
+    import trimesh  # imported late, because the import is slow
 
     sphere = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[detail])
     vertices = np.array(sphere.vertices, dtype=np.float64)
@@ -145,7 +146,7 @@ def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarra
 
 
 def _load_or_build(name: str, build: Callable[[], Float64[np.ndarray, "..."]]) -> Float64[np.ndarray, "..."]:
-    """An array from the cache of terrains, built where it is missing: all shapes take seconds in every process."""
+    """Load an array from the terrain cache, or build and store it: building all shapes takes seconds per process."""
     identity = f"{Path(__file__).read_text()} {np.__version__} {processor_features()}"
     version = hashlib.sha256(identity.encode()).hexdigest()[:16]
     with suppress(OSError):
@@ -181,7 +182,7 @@ def _build_vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
 
 @cache
 def _reach() -> Float64[np.ndarray, "shapes"]:
-    """Largest horizontal distance from the origin, over all levels of detail: fitted corners may stick out."""
+    """Maximum horizontal distance from the origin over all levels: fitted corners may lie outside the finest shape."""
     levels = [np.hypot(_vertices(k)[..., 0], _vertices(k)[..., 1]).max(axis=1) for k in range(len(SUBDIVISIONS))]
     reach: Float64[np.ndarray, "shapes"] = np.max(levels, axis=0)
     reach.setflags(write=False)
@@ -190,11 +191,12 @@ def _reach() -> Float64[np.ndarray, "shapes"]:
 
 @dataclass(frozen=True)
 class _Block:
-    """A star-shaped body: an ellipsoid cut by planes whose edges are rounded, with a bumpy surface.
+    """A star-shaped body: an ellipsoid cut by planes, with rounded edges and a bumpy surface.
 
-    In its own axes the distance of the surface from the centre along direction d is
-    ``(|d|**-p + sum((n_i . d / c_i)**p))**(-1/p) (1 + bumps(d))``: for large p the smallest of all cuts. The bumps are
-    waves; clinker's are folded, so that they meet in sharp ridges. Vesicles are paraboloids below the surface.
+    In the block's axes, before stretching, the distance of the surface from the centre along the unit vector d is
+    ``(1 + sum((n_i . d / c_i)**p))**(-1/p) (1 + bumps(d))``, with the normals n_i and distances c_i of the cuts and the
+    sharpness p. For large p this is the minimum over the sphere and all cuts. Bumps are waves; those of clinker are
+    folded, so that they meet in sharp ridges. Vesicles are paraboloids below the surface.
     """
 
     cut_normals: Float64[np.ndarray, "cuts 3"]
@@ -245,43 +247,45 @@ class _Block:
             pit_radii=rng.uniform(*_PIT_RADII, form.pits),
         )
 
-    def to_unit_shape(self, own: Points) -> Points:
-        """Points of the unit shape from points in the block's own axes before stretching."""
+    def to_unit_shape(self, points: Points) -> Points:
+        """Convert points in the block's own axes, before stretching, to points of the unit shape."""
         shift, stretch = self.frame
-        return np.asarray((own * self.axes - shift) * stretch)
+        return np.asarray((points * self.axes - shift) * stretch)
 
     def normals(self, directions: Points) -> Points:
-        """Outward unit normals along directions, by differences of the implicit surface ``|x| - r(x / |x|)``."""
+        """Outward unit normals along directions, by finite differences of the implicit surface ``|x| - r(x / |x|)``."""
 
         def implicit(points: Points) -> Float64[np.ndarray, "n"]:
             length = np.linalg.norm(points, axis=1)
             return np.asarray(length - self.radius(points / length[:, None]))
 
-        own = directions * self.radius(directions)[:, None] * self.axes / self.axes
+        surface_points = directions * self.radius(directions)[:, None] * self.axes / self.axes
         step = 1e-4
-        differences = [implicit(own + offset) - implicit(own - offset) for offset in step * np.eye(3)]
+        differences = [
+            implicit(surface_points + offset) - implicit(surface_points - offset) for offset in step * np.eye(3)
+        ]
         gradient = np.stack(differences, axis=1) / (2.0 * step) / (self.axes * self.frame[1])
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def radius(self, d: Points) -> Float64[np.ndarray, "n"]:
         """Distance of the surface along directions, in the block's own axes."""
-        towards = np.maximum(_dot_products(d, self.cut_normals), 0.0) / self.cut_distances
-        radius = (1.0 + np.sum(towards**self.sharpness, axis=1)) ** (-1.0 / self.sharpness)
+        inverse_distance = np.maximum(_dot_products(d, self.cut_normals), 0.0) / self.cut_distances
+        radius = (1.0 + np.sum(inverse_distance**self.sharpness, axis=1)) ** (-1.0 / self.sharpness)
         phase = _dot_products(d, self.waves) + self.wave_phases
         wave = np.cos(phase)
         if self.folded:
-            # same mean square, 1/2, about the mean 0; cusps outwards
+            # cusps point outwards; mean 0 and mean square 1/2 as without folding
             wave = (2.0 / np.pi - np.abs(wave)) / np.sqrt(1.0 - 8.0 / np.pi**2)
         radius *= 1.0 + np.sum(self.wave_heights * wave, axis=1)
         if self.pit_radii.size:
-            # (angle / radius)**2 for small angles; of overlapping vesicles the deepest counts
-            square = 2.0 * (1.0 - _dot_products(d, self.pit_directions)) / self.pit_radii**2
-            radius *= 1.0 - np.max(_PIT_DEPTH * self.pit_radii * np.maximum(1.0 - square, 0.0), axis=1)
+            # approximately (angle / radius)**2; overlapping vesicles: the deepest one
+            ratio2 = 2.0 * (1.0 - _dot_products(d, self.pit_directions)) / self.pit_radii**2
+            radius *= 1.0 - np.max(_PIT_DEPTH * self.pit_radii * np.maximum(1.0 - ratio2, 0.0), axis=1)
         return np.asarray(radius)
 
     @cached_property
     def finest_radius(self) -> Float64[np.ndarray, "n"]:
-        """Radii along the finest shapes' directions."""
+        """Radii along the directions of the finest shapes."""
         return self.radius(_icosphere(FINEST)[0])
 
     @cached_property
@@ -292,15 +296,17 @@ class _Block:
         ground = lowest + self.buried_fraction * (highest - lowest)
         visible = points[points[:, 2] >= ground, :2]
         azimuth = np.linspace(0.0, np.pi, 180, endpoint=False)
-        along = visible[:, :1] * np.cos(azimuth) + visible[:, 1:] * np.sin(azimuth)
-        diameters = np.ptp(along, axis=0)
+        projections = visible[:, :1] * np.cos(azimuth) + visible[:, 1:] * np.sin(azimuth)
+        diameters = np.ptp(projections, axis=0)
         middle = 0.5 * (visible.max(axis=0) + visible.min(axis=0))
-        across = 2.0 / (diameters.max() + diameters.min())
-        return np.array([*middle, ground]), np.array([across, across, UNIT_HEIGHT / (highest - ground)])
+        horizontal_scale = 2.0 / (diameters.max() + diameters.min())
+        return np.array([*middle, ground]), np.array(
+            [horizontal_scale, horizontal_scale, UNIT_HEIGHT / (highest - ground)]
+        )
 
 
 def _dot_products(d: Points, vectors: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n m"]:
-    """All scalar products, written out because the order of summation of BLAS differs between machines."""
+    """Compute all scalar products without BLAS, whose order of summation differs between machines."""
     x, y, z = (d[:, axis, None] * vectors[:, axis] for axis in range(3))
     return np.asarray(x + y + z)
 
@@ -312,10 +318,10 @@ def _blocks() -> tuple[_Block, ...]:
 
 @cache
 def _fitted_inverse_radii(number: int, detail: int) -> Float64[np.ndarray, "corners"]:
-    """Inverse radii of a level's corners whose flat triangles deviate least, in mean square, from the finest shape.
+    """Fit the inverse radii of a level's corners, so that its triangles approximate the finest shape (least squares).
 
-    Along a direction that is a sum of three corners' directions with weights c, a triangle lies at the distance
-    1 / sum(c / r): its inverse is linear in the inverse radii of its corners.
+    Along the direction sum(c d) of three corners with directions d and radii r, the distance of the triangle is
+    1 / sum(c / r). The inverse distance is therefore linear in the inverse radii of the corners.
     """
     corners, radius = _corner_weights(detail), _blocks()[number].finest_radius
     weighted = corners.multiply(radius[:, None] ** 4).tocsc()
@@ -324,14 +330,14 @@ def _fitted_inverse_radii(number: int, detail: int) -> Float64[np.ndarray, "corn
 
 @cache
 def _corner_weights(detail: int) -> csc_matrix:
-    """Weights that express each direction of the finest shapes by the corners of a level's triangle there."""
+    """Compute weights that express each direction of the finest shapes by the corners of the level's triangle there."""
     directions, faces = _icosphere(detail)
     finest = _icosphere(FINEST)[0]
-    middles = directions[faces].sum(axis=1)
-    # the triangle that holds a direction is among those whose middles are nearest
-    near = np.argsort(-(finest @ middles.T), axis=1, kind="stable")[:, :4]
-    solved = np.linalg.inv(directions[faces].transpose(0, 2, 1))
-    weights = np.einsum("nkij,nj->nki", solved[near], finest)
+    centroids = directions[faces].sum(axis=1)
+    # the triangle that contains a direction is among the four triangles with the nearest centroids
+    near = np.argsort(-(finest @ centroids.T), axis=1, kind="stable")[:, :4]
+    inverses = np.linalg.inv(directions[faces].transpose(0, 2, 1))
+    weights = np.einsum("nkij,nj->nki", inverses[near], finest)
     rows = np.arange(len(finest))
     best = np.argmax(weights.min(axis=2), axis=1)
     corners = faces[near[rows, best]]

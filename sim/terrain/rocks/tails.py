@@ -19,10 +19,10 @@ SAMPLES_ACROSS = 4.0  #: Minimum width of a tail in samples of the terrain; narr
 
 
 class WindTails(Parameters):
-    """Ridges in the lee of rocks, as Spirit and Opportunity saw them (Greeley et al. 2004; Sullivan et al. 2005).
+    """Ridges in the lee of rocks, as in images of Spirit and Opportunity (Greeley et al. 2004; Sullivan et al. 2005).
 
-    Like a shadow dune (Hesp 1981), a ridge has the rock's width at the rock and narrows to a point. Its height is that
-    of the angle of repose over half of the width, but at most a fraction of the rock's height.
+    Like a shadow dune (Hesp 1981), a ridge has the rock's width at the rock and narrows to a point. Its height is the
+    half width times the tangent of the angle of repose, limited to a fraction of the rock's height.
     """
 
     wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth the wind comes from")] = 330.0
