@@ -35,9 +35,10 @@ class TerrainSupply:
     def advice(self, needed: int, probability: float, confidence: float) -> str:
         """Explain that the campaign needs more terrains (`needed`), not more cases, and how to configure them."""
         level = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
+        draws = "The" if self.in_turn else "Random draws from the"
         text = (
-            f"To show {level}, the cases must include at least {count(needed, 'different terrain')}; this campaign "
-            f"draws from a set of {count(self.terrains, 'terrain')} ({self.key} = {self.terrains})."
+            f"To show {level}, the cases must include at least {count(needed, 'different terrain')}. {draws} "
+            f"{count(self.terrains, 'stored terrain')} ({self.key} = {self.terrains}) do not give as many."
         )
         if not self.key.endswith(".bank"):
             return f"{text} Widen the range of {self.key}, and the bank, and run the campaign again."

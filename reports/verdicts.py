@@ -188,7 +188,7 @@ class Verdict:
         is_assumed = math.isnan(evidence.design_effect)
         effect = self.n / evidence.effective_n if is_assumed else evidence.design_effect
         text = (
-            f"The {count(self.n, 'case')} lie on {count(self.terrains or 0, 'terrain')}: {evidence.method}, effective "
+            f"The {count(self.n, 'case')} lie on {count(self.terrains or 0, 'terrain')}: {evidence.method}. Effective "
             f"number of cases {evidence.effective_n:.4g}, {'assumed ' if is_assumed else ''}design effect {effect:.3g}."
         )
         if self.plain_status is not None and self.plain_status is not self.status:

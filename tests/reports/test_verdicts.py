@@ -365,8 +365,9 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     (verdict,) = evaluate_requirements(frame, [velocity], design)
     assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
     message = (
-        "To show 99 % at 90 % confidence, the cases must include at least 230 different terrains; this campaign draws "
-        "from a set of 8 terrains (location.bank = 8). Run the campaign again with --set location.bank=2300 -n 254."
+        "To show 99 % at 90 % confidence, the cases must include at least 230 different terrains. Random draws from "
+        "the 8 stored terrains (location.bank = 8) do not give as many. Run the campaign again with --set "
+        "location.bank=2300 -n 254."
     )
     assert message in verdict.note
     assert message in combine_verdicts([verdict], frame).sentence
