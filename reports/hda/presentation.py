@@ -78,7 +78,7 @@ SITES = SectionDeclaration(
         Distribution(
             sections.hazard_distances,
             ("distance to the nearest unsafe position (m)", "fraction above this distance"),
-            "Fraction of sites and touchdowns with a distance to the nearest unsafe position above the value on the axis.",
+            "Fraction of sites and touchdowns with a larger distance to the nearest unsafe position than the value shown.",
             heading="Distance to true hazards",
             complementary=True,
             table=sections.distance_grid,
