@@ -65,7 +65,7 @@ class WorldParameters(Parameters):
     incline: InclineParameters = InclineParameters()
     rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "ground's RMS slope; default: the site's")] = None
     dust_opacity: Annotated[
-        float | None, bounded_field(0.0, 10.0, "optical depth of the dusty air; by default that of the site")
+        float | None, bounded_field(0.0, 10.0, "optical depth of the dusty air; default: that of the world")
     ] = None
     rock_abundance: Annotated[
         float | None, bounded_field(0.0, 0.4, "fraction of the ground covered by rocks; by default that of the site")
@@ -106,7 +106,7 @@ class TargetParameters(Parameters):
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 0.8
     height_m: Annotated[Positive | None, Field(description="height of the rock; default: half the diameter")] = None
     shape: Annotated[
-        int | None, Field(ge=0, le=31, description="number of the rock's shape, see PlacedRock; random if omitted")
+        int | None, Field(ge=0, le=31, description="number of the rock's shape; random if omitted, see PlacedRock")
     ] = None
     yaw_deg: Annotated[float | None, Field(description="yaw of the rock, deg; random if omitted")] = None
     across: Annotated[
@@ -237,13 +237,17 @@ class CameraParameters(Parameters):
 
     preset: str = Field(
         default="mer-navcam",
-        description="stereo cameras with mast and rover, a key of `marsyard.sim.sensor.mast.MASTS`",
+        description="pair of stereo cameras with its mast and rover; a key of `marsyard.sim.sensor.mast.MASTS`",
     )
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="both detectors; default: the preset's")
     detector_noise: Annotated[bool, Field(description="whether images have detector noise and response")] = True
-    defocus_px: Annotated[NonNegative, Field(le=10.0, description="diameter of the blur circle of a point, px")] = 0.0
-    stray_light: Annotated[float, bounded_field(0.0, 0.5, "fraction of the light spread over the image")] = 0.0
+    defocus_px: Annotated[
+        NonNegative, Field(le=10.0, description="defocus: diameter of the blur circle of a point")
+    ] = 0.0
+    stray_light: Annotated[
+        float, bounded_field(0.0, 0.5, "stray light: fraction of all light that is spread evenly")
+    ] = 0.0
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="number of specks of dust on each camera window")] = 0
     dust_depth: Annotated[Fraction, Field(description="fraction of the light absorbed by a speck")] = 0.3
 

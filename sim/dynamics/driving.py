@@ -49,7 +49,9 @@ class SlipParameters(Parameters):
     """
 
     flat: Annotated[Fraction, Field(description="wheel slip on level ground, fraction of the commanded path")] = 0.01
-    full_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="slope of 100 % slip, deg")] = 20.0
+    full_slope_deg: Annotated[
+        float, Field(gt=0.0, lt=90.0, description="slope at which the wheels slip completely")
+    ] = 20.0
     exponent: Annotated[float, bounded_field(1.0, 100.0, "exponent of the slope in the slip formula")] = 2.4
     downhill: Annotated[Fraction, Field(description="path gained downhill divided by path lost uphill")] = 0.3
     across: Annotated[Fraction, Field(description="sideways sliding on a cross slope / path lost uphill")] = 0.5

@@ -127,7 +127,9 @@ class OpticsParameters(Parameters):
     diffraction_px: Annotated[NonNegative, Field(le=5.0, description="wavelength x f-number / pitch; 0: none")] = 0.70
     diffusion_px: Annotated[NonNegative, Field(le=5.0, description="RMS charge diffusion, px (assumed)")] = 0.25
     pixel_aperture: Annotated[bool, Field(description="average over pixels; only for point-sampled scenes")] = False
-    defocus_px: Annotated[NonNegative, Field(le=10.0, description="diameter of the blur circle of a point, px")] = 0.0
+    defocus_px: Annotated[
+        NonNegative, Field(le=10.0, description="defocus: diameter of the blur circle of a point")
+    ] = 0.0
     stray_light: Annotated[
         float, Field(ge=0.0, le=0.5, description="stray light: fraction of all light that is spread evenly")
     ] = 0.0

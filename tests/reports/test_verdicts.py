@@ -303,7 +303,7 @@ def test_consumer_risk_is_exact_at_the_minimum_number_of_cases(velocity: dict[st
     # ten cases on each of 230 terrains count as 230 cases
     verdict = _evaluate(_make_rows(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
     assert verdict.consumer_risk == pytest.approx(0.99**230)
-    assert "assumed design effect 10" in verdict.note
+    assert "assumed design effect of 10" in verdict.note
 
 
 def test_missing_answered_column_is_noted(velocity: dict[str, Any]) -> None:
@@ -365,9 +365,9 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     (verdict,) = evaluate_requirements(frame, [velocity], design)
     assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
     message = (
-        "To show 99 % at 90 % confidence, the cases must include at least 230 different terrains. Random draws from "
-        "the 8 stored terrains (location.bank = 8) do not give as many. Run the campaign again with --set "
-        "location.bank=2300 -n 254."
+        "To show a success rate of 99 % at 90 % confidence, the cases must include at least 230 different terrains. "
+        "The campaign has only 8 stored terrains (location.bank = 8). Run the campaign again with 2,300 stored "
+        "terrains and 254 cases: --set location.bank=2300 -n 254."
     )
     assert message in verdict.note
     assert message in combine_verdicts([verdict], frame).sentence
@@ -449,7 +449,7 @@ def test_population_defined_by_truth_is_named_and_compared_with_all_cases(veloci
     frame = _make_rows(20, 2)
     frame["lit"] = np.arange(20) >= 10
     requirement = {**velocity, "population": "lit", "statement": "The error is small."}
-    (verdict,) = evaluate_requirements(frame, [requirement], from_truth=("lit",))
+    (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"})
     assert verdict.statement == "Given truth (lit): The error is small."
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.failures) == (10, 20, 2)
@@ -459,7 +459,9 @@ def test_population_defined_by_truth_is_named_and_compared_with_all_cases(veloci
     )
     (not_from_truth,) = evaluate_requirements(frame, [requirement])
     assert not_from_truth.statement == "The error is small."
-    (over_all_cases,) = evaluate_requirements(frame, [{**requirement, "population": "all"}], from_truth=("lit",))
+    (over_all_cases,) = evaluate_requirements(
+        frame, [{**requirement, "population": "all"}], from_truth={"lit": "the sun is up"}
+    )
     assert (over_all_cases.all_cases, over_all_cases.statement) == (None, "The error is small.")
 
 
@@ -467,10 +469,10 @@ def test_configured_conditions_also_restrict_the_result_of_all_cases(velocity: d
     frame = _make_rows(20, 2)
     frame["lit"], frame["navcam"] = np.arange(20) >= 10, np.arange(20) % 2 == 0
     requirement = {**velocity, "population": "lit and navcam"}
-    (verdict,) = evaluate_requirements(frame, [requirement], from_truth=("lit",), configured=("nav*",))
+    (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"}, configured=("nav*",))
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.configured) == (5, 10, ("navcam",))
-    assert verdict.all_cases.text.startswith("For comparison: of all 10 cases with the navcam, ")
+    assert verdict.all_cases.text.startswith("If all 10 cases with the navcam counted, ")
     # the population is the configuration itself
     (configured,) = evaluate_requirements(frame, [{**velocity, "population": "navcam"}], configured=("nav*",))
     assert configured.all_cases is None
