@@ -378,7 +378,7 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     in_turn = _make_terrain_design(8, distribution="in-turn", low=0, high="location.bank - 1")
     assert "--set location.bank=230 -n 230" in evaluate_requirements(frame, [velocity], in_turn)[0].note
     fixed = evaluate_requirements(frame.assign(terrain=0), [velocity], _make_terrain_design(8))[0]
-    assert "draws from 1 terrain (location.terrain = 1)" in fixed.note
+    assert "has only 1 stored terrain (location.terrain = 1)" in fixed.note
     narrow = _make_terrain_design(100, distribution="integer", low=0, high=7)
     assert 'dispersions."location.terrain"' in evaluate_requirements(frame, [velocity], narrow)[0].note
     large = _make_terrain_design(1000, distribution="integer", low=0, high="location.bank - 1")
@@ -453,9 +453,9 @@ def test_population_defined_by_truth_is_named_and_compared_with_all_cases(veloci
     assert verdict.statement == "Given truth (lit): The error is small."
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.failures) == (10, 20, 2)
-    assert (
-        "For comparison: of all 20 cases, 18 (90.00 %) meet the criterion. Cases without a value count as failed. "
-        f"The verdict would be {verdict.all_cases.status}." in verdict.note
+    assert verdict.note == (
+        "Lit: the sun is up. If all 20 cases counted, and those without a value as failed, 18 (90.00 %) would meet the "
+        f"criterion, and the verdict would be {verdict.all_cases.status}."
     )
     (not_from_truth,) = evaluate_requirements(frame, [requirement])
     assert not_from_truth.statement == "The error is small."
