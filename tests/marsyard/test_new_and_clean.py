@@ -89,7 +89,7 @@ def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) 
     assert evidence_limits(larger) == []
     # more cases on the same terrains do not add evidence
     (terrains,) = evidence_limits(load_campaign("dimes-smoke", cases=1000))
-    assert "draws from 8 terrains" in terrains
+    assert "only 8 stored terrains" in terrains
     grid = evidence_limits(load_campaign("dimes-smoke", ["design.kind=sobol"], 32))
     assert 'Set design.kind = "random", and run it again.' in grid[0]
 
