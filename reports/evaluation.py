@@ -128,7 +128,7 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     sampling = read_sampling_design(run.configuration)
     evidence = read_evidence(run.record, own_requirements=requirements is None)
     columns = _shipped_columns(str(run.configuration.get("scenario") or ""))
-    from_truth, configured = ((), ()) if columns is None else (columns.from_truth, columns.configured)
+    from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
     verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling, from_truth, configured)
     verdicts = [withhold(verdict, evidence) for verdict in verdicts]
     if evidence.kind is EvidenceKind.CONFIRMATION and evidence.of_algorithm > 1:

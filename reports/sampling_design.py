@@ -35,15 +35,19 @@ class TerrainSupply:
     def advice(self, needed: int, probability: float, confidence: float) -> str:
         """Explain that the campaign needs more terrains (`needed`), not more cases, and how to configure them."""
         level = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
+        stored = f"{count(self.terrains, 'stored terrain')} ({self.key} = {self.terrains})"
+        limit = f"The campaign has only {stored}."
+        if self.terrains >= needed:
+            limit = f"Terrains are drawn at random and can repeat, so the {stored} are unlikely to give as many."
         text = (
-            f"To show {level}, the cases must include at least {count(needed, 'different terrain')}; this campaign "
-            f"draws from a set of {count(self.terrains, 'terrain')} ({self.key} = {self.terrains})."
+            f"To show a success rate of {level}, the cases must include at least {needed:,} different terrains. {limit}"
         )
         if not self.key.endswith(".bank"):
             return f"{text} Widen the range of {self.key}, and the bank, and run the campaign again."
         # random draws from ten times as many terrains rarely repeat a terrain, so 1.1 cases per terrain are sufficient
         bank, cases = (needed, needed) if self.in_turn else (10 * needed, math.ceil(1.1 * needed))
-        return f"{text} Run the campaign again with --set {self.key}={bank} -n {cases}."
+        remedy = f"{bank:,} stored terrains and {cases:,} cases: --set {self.key}={bank} -n {cases}."
+        return f"{text} Run the campaign again with {remedy}"
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,7 @@ from marsyard.reports.wording import (
     numbers,
     percent,
     requirement_text,
+    split_unit,
 )
 from marsyard.scenarios.systems import scenario
 
@@ -161,7 +162,10 @@ def dispersion_grid(run: StoredRun) -> Grid:
             statistics[1] = f"{run.frame[column].nunique()} values"
             if len(values) and not pd.api.types.is_bool_dtype(run.frame[column].dtype):
                 statistics = [_format_value(float(x)) for x in (values.min(), values.mean(), values.max())]
+        # defaults, which follow a semicolon, do not apply to dispersed parameters
         meaning = str(dispersion.get("description") or (model and description_at(model, str(path))) or NOTHING)
+        meaning, unit = meaning.split(";")[0], split_unit(parts[-1])[1]
+        meaning += f" ({unit})" if unit and not meaning.endswith(f", {unit}") else ""
         source = str(dispersion.get("source") or NOTHING)
         rows.append([meaning, str(path), _distribution_text(dispersion), *statistics, source])
     return Grid(["Quantity", "Parameter", "Distribution", "Minimum", "Mean", "Maximum", "Source"], rows)

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from fnmatch import fnmatchcase
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -69,9 +70,10 @@ class AllCases:
     def text(self) -> str:
         """The result in a sentence."""
         cases = f"all {self.n:,} {population_text(' and '.join(self.configured))}"
-        met = f"{self.n - self.failures:,} ({percent(self.estimate)}) meet the criterion"
-        verdict = f"Cases without a value count as failed. The verdict would be {self.status}."
-        return f"For comparison: of {cases}, {met}. {verdict}"
+        met = f"{self.n - self.failures:,} ({percent(self.estimate)}) would meet the criterion"
+        return (
+            f"If {cases} counted, and those without a value as failed, {met}, and the verdict would be {self.status}."
+        )
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ class Verdict:
     - accept_rate: whether MET BY RATE results in the exit status 0
     - withheld_status: status without regard to the kind of evidence, if it was replaced by INSUFFICIENT; otherwise None
     - all_cases: result of the same requirement on all cases; None if its population is all cases
+    - definitions: definitions of the columns of the population that the flight system cannot know; may be empty
     - joint_text: verdict at the confidence of all confirmations of the algorithm together, as a sentence; may be empty
     - terrains: number of distinct terrains of the population; None if unknown
     - clustered: evidence from shared terrains; None if no terrain is shared
@@ -122,6 +125,7 @@ class Verdict:
     accept_rate: bool = False
     withheld_status: Status | None = None
     all_cases: AllCases | None = None
+    definitions: str = ""
     joint_text: str = ""
     source: str = ""
     kind: str = ""
@@ -164,10 +168,11 @@ class Verdict:
     def note(self) -> str:
         """Limits of the verdict in words; may be empty."""
         all_cases_text = "" if self.all_cases is None or self.all_cases.n == self.n else self.all_cases.text
-        texts: tuple[str, ...] = (self.reason, all_cases_text)
+        definitions = f"{self.definitions[:1].upper()}{self.definitions[1:]}." if self.definitions else ""
+        texts: tuple[str, ...] = (definitions, self.reason, all_cases_text)
         if not self.reason:
             decision, terrains = self._decision_text(), self._terrain_text()
-            texts = (decision, all_cases_text, terrains, self._look_text(), self.advice, self.joint_text)
+            texts = (definitions, decision, all_cases_text, terrains, self._look_text(), self.advice, self.joint_text)
         return " ".join(text for text in texts if text)
 
     def _decision_text(self) -> str:
@@ -187,9 +192,10 @@ class Verdict:
             return ""
         is_assumed = math.isnan(evidence.design_effect)
         effect = self.n / evidence.effective_n if is_assumed else evidence.design_effect
+        article = "an assumed" if is_assumed else "a"
         text = (
-            f"The {count(self.n, 'case')} lie on {count(self.terrains or 0, 'terrain')}: {evidence.method}, effective "
-            f"number of cases {evidence.effective_n:.4g}, {'assumed ' if is_assumed else ''}design effect {effect:.3g}."
+            f"The {count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} ({evidence.method}): the bounds "
+            f"are those of {evidence.effective_n:.4g} independent cases, {article} design effect of {effect:.3g}."
         )
         if self.plain_status is not None and self.plain_status is not self.status:
             text += f" For independent cases the lower bound would be {percent(self.plain_lower)}: {self.plain_status}."
@@ -284,13 +290,14 @@ def evaluate_requirements(
     frame: pd.DataFrame,
     requirements: Sequence[Mapping[str, Any]],
     sampling: SamplingDesign = INDEPENDENT,
-    from_truth: Sequence[str] = (),
+    from_truth: Mapping[str, str] = MappingProxyType({}),
     configured: Sequence[str] = (),
 ) -> list[Verdict]:
     """Evaluate each requirement on all rows of a campaign; missing columns or numbers result in INSUFFICIENT.
 
     - sampling: the sampling design; without independent random samples, verdicts have no bounds
-    - from_truth: columns that the flight system cannot know; mentioned in the statement of a requirement
+    - from_truth: columns that the flight system cannot know, with their definitions; mentioned in the statement of a
+      requirement
     - configured: columns, or patterns of names, that the configuration of a case determines; they remain conditions
       over all cases
     """
@@ -301,7 +308,9 @@ def evaluate_requirements(
         names = [name for name in verdict.population.split(" and ") if name in from_truth]
         if names:
             title = f"{GIVEN_TRUTH} ({', '.join(name.replace('_', ' ') for name in names)}): "
-            verdict = replace(verdict, statement=f"{title}{verdict.statement}")
+            texts = {name.replace("_", " "): from_truth[name] for name in names if from_truth[name]}
+            definitions = "; ".join(f"{name}: {text}" for name, text in texts.items())
+            verdict = replace(verdict, statement=f"{title}{verdict.statement}", definitions=definitions)
         verdicts.append(replace(verdict, all_cases=_evaluate_all_cases(frame, requirement, sampling, configured)))
     return verdicts
 

@@ -83,7 +83,7 @@ Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 class SizedFaults(Parameters):
     """Sizes of the faults by name; size 0 means no fault."""
 
-    dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
+    dust_discs: Annotated[int, Field(ge=0, le=1000, description="number of specks of dust on the camera window")] = 0
     bad_pixels: Annotated[
         NonNegative, Field(le=0.5, description="fraction of dead pixels, and fraction of hot pixels")
     ] = 0.0

@@ -238,14 +238,15 @@ class RowColumns:
     - numbers: numeric columns
     - named_flags: path of a list among the parameters; the `name` of each entry is a further boolean column; empty for
       none
-    - from_truth: boolean columns that the flight system cannot know, because they are computed from the truth
+    - from_truth: boolean columns that the flight system cannot know, because they are computed from the truth, and the
+      definition of each
     - configured: boolean columns that the configuration of a case determines, such as its camera or its driving mode
     """
 
     flags: tuple[str, ...]
     numbers: tuple[str, ...]
     named_flags: str = ""
-    from_truth: tuple[str, ...] = ()
+    from_truth: Mapping[str, str] = field(default_factory=dict)
     configured: tuple[str, ...] = ()
 
     def has_flag(self, name: str) -> bool:
@@ -271,7 +272,7 @@ def row_columns(scenario: str) -> RowColumns | None:
             tuple(columns["flags"]),
             tuple(columns["numbers"]),
             columns.get("named_flags", ""),
-            tuple(columns.get("from_truth", ())),
+            dict(columns.get("from_truth", {})),
             tuple(columns.get("configured", ())),
         )
     except (OSError, ValueError, LookupError, TypeError) as error:

@@ -193,7 +193,7 @@ class Evidence:
             EvidenceKind.REPETITION: f"The run repeats confirmation {self.number} without a change; it is no new "
             "evidence.",
             EvidenceKind.CALIBRATION: f"Calibrated on these cases: the parameters {groups} were set by "
-            f"looking at the results of these cases. PASS needs a run on new cases (--confirm).",
+            f"looking at the results of these cases. PASS is possible only on new cases (`marsyard run --confirm`).",
             EvidenceKind.EXPLORATION: "Exploration: the seed was chosen freely. A confirmation is a run with "
             "--confirm, on cases that nobody has seen.",
             EvidenceKind.REUSED_SEED: f"The seed belongs to confirmation {self.number}, and the run differs from it: "

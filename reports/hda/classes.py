@@ -89,14 +89,14 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
     if not classes:
         return [], {}
     rates = {name: pooled_rate(frame, *columns) for name, columns in RATES.items()}
-    caption = "Missed hazards by size: classified as safe, and not detected."
+    caption = "Missed hazards by size: fraction classified as safe, and fraction without a detected hazard."
     figure = section.svg_figure(class_figure(classes), key, caption)
     class_grid = build_grid(
         [item for item in classes if item.called_safe.of],
         {
-            "Hazard by": lambda item: item.kind,
+            "Quantity": lambda item: item.kind,
             "Size divided by limit": lambda item: item.name,
-            "Footprints in flights": lambda item: f"{item.called_safe.of:,} in {item.called_safe.flights:,}",
+            "Footprints (flights)": lambda item: f"{item.called_safe.of:,} ({item.called_safe.flights:,})",
             "Classified as safe": lambda item: rate_text(item.called_safe),
             "Not detected": lambda item: rate_text(item.unflagged) if item.is_hazard else NOTHING,
             "Flights with an undetected hazard": lambda x: (

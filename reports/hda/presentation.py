@@ -78,7 +78,7 @@ SITES = SectionDeclaration(
         Distribution(
             sections.hazard_distances,
             ("distance to the nearest unsafe position (m)", "fraction above this distance"),
-            "Fraction of sites and of touchdowns with a larger distance to the nearest unsafe position.",
+            "Fraction of sites and touchdowns that are farther from unsafe positions than the value on the axis.",
             heading="Distance to true hazards",
             complementary=True,
             table=sections.distance_grid,

@@ -353,7 +353,7 @@ def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
             "Minimum",
             "5 % quantile",
             "Median",
-            f"Lower bound of the 5 % quantile ({format_fraction(CONFIDENCE)})",
+            f"5 % quantile, lower bound at {format_fraction(CONFIDENCE)} confidence",
         ],
         rows,
     )

@@ -137,9 +137,9 @@ class Location(Parameters):
 
     bank: Annotated[int, bounded_field(1, 100000, "number of terrains in the terrain bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
-    terrain: Annotated[int, Field(ge=0, description="index of the terrain in the bank")] = 0
-    east_m: Annotated[float, Field(description="position of the first image on the periodic terrain")] = 0.0
-    north_m: Annotated[float, Field(description="position of the first image on the periodic terrain")] = 0.0
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain among the stored terrains")] = 0
+    east_m: Annotated[float, Field(description="east coordinate at the first image, on the periodic terrain")] = 0.0
+    north_m: Annotated[float, Field(description="north coordinate at the first image, on the periodic terrain")] = 0.0
 
     @model_validator(mode="after")
     def _check_terrain(self) -> Location:
@@ -156,7 +156,9 @@ class SunParameters(Parameters):
 
 
 #: Optical depth of the atmosphere in a case.
-DustOpacity = Annotated[float | None, bounded_field(0.0, 10.0, "optical depth of the air; default: the site's")]
+DustOpacity = Annotated[
+    float | None, bounded_field(0.0, 10.0, "optical depth of the dusty air; by default that of the site")
+]
 
 
 class LanderParameters(Parameters):

@@ -180,7 +180,9 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     terrain: CheckedTerrain = TerrainParameters()
     location: Location = Location()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom meshes on the ground")] = ()
-    texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture divided by the site's")
+    texture: NonNegative = Field(
+        default=1.0, le=10.0, description="contrast of the fine texture of the ground, relative to its nominal value"
+    )
     sun: SunParameters = SunParameters()
     dust_opacity: DustOpacity = None
     camera: NamedOrCustomCamera = Field(default="xc-55", description="nadir camera preset, or a table with file")

@@ -1,4 +1,4 @@
-"""Simulate images and measurements of a landing case; compute landing site truth and errors of the hazard map."""
+"""Simulate images and measurements of a landing case; compute ground truth of sites and errors of the hazard map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import site
 from marsyard.sim.terrain.sites import SiteTexture
 
-#: Maximum number of grounds in a worker's cache; loading a ground with its rocks takes one or two seconds.
+#: Maximum number of terrains in a worker's cache; loading a terrain with its rocks takes one or two seconds.
 MAX_GROUNDS = 64
 
 
@@ -69,7 +69,7 @@ class Pair:
 
     @property
     def axis_range_m(self) -> float:
-        """True range from the camera along the first optical axis to ground or rock, metres."""
+        """True range along the optical axis of the first image to ground or rock, metres."""
         return self.range_along_m(self.images[0].camera.a)
 
     def range_along_m(self, axis: Float64[np.ndarray, "3"]) -> float:
@@ -131,9 +131,9 @@ def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: S
     )
 
 
-#: Spacing of the truth's sampling grid, in footprint diameters: 20 cm for 2 m.
+#: Spacing of the ground-truth grid divided by the diameter of a footprint: 0.2 m for a footprint of 2 m.
 STEP_DIAMETERS = 0.1
-#: Margin of the relief around the visible ground, in footprint diameters: for footprints and landings outside.
+#: Width of the relief outside the visible ground, in footprint diameters, for footprints and landings there.
 MARGIN_DIAMETERS = 1.5
 #: Values of a hazard map: the footprint around the pixel's ground point is safe, unsafe, or partly out of view.
 SAFE, UNSAFE, UNKNOWN = 0, 1, 255
@@ -141,7 +141,7 @@ SAFE, UNSAFE, UNKNOWN = 0, 1, 255
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Ground truth of a flight on a sampling grid aligned with the first image's horizontal axes."""
+    """Ground truth of a flight on a grid aligned with the horizontal axes of the first image."""
 
     relief: Relief
     limits: Limits
@@ -190,7 +190,7 @@ class GroundTruth:
 
     @property
     def safe_with_margin(self) -> Bool[np.ndarray, "rows columns"]:
-        """Positions whose surroundings are safe up to the footprint's radius: a margin for position errors."""
+        """Positions around which all positions within one footprint radius are also safe."""
         distance_m = distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m
         return np.asarray(distance_m > 0.5 * self.limits.diameter_m)
 
@@ -243,7 +243,7 @@ class RenderedFlight:
         return cls(p, world, flight, pair, GroundTruth.from_images(world, flight, pair, p.lander.limits))
 
 
-#: Bounds of the hazard classes (slope or roughness divided by its limit), and names of the classes between them.
+#: Bounds of the classes of slope or roughness divided by its limit, and the names of the classes.
 CLASS_BOUNDS = (1.0, 1.5, 2.0, 3.0)
 CLASS_NAMES = ("below_1", "1_to_1.5", "1.5_to_2", "2_to_3", "above_3")
 #: Gross hazards (criterion 2 of the validation): minimum diameter in map cells, and minimum roughness / limit.

@@ -60,12 +60,16 @@ class WorldParameters(Parameters):
     ] = "mars-yard"
     bank: Annotated[int, Field(ge=1, le=100000, description="number of terrains in the terrain bank")] = 8
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
-    terrain: Annotated[int, Field(ge=0, description="index of the terrain in the bank")] = 0
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain among the stored terrains")] = 0
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, every 2.5 cm")] = 2048
     incline: InclineParameters = InclineParameters()
     rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "ground's RMS slope; default: the site's")] = None
-    dust_opacity: Annotated[float | None, bounded_field(0.0, 10.0, "air's optical depth; default: the site's")] = None
-    rock_abundance: Annotated[float | None, bounded_field(0.0, 0.4, "area fraction; default: the site's")] = None
+    dust_opacity: Annotated[
+        float | None, bounded_field(0.0, 10.0, "optical depth of the dusty air; default: that of the world")
+    ] = None
+    rock_abundance: Annotated[
+        float | None, bounded_field(0.0, 0.4, "fraction of the ground covered by rocks; by default that of the site")
+    ] = None
     largest_near_m: Annotated[NonNegative, Field(description="maximum diameter of rocks on the route")] = 0.08
     east_m: float = Field(default=8.0, description="position of the target's rock, periodic terrain")
     north_m: float = Field(default=8.0, description="position of the target's rock, periodic terrain")
@@ -101,10 +105,17 @@ class TargetParameters(Parameters):
 
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 0.8
     height_m: Annotated[Positive | None, Field(description="height of the rock; default: half the diameter")] = None
-    shape: Annotated[int | None, Field(ge=0, le=31, description="see PlacedRock; default: drawn")] = None
-    yaw_deg: Annotated[float | None, Field(description="azimuth of the rock; default: drawn")] = None
-    across: Annotated[float, Field(ge=-1.0, le=1.0, description="horizontal position of the point")] = 0.0
-    up: Annotated[float, Field(ge=0.0, le=1.0, description="vertical position of the point")] = 0.5
+    shape: Annotated[
+        int | None, Field(ge=0, le=31, description="number of the rock's shape; random if omitted, see PlacedRock")
+    ] = None
+    yaw_deg: Annotated[float | None, Field(description="yaw of the rock, deg; random if omitted")] = None
+    across: Annotated[
+        float,
+        Field(ge=-1.0, le=1.0, description="designated point on the rock: -1 at its left edge, 1 at its right edge"),
+    ] = 0.0
+    up: Annotated[
+        float, Field(ge=0.0, le=1.0, description="designated point on the rock: 0 at its foot, 1 at its top")
+    ] = 0.5
     designation: Literal["pixel", "rover", "site"] = Field(default="pixel", description="kind of designation")
 
 
@@ -112,7 +123,9 @@ class StartParameters(Parameters):
     """The rover's position and heading at the start, relative to the target."""
 
     distance_m: float = Field(default=10.0, gt=1.0, le=40.0, description="horizontal, from mast to designated point")
-    bearing_deg: Azimuth = Field(default=270.0, description="from the target to the rover, clockwise from north")
+    bearing_deg: Azimuth = Field(
+        default=270.0, description="azimuth from the target to the rover at the start, clockwise from north"
+    )
     target_azimuth_deg: RelativeAngle = Field(default=0.0, description="direction of the target, to the right of ahead")
 
 
@@ -222,13 +235,20 @@ class CustomPair(Parameters):
 class CameraParameters(Parameters):
     """The stereo pair on the mast."""
 
-    preset: str = Field(default="mer-navcam", description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")
+    preset: str = Field(
+        default="mer-navcam",
+        description="pair of stereo cameras with its mast and rover; a key of `marsyard.sim.sensor.mast.MASTS`",
+    )
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="both detectors; default: the preset's")
     detector_noise: Annotated[bool, Field(description="whether images have detector noise and response")] = True
-    defocus_px: Annotated[NonNegative, Field(le=10.0, description="diameter of a point's defocused image, px")] = 0.0
-    stray_light: Annotated[float, bounded_field(0.0, 0.5, "fraction of the light spread over the image")] = 0.0
-    dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on each lens")] = 0
+    defocus_px: Annotated[
+        NonNegative, Field(le=10.0, description="defocus: diameter of the blur circle of a point")
+    ] = 0.0
+    stray_light: Annotated[
+        float, bounded_field(0.0, 0.5, "stray light: fraction of all light that is spread evenly")
+    ] = 0.0
+    dust_discs: Annotated[int, Field(ge=0, le=1000, description="number of specks of dust on each camera window")] = 0
     dust_depth: Annotated[Fraction, Field(description="fraction of the light absorbed by a speck")] = 0.3
 
     @field_validator("preset")

@@ -59,11 +59,11 @@ MAX_GROUNDS, MAX_DRIVES, MAX_VISIBILITIES = 4, 1, 128
 class VariantParameters(Parameters):
     """Rock, terrain and sun of one run."""
 
-    terrain: Annotated[int, Field(ge=0, description="index of the terrain in the bank")] = 0
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain among the stored terrains")] = 0
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 1.4
     height_m: Annotated[float, Field(gt=0.01, le=5.0, description="height of the rock")] = 0.8
-    shape: Annotated[int, Field(ge=0, le=31, description="shape of the rock, see PlacedRock")] = 0
-    yaw_deg: Annotated[float, Field(description="azimuth of the rock")] = 0.0
+    shape: Annotated[int, Field(ge=0, le=31, description="number of the rock's shape, see PlacedRock")] = 0
+    yaw_deg: Annotated[float, Field(description="yaw of the rock, deg")] = 0.0
     sun_azimuth_deg: Annotated[
         float, Field(ge=-360.0, le=720.0, description="azimuth of the sun, clockwise from north")
     ] = 225.0

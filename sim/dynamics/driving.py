@@ -48,8 +48,10 @@ class SlipParameters(Parameters):
     Climb and cross slope are the slopes along and across the motion; tilt is the rover's angle from the vertical.
     """
 
-    flat: Annotated[Fraction, Field(description="fraction of the path lost on level ground")] = 0.01
-    full_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="slope of 100 % slip, deg")] = 20.0
+    flat: Annotated[Fraction, Field(description="wheel slip on level ground, fraction of the commanded path")] = 0.01
+    full_slope_deg: Annotated[
+        float, Field(gt=0.0, lt=90.0, description="slope at which the wheels slip completely")
+    ] = 20.0
     exponent: Annotated[float, bounded_field(1.0, 100.0, "exponent of the slope in the slip formula")] = 2.4
     downhill: Annotated[Fraction, Field(description="path gained downhill divided by path lost uphill")] = 0.3
     across: Annotated[Fraction, Field(description="sideways sliding on a cross slope / path lost uphill")] = 0.5

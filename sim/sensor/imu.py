@@ -37,7 +37,7 @@ class WarmUp(Parameters):
     """Temperature of the unit minus that of its calibration: zero until `start_s`, then exponentially to `change_k`."""
 
     start_s: Annotated[float, Field(description="time at which the change begins, s")] = 0.0
-    change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="final temperature change, K")] = 0.0
+    change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="temperature change of the IMU, K")] = 0.0
     time_constant_s: Annotated[Positive, Field(description="time constant of the approach, s")] = 600.0
 
     def temperature_k(self, times_s: Times) -> Times:

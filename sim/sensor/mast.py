@@ -58,7 +58,7 @@ class PointingParameters(Parameters):
     the other values are assumed.
     """
 
-    zero_deg: Annotated[Degrees, Field(description="zero error of the encoder, constant in a run, deg")] = 0.1
+    zero_deg: Annotated[Degrees, Field(description="zero offset of the mast's encoders, constant in a run, deg")] = 0.1
     backlash_deg: Annotated[Degrees, Field(description="full width of the backlash, deg")] = 0.1
     settling_deg: Annotated[Degrees, Field(description="motor stop minus command, deg")] = 0.01
     count_deg: Annotated[Degrees, Field(description="encoder resolution, deg; 0: no rounding")] = 0.005

@@ -78,7 +78,9 @@ class RadarParameters(RangingParameters):
 
     beam_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width of the beam, deg")] = 60.0
     sidelobe_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width with the side lobes, deg")] = 120.0
-    sidelobe_fraction: Annotated[Fraction, Field(description="fraction of readings from the side lobes")] = 0.0
+    sidelobe_fraction: Annotated[
+        Fraction, Field(description="fraction of the radar readings that come from side lobes")
+    ] = 0.0
     scale_error: Annotated[_Fraction, Field(description="constant scale error, fraction of the range")] = 0.003
     noise: Annotated[_Fraction, Field(description="noise per reading, fraction of the range")] = 0.0015
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.3

@@ -20,9 +20,9 @@ class TerrainParameters(Parameters):
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side, a power of two")] = 4096
     spacing_m: Annotated[float, Field(gt=0.0, le=100.0, description="distance between samples, m")] = 1.5
     hurst: Annotated[float, Field(gt=0.0, lt=1.0, description="Hurst exponent of the fractal ground's heights")] = 0.8
-    rms_slope_deg: Annotated[float, bounded_field(0.0, 30.0, "RMS slope along a line over the slope baseline, deg")] = (
-        2.0
-    )
+    rms_slope_deg: Annotated[
+        float, bounded_field(0.0, 30.0, "RMS slope between points slope_baseline_m apart, deg")
+    ] = 2.0
     slope_baseline_m: Annotated[Positive, Field(description="baseline of the RMS slope, m")] = 30.0
     outer_scale_m: Annotated[Positive, Field(description="wavelength above which relief stops growing, m")] = 3000.0
     craters_per_km2: Annotated[float, bounded_field(0.0, 2.0e6, "craters above the smallest diameter per km2")] = 60.0

@@ -1,4 +1,8 @@
-"""Tests of calibration, confirmation and reused seeds: `marsyard run --confirm`, record, verdicts, dashboard."""
+"""Tests that seeds on which options were set give no PASS, and that confirmation runs are recorded and shown.
+
+A confirmation (`marsyard run --confirm`) evaluates fixed options on a new seed. Seeds follow from namespace, campaign
+and number.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +35,13 @@ confidence = 0.9
 """
 CALIBRATION = """
 [calibration]
-namespace = "board"
+namespace = "review-board"
 
 [[calibration.runs]]
 options = ["error_scale"]
 campaign = "fake"
 seed = 5
-note = "the scale was set on these cases"
+note = "the scale was adjusted to these cases"
 """
 
 
@@ -76,19 +80,19 @@ def _statuses(directory: Path) -> list[str]:
     return [verdict["status"] for verdict in json.loads((directory / "report.json").read_text())["verdicts"]]
 
 
-def test_run_on_a_calibration_seed_cannot_pass(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_run_on_a_seed_used_for_calibration_cannot_pass(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     status, out, _ = marsyard("run", campaign, "--out", tmp_path / "calibration", "--jobs", 1)
     assert (status, _statuses(tmp_path / "calibration")) == (3, ["INSUFFICIENT"])
     assert "The verdict would be PASS. Calibrated on these cases" in " ".join(out.split())
     assert "error_scale" in out
     assert _evidence(tmp_path / "calibration").kind is EvidenceKind.CALIBRATION
     # a seed on which no option was calibrated can pass
-    status, out, _ = marsyard("run", campaign, "--seed", 6, "--out", tmp_path / "free", "--jobs", 1)
-    assert (status, _statuses(tmp_path / "free")) == (0, ["PASS"])
+    status, out, _ = marsyard("run", campaign, "--seed", 6, "--out", tmp_path / "unused-seed", "--jobs", 1)
+    assert (status, _statuses(tmp_path / "unused-seed")) == (0, ["PASS"])
     assert "evidence: Exploration" in out
 
 
-def test_run_on_a_calibration_seed_can_fail(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_run_on_a_seed_used_for_calibration_can_fail(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     out = tmp_path / "run"
     arguments = ("run", campaign, "--set", "error_scale=1e9", "--out", out, "--jobs", 1)
     assert (marsyard(*arguments)[0], _statuses(out)) == (1, ["FAIL"])
@@ -98,10 +102,10 @@ def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     campaign: Path, marsyard: Command, tmp_path: Path
 ) -> None:
     folders = {name: tmp_path / name for name in ("first", "changed", "repeated", "second")}
-    seed = confirmation_seed("board", "fake", 1)
+    seed = confirmation_seed("review-board", "fake", 1)
     status, out, _ = marsyard("run", campaign, "--confirm", "--out", folders["first"], "--jobs", 1)
     assert (status, _statuses(folders["first"])) == (0, ["PASS"])
-    assert "evidence: Confirmation 1 in the namespace 'board'" in out
+    assert "evidence: Confirmation 1 in the namespace 'review-board'" in out
     assert json.loads((folders["first"] / "campaign.json").read_text())["seed"] == seed
     (entry,) = read_confirmations(tmp_path / "confirmations.jsonl")
     assert (entry.seed, entry.number, entry.cases, entry.results) == (seed, 1, 10, {"VELOCITY": "PASS"})
@@ -127,7 +131,7 @@ def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     assert "up to 2 times that of one" in output
     assert "for all 2 confirmations together (each at 95.00 %): INSUFFICIENT" in output
     second = json.loads((folders["second"] / "campaign.json").read_text())
-    assert second["seed"] == confirmation_seed("board", "fake", 2)
+    assert second["seed"] == confirmation_seed("review-board", "fake", 2)
     status, out, _ = marsyard("confirmations", "--json")
     assert (status, [entry["results"] for entry in json.loads(out)]) == (0, [{"VELOCITY": "PASS"}] * 2)
     assert marsyard("confirmations")[1].count("PASS") == 2
@@ -147,13 +151,15 @@ def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     assert "not the frozen evaluation" in (tmp_path / "site" / "verification.csv").read_text()
 
 
-def test_run_on_a_future_confirmation_seed_is_recognised(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
-    seed = confirmation_seed("board", "fake", 3)
+def test_run_on_the_seed_of_a_later_confirmation_is_recognised(
+    campaign: Path, marsyard: Command, tmp_path: Path
+) -> None:
+    seed = confirmation_seed("review-board", "fake", 3)
     status, out, _ = marsyard("run", campaign, "--seed", seed, "--out", tmp_path / "early", "--jobs", 1)
     assert (status, "run without --confirm" in " ".join(out.split())) == (3, True)
 
 
-def test_changed_program_invalidates_a_confirmation(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_changed_code_invalidates_a_confirmation(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     directory = tmp_path / "run"
     marsyard("run", campaign, "--confirm", "--out", directory, "--jobs", 1)
     path = directory / "campaign.json"
@@ -180,7 +186,7 @@ def test_errors_are_reported_before_the_first_case(campaign: Path, marsyard: Com
     assert (status, "calibration.runs[0].options[0]" in err, "error_scale" in err) == (2, True, True)
 
 
-def test_killed_confirmation_stays_in_the_record(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_interrupted_confirmation_stays_in_the_record(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     """A run that stopped after it had reserved its seed counts in the correction of the next confirmation."""
     marsyard("run", campaign, "--confirm", "--out", tmp_path / "first", "--jobs", 1)
     path = tmp_path / "confirmations.jsonl"

@@ -83,13 +83,13 @@ def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) 
     assert evidence_limits(load_campaign("few.toml", cases=230)) == []
     cases, terrains = evidence_limits(load_campaign("dimes-smoke"))
     assert cases.startswith("DIMES-VEL: 99 % at 90 % confidence takes at least 230 cases")
-    assert "draws from a set of 8 terrains (location.bank = 8)" in terrains
+    assert "has only 8 stored terrains (location.bank = 8)" in terrains
     assert "--set location.bank=2300 -n 254" in terrains
     larger = load_campaign("dimes-smoke", ["location.bank=2300"], 254)
     assert evidence_limits(larger) == []
     # more cases on the same terrains do not add evidence
     (terrains,) = evidence_limits(load_campaign("dimes-smoke", cases=1000))
-    assert "draws from 8 terrains" in terrains
+    assert "only 8 stored terrains" in terrains
     grid = evidence_limits(load_campaign("dimes-smoke", ["design.kind=sobol"], 32))
     assert 'Set design.kind = "random", and run it again.' in grid[0]
 

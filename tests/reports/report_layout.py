@@ -98,6 +98,7 @@ class RequirementVerdict(_Part):
         description="status without regard to the kind of evidence, if it was replaced by INSUFFICIENT"
     )
     all_cases: AllCases | None = Field(description="the requirement on all cases; null if its population is all cases")
+    definitions: str = Field(description="definitions of columns that the flight system cannot know; may be empty")
     joint_text: str = Field(description="verdict at the confidence of all confirmations of the algorithm together")
     note: str
 

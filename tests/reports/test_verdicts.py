@@ -303,7 +303,7 @@ def test_consumer_risk_is_exact_at_the_minimum_number_of_cases(velocity: dict[st
     # ten cases on each of 230 terrains count as 230 cases
     verdict = _evaluate(_make_rows(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
     assert verdict.consumer_risk == pytest.approx(0.99**230)
-    assert "assumed design effect 10" in verdict.note
+    assert "assumed design effect of 10" in verdict.note
 
 
 def test_missing_answered_column_is_noted(velocity: dict[str, Any]) -> None:
@@ -365,8 +365,9 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     (verdict,) = evaluate_requirements(frame, [velocity], design)
     assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
     message = (
-        "To show 99 % at 90 % confidence, the cases must include at least 230 different terrains; this campaign draws "
-        "from a set of 8 terrains (location.bank = 8). Run the campaign again with --set location.bank=2300 -n 254."
+        "To show a success rate of 99 % at 90 % confidence, the cases must include at least 230 different terrains. "
+        "The campaign has only 8 stored terrains (location.bank = 8). Run the campaign again with 2,300 stored "
+        "terrains and 254 cases: --set location.bank=2300 -n 254."
     )
     assert message in verdict.note
     assert message in combine_verdicts([verdict], frame).sentence
@@ -377,7 +378,7 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     in_turn = _make_terrain_design(8, distribution="in-turn", low=0, high="location.bank - 1")
     assert "--set location.bank=230 -n 230" in evaluate_requirements(frame, [velocity], in_turn)[0].note
     fixed = evaluate_requirements(frame.assign(terrain=0), [velocity], _make_terrain_design(8))[0]
-    assert "draws from 1 terrain (location.terrain = 1)" in fixed.note
+    assert "has only 1 stored terrain (location.terrain = 1)" in fixed.note
     narrow = _make_terrain_design(100, distribution="integer", low=0, high=7)
     assert 'dispersions."location.terrain"' in evaluate_requirements(frame, [velocity], narrow)[0].note
     large = _make_terrain_design(1000, distribution="integer", low=0, high="location.bank - 1")
@@ -448,17 +449,19 @@ def test_population_defined_by_truth_is_named_and_compared_with_all_cases(veloci
     frame = _make_rows(20, 2)
     frame["lit"] = np.arange(20) >= 10
     requirement = {**velocity, "population": "lit", "statement": "The error is small."}
-    (verdict,) = evaluate_requirements(frame, [requirement], from_truth=("lit",))
+    (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"})
     assert verdict.statement == "Given truth (lit): The error is small."
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.failures) == (10, 20, 2)
-    assert (
-        "For comparison: of all 20 cases, 18 (90.00 %) meet the criterion. Cases without a value count as failed. "
-        f"The verdict would be {verdict.all_cases.status}." in verdict.note
+    assert verdict.note == (
+        "Lit: the sun is up. If all 20 cases counted, and those without a value as failed, 18 (90.00 %) would meet the "
+        f"criterion, and the verdict would be {verdict.all_cases.status}."
     )
     (not_from_truth,) = evaluate_requirements(frame, [requirement])
     assert not_from_truth.statement == "The error is small."
-    (over_all_cases,) = evaluate_requirements(frame, [{**requirement, "population": "all"}], from_truth=("lit",))
+    (over_all_cases,) = evaluate_requirements(
+        frame, [{**requirement, "population": "all"}], from_truth={"lit": "the sun is up"}
+    )
     assert (over_all_cases.all_cases, over_all_cases.statement) == (None, "The error is small.")
 
 
@@ -466,10 +469,10 @@ def test_configured_conditions_also_restrict_the_result_of_all_cases(velocity: d
     frame = _make_rows(20, 2)
     frame["lit"], frame["navcam"] = np.arange(20) >= 10, np.arange(20) % 2 == 0
     requirement = {**velocity, "population": "lit and navcam"}
-    (verdict,) = evaluate_requirements(frame, [requirement], from_truth=("lit",), configured=("nav*",))
+    (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"}, configured=("nav*",))
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.configured) == (5, 10, ("navcam",))
-    assert verdict.all_cases.text.startswith("For comparison: of all 10 cases with the navcam, ")
+    assert verdict.all_cases.text.startswith("If all 10 cases with the navcam counted, ")
     # the population is the configuration itself
     (configured,) = evaluate_requirements(frame, [{**velocity, "population": "navcam"}], configured=("nav*",))
     assert configured.all_cases is None

@@ -13,29 +13,29 @@ from marsyard.sim.terrain.kernels import Array, Level, bspline_weights, collapse
 
 Grid = NDArray[np.float32]
 GridRow = NDArray[np.float32]
-#: Depth of the notches in a crater's rim divided by the rim's height, per relative displacement of the outline.
-NOTCHES = 8.0
+#: Relative change of the rim height of a crater per relative change of its radius.
+RIM_HEIGHT_SENSITIVITY = 8.0
 
 
 class Bedforms(NamedTuple):
     """A train of dunes.
 
     - wave_x, wave_y: wavenumbers of the plane wave, rad/m
-    - crest_m: RMS height of crests above troughs, metres
-    - steepest: slope of the slip face
-    - contrast: natural logarithm of the crests' albedo divided by the troughs'
+    - crest_m: RMS crest-to-trough height, metres
+    - slip_face_slope: slope of the slip face, metres per metre
+    - contrast: natural logarithm of the albedo of crests divided by that of troughs
     """
 
     wave_x: float
     wave_y: float
     crest_m: float
-    steepest: float
+    slip_face_slope: float
     contrast: float
 
 
 @njit(cache=True)
 def add_refined(fine: Grid, coarse: Grid) -> None:
-    """Add a cubic B-spline of half as many samples along each side, by exact refinement of its control values."""
+    """Upsample a coarse grid of cubic B-spline coefficients by two (exact subdivision), and add it to the fine grid."""
     side = coarse.shape[0]
     row = np.empty(side, dtype=np.float32)
     one_eighth, six_eighths, half = np.float32(0.125), np.float32(0.75), np.float32(0.5)
@@ -62,9 +62,13 @@ def add_refined(fine: Grid, coarse: Grid) -> None:
 def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reach: float) -> None:
     """Add bowls, rims and ejecta of craters to height and to the logarithm of albedo, in order.
 
-    `craters` has rows (x, y, radius, depth below the surroundings, rim height, rounding of the rim in metres, filled
-    fraction of the depth, tone of the ejecta, tone of the floor, then three pairs of cosine and sine terms of the
-    outline for two, three and five lobes, and the phase of the rays). The outline's lobes also notch the rim.
+    Each crater is a row of `craters`:
+
+    - x, y, radius; depth below the surroundings, rim height, width of the rounded rim crest, all in metres
+    - fraction of the depth that is filled; tones (changes of the logarithm of albedo) of the ejecta and of the floor
+    - three pairs of cosine and sine terms of the outline with two, three and five lobes; phase of the rays
+
+    Where the outline is displaced inwards, the rim is lower.
     """
     mask = height.shape[0] - 1
     for n in range(craters.shape[0]):
@@ -94,7 +98,8 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                     continue
                 outside = max(r, 0.6)
                 fade = min((reach - r) / (reach - 1.0), 1.0)
-                blanket = rim * max(1.0 + NOTCHES * lobes, 0.0) / (outside * outside * outside) * fade
+                notched_rim = rim * max(1.0 + RIM_HEIGHT_SENSITIVITY * lobes, 0.0)
+                blanket = notched_rim / (outside * outside * outside) * fade
                 rays = 0.0
                 if r > 1.0:
                     # seven and twelve rays: cosines of 7 and 12 times the azimuth, each with a phase
@@ -126,9 +131,10 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
 
 @njit(cache=True)
 def stamp_cover(factors: Grid, spacing: float, craters: Array, reach: float) -> None:
-    """Multiply a factor of fine relief by the smoothness of filled crater floors and the roughness of fresh ejecta.
+    """Scale the amplitude of fine relief: lower on filled crater floors, higher on fresh ejecta.
 
-    `craters` has rows (x, y, radius, factor on the floor, factor on the ejecta).
+    `factors` is the relative amplitude on a grid. `craters` has rows (x, y, radius, factor on the floor, factor on the
+    ejecta).
     """
     mask = factors.shape[0] - 1
     for n in range(craters.shape[0]):
@@ -196,8 +202,8 @@ def _add_row_of_dunes(
     """Add dunes along a row from the complex modulation at its samples and the plane wave's phase at the first one."""
     phase_step, crest, contrast = dunes.wave_x * spacing, dunes.crest_m, dunes.contrast
     wave = math.sqrt(dunes.wave_x * dunes.wave_x + dunes.wave_y * dunes.wave_y)
-    # the slip face is straight over its first half, then flattens: it is 4/3 as long as a straight face
-    slip_of_height = 4.0 / 3.0 * wave / (2.0 * math.pi * dunes.steepest)
+    # the upper half of the slip face is plane, the lower half concave: it is 4/3 as long as a plane face
+    slip_of_height = 4.0 / 3.0 * wave / (2.0 * math.pi * dunes.slip_face_slope)
     for j in range(height.shape[0]):
         strength = math.sqrt(real[j] * real[j] + imaginary[j] * imaginary[j])
         crest_height = crest * min(strength, 1.6)
@@ -217,9 +223,9 @@ def _add_row_of_dunes(
 def add_dunes(height: Grid, tone: Grid, spacing: float, modulation: Level, dunes: Bedforms) -> None:
     """Add transverse dunes: a gentle stoss slope up to the crest, a slip face, a concave apron.
 
-    The phase of the dunes is that of the plane wave times a smooth complex modulation of unit mean square. `modulation`
-    contains control values on a grid of the same extent that is not finer. At zeros of the modulation the dunes have no
-    height, and crests end and fork.
+    The dunes are a plane wave multiplied by a smooth complex amplitude of unit mean square: its argument shifts the
+    phase, its modulus scales the height. `modulation` contains the B-spline coefficients of this amplitude on a grid of
+    the same extent that is not finer. Where the amplitude is zero the dunes have no height, and crests end and fork.
     """
     side, cells = height.shape[0], modulation.shape[0]
     step = side // cells
@@ -248,8 +254,9 @@ def add_dunes(height: Grid, tone: Grid, spacing: float, modulation: Level, dunes
 def stamp_lobes(height: Grid, tone: Grid, spacing: float, lobes: Array, warp_x: Grid, warp_y: Grid) -> None:
     """Stack lava lobes: plateaus with a steep, crenulated margin and a slightly lower middle.
 
-    `lobes` has rows (x, y, half length, half width, thickness, cosine and sine of the direction, tone). The warps are
-    displacements in half widths; they make the outlines irregular. The tone of a lobe replaces that of the lobes below.
+    `lobes` has rows (x, y, half length, half width, thickness, cosine and sine of the direction, tone). `warp_x` and
+    `warp_y` are displacements of the outlines in units of the half width; they make the outlines irregular. The tone of
+    a lobe replaces that of the lobes below.
     """
     mask = height.shape[0] - 1
     for n in range(lobes.shape[0]):

@@ -73,7 +73,7 @@ class RockParameters(Parameters):
     The number of rocks per area and diameter follows: ``n(D) = -dF/dD / (pi D**2 / 4)``.
     """
 
-    abundance: Annotated[float, Field(ge=0.0, le=0.4, description="k, fraction of the ground covered by rocks")] = 0.05
+    abundance: Annotated[float, Field(ge=0.0, le=0.4, description="fraction of the ground covered by rocks, k")] = 0.05
     smallest_m: Annotated[Positive, Field(description="minimum diameter of rocks, m")] = 0.05
     largest_m: Annotated[Positive, Field(description="maximum diameter of rocks, m")] = 3.0
     height_ratio: Annotated[float, Field(gt=0.0, le=1.0, description="mean height/diameter (Golombek & Rapp)")] = 0.5
