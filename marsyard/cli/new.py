@@ -161,11 +161,17 @@ def _find_number_problem(limit: float, answer: str) -> str:
 @handle_user_errors
 def ingest(
     folder: Annotated[
-        Path, Argument(metavar="FOLDER", help="Folder with ingest.toml, pictures.csv and the images (docs/real-pictures.md).")
+        Path,
+        Argument(
+            metavar="FOLDER", help="Folder with ingest.toml, pictures.csv and the images (docs/real-pictures.md)."
+        ),
     ],
     out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
     system: Annotated[
-        str | None, Option(help="Type of the system under test (`marsyard new --system list`); by default `measured`, images of a real camera.")
+        str | None,
+        Option(
+            help="Type of the system under test (`marsyard new --system list`); by default `measured`, images of a real camera."
+        ),
     ] = None,
 ) -> None:
     """Create a campaign from recorded images with measured attitude and altitude."""

@@ -114,7 +114,11 @@ def test_units_and_descriptions_come_from_the_scenario() -> None:
     reported = json.loads(marsyard("show", "dimes-gusev", "--json").out)
     dispersions = {dispersion["parameter"]: dispersion for dispersion in reported["dispersions"]}
     sun = dispersions["sun.elevation_deg"]
-    assert (sun["unit"], sun["description"], sun["bounds"]) == ("deg", "above the horizon", [30.0, 60.0])
+    assert (sun["unit"], sun["description"], sun["bounds"]) == (
+        "deg",
+        "elevation of the sun above the horizon",
+        [30.0, 60.0],
+    )
     assert all(dispersion["source"] for dispersion in reported["dispersions"])
     assert all(dispersion["description"] for dispersion in reported["dispersions"])
 

@@ -142,7 +142,7 @@ def test_small_report_contains_the_main_results(
         f"marsyard replay {directory} 23",
         "marsyard run dimes-synthetic -n 24 --seed 7",
         "0123456789abcdef0123456789abcdef01234567",
-        "uniform(low=20.0, high=60.0)",
+        "uniform, 20.0 to 60.0",
         "landing season",
         "+14.10 m/s east",
     ):
