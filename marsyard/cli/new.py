@@ -170,7 +170,7 @@ def ingest(
     system: Annotated[
         str | None,
         Option(
-            help="Type of the system under test (`marsyard new --system list`); by default `measured`, images of a real camera."
+            help="Type of the system under test (see `marsyard new`); by default `measured`, images of a real camera."
         ),
     ] = None,
 ) -> None:
