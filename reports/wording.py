@@ -30,7 +30,8 @@ def requirement_text(requirement: Any) -> str:
     condition = _notes()["metrics"].get(metric, _words(metric if requirement.bound is None else name))
     if requirement.bound is not None and not math.isnan(requirement.bound):
         scaled = "" if requirement.scale == 1.0 else f"{requirement.scale:g} × "
-        condition = f"{scaled}|{condition}| ≤ {requirement.bound:g} {unit}".rstrip()
+        magnitude = condition if unit == "s" else f"|{condition}|"
+        condition = f"{scaled}{magnitude} ≤ {requirement.bound:g} {unit}".rstrip()
     confidence = f"{format_fraction(requirement.confidence)} confidence"
     by_rate = requirement.decide_by == "estimate"
     decision = f"evaluated by observed rate; bounds at {confidence}" if by_rate else f"at {confidence}"
