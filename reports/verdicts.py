@@ -71,9 +71,8 @@ class AllCases:
         """The result in a sentence."""
         cases = f"all {self.n:,} {population_text(' and '.join(self.configured))}"
         met = f"{self.n - self.failures:,} ({percent(self.estimate)}) would meet the criterion"
-        return (
-            f"If {cases} counted, and those without a value as failed, {met}, and the verdict would be {self.status}."
-        )
+        counted = f"if {cases} counted, and cases without a value were failures"
+        return f"For comparison: {counted}, {met}, and the verdict would be {self.status}."
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,7 @@ class Verdict:
     def note(self) -> str:
         """Limits of the verdict in words; may be empty."""
         all_cases_text = "" if self.all_cases is None or self.all_cases.n == self.n else self.all_cases.text
-        definitions = f"{self.definitions[:1].upper()}{self.definitions[1:]}." if self.definitions else ""
+        definitions = f"{self.definitions}." if self.definitions else ""
         texts: tuple[str, ...] = (definitions, self.reason, all_cases_text)
         if not self.reason:
             decision, terrains = self._decision_text(), self._terrain_text()
@@ -192,15 +191,18 @@ class Verdict:
             return ""
         is_assumed = math.isnan(evidence.design_effect)
         effect = self.n / evidence.effective_n if is_assumed else evidence.design_effect
-        article = "an assumed" if is_assumed else "a"
+        reason = "Cases on one terrain are correlated"
+        if evidence.method is ClusterMethod.TERRAIN_COUNT:
+            reason = "With too few failures to estimate their correlation, each terrain counts as one case"
         text = (
-            f"The {count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} ({evidence.method}): the bounds "
-            f"are those of {evidence.effective_n:.4g} independent cases, {article} design effect of {effect:.3g}."
+            f"The {count(self.n, 'case')} lie on {count(self.terrains or 0, 'terrain')}. {reason}: the bounds are those "
+            f"of {evidence.effective_n:.4g} independent cases (design effect {effect:.3g})."
         )
         if self.plain_status is not None and self.plain_status is not self.status:
             text += f" For independent cases the lower bound would be {percent(self.plain_lower)}: {self.plain_status}."
         if evidence.method is ClusterMethod.TERRAIN_COUNT and self.further_cases and self.decide_by != ESTIMATE:
-            text += f" {count(self.further_cases, 'additional terrain')} without a failure would lead to PASS."
+            cases = count(self.further_cases, "additional case")
+            text += f" {cases} without a failure, each on a new terrain, would lead to PASS."
         return text
 
     def _look_text(self) -> str:
@@ -309,7 +311,7 @@ def evaluate_requirements(
         if names:
             title = f"{GIVEN_TRUTH} ({', '.join(name.replace('_', ' ') for name in names)}): "
             texts = {name.replace("_", " "): from_truth[name] for name in names if from_truth[name]}
-            definitions = "; ".join(f"{name}: {text}" for name, text in texts.items())
+            definitions = "; ".join(f"'{name}' means: {text}" for name, text in texts.items())
             verdict = replace(verdict, statement=f"{title}{verdict.statement}", definitions=definitions)
         verdicts.append(replace(verdict, all_cases=_evaluate_all_cases(frame, requirement, sampling, configured)))
     return verdicts

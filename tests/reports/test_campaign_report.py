@@ -136,7 +136,7 @@ def test_small_report_contains_the_main_results(
     for message in (
         "INSUFFICIENT",
         "DIMES-VEL",
-        "share 4 terrains (terrains counted instead of cases)",
+        "lie on 4 terrains. With too few failures",
         "1 case crashed",
         "RuntimeError: the context is lost",
         f"marsyard replay {directory} 23",
@@ -181,7 +181,7 @@ def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: Ma
         make_run(make_rows(400, answered=1.0, error_scale=0.1)[[*MIN_COLUMNS, "terrain"]])
     )
     assert (report["verdict"], report["verdicts"][0]["plain_status"]) == ("INSUFFICIENT", "PASS")
-    assert "400 cases share 4 terrains (terrains counted instead of cases" in text
+    assert "400 cases lie on 4 terrains. With too few failures" in text
 
 
 def test_texts_from_files_are_escaped(

@@ -303,7 +303,7 @@ def test_consumer_risk_is_exact_at_the_minimum_number_of_cases(velocity: dict[st
     # ten cases on each of 230 terrains count as 230 cases
     verdict = _evaluate(_make_rows(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
     assert verdict.consumer_risk == pytest.approx(0.99**230)
-    assert "assumed design effect of 10" in verdict.note
+    assert "design effect 10" in verdict.note
 
 
 def test_missing_answered_column_is_noted(velocity: dict[str, Any]) -> None:
@@ -321,7 +321,7 @@ def test_shared_terrains_count_as_single_cases(velocity: dict[str, Any]) -> None
     assert verdict.lower == proportion_lower(8, 8, 0.9)
     assert verdict.plain_lower == proportion_lower(400, 400, 0.9)
     assert verdict.further_cases == 297 - 8
-    for message in ("8 terrains", "terrains counted instead of cases", "289 additional terrains", "PASS"):
+    for message in ("8 terrains", "each terrain counts as one case", "289 additional cases", "PASS"):
         assert message in verdict.note
     many_terrains = _evaluate(_make_rows(460, 0).assign(terrain=np.arange(460) % 230), velocity)
     assert many_terrains.status is Status.PASS
@@ -454,8 +454,8 @@ def test_population_defined_by_truth_is_named_and_compared_with_all_cases(veloci
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.failures) == (10, 20, 2)
     assert verdict.note == (
-        "Lit: the sun is up. If all 20 cases counted, and those without a value as failed, 18 (90.00 %) would meet the "
-        f"criterion, and the verdict would be {verdict.all_cases.status}."
+        "'lit' means: the sun is up. For comparison: if all 20 cases counted, and cases without a value were failures, "
+        f"18 (90.00 %) would meet the criterion, and the verdict would be {verdict.all_cases.status}."
     )
     (not_from_truth,) = evaluate_requirements(frame, [requirement])
     assert not_from_truth.statement == "The error is small."
@@ -472,7 +472,7 @@ def test_configured_conditions_also_restrict_the_result_of_all_cases(velocity: d
     (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"}, configured=("nav*",))
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.configured) == (5, 10, ("navcam",))
-    assert verdict.all_cases.text.startswith("If all 10 cases with the navcam counted, ")
+    assert verdict.all_cases.text.startswith("For comparison: if all 10 cases with the navcam counted, ")
     # the population is the configuration itself
     (configured,) = evaluate_requirements(frame, [{**velocity, "population": "navcam"}], configured=("nav*",))
     assert configured.all_cases is None
