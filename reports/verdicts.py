@@ -195,8 +195,8 @@ class Verdict:
         if evidence.method is ClusterMethod.TERRAIN_COUNT:
             reason = "With too few failures to estimate their correlation, each terrain counts as one case"
         text = (
-            f"The {count(self.n, 'case')} lie on {count(self.terrains or 0, 'terrain')}. {reason}: the bounds are those "
-            f"of {evidence.effective_n:.4g} independent cases (design effect {effect:.3g})."
+            f"The {count(self.n, 'case')} lie on {count(self.terrains or 0, 'terrain')}. {reason}: the bounds are "
+            f"those of {evidence.effective_n:.4g} independent cases (design effect {effect:.3g})."
         )
         if self.plain_status is not None and self.plain_status is not self.status:
             text += f" For independent cases the lower bound would be {percent(self.plain_lower)}: {self.plain_status}."
