@@ -103,7 +103,7 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
     terrain_text = ", each on a new terrain" if counts_terrains else ""
     cases = count(largest.further_cases or 0, "additional case")
     population = f" of the population of {largest.requirement_id}" if largest.population != "all" else ""
-    return f" {cases}{population}{terrain_text}, all without a failure, would decide them."
+    return f" {cases}{population}{terrain_text}, all without a failure, would be enough."
 
 
 @dataclass(frozen=True)

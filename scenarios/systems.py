@@ -239,7 +239,7 @@ class RowColumns:
     - named_flags: path of a list among the parameters; the `name` of each entry is a further boolean column; empty for
       none
     - from_truth: boolean columns that the flight system cannot know, because they are computed from the truth, and the
-      definition of each
+      definition of each; a list in the file has empty definitions
     - configured: boolean columns that the configuration of a case determines, such as its camera or its driving mode
     """
 
@@ -268,11 +268,12 @@ def row_columns(scenario: str) -> RowColumns | None:
         columns = tomllib.loads(system.columns.read_text(encoding="utf-8")).get(scenario)
         if columns is None:
             return None
+        truth = columns.get("from_truth", {})
         return RowColumns(
             tuple(columns["flags"]),
             tuple(columns["numbers"]),
             columns.get("named_flags", ""),
-            dict(columns.get("from_truth", {})),
+            dict(truth) if isinstance(truth, Mapping) else dict.fromkeys(truth, ""),
             tuple(columns.get("configured", ())),
         )
     except (OSError, ValueError, LookupError, TypeError) as error:
