@@ -269,7 +269,7 @@ TOUCHDOWN = kinds.SectionDeclaration(
                 kinds.Rate(
                     "site",
                     "target of the descent (reported or a-priori site) is truly safe",
-                    kinds.flag_rate("site_safe"),
+                    kinds.flag_rate("descent_target_safe"),
                 ),
             ),
             cases="Landings",

@@ -81,11 +81,18 @@ def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict
     """Compare the reported site with the ground truth.
 
     The true site is the reported site minus the navigation error at the first image. Only the outcome SAFE_SITE
-    reports a safe site. If the algorithm did not converge, the a-priori site is scored.
+    reports a site. If the algorithm did not converge, the helicopter descends to the a-priori site. The numbers of the
+    site and `descent_target_safe` then describe the a-priori site, and `site_safe` is false.
     """
     row = _ground_row("site", _true_site(estimate, flight), truth)
-    reports_safe_site = estimate.outcome is SiteOutcome.SAFE_SITE and bool(row["site_safe"])
-    return {**row, "safe_or_no_site_reported": reports_safe_site or estimate.outcome is SiteOutcome.NO_SAFE_SITE}
+    is_target_safe = bool(row["site_safe"])
+    reports_safe_site = estimate.outcome is SiteOutcome.SAFE_SITE and is_target_safe
+    return {
+        **row,
+        "site_safe": reports_safe_site,
+        "descent_target_safe": is_target_safe,
+        "safe_or_no_site_reported": reports_safe_site or estimate.outcome is SiteOutcome.NO_SAFE_SITE,
+    }
 
 
 def _true_site(estimate: SiteEstimate, flight: Flight) -> np.ndarray | None:

@@ -156,7 +156,7 @@ def test_requirement_texts_describe_metric_and_population() -> None:
     assert texts["VTT-POS"].startswith(
         "|position error| ≤ 0.03 m in at least 99 % of valid answers at selectable targets"
     )
-    assert texts["HDA-SAFE"].startswith("the site is safe in at least 99 % of cases with a reported site")
+    assert texts["HDA-SAFE"].startswith("the reported site is safe in at least 99 % of cases with a reported site")
     assert texts["HDA-TIME"].startswith("60 × run time of all stages ≤ 2 s in at least 95 %")
     assert population_text("valid and selectable and navcam") == "valid answers at selectable targets, with the navcam"
     assert population_text("in_the_dark") == "cases with in the dark"

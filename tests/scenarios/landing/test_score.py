@@ -80,6 +80,8 @@ def test_safe_site_or_no_site_is_a_correct_answer(
 ) -> None:
     row = site_row(SiteEstimate(outcome, site), make_flight(), make_truth(3))
     assert row["safe_or_no_site_reported"] is is_correct
+    assert row["site_safe"] is (outcome is SITE_REPORTED and site is SAFE_SITE)
+    assert row["descent_target_safe"] is (site is SAFE_SITE)
 
 
 def test_flight_without_landing_has_no_touchdown_score() -> None:
