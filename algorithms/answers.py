@@ -37,7 +37,11 @@ def describe_error(error: BaseException | None) -> str:
 
 
 class AlgorithmError(Exception):
-    """An algorithm under test returned no usable answer: the reason (`fault`) and the end of its standard error."""
+    """Error of an algorithm under test that returned no usable answer.
+
+    - fault: Reason
+    - stderr: End of the algorithm's standard error
+    """
 
     def __init__(self, fault: Fault, message: str, stderr: str = "") -> None:
         super().__init__(message)
@@ -79,11 +83,12 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
             raise bad_answer(f"covariance_m2_s2 is not symmetric: {covariance.tolist()}")
         if scale == 0.0 or float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
             raise bad_answer(f"covariance_m2_s2 is not positive definite: {covariance.tolist()}")
-    span, limits = None, answer.span_s
-    if limits is not None:
-        if not isinstance(limits, tuple) or len(limits) != 2 or not all(isinstance(n, float | int) for n in limits):
-            raise bad_answer(f"span_s is {limits!r}; allowed: a tuple of two time tags, or None")
-        span = (float(limits[0]), float(limits[1]))
+    span, given_span = None, answer.span_s
+    if given_span is not None:
+        is_pair = isinstance(given_span, tuple) and len(given_span) == 2
+        if not is_pair or not all(isinstance(tag, float | int) for tag in given_span):
+            raise bad_answer(f"span_s is {given_span!r}; allowed: a tuple of two time tags, or None")
+        span = (float(given_span[0]), float(given_span[1]))
         if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
             raise bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
         if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
@@ -95,7 +100,7 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
 
 
 def check_site(answer: Any) -> interface.SiteEstimate:
-    """Validate a `SiteEstimate`; return a copy with plain arrays. Raises as `check_velocity`."""
+    """Validate a `SiteEstimate`; return a copy with plain arrays. Raises the same error as `check_velocity`."""
     _check_type("the answer", answer, interface.SiteEstimate)
     _check_type("outcome", answer.outcome, interface.SiteOutcome)
     if (answer.outcome is interface.SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
@@ -106,7 +111,7 @@ def check_site(answer: Any) -> interface.SiteEstimate:
 
 
 def check_update(answer: Any) -> interface.TargetUpdate:
-    """Validate a `TargetUpdate`; return a copy with plain arrays. Raises as `check_velocity`."""
+    """Validate a `TargetUpdate`; return a copy with plain arrays. Raises the same error as `check_velocity`."""
     _check_type("the answer", answer, interface.TargetUpdate)
     _check_type("state", answer.state, interface.TrackingState)
     position = _check_numbers("position_rover", answer.position_rover, (3,))
@@ -116,7 +121,7 @@ def check_update(answer: Any) -> interface.TargetUpdate:
 
 
 def check_aim(answer: Any, mast: MastCalibration) -> interface.MastAim | None:
-    """Validate a `MastAim` for this mast, or None; return a copy. Raises as `check_velocity`."""
+    """Validate a `MastAim` for this mast, or None; return a copy. Raises the same error as `check_velocity`."""
     if answer is None:
         return None
     if not isinstance(answer, interface.MastAim):
@@ -178,20 +183,24 @@ class StreamedEstimator:
         answers: list[VelocityEstimate | None] = []
         for number, frame in enumerate(measurements.frames(), start=1):
             answer = self.stream.picture(frame)
-            answers.append(None if answer is None else _check_answer(answer, tags[:number]))
-        final = _check_answer(self.stream.finish(), tags)
+            answers.append(None if answer is None else _check_stream_answer(answer, tags[:number]))
+        final = _check_stream_answer(self.stream.finish(), tags)
         return replace(final, after_pictures=tuple(answers))
 
 
 def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
-    """Validate an estimate; a missing time span becomes the last image interval. Raises as `check_velocity`."""
+    """Validate an estimate; a missing time span becomes the last image interval.
+
+    Raises the same error as `check_velocity`.
+    """
     estimate = check_velocity(answer, tags_s)
     if estimate.span_s is not None or len(tags_s) < 2:
         return estimate
     return replace(estimate, span_s=(tags_s[-2], tags_s[-1]))
 
 
-def _check_answer(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
+def _check_stream_answer(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
+    """Validate one answer of a stream. Raises the same error as `check_velocity`."""
     if isinstance(answer, VelocityEstimate) and answer.after_pictures:
         raise bad_answer("after_pictures is given; it must be empty: the caller sets it")
     return check_and_set_span(answer, tags_s)

@@ -21,6 +21,7 @@ def children(process: int) -> list[int]:
 def descendants(process: int) -> list[int]:
     """Process ids of the children, grandchildren and so on of a process."""
     result = children(process)
+    # the loop also visits the processes that it appends
     for child in result:
         result += children(child)
     return result

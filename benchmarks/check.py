@@ -73,13 +73,13 @@ def reference_workload() -> Callable[[], object]:
     image = rng.standard_normal((1024, 1024)).astype(np.float32)
     values = rng.standard_normal(200_000)
 
-    def work() -> None:
+    def run() -> None:
         matrix @ matrix
         cv2.GaussianBlur(image, (0, 0), 2.0)
         np.sort(values)
         image.copy()
 
-    return work
+    return run
 
 
 def log_ratios(path: Callable[[], object], reference: Callable[[], object], pairs: int) -> list[float]:
@@ -93,9 +93,10 @@ def log_ratios(path: Callable[[], object], reference: Callable[[], object], pair
     return ratios
 
 
-def _processor_seconds(work: Callable[[], object]) -> float:
+def _processor_seconds(run: Callable[[], object]) -> float:
+    """Measure the processor time of one run."""
     start = time.process_time()
-    work()
+    run()
     return time.process_time() - start
 
 
@@ -139,7 +140,7 @@ def main() -> int:
         return 2
     cv2.setNumThreads(1)
     reference = reference_workload()
-    measured = {name: log_ratios(make(), reference, PAIRS) for name, make in PATHS.items()}
+    measured = {name: log_ratios(prepare(), reference, PAIRS) for name, prepare in PATHS.items()}
     if keep:
         record = {
             "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
@@ -153,10 +154,10 @@ def main() -> int:
     return _print_comparison(compare(measured, stored["log_ratios"]), stored["measured"])
 
 
-def _print_comparison(comparisons: Sequence[Comparison], stored_on: str) -> int:
+def _print_comparison(comparisons: Sequence[Comparison], measured_on: str) -> int:
     """Print the comparison. Returns 1 if a path is slower."""
     slower = select_slower(comparisons)
-    print(f"{'ratio divided by that of ' + stored_on[:10]:<40}{'factor':>8}{'p':>10}")
+    print(f"{'ratio divided by that of ' + measured_on[:10]:<40}{'factor':>8}{'p':>10}")
     for comparison in comparisons:
         mark = "  SLOWER" if comparison in slower else ""
         print(f"{comparison.name:<40}{comparison.growth:8.2f}{comparison.p_value:10.2g}{mark}")

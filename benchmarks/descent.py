@@ -28,7 +28,7 @@ def measure_frame(repeats: int) -> list[Measurement]:
     pose = descent_pose(surface)
     return [
         Measurement(
-            "descent frame, 1024 x 1024",
+            "descent frame, 1024 x 1024 px",
             core_seconds(lambda: renderer.render(scene, optics.rays, pose), repeats),
             limit=0.2,
         )
@@ -61,7 +61,7 @@ def measure_new_terrains(repeats: int) -> list[Measurement]:
     }
     return [
         Measurement(
-            f"new descent terrain, {name}",
+            f"generation of a descent terrain: {name}",
             core_seconds(partial(synthesise, site_parameters, np.random.default_rng(0)), repeats),
             limit=2.0,
         )

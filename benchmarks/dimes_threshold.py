@@ -22,8 +22,8 @@ STORED = Path(options.__file__).with_name("imu_threshold.json")
 #: Version of the derivation; increase it if the result changes for the same inputs.
 VERSION = 1
 QUANTILES = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
-#: Minimum and maximum velocity error of the wrong track, m/s: always the smallest error, and up to the search range.
-WRONG_BY_M_S = ((10.0, 10.0), (10.0, 60.0))
+#: Minimum and maximum velocity error of the wrong track, m/s: a constant error, and errors up to the search range.
+WRONG_TRACK_ERRORS_M_S = ((10.0, 10.0), (10.0, 60.0))
 
 
 def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
     threshold = derivation.threshold_m_s(results.single, inputs.kept, inputs.step_m_s)
     wrong_track_outcomes = []
     for tracks in (1, 2):
-        for error_range_m_s in WRONG_BY_M_S:
+        for error_range_m_s in WRONG_TRACK_ERRORS_M_S:
             outcomes = derivation.simulate_wrong_track(
                 errors[:, :, :tracks], error_range_m_s, threshold, inputs.imu_sd_m_s, rng
             )
@@ -62,7 +62,7 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
 
 
 def _quantiles(values: np.ndarray) -> dict[str, float]:
-    return {str(q): float(np.quantile(values, q)) for q in QUANTILES}
+    return {str(quantile): float(np.quantile(values, quantile)) for quantile in QUANTILES}
 
 
 def main() -> None:

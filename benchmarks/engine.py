@@ -56,10 +56,13 @@ class BusyScenario:
 
 
 class Stopwatch:
-    """Progress display that records time and memory of the parent process at given numbers of finished cases."""
+    """Progress display that records time and memory of the parent process at given numbers of finished cases.
+
+    - records: wall-clock time (s) and memory (MB), by number of finished cases
+    """
 
     def __init__(self, case_counts: tuple[int, ...]) -> None:
-        self.at: dict[int, tuple[float, float]] = {}
+        self.records: dict[int, tuple[float, float]] = {}
         self._case_counts = case_counts
         self._done = 0
         self._is_counting = False
@@ -70,7 +73,7 @@ class Stopwatch:
     def step(self) -> None:
         self._done += self._is_counting
         if self._is_counting and self._done in self._case_counts:
-            self.at[self._done] = (time.perf_counter(), resident_bytes([os.getpid()]) / 1e6)
+            self.records[self._done] = (time.perf_counter(), resident_bytes([os.getpid()]) / 1e6)
 
     def note(self, text: str) -> None:
         print(f"note: {text}")
@@ -89,7 +92,7 @@ def measure(repeats: int = 3) -> list[Measurement]:
     """Measure the overhead of the engine. Ratios use wall-clock time, so that load of other programs cancels."""
     empty = [measure_case_cost(0.0, 2_000, 12_000) for _ in range(repeats)]
     busy = [measure_case_cost(0.05, 20, 140) for _ in range(repeats)]
-    long = measure_case_cost(0.0, 10_000, 100_000)
+    long_run = measure_case_cost(0.0, 10_000, 100_000)
     return [
         Measurement(
             "engine: overhead of an empty case (ms)",
@@ -101,15 +104,21 @@ def measure(repeats: int = 3) -> list[Measurement]:
             [100.0 * (cost.wall_s / cost.inside_case_s - 1.0) for cost in busy],
             limit=3.0,
         ),
-        Measurement("engine: growth of the parent, 10,000 to 100,000 cases (MB)", [long.memory_growth_mb], limit=10.0),
+        Measurement(
+            "engine: memory growth of the campaign process from 10,000 to 100,000 cases (MB)",
+            [long_run.memory_growth_mb],
+            limit=10.0,
+        ),
         *_measure_empty_campaign(),
         Measurement(
-            "engine: speed-up by two workers, rendered cases",
+            "engine: speed-up by two workers, rendered cases (ratio)",
             [measure_speed_up() for _ in range(repeats)],
             minimum=1.85,
         ),
         Measurement(
-            f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [measure_table_s(1_000_000)], limit=30.0
+            f"engine: conversion of 1,000,000 rows of {COLUMNS} numbers to Parquet (s)",
+            [measure_table_s(1_000_000)],
+            limit=30.0,
         ),
     ]
 
@@ -121,12 +130,12 @@ def _measure_empty_campaign(cases: int = 100_000) -> list[Measurement]:
     )
     campaign = Campaign(configuration, BusyScenario())
     with TemporaryDirectory() as folder:
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         run_campaign(campaign, Path(folder, "run"), ExecutorConfig(2), Stopwatch(()))
-        campaign_s = time.perf_counter() - began
-    began = time.perf_counter()
+        campaign_s = time.perf_counter() - start_s
+    start_s = time.perf_counter()
     Parallel(2)(delayed(_run_case)(campaign, case) for case in range(cases))
-    loop_s = time.perf_counter() - began
+    loop_s = time.perf_counter() - start_s
     return [
         Measurement(f"engine: {cases:,} empty cases, two workers (wall s)", [campaign_s], limit=60.0),
         Measurement(f"joblib loop without storage: {cases:,} empty cases, two workers (wall s)", [loop_s]),
@@ -152,8 +161,8 @@ def measure_case_cost(busy_s: float, first: int, last: int) -> CaseCost:
         run_campaign(Campaign(configuration, BusyScenario()), Path(folder, "run"), ExecutorConfig(1), watch)
         seconds = pq.read_table(Path(folder, "run", "cases.parquet"), columns=["wall_time_s"])["wall_time_s"]
         inside_case_s = pc.mean(seconds.slice(first, last - first)).as_py()
-    (began, before), (ended, after) = watch.at[first], watch.at[last]
-    return CaseCost((ended - began) / (last - first), inside_case_s, after - before)
+    (start_s, start_mb), (end_s, end_mb) = watch.records[first], watch.records[last]
+    return CaseCost((end_s - start_s) / (last - first), inside_case_s, end_mb - start_mb)
 
 
 def measure_speed_up(campaign: str = "dimes-smoke", cases: int = 120) -> float:
@@ -168,26 +177,31 @@ def measure_speed_up(campaign: str = "dimes-smoke", cases: int = 120) -> float:
         with TemporaryDirectory() as folder:
             loaded = load_campaign(campaign, ["retain.showcase=none"], cases)
             run_campaign(loaded, Path(folder, "run"), ExecutorConfig(jobs), watch)
-        times.append(watch.at[last][0] - watch.at[first][0])
+        times.append(watch.records[last][0] - watch.records[first][0])
     return times[0] / times[1]
 
 
 def measure_table_s(rows: int) -> float:
     """Measure the processor time to write a table with full-precision numbers."""
-    head: dict[str, Scalar] = {"outcome": "VALID", "answered": True}
-    tail: dict[str, Scalar] = {"wall_time_s": 0.1, "cpu_time_s": 0.1, "error": "", "traceback": ""}
+    first_columns: dict[str, Scalar] = {"outcome": "VALID", "answered": True}
+    last_columns: dict[str, Scalar] = {"wall_time_s": 0.1, "cpu_time_s": 0.1, "error": "", "traceback": ""}
     with TemporaryDirectory() as folder:
         path = Path(folder, "cases.sqlite")
         create_store(path, {})
         with RowStore(path) as store:
             for start in range(0, rows, 1000):
                 store.add(
-                    {"case": case, **head, **{f"x{k}": (case + k) / 7.0 for k in range(COLUMNS)}, **tail}
+                    {
+                        "case": case,
+                        **first_columns,
+                        **{f"x{k}": (case + k) / 7.0 for k in range(COLUMNS)},
+                        **last_columns,
+                    }
                     for case in range(start, start + 1000)
                 )
-            began = time.process_time()
+            start_s = time.process_time()
             write_table(Path(folder, "cases.parquet"), store)
-            return time.process_time() - began
+            return time.process_time() - start_s
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ from marsyard.sim.measurements import DescentMeasurements
 #: Compared estimators, by name.
 ESTIMATORS: Mapping[str, VelocityEstimator] = {
     "DIMES": DimesEstimator(),
-    "DIMES, quadric peak fit only": DimesEstimator(DimesOptions(align=False)),
-    "DIMES, whole pixels": DimesEstimator(DimesOptions(subpixel=False)),
+    "DIMES, quadric peak fit without alignment": DimesEstimator(DimesOptions(align=False)),
+    "DIMES, without sub-pixel refinement": DimesEstimator(DimesOptions(subpixel=False)),
     "OpenCV's phase correlation": PhaseCorrelationEstimator(),
     "OpenCV's ORB and homography": HomographyEstimator(),
 }

@@ -24,7 +24,7 @@ from pydantic import BaseModel
 
 from benchmarks.engine import BusyParameters, BusyScenario, Stopwatch
 from benchmarks.images import descent_pose, descent_scene
-from benchmarks.reporting import marsyard, synthetic_campaign
+from benchmarks.reporting import run_marsyard, synthetic_campaign
 from benchmarks.timing import core_seconds
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
@@ -41,7 +41,7 @@ from marsyard.sim.streams import Streams
 RESULTS = Path(__file__).parent / "results" / "growth.json"
 FIGURE = Path(__file__).parents[1] / "docs" / "images" / "growth.svg"
 #: Waiting time of a case that does not compute, s.
-LIGHT_S = 0.02
+WAITING_S = 0.02
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,10 @@ class Curve:
         return float(np.log(larger_cost / smaller_cost) / np.log(larger / smaller))
 
 
-class LightScenario(BusyScenario):
+class WaitingScenario(BusyScenario):
     """Scenario that waits without computing, so that the number of cores does not limit the number of workers."""
 
-    name = "light"
+    name = "waiting"
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         assert isinstance(parameters, BusyParameters)
@@ -115,9 +115,9 @@ def _measure_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
     points = []
     for count in lines:
         # same extent as the default mesh: fewer lines have a wider spacing
-        finest = scene.mesh_finest_m * (scene.mesh_lines - 1) / (count - 1)
-        finer_scene = replace(scene, mesh_lines=count, mesh_finest_m=finest)
-        cost = _min_core_seconds(partial(renderer.render, finer_scene, rays, pose))
+        spacing_m = scene.mesh_finest_m * (scene.mesh_lines - 1) / (count - 1)
+        scene_with_mesh = replace(scene, mesh_lines=count, mesh_finest_m=spacing_m)
+        cost = _min_core_seconds(partial(renderer.render, scene_with_mesh, rays, pose))
         points.append((2.0 * (count - 1) ** 2, cost))
     return points
 
@@ -138,32 +138,33 @@ def _measure_case_counts(cases: Sequence[int]) -> list[tuple[float, float]]:
 
 
 def _measure_workers(jobs: Sequence[int]) -> list[tuple[float, float]]:
-    return [(float(count), _measure_campaign_s(400, LIGHT_S, ExecutorConfig(count))) for count in jobs]
+    return [(float(count), _measure_campaign_s(400, WAITING_S, ExecutorConfig(count))) for count in jobs]
 
 
 def _measure_dask_workers(workers: Sequence[int]) -> list[tuple[float, float]]:
     return [
-        (float(count), _measure_campaign_s(400, LIGHT_S, ExecutorConfig(cluster=f"local:{count}"))) for count in workers
+        (float(count), _measure_campaign_s(400, WAITING_S, ExecutorConfig(cluster=f"local:{count}")))
+        for count in workers
     ]
 
 
 def _measure_campaign_s(cases: int, waiting_s: float, executor: ExecutorConfig) -> float:
     """Run a campaign; return the wall-clock time from the first to the last completed case."""
-    scenario = "benchmarks.growth:LightScenario" if waiting_s else "benchmarks.engine:BusyScenario"
+    scenario = "benchmarks.growth:WaitingScenario" if waiting_s else "benchmarks.engine:BusyScenario"
     configuration = CampaignConfiguration(
         name="growth", scenario=scenario, cases=cases, parameters={"busy_s": waiting_s}, retain=Retain(showcase="none")
     )
     watch = Stopwatch((1, cases))
     with TemporaryDirectory() as folder:
-        instance = LightScenario() if waiting_s else BusyScenario()
+        instance = WaitingScenario() if waiting_s else BusyScenario()
         run_campaign(Campaign(configuration, instance), Path(folder, "run"), executor, watch)
-    return watch.at[cases][0] - watch.at[1][0]
+    return watch.records[cases][0] - watch.records[1][0]
 
 
 def _measure_reports(cases: Sequence[int]) -> list[tuple[float, float]]:
     with TemporaryDirectory() as folder:
         runs = [(count, synthetic_campaign(Path(folder, f"of-{count}"), count)) for count in cases]
-        return [(float(count), marsyard("report", str(run)).core_s) for count, run in runs]
+        return [(float(count), run_marsyard("report", str(run)).core_s) for count, run in runs]
 
 
 def _min_core_seconds(run: Callable[[], object]) -> float:

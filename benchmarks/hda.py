@@ -58,10 +58,11 @@ def make_measurements() -> LandingMeasurements:
 
 
 def _draw_image(texture: np.ndarray, pose: RigidTransform) -> np.ndarray:
+    """Draw the image of textured ground at z = 0 from a body pose; the world origin is at the texture's centre."""
     camera = CAMERA.transform(pose)
     rays = camera.rays(camera.pixel_grid())[1]
     ground = camera.c[:2] - camera.c[2] * rays[..., :2] / rays[..., 2:]
-    texels = (ground / TEXEL_M + 1200.0).astype(np.float32)
+    texels = (ground / TEXEL_M + 0.5 * len(texture)).astype(np.float32)
     return np.rint(np.clip(cv2.remap(texture, texels, None, cv2.INTER_LINEAR), 0, 255)).astype(np.uint16)
 
 
@@ -95,16 +96,19 @@ def measure_stages(measurements: LandingMeasurements, repeats: int) -> list[Meas
 
     rows, columns = ground.elevation.elevation_m.shape
     return [
-        Measurement("HDA features, 11 x 11 in 81 x 81 (paper: 0.21 s)", core_seconds(track, repeats)),
         Measurement(
-            f"HDA motion, {tracks.accepted.sum()} tracks (paper: 59, 0.10 s)", core_seconds(estimate_motion, repeats)
+            "HDA features: 11 x 11 px templates in 81 x 81 px windows (paper: 0.21 s)", core_seconds(track, repeats)
         ),
         Measurement(
-            f"HDA structure, {len(matches.points)} points (paper: 600, 0.41 s)",
+            f"HDA motion: {tracks.accepted.sum()} tracks (paper: 59 tracks, 0.10 s)",
+            core_seconds(estimate_motion, repeats),
+        ),
+        Measurement(
+            f"HDA structure: {len(matches.points)} points (paper: 600 points, 0.41 s)",
             core_seconds(lambda: match_structure(scene, motion, PAPER), repeats),
         ),
         Measurement(
-            f"HDA map and hazards, {rows} x {columns} (paper: 0.05 s)",
+            f"HDA map and hazards: {rows} x {columns} cells (paper: 19 x 27 cells, 0.05 s)",
             core_seconds(lambda: map_ground(scene, matches.points, resolution, PAPER), repeats),
         ),
     ]
@@ -113,17 +117,17 @@ def measure_stages(measurements: LandingMeasurements, repeats: int) -> list[Meas
 def _measure_estimators(measurements: LandingMeasurements, repeats: int) -> list[Measurement]:
     return [
         Measurement(
-            "HDA, the paper's parameters (paper: 0.77 s)",
+            "HDA, all stages with the paper's parameters (paper: 0.77 s)",
             core_seconds(lambda: HdaEstimator(PAPER).estimate(measurements), repeats),
             limit=0.03,
         ),
         Measurement(
-            "HDA, 160 x 120 points of 640 x 480",
+            "HDA, all stages: 160 x 120 points of a 640 x 480 px image",
             core_seconds(lambda: HdaEstimator(DENSE).estimate(measurements), repeats),
             limit=0.2,
         ),
         Measurement(
-            "HDA by semi-global matching, 160 x 120 points of 640 x 480",
+            "HDA by semi-global matching: 160 x 120 points of a 640 x 480 px image",
             core_seconds(lambda: SemiGlobalEstimator(DENSE).estimate(measurements), repeats),
         ),
     ]
@@ -133,7 +137,7 @@ def _measure_large_map(repeats: int) -> Measurement:
     elevation_m = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
     ground = ElevationMap(elevation_m, np.zeros(2), 0.1)
     return Measurement(
-        "HDA hazard maps of 256 x 256", core_seconds(lambda: hazard_maps(ground, HdaOptions()), repeats), limit=0.05
+        "HDA hazard maps: 256 x 256 cells", core_seconds(lambda: hazard_maps(ground, HdaOptions()), repeats), limit=0.05
     )
 
 

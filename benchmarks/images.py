@@ -95,7 +95,7 @@ def measure_rover_images(repeats: int) -> list[Measurement]:
 
     return [
         Measurement("navcam frame over rocks", core_seconds(lambda: renderer.render(scene, full_frame, left), repeats)),
-        Measurement("stereo pair of subframes, 161 x 161", core_seconds(render_pair, 3 * repeats), limit=0.06),
+        Measurement("stereo pair of subframes, 161 x 161 px each", core_seconds(render_pair, 3 * repeats), limit=0.06),
     ]
 
 
@@ -134,7 +134,9 @@ def measure_memory(frames: int) -> list[Measurement]:
             [max(memory_gb)],
             limit=1.2,
         ),
-        Measurement("growth of this memory, second to last quarter of the frames (GB)", [growth_gb], limit=0.02),
+        Measurement(
+            "growth of this memory from the second to the last quarter of the frames (GB)", [growth_gb], limit=0.02
+        ),
         Measurement(
             "maximum resident memory with terrain files (GB)",
             [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20],
@@ -162,6 +164,7 @@ def measure_all_cores(repeats: int) -> list[Measurement]:
 
 
 def _wall_seconds(repeats: int) -> list[float]:
+    """Measure the wall-clock time of each exposure of the descent scene, after a warm-up exposure."""
     expose = prepare_descent_exposure()
     expose()
     times = []

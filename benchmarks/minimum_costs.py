@@ -18,7 +18,7 @@ from benchmarks.images import descent_scene
 from benchmarks.stages import Stages, profile_stages
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.sim.render.kernels.ground import height_range
-from marsyard.sim.render.kernels.strips import STRIP, FetchedCells, fetch_cells, no_cells, spline
+from marsyard.sim.render.kernels.strips import STRIP, FetchedCells, allocate_cells, fetch_cells, spline
 from marsyard.sim.terrain.kernels import Array, Level
 
 #: Images of a case, and their side in pixels.
@@ -59,7 +59,7 @@ def _prepare_splines() -> Callable[[], object]:
 @njit(cache=True)
 def _sum_fields(field: Level, scale: float, x: Array, y: Array) -> float:
     """Sum of heights, slopes and albedos at positions."""
-    cells: FetchedCells = no_cells()
+    cells: FetchedCells = allocate_cells()
     lanes = np.arange(STRIP)
     total = 0.0
     for first in range(0, x.size, STRIP):

@@ -16,8 +16,8 @@ from benchmarks.timing import Measurement
 def measure(repeats: int) -> list[Measurement]:
     """Measure the wall-clock times of starting the command, of compiling kernels and of the first run."""
     return [
-        Measurement("marsyard --help (wall s)", [_wall_s("--help") for _ in range(repeats)], limit=0.3),
-        Measurement("marsyard list (wall s)", [_wall_s("list") for _ in range(repeats)], limit=0.6),
+        Measurement("marsyard --help (wall s)", [_measure_wall_s("--help") for _ in range(repeats)], limit=0.3),
+        Measurement("marsyard list (wall s)", [_measure_wall_s("list") for _ in range(repeats)], limit=0.6),
         *_measure_first_run(),
     ]
 
@@ -25,17 +25,17 @@ def measure(repeats: int) -> list[Measurement]:
 def _measure_first_run() -> list[Measurement]:
     """Measure the compilation of kernels, and the additional time of a first campaign compared with a repetition.
 
-    The campaign is run with an empty folder of terrains, with all terrains built, and again.
+    The campaign runs first with an empty terrain cache, then with all terrains built, then twice more.
     """
     with TemporaryDirectory() as folder:
         empty, built = Path(folder, "new"), Path(folder, "built")
-        compile_s = _wall_s("compile", variables={"MARSYARD_CACHE": str(empty)})
+        compile_s = _measure_wall_s("compile", variables={"MARSYARD_CACHE": str(empty)})
         shutil.copytree(empty, built)
 
         def run(cache: Path, name: str) -> float:
             arguments = ("run", "dimes-smoke", "-n", "1", "--jobs", "1", "--set", "retain.showcase=none")
             variables = {"MARSYARD_CACHE": str(cache)}
-            return _wall_s(*arguments, "--out", str(Path(folder, name)), variables=variables, allowed=(0, 3))
+            return _measure_wall_s(*arguments, "--out", str(Path(folder, name)), variables=variables, allowed=(0, 3))
 
         first = run(empty, "first")
         shutil.copytree(empty / "terrain", built / "terrain", dirs_exist_ok=True)
@@ -43,13 +43,15 @@ def _measure_first_run() -> list[Measurement]:
         repeated = min(run(built, f"again {number}") for number in range(2))
     return [
         Measurement("marsyard compile after installation (wall s)", [compile_s]),
-        Measurement("first run: additional time for kernels (wall s)", [with_terrains - repeated], limit=3.0),
-        Measurement("first run: additional time for kernels and eight terrains (wall s)", [first - repeated]),
+        Measurement("first run: additional time for loading kernels (wall s)", [with_terrains - repeated], limit=3.0),
+        Measurement(
+            "first run: additional time for loading kernels and generating eight terrains (wall s)", [first - repeated]
+        ),
     ]
 
 
-def _wall_s(*arguments: str, variables: dict[str, str] | None = None, allowed: tuple[int, ...] = (0,)) -> float:
-    """Measure the wall-clock time of a command."""
+def _measure_wall_s(*arguments: str, variables: dict[str, str] | None = None, allowed: tuple[int, ...] = (0,)) -> float:
+    """Measure the wall-clock time of a `marsyard` command, seconds; `allowed` are its accepted exit statuses."""
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | (variables or {})
     start = time.perf_counter()
     result = subprocess.run(

@@ -105,34 +105,34 @@ def draw_correct_track_errors(inputs: ThresholdInputs, rng: np.random.Generator)
     camera, options = descent_camera(), DimesOptions()
     tracks: list[Float[np.ndarray, "2 2 2"]] = []
     while len(tracks) < inputs.descents:
-        errors = _descent_errors(inputs, camera, options, rng)
+        errors = _draw_descent_errors(inputs, camera, options, rng)
         if errors is not None:
             tracks.append(errors)
     return np.stack(tracks)
 
 
-def _descent_errors(
+def _draw_descent_errors(
     inputs: ThresholdInputs, camera: CameraModel, options: DimesOptions, rng: np.random.Generator
 ) -> Float[np.ndarray, "2 2 2"] | None:
     """Draw the velocity errors of one descent; None if a pair has no feasible overlap for two templates."""
     true_views, measured_views = _draw_views(inputs, camera, rng)
     velocity = inputs.max_speed_m_s * np.sqrt(rng.uniform()) * _draw_direction(rng)
-    no_sun = np.array([0.0, 0.0, -1.0])
+    no_sun = np.array([0.0, 0.0, -1.0])  # below the horizon, so that no template is masked
     errors = np.empty((2, 2, 2))
     for pair in range(2):
         first, second = measured_views[pair], measured_views[pair + 1]
         candidates = template_candidates(first, second, search_geometry(first, second, options), no_sun, options)
         scores = rng.uniform(size=len(candidates.pixels))
-        chosen = best_candidates(scores, candidates.pixels, candidates.preferred, 2, options.exclusion_px)
-        if len(chosen) < 2:
+        selected = best_candidates(scores, candidates.pixels, candidates.preferred, 2, options.exclusion_px)
+        if len(selected) < 2:
             return None
         heights = inputs.feature_height_sd_m * rng.standard_normal(2)
         displacement_m = velocity * inputs.interval_s
         pixels = _project_features(
-            true_views[pair], true_views[pair + 1], candidates.pixels[chosen], heights, displacement_m
+            true_views[pair], true_views[pair + 1], candidates.pixels[selected], heights, displacement_m
         )
         ground, _ = ground_from_pixels(second, pixels, options.max_off_nadir_rad)
-        errors[pair] = (candidates.ground[chosen] - ground - displacement_m) / inputs.interval_s
+        errors[pair] = (candidates.ground[selected] - ground - displacement_m) / inputs.interval_s
     return np.asarray(errors + inputs.match_sd_m_s * rng.standard_normal((2, 2, 2)))
 
 
@@ -143,7 +143,10 @@ def _project_features(
     heights_m: Float[np.ndarray, " n"],
     displacement_m: Float[np.ndarray, "2"],
 ) -> Float[np.ndarray, "n 2"]:
-    """Project features from pixels of the first true camera into the second; `heights_m` are those of the features."""
+    """Project features from pixels of the first true camera to pixels (u, v) of the second.
+
+    `heights_m` are the heights of the features; `displacement_m` is the camera's horizontal motion (east, north).
+    """
     origins, rays = first.camera.rays(pixels)
     features = origins + rays * ((heights_m - origins[:, 2]) / rays[:, 2])[:, None]
     features[:, :2] -= displacement_m
@@ -169,6 +172,7 @@ def _draw_views(
 
 
 def _draw_attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
+    """Draw a true attitude: tilts by coning and nodding, and a random heading."""
     tilts = (
         np.radians(limit) * rng.uniform() * np.array([*_draw_direction(rng), 0.0])
         for limit in (inputs.max_cone_deg, inputs.max_nod_deg)
@@ -183,6 +187,7 @@ def _create_view(camera: CameraModel, attitude: Rotation, altitude_m: float, tim
 
 
 def _draw_direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:
+    """Draw a horizontal unit vector."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(angle), np.sin(angle)])
 
@@ -248,14 +253,16 @@ def simulate_wrong_track(
     """
     counts = np.zeros(3)
     for tracks in errors:
-        changed = tracks.copy()
-        changed[rng.integers(2), rng.integers(tracks.shape[1])] += rng.uniform(*wrong_by_m_s) * _draw_direction(rng)
+        pair, template = rng.integers(2), rng.integers(tracks.shape[1])
+        changed_tracks = tracks.copy()
+        changed_tracks[pair, template] += rng.uniform(*wrong_by_m_s) * _draw_direction(rng)
         imu_change = np.zeros((2, 3))
         imu_change[1, :2] = imu_sd_m_s * rng.standard_normal(2)
-        best = rank_combinations(list(enumerate(changed[0])), list(enumerate(changed[1])), imu_change)[0]
+        first, second = (list(enumerate(pair_tracks)) for pair_tracks in changed_tracks)
+        best = rank_combinations(first, second, imu_change)[0]
         if not best.discrepancy_m_s < threshold_m_s:
             counts[1] += 1
         else:
-            counts[0 if np.hypot(*changed[1, best.second]) <= required_m_s else 2] += 1
+            counts[0 if np.hypot(*changed_tracks[1, best.second]) <= required_m_s else 2] += 1
     correct, rejected, wrong = counts / len(errors)
     return WrongTrackOutcomes(float(correct), float(rejected), float(wrong))

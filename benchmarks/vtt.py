@@ -72,7 +72,7 @@ def measure_updates(repeats: int) -> list[Measurement]:
     ]
 
 
-def _repeat(search: Callable[[], object]) -> None:
+def _repeat_batch(search: Callable[[], object]) -> None:
     for _ in range(BATCH):
         search()
 
@@ -95,8 +95,10 @@ def measure_searches(repeats: int) -> list[Measurement]:
             "by cv2.matchTemplate": partial(cv2.matchTemplate, window_32, template_32, cv2.TM_CCOEFF_NORMED),
         }
         for name, search in searches.items():
-            batch_ms = [1e3 * s / BATCH for s in core_seconds(partial(_repeat, search), repeats)]
-            measurements.append(Measurement(f"template of 21 x 21 in {side} x {side}, {name} (ms)", batch_ms))
+            batch_ms = [1e3 * seconds / BATCH for seconds in core_seconds(partial(_repeat_batch, search), repeats)]
+            measurements.append(
+                Measurement(f"search of a 21 x 21 px template in {side} x {side} px, {name} (ms)", batch_ms)
+            )
     return measurements
 
 
@@ -110,7 +112,7 @@ def measure_runs(repeats: int) -> list[Measurement]:
     }
     parameters = RoverScenarioParameters.model_validate(settings)
     elapsed_s = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
-    return [Measurement("rover run from 10 m to 2 m, rendered", elapsed_s, limit=1.5)]
+    return [Measurement("rover run from 10 m to 2 m with 34 rendered images", elapsed_s, limit=1.5)]
 
 
 def measure(repeats: int) -> list[Measurement]:

@@ -51,18 +51,21 @@ def draw_distortion() -> Figure:
 
 
 def _compute_distortion(camera: CameraModel) -> tuple[np.ndarray, np.ndarray]:
-    """Angles of pixels to the axis, and their distortion: distance to the centre minus ``focal length x tangent``."""
+    """Compute the angles of pixels to the axis, radians, and their radial distortion, pixels.
+
+    The distortion is the distance to the image centre minus the focal length times the tangent of the angle.
+    """
     columns = np.linspace(0.5 * camera.size[0], camera.size[0] - 1.0, 200)
     pixels = np.stack([columns, np.full_like(columns, 0.5 * (camera.size[1] - 1))], axis=1)
     directions = camera.rays(pixels)[1]
-    right = camera.rays(pixels[-1])[1] - camera.rays(pixels[0])[1]
+    row_chord = camera.rays(pixels[-1])[1] - camera.rays(pixels[0])[1]
     axis = np.asarray(camera.a) / np.linalg.norm(camera.a)
     perpendicular = directions - (directions @ axis)[:, None] * axis
-    row_direction = right - (right @ axis) * axis
+    row_direction = row_chord - (row_chord @ axis) * axis
     tangent = perpendicular @ (row_direction / np.linalg.norm(row_direction)) / (directions @ axis)
     # focal length at the image centre, where the distortion is zero
-    focal = (columns[1] - columns[0]) / (tangent[1] - tangent[0])
-    return np.arctan(tangent), (columns - columns[0]) - focal * (tangent - tangent[0])
+    focal_px = (columns[1] - columns[0]) / (tangent[1] - tangent[0])
+    return np.arctan(tangent), (columns - columns[0]) - focal_px * (tangent - tangent[0])
 
 
 def draw_reflectance() -> Figure:

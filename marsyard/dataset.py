@@ -120,7 +120,7 @@ def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -
         with tempfile.NamedTemporaryFile() as camera:
             write_cahvor(sample.camera, Path(camera.name), frame=BODY_FRAME)
             yield f"{key}.cahvor", Path(camera.name).read_bytes()
-        yield f"{key}.json", json.dumps({**metadata, "bits": sample.bits, **sample.about}, indent=1).encode()
+        yield f"{key}.json", json.dumps({**metadata, "bits": sample.bits, **sample.metadata}, indent=1).encode()
 
 
 def _encode(values: np.ndarray[Any, Any]) -> bytes:

@@ -45,6 +45,10 @@ BACKENDS = {"osmesa": "libosmesa6 libgl1 libxrender1", "egl": "libegl1 libegl-me
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 REINSTALL = "make setup, or: pip install -c constraints.txt -e ."
 BYTES_PER_MIB = 2**20
+#: Free disk space, MiB: below the first value a check warns, below the second value it fails.
+SUFFICIENT_DISK_MIB, MIN_DISK_MIB = 1024, 100
+#: Memory that one worker process needs, MiB.
+WORKER_MEMORY_MIB = 512
 PROBE_TIMEOUT_S = 30.0
 
 
@@ -203,7 +207,7 @@ for name in sys.argv[1:]:
 def _list_requirements() -> list[Requirement]:
     """List the distributions that Marsyard requires on this platform, without extras."""
     requirements = [Requirement(text) for text in importlib.metadata.requires("marsyard") or []]
-    return [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
+    return [item for item in requirements if item.marker is None or item.marker.evaluate({"extra": ""})]
 
 
 def _read_pins() -> dict[str, str]:
@@ -246,17 +250,19 @@ def check_rendering(probes: Mapping[str, Probe]) -> Iterator[Check]:
     checks = {backend: _check_backend(backend, probe) for backend, probe in probes.items()}
     yield from checks.values()
     working = [backend for backend, check in checks.items() if check.verdict is Verdict.OK]
-    selected = os.environ.get("MARSYARD_GL", next(iter(BACKENDS))).lower()
-    if selected not in BACKENDS:
-        finding = f"MARSYARD_GL is '{selected}'; allowed: {', '.join(BACKENDS)}"
+    selected_backend = os.environ.get("MARSYARD_GL", next(iter(BACKENDS))).lower()
+    if selected_backend not in BACKENDS:
+        finding = f"MARSYARD_GL is '{selected_backend}'; allowed: {', '.join(BACKENDS)}"
         yield Check("GL backend in use", finding, Verdict.FAIL, "unset MARSYARD_GL")
-    elif selected in working:
-        yield Check("GL backend in use", selected)
+    elif selected_backend in working:
+        yield Check("GL backend in use", selected_backend)
     elif working:
-        remedy = f"export MARSYARD_GL={working[0]}, or install {BACKENDS[selected]}"
-        yield Check("GL backend in use", f"{selected} does not work; {working[0]} works", Verdict.WARN, remedy)
+        remedy = f"export MARSYARD_GL={working[0]}, or install {BACKENDS[selected_backend]}"
+        yield Check("GL backend in use", f"{selected_backend} does not work; {working[0]} works", Verdict.WARN, remedy)
     else:
-        yield Check("GL backend in use", "no backend works", Verdict.FAIL, f"sudo apt-get install {BACKENDS[selected]}")
+        yield Check(
+            "GL backend in use", "no backend works", Verdict.FAIL, f"sudo apt-get install {BACKENDS[selected_backend]}"
+        )
 
 
 def _check_backend(backend: str, probe: Probe) -> Check:
@@ -306,20 +312,22 @@ def _check_disk_space(name: str, folder: Path, remedy: str) -> Check:
     free = shutil.disk_usage(folder).free // BYTES_PER_MIB
     if not _is_writable(folder):
         return Check(name, f"cannot write to {folder}", Verdict.FAIL, remedy)
-    verdict = Verdict.OK if free >= 1024 else Verdict.FAIL if free < 100 else Verdict.WARN
+    verdict = Verdict.OK if free >= SUFFICIENT_DISK_MIB else Verdict.FAIL if free < MIN_DISK_MIB else Verdict.WARN
     return Check(name, f"{free} MiB free in {folder}", verdict, "" if verdict is Verdict.OK else remedy)
 
 
 def check_machine() -> Check:
-    """Check cores and memory of the machine or of its control group; a worker needs about 0.5 GiB."""
+    """Check cores and memory of the machine or of its control group."""
     cores, limits = _count_cores(), [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     group_limit = Path("/sys/fs/cgroup/memory.max")
     if group_limit.is_file() and (text := group_limit.read_text().strip()).isdigit():
         limits.append(int(text))
     memory = min(limits) // BYTES_PER_MIB
     finding = f"{cores} cores, {memory} MiB of memory"
-    if memory < 512 * cores:
-        return Check("cores and memory", finding, Verdict.WARN, f"run with --jobs {max(1, memory // 512)}")
+    if memory < WORKER_MEMORY_MIB * cores:
+        return Check(
+            "cores and memory", finding, Verdict.WARN, f"run with --jobs {max(1, memory // WORKER_MEMORY_MIB)}"
+        )
     return Check("cores and memory", finding)
 
 

@@ -37,7 +37,8 @@ def probe(backend: str) -> dict[str, Any]:
         raise SystemExit(f"cannot load the OpenGL libraries ({error})") from None
 
     x, y = (axis.ravel() for axis in np.meshgrid([-400.0, 400.0], [-400.0, 400.0]))
-    # in pyrender the centre of the first pixel has the coordinates (0.5, 0.5), and the y axis points up
+    # coordinates (right, down) of the pixel centres relative to the image centre, pixels
+    # pyrender puts the centre of the first pixel at (0.5, 0.5); the y axis of the camera points up
     u, v = np.meshgrid(np.arange(COLUMNS) + 0.5 - COLUMNS / 2, np.arange(ROWS) + 0.5 - ROWS / 2)
     camera = pyrender.IntrinsicsCamera(FOCAL_PX, FOCAL_PX, COLUMNS / 2, ROWS / 2, znear=NEAR_M, zfar=FAR_M)
     renderer = pyrender.OffscreenRenderer(COLUMNS, ROWS)

@@ -23,7 +23,7 @@ from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
-from marsyard.reports.traceability import junit_xml, requirement_evidence, tested_algorithms, verification_csv
+from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count, label, number, numbers, primary_metric
 
@@ -68,8 +68,8 @@ def write_evaluation(evaluation: Evaluation) -> Path:
     bound = next((v.bound / v.scale for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
     subject = Subject(random_run, metric, bound)
     extra_sections = [section for make in section_makers() if (section := make(subject)) is not None]
-    report_data = summary(evaluation, subject, extra_sections)
-    algorithms = tested_algorithms(run.record)
+    report_data = build_report_data(evaluation, subject, extra_sections)
+    algorithms = read_algorithms(run.record)
     write_atomic(directory / REPORT_JSON, json.dumps(report_data, indent=2, allow_nan=False) + "\n")
     rows = requirement_evidence(run.name, verdicts, algorithms, evaluation.evidence.title)
     write_atomic(directory / VERIFICATION_FILE, verification_csv(rows))
@@ -115,7 +115,7 @@ def page_context(
         "provenance": sections.list_provenance(run),
         "versions": sections.list_versions(run),
         "configuration": json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str),
-        "algorithms": tested_algorithms(run.record),
+        "algorithms": read_algorithms(run.record),
         "rerun": sections.rerun_commands(run),
         "rerun_is_stored": run.command is not None,
         "replay": sections.replay_command(run, "CASE"),
@@ -149,9 +149,9 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
             f"The cases are not independent random samples: {sampling.text}. Statistics describe these cases; "
             "intervals, bounds and probabilities on this page assume independent samples and do not apply to them."
         )
-    if run.sampled_from is not None:
+    if run.is_truncated:
         texts.append(
-            f"Verdicts, outcomes, answers, statistics and convergence use all {run.sampled_from:,} cases. Scatter "
+            f"Verdicts, outcomes, answers, statistics and convergence use all {len(run.all_cases):,} cases. Scatter "
             f"plots, conditions and drivers use the first {len(run.frame):,} cases, which are also a random sample."
         )
     nominal = run.frame[run.frame["case"] == 0] if sampling.nominal and "case" in run.frame else run.frame[:0]
@@ -163,7 +163,7 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     return texts
 
 
-def summary(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> dict[str, Any]:
+def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> dict[str, Any]:
     """Create the data of `report.json`; NaN and infinities become null."""
     run, sampling, overall_verdict = evaluation.run, evaluation.sampling, evaluation.overall_verdict
     metric = subject.metric
@@ -176,10 +176,10 @@ def summary(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[S
         "crashed": overall_verdict.crashed,
         "sites": _unique_values(run.frame, "site"),
         "algorithms": _unique_values(run.frame, "algorithm"),
-        "algorithm_details": [asdict(algorithm) for algorithm in tested_algorithms(run.record)],
+        "algorithm_details": [asdict(algorithm) for algorithm in read_algorithms(run.record)],
         "sampling": {**asdict(sampling), "independent": sampling.independent, "text": sampling.text},
         "evidence": {
-            **evaluation.evidence.table(),
+            **evaluation.evidence.to_table(),
             "title": evaluation.evidence.title,
             "text": evaluation.evidence.text,
         },

@@ -100,15 +100,15 @@ def summarize_algorithm(frame: pd.DataFrame, name: str, metric: str | None, boun
     """Summarize the rows of one algorithm; `name` is its label in the result."""
     magnitude = np.abs(numbers(frame, metric)) if metric is not None else np.full(len(frame), np.nan)
     finite = magnitude[np.isfinite(magnitude)]
-    n_within_bound = None
+    succeeded = None
     if metric is not None and bound is not None:
-        n_within_bound = int(success_mask(frame, metric, bound).sum()) if metric in frame else 0
+        succeeded = int(success_mask(frame, metric, bound).sum()) if metric in frame else 0
     return AlgorithmResult(
         name=name,
         cases=len(frame),
         answered=int(frame["answered"].eq(True).sum()),
         failed=int(frame["outcome"].isin(rates.ENGINE_FAILURES).sum()),
-        succeeded=n_within_bound,
+        succeeded=succeeded,
         median=float(np.median(finite)) if finite.size else math.nan,
         p95=float(np.quantile(finite, 0.95)) if finite.size else math.nan,
     )
@@ -283,15 +283,17 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
 def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[MetricComparison]]:
     """Return whether the campaigns' cases are paired, and the comparisons of the metrics of both campaigns."""
     frames, metrics = zip(*(list_metrics(run) for run in (first, second)), strict=True)
-    paired = same_draws(first, second)
+    paired = have_same_draws(first, second)
     second_metrics = {metric.name: metric for metric in metrics[1]}
     metric_pairs = [(metric, second_metrics[metric.name]) for metric in metrics[0] if metric.name in second_metrics]
-    test = _paired_p_value if paired else partial(_unpaired_p_value, common=have_same_terrains(first, second))
-    p_values = correct_holm([test(frames[0], a, frames[1], b) for a, b in metric_pairs])
+    compute_p_value = (
+        _paired_p_value if paired else partial(_unpaired_p_value, common=have_same_terrains(first, second))
+    )
+    p_values = correct_holm([compute_p_value(frames[0], a, frames[1], b) for a, b in metric_pairs])
     return paired, [MetricComparison(a.name, a, b, p) for (a, b), p in zip(metric_pairs, p_values, strict=True)]
 
 
-def same_draws(first: StoredRun, second: StoredRun) -> bool:
+def have_same_draws(first: StoredRun, second: StoredRun) -> bool:
     """Whether equal case numbers are the same case in both campaigns."""
     return all(
         first.recorded(key) == second.recorded(key) for key in ("name", "scenario", "seed", "dispersions", "design")

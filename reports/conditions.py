@@ -47,7 +47,8 @@ def conditions_section(subject: Subject) -> Section | None:
     if metric is None or not rates.is_flag(frame, "answered"):
         return None
     tables = {
-        c: [_summarize_bin(frame[mask], metric, name) for name, mask in bins] for c, bins in bin_conditions(frame)
+        column: [_summarize_bin(frame[mask], metric, name) for name, mask in bins]
+        for column, bins in bin_conditions(frame)
     }
     terrain_rows = [row for part in _signed_parts(frame, metric) if (row := terrain_variance(frame, part)) is not None]
     if not tables and not terrain_rows:
@@ -94,7 +95,7 @@ _TERRAINS_NOTE = note_text("common.terrains")
 
 
 def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
-    """Analysis of variance of an error column with terrains as random effects; None without repeated terrains.
+    """Analyse the variance of an error column with terrains as random effects; None without repeated terrains.
 
     Keys: `within_sd` of errors within a terrain, `between_sd` of the terrains' means, `share` of the variance between
     terrains (intraclass correlation), `p_value` of equal means (F-test).
@@ -106,22 +107,23 @@ def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
         return None
     _, index = np.unique(groups[finite], return_inverse=True)
     errors, sizes = values[finite], np.bincount(index).astype(np.float64)
-    n, k = errors.size, sizes.size
-    if k < 2 or n == k:
+    cases, terrains = errors.size, sizes.size
+    if terrains < 2 or cases == terrains:
         return None
     means = np.bincount(index, weights=errors) / sizes
-    within = float(((errors - means[index]) ** 2).sum()) / (n - k)
-    between = float((sizes * (means - errors.mean()) ** 2).sum()) / (k - 1)
+    within = float(((errors - means[index]) ** 2).sum()) / (cases - terrains)
+    between = float((sizes * (means - errors.mean()) ** 2).sum()) / (terrains - 1)
     # effective number of cases per terrain for terrains of unequal size
-    size = (n - float((sizes**2).sum()) / n) / (k - 1)
-    variance = max(between - within, 0.0) / size
+    effective_size = (cases - float((sizes**2).sum()) / cases) / (terrains - 1)
+    variance = max(between - within, 0.0) / effective_size
+    p_value = float(stats.f.sf(between / within, terrains - 1, cases - terrains)) if within > 0.0 else float("nan")
     return {
         "part": part,
-        "terrains": k,
+        "terrains": terrains,
         "within_sd": float(np.sqrt(within)),
         "between_sd": float(np.sqrt(variance)),
         "share": variance / (variance + within) if variance + within > 0.0 else 0.0,
-        "p_value": float(stats.f.sf(between / within, k - 1, n - k)) if within > 0.0 else float("nan"),
+        "p_value": p_value,
     }
 
 

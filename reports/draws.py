@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports.section import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
+from marsyard.reports.section import GRID, INK, MAX_VECTOR_POINTS, MUTED, RASTER_DPI, SERIES, in_page_style
 from marsyard.reports.wording import count, rank_correlation, split_unit
 
 #: Size of a marginal, height of a heading and margin of the figure, inches; minimum number of marginals in a row.
@@ -114,8 +114,8 @@ def save_figure(figure: Figure, path: Path) -> None:
 def _draw_marginal(axes: Axes, sample: ParameterSample) -> None:
     categories, values = sample.categories, sample.numbers(sample.values)
     expected = None if sample.expected is None else sample.numbers(sample.expected)
-    union = values if expected is None else np.concatenate([values, expected])
-    levels = np.unique(union)
+    all_values = values if expected is None else np.concatenate([values, expected])
+    levels = np.unique(all_values)
     if categories is not None or (levels.size <= 12 and np.all(levels == np.round(levels, 9))):
         positions = np.arange(levels.size)
         axes.bar(positions, [(values == level).sum() for level in levels], width=0.7, color=SERIES[0])
@@ -126,7 +126,9 @@ def _draw_marginal(axes: Axes, sample: ParameterSample) -> None:
         if len(names) <= _MAX_LABELS:
             axes.set_xticks(positions, [name if len(name) <= 14 else f"{name[:13]}…" for name in names])
     else:
-        edges = np.linspace(union.min(), union.max(), min(_BINS, max(5, int(math.sqrt(values.size) * 1.5))) + 1)
+        edges = np.linspace(
+            all_values.min(), all_values.max(), min(_BINS, max(5, int(math.sqrt(values.size) * 1.5))) + 1
+        )
         axes.hist(values, bins=edges.tolist(), color=SERIES[0], alpha=0.85)
         if expected is not None:
             counts = np.histogram(expected, bins=edges)[0] * (values.size / expected.size)
@@ -141,12 +143,13 @@ def _draw_pairs(axes: Axes, samples: Sequence[ParameterSample]) -> None:
     """Draw pairs of parameters: scatter in the lower left, rank correlations in the upper right."""
     size = len(samples)
     numbers = [sample.numbers(sample.values) for sample in samples]
+    # each value is scaled to its cell of side 1, with margins of 0.08
     scaled = [0.08 + 0.84 * (values - values.min()) / np.ptp(values) for values in numbers]
     pairs = [(row, column) for row in range(size) for column in range(row)]
     x = np.concatenate([column + scaled[column] for row, column in pairs])
     y = np.concatenate([row + 1.0 - scaled[row] for row, column in pairs])
-    marks: dict[str, Any] = {"s": 4.0, "color": SERIES[0], "alpha": 0.7, "linewidths": 0.0}
-    axes.scatter(x, y, rasterized=x.size > LARGEST_VECTOR_SAMPLE, **marks)
+    marker_style: dict[str, Any] = {"s": 4.0, "color": SERIES[0], "alpha": 0.7, "linewidths": 0.0}
+    axes.scatter(x, y, rasterized=x.size > MAX_VECTOR_POINTS, **marker_style)
     cells = [Rectangle((column + 0.03, row + 0.03), 0.94, 0.94) for row, column in pairs]
     axes.add_collection(PatchCollection(cells, facecolor="none", edgecolor=GRID, linewidth=0.8))
     for index, sample in enumerate(samples):

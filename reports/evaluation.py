@@ -65,7 +65,7 @@ def combine_verdicts(
         return OverallVerdict(worst, crashed, f"{would_be_met}{reason}{crash_text}")
     worst_count, total = statuses.count(worst), count(len(statuses), "requirement")
     fraction = f"{worst_count} of {total}"
-    few = (
+    subject = (
         "the requirement" if len(statuses) == 1 else f"any of the {total}" if worst_count == len(statuses) else fraction
     )
     undecided = statuses.count(Status.INSUFFICIENT)
@@ -74,12 +74,12 @@ def combine_verdicts(
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",
         Status.FAIL: f"{fraction} not met{undecided_text}.",
-        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {few}.{_remedy_text(verdicts)}",
+        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {subject}.{_remedy_text(verdicts)}",
     }[worst]
     return OverallVerdict(worst, crashed, sentence + crash_text)
 
 
-def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
+def compute_exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
     """Return the exit code: 1 for a failed requirement or a crashed case, 3 for an undecided one, 0 otherwise.
 
     MET BY RATE results in 3, unless the requirement has `accept_rate`.
@@ -119,7 +119,7 @@ class Evaluation:
     @property
     def exit_code(self) -> int:
         """The exit status of the verdicts."""
-        return exit_code(self.verdicts, bool(self.overall_verdict.crashed))
+        return compute_exit_code(self.verdicts, bool(self.overall_verdict.crashed))
 
 
 def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Evaluation:
@@ -130,7 +130,7 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     columns = _shipped_columns(str(run.configuration.get("scenario") or ""))
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
     verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling, from_truth, configured)
-    verdicts = [withhold(verdict, evidence) for verdict in verdicts]
+    verdicts = [withhold_verdict(verdict, evidence) for verdict in verdicts]
     if evidence.kind is EvidenceKind.CONFIRMATION and evidence.of_algorithm > 1:
         verdicts = _add_joint_verdicts(verdicts, run, sampling, evidence.of_algorithm)
     overall = combine_verdicts(verdicts, run.all_cases, sampling, evidence)
@@ -161,7 +161,7 @@ def read_evidence(record: Mapping[str, Any], *, own_requirements: bool = True) -
     return replace(evidence, kind=EvidenceKind.CHANGED, changes=tuple(changes)) if changes else evidence
 
 
-def withhold(verdict: Verdict, evidence: Evidence) -> Verdict:
+def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
     """Replace PASS and MET BY RATE by INSUFFICIENT if the algorithm was not frozen before its cases were seen."""
     if not evidence.withheld or verdict.status not in (Status.PASS, Status.MET_BY_RATE):
         return verdict

@@ -36,6 +36,8 @@ from marsyard.reports.wording import count as count_text
 ELLIPSE = 0.95
 #: Maximum error on the axis divided by the bound; larger errors are counted, not drawn to scale.
 _MAX_EDGE_RATIO = 3.0
+#: If all errors are below this fraction of the bound, an axis does not include the bound.
+_MIN_BOUND_FRACTION = 0.6
 #: If more than this fraction of the errors lies beyond that axis, the axis ends at this quantile of the errors instead.
 _MAX_FRACTION_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
 #: Number of cases per point of the curves of median and 95 % quantile; minimum and maximum number of points.
@@ -131,10 +133,10 @@ def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float
 
 
 def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
-    """Whether all errors are below 60 % of the bound, so that an enlarged figure is needed."""
+    """Whether all errors are so far below the bound that an enlarged figure is needed."""
     magnitude = np.abs(numbers(frame, metric))
     finite = magnitude[np.isfinite(magnitude)]
-    return bound is not None and finite.size > 0 and 0.0 < float(finite.max()) < 0.6 * bound
+    return bound is not None and finite.size > 0 and 0.0 < float(finite.max()) < _MIN_BOUND_FRACTION * bound
 
 
 @in_page_style
@@ -223,7 +225,7 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
     ticks: dict[str, Any] = {"color": INK, "markersize": 9, "clip_on": False}
-    ticks["rasterized"] = bool(unanswered.sum() > section.LARGEST_VECTOR_SAMPLE)
+    ticks["rasterized"] = bool(unanswered.sum() > section.MAX_VECTOR_POINTS)
     axes.plot(x[unanswered], np.full(unanswered.sum(), top), "|", **ticks)
     axes.set(xlabel=label(driver), ylabel=magnitude_label(metric), ylim=(0.0, top))
     axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -234,7 +236,7 @@ def _scatter_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> f
     """Compute the largest magnitude drawn to scale; the axis includes the bound if the errors approach the bound."""
     edge = axis_edge(magnitudes, bound)
     largest = float(magnitudes.max()) if magnitudes.size else 0.0
-    includes_bound = bound is not None and 1.12 * largest > 0.6 * bound
+    includes_bound = bound is not None and 1.12 * largest > _MIN_BOUND_FRACTION * bound
     return edge if includes_bound or largest == 0.0 else largest
 
 
@@ -273,7 +275,7 @@ def _annotate(axes: Axes, text: str, position: tuple[Any, Any], offset: tuple[in
 
 def _finite_magnitudes(
     frame: pd.DataFrame, metric: str, bound: float | None
-) -> tuple[Float[np.ndarray, " known"], float]:
+) -> tuple[Float[np.ndarray, " finite"], float]:
     magnitude = np.abs(numbers(frame, metric))
     finite = magnitude[np.isfinite(magnitude)]
     return finite, axis_edge(finite, bound)
@@ -282,7 +284,7 @@ def _finite_magnitudes(
 def _draw_points(
     axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], category: Category, *, hollow: bool = False
 ) -> None:
-    dense = x.size > section.LARGEST_VECTOR_SAMPLE
+    dense = x.size > section.MAX_VECTOR_POINTS
     axes.plot(
         x, y, linestyle="", marker=category.marker, markersize=3.0 if dense else 5.5, alpha=0.55 if dense else 0.85,
         markeredgewidth=1.0 if hollow else 0.0, markerfacecolor="none" if hollow else category.colour,

@@ -19,9 +19,9 @@ from marsyard.reports.statistics.changes import Sample, correct_holm, difference
 from marsyard.reports.wording import count, format_fraction, number, percent
 
 #: Version of the tables, as `PRAGMA user_version`.
-SCHEMA = 1
-#: Maximum number of earlier nights in the comparison of a night.
-WINDOW = 30
+SCHEMA_VERSION = 1
+#: Maximum number of earlier nights with which a night is compared.
+MAX_EARLIER_NIGHTS = 30
 #: Maximum number of stored cases per metric and night.
 MAX_CASES = 10_000
 
@@ -77,10 +77,10 @@ class History:
             self._connection.execute("PRAGMA synchronous = FULL")
             version = self._connection.execute("PRAGMA user_version").fetchone()[0]
             if is_new or (version == 0 and not self._connection.execute("SELECT * FROM sqlite_master").fetchall()):
-                tables = f"PRAGMA user_version = {SCHEMA}; {_TABLES.read_text(encoding='utf-8')}"
+                tables = f"PRAGMA user_version = {SCHEMA_VERSION}; {_TABLES.read_text(encoding='utf-8')}"
                 self._connection.executescript(f"BEGIN; {tables} COMMIT;")
-            elif version != SCHEMA:
-                raise StoreError(f"{path} has schema {version}; this version of Marsyard reads {SCHEMA}")
+            elif version != SCHEMA_VERSION:
+                raise StoreError(f"{path} has schema {version}; this version of Marsyard reads {SCHEMA_VERSION}")
         except sqlite3.Error as error:
             raise StoreError(f"{path} is not a history of nights: {error}") from error
 
@@ -102,7 +102,7 @@ class History:
 
     def add(self, night: int, campaign: NightCampaign, metrics: Sequence[NightMetric]) -> None:
         """Store the result of a campaign in a night."""
-        rows, head = [], (campaign.name, campaign.definition, campaign.directory)
+        rows, identity = [], (campaign.name, campaign.definition, campaign.directory)
         for metric in metrics:
             values, terrains = metric.sample.values[:MAX_CASES], metric.sample.terrains[:MAX_CASES]
             blobs = values.astype("<f4").tobytes(), terrains.astype("<i8").tobytes()
@@ -110,7 +110,7 @@ class History:
         with self._transaction():
             self._connection.execute(
                 "INSERT INTO campaigns VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (night, *head, campaign.verdict, campaign.exit_code, campaign.sentence),
+                (night, *identity, campaign.verdict, campaign.exit_code, campaign.sentence),
             )
             self._connection.executemany("INSERT INTO figures VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
 
@@ -161,7 +161,7 @@ class History:
                 (SELECT MAX(night) FROM changes WHERE campaign = f.campaign AND figure = f.figure AND night < ?), 0)
             ORDER BY f.night DESC LIMIT ?
             """,
-            (night, campaign.name, metric, campaign.definition, FINISHED, night, WINDOW),
+            (night, campaign.name, metric, campaign.definition, FINISHED, night, MAX_EARLIER_NIGHTS),
         )
         return [_unpack(*row) for row in rows]
 
@@ -190,9 +190,10 @@ def _unpack(values: bytes, terrains: bytes) -> Sample:
 
 
 #: Maximum probability of at least one false alarm in a night in which no metric has changed.
-FALSE_ALARMS = 0.01
-#: Significance level of changes; the other half of the probability is for the nights after a false alarm.
-_SIGNIFICANCE = 0.5 * FALSE_ALARMS
+MAX_FALSE_ALARM_PROBABILITY = 0.01
+#: Significance level of changes. The other half of the probability allows for a second false alarm: after a false
+#: alarm, the only reference is one unusual night (docs/adr/0027).
+_SIGNIFICANCE = 0.5 * MAX_FALSE_ALARM_PROBABILITY
 #: Expected number of permutations that exceed a change at the significance level.
 _MIN_EXCEEDANCES = 10
 
@@ -216,7 +217,7 @@ class Change:
     nights: int
 
     @property
-    def worse(self) -> bool:
+    def is_regression(self) -> bool:
         """Whether the change is a regression."""
         return self.now < self.before if self.is_rate else self.now > self.before
 
@@ -231,7 +232,7 @@ class Comparison:
 
 
 def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
-    """Find the changed metrics of a night, with a family-wise false alarm rate of at most `FALSE_ALARMS`."""
+    """Find the changed metrics of a night, with at most `MAX_FALSE_ALARM_PROBABILITY` of any false alarm."""
     pooled: list[Sample | None] = []
     for comparison in comparisons:
         parts = ([getattr(sample, part) for sample in comparison.before] for part in ("values", "terrains"))
@@ -248,8 +249,8 @@ def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
             campaign=comparison.campaign,
             metric=comparison.metric.name,
             is_rate=comparison.metric.is_rate,
-            before=summary_value(earlier, comparison.metric.is_rate),
-            now=summary_value(comparison.metric.sample, comparison.metric.is_rate),
+            before=compute_summary(earlier, comparison.metric.is_rate),
+            now=compute_summary(comparison.metric.sample, comparison.metric.is_rate),
             p_value=p,
             nights=len(comparison.before),
         )
@@ -267,7 +268,7 @@ def list_comparisons(history: History, night: int) -> list[Comparison]:
     ]
 
 
-def summary_value(sample: Sample, is_rate: bool) -> float:
+def compute_summary(sample: Sample, is_rate: bool) -> float:
     """Compute the rate or the median; NaN for no cases."""
     values = sample.finite_cases().values
     if values.size == 0:
@@ -275,20 +276,21 @@ def summary_value(sample: Sample, is_rate: bool) -> float:
     return float(values.mean() if is_rate else np.median(values))
 
 
-def night_text(
+def format_night_page(
     night: Night, earlier: Sequence[Night], campaigns: Sequence[NightCampaign], changes: Sequence[Change], compared: int
 ) -> str:
     """Format the night's page in Markdown.
 
     - earlier: previous nights, the latest first
-    - changes, compared: changed metrics, and number of compared metrics
+    - changes: changed metrics
+    - compared: number of compared metrics
     """
-    regressions = [change for change in changes if change.worse]
-    improvements = [change for change in changes if not change.worse]
-    counts = Counter(campaign.verdict for campaign in campaigns)
+    regressions = [change for change in changes if change.is_regression]
+    improvements = [change for change in changes if not change.is_regression]
+    verdict_counts = Counter(campaign.verdict for campaign in campaigns)
     headline, end = night.state.upper(), f"{night.state}: its metrics are excluded from comparisons"
     if night.state == FINISHED:
-        verdicts = ", ".join(f"{cases} {word}" for word, cases in counts.items())
+        verdicts = ", ".join(f"{n_campaigns} {verdict}" for verdict, n_campaigns in verdict_counts.items())
         headline = verdicts + (f", {count(len(regressions), 'regression')}" if regressions else "")
         end = f"ended {night.finished_utc}"
     lines = [f"# Night {night.night}: {headline}", ""]
@@ -307,7 +309,7 @@ def night_text(
             lines.append(f"- **{_escape(change.campaign)}: {_escape(change.metric)}**: {values}")
     text = (
         f"{count(compared, 'metric')} compared with earlier nights; the probability of a false alarm is at most "
-        f"{format_fraction(FALSE_ALARMS)}.{'' if changes else ' No metric has changed.'}"
+        f"{format_fraction(MAX_FALSE_ALARM_PROBABILITY)}.{'' if changes else ' No metric has changed.'}"
     )
     lines += ["", text if compared else "No metric has a history for a comparison yet.", ""]
     return "\n".join(lines)

@@ -25,9 +25,10 @@ from marsyard.reports.wording import NOTHING, coefficient, format_fraction, labe
 
 Rows = pd.DataFrame
 BlocksAndData = tuple[Sequence[Block], Mapping[str, Any]]
-RateOf = Callable[[Rows], CaseFraction | PooledRate]
-#: Number of bins of a condition with equally many cases, and the minimum number of cases of a bin.
-_BINS, _MIN_IN_BIN = 5, 4
+#: Function that computes a rate of rows.
+RateFunction = Callable[[Rows], CaseFraction | PooledRate]
+#: Maximum number of bins of a condition (bins contain equally many cases), and minimum number of cases of a bin.
+_N_BINS, _MIN_IN_BIN = 5, 4
 #: Maximum number of values of a condition with a row each.
 _MAX_VALUES = 24
 
@@ -103,8 +104,8 @@ class Quantity:
         return np.asarray(self.scale * numbers(frame, self.column))
 
 
-def flag_rate(name: str, *given: str, value: bool = True) -> RateOf:
-    """Return a function: fraction of rows with flag == `value`, of the rows where all flags `given` are true."""
+def flag_rate(name: str, *given: str, value: bool = True) -> RateFunction:
+    """Return a function that computes how often the flag `name` equals `value`, among rows with all flags `given`."""
 
     def compute_rate(frame: Rows) -> CaseFraction:
         all_rows = np.ones(len(frame), dtype=np.bool_)
@@ -115,7 +116,7 @@ def flag_rate(name: str, *given: str, value: bool = True) -> RateOf:
     return compute_rate
 
 
-def pooled_fraction(numerator: str, denominator: str) -> RateOf:
+def pooled_fraction(numerator: str, denominator: str) -> RateFunction:
     """Return a function that divides the sum of one column of counts by that of another, over all rows."""
     return lambda frame: rates.pooled_rate(frame, numerator, denominator)
 
@@ -126,7 +127,7 @@ class Rate:
 
     key: str
     name: str
-    of: RateOf
+    compute: RateFunction
     in_figure: bool = True
 
 
@@ -148,7 +149,7 @@ class RateTable:
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
         """Create a table of the rates that have cases."""
-        rates_by_name = self.rates(frame) if callable(self.rates) else {r.name: r.of(frame) for r in self.rates}
+        rates_by_name = self.rates(frame) if callable(self.rates) else {r.name: r.compute(frame) for r in self.rates}
         rows = [
             [name, rates.fraction_text(rate), rates.interval_text(rate, shared=self.shared)]
             for name, rate in rates_by_name.items()
@@ -186,7 +187,7 @@ class RateByCondition:
         values = self.by.values(frame)
         records = []
         for mask in condition_bins(values, _MAX_VALUES):
-            bin_rates = {rate.key: rate.of(frame[mask]) for rate in self.rates}
+            bin_rates = {rate.key: rate.compute(frame[mask]) for rate in self.rates}
             records.append((float(np.median(values[mask])), int(mask.sum()), bin_rates))
         limit = None if self.limit is None else (self.limit[0], self.limit[1](subject))
         x = [value for value, _, _ in records]
@@ -211,16 +212,17 @@ class RateByCondition:
         return [block, Block(grid=grid, note=self.note)], data
 
 
-def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _BINS) -> list[Bool[np.ndarray, " n"]]:
+def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _N_BINS) -> list[Bool[np.ndarray, " n"]]:
     """Create a mask for each value, or for bins of equally many cases if there are many values; NaN is in no mask."""
     finite = np.isfinite(values)
     distinct = np.unique(values[finite])
     if distinct.size <= max_values:
         return [values == value for value in distinct]
-    bins = max(1, min(_BINS, int(finite.sum()) // _MIN_IN_BIN))
-    ranks = np.full(values.size, -1)
-    ranks[finite] = np.argsort(np.argsort(values[finite], kind="stable"), kind="stable") * bins // int(finite.sum())
-    return [ranks == k for k in range(bins)]
+    bins = max(1, min(_N_BINS, int(finite.sum()) // _MIN_IN_BIN))
+    ranks = np.argsort(np.argsort(values[finite], kind="stable"), kind="stable")
+    bin_numbers = np.full(values.size, -1)
+    bin_numbers[finite] = ranks * bins // int(finite.sum())
+    return [bin_numbers == k for k in range(bins)]
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,11 @@ def read_paper(path: Path) -> Mapping[str, Any]:
 class PaperFacts:
     """A paper's numbers of single runs next to those of Marsyard: `[[facts]]` of its TOML file.
 
-    Keys: `campaign` (that repeats the run), `title`, `source`, `note`, and `rows`. Keys of a row: `name` (with its
-    unit), `paper` (text, a dash by default), `column`, and optionally `statistic` (``spread``, the median with minimum
-    and maximum, or ``rate``), `among` (flags that select rows), `scale`, `digits`, and `magnitude` (remove signs).
+    Keys: `campaign` (that repeats the run), `title`, `source`, `note`, and `rows`. Keys of a row:
+
+    - `name` with its unit, `paper` (text, a dash by default), `column`
+    - optional: `statistic` (``spread``: median, minimum and maximum; or ``rate``), `among` (flags that select rows),
+      `scale`, `digits`, `magnitude` (remove signs)
 
     extra_parts: additional parts of the section by campaign name
     """
@@ -48,7 +50,7 @@ class PaperFacts:
             for row in facts["rows"]
         }
         grid = Grid(["", "Paper", "Ours"], [[name, *fact.values()] for name, fact in data.items()])
-        blocks = [Block(grid=grid, note=f"{_MEDIANS} {facts.get('note', '')}".strip())]
+        blocks = [Block(grid=grid, note=f"{_VALUES_NOTE} {facts.get('note', '')}".strip())]
         if subject.run.name in self.extra_parts:
             extra_blocks, extra_data = self.extra_parts[subject.run.name].draw(subject.frame, subject, "paper")
             blocks += extra_blocks
@@ -56,13 +58,13 @@ class PaperFacts:
         return Section("paper", "Paper comparison", facts["title"], blocks, data)
 
 
-_MEDIANS = (
+_VALUES_NOTE = (
     '"Ours" is the median over all cases, with minimum to maximum in brackets. A dash means that no value is printed.'
 )
 
 
 def format_simulated_value(frame: Rows, row: Mapping[str, Any]) -> str:
-    """Format Marsyard's value of a paper's quantity."""
+    """Format Marsyard's value of a quantity of a paper; `row` is a row of `PaperFacts`."""
     rows, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
     if row.get("statistic") == "rate":
         return fraction_text(flag_fraction(rows, column)) if column in rows else NOTHING

@@ -67,7 +67,8 @@ class Presentation:
     """Report sections and case figures of a system.
 
     - cases: kinds of case; the first kind that matches the products is used
-    - first, sections: functions that create sections in front of and after those of every campaign
+    - first: functions that create the sections in front of those of every campaign
+    - sections: functions that create the sections after those of every campaign
     - outcomes: enumerations of the outcomes; the values describe the outcomes
     """
 

@@ -69,7 +69,7 @@ def engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
 
 
 def population_mask_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """Create the mask of a population, extended by unfinished cases that a valid answer would add to it."""
+    """Create the mask of a population, extended by the unfinished cases that would belong to it with a valid answer."""
     flags = [part for part in population.split(" and ") if part not in ("valid", "completed")]
     return np.asarray(
         population_mask(frame, population) | (population_and_unknown_masks(frame, flags)[0] & engine_failed(frame))

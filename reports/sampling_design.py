@@ -34,13 +34,14 @@ class TerrainSupply:
 
     def advice(self, needed: int, probability: float, confidence: float) -> str:
         """Explain that the campaign needs more terrains (`needed`), not more cases, and how to configure them."""
-        level = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
+        requirement = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
         stored = f"{count(self.terrains, 'stored terrain')} ({self.key} = {self.terrains})"
-        limit = f"The campaign has only {stored}."
+        shortage = f"The campaign has only {stored}."
         if self.terrains >= needed:
-            limit = f"Terrains are drawn at random and can repeat, so the {stored} are unlikely to give as many."
+            shortage = f"Terrains are drawn at random and can repeat, so the {stored} are unlikely to give as many."
         text = (
-            f"To show a success rate of {level}, the cases must include at least {needed:,} different terrains. {limit}"
+            f"To show a success rate of {requirement}, the cases must include at least {needed:,} different terrains. "
+            f"{shortage}"
         )
         if not self.key.endswith(".bank"):
             return f"{text} Widen the range of {self.key}, and the bank, and run the campaign again."

@@ -27,12 +27,12 @@ from marsyard.reports.stored import StoredRun
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Colours of the figures as drawn, and the page's colours that replace them.
+#: Colours in which matplotlib draws the figures, and the CSS colours of the page that replace them.
 INK, MUTED, GRID = "#10161d", "#5a6672", "#d3d9e0"
 _THEME = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"}
 
-#: Colours and markers of categories, from Okabe & Ito's palette for colour-blind readers, in tones with a contrast of
-#: 3:1 on the light and the dark page; colour is never the only distinction.
+#: Colours and markers of categories. The colours are those of Okabe & Ito's palette for colour-blind readers, adjusted
+#: to a contrast of 3:1 on the light and the dark page. Colour is never the only distinction.
 SERIES = ("#2f83d6", "#cf6a14", "#1c9a76", "#b262b2", "#9c7f12", "#78838f")
 MARKERS = ("o", "^", "s", "D", "v", "P")
 REQUIREMENT = "#d0392f"
@@ -46,7 +46,7 @@ BARS: Mapping[str, Mapping[str, Any]] = {
 }
 
 #: Maximum number of points drawn as vectors; more points are drawn as pixels, to keep pages small.
-LARGEST_VECTOR_SAMPLE = 800
+MAX_VECTOR_POINTS = 800
 #: Dots per inch of parts drawn as pixels: twice the resolution of a screen.
 RASTER_DPI = 160
 

@@ -30,7 +30,7 @@ from marsyard.reports.section import Grid, SvgFigure, svg_figure
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import outcome_counts
-from marsyard.reports.traceability import tested_algorithms
+from marsyard.reports.traceability import read_algorithms
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import (
     NOTHING,
@@ -198,7 +198,7 @@ def list_provenance(run: StoredRun) -> list[tuple[str, str]]:
     environment, times = table(run.recorded("environment")), numbers(run.frame, "cpu_time_s")
     times = times[np.isfinite(times)]
     algorithms: list[tuple[str, Any]] = []
-    for item in tested_algorithms(run.record):
+    for item in read_algorithms(run.record):
         title = "Algorithm under test" if item.tested else "Algorithm compared"
         algorithms += [(title, item.name), (f"{title}: class or file", item.path), (f"{title}: version", item.version)]
         algorithms += [(f"{title}: source hash", item.source_hash), (f"{title}: options", item.options_text)]

@@ -39,9 +39,9 @@ class StoredRun:
     showcases: tuple[int, ...]
 
     @property
-    def sampled_from(self) -> int | None:
-        """Number of all cases if `frame` contains only the first cases; otherwise None."""
-        return len(self.all_cases) if len(self.all_cases) > len(self.frame) else None
+    def is_truncated(self) -> bool:
+        """Whether `frame` contains only the first cases."""
+        return len(self.all_cases) > len(self.frame)
 
     @property
     def configuration(self) -> Mapping[str, Any]:

@@ -46,7 +46,7 @@ class Algorithm:
         return json.dumps(self.options, ensure_ascii=False) if self.options else ""
 
 
-def tested_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
+def read_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
     """Read the algorithms from a campaign's record, the algorithm under test first; old records contain only names."""
     stored_list = record.get("algorithms")
     entries = [table(entry) for entry in stored_list] if isinstance(stored_list, list) else []
@@ -102,16 +102,16 @@ def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
 
 
 #: Columns of the matrix in front of and after those of the algorithm, and the verdict's property in each column.
-_REQUIREMENT = {"requirement": "requirement_id", "statement": "statement", "kind": "kind", "source": "source"}
-_EVIDENCE = {
+_REQUIREMENT_COLUMNS = {"requirement": "requirement_id", "statement": "statement", "kind": "kind", "source": "source"}
+_EVIDENCE_COLUMNS = {
     "verdict": "status", "metric": "metric", "bound": "bound", "population": "population", "probability": "probability",
     "confidence": "confidence", "decided_by": "decide_by", "cases": "n", "failures": "failures", "terrains": "terrains",
     "rate": "estimate", "lower_bound": "lower", "upper_bound": "upper", "design_effect": "design_effect",
     "consumer_risk": "consumer_risk", "further_cases": "further_cases", "note": "note",
 }  # fmt: skip
 #: Columns of the result on all cases, and its fields.
-_ALL_CASES = {"all_cases": "n", "all_failures": "failures", "all_rate": "estimate", "all_verdict": "status"}
-COLUMNS = (*_REQUIREMENT, "campaign", *algorithm_cells(()), *_EVIDENCE, *_ALL_CASES, "evidence")
+_ALL_CASES_COLUMNS = {"all_cases": "n", "all_failures": "failures", "all_rate": "estimate", "all_verdict": "status"}
+COLUMNS = (*_REQUIREMENT_COLUMNS, "campaign", *algorithm_cells(()), *_EVIDENCE_COLUMNS, *_ALL_CASES_COLUMNS, "evidence")
 
 
 def requirement_evidence(
@@ -121,12 +121,14 @@ def requirement_evidence(
     cells = {"campaign": campaign, **algorithm_cells(algorithms), "evidence": evidence_kind}
     rows = []
     for verdict in verdicts:
-        evidence = {column: getattr(verdict, name) for column, name in _EVIDENCE.items()}
+        evidence = {column: getattr(verdict, name) for column, name in _EVIDENCE_COLUMNS.items()}
         if verdict.all_cases is not None:
-            evidence |= {column: getattr(verdict.all_cases, name) for column, name in _ALL_CASES.items()}
+            evidence |= {column: getattr(verdict.all_cases, name) for column, name in _ALL_CASES_COLUMNS.items()}
         evidence["verdict"] = str(verdict.status)
         evidence["metric"] = verdict.metric if verdict.scale == 1.0 else f"{verdict.scale:g} * ({verdict.metric})"
-        rows.append({column: getattr(verdict, name) for column, name in _REQUIREMENT.items()} | cells | evidence)
+        rows.append(
+            {column: getattr(verdict, name) for column, name in _REQUIREMENT_COLUMNS.items()} | cells | evidence
+        )
     return rows
 
 
@@ -157,7 +159,7 @@ def junit_xml(
     statuses = [verdict.status for verdict in verdicts]
     suite = Xml.Element(
         "testsuite",
-        name=_text(campaign),
+        name=_clean_xml(campaign),
         tests=str(len(verdicts) + 1),
         failures=str(statuses.count(Status.FAIL) + bool(overall.crashed)),
         skipped=str(sum(status in _UNDECIDED for status in statuses)),
@@ -166,12 +168,14 @@ def junit_xml(
     if cells:
         properties = Xml.SubElement(suite, "properties")
         for name, value in cells.items():
-            Xml.SubElement(properties, "property", name=name, value=_text(value))
+            Xml.SubElement(properties, "property", name=name, value=_clean_xml(value))
     tested = format_tested_algorithms(algorithms)
     tested_text = f"Under test: {tested}. " if tested else ""
     for verdict in verdicts:
-        test_case = Xml.SubElement(suite, "testcase", classname=_text(campaign), name=_text(verdict.requirement_id))
-        message = _text(
+        test_case = Xml.SubElement(
+            suite, "testcase", classname=_clean_xml(campaign), name=_clean_xml(verdict.requirement_id)
+        )
+        message = _clean_xml(
             f"{verdict.failures} of {verdict.n} failed; at least {verdict.lower:.6g}, "
             f"required {verdict.probability:g}. {verdict.note}"
         )
@@ -179,14 +183,14 @@ def junit_xml(
             Xml.SubElement(test_case, "failure", message=message, type=str(verdict.status))
         elif verdict.status in _UNDECIDED:
             Xml.SubElement(test_case, "skipped", message=f"{verdict.status}: {message}")
-        Xml.SubElement(test_case, "system-out").text = _text(f"{tested_text}{verdict.statement} {message}")
-    completion = Xml.SubElement(suite, "testcase", classname=_text(campaign), name="all cases end")
+        Xml.SubElement(test_case, "system-out").text = _clean_xml(f"{tested_text}{verdict.statement} {message}")
+    completion = Xml.SubElement(suite, "testcase", classname=_clean_xml(campaign), name="all cases end")
     if overall.crashed:
         Xml.SubElement(completion, "failure", message=f"{count(overall.crashed, 'case')} crashed", type="CRASHED")
     Xml.indent(suite)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{Xml.tostring(suite, encoding="unicode")}\n'
 
 
-def _text(text: str) -> str:
+def _clean_xml(text: str) -> str:
     """Replace characters that XML does not allow."""
     return _INVALID_XML.sub("�", text)

@@ -70,9 +70,9 @@ class AllCases:
     def text(self) -> str:
         """The result in a sentence."""
         cases = f"all {self.n:,} {population_text(' and '.join(self.configured))}"
-        met = f"{self.n - self.failures:,} ({percent(self.estimate)}) would meet the criterion"
-        counted = f"if {cases} counted, and cases without a value were failures"
-        return f"For comparison: {counted}, {met}, and the verdict would be {self.status}."
+        successes = f"{self.n - self.failures:,} ({percent(self.estimate)}) would meet the criterion"
+        condition = f"if {cases} counted, and cases without a value were failures"
+        return f"For comparison: {condition}, {successes}, and the verdict would be {self.status}."
 
 
 @dataclass(frozen=True)
@@ -218,6 +218,7 @@ class Verdict:
         )
 
 
+#: Mask of the successful cases, and terrain number of each case.
 Success = Bool[np.ndarray, " n"]
 Groups = Int[np.ndarray, " n"]
 
@@ -241,6 +242,7 @@ def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks:
     """
     n, failures, probability, confidence = success.size, verdict.failures, verdict.probability, verdict.confidence
     first_n = n if looks.in_first_look is None else int(looks.in_first_look.sum())
+    # confidences of the lower and of the upper bound
     levels = _confidences(first_n, n, probability, confidence, looks)
     lower = proportions.proportion_lower(n - failures, n, levels[0])
     upper = proportions.proportion_upper(n - failures, n, levels[1])
@@ -250,7 +252,8 @@ def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks:
         return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), needed - n
     evidence = clustered_evidence(success, groups, confidence)
     in_first_look = np.ones(n, dtype=np.bool_) if looks.in_first_look is None else looks.in_first_look
-    if np.unique(groups[in_first_look]).size != first_n:  # effective number of independent cases at the first look
+    if np.unique(groups[in_first_look]).size != first_n:
+        # effective number of independent cases at the first look
         first_n = math.floor(clustered_evidence(success[in_first_look], groups[in_first_look], confidence).effective_n)
     levels = _confidences(first_n, evidence.effective_n, probability, confidence, looks)
     by_level = [clustered_evidence(success, groups, level) for level in levels]
@@ -338,9 +341,9 @@ def _evaluate_all_cases(
 
 def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign) -> Verdict:
     verdict = _empty_verdict(requirement)
-    fault = _describe_fault(frame, verdict)
-    if fault:
-        return replace(verdict, reason=fault)
+    problem = _describe_problem(frame, verdict)
+    if problem:
+        return replace(verdict, reason=problem)
     try:
         population = frame[rates.population_mask(frame, verdict.population)]
         population_and_unfinished = frame[rates.population_mask_if_answered(frame, verdict.population)]
@@ -378,13 +381,13 @@ def _decide(verdict: Verdict, population: pd.DataFrame, sampling: SamplingDesign
     n, failures, groups = success.size, int((~success).sum()), rates.terrain_groups(population)
     rate, by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
     terrains = None if groups is None else int(population["terrain"].nunique())
-    counted = replace(verdict, n=n, failures=failures, estimate=rate, terrains=terrains)
+    with_counts = replace(verdict, n=n, failures=failures, estimate=rate, terrains=terrains)
     if not sampling.independent:
         reason = f"{'Decided by the rate of these cases. ' if by_rate else ''}{sampling.no_probability}"
         status = _status_by_rate(rate, n, verdict.probability) if by_rate else verdict.status
-        return replace(counted, status=status, reason=reason)
+        return replace(with_counts, status=status, reason=reason)
     looks = Looks(sampling.mask_first_look(frame, population), sampling.risk_fraction_at(len(frame)))
-    evaluated, additional = add_bounds(counted, success, groups, looks)
+    evaluated, additional = add_bounds(with_counts, success, groups, looks)
     status = evaluated.confident_status
     by_rate = by_rate and status is not Status.PASS
     if by_rate:
@@ -422,7 +425,7 @@ def compare_bounds(lower: float, upper: float, probability: float) -> Status:
     return Status.FAIL if upper < probability else Status.INSUFFICIENT
 
 
-def _describe_fault(frame: pd.DataFrame, verdict: Verdict) -> str:
+def _describe_problem(frame: pd.DataFrame, verdict: Verdict) -> str:
     """Describe why a requirement cannot be evaluated; empty if it can."""
     for name in ("probability", "confidence"):
         value = getattr(verdict, name)
@@ -445,19 +448,19 @@ def _empty_verdict(requirement: Mapping[str, Any]) -> Verdict:
         requirement_id=str(requirement.get("id", "?")),
         statement=statement,
         metric=str(requirement.get("metric", "?")),
-        bound=_number(requirement.get("bound")),
-        probability=_number(requirement.get("probability")),
-        confidence=_number(requirement.get("confidence")),
+        bound=_to_float(requirement.get("bound")),
+        probability=_to_float(requirement.get("probability")),
+        confidence=_to_float(requirement.get("confidence")),
         population=str(requirement.get("population", "all")),
         decide_by=decide_by,
         source=str(requirement.get("source") or ""),
         kind=str(requirement.get("kind") or ""),
-        scale=_number(requirement.get("scale", 1.0)),
+        scale=_to_float(requirement.get("scale", 1.0)),
         accept_rate=requirement.get("accept_rate") is True,
     )
 
 
-def _number(value: object) -> float:
+def _to_float(value: object) -> float:
     try:
         return float(value)  # type: ignore[arg-type]  # anything a JSON file may hold
     except (TypeError, ValueError):

@@ -27,7 +27,7 @@ _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "va
 def requirement_text(requirement: Any) -> str:
     """Describe the criterion of a requirement (of a campaign or of a verdict) in words."""
     metric, (name, unit) = requirement.metric, split_unit(requirement.metric)
-    condition = _notes()["metrics"].get(metric, _words(metric if requirement.bound is None else name))
+    condition = _read_notes()["metrics"].get(metric, _to_words(metric if requirement.bound is None else name))
     if requirement.bound is not None and not math.isnan(requirement.bound):
         scaled = "" if requirement.scale == 1.0 else f"{requirement.scale:g} × "
         magnitude = condition if unit == "s" else f"|{condition}|"
@@ -43,9 +43,9 @@ def population_text(population: str) -> str:
     """Describe a population: ``valid answers``, ``cases with feasible overlap``."""
     parts = population.split(" and ")
     base = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
-    phrases = _notes()["populations"]
+    phrases = _read_notes()["populations"]
     flags = [part for part in parts if part and part not in _POPULATIONS]
-    texts = [phrases.get(flag, f"with {_words(flag.removeprefix('with_'))}") for flag in flags]
+    texts = [phrases.get(flag, f"with {_to_words(flag.removeprefix('with_'))}") for flag in flags]
     return f"{base} {', '.join(texts)}" if texts else base
 
 
@@ -82,7 +82,7 @@ def p_text(value: float) -> str:
 
 
 def interval(lower: float, upper: float) -> str:
-    """Format two bounds; only the finite one, or a dash, if the sample is too small for both."""
+    """Format two bounds, or one bound if the other is not finite; a dash if both are not finite."""
     if math.isfinite(lower) and math.isfinite(upper):
         return f"{number(lower)} to {number(upper)}"
     if math.isfinite(lower):
@@ -124,7 +124,7 @@ def plain_value(value: object) -> str:
 
 
 @cache
-def _notes() -> Mapping[str, Mapping[str, str]]:
+def _read_notes() -> Mapping[str, Mapping[str, str]]:
     with (Path(__file__).parent / "templates" / "notes.toml").open("rb") as file:
         return tomllib.load(file)
 
@@ -132,7 +132,7 @@ def _notes() -> Mapping[str, Mapping[str, str]]:
 def note_text(key: str, **values: object) -> str:
     """Return a text of `templates/notes.toml` by ``table.key``, with its values filled in."""
     table, name = key.split(".")
-    return _notes()[table][name].format(**values)
+    return _read_notes()[table][name].format(**values)
 
 
 #: Suffixes of column names and their units, longest first.
@@ -142,8 +142,8 @@ _UNITS = {
     "_k": "K",
 }  # fmt: skip
 _AXES = ("x", "y", "z")
-#: Columns that describe the run or results, not the conditions of the case.
-_NO_CONDITION = re.compile(
+#: Pattern of columns that describe the run or the results, not the conditions of the case.
+_EXCLUDED_COLUMNS = re.compile(
     r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|^place_|estimated|_true_"
     r"|^firing_|^touchdown_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
     r"|\.|^algorithm$|^stderr$|^velocity_(?:nees|normalised|sd|correlation)"
@@ -171,14 +171,14 @@ def split_unit(column: str) -> tuple[str, str]:
 def label(column: str) -> str:
     """Return the column in words, with its unit: ``velocity error (m/s)``."""
     name, unit = split_unit(column)
-    words = _notes()["labels"].get(column, _words(name))
+    words = _read_notes()["labels"].get(column, _to_words(name))
     return f"{words} ({unit})" if unit else words
 
 
 def magnitude_label(column: str) -> str:
     """Return the magnitude of a column in words, with its unit: ``|velocity error| (m/s)``."""
     name, unit = split_unit(column)
-    return f"|{_words(name)}| ({unit})" if unit else f"|{_words(name)}|"
+    return f"|{_to_words(name)}| ({unit})" if unit else f"|{_to_words(name)}|"
 
 
 def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
@@ -213,7 +213,7 @@ def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6) -> li
         name
         for name in names
         if name not in excluded
-        and not _NO_CONDITION.search(name)
+        and not _EXCLUDED_COLUMNS.search(name)
         and _is_number(frame, name)
         and frame[name].nunique() > 1
     ]
@@ -237,14 +237,14 @@ def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> 
 
 def category_column(frame: pd.DataFrame) -> str | None:
     """Return the first column with 2 to 6 distinct values: a column of text, or the terrain; None if there is none."""
-    types = {str(name): dtype for name, dtype in frame.dtypes.items() if not _NO_CONDITION.search(str(name))}
+    types = {str(name): dtype for name, dtype in frame.dtypes.items() if not _EXCLUDED_COLUMNS.search(str(name))}
     is_text = (pd.api.types.is_string_dtype, pd.api.types.is_object_dtype)
     names = [name for name, dtype in types.items() if any(check(dtype) for check in is_text)]
     names += ["terrain"] if "terrain" in frame else []
     return next((name for name in names if 2 <= frame[name].nunique() <= _MAX_CATEGORIES), None)
 
 
-def _words(name: str) -> str:
+def _to_words(name: str) -> str:
     return name.replace("_", " ").replace(".", " ")
 
 

@@ -70,9 +70,9 @@ def copy_inputs(original: Inputs, *, writable: bool = False) -> Inputs:
 
     Rotations and transforms are immutable and not copied: a copy would be normalised again, with different last digits.
     """
-    immutable = {id(part): part for part in _parts(original) if isinstance(part, Rotation | RigidTransform)}
+    immutable = {id(part): part for part in _walk_values(original) if isinstance(part, Rotation | RigidTransform)}
     copied = copy.deepcopy(original, dict(immutable))
-    for part in _parts(copied):
+    for part in _walk_values(copied):
         if isinstance(part, np.ndarray):
             part.flags.writeable = writable
     return copied
@@ -81,7 +81,7 @@ def copy_inputs(original: Inputs, *, writable: bool = False) -> Inputs:
 def hash_inputs(value: Any, excluded: tuple[str, ...] = ()) -> str:
     """Compute the SHA-256 of all values in arrays, poses and data classes, without the fields in `excluded`."""
     digest = hashlib.sha256()
-    for part in _parts(value, excluded):
+    for part in _walk_values(value, excluded):
         if isinstance(part, np.ndarray):
             digest.update(f"{part.dtype}{part.shape}".encode())
             digest.update(np.ascontiguousarray(part).data)
@@ -94,17 +94,17 @@ def hash_inputs(value: Any, excluded: tuple[str, ...] = ()) -> str:
     return digest.hexdigest()
 
 
-def _parts(value: Any, excluded: tuple[str, ...] = ()) -> Iterator[Any]:
+def _walk_values(value: Any, excluded: tuple[str, ...] = ()) -> Iterator[Any]:
     """Walk through data classes, lists and tuples; yield the class names, lengths, arrays, poses and other values."""
     if is_dataclass(value) and not isinstance(value, type):
         yield type(value).__name__
         for field in fields(value):
             if field.name not in excluded:
-                yield from _parts(getattr(value, field.name), excluded)
+                yield from _walk_values(getattr(value, field.name), excluded)
     elif isinstance(value, list | tuple):
         yield len(value)
         for inner in value:
-            yield from _parts(inner, excluded)
+            yield from _walk_values(inner, excluded)
     else:
         yield value
 
@@ -113,9 +113,9 @@ def run_algorithm(call: Callable[[], object], check: Callable[[object], Answer])
     """Run an algorithm and validate its answer; all exceptions become failures of the algorithm."""
     start_s = time.process_time()
     try:
-        raw = call()
+        raw_answer = call()
         elapsed_s = time.process_time() - start_s
-        answer = check(raw)
+        answer = check(raw_answer)
     except Exception as error:
         row: dict[str, Scalar] = {"estimation_time_s": time.process_time() - start_s}
         if isinstance(error, AlgorithmError):

@@ -17,7 +17,7 @@ from marsyard.sim.terrain import Site, TerrainBank, TerrainParameters
 
 ParametersType = TypeVar("ParametersType", bound=BaseModel)
 
-#: Loads a terrain: site, terrain parameters, seed of the bank, number of the terrain in the bank.
+#: Function that loads a terrain by site, terrain parameters, seed of the bank, and number of the terrain in the bank.
 LoadGround = Callable[[Site, TerrainParameters, int, int], SiteGround]
 
 
@@ -44,8 +44,8 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
     algorithm_table: tuple[str, ...] = ()
     part_keys: Mapping[str, PartKind] = {"scores": SCORE}
 
-    def __init__(self, cached_grounds: int = 0) -> None:
-        self.load_ground: LoadGround = lru_cache(maxsize=cached_grounds)(SiteGround.from_bank)
+    def __init__(self, max_cached_grounds: int = 0) -> None:
+        self.load_ground: LoadGround = lru_cache(maxsize=max_cached_grounds)(SiteGround.from_bank)
 
     @abstractmethod
     def input_terrain(self, p: ParametersType, shared_input: int) -> tuple[TerrainBank, int]:

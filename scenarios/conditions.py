@@ -47,7 +47,10 @@ def optics_columns(optics: OpticsParameters) -> dict[str, Scalar]:
 
 
 def contrast_columns(image: UInt16[np.ndarray, "rows columns"], detector: DetectorParameters) -> dict[str, Scalar]:
-    """Return median and 90 % / 10 % percentile of a delivered image's local contrast (see `local_contrast`)."""
+    """Return the median of a delivered image's local contrast, and its 90 % quantile divided by its 10 % quantile.
+
+    `local_contrast` defines the contrast; the quotient is NaN if the 10 % quantile is 0.
+    """
     p10, median, p90 = local_contrast(np.maximum(image - detector.offset_dn, 0.0))
     return {"image_contrast": median, "image_patchiness": p90 / p10 if p10 > 0.0 else np.nan}
 

@@ -81,7 +81,7 @@ class Task(Generic[Algorithm, Options]):
     """A task of a system and its algorithms.
 
     - name: name on the command line and in the exchange with programs
-    - what: noun for its algorithms in messages
+    - what: noun for an algorithm of the task in messages, such as "velocity estimator"
     - methods: required methods of an algorithm
     - shipped: functions that create Marsyard's algorithms from the options of the published algorithm
     - options: class of the options of the published algorithm
@@ -140,7 +140,7 @@ class Task(Generic[Algorithm, Options]):
             return self.streamed(algorithm)
         return cast(Algorithm, algorithm)
 
-    def takes_stream(self, spec: str) -> bool | None:
+    def accepts_stream(self, spec: str) -> bool | None:
         """Return whether an algorithm accepts any number of images; None if unknown before its creation."""
         if spec in self.shipped:
             return False
@@ -276,12 +276,12 @@ def labels(specs: Sequence[str]) -> tuple[str, ...]:
     >>> labels(["dimes", "phase-correlation", "mypkg.velocity:Estimator", "exec:./mine --fast", "exec:./mine"])
     ('dimes', 'phase_correlation', 'Estimator', 'mine', 'mine_2')
     """
-    labels: list[str] = []
+    unique_labels: list[str] = []
     for spec in specs:
         program = re.match(r"(?:(?:exec|serve)(?:-stream)?|answers|export):\s*(\S+)", spec)
         basename = Path(program[1]).stem if program else spec.rpartition(":")[2]
         label = re.sub(r"\W", "_", basename, flags=re.ASCII)
         label = label if label[:1].isalpha() else f"a_{label}"
         candidates = itertools.chain([label], (f"{label}_{number}" for number in itertools.count(2)))
-        labels.append(next(name for name in candidates if name not in labels))
-    return tuple(labels)
+        unique_labels.append(next(name for name in candidates if name not in unique_labels))
+    return tuple(unique_labels)

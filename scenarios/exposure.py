@@ -90,7 +90,7 @@ class Sample:
     - rocks: 1 for a rock or another object, 0 for ground
     - hazard: footprint hazard of a lander: 0 safe, 1 hazard, 255 not completely visible; None without a lander
     - camera: camera in body axes
-    - about: pose, sun and other metadata; plain data
+    - metadata: pose, sun and other values that JSON can store
     """
 
     image: UInt16[np.ndarray, "rows columns"]
@@ -100,7 +100,7 @@ class Sample:
     rocks: UInt8[np.ndarray, "rows columns"]
     hazard: UInt8[np.ndarray, "rows columns"] | None
     camera: CameraModel
-    about: Mapping[str, Any]
+    metadata: Mapping[str, Any]
 
 
 def select_middle_rows(rows_summed: int) -> slice:
@@ -139,7 +139,8 @@ def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> F
     if extinction_m == 0.0:
         return frame.radiance
     transmission = np.exp(np.float32(-extinction_m) * frame.range_m.astype(np.float32))
-    # sunlight travels along -sun and is scattered along -direction, towards the camera; `cosine`: scattering angle
+    # Sunlight travels along -sun and is scattered along -direction, towards the camera. `cosine`: cosine of the
+    # scattering angle; g: asymmetry factor of the phase function; `source`: source function of the air
     sun_body = frame.world_from_body.rotation.inv().apply(sun.direction).astype(np.float32)
     cosine = (frame.rays.directions.astype(np.float32) @ sun_body).reshape(frame.radiance.shape)
     g = np.float32(air.asymmetry)
@@ -162,7 +163,7 @@ def pixel_sample(
     frame: Frame,
     detector: DetectorParameters,
     camera: CameraModel,
-    about: Mapping[str, Any],
+    metadata: Mapping[str, Any],
     hazard: UInt8[np.ndarray, "rows columns"] | None = None,
 ) -> Sample:
     """Assemble an image and the truth of its pixels; `camera` is that of the delivered image."""
@@ -175,5 +176,5 @@ def pixel_sample(
         rocks=(frame.body[rows] >= 0).astype(np.uint8),
         hazard=hazard,
         camera=camera,
-        about=about,
+        metadata=metadata,
     )

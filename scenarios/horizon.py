@@ -12,17 +12,17 @@ from marsyard.sim.render import Frame, Objects, Scene
 from marsyard.sim.terrain import RockField
 from marsyard.sim.terrain.sites import Hill
 
-#: Identifier of hills in `Objects.names`; identifiers of rocks are not negative.
+#: Identifier of hills in `Objects.names`; identifiers of rocks are 0 or greater.
 HILL_NAME = -4
 #: Number of mesh lines of the hills in azimuth and in distance, and of azimuth lines per body.
 _AZIMUTHS, _DISTANCES, _LINES_PER_BODY = 1440, 64, 60
-#: Sizes of the ridges in lines of the mesh, and their RMS height relative to the hill's; assumed.
-_RIDGE_SIZES, _RIDGES = (12.0, 6.0, 3.0), 0.25
+#: Sizes of the ridges in lines of the mesh, and RMS height of the largest ridges relative to the hill's; assumed.
+_RIDGE_SIZES, _RIDGE_HEIGHT = (12.0, 6.0, 3.0), 0.25
 #: Minimum height of a face above the plain, metres, and albedo relative to the plain's; assumed.
-_BASE_M, _HILL_ALBEDO = 1.0, 0.85
+_MIN_FACE_HEIGHT_M, _HILL_ALBEDO = 1.0, 0.85
 _MARS_RADIUS_M = 3.39e6
 #: Mean width of a rock's silhouette divided by its diameter and height: between an ellipse (pi/4) and a rectangle.
-_SILHOUETTE = 0.85
+_SILHOUETTE_FRACTION = 0.85
 
 
 def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objects:
@@ -43,7 +43,7 @@ def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objec
     rng = np.random.default_rng(0)
     for size in _RIDGE_SIZES:
         noise = gaussian_filter(rng.standard_normal(height.shape), (size / 3.0, size), mode=("nearest", "wrap"))
-        height *= np.maximum(1.0 + _RIDGES * size / _RIDGE_SIZES[0] * noise / noise.std(), 0.0)
+        height *= np.maximum(1.0 + _RIDGE_HEIGHT * size / _RIDGE_SIZES[0] * noise / noise.std(), 0.0)
     x, y = distance * np.sin(azimuth), distance * np.cos(azimuth)
     above_plain = height - distance**2 / (2.0 * _MARS_RADIUS_M)
     vertices = np.stack([x, y, ground_m + above_plain], axis=-1)
@@ -53,8 +53,8 @@ def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objec
     corner = np.arange(height.size, dtype=np.int32).reshape(height.shape)
     right = np.roll(corner, -1, axis=1)
     quads = np.stack([corner[:-1], right[:-1], right[1:], corner[1:]], axis=-1)
-    # omit faces below `_BASE_M`: they would intersect the terrain; bodies are sectors of azimuth
-    row, column = np.nonzero(np.all(above_plain.reshape(-1)[quads] > _BASE_M, axis=-1))
+    # omit faces below `_MIN_FACE_HEIGHT_M`: they would intersect the terrain; bodies are sectors of azimuth
+    row, column = np.nonzero(np.all(above_plain.reshape(-1)[quads] > _MIN_FACE_HEIGHT_M, axis=-1))
     order = np.argsort(column // _LINES_PER_BODY, kind="stable")
     quad, body = quads[row, column][order], (column // _LINES_PER_BODY)[order]
     faces = np.stack([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
@@ -68,15 +68,17 @@ def add_unresolved_rocks(
 ) -> Frame:
     """Blend the mean radiance of the rendered rocks into ground pixels that rocks below the resolution occlude.
 
-    Rocks below ``smallest_rad x range`` are not drawn. At grazing view they hide the ground: with frontal areas a per
-    square metre, the visible fraction of the ground is ``exp(-sum a / t)`` with ``t**2 = tan(e)**2 + rms_slope**2``,
-    where e is the angle between the line of sight and level ground. Range and normals are not changed.
+    Rocks with diameters below ``smallest_rad x range`` are not drawn. At grazing view they hide the ground. The visible
+    fraction of the ground is ``exp(-A / t)`` with ``t**2 = tan(e)**2 + rms_slope**2``. Here A is the frontal area of
+    these rocks per square metre, and e is the angle between the line of sight and level ground. Range and normals are
+    not changed.
     """
+    # the bodies -1 (ground) and -2 (sky) index the two appended negative names
     is_rock = np.append(scene.objects.names, [-2, -1])[frame.body] >= 0
     if rocks is None or len(rocks) == 0 or not np.any(is_rock):
         return frame
     order = np.argsort(rocks.diameter_m)
-    areas = _SILHOUETTE * (rocks.diameter_m * rocks.height_m)[order] / rocks.period_m**2
+    areas = _SILHOUETTE_FRACTION * (rocks.diameter_m * rocks.height_m)[order] / rocks.period_m**2
     area_below = np.concatenate([[0.0], np.cumsum(areas)])
     smaller = np.searchsorted(rocks.diameter_m[order], smallest_rad * np.where(frame.body == -1, frame.range_m, 0.0))
     up = frame.rays.directions.reshape(*frame.range_m.shape, 3) @ frame.world_from_body.rotation.as_matrix()[2]

@@ -50,7 +50,7 @@ class Failure:
     """Failure of the algorithm under test in an otherwise valid case.
 
     - outcome: a name of `marsyard.algorithms.answers.Fault`
-    - error, trace: stored as `error` and `traceback`
+    - error, trace: message and traceback, stored in the columns `error` and `traceback`
     """
 
     outcome: str
@@ -64,8 +64,8 @@ class CaseResult:
 
     - outcome: a member of the estimate's enumeration, or the name of the failure
     - answered: whether the algorithm under test reported an answer (the population `valid` of requirements)
-    - row: columns: errors (NaN without an answer) and sampled values, read from the simulated objects. Columns that may
-      differ between two runs of one case have `time` in their name.
+    - row: values by column: errors (NaN without an answer) and sampled values, read from the simulated objects. Columns
+      that may differ between two runs of one case have `time` in their name.
     - products: arrays and texts for the case's figures; stored only for cases that the campaign retains
     - failure: None if the algorithm under test answered
     """

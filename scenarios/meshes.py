@@ -36,8 +36,6 @@ _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 
 FIRST_MESH_NUMBER = 1 << 30
 #: Default albedo by kind: rock, painted structure, bright target.
 _ALBEDO = {"rock": 0.15, "lander": 0.5, "landmark": 0.6}
-
-
 #: Rotations from the file's axes, by the axis that points up, to axes whose z axis points up.
 _UPRIGHT = {
     "x": Rotation.from_euler("y", -90.0, degrees=True),
@@ -130,6 +128,7 @@ def read_mesh(path: str) -> Mesh:
 
 @lru_cache(maxsize=16)
 def _read(path: str, _changed_ns: int) -> Mesh:
+    """Read a mesh; the time of the last change is part of the cache's key."""
     import trimesh
 
     kind = Path(path).suffix.lower().lstrip(".")

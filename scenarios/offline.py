@@ -126,13 +126,13 @@ def create_offline(spec: str, answer_format: AnswerFormat[Any], case: int) -> An
     file = answers_file(spec)
     if file is None:
         folder, _, bits = spec.removeprefix(EXPORT).partition(LOSSY)
-        return Recorder(Path(folder) / CASES / f"{case:06d}", answer_format, float(bits) if bits else None)
+        return CaseExporter(Path(folder) / CASES / f"{case:06d}", answer_format, float(bits) if bits else None)
     answer = read_answers(file, answer_format).get(case)
     return RecordedAnswer(answer, f"{file.name} has no answer to case {case}", answer_format)
 
 
 @dataclass(frozen=True)
-class Recorder:
+class CaseExporter:
     """Replaces an algorithm: writes its inputs into a folder atomically, and returns a failure."""
 
     folder: Path
@@ -181,6 +181,7 @@ def read_answers(file: Path, answer_format: AnswerFormat[Answer]) -> Mapping[int
 
 @lru_cache(maxsize=4)
 def _read(file: Path, answer_format: AnswerFormat[Any], _time: int, _size: int) -> Mapping[int, Any]:
+    """Read a table; time and size are part of the cache's key, so that a changed file is read again."""
     first_lines: dict[int, int] = {}
 
     def parse(line: int, cells: Mapping[str, str]) -> tuple[int, Any]:
@@ -202,6 +203,7 @@ def _parse_answer(cells: Mapping[str, str], answer_format: AnswerFormat[Any]) ->
     if not cells["case"].isdecimal():
         raise ValueError(f"case is '{cells['case']}'; allowed: a whole number from 0")
     numbers = {}
+    # the first two columns are `case` and `outcome`
     for name, text in ((name, text) for name, text in cells.items() if name in answer_format.columns[2:] and text):
         numbers[name] = value = finite_number(name, text, ", or an empty cell if the outcome is a failure")
         unit, limit = next((unit, limit) for unit, limit in _MAX_MAGNITUDE.items() if name.endswith(unit))

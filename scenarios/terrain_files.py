@@ -22,13 +22,14 @@ from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, read_npz_headers
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, choose_grid, read_rasters
 
-#: Maximum number of DTM posts along a side (largest terrain), and of orthoimage pixels along a side (memory).
+#: Maximum number of DTM posts along a side (size of the largest terrain), and of orthoimage pixels (memory).
 _MAX_POSTS, _MAX_PIXELS = 5461, 8192
 #: Maximum relative distortion of lengths by the projection.
 _MAX_STRETCH = 0.02
 #: Range of heights on Earth, Moon and Mars: Mariana Trench to Olympus Mons.
 HEIGHTS_M = (-11_500.0, 22_000.0)
-_METRES = ("", "m", "metre", "metres", "meter", "meters")
+#: Names of the unit metre in a GeoTIFF; without a name, heights are assumed to be in metres.
+_METRE_UNITS = ("", "m", "metre", "metres", "meter", "meters")
 #: Arrays of an .npz archive and their dimensions.
 _ARRAYS = {"dem": 2, "dem_gsd": 0, "ortho": 2, "ortho_gsd": 0, "ortho_valid": 2}
 
@@ -58,11 +59,12 @@ def site_validator(user: str, scale: str) -> AfterValidator:
 def check_source(source: RealTerrain) -> None:
     """Raise TerrainFileError for invalid files; the message contains the file and the problem."""
     paths = [path for path in (source.dtm, source.ortho) if path is not None]
-    _check(source, tuple(_check_present(path).st_mtime_ns for path in paths))
+    _check_files(source, tuple(_check_present(path).st_mtime_ns for path in paths))
 
 
 @lru_cache(maxsize=16)
-def _check(source: RealTerrain, _changed_ns: tuple[int, ...]) -> None:
+def _check_files(source: RealTerrain, _modified_ns: tuple[int, ...]) -> None:
+    """Check the files; the modification times are a key of the cache, so that changed files are checked again."""
     dtm = source.dtm
     if dtm.suffix == ".npz":
         _raise_first(dtm, _npz_problems(source))
@@ -151,7 +153,7 @@ def _geotiff_problems(file: Any, max_side: int, are_heights: bool) -> Iterator[s
         return
     if file.dtypes[0] == "uint8":
         yield "contains 8-bit values, as in an image; allowed: heights in metres"
-    if (file.units[0] or "").strip().lower() not in _METRES:
+    if (file.units[0] or "").strip().lower() not in _METRE_UNITS:
         yield f"its heights are in {file.units[0]!r}; allowed: metres (rio calc)"
     if file.scales[0] != 1.0 or file.offsets[0] != 0.0:
         yield f"has scale {file.scales[0]:g} and offset {file.offsets[0]:g}; apply them with rio calc"
@@ -259,6 +261,7 @@ def map_scale(file: Any) -> MapScale | None:
     # ground lengths divided by map lengths along x and y
     length = 2.0 * step * unit_m
     east, north = (positions[1] - positions[0]) / length, (positions[3] - positions[2]) / length
+    # the eigenvalues of the Gram matrix are the squared extreme ratios
     gram = np.array([[east @ east, east @ north], [east @ north, north @ north]])
     if not np.all(np.isfinite(gram)) or np.linalg.det(gram) <= 0.0:
         return None
@@ -300,7 +303,8 @@ def load_site(name: str, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
 
 
 @lru_cache(maxsize=4)
-def _import_site(source: RealTerrain, _changed_ns: int) -> Site:
+def _import_site(source: RealTerrain, _modified_ns: int) -> Site:
+    """Create the site of a terrain model; the modification time is a key of the cache."""
     samples, spacing_m = choose_grid(source)
     terrain = TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
     changes = {

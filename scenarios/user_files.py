@@ -1,4 +1,4 @@
-"""Read a user's files: hashed input files, tables, imports, axes of recorded poses, and lists of problems."""
+"""Read a user's files: input files with hashes, tables, Python objects, and axes of recorded poses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from marsyard.sim.files import check_regular
 from marsyard.sim.frames import SITE_FROM_WORLD
 from marsyard.sim.parameters import Parameters
 
-#: Packages that had these names before they became parts of `marsyard`.
+#: Former top-level names of the subpackages of `marsyard`.
 _FORMER_PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports")
 
 
@@ -194,11 +194,13 @@ def _read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, l
     return header, lines
 
 
-def _header_problems(header: Sequence[str], needed: Sequence[str], allowed: Sequence[str], hint: str) -> Iterator[str]:
+def _header_problems(
+    header: Sequence[str], required: Sequence[str], allowed: Sequence[str], hint: str
+) -> Iterator[str]:
     if not header:
         yield "it is empty"
         return
-    for name in needed:
+    for name in required:
         if name not in header:
             yield f"the column '{name}' is missing"
     for name in dict.fromkeys(header):
@@ -231,7 +233,7 @@ def check_column_groups(groups: Iterable[Sequence[str]], values: Mapping[str, fl
 
 
 #: Rotations from a file's world axes to east, north, up.
-_WORLD = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
+_ENU_FROM_AXES = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
 #: OpenCV's camera axes (x right, y down, z forward) in body axes: optical axis along -z, columns along x.
 _CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
@@ -261,7 +263,7 @@ class RecordedAxes(Parameters):
     @property
     def world(self) -> Rotation:
         """Rotation from the file's world axes to east, north, up."""
-        return _WORLD[self.axes]
+        return _ENU_FROM_AXES[self.axes]
 
     def body_attitudes(self, world_from_vehicle: Rotation) -> Rotation:
         """Convert attitudes of the recorded vehicle to those of the body, both relative to east, north, up."""

@@ -12,7 +12,7 @@ from marsyard.algorithms.dimes import DimesDetails, dimes_products
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm_on_copy
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.offline import RecordedAnswer, Recorder
+from marsyard.scenarios.offline import CaseExporter, RecordedAnswer
 from marsyard.sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]
@@ -36,7 +36,7 @@ def run_estimator(
     def estimate(inputs: DescentMeasurements) -> object:
         nonlocal tags
         estimator = make()
-        if isinstance(estimator, StreamedEstimator | Recorder | RecordedAnswer):
+        if isinstance(estimator, StreamedEstimator | CaseExporter | RecordedAnswer):
             return estimator.estimate(inputs)
         if triple is None:
             raise ValueError(f"it needs three images, but the descent has {len(measurements.images)}")

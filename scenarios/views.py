@@ -37,16 +37,20 @@ ROCK_TRIANGLES = 600_000
 DETAIL_TRIANGLES = 1_200_000
 #: Number of triangles of a coarse rock.
 _COARSE_TRIANGLES = 20
-#: Maximum distance of rocks outside of the sector, included for their shadows: in heights of the eye, and minimum in m.
+#: Radius around the eye in which rocks outside the sector are included for their shadows: `_NEAR_HEIGHTS` times the
+#: eye's height, at least `_NEAR_M` metres.
 _NEAR_HEIGHTS, _NEAR_M = 3.0, 5.0
+#: Margin of an eye's sector on each side, and depression of the image's upper edge above which the horizon is assumed
+#: visible, radians.
+_SECTOR_MARGIN_RAD, _MIN_DEPRESSION_RAD = np.radians(3.0), np.radians(5.0)
 #: Ratio of the diameters of neighbouring size classes.
 _CLASS_RATIO = float(np.sqrt(2.0))
-#: Ground mesh: spacing divided by the eye's height, relative growth per line, minimum extent in heights and in m.
+#: Ground mesh: spacing / height of the eye, relative growth per line, minimum extent / height of the eye, and in m.
 _MESH_FINEST, _MESH_GROWTH, _MESH_REACH_HEIGHTS, _MESH_REACH_M = 0.0085, 0.012, 14.0, 700.0
 #: Radius of Mars, m, for the distance of the horizon.
 _MARS_RADIUS_M = 3.39e6
 #: Maximum height of an eye, m, at which it is among the rocks (`Scene.among_objects`).
-_LOW_M = 100.0
+_MAX_AMONG_ROCKS_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -74,13 +78,13 @@ class SiteGround:
 
     def photometry(self, sun: Sun) -> Photometry:
         """Return the photometry of this ground under a sun and the sky of the site's atmosphere."""
-        law = self.site.photometry
+        reflectance = self.site.photometry
         air = self.site.environment
         sky = air.sky_fraction(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
         return Photometry(
-            lunar_fraction=law.lunar_fraction,
-            surge_amplitude=law.surge_amplitude,
-            surge_width=law.surge_width,
+            lunar_fraction=reflectance.lunar_fraction,
+            surge_amplitude=reflectance.surge_amplitude,
+            surge_width=reflectance.surge_width,
             sky_fraction=sky,
             sky_radiance=sky,
             surrounding_albedo=self.terrain.albedo,
@@ -120,22 +124,22 @@ class Eye:
         horizontal = float(np.cos(elevation))
         is_full_circle = np.sin(half_angle) >= horizontal or half_angle >= np.pi / 2
         half_width = np.pi if is_full_circle else np.arcsin(np.sin(half_angle) / horizontal)
-        half_width = float(min(half_width + np.radians(3.0), np.pi))
-        highest = elevation + half_angle
-        # twice the maximum distance on level ground, because slopes may descend
-        reach = 2.0 * height / np.tan(-highest) + _NEAR_M if highest < -np.radians(5.0) else np.inf
-        return cls(east, north, height, rays.pixel_rad, float(np.arctan2(axis[0], axis[1])), half_width, float(reach))
+        half_width = float(min(half_width + _SECTOR_MARGIN_RAD, np.pi))
+        upper_edge = elevation + half_angle
+        # twice the maximum distance on level ground, because slopes may descend; unlimited near the horizon
+        reach_m = 2.0 * height / np.tan(-upper_edge) + _NEAR_M if upper_edge < -_MIN_DEPRESSION_RAD else np.inf
+        return cls(east, north, height, rays.pixel_rad, float(np.arctan2(axis[0], axis[1])), half_width, float(reach_m))
 
 
 def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
     """Build the scene for an eye: ground, resolved rocks, texture and light."""
-    spacing = ground.surface.spacing_m
-    finest = max(_MESH_FINEST * eye.height_m, 0.8 * spacing)
-    horizon = float(np.sqrt(2.0 * _MARS_RADIUS_M * eye.height_m))
-    reach = max(_MESH_REACH_HEIGHTS * eye.height_m, _MESH_REACH_M, min(horizon, eye.reach_m))
-    half = int(np.ceil(np.arcsinh(reach / finest * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
-    objects = select_rocks(ground, eye, reach)
-    if ground.site.hills and np.isinf(eye.reach_m) and eye.height_m < _LOW_M:
+    spacing_m = ground.surface.spacing_m
+    finest_m = max(_MESH_FINEST * eye.height_m, 0.8 * spacing_m)
+    horizon_m = float(np.sqrt(2.0 * _MARS_RADIUS_M * eye.height_m))
+    reach_m = max(_MESH_REACH_HEIGHTS * eye.height_m, _MESH_REACH_M, min(horizon_m, eye.reach_m))
+    half_lines = int(np.ceil(np.arcsinh(reach_m / finest_m * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
+    objects = select_rocks(ground, eye, reach_m)
+    if ground.site.hills and np.isinf(eye.reach_m) and eye.height_m < _MAX_AMONG_ROCKS_M:
         mean_m = float(ground.surface.levels[-1][..., 0].mean())
         objects = Objects.join([objects, hill_objects(ground.site.hills, mean_m, ground.terrain.albedo)])
     return Scene(
@@ -147,20 +151,20 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
         relief=micro_relief(ground),
         ground_texture=Texture(ground.site.ground_texture.coarsest_m, ground.site.ground_texture.amplitudes),
         object_texture=Texture(ground.site.rock_texture.coarsest_m, ground.site.rock_texture.amplitudes),
-        mesh_finest_m=finest,
-        mesh_reach_m=reach,
-        mesh_lines=2 * half + 1,
-        among_objects=eye.height_m < _LOW_M,
+        mesh_finest_m=finest_m,
+        mesh_reach_m=reach_m,
+        mesh_lines=2 * half_lines + 1,
+        among_objects=eye.height_m < _MAX_AMONG_ROCKS_M,
     )
 
 
 def micro_relief(ground: SiteGround) -> MicroRelief:
     """Create the relief that is finer than the samples of the surface, for the renderer."""
-    p, cover = ground.terrain, ground.surface.cover
+    p, cover_maps = ground.terrain, ground.surface.cover
     slope = float(np.radians(p.rms_slope_deg))
     coarsest, heights = octave_heights(p.hurst, slope, p.slope_baseline_m, p.outer_scale_m, p.spacing_m)
-    roughness, texture = (np.ascontiguousarray(cover[..., channel]) for channel in (ROUGHNESS, TEXTURE))
-    return MicroRelief(coarsest, heights, roughness, texture, len(cover) / ground.surface.period_m)
+    roughness, texture = (np.ascontiguousarray(cover_maps[..., channel]) for channel in (ROUGHNESS, TEXTURE))
+    return MicroRelief(coarsest, heights, roughness, texture, len(cover_maps) / ground.surface.period_m)
 
 
 def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Objects:
@@ -173,7 +177,7 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
     field = ground.rocks
     if field is None or len(field) == 0:
         return Objects.none()
-    smallest_rad, pixel_rad = smallest_rock_rad(field, eye), _pixel_of_detail_rad(field, eye)
+    smallest_rad, pixel_rad = smallest_rock_rad(field, eye), _detail_pixel_rad(field, eye)
     reach = min(farthest_m, eye.reach_m)
     smallest_m = float(field.diameter_m.min())
     size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
@@ -183,7 +187,7 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
         # horizontal part of the maximum distance of this size class
         horizontal = np.sqrt(max((min_diameter_m * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - eye.height_m**2, 0.0))
         radius = float(min(horizontal, reach))
-        selected = members[_near_sector(field, members, eye, radius)]
+        selected = members[_find_near_rocks(field, members, eye, radius)]
         if selected.size:
             subset = replace(field, names={}, **{name: getattr(field, name)[selected] for name in ROCK_ARRAYS})
             mesh = subset.near(eye.east_m, eye.north_m, radius, above_m=eye.height_m, pixel_rad=pixel_rad)
@@ -191,7 +195,7 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
     if not meshes:
         return Objects.none()
     # keep only triangles in the eye's sector or near the eye; offsets number vertices and bodies of the joined meshes
-    masks = [_in_sector(mesh, eye) for mesh in meshes]
+    masks = [_find_visible_triangles(mesh, eye) for mesh in meshes]
     vertex_offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     body_offsets = np.cumsum([0] + [int(mesh.body_of_face.max(initial=-1)) + 1 for mesh in meshes])
     offsets = vertex_offsets.astype(np.int32), body_offsets.astype(np.int32)
@@ -219,7 +223,7 @@ def smallest_rock_rad(field: RockField, eye: Eye) -> float:
     return float(max(SMALLEST_ROCK_PX * eye.pixel_rad, limit_rad))
 
 
-def _pixel_of_detail_rad(field: RockField, eye: Eye) -> float:
+def _detail_pixel_rad(field: RockField, eye: Eye) -> float:
     """Return the pixel angle for the detail of rocks: that of the eye, or the smallest that `DETAIL_TRIANGLES` allows.
 
     Detail level k of a rock of diameter D is sufficient up to a size of p_k pixels. The additional triangles of the
@@ -295,10 +299,10 @@ def _above(surface: Surface, east_m: float, north_m: float, height_m: float) -> 
     return np.array([east_m, north_m, float(surface.height(east_m, north_m)) + height_m])
 
 
-def _near_sector(
+def _find_near_rocks(
     field: RockField, members: Int64[np.ndarray, "members"], eye: Eye, radius_m: float
 ) -> Bool[np.ndarray, "members"]:
-    """Select rocks with a periodic position, within a radius of the eye, whose triangles `_in_sector` may select."""
+    """Select rocks with a periodic position within a radius of the eye; a superset of `_find_visible_triangles`."""
     period, selected = field.period_m, np.zeros(members.size, dtype=np.bool_)
     # larger than any shape on the steepest ground
     extent = field.diameter_m[members] + field.height_m[members]
@@ -316,7 +320,7 @@ def _near_sector(
     return selected
 
 
-def _in_sector(mesh: RockMesh, eye: Eye) -> Bool[np.ndarray, "triangles"]:
+def _find_visible_triangles(mesh: RockMesh, eye: Eye) -> Bool[np.ndarray, "triangles"]:
     """Select the triangles whose first corner is in the eye's sector or near the eye."""
     offsets = mesh.vertices[:, :2] - (eye.east_m, eye.north_m)
     bearing = np.arctan2(offsets[:, 0], offsets[:, 1]) - eye.azimuth_rad

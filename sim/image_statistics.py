@@ -49,7 +49,7 @@ def compute_image_statistics(image: Float[np.ndarray, "rows columns"]) -> ImageS
 
 
 def local_contrast(image: Float[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
-    """Compute the 10, 50 and 90 % percentiles over all blocks of (standard deviation / mean of a block).
+    """Compute the 10th, 50th and 90th percentiles over all blocks of (standard deviation / mean of a block).
 
     The image is resized to `SIDE` x `SIDE` pixels first. The result is NaN if all blocks are black.
     """

@@ -48,15 +48,15 @@ def set_cache_folder() -> None:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
 
 
-def kernels_are_ready(user: str) -> bool:
-    """Return whether a scenario (`user`) has completed a run with the cached kernels on this type of processor."""
-    marker = _marker_path(user)
+def kernels_are_ready(scenario: str) -> bool:
+    """Return whether a scenario has completed a run with the cached kernels on this type of processor."""
+    marker = _marker_path(scenario)
     return marker is not None and marker.exists()
 
 
-def mark_ready(user: str) -> None:
-    """Create a marker file: all kernels of a scenario (`user`) are compiled."""
-    if (marker := _marker_path(user)) is not None:
+def mark_ready(scenario: str) -> None:
+    """Create a marker file: all kernels of a scenario are compiled."""
+    if (marker := _marker_path(scenario)) is not None:
         with suppress(OSError):
             marker.parent.mkdir(parents=True, exist_ok=True)
             marker.touch()
@@ -68,8 +68,8 @@ def count_compiled_functions() -> int:
     return 0 if folder is None else sum(1 for _ in Path(folder).rglob("*.nbc"))
 
 
-def _marker_path(user: str) -> Path | None:
+def _marker_path(scenario: str) -> Path | None:
     # numba stores compiled code per processor type
     folder = os.environ.get("NUMBA_CACHE_DIR")
-    digest = hashlib.sha256(f"{user} {processor_features()}".encode())
+    digest = hashlib.sha256(f"{scenario} {processor_features()}".encode())
     return None if folder is None else Path(folder) / f"{digest.hexdigest()[:16]}.ready"

@@ -45,9 +45,9 @@ def current_column(name: str, exists: Callable[[str], bool]) -> str:
     return name
 
 
-def current_options(words: Sequence[str]) -> list[str]:
-    """Replace deprecated names of options in the words of a command line."""
-    return [_warn_deprecated(word, _read_renamed("options").get(word, word)) for word in words]
+def current_options(arguments: Sequence[str]) -> list[str]:
+    """Replace deprecated names of options in the arguments of a command line."""
+    return [_warn_deprecated(argument, _read_renamed("options").get(argument, argument)) for argument in arguments]
 
 
 class Choice(Enum):

@@ -15,13 +15,13 @@ import numpy as np
 
 @lru_cache(maxsize=1024)
 def hash_words(text: str) -> tuple[int, ...]:
-    """Return the first 128 bits of a text's SHA-256 hash as four words for the spawn key of `SeedSequence`."""
+    """Return the first 128 bits of a text's SHA-256 hash as four 32-bit words for the spawn key of `SeedSequence`."""
     digest = hashlib.sha256(text.encode()).digest()
     return tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
 
 
 def stream_key(campaign: str, case: int, name: str) -> tuple[int, ...]:
-    """Return the spawn key of a stream, always nine words."""
+    """Return the spawn key of a stream: nine integers."""
     return (*hash_words(campaign), case, *hash_words(name))
 
 

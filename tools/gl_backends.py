@@ -18,14 +18,14 @@ def can_load(*names: str) -> bool:
 
 
 def find_backends() -> list[str]:
-    """Return the names of the loadable backends, as PyOpenGL uses them."""
-    # the import of pyrender includes its viewer, which loads these libraries even without a window
+    """Return the PyOpenGL names of the backends that can be loaded."""
+    # Importing pyrender also imports its viewer, which loads these libraries even without a window.
     if not (can_load("libGL.so.1") and can_load("libX11.so.6") and can_load("libXrender.so.1")):
         return []
     backends = []
     if can_load("libOSMesa.so.8", "libOSMesa.so.7", "libOSMesa.so.6", "libOSMesa.so"):
         backends.append("osmesa")
-    # libEGL only forwards calls to the library of a vendor
+    # libEGL only forwards calls to the library of a vendor.
     if can_load("libEGL.so.1") and can_load("libEGL_mesa.so.0", "libEGL_nvidia.so.0"):
         backends.append("egl")
     return backends

@@ -60,7 +60,7 @@ class HomographyEstimator:
         self.options = HomographyOptions() if options is None else options
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """Estimate the velocity, with `BaselineDetails`. Raises as `DimesEstimator.estimate`."""
+        """Estimate the velocity, with `BaselineDetails`. Raises the same errors as `DimesEstimator.estimate`."""
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:

@@ -120,8 +120,10 @@ def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, 
     """
     vertical = measurements.interval_velocities_m_s[:, 2]
     rates = np.concatenate([vertical[:1], 0.5 * (vertical[:-1] + vertical[1:]), vertical[-1:]])
-    delays_s = np.array([i.time_s - a.time_s for i, a in zip(measurements.images, measurements.altitudes, strict=True)])
-    return np.asarray(np.array([a.altitude_m for a in measurements.altitudes], dtype=np.float64) + rates * delays_s)
+    image_times_s = np.array([image.time_s for image in measurements.images])
+    altitudes_m = np.array([altitude.altitude_m for altitude in measurements.altitudes], dtype=np.float64)
+    altitude_times_s = np.array([altitude.time_s for altitude in measurements.altitudes])
+    return np.asarray(altitudes_m + rates * (image_times_s - altitude_times_s))
 
 
 def build_views(measurements: DescentMeasurements, binned_size: tuple[int, int]) -> tuple[View, View, View] | None:

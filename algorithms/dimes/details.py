@@ -135,11 +135,11 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
     chosen = () if details.chosen is None else (details.chosen.first, details.chosen.second)
     rows = []
     for track in details.tracks:
-        m, vectors = track.metrics, (*track.velocity_m_s, *track.ground_m)
-        metrics = (m.contrast, m.peak, m.peak_width_px, m.second_peak_ratio)
+        metrics, vectors = track.metrics, (*track.velocity_m_s, *track.ground_m)
+        metric_values = (metrics.contrast, metrics.peak, metrics.peak_width_px, metrics.second_peak_ratio)
         failed = (check in track.failed for check in ValidityCheck)
         pixel_values = (*track.template_pixel, *track.match_pixel)
-        rows.append([track.pair, track.index, *pixel_values, *metrics, track.valid, *vectors, *failed])
+        rows.append([track.pair, track.index, *pixel_values, *metric_values, track.valid, *vectors, *failed])
     combination_rows = [[c.first, c.second, c.discrepancy_m_s] for c in details.combinations]
     products: dict[str, Any] = {
         "tracks": np.array(rows, dtype=np.float64).reshape(-1, len(TRACK_COLUMNS)),

@@ -1,7 +1,8 @@
 """Exchange files: cases, frames and rover stops with images as 16-bit PGM or PNG, cameras as `.cahvor`, and JSON.
 
-Written for external programs. Reading restores counts, flat fields and numbers exactly (JSON stores the shortest text
-of the same float64), and attitudes except for rounding of the quaternion's norm.
+The files are written for external programs. Reading restores counts, flat fields and numbers exactly, because JSON
+stores the shortest decimal text that reads back as the same float64. Attitudes are restored except for rounding of the
+quaternion's norm.
 """
 
 from __future__ import annotations
@@ -71,7 +72,9 @@ def write_case(
     else:
         content = {
             "task": "landing",
-            "poses": [{**encode_pose(p.world_from_body, "body"), "time_s": p.time_s} for p in measurements.poses],
+            "poses": [
+                {**encode_pose(pose.world_from_body, "body"), "time_s": pose.time_s} for pose in measurements.poses
+            ],
             "slant_range_m": _encode_length(measurements.slant_range_m),
             "up_body": measurements.up_body.tolist(),
             "apriori_site_world": measurements.apriori_site_world.tolist(),
@@ -193,7 +196,8 @@ def _write_images(folder: Path, images: Sequence[DetectorImage], image_format: I
         detector = image.calibration
         write_counts(folder / names["file"], image.counts)
         write_cahvor(image.camera, folder / names["camera"], frame=BODY_FRAME)
-        flat_file = next((n for n, field in flat_fields.items() if np.array_equal(field, detector.flat_field)), None)
+        equal_files = (name for name, field in flat_fields.items() if np.array_equal(field, detector.flat_field))
+        flat_file = next(equal_files, None)
         if flat_file is None:
             flat_file = f"flat_field_{len(flat_fields) + 1}.f64"
             flat_fields[flat_file] = detector.flat_field
@@ -234,12 +238,14 @@ def read_counts(path: Path) -> UInt16[np.ndarray, "rows columns"]:
 
 
 MAST_FILE, STOP_FILE = "mast.json", "stop.json"
-_OFFSETS, _LIMITS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "elevation_limits_rad")
+_OFFSET_KEYS, _LIMIT_KEYS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "elevation_limits_rad")
 
 
 def write_mast(folder: Path, mast: MastCalibration) -> None:
     """Write a mast and its two cameras into an existing folder."""
-    content: dict[str, Any] = {name: np.asarray(getattr(mast.geometry, name)).tolist() for name in _OFFSETS + _LIMITS}
+    content: dict[str, Any] = {
+        name: np.asarray(getattr(mast.geometry, name)).tolist() for name in _OFFSET_KEYS + _LIMIT_KEYS
+    }
     for name, camera in (("left", mast.left), ("right", mast.right)):
         write_cahvor(camera, folder / f"{name}.cahvor", frame=HEAD_FRAME)
         content[name] = {"camera": f"{name}.cahvor", "columns": camera.size[0], "rows": camera.size[1]}
@@ -250,8 +256,8 @@ def read_mast(folder: Path) -> MastCalibration:
     """Read the mast that `write_mast` wrote. Raises ValueError if it is missing."""
     with open_json(folder / MAST_FILE, "mast") as content:
         left, right = (read_cahvor(folder / content[name]["camera"]) for name in ("left", "right"))
-        base, elbow, head = (_read_vector(content[name]) for name in _OFFSETS)
-        azimuths, elevations = ((content[name][0], content[name][1]) for name in _LIMITS)
+        base, elbow, head = (_read_vector(content[name]) for name in _OFFSET_KEYS)
+        azimuths, elevations = ((content[name][0], content[name][1]) for name in _LIMIT_KEYS)
         return MastCalibration(MastGeometry(base, elbow, head, azimuths, elevations), left, right)
 
 
@@ -267,7 +273,7 @@ def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
 
 
 def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
-    """Read the stop that `write_stop` wrote; `mast` completes it. Raises ValueError if it is missing."""
+    """Read the stop that `write_stop` wrote; add the given `mast`. Raises ValueError if the stop is missing."""
     with open_json(folder / STOP_FILE, "stop") as content:
         left, right = (
             MastImage(read_counts(folder / record["file"]), (int(record["corner"][0]), int(record["corner"][1])))

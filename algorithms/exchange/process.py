@@ -85,8 +85,8 @@ def parse_command(text: str) -> Command | None:
     if not words:
         raise ValueError(f"'{text}' contains no program; expected {prefix}PROGRAM, followed by its arguments")
     if shutil.which(words[0]) is None:
-        no_path = "is not on the PATH; for a program in this folder write ./ in front of its name"
-        problem = "does not exist or is not executable" if "/" in words[0] else no_path
+        path_problem = "is not on the PATH; for a program in this folder write ./ in front of its name"
+        problem = "does not exist or is not executable" if "/" in words[0] else path_problem
         raise ValueError(f"no program for '{text}': {words[0]} {problem}")
     return Command(tuple(words), *PREFIXES[prefix])
 
@@ -116,7 +116,7 @@ class RunningProgram:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 process_group=0,
-                preexec_fn=_end_with_parent if sys.platform == "linux" else None,
+                preexec_fn=_kill_with_parent if sys.platform == "linux" else None,
             )
         except OSError as error:
             message = f"{words[0]} cannot be started: {error.strerror or error}"
@@ -237,7 +237,7 @@ class RunningProgram:
         return Output(output, _decode_tail(self._stderr), time.perf_counter() - start_s)
 
 
-def _end_with_parent() -> None:
+def _kill_with_parent() -> None:
     """Configure Linux to kill the program when its parent thread ends; called between fork and exec."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
@@ -260,4 +260,4 @@ def shorten(raw: bytes) -> str:
 def _decode_tail(raw: bytearray) -> str:
     """Decode the end of an output as printable text."""
     text = bytes(raw[-4 * MAX_STDERR_CHARACTERS :]).decode("utf-8", errors="replace")[-MAX_STDERR_CHARACTERS:]
-    return "".join(letter if letter.isprintable() or letter in "\n\t" else "�" for letter in text)
+    return "".join(character if character.isprintable() or character in "\n\t" else "�" for character in text)

@@ -63,11 +63,11 @@ def check_keys(answer: Mapping[str, Any], allowed: set[str]) -> None:
         raise bad_answer(f"the answer has an unknown key '{unknown[0]}'; allowed: {', '.join(sorted(keys))}")
 
 
-def read_member(label: str, name: object, kinds: type[Member]) -> Member:
-    """Look up a member of the enumeration `kinds` by name; raises AlgorithmError (BAD_ANSWER). `label` is the key."""
-    if not isinstance(name, str) or name not in kinds.__members__:
-        raise bad_answer(f"{label} is {name!r}; allowed: {', '.join(kinds.__members__)}")
-    return kinds[name]
+def read_member(label: str, name: object, enumeration: type[Member]) -> Member:
+    """Look up a member of the `enumeration` by name; raises AlgorithmError (BAD_ANSWER). `label` is the key."""
+    if not isinstance(name, str) or name not in enumeration.__members__:
+        raise bad_answer(f"{label} is {name!r}; allowed: {', '.join(enumeration.__members__)}")
+    return enumeration[name]
 
 
 def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray | None:
@@ -115,18 +115,18 @@ class Server:
         is ended and AlgorithmError raised.
         """
         self.request_count += 1
-        identity = {"id": self.request_count} if self.version > 1 else {}
-        output = self.child.read_line(json.dumps({"exchange": self.version, **identity, **request}, allow_nan=False))
+        id_field = {"id": self.request_count} if self.version > 1 else {}
+        output = self.child.read_line(json.dumps({"exchange": self.version, **id_field, **request}, allow_nan=False))
         try:
             answer = parse_object(output)
-            for key, expected in {"exchange": self.version, **identity}.items():
+            for key, expected in {"exchange": self.version, **id_field}.items():
                 if type(answer.get(key)) is not int or answer[key] != expected:
                     message = f"the answer's {key} is {answer.get(key)!r}; allowed: {expected}, as in the request"
                     raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
         except AlgorithmError:
             self.child.stop()
             raise
-        return {key: value for key, value in answer.items() if key not in identity}, output
+        return {key: value for key, value in answer.items() if key not in id_field}, output
 
 
 #: Idle persistent programs by command and limits.
@@ -177,7 +177,7 @@ def end_idle_programs() -> None:
 
 
 class Session:
-    """Requests of one algorithm to a program, one JSON line each; the first request starts the program.
+    """Connection of one algorithm to a program: one JSON line per request. The first request starts the program.
 
     The session's `folder` contains the input files and is removed with the session.
     """

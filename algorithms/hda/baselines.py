@@ -104,7 +104,7 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
 
 @dataclass(frozen=True)
 class Rectification:
-    """A pair of linear cameras with parallel axes and columns along the baseline.
+    """Pair of linear cameras with parallel axes; the x axes (image columns) lie along the baseline.
 
     - rectified_from_first: From the first camera's frame to the rectified one, with the same origin
     - baseline_m: Distance between the cameras
@@ -156,23 +156,23 @@ def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectificat
 
 
 def match_disparities(
-    views: Views, pair: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
+    views: Views, rectification: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
 ) -> Float[np.ndarray, "rows columns"]:
     """Compute disparities (pixels) in the first rectified image by semi-global matching; NaN without a match."""
-    first_from_rectified = pair.rectified_from_first.inv()
+    first_from_rectified = rectification.rectified_from_first.inv()
     full_scale = max(float(np.quantile(views[0].counts, 0.995)), 1.0)
     rotations = (first_from_rectified, second_from_first.rotation * first_from_rectified)
-    rays = pair.camera.rays(pair.camera.pixel_grid())[1].reshape(-1, 3)
+    rays = rectification.camera.rays(rectification.camera.pixel_grid())[1].reshape(-1, 3)
     images = []
     for view, rotation in zip(views, rotations, strict=True):
         # 8-bit images, black outside the field of view
         pixels = np.nan_to_num(view.camera.project(rotation.apply(rays))[0], nan=-10.0).astype(np.float32)
         grey = np.clip(view.counts * (255.0 / full_scale), 0.0, 255.0).astype(np.float32)
-        grid = pixels.reshape(pair.camera.size[1], pair.camera.size[0], 2)
+        grid = pixels.reshape(rectification.camera.size[1], rectification.camera.size[0], 2)
         images.append(np.rint(cv2.remap(grey, grid, None, cv2.INTER_LINEAR)).astype(np.uint8))
-    disparity_px_m = pair.focal_px * pair.baseline_m
-    min_disparity = int(disparity_px_m / bounds_m[1])
-    count = DISPARITY_STEP * (int(disparity_px_m / bounds_m[0] - min_disparity) // DISPARITY_STEP + 1)
+    disparity_times_depth_px_m = rectification.focal_px * rectification.baseline_m
+    min_disparity = int(disparity_times_depth_px_m / bounds_m[1])
+    count = DISPARITY_STEP * (int(disparity_times_depth_px_m / bounds_m[0] - min_disparity) // DISPARITY_STEP + 1)
     matcher = cv2.StereoSGBM.create(
         minDisparity=min_disparity,
         numDisparities=count,

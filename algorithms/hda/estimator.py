@@ -174,8 +174,10 @@ def plane_normal(points: Points3, seed: int) -> Vector3:
     distances = np.abs(points @ normals.T - np.sum(normals * corners[:, 0], axis=1))
     medians = np.median(distances, axis=0)
     best = int(np.argmin(medians))
-    fit = points[distances[:, best] <= 2.5 * 1.4826 * (1.0 + 5.0 / max(len(points) - 3, 1)) * medians[best]]
-    normal = np.linalg.svd(fit - fit.mean(axis=0), full_matrices=False)[2][2] if len(fit) >= 3 else normals[best]
+    inliers = points[distances[:, best] <= 2.5 * 1.4826 * (1.0 + 5.0 / max(len(points) - 3, 1)) * medians[best]]
+    normal = normals[best]
+    if len(inliers) >= 3:
+        normal = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)[2][2]
     return np.asarray(-np.sign(normal @ points.mean(axis=0)) * normal)
 
 

@@ -192,6 +192,7 @@ def grassfire(marked: Mask) -> Raster:
 
 
 def _dilate(marked: Mask, radius_cells: float) -> Mask:
+    """Mark also the cells within `radius_cells` of a marked cell."""
     return np.asarray(marked | (grassfire(marked) <= radius_cells))
 
 
@@ -265,8 +266,8 @@ def check_footprints(
     lattice[::step, ::step] = True
     # test the lattice cell nearest to each safe cell, even if that lattice cell is not safe
     is_tested = np.zeros_like(lattice)
-    safe = np.argwhere(safety == Safety.SAFE)
-    nearest = tuple(np.minimum((safe + step // 2) // step * step, (np.array(safety.shape) - 1) // step * step).T)
+    safe_cells = np.argwhere(safety == Safety.SAFE)
+    nearest = tuple(np.minimum((safe_cells + step // 2) // step * step, (np.array(safety.shape) - 1) // step * step).T)
     is_tested[nearest] = True
     rows, columns = np.nonzero(is_tested & lattice)
     offsets = disc_cells(0.5 * diameter_cells)
@@ -284,7 +285,7 @@ def check_footprints(
     is_unsafe = np.zeros_like(lattice)
     is_unsafe[rows[~is_safe], columns[~is_safe]] = True
     result = safety.copy()
-    result[tuple(safe[is_unsafe[nearest]].T)] = Safety.HAZARD
+    result[tuple(safe_cells[is_unsafe[nearest]].T)] = Safety.HAZARD
     return result
 
 

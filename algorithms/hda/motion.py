@@ -117,7 +117,7 @@ class LandingScene:
 
 
 def build_scene(measurements: LandingMeasurements) -> LandingScene:
-    """Transform the measurements to the cameras' frames. Raises ValueError as `build_view`."""
+    """Transform the measurements to the cameras' frames. Raises the same error as `build_view`."""
     pairs = zip(measurements.images, measurements.poses, strict=True)
     first, second = (build_view(image, pose) for image, pose in pairs)
     body_from_camera = camera_pose(measurements.images[0].camera)
@@ -222,35 +222,39 @@ def assess_motion(
 ) -> Motion:
     """Compute residuals, inliers and parallax of a motion; the arguments are those of `estimate_motion`."""
     quaternion = second_from_first.rotation.as_quat(scalar_first=True)
-    inverse = 1.0 / depths
+    inverse_depths = 1.0 / depths
     # with measurements of zero, residuals are the projections of the features, pixels
     zero_matches = kernels.Matches(first, np.zeros_like(first), focal_px, 1.0)
     translations = (np.zeros(3), np.array(second_from_first.translation))
-    without_t, with_t = (kernels.residuals(zero_matches, kernels.Motion(quaternion, t, inverse)) for t in translations)
+    without_t, with_t = (
+        kernels.residuals(zero_matches, kernels.Motion(quaternion, t, inverse_depths)) for t in translations
+    )
     residuals = np.hypot(*(with_t - focal_px * second).T)
-    is_fit = residuals <= options.max_residual_px
+    has_small_residual = residuals <= options.max_residual_px
+    shifts_px = np.hypot(*(with_t - without_t)[has_small_residual].T)
     return Motion(
         second_from_first=second_from_first,
         depths=depths,
         residuals_px=residuals,
-        inliers=is_fit & _has_plausible_depth(first, inverse, is_fit),
-        parallax_px=float(np.median(np.hypot(*(with_t - without_t)[is_fit].T))) if np.any(is_fit) else 0.0,
+        inliers=has_small_residual & _has_plausible_depth(first, inverse_depths, has_small_residual),
+        parallax_px=float(np.median(shifts_px)) if len(shifts_px) else 0.0,
         converged=converged,
     )
 
 
-def _has_plausible_depth(first: Points2, inverse: Vector, is_fit: Flags) -> Flags:
+def _has_plausible_depth(first: Points2, inverse_depths: Vector, has_small_residual: Flags) -> Flags:
     """Whether inverse depths are near those of the ground plane, linear in normalised image coordinates.
 
     A wrong match along the epipolar line fits any motion; only its depth is wrong.
     """
     design = np.column_stack([first, np.ones(len(first))])
-    mask = is_fit & (inverse > 0.0)
+    mask = has_small_residual & (inverse_depths > 0.0)
     for _ in range(3):
         if mask.sum() < 4:
             return mask
-        plane = design @ np.linalg.lstsq(design[mask], inverse[mask], rcond=None)[0]
-        deviations = np.abs(inverse - plane)
-        limit = max(3.0 * 1.4826 * float(np.median(deviations[mask])), 1e-3 * float(np.median(inverse[mask])))
-        mask = is_fit & (inverse > 0.0) & (deviations <= limit)
-    return np.asarray((inverse > 0.0) & (deviations <= MAX_INVERSE_DEPTH_FRACTION * np.abs(plane)))
+        plane = design @ np.linalg.lstsq(design[mask], inverse_depths[mask], rcond=None)[0]
+        deviations = np.abs(inverse_depths - plane)
+        # 1.4826 times the median absolute deviation is the standard deviation of a normal distribution
+        limit = max(3.0 * 1.4826 * float(np.median(deviations[mask])), 1e-3 * float(np.median(inverse_depths[mask])))
+        mask = has_small_residual & (inverse_depths > 0.0) & (deviations <= limit)
+    return np.asarray((inverse_depths > 0.0) & (deviations <= MAX_INVERSE_DEPTH_FRACTION * np.abs(plane)))

@@ -130,7 +130,7 @@ class HdaOptions:
         for name, minimum in ((name, minimum) for minimum, names in _NAMES_BY_MINIMUM.items() for name in names):
             if not getattr(self, name) >= minimum:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {minimum}")
-        for name in _POSITIVE:
+        for name in _POSITIVE_NAMES:
             if getattr(self, name) is not None and not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
         if not self.max_slope_rad < np.pi / 2:
@@ -151,7 +151,7 @@ _NAMES_BY_MINIMUM = {
     6: ("min_tracks",),
 }
 #: Names of the options that must be positive.
-_POSITIVE = (
+_POSITIVE_NAMES = (
     *("robust_px", "max_return_px", "narrowest_hazard", "max_residual_px"),
     *("lander_diameter_m", "max_slope_rad", "max_roughness_m"),
 )

@@ -92,6 +92,7 @@ def triangulate(first: Points2, second: Points2, second_from_first: RigidTransfo
     """Depths z in the first camera's frame that best fit z' h' = z R h + t, metres; NaN for parallel rays.
 
     Least squares over both depths (Weng, Ahuja & Huang 1993); h and h' are homogeneous normalised image coordinates.
+    The variables a and b are R h and h'.
     """
     a = second_from_first.rotation.apply(np.column_stack([first, np.ones(len(first))]))
     b = np.column_stack([second, np.ones(len(second))])
@@ -130,11 +131,12 @@ def match_pixels(
     statuses[~((depths > bounds_m[0]) & (depths < bounds_m[1]))] = MatchStatus.OUT_OF_BOUNDS
     statuses[~(correlations >= options.min_match_correlation)] = MatchStatus.DISSIMILAR
     if options.max_return_px is not None:
-        k = np.flatnonzero(statuses == MatchStatus.ACCEPTED)
+        indices = np.flatnonzero(statuses == MatchStatus.ACCEPTED)
+        accepted_matches = (rounded[indices], matches[indices], coordinates[indices])
         errors_px = forward_backward_error(
-            views, second_from_first, rounded[k], matches[k], coordinates[k], bounds_m, options.search_half_px
+            views, second_from_first, *accepted_matches, bounds_m, options.search_half_px
         )
-        statuses[k[errors_px > options.max_return_px]] = MatchStatus.NOT_RETURNED
+        statuses[indices[errors_px > options.max_return_px]] = MatchStatus.NOT_RETURNED
     accepted = statuses == MatchStatus.ACCEPTED
     points = points_at_depth(coordinates[accepted], depths[accepted])
     return Matches(pixels, starts, ends, matched_pixels, correlations, depths, statuses, points)

@@ -62,8 +62,8 @@ def pyramid(counts: Counts, levels: int) -> tuple[Float[np.ndarray, "_ _"], ...]
 def eigenvalue_test(image: Raster, support: int, min_eigenvalue: float) -> Raster:
     """Interest P of Eq. 2 where both eigenvalues of the structure tensor exceed the minimum l; -inf elsewhere.
 
-    P is (a - l)(c - l) - b b with a > l (Benedetti & Perona 1998). The tensor is the mean, not the sum, over
-    `support` x `support` pixels (Eq. 1 divided by their number).
+    P is (a - l)(c - l) - b b with a > l, for the tensor's entries a (uu), c (vv) and b (uv) (Benedetti & Perona 1998).
+    The tensor is the mean, not the sum, over `support` x `support` pixels (Eq. 1 divided by their number).
     """
     a, c, b = structure_tensor(image, support)
     interest = (a - min_eigenvalue) * (c - min_eigenvalue) - b * b

@@ -16,7 +16,7 @@ from marsyard.algorithms.arrays import Raster, Vector2
 from marsyard.algorithms.image.kernels import correlation as kernels
 
 #: Row and column offsets of 3 x 3 pixels from the centre.
-_ROW, _COLUMN = np.mgrid[-1.0:2.0, -1.0:2.0]
+_ROW_OFFSETS, _COLUMN_OFFSETS = np.mgrid[-1.0:2.0, -1.0:2.0]
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,11 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
     if peak.on_border:
         return np.zeros(2)
     z = surface[peak.row - 1 : peak.row + 2, peak.column - 1 : peak.column + 2]
-    gradient = np.array([np.sum(z * _ROW), np.sum(z * _COLUMN)]) / 6.0
-    rr = float(np.sum(z * (_ROW**2 - 2.0 / 3.0)))
-    cc = float(np.sum(z * (_COLUMN**2 - 2.0 / 3.0)))
-    rc = float(np.sum(z * _ROW * _COLUMN)) / 4.0
+    gradient = np.array([np.sum(z * _ROW_OFFSETS), np.sum(z * _COLUMN_OFFSETS)]) / 6.0
+    # second derivatives of the quadratic along rows, along columns, and mixed
+    rr = float(np.sum(z * (_ROW_OFFSETS**2 - 2.0 / 3.0)))
+    cc = float(np.sum(z * (_COLUMN_OFFSETS**2 - 2.0 / 3.0)))
+    rc = float(np.sum(z * _ROW_OFFSETS * _COLUMN_OFFSETS)) / 4.0
     determinant = rr * cc - rc * rc
     if rr >= 0.0 or determinant <= 0.0:
         return np.zeros(2)

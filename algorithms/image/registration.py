@@ -26,8 +26,9 @@ ORDER: Final = 5
 ALIGNMENT_TOLERANCE_PX = 1e-3
 #: Margin around a patch for its spline; pixels outside it change the result by less than 1e-4 px.
 MARGIN_PX = 12
-#: Positions of the six spline coefficients relative to a point's pixel; the B-spline and its derivative.
+#: Positions of the six spline coefficients relative to a point's pixel.
 _TAPS = np.arange(ORDER + 1) - ORDER // 2
+#: Quintic B-spline and its derivative.
 _BASIS = BSpline.basis_element(np.arange(ORDER + 2) - (ORDER + 1) / 2.0, extrapolate=False)
 _SLOPE = _BASIS.derivative()
 
@@ -188,7 +189,9 @@ def similarity_patch(
     start = np.floor(position).astype(int) - margin
     stop = start + 2 * margin + 2
     valid_region = image[max(start[0], 0) : max(stop[0], 0), max(start[1], 0) : max(stop[1], 0)]
-    padding = [(max(-a, 0), max(b - n, 0)) for a, b, n in zip(start, stop, image.shape, strict=True)]
+    padding = [
+        (max(-low, 0), max(high - extent, 0)) for low, high, extent in zip(start, stop, image.shape, strict=True)
+    ]
     region = np.pad(valid_region, padding, mode="reflect") if np.any(padding) else valid_region
     values = np.empty(side * side)
     row, column = position - start

@@ -46,7 +46,7 @@ class NavigationOptions:
     - tilt_deg: Maximum tilt of the ground
     - roughness_m: Maximum standard deviation of the ground's height from a plane
     - lookahead_m: Length of the path that must be mapped and clear
-    - curvature_m: Largest curvature, 1/m
+    - max_curvature_per_m: Maximum curvature, 1/m
     - turn_cost_m: Cost of a turn in place, metres of path per radian
     - bend_cost_m2: Weight of the integral of the squared curvature in the cost (in metres of path)
     """
@@ -57,14 +57,14 @@ class NavigationOptions:
     tilt_deg: float = 30.0
     roughness_m: float = 0.06
     lookahead_m: float = 4.0
-    curvature_m: float = 0.6
+    max_curvature_per_m: float = 0.6
     turn_cost_m: float = 0.5
     bend_cost_m2: float = 1.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if (
-                name in ("half_width_m", "climb_m", "tilt_deg", "roughness_m", "lookahead_m", "curvature_m")
+                name in ("half_width_m", "climb_m", "tilt_deg", "roughness_m", "lookahead_m", "max_curvature_per_m")
                 and not 0.0 < value < np.inf
             ):
                 raise ValueError(f"{name} is {value}; it must be positive")
@@ -115,8 +115,9 @@ def navigate(
     - backwards: Whether to drive backwards
     """
     forward = world_from_rover.rotation.as_matrix()[:2, 0] * (-1.0 if backwards else 1.0)
-    position, heading = world_from_rover.translation[:2], _rotation_matrix(np.arctan2(forward[1], forward[0]))
-    goal = np.asarray((goal_m - position) @ heading)
+    position = world_from_rover.translation[:2]
+    world_from_forward = _rotation_matrix(np.arctan2(forward[1], forward[0]))
+    goal = np.asarray((goal_m - position) @ world_from_forward)
     no_path = np.empty((0, 2))
     if float(np.hypot(*goal)) < AT_GOAL_M:
         return NavigationPlan(NavigationOutcome.AT_GOAL, (), no_path)
@@ -124,39 +125,44 @@ def navigate(
     if np.isnan(goodness.at(position[None])[0]):
         return NavigationPlan(NavigationOutcome.NOT_MAPPED, (), no_path)
     for path in _generate_paths(goal, options):
-        lookahead = position + path.points(np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)) @ heading.T
-        if _is_clear(lookahead, goodness, options):
-            path_points = np.asarray(position + path.points(np.linspace(0.0, path.length_m, 60)) @ heading.T)
+        lookahead_distances = np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)
+        lookahead_points = position + path.points(lookahead_distances) @ world_from_forward.T
+        if _is_clear(lookahead_points, goodness, options):
+            path_distances = np.linspace(0.0, path.length_m, 60)
+            path_points = np.asarray(position + path.points(path_distances) @ world_from_forward.T)
             return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), path_points)
     return NavigationPlan(NavigationOutcome.NO_PATH, (), no_path)
 
 
 @dataclass(frozen=True)
 class _Path:
-    """Turn in place, then two arcs, each with a curvature (positive to the left) and a length."""
+    """Turn in place, then two arcs with curvatures and lengths; turns and curvatures are positive to the left."""
 
     turn_rad: float
-    curvatures_m: tuple[float, float]
+    curvatures_per_m: tuple[float, float]
     lengths_m: tuple[float, float]
 
     @property
     def length_m(self) -> float:
+        """Length of both arcs, metres."""
         return self.lengths_m[0] + self.lengths_m[1]
 
     def points(self, distances_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
         """Positions at distances along the path, in the axes of the rover before the turn."""
-        first_m = np.minimum(distances_m, self.lengths_m[0])
-        first_end = _arc(self.curvatures_m[0], np.array([self.lengths_m[0]]))[0]
-        heading = self.curvatures_m[0] * self.lengths_m[0]
-        second_arc = first_end + _arc(self.curvatures_m[1], distances_m - first_m) @ _rotation_matrix(heading).T
-        points = np.where((distances_m > self.lengths_m[0])[:, None], second_arc, _arc(self.curvatures_m[0], first_m))
+        (first_curvature, second_curvature), first_length_m = self.curvatures_per_m, self.lengths_m[0]
+        first_distances_m = np.minimum(distances_m, first_length_m)
+        first_arc = _arc_positions(first_curvature, first_distances_m)
+        first_end = _arc_positions(first_curvature, np.array([first_length_m]))[0]
+        heading = _rotation_matrix(first_curvature * first_length_m)
+        second_arc = first_end + _arc_positions(second_curvature, distances_m - first_distances_m) @ heading.T
+        points = np.where((distances_m > first_length_m)[:, None], second_arc, first_arc)
         return np.asarray(points @ _rotation_matrix(self.turn_rad).T)
 
     def commands(self, step_m: float, backwards: bool) -> tuple[DriveCommand, ...]:
         """Drive commands for the turn and the first `step_m` metres of the arcs."""
         commands = [DriveCommand(turn_left_rad=self.turn_rad)] if self.turn_rad else []
         remaining_m = step_m
-        for curvature, length in zip(self.curvatures_m, self.lengths_m, strict=True):
+        for curvature, length in zip(self.curvatures_per_m, self.lengths_m, strict=True):
             length_m = min(length, remaining_m)
             remaining_m -= length_m
             if length_m > 0.0:
@@ -164,11 +170,12 @@ class _Path:
         return tuple(commands)
 
 
-def _arc(curvature_m: float, distances_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
+def _arc_positions(curvature_per_m: float, distances_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
     """Positions at distances along an arc that starts at the origin in the direction of x."""
-    half = 0.5 * curvature_m * distances_m
-    chord = distances_m * np.sinc(half / np.pi)
-    return np.stack([chord * np.cos(half), chord * np.sin(half)], axis=-1)
+    # the direction of a chord is half of the heading change
+    angles = 0.5 * curvature_per_m * distances_m
+    chords = distances_m * np.sinc(angles / np.pi)
+    return np.stack([chords * np.cos(angles), chords * np.sin(angles)], axis=-1)
 
 
 def _rotation_matrix(angle_rad: float) -> Float[np.ndarray, "2 2"]:
@@ -183,7 +190,7 @@ def _generate_paths(goal: Float[np.ndarray, "2"], options: NavigationOptions) ->
     """
     goal_direction = float(np.arctan2(goal[1], goal[0]))
     turns = np.concatenate([np.radians(_TURNS_DEG), [goal_direction]])
-    curvatures = options.curvature_m * np.linspace(-1.0, 1.0, 9)
+    curvatures = options.max_curvature_per_m * np.linspace(-1.0, 1.0, 9)
     lengths = 0.75 * float(np.hypot(*goal)) * np.linspace(0.0, 1.0, 9)
     turn, curvature_1, length_1 = (grid.ravel() for grid in np.meshgrid(turns, curvatures, lengths, indexing="ij"))
     # the end of the first arc, and distance and direction from it to the goal
@@ -196,19 +203,19 @@ def _generate_paths(goal: Float[np.ndarray, "2"], options: NavigationOptions) ->
     curvature_2 = 2.0 * np.sin(angle) / np.maximum(range_m, AT_GOAL_M)
     length_2 = range_m / np.sinc(angle / np.pi)
     feasible = (range_m >= AT_GOAL_M) & (np.abs(angle) <= _MAX_HEADING_RAD)
-    feasible &= np.abs(curvature_2) <= options.curvature_m
+    feasible &= np.abs(curvature_2) <= options.max_curvature_per_m
     bending = curvature_1**2 * length_1 + curvature_2**2 * length_2
     cost = length_1 + length_2 + options.turn_cost_m * np.abs(turn) + options.bend_cost_m2 * bending
     cost = np.where(feasible, cost, np.inf)
     for k in np.argsort(cost, kind="stable")[: np.count_nonzero(feasible)]:
-        curvatures_m = (float(curvature_1[k]), float(curvature_2[k]))
-        yield _Path(float(turn[k]), curvatures_m, (float(length_1[k]), float(length_2[k])))
+        curvatures_per_m = (float(curvature_1[k]), float(curvature_2[k]))
+        yield _Path(float(turn[k]), curvatures_per_m, (float(length_1[k]), float(length_2[k])))
 
 
 def _is_clear(positions_m: Float[np.ndarray, "n 2"], goodness: Goodness, options: NavigationOptions) -> bool:
-    """Return whether the swept disc is mapped and avoids all hazards.
+    """Whether the swept disc is mapped and avoids all hazards, at positions (east, north) along the path.
 
-    It may overlap a hazard at the start if the distance then increases.
+    The disc may overlap a hazard at the start, if it never comes closer to a hazard afterwards.
     """
     values, distances = goodness.at(positions_m), goodness.hazard_distances_m(positions_m)
     if np.any(np.isnan(values)):

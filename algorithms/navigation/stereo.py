@@ -29,8 +29,8 @@ _BLOCK_PX, _FEATURE_PX = 9, 11
 _TEXTURE, _UNIQUENESS, _LEFT_RIGHT_PX, _SPECKLE_PX, _SPECKLE_RANGE = 10, 15, 1, 100, 8
 #: OpenCV's unit of disparity, pixels, and the step of its number of disparities.
 _DISPARITY_UNIT, _DISPARITY_STEP = 1.0 / 16.0, 16
-#: Maximum distance of a feature match from its epipolar line, pixels, and maximum error of matching there and back.
-_EPIPOLAR_PX, _RETURN_PX = 1.0, 0.5
+#: Maximum distance of a feature match from its epipolar line, and maximum forward-backward error, pixels.
+_EPIPOLAR_PX, _FORWARD_BACKWARD_PX = 1.0, 0.5
 #: Pyramid levels of feature matching above the full resolution.
 _LEVELS = 2
 
@@ -54,23 +54,23 @@ class RectifiedPair:
         left, right = pair.cameras
         baseline = right.c - left.c
         baseline_m = float(np.linalg.norm(baseline))
-        along = baseline / baseline_m
+        baseline_direction = baseline / baseline_m
         boresight = left.boresight() + right.boresight()
-        axis = boresight - (boresight @ along) * along
+        axis = boresight - (boresight @ baseline_direction) * baseline_direction
         focal_px = left.focal_lengths[0]
         axis = axis / np.linalg.norm(axis)
         # the field of view at the ends of the camera's central row and column
         columns, rows = left.size
-        middle = np.array(left.image_centre)
-        edges = np.array([[0.0, middle[1]], [columns - 1.0, middle[1]], [middle[0], 0.0], [middle[0], rows - 1.0]])
+        centre = np.array(left.image_centre)
+        edges = np.array([[0.0, centre[1]], [columns - 1.0, centre[1]], [centre[0], 0.0], [centre[0], rows - 1.0]])
         angles = np.minimum(np.arccos(np.clip(left.rays(edges)[1] @ axis, -1.0, 1.0)), _MAX_FIELD_RAD)
-        half_width, half_height = (float(np.tan(angles[pair].max())) * focal_px for pair in ([0, 1], [2, 3]))
+        half_width, half_height = (float(np.tan(angles[ends].max())) * focal_px for ends in ([0, 1], [2, 3]))
         size = 2 * int(np.ceil(half_width)), 2 * int(np.ceil(half_height))
-        camera = Cahv.from_axes((focal_px, focal_px), size, axis=axis, right=along, centre=left.c)
-        white = max(float(np.percentile(pair.left, _WHITE_PERCENTILE)), 1.0)
+        camera = Cahv.from_axes((focal_px, focal_px), size, axis=axis, right=baseline_direction, centre=left.c)
+        white_counts = max(float(np.percentile(pair.left, _WHITE_PERCENTILE)), 1.0)
         return cls(
-            _resample(_to_8_bit(pair.left, white), left, camera),
-            _resample(_to_8_bit(pair.right, white), right, camera),
+            _resample(_to_8_bit(pair.left, white_counts), left, camera),
+            _resample(_to_8_bit(pair.right, white_counts), right, camera),
             camera,
             baseline_m,
         )
@@ -100,11 +100,11 @@ class RectifiedPair:
         jacobian[:, 0, 0] = jacobian[:, 1, 1] = depth / focal
         slopes = np.column_stack([(pixels - centre) / focal, np.ones(len(pixels))])
         jacobian[:, :, 2] = -slopes * (depth / disparity_px)[:, None]
-        in_rover = axes.T @ jacobian
+        rover_jacobian = axes.T @ jacobian
         variance = np.array([1.0, 1.0, 2.0]) * error_px**2
-        return np.asarray((in_rover * variance) @ in_rover.transpose(0, 2, 1))
+        return np.asarray((rover_jacobian * variance) @ rover_jacobian.transpose(0, 2, 1))
 
-    def range_map(self, min_range_m: float) -> Float32[np.ndarray, "rows columns"]:
+    def disparity_map(self, min_range_m: float) -> Float32[np.ndarray, "rows columns"]:
         """Compute the disparity of each left pixel by block matching; NaN without a reliable match.
 
         Occluded, textureless and ambiguous areas have no match. `min_range_m` limits the disparity.
@@ -123,7 +123,7 @@ class RectifiedPair:
 
     def points(self, min_range_m: float, max_range_m: float) -> Points3:
         """Compute the points of all matched pixels with a depth between the limits, rover frame, metres."""
-        disparity = self.range_map(min_range_m)
+        disparity = self.disparity_map(min_range_m)
         with np.errstate(invalid="ignore"):
             rows, columns = np.nonzero(disparity >= self.disparity_px_m / max_range_m)
         pixels = np.column_stack([columns, rows]).astype(np.float64)
@@ -131,13 +131,13 @@ class RectifiedPair:
 
     def feature_disparities(self, pixels: Points2, min_range_m: float) -> tuple[Float64[np.ndarray, "n"], Flags]:
         """Match features of the left image in the right one; return their disparities and which are valid."""
-        dense = self.range_map(min_range_m)
+        dense = self.disparity_map(min_range_m)
         columns, rows = np.clip(np.rint(pixels).astype(int), 0, np.array(self.camera.size) - 1).T
-        first = dense[rows, columns].astype(np.float64)
-        guess = np.where(np.isfinite(first), first, 0.0)
-        matched, valid = track_features(self.left, self.right, pixels, pixels - np.column_stack([guess, 0.0 * guess]))
+        initial = dense[rows, columns].astype(np.float64)
+        shifts = np.column_stack([np.nan_to_num(initial), np.zeros(len(initial))])
+        matched, valid = track_features(self.left, self.right, pixels, pixels - shifts)
         disparity = pixels[:, 0] - matched[:, 0]
-        valid &= np.isfinite(first) & (np.abs(matched[:, 1] - pixels[:, 1]) <= _EPIPOLAR_PX) & (disparity > 0.0)
+        valid &= np.isfinite(initial) & (np.abs(matched[:, 1] - pixels[:, 1]) <= _EPIPOLAR_PX) & (disparity > 0.0)
         return disparity, valid
 
 
@@ -159,12 +159,13 @@ def track_features(
     end, forward, _ = cv2.calcOpticalFlowPyrLK(first, second, start, guess.copy(), **settings)
     back, reverse, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **settings)
     valid = (forward.ravel() == 1) & (reverse.ravel() == 1)
-    valid &= np.hypot(*(back - start).T) <= _RETURN_PX
+    valid &= np.hypot(*(back - start).T) <= _FORWARD_BACKWARD_PX
     return end.astype(np.float64), np.asarray(valid)
 
 
-def _to_8_bit(counts: np.ndarray, white: float) -> UInt8[np.ndarray, "rows columns"]:
-    scaled = 255.0 * np.sqrt(np.minimum(counts.astype(np.float32) / np.float32(white), 1.0))
+def _to_8_bit(counts: np.ndarray, white_counts: float) -> UInt8[np.ndarray, "rows columns"]:
+    """Convert counts to 1 .. 255 by their square root; `white_counts` becomes 255. The value 0 means no image."""
+    scaled = 255.0 * np.sqrt(np.minimum(counts.astype(np.float32) / np.float32(white_counts), 1.0))
     return np.asarray(np.maximum(np.rint(scaled), 1.0).astype(np.uint8))
 
 

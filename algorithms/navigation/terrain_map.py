@@ -23,7 +23,7 @@ CELL_M, HALF_SIDE_M = 0.2, 20.0
 #: false matches have no effect.
 _MIN_POINTS, _QUANTILES = 4, (0.2, 0.8)
 #: Minimum fraction of a disc's cells that must be mapped for a plane fit.
-_MIN_MAPPED = 0.8
+_MIN_MAPPED_FRACTION = 0.8
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,9 @@ class TerrainMap:
         numbers, first, counts = np.unique(cells, return_index=True, return_counts=True)
         has_enough_points = counts >= _MIN_POINTS
         numbers, first, counts = numbers[has_enough_points], first[has_enough_points], counts[has_enough_points]
-        low, middle, high = (first + np.rint(q * (counts - 1)).astype(int) for q in (_QUANTILES[0], 0.5, _QUANTILES[1]))
+        low, middle, high = (
+            first + np.rint(quantile * (counts - 1)).astype(int) for quantile in (_QUANTILES[0], 0.5, _QUANTILES[1])
+        )
         values = heights[low], heights[middle], heights[high]
         layers = [self.lower_m.copy(), self.median_m.copy(), self.upper_m.copy()]
         for layer, heights_of_cells in zip(layers, values, strict=True):
@@ -104,7 +106,7 @@ class TerrainMap:
     def add_plane(
         self, centre_m: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], radius_m: float
     ) -> TerrainMap:
-        """Return the map with a plane in the unmapped cells of a disc: ground under the rover, known to operators."""
+        """Return the map with a plane in the unmapped cells of a disc: ground under the rover, which operators know."""
         axis = self.corner_m[:, None] + CELL_M * np.arange(len(self.median_m))
         east, north = np.meshgrid(axis[0] - centre_m[0], axis[1] - centre_m[1])
         heights = centre_m[2] - (normal[0] * east + normal[1] * north) / normal[2]
@@ -135,18 +137,18 @@ class TerrainMap:
         weight = mapped.astype(np.float64)
         disc, x, y = _disc(limits.radius_m)
 
-        def total(values: Raster, kernel: Float[np.ndarray, "_ _"]) -> Raster:
+        def sum_over_disc(values: Raster, kernel: Float[np.ndarray, "_ _"]) -> Raster:
             return np.asarray(cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT))
 
         # normal equations of z = a + b x + c y over the mapped cells of the disc
-        count, sx, sy = total(weight, disc), total(weight, x), total(weight, y)
-        sxx, sxy, syy = total(weight, x * x), total(weight, x * y), total(weight, y * y)
-        sz, sxz, syz, szz = total(z, disc), total(z, x), total(z, y), total(z * z, disc)
-        is_known = count >= _MIN_MAPPED * disc.sum()
+        count, sx, sy = sum_over_disc(weight, disc), sum_over_disc(weight, x), sum_over_disc(weight, y)
+        sxx, sxy, syy = sum_over_disc(weight, x * x), sum_over_disc(weight, x * y), sum_over_disc(weight, y * y)
+        sz, sxz, syz, szz = sum_over_disc(z, disc), sum_over_disc(z, x), sum_over_disc(z, y), sum_over_disc(z * z, disc)
+        is_known = count >= _MIN_MAPPED_FRACTION * disc.sum()
         matrices = np.stack([count, sx, sy, sx, sxx, sxy, sy, sxy, syy], axis=-1).reshape(*z.shape, 3, 3)[is_known]
-        sides = np.stack([sz, sxz, syz], axis=-1)[is_known]
-        planes = np.linalg.solve(matrices, sides[..., None])[..., 0]
-        squared_residuals = szz[is_known] - np.sum(planes * sides, axis=-1)
+        right_hand_sides = np.stack([sz, sxz, syz], axis=-1)[is_known]
+        planes = np.linalg.solve(matrices, right_hand_sides[..., None])[..., 0]
+        squared_residuals = szz[is_known] - np.sum(planes * right_hand_sides, axis=-1)
         centre = np.full(z.shape, np.nan)
         centre[is_known] = planes[:, 0] + reference
         hazard = is_known & mapped
@@ -158,11 +160,11 @@ class TerrainMap:
         roughness = np.sqrt(np.maximum(squared_residuals, 0.0) / count[is_known])
         # largest step of any cell in the disc
         steps = np.where(is_known & mapped, np.nan_to_num(step), 0.0)
-        worst = cv2.dilate(steps, (disc > 0.0).astype(np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
+        max_steps = cv2.dilate(steps, (disc > 0.0).astype(np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
         margins = [
             1.0 - tilt / limits.tilt_rad,
             1.0 - roughness / limits.roughness_m,
-            1.0 - worst[is_known] / limits.climb_m,
+            1.0 - max_steps[is_known] / limits.climb_m,
         ]
         values = np.full(z.shape, np.nan)
         values[is_known] = np.maximum(np.min(margins, axis=0), 0.0)
@@ -180,9 +182,10 @@ def _disc(radius_m: float) -> tuple[Raster, Raster, Raster]:
 
 
 def _look_up(values: Raster, corner_m: Vector2, positions_m: Float[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n"]:
+    """Return the value of the cell that contains each position (east, north); NaN outside of the map."""
     columns, rows = np.rint((positions_m - corner_m) / CELL_M).astype(int).T
     count = len(values)
     inside = (columns >= 0) & (columns < count) & (rows >= 0) & (rows < count)
-    found = np.full(len(columns), np.nan)
-    found[inside] = values[rows[inside], columns[inside]]
-    return found
+    result = np.full(len(columns), np.nan)
+    result[inside] = values[rows[inside], columns[inside]]
+    return result

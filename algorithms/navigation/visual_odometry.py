@@ -1,9 +1,9 @@
 """Visual odometry: motion of the rover between two stereo pairs (as on MER: Cheng, Maimone & Matthies 2005).
 
-Features of the first pair are matched between its images and triangulated. They are tracked to the second pair from
-where the motion of wheel odometry and gyros predicts them, and are triangulated there again. A robust pose estimate
-rejects outliers; the motion then minimizes the distances between both sets of points, weighted by their covariances.
-The estimate is rejected if it has too few features, is inaccurate, or contradicts the prediction: wheel odometry then
+Features of the first pair are matched between its images and triangulated. They are tracked to the second pair, and
+triangulated there again; tracking starts at the pixels that wheel odometry and gyros predict. A robust pose estimate
+rejects outliers. The motion minimises the distances between both sets of points, weighted by their covariances. The
+estimate is rejected if it has too few features, is inaccurate, or contradicts the prediction: wheel odometry then
 remains in use. Features, windows and limits of the flight software are not published in detail; they are assumed.
 """
 
@@ -81,9 +81,9 @@ class VisualOdometry:
 #: Iterations and confidence of the robust pose estimate.
 _RANSAC_ITERATIONS, _RANSAC_CONFIDENCE = 300, 0.999
 #: Number of adjustments, each followed by a rejection of outliers, and largest normalised distance of an inlier.
-_ADJUSTMENTS, _GATE = 3, 3.5
+_ADJUSTMENTS, _MAX_NORMALISED_DISTANCE = 3, 3.5
 #: Additional distance from the predicted position that is accepted, metres.
-_EXCESS_M = 0.05
+_MAX_EXCESS_M = 0.05
 
 
 def estimate_motion(
@@ -96,53 +96,54 @@ def estimate_motion(
 
     `predicted` is the pose of the second rover frame in the first, from wheel odometry and gyros.
     """
-    o = VisualOdometryOptions() if options is None else options
+    options = VisualOdometryOptions() if options is None else options
     first_pair, second_pair = RectifiedPair.of(first), RectifiedPair.of(second)
-    pixels = _detect_features(first_pair, o)
-    disparities, valid = first_pair.feature_disparities(pixels, o.min_range_m)
+    pixels = _detect_features(first_pair, options)
+    disparities, valid = first_pair.feature_disparities(pixels, options.min_range_m)
     pixels, disparities = pixels[valid], disparities[valid]
     points = first_pair.triangulate(pixels, disparities)
     expected, visible = second_pair.camera.project(np.asarray(predicted.inv().apply(points.copy())).reshape(-1, 3))
     inside = visible & second_pair.camera.in_frame(expected)
     pixels, disparities, points, expected = (values[inside] for values in (pixels, disparities, points, expected))
     tracked, valid = track_features(first_pair.left, second_pair.left, pixels, expected)
-    second_disparities, matched = second_pair.feature_disparities(tracked, o.min_range_m)
+    second_disparities, matched = second_pair.feature_disparities(tracked, options.min_range_m)
     valid &= matched
     count = int(np.count_nonzero(valid))
-    if count < o.min_features:
+    if count < options.min_features:
         return VisualOdometry(VisualOdometryOutcome.TOO_FEW_FEATURES, None, count, 0, float("nan"))
     pixels, disparities, points = pixels[valid], disparities[valid], points[valid]
     tracked, second_disparities = tracked[valid], second_disparities[valid]
     second_points = second_pair.triangulate(tracked, second_disparities)
-    inliers = _find_inliers(second_pair, points, tracked, predicted, o)
+    inliers = _find_inliers(second_pair, points, tracked, predicted, options)
     covariances = (
-        first_pair.covariances(pixels, disparities, o.match_error_px),
-        second_pair.covariances(tracked, second_disparities, o.match_error_px),
+        first_pair.covariances(pixels, disparities, options.match_error_px),
+        second_pair.covariances(tracked, second_disparities, options.match_error_px),
     )
     motion, sigma_m = predicted, float("nan")
     for _ in range(_ADJUSTMENTS):
-        if np.count_nonzero(inliers) < o.min_inliers:
+        if np.count_nonzero(inliers) < options.min_inliers:
             return VisualOdometry(
                 VisualOdometryOutcome.TOO_FEW_INLIERS, None, count, int(np.count_nonzero(inliers)), float("nan")
             )
-        whitening = _whitening(covariances, motion)
-        motion, sigma_m = _adjust(points, second_points, whitening, inliers, motion)
+        whitening = _compute_whitening(covariances, motion)
+        motion, sigma_m = _refine_motion(points, second_points, whitening, inliers, motion)
         distances = np.linalg.norm(_residuals(points, second_points, whitening, motion), axis=1)
-        inliers = distances <= _GATE
-    number = int(np.count_nonzero(inliers))
-    outcome = _check(motion, sigma_m, predicted, o)
+        inliers = distances <= _MAX_NORMALISED_DISTANCE
+    inlier_count = int(np.count_nonzero(inliers))
+    outcome = _check_motion(motion, sigma_m, predicted, options)
     is_valid = outcome is VisualOdometryOutcome.CONVERGED
-    return VisualOdometry(outcome, motion if is_valid else None, count, number, sigma_m)
+    return VisualOdometry(outcome, motion if is_valid else None, count, inlier_count, sigma_m)
 
 
-def _detect_features(pair: RectifiedPair, o: VisualOdometryOptions) -> Points2:
+def _detect_features(pair: RectifiedPair, options: VisualOdometryOptions) -> Points2:
+    """Detect corners (u, v) in the left image, at least four pixels from its border and from pixels without data."""
     mask = cv2.erode((pair.left > 0).astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0)
-    corners = cv2.goodFeaturesToTrack(pair.left, o.features, o.quality, o.spacing_px, mask=mask)
+    corners = cv2.goodFeaturesToTrack(pair.left, options.features, options.quality, options.spacing_px, mask=mask)
     return np.empty((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
 def _find_inliers(
-    pair: RectifiedPair, points: Points3, pixels: Points2, predicted: RigidTransform, o: VisualOdometryOptions
+    pair: RectifiedPair, points: Points3, pixels: Points2, predicted: RigidTransform, options: VisualOdometryOptions
 ) -> Flags:
     """Find the points whose pixels in the second image agree with one motion (RANSAC over poses from three points)."""
     axes = np.stack([pair.camera.right, pair.camera.down, pair.camera.a])
@@ -151,17 +152,17 @@ def _find_inliers(
     # pose of the first rover frame in the second camera's axes
     rotation = Rotation.from_matrix(axes) * predicted.inv().rotation
     translation = axes @ (predicted.inv().translation - pair.camera.c)
-    found, _, _, inliers = cv2.solvePnPRansac(
+    is_solved, _, _, inliers = cv2.solvePnPRansac(
         points, pixels, matrix, None, rotation.as_rotvec().reshape(3, 1), translation.reshape(3, 1), True,
-        _RANSAC_ITERATIONS, o.inlier_px, _RANSAC_CONFIDENCE, flags=cv2.SOLVEPNP_ITERATIVE,
+        _RANSAC_ITERATIONS, options.inlier_px, _RANSAC_CONFIDENCE, flags=cv2.SOLVEPNP_ITERATIVE,
     )  # fmt: skip
     flags = np.zeros(len(points), dtype=np.bool_)
-    if found and inliers is not None:
+    if is_solved and inliers is not None:
         flags[inliers.ravel()] = True
     return flags
 
 
-def _whitening(
+def _compute_whitening(
     covariances: tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3 3"]], motion: RigidTransform
 ) -> Float64[np.ndarray, "n 3 3"]:
     """Compute the matrices that normalise the differences of both sets of points."""
@@ -173,18 +174,19 @@ def _whitening(
 def _residuals(
     points: Points3, second_points: Points3, whitening: Float64[np.ndarray, "n 3 3"], motion: RigidTransform
 ) -> Points3:
+    """Compute the normalised differences between the points of the first pair and the moved points of the second."""
     difference = points - motion.apply(second_points.copy())
     return np.asarray((whitening @ difference[..., None])[..., 0])
 
 
-def _adjust(
+def _refine_motion(
     points: Points3,
     second_points: Points3,
     whitening: Float64[np.ndarray, "n 3 3"],
     inliers: Flags,
     start: RigidTransform,
 ) -> tuple[RigidTransform, float]:
-    """Minimize the normalised distances of the inliers; return the motion and the position's standard deviation."""
+    """Minimise the normalised distances of the inliers; return the motion and the position's standard deviation."""
     first, second, weights = points[inliers], second_points[inliers], whitening[inliers]
 
     def apply(x: Float64[np.ndarray, "6"]) -> RigidTransform:
@@ -210,14 +212,15 @@ def _adjust(
     return apply(solution.x), float(sigma)
 
 
-def _check(
-    motion: RigidTransform, sigma_m: float, predicted: RigidTransform, o: VisualOdometryOptions
+def _check_motion(
+    motion: RigidTransform, sigma_m: float, predicted: RigidTransform, options: VisualOdometryOptions
 ) -> VisualOdometryOutcome:
-    if not sigma_m <= o.max_sigma_m:
+    """Return the outcome of an estimated motion: accuracy, and agreement with the prediction."""
+    if not sigma_m <= options.max_sigma_m:
         return VisualOdometryOutcome.INACCURATE
     path_m = float(np.linalg.norm(predicted.translation))
     excess_m = float(np.linalg.norm(motion.translation - predicted.translation))
     turn_error_rad = (predicted.rotation.inv() * motion.rotation).magnitude()
-    if excess_m > o.max_excess * path_m + _EXCESS_M or turn_error_rad > o.max_turn_error_rad:
+    if excess_m > options.max_excess * path_m + _MAX_EXCESS_M or turn_error_rad > options.max_turn_error_rad:
         return VisualOdometryOutcome.INCONSISTENT
     return VisualOdometryOutcome.CONVERGED

@@ -77,7 +77,12 @@ class Match:
 
 
 #: Registrations after the pure shift, in this order, for each option `warp`.
-_WARPS: dict[str, tuple[Warp, ...]] = {"none": (), "shift": (), "stretch": ("stretch",), "bend": ("stretch", "bend")}
+_WARPS_BY_OPTION: dict[str, tuple[Warp, ...]] = {
+    "none": (),
+    "shift": (),
+    "stretch": ("stretch",),
+    "bend": ("stretch", "bend"),
+}
 #: Function that matches the target in a new image near a full-frame pixel; None if the window does not fit.
 Matcher = Callable[[Sighting, MastImage, Vector2, ViewChange, VttOptions], Match | None]
 
@@ -149,7 +154,7 @@ def refine_match(
     if shifted is None:
         return fitted
     best = shifted
-    for warp in _WARPS[options.warp]:
+    for warp in _WARPS_BY_OPTION[options.warp]:
         part = build_spline(region, best.corner, len(template), previous=part)
         warped = register_template(template, part, best.corner, warp)
         if warped is None:

@@ -35,16 +35,16 @@ from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasure
 
 
 @dataclass(frozen=True)
-class Journey:
+class Distances:
     """Distances that determine the tolerances of an update.
 
-    - seed_m, last_m, now_m: Distance from the camera to the target at the seed, at the last match, and in this update
+    - seed_m, last_m, current_m: Distance from camera to target at the seed, at the last match, and in this update
     - step_m, driven_m: Rover displacement since the last match, and path length since the seed
     """
 
     seed_m: float
     last_m: float
-    now_m: float
+    current_m: float
     step_m: float
     driven_m: float
 
@@ -57,18 +57,23 @@ class Tolerances:
     position_m: float
 
 
-def tolerances(journey: Journey, left: CameraModel, right: CameraModel, options: VttOptions) -> Tolerances:
+def tolerances(distances: Distances, left: CameraModel, right: CameraModel, options: VttOptions) -> Tolerances:
     """Compute the tolerances of Fig. 5 for this update: a minimum plus the root sum square of the errors."""
     focal_times_baseline = disparity_px_m(left, right)
 
     def compute_tolerance(reference_m: float, motion_m: float, lateral_m: float) -> float:
         error_px = options.stereo_disparity_error_px
-        errors_m = [stereo_range_error_m(m, focal_times_baseline, 1.0, error_px) for m in (reference_m, journey.now_m)]
+        errors_m = [
+            stereo_range_error_m(range_m, focal_times_baseline, 1.0, error_px)
+            for range_m in (reference_m, distances.current_m)
+        ]
         return options.min_tolerance_m + math.hypot(*errors_m, options.pose_error * motion_m, lateral_m)
 
     return Tolerances(
-        distance_m=compute_tolerance(journey.last_m, journey.step_m, 0.0),
-        position_m=compute_tolerance(journey.seed_m, journey.driven_m, options.direction_error_rad * journey.now_m),
+        distance_m=compute_tolerance(distances.last_m, distances.step_m, 0.0),
+        position_m=compute_tolerance(
+            distances.seed_m, distances.driven_m, options.direction_error_rad * distances.current_m
+        ),
     )
 
 
@@ -95,7 +100,7 @@ def find_losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) ->
         TargetLoss.DISTANCE_JUMP: abs(evidence.distance_correction_m) > allowed.distance_m,
         TargetLoss.POSITION_JUMP: evidence.position_correction_m > allowed.position_m,
     }
-    return tuple(loss for loss, lost in criteria.items() if lost)
+    return tuple(loss for loss, is_exceeded in criteria.items() if is_exceeded)
 
 
 def next_state(state: TrackingState, lost_updates: int, found: bool, limit: int) -> tuple[TrackingState, int]:
@@ -377,10 +382,10 @@ def check_losses(
         raise ValueError("the loss criteria require a match, a stereo match, a position and a seed")
     motion_m = sighting.world_from_rover.translation - last.world_from_rover.translation
     latest_motion_m = sighting.world_from_rover.translation - track.world_from_rover.translation
-    journey = Journey(
+    distances = Distances(
         seed_m=track.seed_distance_m,
         last_m=last.distance_m,
-        now_m=details.distance_m,
+        current_m=details.distance_m,
         step_m=float(np.linalg.norm(motion_m)),
         driven_m=track.driven_m + float(np.linalg.norm(latest_motion_m)),
     )
@@ -390,11 +395,11 @@ def check_losses(
         distance_correction_m=details.distance_m - expected_m,
         position_correction_m=float(np.linalg.norm(position - track.seed_world)),
     )
-    allowed: Tolerances = tolerances(journey, stop.left, stop.right, options)
+    allowed: Tolerances = tolerances(distances, stop.left, stop.right, options)
     azimuth_change = sighting.azimuth_world_rad - last.azimuth_world_rad
     details = replace(
         details,
-        step_m=journey.step_m,
+        step_m=distances.step_m,
         azimuth_change_rad=float(np.arctan2(np.sin(azimuth_change), np.cos(azimuth_change))),
         evidence=evidence,
         allowed=allowed,

@@ -20,7 +20,7 @@ from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store.table import read_rows
 
-FILE = """
+CAMPAIGN_TEXT = """
 name = "chaos"
 scenario = "benchmarks.validation.chaos:ChaosScenario"
 cases = 100
@@ -51,11 +51,11 @@ class SilentProgress:
 
 def check_rows(quick: bool) -> Iterator[Measure]:
     """Compare the rows of all ways to run a campaign with those of one worker, for faulty and for rendered cases."""
-    faulty, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
+    faulty_fraction, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
     with TemporaryDirectory() as name:
         folder = Path(name)
-        settings = [f"faulty_fraction={faulty}", f"cases={cases}"]
-        population = f"cases, {100 * faulty:g} % of which misbehave"
+        settings = [f"faulty_fraction={faulty_fraction}", f"cases={cases}"]
+        population = f"cases, {100 * faulty_fraction:g} % of which misbehave"
         yield from _compare_executors(str(_write_campaign(folder)), folder / "chaos", settings, kills, population)
         rendered = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
         yield from _compare_executors("dimes-smoke", folder / "rendered", rendered, kills, "rendered descents")
@@ -93,14 +93,14 @@ def check_survival(quick: bool) -> Iterator[Measure]:
         file = _write_campaign(folder)
         elapsed_s, rows = {}, {}
         for fraction in (0.0, faulty):
-            began = time.monotonic()
+            start_s = time.monotonic()
             rows[fraction] = _run_campaign(
                 file,
                 folder / f"{fraction}",
                 ExecutorConfig(2),
                 [f"faulty_fraction={fraction}", f"cases={cases}", "work_s=0.4"],
             )
-            elapsed_s[fraction] = time.monotonic() - began
+            elapsed_s[fraction] = time.monotonic() - start_s
         campaign = load_campaign(str(file), [f"faulty_fraction={faulty}"])
         faults = [_draw_fault(campaign, case) for case in range(cases)]
         wrong = sum(
@@ -132,7 +132,7 @@ def _draw_fault(campaign: Any, case: int) -> str:
 
 def _write_campaign(folder: Path) -> Path:
     path = folder / "chaos.toml"
-    path.write_text(FILE)
+    path.write_text(CAMPAIGN_TEXT)
     return path
 
 
@@ -157,7 +157,7 @@ def _run_with_kills(campaign: str, directory: Path, settings: Sequence[str], kil
         runner.kill()
         runner.wait()
         command = [*program, "resume", str(directory), "--jobs", "2", "--allow-changed"]
-    # exit status 1 because some cases crash
+    # the exit status is 1, because some cases crash
     subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
     return read_rows(directory / "cases.parquet")
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from benchmarks.dimes_threshold import STORED, WRONG_BY_M_S
+from benchmarks.dimes_threshold import STORED, WRONG_TRACK_ERRORS_M_S
 from benchmarks.estimators import ESTIMATORS, record_descents, run_estimator
 from benchmarks.threshold_derivation import ThresholdInputs
 from benchmarks.validation.imu_reference import Reference
@@ -29,26 +29,35 @@ def check_imu_threshold(quick: bool) -> Iterator[Measure]:
     threshold = DimesOptions().imu_threshold_m_s
     single = reference.single()
     how = f"{descents} descents of a second implementation by first-order propagation; threshold {threshold:g} m/s"
-    # limits: three standard errors of the quantiles, sqrt(q (1 - q) / n) divided by density times quantile, which is
-    # 0.44 at the median and 0.03 at 99.5 %
-    median = float(np.median(single)) / _read_stored_median_m_s() - 1.0
+    # The limits are three standard errors of a quantile. The relative standard error of the quantile q is
+    # sqrt(q (1 - q) / n) / (density * quantile). The product in the denominator is 0.44 at the median, 0.03 at 99.5 %.
+    median_error = float(np.median(single)) / _read_stored_median_m_s() - 1.0
     limit = 3.4 / math.sqrt(descents)
-    yield Measure("discrepancy of correct tracks: median against the stored derivation", abs(median), "", limit, how)
-    tail = float(np.quantile(single, inputs.kept)) / threshold - 1.0
+    yield Measure(
+        "discrepancy of correct tracks: median against the stored derivation", abs(median_error), "", limit, how
+    )
+    quantile_error = float(np.quantile(single, inputs.kept)) / threshold - 1.0
     limit = 7.0 / math.sqrt(descents)
-    yield Measure("discrepancy of correct tracks: 99.5 % quantile against the threshold", abs(tail), "", limit, how)
+    yield Measure(
+        "discrepancy of correct tracks: 99.5 % quantile against the threshold", abs(quantile_error), "", limit, how
+    )
     limit = inputs.kept - 3.0 * math.sqrt(inputs.kept * (1.0 - inputs.kept) / descents)
-    passed = float(np.mean(single < threshold))
+    passed_fraction = float(np.mean(single < threshold))
     claim = "descents with one correct track per pair that pass the IMU check"
     yield Measure(
-        claim, passed, "", limit, f"{how}; limit: 99.5 % minus three standard deviations of the simulation", "at least"
+        claim,
+        passed_fraction,
+        "",
+        limit,
+        f"{how}; limit: 99.5 % minus three standard deviations of the simulation",
+        "at least",
     )
-    passed = float(np.mean(reference.best() < threshold))
+    passed_fraction = float(np.mean(reference.best() < threshold))
     yield Measure(
-        "descents with two correct tracks per pair that pass the IMU check", passed, "", 0.995, how, "at least"
+        "descents with two correct tracks per pair that pass the IMU check", passed_fraction, "", 0.995, how, "at least"
     )
     for tracks in (1, 2):
-        for low, high in WRONG_BY_M_S:
+        for low, high in WRONG_TRACK_ERRORS_M_S:
             correct, rejected = reference.correct_and_rejected_fractions(tracks, (low, high), threshold, rng)
             error_range = f"{low:g} m/s" if low == high else f"{low:g} to {high:g} m/s"
             yield Measure(

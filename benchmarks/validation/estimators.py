@@ -47,6 +47,7 @@ class SmoothImage:
 
         Shapes (n, PATCH, PATCH) and (n, 2, PATCH, PATCH).
         """
+        # weights of values (wu, wv) and of derivatives (du, dv)
         columns, wu, du = _spline_weights(shift[:, 0])
         rows, wv, dv = _spline_weights(shift[:, 1])
         first_row = (centres[:, 1] + rows - HALF - 2)[:, None] + np.arange(PATCH + 5)

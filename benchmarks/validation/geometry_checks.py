@@ -42,7 +42,7 @@ MAX_MAST_RANGE_M = 40.0
 
 
 def _is_available(backend: str) -> bool:
-    """Return whether the library of an OpenGL backend can be loaded."""
+    """Whether the library of an OpenGL backend can be loaded."""
     try:
         ctypes.CDLL(LIBRARIES[backend])
     except OSError:
@@ -96,11 +96,11 @@ def run_planes(quick: bool) -> Iterator[Measure]:
         attitude = Rotation.align_vectors(np.array([[0.15, 0.1, -1.0]]), camera.boresight()[None])[0]
         # points beyond two camera heights are excluded because wide cameras see the horizon
         height, spacing = 500.0, 6.0
-        middle = np.array([0.5 * side * spacing, 0.5 * side * spacing, height])
-        scene = Scene(_tilted_plane(slope, side, spacing), (middle[0], middle[1]), OVERHEAD_SUN, LAMBERTIAN)
-        view = View(scene, camera, rigid(attitude, middle))
+        position = np.array([0.5 * side * spacing, 0.5 * side * spacing, height])
+        scene = Scene(_tilted_plane(slope, side, spacing), (position[0], position[1]), OVERHEAD_SUN, LAMBERTIAN)
+        view = View(scene, camera, rigid(attitude, position))
         frame = render(renderer(), view)
-        points = frame.points_world() - [middle[0], middle[1], 0.0]
+        points = frame.points_world() - [position[0], position[1], 0.0]
         is_near = np.hypot(points[..., 0], points[..., 1]) < 2.0 * height
         error = np.abs(points @ upward / frame.range_m)[is_near].max()
         how = f"all {int(is_near.sum())} pixels within two heights of a plane tilted by 10 deg"
@@ -150,14 +150,14 @@ def cast_ranges(view: View, count: int, max_range_m: float, step: float) -> Rang
     ranges, is_object = cast(0.0, 0.0)
     is_smooth = np.ones(len(ranges), dtype=bool)
     for right, down in ((1.0, 0.0), (0.0, 1.0), (0.5, 0.5), (0.5, -0.5)):
-        (ahead, object_ahead), (back, object_back) = cast(right, down), cast(-right, -down)
+        (forward, is_object_forward), (backward, is_object_backward) = cast(right, down), cast(-right, -down)
         with np.errstate(invalid="ignore"):
-            is_smooth &= np.abs(ahead + back - 2.0 * ranges) < MAX_RANGE_CURVATURE * ranges
-        is_smooth &= (object_ahead == is_object) & (object_back == is_object)
-    descending = -camera.rays(pixels.astype(np.float64))[1][:, 2]
+            is_smooth &= np.abs(forward + backward - 2.0 * ranges) < MAX_RANGE_CURVATURE * ranges
+        is_smooth &= (is_object_forward == is_object) & (is_object_backward == is_object)
+    downward = -camera.rays(pixels.astype(np.float64))[1][:, 2]
     pixel_rad = 1.0 / np.sqrt(np.prod(view.camera.focal_lengths))
     is_resolved = (
-        rendered * pixel_rad / np.maximum(descending, 0.01) < MAX_SAMPLES_PER_PIXEL * view.scene.surface.spacing_m
+        rendered * pixel_rad / np.maximum(downward, 0.01) < MAX_SAMPLES_PER_PIXEL * view.scene.surface.spacing_m
     )
     compared = is_smooth & is_resolved
     return Ranges(rendered[compared], ranges[compared], 1.0 - is_smooth.mean(), 1.0 - is_resolved.mean())

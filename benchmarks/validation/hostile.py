@@ -24,6 +24,8 @@ from marsyard.scenarios.algorithm_run import InputCopy
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
+#: `FE_UPWARD` of the C library on x86.
+_ROUND_UPWARD = 0x800
 #: Objects that remain in the worker process after the end of a case.
 _remaining_objects: list[Any] = []
 
@@ -55,11 +57,11 @@ def _leave_fork() -> None:
 
 def _leave_orphan() -> None:
     """Leave a process whose parent has ended."""
-    middle = os.fork()
-    if middle == 0:
+    parent = os.fork()
+    if parent == 0:
         _leave_fork()
         os._exit(0)
-    os.waitpid(middle, 0)
+    os.waitpid(parent, 0)
 
 
 def _leave_session() -> subprocess.Popen[bytes]:
@@ -104,8 +106,7 @@ def _change_state() -> None:
     import cv2
 
     cv2.setUseOptimized(False)
-    # rounding upwards on x86
-    ctypes.CDLL("libm.so.6").fesetround(0x800)
+    ctypes.CDLL("libm.so.6").fesetround(_ROUND_UPWARD)
     os.chdir("/")
     os.environ["LEFT_BEHIND"] = "1"
     np.seterr(all="raise")
@@ -129,7 +130,7 @@ def _change_inputs() -> None:
     input_copy.check()
 
 
-#: Entry of `_remaining_objects` that shows that an earlier case has changed the state of this process.
+#: Entry of `_remaining_objects` after a case that changed the state of this process.
 _CHANGED_STATE = "spoiled"
 
 #: Faults of misbehaving cases and their expected outcomes; a VALID case must have the row of a healthy case.
@@ -191,6 +192,7 @@ class HostileScenario:
 
 
 def _compute_numbers(streams: Streams) -> dict[str, float | str | bool]:
+    """Compute random numbers and values that depend on the state of the process."""
     import cv2
 
     rng = streams.generator("number")

@@ -22,6 +22,7 @@ SEED = 20050107
 #: Terrain banks of the sites, as in the campaigns.
 BANK = {"bank": 8, "bank_seed": 1}
 SITES = ("heli-benign", "heli-hazardous")
+#: Limits of rms errors: rotation; baseline divided by its length; elevation divided by the height.
 ROTATION_LIMIT_DEG, BASELINE_LIMIT, ELEVATION_LIMIT = 0.05, 0.0075, 0.005
 #: Both sets of options compute elevations at 160 x 120 points. The first tracks about 59 features, as in the landing
 #: paper, the second about 200: over rocks the motion estimate needs more features, because an affine warp does not
@@ -32,13 +33,13 @@ MANY_FEATURES = replace(PAPER_FEATURES, block_px=32)
 
 def make_noise_free_detector(camera: str) -> DetectorParameters:
     """Return a camera's detector with 16 bits and a large full well, so that shot noise is below 1e-4 of the signal."""
-    well = 1e9
+    full_well_e = 1e9
     original = preset(camera).detector
     return original.model_copy(
         update={
-            "full_well_e": well,
-            "gain_e_dn": well / 2**16,
-            "responsivity_e_s": original.responsivity_e_s * well / original.full_well_e,
+            "full_well_e": full_well_e,
+            "gain_e_dn": full_well_e / 2**16,
+            "responsivity_e_s": original.responsivity_e_s * full_well_e / original.full_well_e,
             "bits": 16,
             "read_noise_e": 0.0,
             "dark_e_s": 0.0,
@@ -79,17 +80,22 @@ def draw_exact_parameters(site: str, rng: np.random.Generator) -> LandingScenari
 def simulate_errors(number: int) -> dict[str, dict[str, Scalar]]:
     """Simulate the errors of one image pair with both sets of options; the sites alternate."""
     streams = Streams(SEED, "landing checks", number)
-    p = draw_exact_parameters(SITES[number % len(SITES)], streams.generator("pair"))
-    world = World.from_parameters(p)
-    flight = Flight.from_parameters(p, world.ground.surface, streams)
-    pair = take_images(p, world, flight, camera_optics(p.optics), streams)
-    measurements = measure(p, flight, pair, streams)
-    truth = GroundTruth.from_images(world, flight, pair, p.lander.limits)
+    parameters = draw_exact_parameters(SITES[number % len(SITES)], streams.generator("pair"))
+    world = World.from_parameters(parameters)
+    flight = Flight.from_parameters(parameters, world.ground.surface, streams)
+    pair = take_images(parameters, world, flight, camera_optics(parameters.optics), streams)
+    measurements = measure(parameters, flight, pair, streams)
+    truth = GroundTruth.from_images(world, flight, pair, parameters.lander.limits)
     rows: dict[str, dict[str, Scalar]] = {}
     for name, options in (("paper", PAPER_FEATURES), ("many features", MANY_FEATURES)):
         estimate = HdaEstimator(options).estimate(measurements)
         motion = motion_row(estimate.details, flight, pair)
-        rows[name] = {"site": p.site, "range_m": pair.axis_range_m, **motion, **map_row(p, estimate, flight, truth)}
+        rows[name] = {
+            "site": parameters.site,
+            "range_m": pair.axis_range_m,
+            **motion,
+            **map_row(parameters, estimate, flight, truth),
+        }
     return rows
 
 

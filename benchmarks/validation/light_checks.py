@@ -103,12 +103,12 @@ def _compare_shadows(name: str, view: View, sun: Sun, count: int, max_range_m: f
     # the renderer smooths distant ground; exact heights are used, because only shadows are compared
     on_ground = frame.body.ravel()[pixels] < 0
     points[on_ground, 2] = ground.height(points[on_ground, 0], points[on_ground, 1])
-    hidden = ground.is_occluded(points, to_sun, step)
+    is_occluded = ground.is_occluded(points, to_sun, step)
     rays = np.broadcast_to(to_sun, points.shape)
-    hidden |= np.isfinite(cast_triangles(view.scene.objects, points, rays, nearest=2e-3))
-    reference_lit = (cos_i > 0.0) & ~hidden
+    is_occluded |= np.isfinite(cast_triangles(view.scene.objects, points, rays, nearest=2e-3))
+    reference_lit = (cos_i > 0.0) & ~is_occluded
     agreement = float(np.mean(rendered_lit == reference_lit))
-    in_cast_shadow = (cos_i > 0.0) & hidden
+    in_cast_shadow = (cos_i > 0.0) & is_occluded
     rendered_dark = ~rendered_lit[in_cast_shadow]
     dark_text = f", of which {np.mean(rendered_dark):.0%} are dark in the image" if in_cast_shadow.any() else ""
     how = (
@@ -232,12 +232,12 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
         for position in rng.uniform(0.0, 12800.0, (4, 2)):
             image = _render_from_above(scene, camera, position, 0.0)
             covers.append(1.0 - float(np.mean((image - sky_light) / direct_light)))
-            later = _render_from_above(
+            later_image = _render_from_above(
                 scene, camera, position + 3.75 * np.array([parameters.wind_east_m_s, parameters.wind_north_m_s]), 3.75
             )
             slope = np.hypot(*np.gradient(image))
             is_edge = slope > 0.2 * slope.max()
-            motion_errors.append(float(np.max(np.abs(later - image)[is_edge] / slope[is_edge])))
+            motion_errors.append(float(np.max(np.abs(later_image - image)[is_edge] / slope[is_edge])))
     how = f"{len(covers)} images from 2 km over flat ground, {2 if quick else 8} layers; cover {parameters.cover:g}"
     yield Measure(
         "fraction of the ground in cloud shadows, difference from the specified cover",

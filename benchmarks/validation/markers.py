@@ -23,6 +23,7 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.render import PixelRays, Renderer, Scene
 from marsyard.sim.terrain import Surface
 
+#: Side of the periodic terrain, samples.
 SIDE = 2048
 #: Size of a marker in the image: geometric mean of the standard deviations of its ellipse, pixels.
 SPOT_PX = 2.7
@@ -32,6 +33,7 @@ WINDOW, MIN_DISTANCE = 14, 46
 MAX_OBLIQUITY_RAD = np.radians(68.0)
 #: Maximum off-nadir angle of a camera's axis.
 MAX_TILT_RAD = np.radians(30.0)
+#: Number of markers for each camera.
 MARKERS = 1000
 
 
@@ -58,9 +60,10 @@ def _draw_undulating_heights(extent_m: float, rng: np.random.Generator) -> np.nd
     phase = np.arange(SIDE) * (2.0 * np.pi / SIDE)
     heights = np.zeros((SIDE, SIDE))
     for _ in range(6):
+        # wave numbers in periods per side
         m, n = rng.integers(-5, 6, 2)
-        k = max(np.hypot(m, n), 1.0)
-        amplitude = 0.05 * extent_m / (2.0 * np.pi * k)
+        wave_number = max(np.hypot(m, n), 1.0)
+        amplitude = 0.05 * extent_m / (2.0 * np.pi * wave_number)
         heights += amplitude * np.cos(n * phase[:, None] + m * phase[None, :] + rng.uniform(0.0, 2.0 * np.pi))
     return heights
 
@@ -71,8 +74,8 @@ def create_marked_view(camera: CameraModel, height_m: float, rng: np.random.Gene
     world_camera = camera.transform(pose)
     pixels = _scatter_points(camera.size, rng)
     origins, rays = world_camera.rays(pixels)
-    steep = rays[:, 2] < -np.cos(MAX_OBLIQUITY_RAD)
-    pixels, origins, rays = pixels[steep], np.array(origins[steep]), rays[steep]
+    is_steep = rays[:, 2] < -np.cos(MAX_OBLIQUITY_RAD)
+    pixels, origins, rays = pixels[is_steep], np.array(origins[is_steep]), rays[is_steep]
     half_side = np.abs((origins - rays * (origins[:, 2:] / rays[:, 2:]))[:, :2]).max() * 1.15
     spacing = 2.0 * half_side / SIDE
     samples = np.zeros((SIDE, SIDE, 2), dtype=np.float32)
@@ -148,8 +151,8 @@ def _locate_marker(radiance: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Centroid of the radiance in the window around the expected pixel."""
     u0, v0 = np.rint(expected).astype(int)
     v, u = np.mgrid[v0 - WINDOW : v0 + WINDOW + 1, u0 - WINDOW : u0 + WINDOW + 1]
-    light = radiance[v, u].astype(np.float64)
-    return np.array([(light * u).sum(), (light * v).sum()]) / light.sum()
+    weights = radiance[v, u].astype(np.float64)
+    return np.array([(weights * u).sum(), (weights * v).sum()]) / weights.sum()
 
 
 def measure_marker_errors(renderer: Renderer, camera: CameraModel, seed: int, count: int = MARKERS) -> np.ndarray:

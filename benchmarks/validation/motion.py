@@ -103,8 +103,8 @@ def supersample(renderer: Renderer, view: View, samples: int) -> np.ndarray:
 def compute_sideways_offset(view: View, frame: Frame) -> np.ndarray:
     """Compute the world offset of the camera that moves the image centre by one pixel along u."""
     rows, columns = frame.range_m.shape
-    middle = (slice(rows // 2 - HALF, rows // 2 + HALF + 1), slice(columns // 2 - HALF, columns // 2 + HALF + 1))
-    distance = float(np.median(frame.range_m[middle]))
+    central_patch = (slice(rows // 2 - HALF, rows // 2 + HALF + 1), slice(columns // 2 - HALF, columns // 2 + HALF + 1))
+    distance = float(np.median(frame.range_m[central_patch]))
     right = view.world_from_body.rotation.apply(view.camera.right)
     return -right * distance / view.camera.focal_lengths[0]
 
@@ -144,25 +144,25 @@ def measure(
 ) -> Iterator[Motion]:
     """Yield the errors of the measured motion for each step."""
     first = render(renderer, view, samples)
-    unit = compute_sideways_offset(view, first)
+    offset_per_px_m = compute_sideways_offset(view, first)
     first_smooth = SmoothImage(first.radiance)
-    one_pixel = compute_true_motion(first, view, view.shift(unit))
+    one_pixel = compute_true_motion(first, view, view.shift(offset_per_px_m))
     centres = _select_patches(one_pixel, patch_grid(view.camera.size, stride))
     for step in steps:
-        shifted = view.shift(step * unit)
+        shifted = view.shift(step * offset_per_px_m)
         second = render(renderer, shifted, samples)
         shifts = symmetric_shifts(first_smooth, SmoothImage(second.radiance), centres)
         # motion relative to the midpoint of both images, as in the estimator
-        ahead, back = compute_true_motion(first, view, shifted), compute_true_motion(second, shifted, view)
-        is_visible_in_both = ~np.isnan(_extract_patches(ahead - back, centres)).any(axis=(1, 2, 3))
-        motion = 0.5 * (_extract_patches(ahead, centres) - _extract_patches(back, centres))
-        mean_ahead = _extract_patches(ahead, centres).mean(axis=(1, 2))
+        forward, backward = compute_true_motion(first, view, shifted), compute_true_motion(second, shifted, view)
+        is_visible_in_both = ~np.isnan(_extract_patches(forward - backward, centres)).any(axis=(1, 2, 3))
+        motion = 0.5 * (_extract_patches(forward, centres) - _extract_patches(backward, centres))
+        mean_forward = _extract_patches(forward, centres).mean(axis=(1, 2))
         parabola, biquadratic = peak_fits(first.radiance, second.radiance, centres)
         yield Motion(
             float(step),
             (shifts.motion_px - shifts.expected(motion))[is_visible_in_both],
-            (parabola - mean_ahead)[is_visible_in_both],
-            (biquadratic - mean_ahead)[is_visible_in_both],
+            (parabola - mean_forward)[is_visible_in_both],
+            (biquadratic - mean_forward)[is_visible_in_both],
             _body_of_patches(_extract_patches(first.body, centres))[is_visible_in_both],
         )
 

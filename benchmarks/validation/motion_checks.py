@@ -79,12 +79,14 @@ def run_motion(quick: bool) -> Iterator[Measure]:
         motions = list(measure(renderer(), rock_view(ROCK_SITE, distance), steps, stride=stride))
         fits.append(_median_fit_errors(motions))
         rock = _dominant_rock(motions[0])
-        on_rock = [motion.error[motion.body == rock] for motion in motions]
-        yield _measure_bias(f"bias of motion, rock at {distance:g} m", on_rock, steps)
-        around = [motion.error[motion.body != rock] for motion in motions]
-        if min(len(error) for error in around) >= 200:
+        rock_errors = [motion.error[motion.body == rock] for motion in motions]
+        yield _measure_bias(f"bias of motion, rock at {distance:g} m", rock_errors, steps)
+        surrounding_errors = [motion.error[motion.body != rock] for motion in motions]
+        if min(len(error) for error in surrounding_errors) >= 200:
             yield _measure_bias(
-                f"bias of motion, ground at grazing view and rocks around the large rock, {distance:g} m", around, steps
+                f"bias of motion, ground at grazing view and rocks around the large rock, {distance:g} m",
+                surrounding_errors,
+                steps,
             )
     point_sampled = replace(rock_view(ROCK_SITE, 10.0), footprint=1.0 / 64.0)
     errors = [motion.error for motion in measure(renderer(), point_sampled, np.array([0.25, 0.5, 0.75]))]

@@ -48,10 +48,12 @@ class CampaignSimulator:
         answered = self._rng.random(CASES) < answer_probability[terrains]
         # terrains of a bank have the same numbers in every nightly run; other terrains are new
         terrain_numbers = terrains if kind == KINDS[0] else terrains + 1000 * self._number
-        within = (answered & (errors < _LIMIT_M)).astype(np.float64)
+        is_within_bound = (answered & (errors < _LIMIT_M)).astype(np.float64)
         errors = np.where(answered, errors, np.nan)
         return [
-            NightMetric("within the bound", True, float(within.mean()), Sample(within, terrain_numbers)),
+            NightMetric(
+                "within the bound", True, float(is_within_bound.mean()), Sample(is_within_bound, terrain_numbers)
+            ),
             NightMetric("answered", True, float(answered.mean()), Sample(answered.astype(np.float64), terrain_numbers)),
             NightMetric("error (m)", False, float(np.nanmedian(errors)), Sample(errors, terrain_numbers)),
         ]
@@ -82,7 +84,9 @@ def count_false_alarms(nights: int, seed: int) -> int:
                 history.add(night, NightCampaign(kind, "", "", "PASS", 0, ""), simulator.draw_metrics(kind))
             flagged = find_changes(list_comparisons(history, night))
             history.finish(
-                night, FINISHED, [(change.campaign, change.metric, change.p_value, change.worse) for change in flagged]
+                night,
+                FINISHED,
+                [(change.campaign, change.metric, change.p_value, change.is_regression) for change in flagged],
             )
             alarms += bool(flagged)
     return alarms

@@ -20,25 +20,26 @@ class Ground:
     """Heights of a surface, evaluated by SciPy."""
 
     def __init__(self, surface: Surface) -> None:
-        self._control = surface.levels[0][..., 0].astype(np.float64)
+        self._coefficients = surface.levels[0][..., 0].astype(np.float64)
         self._spacing = surface.spacing_m
-        self.lowest, self.highest = float(self._control.min()), float(self._control.max())
+        self.lowest, self.highest = float(self._coefficients.min()), float(self._coefficients.max())
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Heights at positions, metres."""
         positions = np.stack([np.ravel(y), np.ravel(x)]) / self._spacing
-        return map_coordinates(self._control, positions, order=3, mode="grid-wrap", prefilter=False).reshape(
+        return map_coordinates(self._coefficients, positions, order=3, mode="grid-wrap", prefilter=False).reshape(
             np.shape(x)
         )
 
     def gradient(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Slopes by central differences over a hundredth of a sample."""
-        d = 0.01 * self._spacing
-        by_x = (self.height(x + d, y) - self.height(x - d, y)) / (2.0 * d)
-        by_y = (self.height(x, y + d) - self.height(x, y - d)) / (2.0 * d)
+        delta = 0.01 * self._spacing
+        by_x = (self.height(x + delta, y) - self.height(x - delta, y)) / (2.0 * delta)
+        by_y = (self.height(x, y + delta) - self.height(x, y - delta)) / (2.0 * delta)
         return np.stack([by_x, by_y], axis=-1)
 
     def clearance(self, origins: np.ndarray, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Height above ground of points along rays."""
+        """Height above ground of the points at distances `t` along the rays."""
         x, y, z = (origins[:, k] + t * directions[:, k] for k in range(3))
         return z - self.height(x, y)
 
@@ -63,28 +64,28 @@ class Ground:
         steps = int(np.ceil((stop - start).max() / step)) + 2
         t = start[:, None] + (stop - start)[:, None] * np.linspace(0.0, 1.0, steps)
         x, y, z = (origins[:, k, None] + t * directions[:, k, None] for k in range(3))
-        under = z - self.height(x, y) < 0.0
-        first = under.argmax(axis=1)
-        hit = under[np.arange(len(t)), first] & (first > 0)
+        is_below = z - self.height(x, y) < 0.0
+        first = is_below.argmax(axis=1)
+        is_hit = is_below[np.arange(len(t)), first] & (first > 0)
         high = t[np.arange(len(t)), first]
         low = t[np.arange(len(t)), np.maximum(first - 1, 0)]
         for _ in range(45):
             middle = 0.5 * (low + high)
-            beneath = self.clearance(origins, directions, middle) < 0.0
-            high, low = np.where(beneath, middle, high), np.where(beneath, low, middle)
-        return np.where(hit, 0.5 * (low + high), np.inf)
+            is_below_ground = self.clearance(origins, directions, middle) < 0.0
+            high, low = np.where(is_below_ground, middle, high), np.where(is_below_ground, low, middle)
+        return np.where(is_hit, 0.5 * (low + high), np.inf)
 
-    def is_occluded(self, points: np.ndarray, towards: np.ndarray, step: float) -> np.ndarray:
-        """Whether the ground occludes a distant light source in the direction `towards`, for each point."""
-        length = max((self.highest - float(points[:, 2].min())) / max(towards[2], 1e-3), step)
+    def is_occluded(self, points: np.ndarray, to_light: np.ndarray, step: float) -> np.ndarray:
+        """Whether the ground occludes a distant light source in the direction `to_light`, for each point."""
+        length = max((self.highest - float(points[:, 2].min())) / max(to_light[2], 1e-3), step)
         t = np.concatenate([[0.05 * step], np.arange(step, length + step, step)])
-        hidden = np.zeros(len(points), dtype=bool)
+        is_occluded = np.zeros(len(points), dtype=bool)
         size = max(BLOCK // t.size, 1)
         for first in range(0, len(points), size):
             part = points[first : first + size]
-            x, y, z = (part[:, k, None] + t * towards[k] for k in range(3))
-            hidden[first : first + size] = (z - self.height(x, y) < 0.0).any(axis=1)
-        return hidden
+            x, y, z = (part[:, k, None] + t * to_light[k] for k in range(3))
+            is_occluded[first : first + size] = (z - self.height(x, y) < 0.0).any(axis=1)
+        return is_occluded
 
 
 def cast_triangles(objects: Objects, origins: np.ndarray, directions: np.ndarray, nearest: float = 0.0) -> np.ndarray:
@@ -101,11 +102,11 @@ def cast_triangles(objects: Objects, origins: np.ndarray, directions: np.ndarray
 
 def _select_rays(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Select rays that intersect the bounding sphere of a body."""
-    middle = corners.reshape(-1, 3).mean(axis=0)
-    radius = np.linalg.norm(corners - middle, axis=-1).max()
-    to_middle = middle - origins
-    distance = np.sum(to_middle * directions, axis=1)
-    return np.flatnonzero((np.sum(to_middle**2, axis=1) - distance**2 <= radius**2) & (distance > -radius))
+    centre = corners.reshape(-1, 3).mean(axis=0)
+    radius = np.linalg.norm(corners - centre, axis=-1).max()
+    to_centre = centre - origins
+    distance = np.sum(to_centre * directions, axis=1)
+    return np.flatnonzero((np.sum(to_centre**2, axis=1) - distance**2 <= radius**2) & (distance > -radius))
 
 
 def _intersect_triangles(
@@ -126,6 +127,6 @@ def _intersect_triangles(
             moment = np.cross(offset, direction)
             p = np.sum(second * moment, axis=-1) * scale
             q = -np.sum(first * moment, axis=-1) * scale
-        hit = (p >= -1e-12) & (q >= -1e-12) & (p + q <= 1.0 + 1e-12) & (t > nearest)
-        ranges[start : start + size] = np.where(hit, t, np.inf).min(axis=1)
+        is_hit = (p >= -1e-12) & (q >= -1e-12) & (p + q <= 1.0 + 1e-12) & (t > nearest)
+        ranges[start : start + size] = np.where(is_hit, t, np.inf).min(axis=1)
     return ranges

@@ -1,4 +1,4 @@
-"""Check of random streams: all of ten million streams have different seeds."""
+"""Check of random streams: the seeds of ten million streams differ from each other."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ class _Hash:
 
 
 def _mix(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Combine two words of the pool, as in `SeedSequence`."""
     result = np.asarray(np.uint32(_MIX_LEFT) * x - np.uint32(_MIX_RIGHT) * y, dtype=np.uint32)
     return result ^ (result >> np.uint32(_SHIFT))
 
@@ -67,6 +68,7 @@ def stream_words(seed: int, campaign: str, cases: np.ndarray, name: str) -> np.n
     root_words = [seed & _MASK, seed >> 32, 0, 0]
     key = list(stream_key(campaign, 0, name))
     words = np.tile(np.array([*root_words, *key], dtype=np.uint32), (cases.size, 1))
+    # the case is the word of the spawn key that `stream_key` leaves at 0
     words[:, _POOL + 4] = cases
     return words
 

@@ -141,17 +141,17 @@ def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
     source = RealTerrain(dtm=TILE, ortho_east_m=2.0, ortho_north_m=-1.0)
     terrain = TerrainParameters(samples=2048, spacing_m=0.25, craters_per_km2=0.0, source=source)
     surface = synthesise(terrain, np.random.default_rng(SEED))
-    middle = (0.5 * 2048 * 0.25, 0.5 * 2048 * 0.25)
+    centre = (0.5 * 2048 * 0.25, 0.5 * 2048 * 0.25)
     camera = crop_centre(preset("mer-descent-flown").cameras()[0], size)
     scene = Scene(
         surface,
-        middle,
+        centre,
         Sun(direction(np.radians(110.0), np.radians(40.0))),
         Photometry(),
         mesh_finest_m=0.0085 * height_m,
         mesh_reach_m=14.0 * height_m,
     )
-    eye = np.array([*middle, float(surface.height(*middle)) + height_m])
+    eye = np.array([*centre, float(surface.height(*centre)) + height_m])
     return View(scene, camera, rigid(Rotation.from_euler("xy", [4.0, -3.0], degrees=True), eye))
 
 
@@ -215,8 +215,8 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
         mesh_lines=641,
         among_objects=True,
     )
-    down = np.arctan2(MAST_M - 0.3 * ROCK_DIAMETER_M, ground_distance_m - 0.3 * ROCK_DIAMETER_M)
-    return View(scene, camera, rigid(Rotation.from_euler("y", down), eye))
+    pitch_rad = np.arctan2(MAST_M - 0.3 * ROCK_DIAMETER_M, ground_distance_m - 0.3 * ROCK_DIAMETER_M)
+    return View(scene, camera, rigid(Rotation.from_euler("y", pitch_rad), eye))
 
 
 def ground_view(name: str) -> View:

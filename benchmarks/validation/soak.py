@@ -21,7 +21,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store.table import read_rows
 
-FILE = """
+CAMPAIGN_TEXT = """
 name = "soak"
 scenario = "benchmarks.validation.hostile:HostileScenario"
 seed = 21
@@ -52,7 +52,7 @@ _MAX_SHUTDOWN_S = 10.0
 
 
 @dataclass(frozen=True)
-class Soak:
+class SoakResult:
     """Result of a soak test.
 
     Attributes
@@ -83,7 +83,7 @@ class Soak:
 
 def run_soak_test(
     folder: Path, cases: int, kills: int, misbehaving: float, killed_after_s: tuple[float, float]
-) -> Soak:
+) -> SoakResult:
     """Run the soak test in a folder, with and without faults.
 
     Parameters
@@ -98,12 +98,12 @@ def run_soak_test(
     temporary = folder / "tmp"
     temporary.mkdir()
     environment = {**os.environ, _MARK: str(folder), "TMPDIR": str(temporary)}
-    (folder / "soak.toml").write_text(f"cases = {cases}\n{FILE}")
+    (folder / "soak.toml").write_text(f"cases = {cases}\n{CAMPAIGN_TEXT}")
     healthy = _run(folder, "healthy", 0.0, environment, cases)
-    began = time.monotonic()
+    start_s = time.monotonic()
     killed = _run_with_kills(folder, misbehaving, kills, killed_after_s, environment)
     ended = _run(folder, "soaked", None, environment, cases) == 0 or (folder / "soaked" / "cases.parquet").exists()
-    seconds = time.monotonic() - began
+    seconds = time.monotonic() - start_s
     deadline = time.monotonic() + _MAX_SHUTDOWN_S
     while _find_processes(folder) and time.monotonic() < deadline:
         time.sleep(0.1)
@@ -112,7 +112,7 @@ def run_soak_test(
     campaign = load_campaign(str(folder / "soak.toml"), [f"misbehaving={misbehaving}"])
     faults = tuple(_draw_fault(campaign, case) for case in range(cases))
     pairs = list(zip(faults, rows["soaked"], rows["healthy"], strict=True))
-    return Soak(
+    return SoakResult(
         kills=killed,
         ended=ended,
         seconds=seconds,
@@ -132,7 +132,8 @@ def run_soak_test(
     )
 
 
-def _command(folder: Path, name: str, misbehaving: float | None) -> list[str]:
+def _build_command(folder: Path, name: str, misbehaving: float | None) -> list[str]:
+    """Build the command that runs the campaign with a fraction of misbehaving cases, or resumes it (None)."""
     program = [sys.executable, "-m", "marsyard"]
     if misbehaving is None:
         return [*program, "resume", str(folder / name), "--jobs", "2"]
@@ -141,11 +142,11 @@ def _command(folder: Path, name: str, misbehaving: float | None) -> list[str]:
 
 
 def _run(folder: Path, name: str, misbehaving: float | None, environment: Mapping[str, str], cases: int) -> int:
-    """Exit status of an uninterrupted run; 1 if cases did not finish."""
-    silent = subprocess.DEVNULL
-    command = _command(folder, name, misbehaving)
+    """Run or resume a campaign without interruption; return the exit status."""
+    no_output = subprocess.DEVNULL
+    command = _build_command(folder, name, misbehaving)
     return subprocess.run(
-        command, env=environment, stdout=silent, stderr=silent, timeout=60.0 + cases * _MAX_CASE_S, check=False
+        command, env=environment, stdout=no_output, stderr=no_output, timeout=60.0 + cases * _MAX_CASE_S, check=False
     ).returncode
 
 
@@ -156,9 +157,9 @@ def _run_with_kills(
     rng = np.random.default_rng(21)
     killed = 0
     for number in range(kills):
-        command = _command(folder, "soaked", None if number else misbehaving)
-        silent = subprocess.DEVNULL
-        with subprocess.Popen(command, env=environment, stdout=silent, stderr=silent) as runner:
+        command = _build_command(folder, "soaked", None if number else misbehaving)
+        no_output = subprocess.DEVNULL
+        with subprocess.Popen(command, env=environment, stdout=no_output, stderr=no_output) as runner:
             while not (folder / "soaked" / "cases.sqlite").exists() and runner.poll() is None:
                 time.sleep(0.02)
             time.sleep(rng.uniform(*after_s))

@@ -17,7 +17,7 @@ from benchmarks.validation.nights import (
     count_false_alarms,
 )
 from benchmarks.validation.records import Check, Measure
-from marsyard.reports.history import WINDOW
+from marsyard.reports.history import MAX_EARLIER_NIGHTS
 from marsyard.reports.statistics.proportions import (
     Interval,
     clustered_evidence,
@@ -201,7 +201,8 @@ def run_nights(quick: bool) -> Iterator[Measure]:
     unchanged, changed = (100, 100) if quick else (2000, 1000)
     alarms = count_false_alarms(unchanged, seed=4)
     campaigns = f"three campaigns of {CASES} cases: {', '.join(KINDS)}"
-    how = f"{alarms} of {unchanged} successive nights, each compared with up to {WINDOW} earlier nights; {campaigns}"
+    comparison = f"each compared with up to {MAX_EARLIER_NIGHTS} earlier nights"
+    how = f"{alarms} of {unchanged} successive nights, {comparison}; {campaigns}"
     yield Measure("nights with a false alarm", alarms / unchanged, "", 0.01, how)
     if not quick:
         upper_bound = proportion_upper(alarms, unchanged, 0.95)

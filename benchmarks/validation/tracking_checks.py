@@ -20,6 +20,7 @@ from marsyard.sim.sensor.odometry import EXACT
 from marsyard.sim.streams import Streams
 
 SEED = 20061108
+#: Limits of the drift (rms, maximum), and of the relative deviation of the range error from Eq. 1.
 DRIFT_RMS_LIMIT_PX, DRIFT_WORST_LIMIT_PX, RANGE_LIMIT = 1.0, 2.5, 0.15
 #: Maximum fraction of lost targets: 2 of 100 measured, plus three standard deviations (4).
 LOST_LIMIT = 0.06
@@ -52,9 +53,9 @@ def draw_exact_parameters(number: int, camera: str) -> RoverScenarioParameters:
 
 def simulate_run(number: int, camera: str) -> dict[str, Scalar]:
     """Simulate a run without errors and return its row."""
-    p = draw_exact_parameters(number, camera)
-    run = run_case(p, Streams(SEED, "validation tracking", number))
-    return {**score_run(p, run), **fixed_conditions(p, run), **run_conditions(p, run)}
+    parameters = draw_exact_parameters(number, camera)
+    run = run_case(parameters, Streams(SEED, "validation tracking", number))
+    return {**score_run(parameters, run), **fixed_conditions(parameters, run), **run_conditions(parameters, run)}
 
 
 def check_drift(quick: bool) -> Iterator[Measure]:
@@ -71,15 +72,15 @@ def check_drift(quick: bool) -> Iterator[Measure]:
 
 def _measure_drifts(rows: list[dict[str, Scalar]], name: str, *, has_limit: bool) -> Iterator[Measure]:
     """Measure the drift in pixels of the tracked targets, and the fraction of lost targets."""
-    px = np.array([float(row["drift_px"]) for row in rows])
+    drifts_px = np.array([float(row["drift_px"]) for row in rows])
     how = (
         f"{len(rows)} targets on rendered rocks, 10 m to 2 m in steps of 10 %, no noise, exact pose and cameras, "
         f"sun motion {_median_sun_motion_deg(rows):.0f} deg; "
-        f"{np.count_nonzero(np.isnan(px))} not tracked to the end"
+        f"{np.count_nonzero(np.isnan(drifts_px))} not tracked to the end"
     )
     if has_limit:
-        yield _measure_losses(f"targets lost before 2 m: {name}", int(np.isnan(px).sum()), len(px), how)
-    tracked = px[~np.isnan(px)]
+        yield _measure_losses(f"targets lost before 2 m: {name}", int(np.isnan(drifts_px).sum()), len(drifts_px), how)
+    tracked = drifts_px[~np.isnan(drifts_px)]
     rms, worst = float(np.sqrt(np.mean(tracked**2))), float(tracked.max())
     yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_LIMIT_PX if has_limit else None, how)
     yield Measure(
@@ -130,9 +131,9 @@ def _simulate_designation(number: int, camera: str) -> tuple[float, float] | Non
     # large rock: the template contains only the rock and no ground behind it
     rock = {"target.diameter_m": 1.5, "target.up": 0.5, "camera.preset": camera, "world.terrain": number % 8}
     drawn = campaign.with_values(campaign.draws(number) | rock)
-    p = RoverScenarioParameters.model_validate(drawn.model_dump() | {"legs": [{"motion": "stay", "steps": 1}]})
-    run = run_case(p, Streams(SEED, "validation stereo", number))
-    row = fixed_conditions(p, run)
+    parameters = RoverScenarioParameters.model_validate(drawn.model_dump() | {"legs": [{"motion": "stay", "steps": 1}]})
+    run = run_case(parameters, Streams(SEED, "validation stereo", number))
+    row = fixed_conditions(parameters, run)
     if not row["selectable"]:
         return None
     error = _range_error_m(run) if run.stops[0].update.found else float("nan")

@@ -21,7 +21,8 @@ from marsyard.campaigns.sampling.design import (
     locate_case,
 )
 from marsyard.campaigns.sampling.dispersion import Dispersion
-from marsyard.campaigns.sampling.dispersions import Derived, Fixed, Grid, InTurn, Normal
+from marsyard.campaigns.sampling.dispersions import CyclicInteger, Derived, Fixed, Grid, Normal
+from marsyard.campaigns.sampling.points import Point, transform_to_uniform
 from marsyard.scenarios.interface import Scenario
 from marsyard.sim.parameters import stream_name
 from marsyard.sim.streams import Streams
@@ -57,17 +58,28 @@ class Campaign:
         The values of the nominal case are the campaign's parameters; only fixed and derived values are computed.
         Raises ValueError if a formula is undefined for the sampled values or results in an invalid distribution.
         """
+        return self._evaluate(self.probabilities(case), case)
+
+    def draws_at(self, point: Point) -> dict[str, Any]:
+        """Compute the values of the dispersions at a point of a study. Raises ValueError like `draws`."""
+        uniform = transform_to_uniform(point.coordinates, self.drawn_paths, self.configuration.correlations)
+        return self._evaluate(uniform, point.stream, point.nominal)
+
+    def _evaluate(
+        self, probabilities: Mapping[str, float] | None, case: int, nominal: Sequence[str] = ()
+    ) -> dict[str, Any]:
+        """Evaluate the dispersions; those in `nominal` (all without `probabilities`) have the campaign's parameter."""
         parameters = self.configuration.parameters
-        probabilities = self.probabilities(case)
         values: dict[str, Any] = {}
         for path in self.order:
             dispersion = self.marginals[path]
-            if probabilities is None and not isinstance(dispersion, Fixed | Derived):
+            is_nominal = probabilities is None or path in nominal
+            if is_nominal and not isinstance(dispersion, Fixed | Derived):
                 values[path] = value_at(parameters, path)
                 continue
             inputs = {name: values[name] if name in values else value_at(parameters, name) for name in dispersion.names}
             distribution = dispersion.insert_values(inputs)
-            if isinstance(distribution, InTurn):
+            if isinstance(distribution, CyclicInteger):
                 values[path] = distribution.value(case)
             else:
                 values[path] = distribution.quantile(0.5 if probabilities is None else probabilities.get(path, 0.5))
@@ -75,28 +87,34 @@ class Campaign:
 
     def probabilities(self, case: int) -> dict[str, float] | None:
         """Compute the uniform number of each random or grid dispersion of a case; None for the nominal case."""
-        setup, paths = self.configuration, self.drawn_paths
-        position = locate_case(setup.design, setup.blocks, setup.grid_size, case)
+        configuration, paths = self.configuration, self.drawn_paths
+        position = locate_case(configuration.design, configuration.blocks, configuration.grid_size, case)
         if position is None:
             return None
         grid_point, first, size, index = position
-        if setup.design.kind == "random":
+        if configuration.design.kind == "random":
             streams = self.streams(case)
             uniform = {path: streams.generator(f"dispersion:{stream_name(path)}").random() for path in paths}
             numbers = {path: max(float(value), MIN_DRAW) for path, value in uniform.items()}
-            for group in setup.correlations:
+            for group in configuration.correlations:
                 correlated = correlate_uniform(np.array([numbers[path] for path in group.parameters]), group.factor)
                 numbers.update(zip(group.parameters, correlated.tolist(), strict=True))
         else:
             groups = tuple(
                 (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
-                for group in setup.correlations
+                for group in configuration.correlations
             )
             design = build_stratified_design(
-                setup.design.kind, setup.seed, setup.name, first, size, tuple(map(stream_name, paths)), groups
+                configuration.design.kind,
+                configuration.seed,
+                configuration.name,
+                first,
+                size,
+                tuple(map(stream_name, paths)),
+                groups,
             )
             numbers = dict(zip(paths, design[index].tolist(), strict=True))
-        grids = {path: len(grid.points) for path, grid in setup.grids.items()}
+        grids = {path: len(grid.points) for path, grid in configuration.grids.items()}
         return {**numbers, **compute_grid_quantiles(grids, grid_point)}
 
     @cached_property
@@ -113,7 +131,7 @@ class Campaign:
     def drawn_paths(self) -> tuple[str, ...]:
         """Paths of the dispersions that use a random number, in the order of the file."""
         dispersions = self.configuration.dispersions.items()
-        return tuple(path for path, item in dispersions if not isinstance(item, Grid | Fixed | Derived | InTurn))
+        return tuple(path for path, item in dispersions if not isinstance(item, Grid | Fixed | Derived | CyclicInteger))
 
     @cached_property
     def order(self) -> tuple[str, ...]:
@@ -135,6 +153,10 @@ class Campaign:
     def parameters(self, case: int) -> BaseModel:
         """Create the parameters of a case. Raises ValueError if sampling fails or the scenario rejects the values."""
         return self.with_values(self.draws(case))
+
+    def parameters_at(self, point: Point) -> BaseModel:
+        """Create the parameters of a case at a point of a study. Raises ValueError like `parameters`."""
+        return self.with_values(self.draws_at(point))
 
     def with_values(self, values: Mapping[str, Any]) -> BaseModel:
         """Create the campaign's parameters with other values at some paths."""

@@ -350,24 +350,25 @@ def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str
 
     The parameter models replace the former keys of the parameters themselves.
     """
-    path = partial(current_path, selected.parameters_type)
-    column = _column_renamer(str(tables.get("scenario")))
+    rename_path = partial(current_path, selected.parameters_type)
+    rename_column = _column_renamer(str(tables.get("scenario")))
     current = dict(tables)
     dispersions, correlations = tables.get("dispersions"), tables.get("correlations")
     if isinstance(dispersions, Mapping):
         current["dispersions"] = {
-            path(name): {
-                key: _rename_in_value(value, path) if key not in _TEXT_KEYS else value for key, value in table.items()
+            rename_path(name): {
+                key: _rename_in_value(value, rename_path) if key not in _TEXT_KEYS else value
+                for key, value in table.items()
             }
             if isinstance(table, Mapping)
             else table
             for name, table in dispersions.items()
         }
     if isinstance(correlations, list):
-        current["correlations"] = [_rename_entries(group, ("parameters",), path) for group in correlations]
+        current["correlations"] = [_rename_entries(group, ("parameters",), rename_path) for group in correlations]
     if isinstance(tables.get("requirements"), list):
         keys = ("metric", "population")
-        current["requirements"] = [_rename_entries(entry, keys, column) for entry in tables["requirements"]]
+        current["requirements"] = [_rename_entries(entry, keys, rename_column) for entry in tables["requirements"]]
     return current
 
 
@@ -387,10 +388,10 @@ def update_stored_configuration(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 def find_renamed_columns(names: Iterable[str], scenario_name: str) -> dict[str, str]:
     """Map stored columns that have a former name to their current names, without warnings."""
-    column = _column_renamer(scenario_name)
+    rename_column = _column_renamer(scenario_name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecatedNameWarning)
-        return {name: current for name in names if (current := column(name)) != name}
+        return {name: current for name in names if (current := rename_column(name)) != name}
 
 
 def _column_renamer(scenario_name: str) -> Callable[[str], str]:
@@ -412,6 +413,7 @@ def _rename_in_value(value: Any, rename: Callable[[str], str]) -> Any:
 
 
 def _rename_entries(entry: Any, keys: Iterable[str], rename: Callable[[str], str]) -> Any:
+    """Rename all names in the entries `keys` of a table; another value is returned unchanged."""
     if not isinstance(entry, Mapping):
         return entry
     return {key: _rename_in_value(value, rename) if key in keys else value for key, value in entry.items()}

@@ -24,8 +24,8 @@ NAMESPACE = "confirmation"
 _KEYS_NOT_FROZEN = frozenset(
     {"appended", "calibration", "cases", "description", "limits", "max_cases", "requirements", "retain", "seed"}
 )
-#: Numbers of confirmations whose seeds are recognised without an entry in the record.
-_RESERVED_NUMBERS = 1000
+#: Confirmation numbers up to this one have seeds that are recognised without an entry in the record.
+_MAX_RESERVED_NUMBER = 1000
 
 
 class EvidenceKind(StrEnum):
@@ -78,8 +78,8 @@ class FrozenAlgorithm:
         return [*texts, *changed]
 
 
-def freeze(campaign: Campaign) -> FrozenAlgorithm:
-    """Describe the choices that a confirmation of a campaign freezes."""
+def freeze_algorithm(campaign: Campaign) -> FrozenAlgorithm:
+    """Describe all choices that a confirmation of a campaign freezes."""
     configuration = campaign.configuration
     algorithms = describe_algorithms(campaign)
     tested = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), configuration.scenario)
@@ -101,7 +101,7 @@ def _hash(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def namespace(configuration: CampaignConfiguration) -> str:
+def confirmation_namespace(configuration: CampaignConfiguration) -> str:
     """Return the namespace of the seeds of a campaign's confirmations."""
     return NAMESPACE if configuration.calibration is None else configuration.calibration.namespace
 
@@ -166,7 +166,7 @@ class Evidence:
         except ValueError:
             return cls()
 
-    def table(self) -> dict[str, Any]:
+    def to_table(self) -> dict[str, Any]:
         """Return the fields as JSON types."""
         return {**asdict(self), "kind": str(self.kind), "changes": list(self.changes)}
 
@@ -210,7 +210,7 @@ class Evidence:
         )
 
 
-def classify(campaign: Campaign, confirmations: Sequence[Confirmation], frozen: FrozenAlgorithm) -> Evidence:
+def classify_evidence(campaign: Campaign, confirmations: Sequence[Confirmation], frozen: FrozenAlgorithm) -> Evidence:
     """Determine the kind of evidence of a run that was not started as a confirmation.
 
     confirmations: entries of the record of confirmations
@@ -228,8 +228,8 @@ def classify(campaign: Campaign, confirmations: Sequence[Confirmation], frozen: 
     if calibration_runs:
         options = dict.fromkeys(option for run in calibration_runs for option in run.options)
         return Evidence(EvidenceKind.CALIBRATION, changes=tuple(options))
-    own_namespace = namespace(configuration)
-    for number in range(1, _RESERVED_NUMBERS + 1):
+    own_namespace = confirmation_namespace(configuration)
+    for number in range(1, _MAX_RESERVED_NUMBER + 1):
         if confirmation_seed(own_namespace, name, number) == seed:
             reason = "it was run without --confirm, so the seed is not in the record of confirmations"
             return Evidence(EvidenceKind.REUSED_SEED, own_namespace, number, changes=(reason,))

@@ -79,8 +79,8 @@ def create_identity(configuration: CampaignConfiguration) -> Identity:
 
     Raises CampaignError if an input file is no longer valid.
     """
-    custom = (*list_algorithms(configuration), *list_parts(configuration))
-    code = hash_code((scenario_source(configuration.scenario), *custom))
+    custom_components = (*list_algorithms(configuration), *list_parts(configuration))
+    code = hash_code((scenario_source(configuration.scenario), *custom_components))
     return Identity(configuration_hash(configuration), code, read_versions(), hash_inputs(configuration))
 
 
@@ -111,10 +111,10 @@ def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
 
 def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """List the algorithms in a configuration or its dispersions: under test, then compared."""
-    selected = find_scenario(configuration.scenario)
-    if not isinstance(selected, HasAlgorithms):
+    selected_scenario = find_scenario(configuration.scenario)
+    if not isinstance(selected_scenario, HasAlgorithms):
         return ()
-    tested, compared = (".".join((*selected.algorithm_table, name)) for name in ("algorithm", "compared"))
+    tested, compared = (".".join((*selected_scenario.algorithm_table, name)) for name in ("algorithm", "compared"))
     specs = [find_value(configuration.parameters, tested), *find_value(configuration.parameters, compared)]
     if tested in configuration.dispersions:
         specs += configuration.dispersions[tested].extremes()
@@ -123,19 +123,19 @@ def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
 
 def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """List the import paths (``module:name``) of the custom parts in a configuration or its dispersions."""
-    selected = find_scenario(configuration.scenario)
-    if not isinstance(selected, HasParts):
+    selected_scenario = find_scenario(configuration.scenario)
+    if not isinstance(selected_scenario, HasParts):
         return ()
     parameter_trees = [configuration.parameters]
     for path, dispersion in configuration.dispersions.items():
-        if any(f"{key}.".startswith(f"{path}.") for key in selected.part_keys):
+        if any(f"{key}.".startswith(f"{path}.") for key in selected_scenario.part_keys):
             for tree in dispersion.extremes():
                 for name in reversed(path.split(".")):
                     tree = {name: tree}
                 parameter_trees.append(tree)
     paths: dict[str, None] = {}
     for tree in parameter_trees:
-        for key, kind in selected.part_keys.items():
+        for key, kind in selected_scenario.part_keys.items():
             value = find_value(tree, key)
             specs = [value] if isinstance(value, str) else [str(item) for item in value or ()]
             paths.update(dict.fromkeys(map(kind.path, specs)))
@@ -218,20 +218,20 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
     `version` attribute; None if there is neither), `options` and `source_hash` (SHA-256, 16 digits; None without a
     readable source).
     """
-    selected = campaign.scenario
-    if not isinstance(selected, HasAlgorithms):
+    selected_scenario = campaign.scenario
+    if not isinstance(selected_scenario, HasAlgorithms):
         return []
-    compared = find_value(campaign.configuration.parameters, ".".join((*selected.algorithm_table, "compared")))
+    compared = find_value(campaign.configuration.parameters, ".".join((*selected_scenario.algorithm_table, "compared")))
     parameters: Any = campaign.base_parameters()
-    for name in selected.algorithm_table:
+    for name in selected_scenario.algorithm_table:
         parameters = getattr(parameters, name)
     entries = []
     for spec in list_algorithms(campaign.configuration):
-        shipped = spec in selected.task.shipped
+        shipped = spec in selected_scenario.task.shipped
         sources = list(source_files("algorithms:") if shipped else custom_sources(spec))
         if shipped:
-            configured_options = (value for _, value in parameters if isinstance(value, selected.task.options))
-            algorithm = selected.task.shipped[spec](next(configured_options, selected.task.options()))
+            configured_options = (value for _, value in parameters if isinstance(value, selected_scenario.task.options))
+            algorithm = selected_scenario.task.shipped[spec](next(configured_options, selected_scenario.task.options()))
             kind, version = type(algorithm), _distribution_version("marsyard")
             path = f"{kind.__module__}:{kind.__qualname__}"
             options = _plain_options(getattr(algorithm, "options", None))
@@ -255,8 +255,8 @@ def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
     command = parse_command(spec)
     if command is not None or is_offline(spec):
         return (spec.partition(":")[2] if command is None else command.words[0]), None, {}
-    point = list_installed().get(spec)
-    path, target = (spec, import_object(spec)) if point is None else (point.value, point.load())
+    entry_point = list_installed().get(spec)
+    path, target = (spec, import_object(spec)) if entry_point is None else (entry_point.value, entry_point.load())
     package = path.partition(":")[0].partition(".")[0]
     versions = map(_distribution_version, metadata.packages_distributions().get(package, []))
     version = next((text for text in versions if text is not None), None) or getattr(target, "version", None)

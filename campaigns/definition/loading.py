@@ -88,39 +88,39 @@ def load_campaign(
 
     - name_or_path: a name from the catalogue, or the path of a TOML file
     - overrides: options ``KEY=VALUE``. KEY is a dotted path of a parameter or a top-level key of the file; VALUE is in
-      TOML syntax or plain text. An overridden parameter is no longer dispersed
+      TOML syntax or plain text. An overridden parameter is not dispersed
     - cases, seed, algorithms: replace those of the file; the first algorithm is under test, the others are compared
 
     Raises ConfigurationError with all problems: file (or option), key and allowed values.
     """
     path = find_campaign(name_or_path)
     tables = read_tables(path)
-    selected = find_scenario(tables.get("scenario"))
-    if selected is not None:
-        tables = use_current_names(tables, selected)
-    overridden: dict[tuple[str, ...], str] = {}
+    selected_scenario = find_scenario(tables.get("scenario"))
+    if selected_scenario is not None:
+        tables = use_current_names(tables, selected_scenario)
+    options_by_key: dict[tuple[str, ...], str] = {}
     command = ["marsyard", "run", name_or_path]
     for override in overrides:
         option = f"--set {override}"
-        tables = _apply_option(tables, _parse_override(override, option, selected), option, overridden)
+        tables = _apply_option(tables, _parse_override(override, option, selected_scenario), option, options_by_key)
     if algorithms:
-        tables = _select_algorithms(tables, algorithms, str(path), overridden)
+        tables = _select_algorithms(tables, algorithms, str(path), options_by_key)
     for key, option, value in (("cases", "-n", cases), ("seed", "--seed", seed)):
         if value is not None:
             tables[key] = value
-            overridden[(key,)] = f"{option} {value}"
+            options_by_key[(key,)] = f"{option} {value}"
             command += [option, str(value)]
     for option, values in (("--algorithm", algorithms), ("--set", overrides)):
         command += [word for value in values for word in (option, value)]
-    return replace(_validate(str(path), tables, overridden), command=tuple(command))
+    return replace(_validate(str(path), tables, options_by_key), command=tuple(command))
 
 
-def _parse_override(override: str, option: str, selected: Scenario | None) -> dict[str, Any]:
+def _parse_override(override: str, option: str, selected_scenario: Scenario | None) -> dict[str, Any]:
     key, separator, value = override.partition("=")
     if not separator or not key.strip() or "\n" in override:
         raise ConfigurationError([Problem(option, "", "expected KEY=VALUE, such as --set render.backend=egl")])
-    if selected is not None and key.split(".")[0].strip() not in _FILE_KEYS:
-        key = current_path(selected.parameters_type, key.strip())
+    if selected_scenario is not None and key.split(".")[0].strip() not in _FILE_KEYS:
+        key = current_path(selected_scenario.parameters_type, key.strip())
     try:
         try:
             values = tomllib.loads(f"{key} = {value.strip()}")
@@ -132,14 +132,14 @@ def _parse_override(override: str, option: str, selected: Scenario | None) -> di
 
 
 def _select_algorithms(
-    tables: dict[str, Any], algorithms: Sequence[str], source: str, overridden: dict[tuple[str, ...], str]
+    tables: dict[str, Any], algorithms: Sequence[str], source: str, options_by_key: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
     """Replace the algorithms in the tables; no change for an unknown scenario, which is reported later."""
     options = [f"--algorithm {spec}" for spec in algorithms]
-    selected = find_scenario(tables.get("scenario"))
-    if selected is None:
+    selected_scenario = find_scenario(tables.get("scenario"))
+    if selected_scenario is None:
         return tables
-    if not isinstance(selected, HasAlgorithms):
+    if not isinstance(selected_scenario, HasAlgorithms):
         raise ConfigurationError([Problem(options[0], "", f"the scenario of {source} has no selectable algorithms")])
     settings: tuple[tuple[str, Any, str], ...] = (
         ("algorithm", algorithms[0], options[0]),
@@ -147,19 +147,19 @@ def _select_algorithms(
     )
     for key, value, option in settings:
         inner: dict[str, Any] = {key: value}
-        for part in reversed(("parameters", *selected.algorithm_table)):
+        for part in reversed(("parameters", *selected_scenario.algorithm_table)):
             inner = {part: inner}
-        tables = _apply_option(tables, inner, option, overridden)
+        tables = _apply_option(tables, inner, option, options_by_key)
     return tables
 
 
 def _apply_option(
-    tables: Mapping[str, Any], settings: Mapping[str, Any], option: str, overridden: dict[tuple[str, ...], str]
+    tables: Mapping[str, Any], settings: Mapping[str, Any], option: str, options_by_key: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
-    """Merge the tables with those of an option; parameters that the option sets are no longer dispersed."""
+    """Merge the tables with those of an option; parameters that the option sets are not dispersed."""
     merged = _merge(tables, settings)
     paths = _list_paths(settings)
-    overridden.update(dict.fromkeys(paths, option))
+    options_by_key.update(dict.fromkeys(paths, option))
     fixed = [".".join(path[1:]) for path in paths if path[0] == "parameters"]
     dispersions = merged.get("dispersions")
     if isinstance(dispersions, dict):
@@ -203,7 +203,7 @@ def _merge(tables: Mapping[str, Any], updates: Mapping[str, Any]) -> dict[str, A
     return merged
 
 
-def _validate(source: str, tables: Mapping[str, Any], overridden: Mapping[tuple[str, ...], str]) -> Campaign:
+def _validate(source: str, tables: Mapping[str, Any], options_by_key: Mapping[tuple[str, ...], str]) -> Campaign:
     """Create a campaign from the tables of a file; missing parameters have default values."""
     problems: list[Problem] = []
 
@@ -211,7 +211,7 @@ def _validate(source: str, tables: Mapping[str, Any], overridden: Mapping[tuple[
         """Add problems at keys; their location is the file, or the command-line option that sets the key."""
         for key, message in new_problems:
             key, location = (*prefix, *key), source
-            for path, option in overridden.items():
+            for path, option in options_by_key.items():
                 common_length = min(len(key), len(path))
                 if common_length and key[:common_length] == path[:common_length]:
                     location = option
@@ -225,23 +225,23 @@ def _validate(source: str, tables: Mapping[str, Any], overridden: Mapping[tuple[
             add_problems(validation_problems(error, model), prefix)
             return None
 
-    tables, unresolved = fill_requirements(tables)
-    add_problems(unresolved)
+    tables, requirement_problems = fill_requirements(tables)
+    add_problems(requirement_problems)
     if problems:
         raise ConfigurationError(problems)
-    configuration, selected, parameters = validate(CampaignConfiguration, tables), None, None
+    configuration, selected_scenario, parameters = validate(CampaignConfiguration, tables), None, None
     try:
         if isinstance(name := tables.get("scenario"), str) and name:
-            selected = scenario(name)
+            selected_scenario = scenario(name)
     except UnknownScenarioError as error:
         add_problems([(("scenario",), str(error))])
     values = tables.get("parameters", {})
-    if selected is not None and isinstance(values, Mapping):
-        parameters = validate(selected.parameters_type, values, ("parameters",))
-    if configuration is None or selected is None or parameters is None:
+    if selected_scenario is not None and isinstance(values, Mapping):
+        parameters = validate(selected_scenario.parameters_type, values, ("parameters",))
+    if configuration is None or selected_scenario is None or parameters is None:
         raise ConfigurationError(problems)
-    complete = parameters.model_dump(mode="json", round_trip=True)
-    campaign = Campaign(configuration.model_copy(update={"parameters": complete}), selected)
+    complete_parameters = parameters.model_dump(mode="json", round_trip=True)
+    campaign = Campaign(configuration.model_copy(update={"parameters": complete_parameters}), selected_scenario)
     add_problems([*_check_sampling(campaign), *_check_metrics(campaign), *_check_calibration(campaign)])
     if problems:
         raise ConfigurationError(problems)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from types import MappingProxyType
 from typing import Any
 
 from marsyard.algorithms.answers import describe_error
@@ -20,7 +21,8 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, L
 from marsyard.campaigns.errors import CRASHED, ENGINE_FAILURES, OUT_OF_MEMORY, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Work, WorkLimits
-from marsyard.campaigns.store.products import Keep, PackedProducts, pack_products
+from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.store.products import PackedProducts, ProductSelection, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
 from marsyard.scenarios.systems import scenario
@@ -28,7 +30,7 @@ from marsyard.sim.cache import CacheWarning
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.
 _MAX_INT_BITS = 1023
-#: Maximum length of an error's text, or of a traceback, in a row: beginning and end.
+#: Maximum characters of an error's text, or of a traceback, in a row; the middle of a longer text is omitted.
 _MAX_TEXT = 8000
 
 
@@ -53,18 +55,19 @@ def configuration_text(configuration: CampaignConfiguration) -> str:
 def _load_campaign(configuration: str) -> Campaign:
     """Create the campaign of a configuration text; the result is cached because loading is slow."""
     worker_process.start_clock(grace_s=worker_process.LOADING_S)
-    contents = CampaignConfiguration.model_validate_json(configuration)
-    selected = scenario(contents.scenario)
+    campaign_configuration = CampaignConfiguration.model_validate_json(configuration)
+    selected_scenario = scenario(campaign_configuration.scenario)
     worker_process.limit_threads()
     worker_process.accept_process_state()
     worker_process.start_clock()
-    return Campaign(contents, selected)
+    return Campaign(campaign_configuration, selected_scenario)
 
 
-def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
+def run_case(configuration: str, selection: ProductSelection, points: Mapping[int, Point], case: int) -> CompletedCase:
     """Run one case of the campaign of a `configuration_text`; the row of a failed case contains its exception.
 
-    `keep` decides whether the products of the case are returned with the row.
+    - selection: decides whether the products of the case are returned with the row
+    - points: points of the cases of a study; other cases are drawn by the sampling design
     """
     wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
     products: Mapping[str, Any] = {}
@@ -78,7 +81,9 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
         campaign = _load_campaign(configuration)
         wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
         with conditions_recorded_by(record):
-            result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
+            point = points.get(case)
+            parameters = campaign.parameters(case) if point is None else campaign.parameters_at(point)
+            result = campaign.scenario.run(parameters, campaign.streams(case if point is None else point.stream))
         row = _build_finished_row(case, result, campaign.configuration.requirements)
         products = result.products
     except BaseException as error:
@@ -88,7 +93,7 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
     row = {**row, "wall_time_s": wall_time_s, "cpu_time_s": cpu_time_s}
     if row["outcome"] in (CRASHED, OUT_OF_MEMORY):
         worker_process.request_fresh_worker()
-    if not products or not keep.selects(row):
+    if not products or not selection.selects(row):
         return CompletedCase(row)
     try:
         return CompletedCase(row, pack_products(products))
@@ -110,20 +115,28 @@ def run_cases(
     configuration: CampaignConfiguration,
     cases: Iterable[int],
     *,
-    keep: Keep,
+    selection: ProductSelection,
     total: int | None = None,
+    points: Mapping[int, Point] = MappingProxyType({}),
 ) -> Iterator[list[CompletedCase]]:
-    """Run cases and yield them as they end, also cases whose worker died or was terminated."""
-    task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
+    """Run cases and yield them as they end, also cases whose worker died or was terminated.
+
+    points: see `run_case`; rows of these cases contain their point
+    """
+    task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), selection, dict(points))
     note_counts: Counter[str] = Counter()
     limits = work_limits(configuration.limits, configuration.limits.case_time_s)
     for results in executor.run(Work(task, cases, limits, total)):
         completed = []
-        for finished in results:
+        for task_result in results:
             times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
-            case_result = finished.result or CompletedCase({**_build_lost_row(finished.item, finished.error), **times})
-            note = "; ".join(filter(None, (case_result.note, *_describe_changes(finished, note_counts))))
-            completed.append(replace(case_result, note=note))
+            case_result = task_result.result or CompletedCase(
+                {**_build_terminated_row(task_result.item, task_result.error), **times}
+            )
+            note = "; ".join(filter(None, (case_result.note, *_describe_changes(task_result, note_counts))))
+            row, point = case_result.row, points.get(task_result.item)
+            row = row if point is None else {**row, POINT_COLUMN: point.text}
+            completed.append(replace(case_result, row=row, note=note))
         yield completed
 
 
@@ -133,17 +146,19 @@ def work_limits(limits: Limits, time_s: float) -> WorkLimits:
     return WorkLimits(time_s, memory, limits.output_mb * 1e6)
 
 
-def _build_lost_row(case: int, error: Exception | None) -> Row:
-    """Create the row of a case whose process ended, with the conditions that the case recorded before."""
+def _build_terminated_row(case: int, error: Exception | None) -> Row:
+    """Create the row of a case whose process ended early, with the conditions that the case recorded."""
     if not isinstance(error, WorkerExitError):
         return make_unfinished_row(case, CRASHED, describe_error(error), "")
     trace, conditions = error.trace, {}
     lines = trace.splitlines()
-    call = next((index for index, line in enumerate(lines) if line.endswith(" in run_case")), None)
-    if call is not None:
+    call_index = next((index for index, line in enumerate(lines) if line.endswith(" in run_case")), None)
+    if call_index is not None:
         # remove the frames above the engine's call of the scenario
-        next_thread = next((k for k in range(call + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
-        trace = "\n".join([*lines[: call + 1], *lines[next_thread:]])
+        next_thread = next(
+            (k for k in range(call_index + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines)
+        )
+        trace = "\n".join([*lines[: call_index + 1], *lines[next_thread:]])
     # the process may have ended while writing the note, and other code may have written to the file
     with suppress(ValueError, TypeError, LookupError, AttributeError, RecursionError):
         recorded = json.loads(error.note)
@@ -226,11 +241,15 @@ def _replace_surrogates(text: str) -> str:
 _MAX_NOTES = 3
 
 
-def _describe_changes(run: TaskResult[Any], note_counts: Counter[str]) -> Iterator[str]:
+def _describe_changes(result: TaskResult[Any], note_counts: Counter[str]) -> Iterator[str]:
     """Yield notes on a case that changed its worker process; `note_counts` limits the notes of each kind in one run."""
-    notes = [(part.partition(" (")[0], f"case {run.item} changed its worker process: {part}") for part in run.changed]
-    if run.crashed_only_after is not None:
-        text = f"case {run.item} crashed in the worker of case {run.crashed_only_after}, but not in a fresh worker"
+    notes = [
+        (part.partition(" (")[0], f"case {result.item} changed its worker process: {part}") for part in result.changed
+    ]
+    if result.crashed_only_after is not None:
+        text = (
+            f"case {result.item} crashed in the worker of case {result.crashed_only_after}, but not in a fresh worker"
+        )
         notes.append(("crashed only after", f"{text}: an earlier case changed the state of that worker"))
     for kind, text in notes:
         note_counts[kind] += 1

@@ -25,6 +25,8 @@ from marsyard.campaigns.execution.worker_process import TaskResult, Work
 from marsyard.campaigns.execution.workers import Batches, LocalExecutor
 
 Result = TypeVar("Result")
+#: Prefix of the address of a new cluster on this machine.
+_LOCAL_PREFIX = "local:"
 #: Seconds to wait for a scheduler, and for the first worker.
 _TIMEOUT_S = 30
 #: Batches queued at each Dask worker, so that no worker waits for the network.
@@ -45,16 +47,15 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         except ImportError as error:
             raise CampaignError("a cluster needs Dask: pip install 'marsyard[dask]'") from error
         self._distributed = distributed
-        number = address.removeprefix("local:")
         with ExitStack() as stack:
             try:
                 cluster: Any = None
-                if number == address:
+                if not address.startswith(_LOCAL_PREFIX):
                     # Check the address first. Dask does not close a client with an invalid address; its later garbage
                     # collection can block the next client for 10 s.
                     distributed.comm.get_address_host_port(address)
                 else:
-                    cluster = _start_local_cluster(address, number)
+                    cluster = _start_local_cluster(address)
                     stack.callback(cluster.close)
                 self._client = distributed.Client(cluster or address, timeout=_TIMEOUT_S, set_as_default=False)
                 stack.callback(self._client.close)
@@ -131,14 +132,16 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
 
-def _start_local_cluster(address: str, number: str) -> Any:
+def _start_local_cluster(address: str) -> Any:
+    """Start a Dask cluster with N workers on this machine, for the address `local:N`."""
     from distributed import LocalCluster
 
+    number = address.removeprefix(_LOCAL_PREFIX)
     if not (number.isdecimal() and int(number) >= 1):
         raise CampaignError(f"--cluster {address}: expected local:N, with N at least 1")
     # the memory limit applies to the worker processes of the cases, not to the Dask workers
-    processes: dict[str, Any] = {"n_workers": int(number), "threads_per_worker": 1, "processes": True}
-    return LocalCluster(**processes, dashboard_address=None, memory_limit=0, silence_logs="ERROR")
+    worker_options: dict[str, Any] = {"n_workers": int(number), "threads_per_worker": 1, "processes": True}
+    return LocalCluster(**worker_options, dashboard_address=None, memory_limit=0, silence_logs="ERROR")
 
 
 def _identify_code() -> tuple[str, dict[str, str]]:

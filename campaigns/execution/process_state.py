@@ -30,12 +30,12 @@ import numpy as np
 from marsyard.algorithms.processes import children
 
 #: Maximum seconds to wait for threads and processes to end.
-_MAX_ENDING_S = 0.2
+_MAX_END_WAIT_S = 0.2
 FileIdentity = tuple[int, int] | None
 _SIGNALS = tuple(range(1, signal.SIGSYS + 1))
 
 
-class _Part(NamedTuple):
+class _StatePart(NamedTuple):
     """A part of the state: its name, a function that reads it, and a function that sets it."""
 
     name: str
@@ -43,7 +43,7 @@ class _Part(NamedTuple):
     set: Callable[[Any], object]
 
 
-def _read_folder() -> str:
+def _read_working_folder() -> str:
     try:
         return str(Path.cwd())
     except FileNotFoundError:
@@ -79,7 +79,7 @@ def _read_umask() -> int:
     return mask
 
 
-def _read_decimals() -> tuple[Any, ...]:
+def _read_decimal_context() -> tuple[Any, ...]:
     context = decimal.getcontext()
     enabled_traps = [kind for kind, is_enabled in context.traps.items() if is_enabled]
     return (
@@ -122,18 +122,18 @@ def _set_arithmetic(_: object) -> None:
 
 
 _PARTS = (
-    _Part("the working folder", _read_folder, os.chdir),
-    _Part("environment variables", _read_environment, _set_environment),
-    _Part("sys.path", lambda: list(sys.path), lambda saved: sys.path.__setitem__(slice(None), saved)),
-    _Part("the warning filters", lambda: list(warnings.filters), _set_filters),
-    _Part("NumPy's error handling (numpy.seterr)", np.geterr, lambda saved: np.seterr(**saved)),
-    _Part("the locale", partial(locale.setlocale, locale.LC_ALL), partial(locale.setlocale, locale.LC_ALL)),
-    _Part("the file mode mask (umask)", _read_umask, os.umask),
-    _Part("the recursion limit", sys.getrecursionlimit, sys.setrecursionlimit),
-    _Part("the decimal context", _read_decimals, lambda saved: decimal.setcontext(decimal.Context(*saved))),
-    _Part("OpenCV's settings (optimised code, threads)", _read_opencv, _set_opencv),
-    _Part("the floating-point rounding mode", _read_arithmetic, _set_arithmetic),
-    _Part("garbage collection", gc.isenabled, lambda enabled: (gc.enable if enabled else gc.disable)()),
+    _StatePart("the working folder", _read_working_folder, os.chdir),
+    _StatePart("environment variables", _read_environment, _set_environment),
+    _StatePart("sys.path", lambda: list(sys.path), lambda saved: sys.path.__setitem__(slice(None), saved)),
+    _StatePart("the warning filters", lambda: list(warnings.filters), _set_filters),
+    _StatePart("NumPy's error handling (numpy.seterr)", np.geterr, lambda saved: np.seterr(**saved)),
+    _StatePart("the locale", partial(locale.setlocale, locale.LC_ALL), partial(locale.setlocale, locale.LC_ALL)),
+    _StatePart("the file mode mask (umask)", _read_umask, os.umask),
+    _StatePart("the recursion limit", sys.getrecursionlimit, sys.setrecursionlimit),
+    _StatePart("the decimal context", _read_decimal_context, lambda saved: decimal.setcontext(decimal.Context(*saved))),
+    _StatePart("OpenCV's settings (optimised code, threads)", _read_opencv, _set_opencv),
+    _StatePart("the floating-point rounding mode", _read_arithmetic, _set_arithmetic),
+    _StatePart("garbage collection", gc.isenabled, lambda enabled: (gc.enable if enabled else gc.disable)()),
 )
 #: Indices of the parts that imports of modules change: environment, `sys.path` and warning filters.
 _CHANGED_BY_IMPORTS = (1, 2, 3)
@@ -156,7 +156,7 @@ class ProcessState:
 
     def __init__(self) -> None:
         self._parts = [part.read() for part in _PARTS]
-        self._lasting = (_read_signals(), _read_streams())
+        self._signals_and_streams = (_read_signals(), _read_streams())
         self._threads = set(threading.enumerate())
         self._importing = False
         sys.meta_path[:] = [self, *(finder for finder in sys.meta_path if not isinstance(finder, ProcessState))]
@@ -180,46 +180,46 @@ class ProcessState:
 
         A module is imported once per process, in the first case that needs it. The case has not caused its changes.
         """
-        earlier = {index: _PARTS[index].read() for index in _CHANGED_BY_IMPORTS}
+        states_before = {index: _PARTS[index].read() for index in _CHANGED_BY_IMPORTS}
         self._importing = True
         try:
             execute(module)
         finally:
             self._importing = False
-            for index, old in earlier.items():
+            for index, old in states_before.items():
                 new, saved = _PARTS[index].read(), self._parts[index]
                 if isinstance(saved, dict):
-                    unremoved = {name: value for name, value in saved.items() if name in new or name not in old}
+                    remaining = {name: value for name, value in saved.items() if name in new or name not in old}
                     changed = {name: value for name, value in new.items() if old.get(name) != value}
-                    self._parts[index] = unremoved | changed
+                    self._parts[index] = remaining | changed
                 elif saved == old:
                     self._parts[index] = new
 
     def restore(self) -> tuple[list[str], list[str]]:
         """Restore all changed parts; return the names of the restored parts, and of changes that cannot be restored."""
         restored: list[str] = []
-        lasting = self._find_leftovers()
+        unrestorable = self._list_unrestorable_changes()
         for part, reference in zip(_PARTS, self._parts, strict=True):
             if part.read() == reference:
                 continue
             with suppress(Exception):
                 part.set(reference)
-            (restored if part.read() == reference else lasting).append(part.name)
-        return restored, lasting
+            (restored if part.read() == reference else unrestorable).append(part.name)
+        return restored, unrestorable
 
-    def _find_leftovers(self) -> list[str]:
+    def _list_unrestorable_changes(self) -> list[str]:
         """List changes that cannot be restored: signals, streams, non-daemon threads, and child processes."""
-        signals, streams = self._lasting
+        signals, streams = self._signals_and_streams
         names = ["handlers of signals, or timers"] if _read_signals() != signals else []
         if _read_streams() != streams:
             names.append("standard output or error")
-        deadline = time.monotonic() + _MAX_ENDING_S
+        deadline = time.monotonic() + _MAX_END_WAIT_S
         while True:
             threads = [item.name for item in threading.enumerate() if item not in self._threads and not item.daemon]
             running = {"threads": threads, "child processes": _list_child_processes()}
             if not any(running.values()) or time.monotonic() >= deadline:
-                leftovers = {kind: ", ".join(sorted(set(items))) for kind, items in running.items() if items}
-                return [*names, *(f"{kind} that are still running ({items})" for kind, items in leftovers.items())]
+                running_texts = {kind: ", ".join(sorted(set(items))) for kind, items in running.items() if items}
+                return [*names, *(f"{kind} that are still running ({items})" for kind, items in running_texts.items())]
             # finalizers of unreferenced objects can end their child processes
             gc.collect()
             time.sleep(0.01)

@@ -53,6 +53,7 @@ def _supervise(worker: int, parent: int, folder: Path, handled_signals: set[sign
     """Wait for the worker's end or the end signal; then kill all descendants and end with the worker's status."""
     import resource
 
+    # exit status of the worker; minus the signal number if a signal ended the worker
     status: int | None = None
     while status is None:
         received_signal = signal.sigwait(handled_signals)
@@ -62,9 +63,10 @@ def _supervise(worker: int, parent: int, folder: Path, handled_signals: set[sign
             status = -signal.SIGKILL
         else:
             with suppress(ChildProcessError):
-                while (child := os.waitpid(-1, os.WNOHANG))[0]:
-                    if child[0] == worker:
-                        status = os.waitstatus_to_exitcode(child[1])
+                while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                    process, wait_status = ended
+                    if process == worker:
+                        status = os.waitstatus_to_exitcode(wait_status)
     deadline = time.monotonic() + _KILLING_S
     with suppress(ChildProcessError):
         # `waitpid` raises ChildProcessError as soon as this process has no children
@@ -83,14 +85,14 @@ def _supervise(worker: int, parent: int, folder: Path, handled_signals: set[sign
     if -status not in (signal.SIGKILL, signal.SIGSTOP):
         signal.signal(-status, signal.SIG_DFL)
     os.kill(os.getpid(), -status)
-    os._exit(128 - status)
+    os._exit(128 - status)  # as shells report a signal: 128 plus its number
 
 
 #: Options of Linux's `prctl`: send a signal at the parent's end; become the parent of orphaned descendants.
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 #: Maximum seconds of repeated killing, since processes may start other processes meanwhile.
 _KILLING_S = 10.0
-#: Seconds between two checks of killed processes.
+#: Seconds between two rounds of killing.
 _PAUSE_S = 0.005
 
 

@@ -142,7 +142,11 @@ class StatusBoard:
 
 @dataclass
 class _WorkerContext:
-    """Context of this worker process: status board, files, current item, and reference process state."""
+    """Context of this worker process: status board, files, current item, and reference process state.
+
+    - trace, note: files of the stack trace and of the task's note; output: descriptor of the output file
+    - files: open descriptors that an item must not close, with their identities
+    """
 
     board: StatusBoard
     trace: Path
@@ -226,9 +230,9 @@ def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
         # results can no longer be sent; the parent identifies the item by the status board
         _context.trace.write_text("Fatal: the files that the worker process needs were closed\n")
         os._exit(FILES_CLOSED)
-    restored, lasting = _context.state.restore()
-    must_replace = bool(lasting) or _context.crashed
-    names = (*restored, *lasting)
+    restored, unrestorable = _context.state.restore()
+    must_replace = bool(unrestorable) or _context.crashed
+    names = (*restored, *unrestorable)
     if len(group) > 1 and (names or process_state.generators_were_used(group[0])):
         _context.checks_each_item = True
         return must_replace, None

@@ -56,6 +56,7 @@ _MARK = "MARSYARD_WORKER"
 _MAX_ATTEMPTS = 2
 #: Maximum number of consecutive deaths of workers before they start a task.
 _MAX_START_DEATHS = 3
+#: Prefix of the names of executors' temporary folders.
 _PREFIX = "marsyard-"
 #: Lock file in the folder of an executor; the process of the executor locks it while it runs.
 _LOCK = "lock"
@@ -106,7 +107,7 @@ class Batches:
         self._size = max(1, min(target_size, 2 * self._size, MAX_BATCH))
 
 
-class WatchedWorker:
+class MonitoredWorker:
     """One worker process, which is monitored, and replaced when it dies.
 
     Signals are sent only to the process that loky started: the worker's supervisor, which ends after its descendants.
@@ -114,14 +115,14 @@ class WatchedWorker:
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir()
-        self._home = folder
+        self._parent_folder = folder
         self._generation = 0
         self._start()
 
     def _start(self) -> None:
         """Prepare a new process with a new folder; loky starts the process with the first batch."""
         self._generation += 1
-        self._folder = self._home / str(self._generation)
+        self._folder = self._parent_folder / str(self._generation)
         (self._folder / "tmp").mkdir(parents=True)
         self._mark = f"{_MARK}={self._folder}"
         self._board = worker_process.StatusBoard.create(self._folder / "board")
@@ -275,7 +276,7 @@ class LocalExecutor(AbstractContextManager["LocalExecutor"]):
             self._lock = os.open(partial, os.O_RDWR | os.O_CREAT, 0o600)
             fcntl.flock(self._lock, fcntl.LOCK_EX)
             partial.rename(self._folder / _LOCK)
-            self._workers = [WatchedWorker(self._folder / str(number)) for number in range(jobs)]
+            self._workers = [MonitoredWorker(self._folder / str(number)) for number in range(jobs)]
         except OSError as error:
             raise CampaignError(f"temporary files cannot be written (TMPDIR defines their folder): {error}") from error
 
@@ -291,13 +292,13 @@ class LocalExecutor(AbstractContextManager["LocalExecutor"]):
 
     def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
         """Run work as described in `Executor.run`."""
-        yield from _Run(work, work.limits.memory_bytes or self._default_memory_bytes, self._workers).results()
+        yield from _WorkProgress(work, work.limits.memory_bytes or self._default_memory_bytes, self._workers).results()
 
 
-class _Run:
+class _WorkProgress:
     """Progress of one `Work`: batches at workers, items to be run again, and results."""
 
-    def __init__(self, work: Work[Any], memory_bytes: float, workers: Sequence[WatchedWorker]) -> None:
+    def __init__(self, work: Work[Any], memory_bytes: float, workers: Sequence[MonitoredWorker]) -> None:
         self._work = work
         self._batches = Batches(work.items, work.total, len(workers))
         self._memory_bytes = memory_bytes
@@ -305,7 +306,7 @@ class _Run:
         self._retries: deque[list[int]] = deque()
         self._attempts: dict[int, int] = {}
         self._suspect_predecessors: dict[int, int | None] = {}
-        self._running: dict[Future[Any], tuple[WatchedWorker, Sequence[int]]] = {}
+        self._running: dict[Future[Any], tuple[MonitoredWorker, Sequence[int]]] = {}
         self._deaths_at_start = 0
 
     def results(self) -> Iterator[list[TaskResult[Any]]]:
@@ -330,7 +331,7 @@ class _Run:
                 return
             self._submit(self._idle.popleft(), batch)
 
-    def _submit(self, worker: WatchedWorker, batch: Sequence[int]) -> None:
+    def _submit(self, worker: MonitoredWorker, batch: Sequence[int]) -> None:
         self._running[worker.submit(self._work.task, batch)] = (worker, batch)
 
     def _collect(self, future: Future[Any]) -> list[TaskResult[Any]]:
@@ -348,7 +349,7 @@ class _Run:
             return []
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
-    def _handle_batch_result(self, worker: WatchedWorker, batch_result: BatchResult[Any]) -> list[TaskResult[Any]]:
+    def _handle_batch_result(self, worker: MonitoredWorker, batch_result: BatchResult[Any]) -> list[TaskResult[Any]]:
         self._retries.extend([item] for item in batch_result.to_isolate)
         if batch_result.not_started:
             self._retries.append(list(batch_result.not_started))
@@ -374,7 +375,7 @@ class _Run:
         ]
 
     def _handle_worker_crash(
-        self, worker: WatchedWorker, batch: Sequence[int], error: BaseException
+        self, worker: MonitoredWorker, batch: Sequence[int], error: BaseException
     ) -> list[TaskResult[Any]]:
         """Identify the task that ended the worker; run the other tasks of its batch again."""
         item, exit_error = worker.handle_death(error)

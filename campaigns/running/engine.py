@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
-from marsyard.campaigns.definition.evidence import classify, freeze
+from marsyard.campaigns.definition.evidence import classify_evidence, freeze_algorithm
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.definition.loading import NUMBERS, find_unknown_columns
 from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, ConfigurationError, Problem, StoreError
@@ -22,10 +22,10 @@ from marsyard.campaigns.execution.cases import CompletedCase, configuration_text
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.running.preparation import plan_inputs, report_compilation
-from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
+from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.confirmations import read_confirmations, reserve
-from marsyard.campaigns.store.products import ProductStore, select_kept_cases
+from marsyard.campaigns.store.confirmations import read_confirmations, reserve_confirmation
+from marsyard.campaigns.store.products import ProductStore, create_product_selection
 from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, find_showcase, find_worst_cases, numeric_metrics, write_table
@@ -33,7 +33,7 @@ from marsyard.scenarios.systems import RowColumns, row_columns
 from marsyard.sim.kernel_cache import mark_ready
 
 
-class Watch(Protocol):
+class ProgressObserver(Protocol):
     """Receiver of progress reports of a campaign."""
 
     def begin(self, stage: str, total: int) -> None:
@@ -47,50 +47,52 @@ class Watch(Protocol):
 
 
 @dataclass(frozen=True)
-class _Run:
+class _CampaignRun:
     """A campaign with its folder, its executor and the receiver of its progress."""
 
     campaign: Campaign
     directory: Path
     executor: ExecutorConfig
-    watch: Watch
+    observer: ProgressObserver
 
 
-def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
+def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> None:
     """Run a campaign in a new folder.
 
     Rows are stored in `cases.sqlite` as soon as cases end; `cases.parquet` is written after the last case.
     Raises CampaignError if the folder contains a campaign or is not writable, or a column of a requirement is missing.
     On KeyboardInterrupt, rows and record are stored before the exception is raised again.
     """
-    record.claim(directory)
+    record.claim_folder(directory)
     with folder_lock(directory):
-        record.claim(directory)
+        record.claim_folder(directory)
         identity = create_identity(campaign.configuration)
         algorithms = describe_algorithms(campaign)
         create_store(directory / ROWS_FILE, {"identity": identity.configuration})
-        words, configuration = campaign.command, campaign.configuration
+        command, configuration = campaign.command, campaign.configuration
         if campaign.confirms:
-            evidence = reserve(campaign, directory)
+            evidence = reserve_confirmation(campaign, directory)
         else:
-            evidence = classify(campaign, read_confirmations(campaign.confirmations), freeze(campaign))
-        record.begin(
+            evidence = classify_evidence(
+                campaign, read_confirmations(campaign.confirmations), freeze_algorithm(campaign)
+            )
+        record.write_first_record(
             directory,
             configuration,
             identity,
             executor.describe(),
-            command=words,
+            command=command,
             algorithms=algorithms,
-            evidence=evidence.table(),
+            evidence=evidence.to_table(),
         )
         with RowStore(directory / ROWS_FILE) as store:
-            _execute(_Run(campaign, directory, executor, watch), store, ())
+            _execute(_CampaignRun(campaign, directory, executor, observer), store, ())
 
 
 def resume_campaign(
     directory: Path,
     executor: ExecutorConfig,
-    watch: Watch,
+    observer: ProgressObserver,
     *,
     retry: Sequence[str] = (),
     case_time_s: float | None = None,
@@ -114,11 +116,11 @@ def resume_campaign(
                 raise CampaignError(f"--case-time {case_time_s}: {error.errors()[0]['msg'].lower()}") from error
             configuration = configuration.model_copy(update={"limits": limits})
         campaign = load_stored_campaign(directory, configuration)
-        _continue_campaign(_Run(campaign, directory, executor, watch), "resume", allow_changed, retry)
+        _continue_campaign(_CampaignRun(campaign, directory, executor, observer), "resume", allow_changed, retry)
 
 
 def append_cases(
-    directory: Path, cases: int, executor: ExecutorConfig, watch: Watch, *, allow_changed: bool = False
+    directory: Path, cases: int, executor: ExecutorConfig, observer: ProgressObserver, *, allow_changed: bool = False
 ) -> None:
     """Append a block of cases to a finished campaign, and run it.
 
@@ -131,7 +133,7 @@ def append_cases(
         if state != "finished":
             raise CampaignError(f"{directory} is not finished ({state}): marsyard resume {directory}")
         campaign = campaign_with_block(directory, cases)
-        _continue_campaign(_Run(campaign, directory, executor, watch), "append", allow_changed)
+        _continue_campaign(_CampaignRun(campaign, directory, executor, observer), "append", allow_changed)
 
 
 def campaign_with_block(directory: Path, cases: int) -> Campaign:
@@ -144,9 +146,9 @@ def campaign_with_block(directory: Path, cases: int) -> Campaign:
     return load_stored_campaign(directory, appended)
 
 
-def _continue_campaign(run: _Run, command: str, allow_changed: bool, retry: Sequence[str] = ()) -> None:
+def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, retry: Sequence[str] = ()) -> None:
     """Run the missing cases of a stored campaign, and cases with the outcomes in `retry` again."""
-    campaign, directory, watch = run.campaign, run.directory, run.watch
+    campaign, directory, observer = run.campaign, run.directory, run.observer
     configuration, stored = campaign.configuration, record.read(directory)
     if "identity" not in stored:
         reason = "was run by an earlier version, which stored no rows to continue from"
@@ -161,15 +163,15 @@ def _continue_campaign(run: _Run, command: str, allow_changed: bool, retry: Sequ
         )
     if previous.inputs is None and identity.inputs:
         files = ", ".join(identity.inputs)
-        watch.note(f"no hash is stored for these files, so earlier changes are unknown: {files}")
+        observer.note(f"no hash is stored for these files, so earlier changes are unknown: {files}")
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         if store.about.get("identity") != stored["identity"]["configuration"] and not stored["changes"]:
             raise StoreError(f"{directory}: {ROWS_FILE} and {record.RECORD_FILE} belong to different campaigns")
         count = store.count()
-        retries = store.with_outcomes(RETRYABLE[word] for word in retry)
+        retries = store.list_cases_with_outcomes(RETRYABLE[word] for word in retry)
         is_complete = stored["state"] == "finished" and (directory / TABLE_FILE).is_file()
-        if not retries and is_complete and not store.missing(configuration.total_cases):
-            watch.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
+        if not retries and is_complete and not store.list_missing_cases(configuration.total_cases):
+            observer.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
             return
         session = record.describe_session(command, run.executor.describe(), count)
         updates: dict[str, Any] = {"state": "running", "exit_code": None, "finished_utc": None}
@@ -184,11 +186,11 @@ def _continue_campaign(run: _Run, command: str, allow_changed: bool, retry: Sequ
         old, new = stored["environment"], session["environment"]
         if any(old.get(key) != new[key] for key in ("machine", "processor", "processor_features")):
             change = f"the campaign was started on another processor ({old.get('processor')})"
-            watch.note(f"{change}: new rows may differ from the earlier rows in their last bits")
+            observer.note(f"{change}: new rows may differ from the earlier rows in their last bits")
         _execute(run, store, retries)
 
 
-def _execute(run: _Run, store: RowStore, retries: Sequence[int]) -> None:
+def _execute(run: _CampaignRun, store: RowStore, retries: Sequence[int]) -> None:
     """Run the missing cases and those of `retries`; write the table, store products, and record the progress."""
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
 
@@ -198,9 +200,9 @@ def _execute(run: _Run, store: RowStore, retries: Sequence[int]) -> None:
 
     try:
         with create_executor(run.executor) as executor:
-            missing = store.missing(configuration.total_cases)
+            missing = store.list_missing_cases(configuration.total_cases)
             if missing or retries:
-                with report_compilation(configuration.scenario, run.watch.note) as first_case_ended:
+                with report_compilation(configuration.scenario, run.observer.note) as first_case_ended:
                     _prepare_inputs(run, executor, itertools.chain(*missing, retries))
                     _run_cases(run, store, executor, [*missing, retries], first_case_ended)
             write_table(table, store, numeric_metrics(configuration.requirements))
@@ -213,42 +215,48 @@ def _execute(run: _Run, store: RowStore, retries: Sequence[int]) -> None:
     record_end("finished")
 
 
-def _prepare_inputs(run: _Run, executor: Executor, cases: Iterable[int]) -> None:
+def _prepare_inputs(run: _CampaignRun, executor: Executor, cases: Iterable[int]) -> None:
     """Build the inputs shared by cases; if this fails, the rows of the affected cases contain the error."""
-    configuration, watch = run.campaign.configuration, run.watch
+    configuration, observer = run.campaign.configuration, run.observer
     plan = plan_inputs(run.campaign, cases)
     inputs = plan.to_prepare
     if plan.build_bytes > plan.limit_bytes:
         sizes = f"{plan.build_bytes / 1e9:.1f} GB, more than the cache limit ({plan.limit_bytes / 1e9:.1f} GB)"
         advice = "some are built more than once; MARSYARD_CACHE_GB sets the limit"
-        watch.note(f"the terrains to be built need {sizes}: {advice}")
+        observer.note(f"the terrains to be built need {sizes}: {advice}")
     if not inputs:
         return
-    watch.begin("preparing", len(inputs))
+    observer.begin("preparing", len(inputs))
     task = partial(prepare_input, configuration_text(configuration))
     limits = work_limits(configuration.limits, configuration.limits.prepare_time_s)
     for result in itertools.chain.from_iterable(executor.run(Work(task, inputs, limits, len(inputs)))):
         if result.error is not None:
             error = f"{type(result.error).__name__}: {result.error}"
-            watch.note(f"shared input {result.item} could not be prepared: {error}")
+            observer.note(f"shared input {result.item} could not be prepared: {error}")
         elif result.result:
-            watch.note(result.result)
-        watch.step()
+            observer.note(result.result)
+        observer.step()
 
 
 def _run_cases(
-    run: _Run, store: RowStore, executor: Executor, parts: Sequence[Sequence[int]], first_case_ended: Callable[[], None]
+    run: _CampaignRun,
+    store: RowStore,
+    executor: Executor,
+    parts: Sequence[Sequence[int]],
+    first_case_ended: Callable[[], None],
 ) -> None:
     """Run cases; store products before their rows, and the rows of one batch in one transaction."""
-    configuration, watch = run.campaign.configuration, run.watch
+    configuration, observer = run.campaign.configuration, run.observer
     total = sum(len(part) for part in parts)
     products = ProductStore(run.directory, configuration.retain.budget_gb)
     cases = itertools.chain.from_iterable(parts)
-    watch.begin("cases", total)
+    observer.begin("cases", total)
     is_checked = False
-    for batch in run_cases(executor, configuration, cases, keep=select_kept_cases(configuration), total=total):
+    for batch in run_cases(
+        executor, configuration, cases, selection=create_product_selection(configuration), total=total
+    ):
         for completed in batch:
-            _store_products(products, completed, watch)
+            _store_products(products, completed, observer)
         store.add(completed.row for completed in batch)
         finished = next((item.row for item in batch if item.row["outcome"] not in ENGINE_FAILURES), None)
         if not is_checked and finished is not None:
@@ -257,17 +265,17 @@ def _run_cases(
             first_case_ended()
             is_checked = True
         for _ in batch:
-            watch.step()
+            observer.step()
 
 
-def _store_products(products: ProductStore, completed: CompletedCase, watch: Watch) -> None:
+def _store_products(products: ProductStore, completed: CompletedCase, observer: ProgressObserver) -> None:
     if completed.note:
-        watch.note(completed.note)
+        observer.note(completed.note)
     if completed.products is None or products.full:
         return
     case = int(completed.row["case"])
     if not products.save(case, completed.products, completed.row):
-        watch.note(f"the disk space for products (retain.budget_gb) is used: none are stored from case {case} on")
+        observer.note(f"the disk space for products (retain.budget_gb) is used: none are stored from case {case} on")
 
 
 def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Path) -> None:
@@ -292,7 +300,7 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
         raise ConfigurationError([*problems, consequence])
 
 
-def _rerun_for_products(run: _Run, store: RowStore, executor: Executor) -> None:
+def _rerun_for_products(run: _CampaignRun, store: RowStore, executor: Executor) -> None:
     """Run the showcase again, and the worst cases if the campaign stores their products, to store the products."""
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
     showcase = find_showcase(configuration, table, store)
@@ -302,13 +310,15 @@ def _rerun_for_products(run: _Run, store: RowStore, executor: Executor) -> None:
     if not cases:
         return
     cases = list(dict.fromkeys(cases))
-    run.watch.begin("showcase", len(cases))
+    run.observer.begin("showcase", len(cases))
     products = ProductStore(run.directory, configuration.retain.budget_gb)
     for case in cases:
-        replayed = replay_with(executor, configuration, case, store.row(case))
+        replayed = replay_in_executor(executor, configuration, case, store.row(case))
         if replayed.differing:
             record.update(run.directory, {"showcase_differs": list(replayed.differing)})
-            run.watch.note(f"case {case}, run again, differs from its stored row in: {', '.join(replayed.differing)}")
-        _store_products(products, CompletedCase(replayed.row, replayed.products, replayed.note), run.watch)
-        run.watch.step()
+            run.observer.note(
+                f"case {case}, run again, differs from its stored row in: {', '.join(replayed.differing)}"
+            )
+        _store_products(products, CompletedCase(replayed.row, replayed.products, replayed.note), run.observer)
+        run.observer.step()
     record.update(run.directory, {"showcase": showcase})

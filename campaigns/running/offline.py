@@ -16,7 +16,7 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, R
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import Watch, resume_campaign, run_campaign
+from marsyard.campaigns.running.engine import ProgressObserver, resume_campaign, run_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import TABLE_FILE, read_rows
 from marsyard.scenarios.estimators import Task
@@ -26,6 +26,7 @@ from marsyard.scenarios.systems import scenario
 
 #: Files that describe an exported folder, for programs and for the team under test.
 MANIFEST_FILE, README_FILE = "export.json", "README.md"
+#: Version of the layout of the manifest.
 SCHEMA = 1
 
 
@@ -34,7 +35,9 @@ def truth_folder(directory: Path) -> Path:
     return directory.with_name(f"{directory.name}-truth")
 
 
-def export_campaign(campaign: Campaign, directory: Path, truth: Path, executor: ExecutorConfig, watch: Watch) -> None:
+def export_campaign(
+    campaign: Campaign, directory: Path, truth: Path, executor: ExecutorConfig, observer: ProgressObserver
+) -> None:
     """Export a campaign's cases, or continue an interrupted export of the same campaign.
 
     The campaign's algorithm is `export:` with the folder. Raises CampaignError if the folders contain other files, or
@@ -46,15 +49,16 @@ def export_campaign(campaign: Campaign, directory: Path, truth: Path, executor: 
         stored = record.stored_configuration(truth)
         if configuration_hash(stored) != configuration_hash(campaign.configuration):
             raise StoreError(f"{truth} contains the truth of another export; choose other folders")
-        resume_campaign(truth, executor, watch)
+        resume_campaign(truth, executor, observer)
     else:
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
             raise StoreError(f"{directory} already exists and is not empty; choose a new folder with --out")
-        run_campaign(campaign, truth, executor, watch)
+        run_campaign(campaign, truth, executor, observer)
     _write_manifest(campaign, directory)
 
 
 def _write_manifest(campaign: Campaign, directory: Path) -> None:
+    """Write the manifest and the README of an exported folder."""
     task, name, cases = _find_task(campaign), campaign.configuration.name, campaign.configuration.total_cases
     answer_format = task.offline
     columns = () if answer_format is None else answer_format.columns

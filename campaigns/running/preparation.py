@@ -16,7 +16,7 @@ from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
-from marsyard.campaigns.store.products import KEEP_ALL
+from marsyard.campaigns.store.products import ALL_PRODUCTS
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import scenario_paths
 from marsyard.sim.cache import cache_directory, cached_bytes, limit_bytes
@@ -163,7 +163,7 @@ class Estimate:
     products_bytes: float
 
 
-def estimate(campaign: Campaign, jobs: int) -> Estimate:
+def estimate_campaign(campaign: Campaign, jobs: int) -> Estimate:
     """Estimate a campaign from evenly spaced trial cases in one worker; only their shared inputs remain on disk."""
     configuration, total = campaign.configuration, campaign.configuration.total_cases
     plan = plan_inputs(campaign, range(total))
@@ -178,7 +178,7 @@ def estimate(campaign: Campaign, jobs: int) -> Estimate:
                 break
             build_times += _build_inputs(campaign, executor, case)
             case_start_s = time.monotonic()
-            ((completed,),) = run_cases(executor, configuration, [case], keep=KEEP_ALL)
+            ((completed,),) = run_cases(executor, configuration, [case], selection=ALL_PRODUCTS)
             trials.append(completed)
             times.append(time.monotonic() - case_start_s)
     times = times[1:] or times

@@ -23,8 +23,8 @@ from marsyard.campaigns.execution.worker_process import (
     start_clock,
 )
 from marsyard.campaigns.execution.workers import LocalExecutor
-from marsyard.campaigns.store.products import KEEP_ALL, PackedProducts
-from marsyard.campaigns.store.record import read, stored_configuration
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.products import ALL_PRODUCTS, PackedProducts
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
 from marsyard.scenarios import conformance as suite
@@ -63,18 +63,18 @@ def replay(directory: Path, case: int) -> Replay:
     Raises CampaignError if the folder contains no campaign, the case does not exist, or the scenario or an algorithm
     cannot be imported.
     """
-    configuration = stored_configuration(directory)
+    configuration = record.stored_configuration(directory)
     if not 0 <= case < configuration.total_cases:
         raise CampaignError(f"{directory} has no case {case}; allowed: 0 to {configuration.total_cases - 1}")
     load_stored_campaign(directory, configuration)
     stored = stored_row(directory, case)
-    identity = read(directory).get("identity")
+    identity = record.read(directory).get("identity")
     changed = Identity.read(identity).differences(create_identity(configuration)) if identity else []
     with LocalExecutor(1) as workers:
-        return replay_with(workers, configuration, case, stored, tuple(changed))
+        return replay_in_executor(workers, configuration, case, stored, tuple(changed))
 
 
-def replay_with(
+def replay_in_executor(
     executor: Executor,
     configuration: CampaignConfiguration,
     case: int,
@@ -82,7 +82,7 @@ def replay_with(
     changed: tuple[str, ...] = (),
 ) -> Replay:
     """Run one case again in an executor, and compare it with its stored row."""
-    ((completed,),) = run_cases(executor, configuration, [case], keep=KEEP_ALL)
+    ((completed,),) = run_cases(executor, configuration, [case], selection=ALL_PRODUCTS)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
     return Replay(case, completed.row, stored, differing, completed.products, completed.note, changed)
 
@@ -121,7 +121,7 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
     return campaign
 
 
-#: Limits of output and memory of a conformance check.
+#: Limits of output and memory of a conformance check, bytes.
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 

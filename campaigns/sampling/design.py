@@ -61,9 +61,9 @@ class Design(Parameters):
 
     def find_invalid_block(self, blocks: Sequence[int], grid_size: int) -> tuple[int, str] | None:
         """Find the first block whose size does not fit the design; return its index and the reason, or None."""
-        for number, block in enumerate(blocks):
-            nominal = int(self.nominal and number == 0)
-            cases = block - nominal
+        for index, block in enumerate(blocks):
+            nominal_cases = int(self.nominal and index == 0)
+            cases = block - nominal_cases
             size, remainder = divmod(cases, grid_size)
             problem = ""
             if remainder or (cases == 0 and (self.kind != "random" or grid_size > 1)):
@@ -77,8 +77,8 @@ class Design(Parameters):
                 condition = " at each point of the grid" if grid_size > 1 else ""
                 problem = f"a Sobol design needs a power of 2{condition}, such as {lower_power} or {2 * lower_power}"
             if problem:
-                after_nominal = " after the nominal case" * nominal
-                return number, f"{cases} cases{after_nominal} do not fit the sampling design: {problem}"
+                after_nominal = " after the nominal case" * nominal_cases
+                return index, f"{cases} cases{after_nominal} do not fit the sampling design: {problem}"
         return None
 
 
@@ -90,12 +90,12 @@ def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int
     """
     if design.nominal and case == 0:
         return None
-    start, number = 0, 0
-    while number < len(blocks) - 1 and case >= start + blocks[number]:
-        start += blocks[number]
-        number += 1
-    size = blocks[number]
-    if design.nominal and number == 0:
+    start, block = 0, 0
+    while block < len(blocks) - 1 and case >= start + blocks[block]:
+        start += blocks[block]
+        block += 1
+    size = blocks[block]
+    if design.nominal and block == 0:
         start, size = 1, size - 1
     index, point = divmod(case - start, grid_size)
     return point, start + point, size // grid_size, index

@@ -26,15 +26,18 @@ from marsyard.campaigns.errors import suggest_similar
 from marsyard.sim.parameters import Parameters
 
 #: Maximum number of characters of a formula.
-MAX_LENGTH = 300
-_BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
+MAX_FORMULA_LENGTH = 300
+_BINARY_OPERATORS: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
     ast.Pow: math.pow,  # unlike **, it results in no complex numbers and no integers of a million digits
 }
-_UNARY: Mapping[type[ast.unaryop], Callable[[float], float]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
+_UNARY_OPERATORS: Mapping[type[ast.unaryop], Callable[[float], float]] = {
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
+}
 #: Functions by name, with the minimum and maximum number of arguments.
 _FUNCTIONS: Mapping[str, tuple[Callable[..., float], int, int]] = {
     **{name: (getattr(math, name), 1, 1) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos")},
@@ -56,7 +59,7 @@ class Formula:
     names: tuple[str, ...]
     _root: ast.expr
 
-    def value(self, values: Mapping[str, Any]) -> float:
+    def evaluate(self, values: Mapping[str, Any]) -> float:
         """Evaluate the formula for parameter values by dotted path.
 
         Raises ValueError if a parameter is not a number, or the result is not finite.
@@ -79,10 +82,10 @@ class Formula:
 
 
 @lru_cache(maxsize=1024)
-def formula(text: str) -> Formula:
+def parse_formula(text: str) -> Formula:
     """Parse a formula. Raises ValueError if the text is not a formula."""
-    if len(text) > MAX_LENGTH:
-        raise ValueError(f"a formula has at most {MAX_LENGTH} characters, not {len(text)}")
+    if len(text) > MAX_FORMULA_LENGTH:
+        raise ValueError(f"a formula has at most {MAX_FORMULA_LENGTH} characters, not {len(text)}")
     try:
         with warnings.catch_warnings():  # ignore warnings of the parser about invalid syntax
             warnings.simplefilter("ignore")
@@ -102,9 +105,9 @@ def _list_names(node: ast.expr) -> list[str]:
         case ast.Name() | ast.Attribute() | ast.Subscript():
             path = _format_path(node)
             return [] if path in _CONSTANTS else [path]
-        case ast.UnaryOp(op=op, operand=inner) if type(op) in _UNARY:
+        case ast.UnaryOp(op=op, operand=inner) if type(op) in _UNARY_OPERATORS:
             return _list_names(inner)
-        case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY_OPERATORS:
             return _list_names(left) + _list_names(right)
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
             _, minimum, maximum = _FUNCTIONS.get(name, (None, 0, 0))
@@ -136,9 +139,9 @@ def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
         case ast.Constant(value=value):
             return float(value)  # type: ignore[arg-type]  # `_list_names` accepts numbers only
         case ast.UnaryOp(op=op, operand=inner):
-            return _UNARY[type(op)](_evaluate(inner, numbers))
+            return _UNARY_OPERATORS[type(op)](_evaluate(inner, numbers))
         case ast.BinOp(left=left, op=op, right=right):
-            return _BINARY[type(op)](_evaluate(left, numbers), _evaluate(right, numbers))
+            return _BINARY_OPERATORS[type(op)](_evaluate(left, numbers), _evaluate(right, numbers))
         case ast.Call(func=ast.Name(id=name), args=arguments):
             return float(_FUNCTIONS[name][0](*(_evaluate(argument, numbers) for argument in arguments)))
     path = _format_path(node)
@@ -199,7 +202,7 @@ class Dispersion(Parameters, ABC):
             table: Any = fields
             for part in key[:-1]:
                 table = table[part]
-            table[key[-1]] = expression.value(values)
+            table[key[-1]] = expression.evaluate(values)
         return type(self).model_validate(fields)
 
     def describe(self) -> str:
@@ -218,7 +221,7 @@ class Dispersion(Parameters, ABC):
 
 def _find_formulas(tree: Any, key: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Formula]]:
     if isinstance(tree, str):
-        yield key, formula(tree)
+        yield key, parse_formula(tree)
         return
     inner = tree.items() if isinstance(tree, Mapping) else enumerate(tree) if isinstance(tree, list) else ()
     for part, value in inner:
@@ -227,7 +230,7 @@ def _find_formulas(tree: Any, key: tuple[str | int, ...] = ()) -> Iterator[tuple
 
 def _check_number(value: Any) -> float | str:
     if isinstance(value, str):
-        return formula(value).text
+        return parse_formula(value).text
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise PydanticKnownError("float_type")
     if not abs(value) < math.inf:
@@ -248,7 +251,7 @@ def _check_positive_number(value: Any) -> float | str:
 def _check_whole_number(value: Any) -> int | str:
     """Return an integer that a float represents exactly, or the text of a formula."""
     if isinstance(value, str):
-        return formula(value).text
+        return parse_formula(value).text
     if type(value) is not int:
         raise PydanticKnownError("int_type")
     if abs(value) > 2**52:
@@ -280,7 +283,7 @@ def read_interval(low: float | str, high: float | str) -> tuple[float, float] | 
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class UnivariateDistribution:
     """A distribution of one variable.
 
     - evaluate: evaluates `cdf`, `sf` (survival function), or the inverse functions `ppf` and `isf`, by name
@@ -299,7 +302,7 @@ _NORMAL_FUNCTIONS: Mapping[str, Callable[[float], Any]] = {
     "isf": lambda q: -ndtri(q),
 }
 #: Standard normal distribution, without `scipy.stats`, whose import takes a second.
-STANDARD_NORMAL = Shape(lambda function, x: float(_NORMAL_FUNCTIONS[function](x)))
+STANDARD_NORMAL = UnivariateDistribution(lambda function, x: float(_NORMAL_FUNCTIONS[function](x)))
 
 
 @lru_cache(maxsize=1)
@@ -324,7 +327,7 @@ def scipy_parameters(distribution: str) -> tuple[list[str], list[str]]:
     return required, [*required, "loc"] if scipy_distributions()[distribution] else [*required, "loc", "scale"]
 
 
-def scipy_shape(distribution: str, parameters: Mapping[str, float]) -> Shape:
+def create_scipy_distribution(distribution: str, parameters: Mapping[str, float]) -> UnivariateDistribution:
     """Create a distribution of `scipy.stats` with parameters.
 
     Raises ValueError if the distribution is not defined for the parameters, now or when it is evaluated.
@@ -333,8 +336,8 @@ def scipy_shape(distribution: str, parameters: Mapping[str, float]) -> Shape:
 
     failure = f"{distribution} is not defined for {', '.join(f'{key} = {value}' for key, value in parameters.items())}"
 
-    def call(function: Callable[[], Any]) -> Any:
-        # SciPy's warnings are suppressed, since invalid results are recognized as NaN
+    def call_without_warnings(function: Callable[[], Any]) -> Any:
+        # SciPy's warnings are not needed, since invalid results are recognized as NaN
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -343,19 +346,21 @@ def scipy_shape(distribution: str, parameters: Mapping[str, float]) -> Shape:
             raise ValueError(f"{failure}: {error}") from error
 
     def evaluate(function: str, x: float) -> float:
-        result = call(lambda: float(getattr(frozen, function)(x)))
+        result = call_without_warnings(lambda: float(getattr(frozen, function)(x)))
         if math.isnan(result):
             raise ValueError(f"{failure}: its {function} at {x} is not a number")
         return float(result)
 
-    frozen = call(lambda: getattr(stats, distribution)(**parameters))
-    low, high = call(lambda: [float(limit) for limit in frozen.support()])
+    frozen = call_without_warnings(lambda: getattr(stats, distribution)(**parameters))
+    low, high = call_without_warnings(lambda: [float(limit) for limit in frozen.support()])
     if not low <= high:
         raise ValueError(failure)
-    return Shape(evaluate, (low, high), scipy_distributions()[distribution])
+    return UnivariateDistribution(evaluate, (low, high), scipy_distributions()[distribution])
 
 
-def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probability: float) -> float | int:
+def truncated_quantile(
+    distribution: UnivariateDistribution, limits: tuple[float, float] | None, probability: float
+) -> float | int:
     """Compute a quantile of a distribution F, truncated to `limits` [a, b] if they are defined.
 
     The quantile at p is F^-1(F(a) + p (F(b) - F(a))). If a exceeds the median, the survival function replaces F, since
@@ -363,26 +368,26 @@ def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probabi
 
     Raises ValueError if the limits are in the wrong order or the probability between them is zero.
     """
-    low, high = shape.support if limits is None else limits
+    low, high = distribution.support if limits is None else limits
     if limits is None:
-        value = shape.evaluate("ppf", probability)
+        value = distribution.evaluate("ppf", probability)
     else:
-        inverse, at_low, at_high = _find_truncated_inverse(shape, low, high)
-        value = shape.evaluate(inverse, at_low + probability * (at_high - at_low))
+        inverse, at_low, at_high = _find_truncated_inverse(distribution, low, high)
+        value = distribution.evaluate(inverse, at_low + probability * (at_high - at_low))
     value = min(max(value, low), high)
-    if shape.is_discrete and not math.isfinite(value):
+    if distribution.is_discrete and not math.isfinite(value):
         raise ValueError(f"the distribution includes {value}")
-    return round(value) if shape.is_discrete else value
+    return round(value) if distribution.is_discrete else value
 
 
 @lru_cache(maxsize=1024)
-def _find_truncated_inverse(shape: Shape, low: float, high: float) -> tuple[str, float, float]:
+def _find_truncated_inverse(distribution: UnivariateDistribution, low: float, high: float) -> tuple[str, float, float]:
     """Return the name of the inverse function with the higher precision, and its arguments at the two limits."""
-    if not (low <= high if shape.is_discrete else low < high):
+    if not (low <= high if distribution.is_discrete else low < high):
         raise ValueError(f"truncate = [{low}, {high}]: the first limit must be below the second")
-    start = math.ceil(low) - 1.0 if shape.is_discrete else low
-    function, inverse = ("sf", "isf") if shape.evaluate("cdf", start) > 0.5 else ("cdf", "ppf")
-    at_low, at_high = shape.evaluate(function, start), shape.evaluate(function, high)
+    start = math.ceil(low) - 1.0 if distribution.is_discrete else low
+    function, inverse = ("sf", "isf") if distribution.evaluate("cdf", start) > 0.5 else ("cdf", "ppf")
+    at_low, at_high = distribution.evaluate(function, start), distribution.evaluate(function, high)
     if not abs(at_high - at_low) > 0.0:
         raise ValueError(f"truncate = [{low}, {high}]: the distribution has no probability between the limits")
     return inverse, at_low, at_high

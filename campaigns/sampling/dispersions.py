@@ -244,7 +244,7 @@ class Integer(_WholeNumbers):
     distribution: Literal["integer"]
 
 
-class InTurn(_WholeNumbers):
+class CyclicInteger(_WholeNumbers):
     """The whole numbers from `low` to `high`, both included, in sequence over the cases, then from `low` again.
 
     No number repeats before all numbers have occurred; for example, a campaign then uses as many terrains as possible.
@@ -301,18 +301,18 @@ class Scipy(base.Dispersion):
         return not base.scipy_distributions()[self.distribution]
 
     @cached_property
-    def _shape(self) -> base.Shape:
+    def _scipy_distribution(self) -> base.UnivariateDistribution:
         parameters = {name: float(value) for name, value in (self.__pydantic_extra__ or {}).items()}
-        return base.scipy_shape(self.distribution, parameters)
+        return base.create_scipy_distribution(self.distribution, parameters)
 
     def quantile(self, probability: float) -> float | int:
         limits = None if self.truncate is None else (float(self.truncate[0]), float(self.truncate[1]))
-        return base.truncated_quantile(self._shape, limits, probability)
+        return base.truncated_quantile(self._scipy_distribution, limits, probability)
 
     def bounds(self) -> tuple[float, float] | None:
         if self.formulas:
             return None
-        low, high = self._shape.support
+        low, high = self._scipy_distribution.support
         limits = self.truncate or (-math.inf, math.inf)
         return max(low, float(limits[0])), min(high, float(limits[1]))
 
@@ -322,7 +322,7 @@ _Dispersion = (
     | Annotated[Normal, Tag("normal")]
     | Annotated[Choice, Tag("choice")]
     | Annotated[Integer, Tag("integer")]
-    | Annotated[InTurn, Tag("in-turn")]
+    | Annotated[CyclicInteger, Tag("in-turn")]
     | Annotated[Fixed, Tag("fixed")]
     | Annotated[Derived, Tag("derived")]
     | Annotated[Grid, Tag("grid")]

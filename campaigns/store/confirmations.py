@@ -19,14 +19,15 @@ from marsyard.campaigns.definition.evidence import (
     Evidence,
     EvidenceKind,
     FrozenAlgorithm,
+    confirmation_namespace,
     confirmation_seed,
-    freeze,
-    namespace,
+    freeze_algorithm,
 )
 from marsyard.campaigns.errors import StoreError, report_write_errors
 from marsyard.campaigns.store.record import git_commit, utc_now
 
-_KEYS = ("campaign", "namespace", "number", "seed", "started_utc", "git_commit", "folder", "cases")
+#: Keys of the entry of a start; the entry of a result has the key `results`.
+_START_KEYS = ("campaign", "namespace", "number", "seed", "started_utc", "git_commit", "folder", "cases")
 
 
 def read_confirmations(path: Path) -> list[Confirmation]:
@@ -37,14 +38,15 @@ def read_confirmations(path: Path) -> list[Confirmation]:
     if not path.exists():
         return []
     try:
-        return _parse(path, path.read_text(encoding="utf-8"))
+        return _parse_entries(path, path.read_text(encoding="utf-8"))
     except OSError as error:
         raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise StoreError(f"{path} is not a record of confirmations: {error}") from error
 
 
-def _parse(path: Path, text: str) -> list[Confirmation]:
+def _parse_entries(path: Path, text: str) -> list[Confirmation]:
+    """Parse the lines of a record; a line with `results` completes the entry of its confirmation."""
     entries: dict[tuple[str, str, int], Confirmation] = {}
     for index, line in enumerate(text.splitlines()):
         try:
@@ -53,7 +55,7 @@ def _parse(path: Path, text: str) -> list[Confirmation]:
             if "results" in stored:
                 entries[key] = replace(entries[key], results=dict(stored["results"]), cases=int(stored["cases"]))
             else:
-                values = {name: stored[name] for name in _KEYS}
+                values = {name: stored[name] for name in _START_KEYS}
                 entries[key] = Confirmation(frozen=FrozenAlgorithm.read(stored["frozen"]), **values)
         except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{path}:{index + 1} is not an entry of a record of confirmations") from error
@@ -70,25 +72,25 @@ def select_confirmation_seed(campaign: Campaign) -> Campaign:
 
 def _next_confirmation(campaign: Campaign, entries: list[Confirmation]) -> tuple[int, int]:
     """Return number and seed of the next confirmation of a campaign."""
-    name, own_namespace = campaign.configuration.name, namespace(campaign.configuration)
+    name, own_namespace = campaign.configuration.name, confirmation_namespace(campaign.configuration)
     number = 1 + sum((entry.campaign, entry.namespace) == (name, own_namespace) for entry in entries)
     return number, confirmation_seed(own_namespace, name, number)
 
 
-def reserve(campaign: Campaign, directory: Path) -> Evidence:
+def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
     """Enter a confirmation in the record before its first case.
 
     Raises StoreError if the record is invalid or not writable, or another run has taken the seed in the meantime.
     """
-    path, frozen, configuration = campaign.confirmations, freeze(campaign), campaign.configuration
-    with _locked(path) as file:
-        entries = _parse(path, file.read())
+    path, frozen, configuration = campaign.confirmations, freeze_algorithm(campaign), campaign.configuration
+    with _open_locked(path) as file:
+        entries = _parse_entries(path, file.read())
         number, seed = _next_confirmation(campaign, entries)
         if seed != configuration.seed:
             raise StoreError(f"{path}: another confirmation has taken the seed {configuration.seed}; run again")
         entry = Confirmation(
             campaign=configuration.name,
-            namespace=namespace(configuration),
+            namespace=confirmation_namespace(configuration),
             number=number,
             seed=seed,
             frozen=frozen,
@@ -99,9 +101,13 @@ def reserve(campaign: Campaign, directory: Path) -> Evidence:
         )
         values = {name: value for name, value in asdict(entry).items() if name != "results"}
         file.write(json.dumps(values, ensure_ascii=False) + "\n")
-    same = [item for item in entries if (item.campaign, item.frozen.algorithm) == (entry.campaign, frozen.algorithm)]
+    previous_confirmations = [
+        item for item in entries if (item.campaign, item.frozen.algorithm) == (entry.campaign, frozen.algorithm)
+    ]
     kind = EvidenceKind.CONFIRMATION
-    return Evidence(kind, entry.namespace, number, of_algorithm=len(same) + 1, record=str(path.resolve()))
+    return Evidence(
+        kind, entry.namespace, number, of_algorithm=len(previous_confirmations) + 1, record=str(path.resolve())
+    )
 
 
 def add_result(evidence: Evidence, campaign: str, cases: int, results: Mapping[str, str]) -> None:
@@ -110,8 +116,8 @@ def add_result(evidence: Evidence, campaign: str, cases: int, results: Mapping[s
     Raises StoreError if the record is invalid or not writable, or does not contain the confirmation.
     """
     path, key = Path(evidence.record), (campaign, evidence.namespace, evidence.number)
-    with _locked(path) as file:
-        entries = {(item.campaign, item.namespace, item.number): item for item in _parse(path, file.read())}
+    with _open_locked(path) as file:
+        entries = {(item.campaign, item.namespace, item.number): item for item in _parse_entries(path, file.read())}
         if key not in entries:
             raise StoreError(f"{path} does not contain confirmation {evidence.number} of {campaign}")
         if entries[key].results == dict(results) and entries[key].cases == cases:
@@ -122,7 +128,7 @@ def add_result(evidence: Evidence, campaign: str, cases: int, results: Mapping[s
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[IO[str]]:
+def _open_locked(path: Path) -> Iterator[IO[str]]:
     """Open the record for reading and appending, locked against other processes."""
     with report_write_errors(path), path.open("a+", encoding="utf-8") as file:
         fcntl.flock(file, fcntl.LOCK_EX)

@@ -20,12 +20,17 @@ from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError, report_write_
 
 #: Key of a table in `products.json` that refers to an array by its name in `products.npz`.
 _ARRAY_KEY = "__array__"
+#: File of the products with references in place of their arrays.
 _OUTLINE_FILE = "products.json"
 
 
 @dataclass(frozen=True)
 class PackedProducts:
-    """Products of a case as the contents of their two files, `products.json` and `products.npz`."""
+    """Products of a case as the contents of their two files.
+
+    - outline: contents of `products.json`, in which references replace the arrays
+    - arrays: contents of `products.npz`
+    """
 
     outline: bytes
     arrays: bytes
@@ -137,7 +142,7 @@ def case_directory(directory: Path, case: int) -> Path:
 
 
 @dataclass(frozen=True)
-class Keep:
+class ProductSelection:
     """Selection of the cases whose products are stored.
 
     - every: step between the numbers of selected cases; 0 to select none by number
@@ -154,17 +159,17 @@ class Keep:
         return any(fails(row, requirement) for requirement in self.failed)
 
 
-KEEP_ALL = Keep(every=1)
+ALL_PRODUCTS = ProductSelection(every=1)
 
 
-def select_kept_cases(configuration: CampaignConfiguration) -> Keep:
+def create_product_selection(configuration: CampaignConfiguration) -> ProductSelection:
     """Create the selection for a campaign's first run of its cases; the worst cases run again at the end."""
     retain = configuration.retain
     if retain.products == "all":
-        return KEEP_ALL
+        return ALL_PRODUCTS
     if retain.products == "every":
-        return Keep(every=retain.every)
-    return Keep(failed=configuration.requirements) if retain.products == "failed" else Keep()
+        return ProductSelection(every=retain.every)
+    return ProductSelection(failed=configuration.requirements) if retain.products == "failed" else ProductSelection()
 
 
 def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
@@ -172,10 +177,10 @@ def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
     unfinished = row["outcome"] in ENGINE_FAILURES
     memberships = {"all": True, "completed": not unfinished, "valid": row["answered"]}
     populations = requirement.population.split(" and ")
-    parts = [memberships[name] if name in memberships else row.get(name) for name in populations]
-    if any(value is False for value in parts):
+    flags = [memberships[name] if name in memberships else row.get(name) for name in populations]
+    if any(value is False for value in flags):
         return False
-    if None in parts or unfinished:
+    if None in flags or unfinished:
         return True
     values: list[Any] = [row.get(name) for name in requirement.metric_columns]
     if requirement.bound is None:
@@ -190,8 +195,8 @@ class ProductStore:
 
     def __init__(self, directory: Path, budget_gb: float) -> None:
         self._directory = directory
-        used = sum(path.stat().st_size for path in (directory / CASES_FOLDER).rglob("*") if path.is_file())
-        self._free_bytes = budget_gb * 1e9 - used
+        used_bytes = sum(path.stat().st_size for path in (directory / CASES_FOLDER).rglob("*") if path.is_file())
+        self._free_bytes = budget_gb * 1e9 - used_bytes
         self.full = False
 
     def save(self, case: int, packed: PackedProducts, row: Mapping[str, Any]) -> bool:

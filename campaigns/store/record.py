@@ -28,7 +28,7 @@ RECORD_FILE = "campaign.json"
 #: Files of a campaign; a folder that contains any of them is never used for another campaign.
 _CAMPAIGN_FILES = (RECORD_FILE, "cases.parquet", ROWS_FILE, "report.html", "report.json", "cases")
 #: JSON types of the keys of a record that commands read.
-_TYPES: Mapping[str, tuple[type, str]] = {
+_KEY_TYPES: Mapping[str, tuple[type, str]] = {
     **dict.fromkeys(("name", "state"), (str, "a text")),
     **dict.fromkeys(("cases", "cases_finished", "cases_crashed"), (int, "a whole number")),
     **dict.fromkeys(("requirements", "sessions", "changes"), (list, "a list")),
@@ -41,7 +41,7 @@ def utc_now() -> str:
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def claim(directory: Path) -> None:
+def claim_folder(directory: Path) -> None:
     """Create the folder of a new campaign; the folder of a run that was killed before its first record can be reused.
 
     Raises StoreError if the folder contains a campaign or is not writable.
@@ -56,7 +56,7 @@ def claim(directory: Path) -> None:
             raise StoreError(f"{directory} contains a campaign ({campaign_files[0]}); choose another folder with --out")
 
 
-def begin(
+def write_first_record(
     directory: Path,
     configuration: CampaignConfiguration,
     identity: Identity,
@@ -158,9 +158,9 @@ def read(directory: Path) -> dict[str, Any]:
     if schema != SCHEMA:
         raise StoreError(f"{path} has schema {schema}; this version of Marsyard reads {SCHEMA}")
     # records of earlier versions have no identity and fewer keys; reports can still be created for them
-    required = _TYPES if "identity" in record else ("name", "state", "cases", "configuration")
+    required = _KEY_TYPES if "identity" in record else ("name", "state", "cases", "configuration")
     problems = [f"it has no {key}" for key in required if key not in record]
-    for key, (kind, type_text) in _TYPES.items():
+    for key, (kind, type_text) in _KEY_TYPES.items():
         if key in record and (not isinstance(record[key], kind) or isinstance(record[key], bool)):
             problems.append(f"{key} is not {type_text}")
     if not problems and "identity" in record:

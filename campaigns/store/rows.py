@@ -161,24 +161,24 @@ class RowStore(AbstractContextManager["RowStore"]):
 
     def count_unfinished(self) -> int:
         """Return the number of unfinished cases."""
-        return len(self.with_outcomes(ENGINE_FAILURES))
+        return len(self.list_cases_with_outcomes(ENGINE_FAILURES))
 
-    def missing(self, total: int) -> list[range]:
+    def list_missing_cases(self, total: int) -> list[range]:
         """List the cases below `total` that have no row, as ranges."""
         ends = [-1, *(number for (number,) in self._query("SELECT case_number FROM cases ORDER BY 1")), total]
         return [range(last + 1, next_row) for last, next_row in pairwise(ends) if next_row > last + 1]
 
-    def with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
+    def list_cases_with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
         """List the cases with one of these outcomes."""
         values = sorted(outcomes)
-        marks = ", ".join("?" * len(values))
-        query = f"SELECT case_number FROM cases WHERE outcome IN ({marks}) ORDER BY 1"  # noqa: S608 (marks only)
+        placeholders = ", ".join("?" * len(values))
+        query = f"SELECT case_number FROM cases WHERE outcome IN ({placeholders}) ORDER BY 1"  # noqa: S608
         return [number for (number,) in self._query(query, values)]
 
-    def first_completed(self) -> int | None:
+    def find_first_finished_case(self) -> int | None:
         """Return the first finished case; None if no case is finished."""
-        marks = ", ".join("?" * len(ENGINE_FAILURES))
-        query = f"SELECT min(case_number) FROM cases WHERE outcome NOT IN ({marks})"  # noqa: S608 (marks only)
+        placeholders = ", ".join("?" * len(ENGINE_FAILURES))
+        query = f"SELECT min(case_number) FROM cases WHERE outcome NOT IN ({placeholders})"  # noqa: S608
         (case,) = self._query(query, sorted(ENGINE_FAILURES)).fetchone()
         return None if case is None else int(case)
 

@@ -23,18 +23,18 @@ TABLE_FILE = "cases.parquet"
 _GROUP_ROWS = 50_000
 
 
-def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> None:
+def write_table(path: Path, store: RowStore, metric_columns: Sequence[str] = ()) -> None:
     """Write the rows of a store as a Parquet table in the order of the cases, atomically.
 
     The engine's columns are the first and the last. Missing numbers are NaN, other missing values are null. The table
-    always contains the numeric columns `measures`.
+    always contains the numeric columns `metric_columns`.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
     import pyarrow.parquet as pq
 
     layouts, kinds = store.columns_by_layout(), store.kinds()
-    columns = dict.fromkeys((*itertools.chain.from_iterable(layouts.values()), *measures))
+    columns = dict.fromkeys((*itertools.chain.from_iterable(layouts.values()), *metric_columns))
     scenario_columns = [name for name in columns if name not in (*LEADING_COLUMNS, *TRAILING_COLUMNS)]
     names = (*LEADING_COLUMNS, *scenario_columns, *TRAILING_COLUMNS)
     types = {name: _choose_type(kinds.get(name, set())) for name in names}
@@ -71,12 +71,12 @@ def _transpose(
     chunk: Sequence[tuple[int, list[Any]]], layouts: Mapping[int, Sequence[str]], columns: Sequence[str]
 ) -> Iterator[Sequence[Any]]:
     """Yield the values of each column from rows with their layouts; None for missing values."""
-    indices: dict[int, list[int]] = {}
+    indices_by_layout: dict[int, list[int]] = {}
     for index, (layout, _) in enumerate(chunk):
-        indices.setdefault(layout, []).append(index)
+        indices_by_layout.setdefault(layout, []).append(index)
     values_by_layout = {
-        layout: dict(zip(layouts[layout], zip(*(chunk[index][1] for index in layout_rows), strict=True), strict=True))
-        for layout, layout_rows in indices.items()
+        layout: dict(zip(layouts[layout], zip(*(chunk[index][1] for index in row_indices), strict=True), strict=True))
+        for layout, row_indices in indices_by_layout.items()
     }
     for name in columns:
         if len(values_by_layout) == 1:
@@ -84,8 +84,8 @@ def _transpose(
             yield layout_values.get(name, [None] * len(chunk))
             continue
         values: list[Any] = [None] * len(chunk)
-        for layout, layout_rows in indices.items():
-            for index, value in zip(layout_rows, values_by_layout[layout].get(name, ()), strict=False):
+        for layout, row_indices in indices_by_layout.items():
+            for index, value in zip(row_indices, values_by_layout[layout].get(name, ()), strict=False):
                 values[index] = value
         yield values
 
@@ -150,7 +150,7 @@ def find_showcase(configuration: CampaignConfiguration, table: Path, store: RowS
     if configuration.retain.showcase == "none":
         return None
     worst = find_worst_cases(configuration, table, 1) if configuration.retain.showcase == "worst" else []
-    return worst[0] if worst else store.first_completed()
+    return worst[0] if worst else store.find_first_finished_case()
 
 
 def find_worst_cases(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:

@@ -9,7 +9,7 @@ import marsyard
 from marsyard.sim.camera import read_calibrations
 
 # EuRoC's first camera in Kalibr's format
-CHAIN = """cam0:
+CALIBRATION_FILE = """cam0:
   camera_model: pinhole
   distortion_coeffs: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
   distortion_model: radtan
@@ -18,7 +18,7 @@ CHAIN = """cam0:
 """
 with tempfile.TemporaryDirectory() as folder:
     path = Path(folder) / "camchain.yaml"
-    path.write_text(CHAIN)
+    path.write_text(CALIBRATION_FILE)
     (calibration,) = read_calibrations(path)
     residual = calibration.residual
     print(f"{type(calibration.camera).__name__}: {residual.rms_px:.2f} px off (RMS), maximum {residual.max_px:.2f} px")

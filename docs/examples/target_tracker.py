@@ -22,7 +22,7 @@ from marsyard.algorithms.exchange import read_mast, read_pose, read_stop, read_t
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements, RoverTarget
 
-HALF_PX = 10  # half of the template
+HALF_PX = 10  # half of the template: its side is 2 * HALF_PX + 1 pixels
 SEARCH_PX = 70  # maximum distance from the predicted pixel, and maximum disparity error
 STEREO_ROWS_PX = 3  # maximum distance from the predicted row in the right image
 MIN_SCORE = 0.7

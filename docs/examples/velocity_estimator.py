@@ -30,6 +30,7 @@ class MedianShift:
         velocities = _measure_velocities(measurements)
         if len(velocities) < MIN_TRACKS:
             return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+        # for a normal distribution, the standard deviation is 1.4826 times the median absolute deviation
         scatter = 1.4826 * np.median(np.abs(velocities - np.median(velocities, axis=0)), axis=0)
         # the variance of the median of n values is pi / 2 times that of their mean
         variance = 0.5 * np.pi * scatter**2 / len(velocities) + MIN_VARIANCE_M2_S2
@@ -41,8 +42,8 @@ class MedianShift:
 def _measure_velocities(measurements: DescentMeasurements) -> np.ndarray:
     """Measure the velocity of each matched template, shape (n, 2), m/s east and north."""
     second, third = (measurements.images[k].counts.astype(np.float32) for k in (1, 2))
-    interval = measurements.images[2].time_s - measurements.images[1].time_s
-    displacement = -measurements.interval_velocities_m_s[1] * interval
+    interval_s = measurements.images[2].time_s - measurements.images[1].time_s
+    displacement = -measurements.interval_velocities_m_s[1] * interval_s
     rows, columns = second.shape
     velocities = []
     for row in range(rows // 6, rows - HALF_SIZE_PX[1] - 1, rows // 6):
@@ -52,14 +53,14 @@ def _measure_velocities(measurements: DescentMeasurements) -> np.ndarray:
             predicted = _project(measurements, 2, ground + displacement)
             match = _match_template(second, third, pixel, predicted)
             if match is not None:
-                velocities.append((ground - _intersect_ground(measurements, 2, match))[:2] / interval)
+                velocities.append((ground - _intersect_ground(measurements, 2, match))[:2] / interval_s)
     return np.array(velocities).reshape(-1, 2)
 
 
 def _match_template(
     second: np.ndarray, third: np.ndarray, pixel: np.ndarray, predicted: np.ndarray
 ) -> np.ndarray | None:
-    """Return the pixel of the best match in the third image; None without a match."""
+    """Return the pixel (column, row) of the best match in the third image; None without a match."""
     if not np.all(np.isfinite(predicted)):
         return None
     columns, rows = HALF_SIZE_PX
@@ -85,7 +86,7 @@ def _intersect_ground(measurements: DescentMeasurements, number: int, pixel: np.
 
 def _project(measurements: DescentMeasurements, number: int, point: np.ndarray) -> np.ndarray:
     """Return the pixel of a ground point relative to the body; NaN if the point is not visible."""
-    level = np.array([point[0], point[1], -measurements.altitudes[number].altitude_m])
-    body = measurements.attitudes[number].world_from_body.inv().apply(level)
-    pixel, is_in_front = measurements.images[number].camera.project(body)
+    ground_point = np.array([point[0], point[1], -measurements.altitudes[number].altitude_m])
+    point_body = measurements.attitudes[number].world_from_body.inv().apply(ground_point)
+    pixel, is_in_front = measurements.images[number].camera.project(point_body)
     return np.asarray(pixel) if np.all(is_in_front) else np.full(2, np.nan)

@@ -27,8 +27,8 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentFrame
 
 SIDE_PX = 128  # side of the compared square of ground
-SIDE_HEIGHTS = 0.35  # its side divided by the height above ground
-MIN_VISIBLE = 0.9  # fraction of the square that each image must contain
+SIDE_TO_HEIGHT_RATIO = 0.35  # side of the square divided by the height above ground
+MIN_VISIBLE_FRACTION = 0.9  # minimum fraction of the square that each image contains
 MIN_RESPONSE = 0.2  # response of phase correlation; images of different ground reach about 0.12
 SHIFT_SD_PX = 0.15  # standard deviation of a shift
 ATTITUDE_SD_RAD = 0.003  # attitude error common to all images; multiplied by the vertical speed, a velocity error
@@ -88,16 +88,16 @@ class ChainedShifts:
 
 def compare_frames(first: DescentFrame, second: DescentFrame) -> Pair | None:
     """Measure the error of the inertial velocity with two images; None if they do not match."""
-    interval = second.image.time_s - first.image.time_s
+    interval_s = second.image.time_s - first.image.time_s
     heights = [height_m(frame) for frame in (first, second)]
     centres = [intersect_boresight(frame, height) for frame, height in zip((first, second), heights, strict=True)]
-    if not interval > 0.0 or not all(np.all(np.isfinite(centre)) for centre in centres):
+    if not interval_s > 0.0 or not all(np.all(np.isfinite(centre)) for centre in centres):
         return None
-    displacement = second.interval_velocity_m_s[:2] * interval
+    displacement = second.interval_velocity_m_s[:2] * interval_s
     # centre of the square: the mean of the centres of both images, relative to the first body position
     centre = 0.5 * (centres[0] + centres[1] + displacement)
-    gsd = SIDE_HEIGHTS * heights[1] / SIDE_PX
-    patches = [rectify(first, heights[0], centre, gsd), rectify(second, heights[1], centre - displacement, gsd)]
+    gsd_m = SIDE_TO_HEIGHT_RATIO * heights[1] / SIDE_PX
+    patches = [rectify(first, heights[0], centre, gsd_m), rectify(second, heights[1], centre - displacement, gsd_m)]
     if patches[0] is None or patches[1] is None:
         return None
     window = cv2.createHanningWindow((SIDE_PX, SIDE_PX), cv2.CV_64F)
@@ -105,31 +105,31 @@ def compare_frames(first: DescentFrame, second: DescentFrame) -> Pair | None:
     if response < MIN_RESPONSE:
         return None
     # a shift to the east or south in the second image: the camera moved less to the east, or more to the north
-    error = gsd * np.array([-shift[0], shift[1]]) / interval
-    return Pair(error, (SHIFT_SD_PX * gsd / interval) ** 2)
+    error = gsd_m * np.array([-shift[0], shift[1]]) / interval_s
+    return Pair(error, (SHIFT_SD_PX * gsd_m / interval_s) ** 2)
 
 
 def descent_rate_m_s(frame: DescentFrame) -> float:
-    """Downward velocity."""
+    """Return the downward velocity, m/s."""
     return -float(frame.interval_velocity_m_s[2])
 
 
 def height_m(frame: DescentFrame) -> float:
-    """Measured altitude, propagated to the time of the image; without a velocity, the altitude as measured."""
+    """Propagate the measured altitude (m) to the time of the image; without a velocity, return it unchanged."""
     delay_s = frame.image.time_s - frame.altitude.time_s
     velocity = frame.inertial_velocity_m_s if frame.interval_velocity_m_s is None else frame.interval_velocity_m_s
     return frame.altitude.altitude_m + (0.0 if velocity is None else float(velocity[2]) * delay_s)
 
 
 def intersect_boresight(frame: DescentFrame, height: float) -> np.ndarray:
-    """Intersection of the boresight with level ground, relative to the body (east, north), metres; NaN if none."""
+    """Intersect the boresight with level ground, relative to the body (east, north), metres; NaN if none."""
     ray = frame.attitude.world_from_body.apply(frame.image.camera.boresight())
     return ray[:2] * (height / -ray[2]) if ray[2] < 0.0 and height > 0.0 else np.full(2, np.nan)
 
 
-def rectify(frame: DescentFrame, height: float, centre: np.ndarray, gsd: float) -> np.ndarray | None:
+def rectify(frame: DescentFrame, height: float, centre: np.ndarray, gsd_m: float) -> np.ndarray | None:
     """Project the image onto a square of level ground around a point; None if the image contains too little of it."""
-    offsets = gsd * (np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1))
+    offsets = gsd_m * (np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1))
     east, south = np.meshgrid(offsets, offsets)
     ground = np.stack([centre[0] + east, centre[1] - south, np.full_like(east, -height)], axis=-1)
     body = frame.attitude.world_from_body.inv().apply(ground.reshape(-1, 3))
@@ -141,7 +141,7 @@ def rectify(frame: DescentFrame, height: float, centre: np.ndarray, gsd: float) 
     signal = (frame.image.counts - calibration.offset_dn) / calibration.flat_field
     size = signal.shape
     is_visible = (columns >= 0) & (columns <= size[1] - 1) & (rows >= 0) & (rows <= size[0] - 1)
-    if is_visible.mean() < MIN_VISIBLE:
+    if is_visible.mean() < MIN_VISIBLE_FRACTION:
         return None
     patch = cv2.remap(signal, columns, rows, cv2.INTER_LINEAR).astype(np.float64)
     patch -= patch[is_visible].mean()

@@ -185,4 +185,4 @@ def main() -> None:
         app()
     except Exception:
         traceback.print_exc()
-        sys.exit(Exit.WRONG)
+        sys.exit(Exit.INVALID)

@@ -18,7 +18,7 @@ from marsyard.cli import options
 
 if TYPE_CHECKING:
     from marsyard.campaigns.execution.workers import ExecutorConfig
-    from marsyard.campaigns.running.engine import Watch
+    from marsyard.campaigns.running.engine import ProgressObserver
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def run(arguments: RunOptions) -> None:
         return
     directory = arguments.out if arguments.out is not None else default_directory(campaign.configuration.name)
     run_cases = outcome.run_until_decided if arguments.until_decided else run_campaign
-    run_and_evaluate(directory, lambda watch: run_cases(campaign, directory, executor, watch))
+    run_and_evaluate(directory, lambda observer: run_cases(campaign, directory, executor, observer))
 
 
 @options.handle_user_errors
@@ -111,9 +111,11 @@ def resume(
             raise CampaignError(f"--retry: {unknown_name_message('outcome', name, allowed)}")
     outcomes = list(RETRYABLE) if "all" in (retry or []) else retry or []
 
-    def continue_campaign(watch: Watch) -> None:
-        resume_campaign(directory, executor, watch, retry=outcomes, case_time_s=case_time, allow_changed=allow_changed)
-        continue_until_decided(directory, executor, watch)
+    def continue_campaign(observer: ProgressObserver) -> None:
+        resume_campaign(
+            directory, executor, observer, retry=outcomes, case_time_s=case_time, allow_changed=allow_changed
+        )
+        continue_until_decided(directory, executor, observer)
 
     run_and_evaluate(directory, continue_campaign)
 
@@ -205,7 +207,7 @@ def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
     return ExecutorConfig(jobs or available_cores(), cluster)
 
 
-def run_and_evaluate(directory: Path, work: Callable[[Watch], None]) -> None:
+def run_and_evaluate(directory: Path, work: Callable[[ProgressObserver], None]) -> None:
     """Run the campaign by the function `work`, evaluate it, and exit with the status of its verdict."""
     from marsyard.cli.outcome import evaluate_and_report
     from marsyard.cli.progress import RunLog
@@ -216,7 +218,7 @@ def run_and_evaluate(directory: Path, work: Callable[[Watch], None]) -> None:
 
 
 @contextmanager
-def show_progress(directory: Path, next_command: str) -> Iterator[Watch]:
+def show_progress(directory: Path, next_command: str) -> Iterator[ProgressObserver]:
     """Show the progress of a campaign; an interruption prints `next_command` and exits with status 130."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.record import read

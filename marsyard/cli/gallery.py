@@ -64,11 +64,12 @@ class GalleryImage:
     @property
     def caption(self) -> str:
         """Text with camera, height, viewing direction and sun direction."""
-        r = self.request
-        direction = "looking straight down" if r.elevation_deg == -90.0 else f"looking to {r.azimuth_deg:g}°"
+        request = self.request
+        is_nadir = request.elevation_deg == -90.0
+        direction = "looking straight down" if is_nadir else f"looking to {request.azimuth_deg:g}°"
         return (
-            f"{r.camera}, {r.altitude_m:g} m above the ground, {direction}; "
-            f"sun elevation {r.sun_elevation_deg:g}°, azimuth {r.sun_azimuth_deg:g}°"
+            f"{request.camera}, {request.altitude_m:g} m above the ground, {direction}; "
+            f"sun elevation {request.sun_elevation_deg:g}°, azimuth {request.sun_azimuth_deg:g}°"
         )
 
 
@@ -123,21 +124,22 @@ def write_gallery(images: Sequence[GalleryImage], folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     groups: dict[str, list[dict[str, Any]]] = {}
     for image in images:
-        r, (rows, columns) = image.request, image.grey.shape
+        request, (rows, columns) = image.request, image.grey.shape
         full_size_jpeg = encode_image(".jpg", image.grey, [cv2.IMWRITE_JPEG_QUALITY, FULL_QUALITY])
         (folder / image.file).write_bytes(full_size_jpeg)
         width = min(PAGE_WIDTH_PX, columns)
         reduced = cv2.resize(image.grey, (width, round(rows * width / columns)), interpolation=cv2.INTER_AREA)
         page_jpeg = encode_image(".jpg", reduced, [cv2.IMWRITE_JPEG_QUALITY, PAGE_QUALITY])
         command = (
-            f"marsyard render {r.site} --camera {r.camera} --scale {r.scale} --altitude {r.altitude_m:g} "
-            f"--east {r.east_m:g} --north {r.north_m:g} "
-            f"--azimuth {r.azimuth_deg:g} --elevation {r.elevation_deg:g} --sun-azimuth {r.sun_azimuth_deg:g} "
-            f"--sun-elevation {r.sun_elevation_deg:g} --out {Path(r.site).stem}"
+            f"marsyard render {request.site} --camera {request.camera} --scale {request.scale} "
+            f"--altitude {request.altitude_m:g} --east {request.east_m:g} --north {request.north_m:g} "
+            f"--azimuth {request.azimuth_deg:g} --elevation {request.elevation_deg:g} "
+            f"--sun-azimuth {request.sun_azimuth_deg:g} --sun-elevation {request.sun_elevation_deg:g} "
+            f"--out {Path(request.site).stem}"
         )
         values = {"file": image.file, "columns": columns, "rows": rows, "caption": image.caption, "command": command}
         source = f"data:image/jpeg;base64,{base64.b64encode(page_jpeg).decode()}"
-        groups.setdefault(r.site, []).append({"source": source, **values})
+        groups.setdefault(request.site, []).append({"source": source, **values})
     (folder / SHEET).write_bytes(draw_contact_sheet(images))
     site_images = [(load_site(name), entries) for name, entries in groups.items()]
     page = page_environment().get_template("gallery.html.j2").render(groups=site_images, version=version("marsyard"))

@@ -18,13 +18,13 @@ from marsyard.campaigns.definition.configuration import MAX_CASES, read_table
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import Watch, run_campaign
+from marsyard.campaigns.running.engine import ProgressObserver, run_campaign
 from marsyard.cli.options import Exit
 from marsyard.cli.outcome import evaluate_and_store
 from marsyard.reports.campaign import write_atomic
 from marsyard.reports.comparison import build_sample, list_metrics
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.history import Change, History, NightCampaign, NightMetric, list_comparisons, night_text
+from marsyard.reports.history import Change, History, NightCampaign, NightMetric, format_night_page, list_comparisons
 from marsyard.sim.parameters import Parameters
 
 #: Files and folders in the output folder of `marsyard nightly`.
@@ -98,18 +98,19 @@ class NightlyRun:
     plan: Plan
 
 
-def run_scheduled_campaign(run: NightlyRun, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
+def run_scheduled_campaign(run: NightlyRun, planned: PlannedCampaign, folder: Path, observer: ProgressObserver) -> None:
     """Run a campaign, evaluate it, and store its metrics; its errors do not affect the other campaigns."""
     night_metrics = []
     try:
         campaign = planned.load(run.plan.seed, run.number, folder)
         name = campaign.configuration.name
         directory = run.out / RUNS / f"night-{run.number:05d}-{name}"
-        run_campaign(campaign, directory, run.executor, watch)
+        run_campaign(campaign, directory, run.executor, observer)
         evaluation, _ = evaluate_and_store(directory)
         frame, metrics = list_metrics(evaluation.run)
         night_metrics = [
-            NightMetric(m.name, m.larger_is_better, m.summary_value, build_sample(frame, m)) for m in metrics
+            NightMetric(metric.name, metric.larger_is_better, metric.summary_value, build_sample(frame, metric))
+            for metric in metrics
         ]
         verdict, definition = evaluation.overall_verdict, hash_definition(campaign)
         result = NightCampaign(name, definition, directory.name, verdict.word, evaluation.exit_code, verdict.sentence)
@@ -133,6 +134,6 @@ def write_page(history: History, night: int, out: Path, changes: Sequence[Change
     nights = {record.night: record for record in history.nights()}
     earlier = [record for number, record in nights.items() if number < night]
     compared = sum(bool(comparison.before) for comparison in list_comparisons(history, night))
-    text = night_text(nights[night], earlier, history.campaigns(night), changes, compared)
+    text = format_night_page(nights[night], earlier, history.campaigns(night), changes, compared)
     write_atomic(out / PAGE_FILE, text)
     return text

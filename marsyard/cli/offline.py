@@ -49,8 +49,8 @@ def export(
     command += [word for value in override or [] for word in ("--set", value)]
     command += [] if bits_per_pixel is None else ["--bits-per-pixel", f"{bits_per_pixel:g}"]
     export_definition = replace(export_definition, command=tuple(command))
-    with show_progress(truth, f"the same command again ({out})") as watch:
-        export_campaign(export_definition, out, truth, make_executor(jobs, cluster), watch)
+    with show_progress(truth, f"the same command again ({out})") as observer:
+        export_campaign(export_definition, out, truth, make_executor(jobs, cluster), observer)
     crashed = int(record.read(truth)["cases_crashed"])
     total = export_definition.configuration.total_cases
     typer.echo(f"exported {total - crashed} of {count(total, 'case')} to {out}")
@@ -76,7 +76,7 @@ def score(
     cluster: options.ClusterOption = None,
 ) -> None:
     """Score the answers of an external algorithm; write verdicts and report."""
-    from marsyard.campaigns.running.engine import Watch, run_campaign
+    from marsyard.campaigns.running.engine import ProgressObserver, run_campaign
     from marsyard.campaigns.running.offline import create_scoring_campaign, find_cases_with_changed_images, truth_folder
     from marsyard.reports.wording import count
 
@@ -85,11 +85,13 @@ def score(
     campaign = replace(create_scoring_campaign(directory, truth, answers), command=command)
     target = out if out is not None else default_directory(campaign.configuration.name)
 
-    def run(watch: Watch) -> None:
-        run_campaign(campaign, target, make_executor(jobs, cluster), watch)
+    def run(observer: ProgressObserver) -> None:
+        run_campaign(campaign, target, make_executor(jobs, cluster), observer)
         changed = find_cases_with_changed_images(truth, target)
         if changed:
-            watch.note(f"the images of {count(len(changed), 'case')} (first: case {changed[0]}) differ from the export")
+            observer.note(
+                f"the images of {count(len(changed), 'case')} (first: case {changed[0]}) differ from the export"
+            )
 
     run_and_evaluate(target, run)
 

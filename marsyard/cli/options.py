@@ -22,7 +22,7 @@ class Exit(IntEnum):
 
     MET = 0  #: all requirements are met, or there are none
     FAILED = 1  #: a requirement failed, or a case crashed
-    WRONG = 2  #: the command or a file is invalid
+    INVALID = 2  #: the command or a file is invalid
     INSUFFICIENT = 3  #: not enough cases for a verdict
     INTERRUPTED = 130  #: by Ctrl-C or SIGTERM
 
@@ -118,15 +118,15 @@ def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Paramete
         except (CampaignError, OSError) as error:
             if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
                 raise
-            fail(error)
+            exit_with_error(error)
 
     return call
 
 
-def fail(error: object) -> NoReturn:
+def exit_with_error(error: object) -> NoReturn:
     """Print an error message and exit with status 2."""
     typer.echo(f"error: {error}", err=True)
-    raise typer.Exit(Exit.WRONG) from None
+    raise typer.Exit(Exit.INVALID) from None
 
 
 def console(*, stderr: bool = False) -> Console:

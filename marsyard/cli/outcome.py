@@ -28,9 +28,9 @@ from marsyard.campaigns.definition.configuration import find_renamed_columns
 from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
-from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
-from marsyard.campaigns.running.preparation import estimate
-from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
+from marsyard.campaigns.running.engine import ProgressObserver, append_cases, run_campaign
+from marsyard.campaigns.running.preparation import estimate_campaign
+from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import add_result
 from marsyard.campaigns.store.products import case_directory, save_packed
@@ -168,7 +168,7 @@ def rerun_notable_cases(directory: Path) -> None:
     load_stored_campaign(directory, configuration)
     with LocalExecutor(1) as workers:
         for case in missing:
-            replayed = replay_with(workers, configuration, case, stored_row(directory, case))
+            replayed = replay_in_executor(workers, configuration, case, stored_row(directory, case))
             if replayed.products is None or replayed.failed:
                 typer.echo(f"case {case}: rerun, but no images were produced")
                 continue
@@ -217,7 +217,7 @@ def evidence_limits(campaign: Campaign) -> list[str]:
 def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
     """Print the estimated time and disk space of a campaign."""
     workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1
-    estimated = estimate(campaign, workers)
+    estimated = estimate_campaign(campaign, workers)
     total = campaign.configuration.total_cases
     low, high = estimated.case_range_s
     time_s = estimated.time_s
@@ -243,7 +243,9 @@ def print_limits(campaign: Campaign) -> None:
         typer.echo(f"note: {limit}")
 
 
-def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
+def run_until_decided(
+    campaign: Campaign, directory: Path, executor: ExecutorConfig, observer: ProgressObserver
+) -> None:
     """Run a campaign until its verdicts are decided, with at most the configured number of cases.
 
     See `marsyard.reports.statistics.proportions`. Raises CampaignError for dependent draws, or if no requirement has a
@@ -260,11 +262,11 @@ def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorCon
         update={"cases": planned_looks(max_cases)[0].cases, "appended": (), "max_cases": max_cases}
     )
     command = (*campaign.command, "--until-decided")
-    run_campaign(replace(campaign, configuration=first_block, command=command), directory, executor, watch)
-    continue_until_decided(directory, executor, watch)
+    run_campaign(replace(campaign, configuration=first_block, command=command), directory, executor, observer)
+    continue_until_decided(directory, executor, observer)
 
 
-def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
+def continue_until_decided(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> None:
     """Append cases at the planned interim evaluations until the campaign is decided."""
     while True:
         configuration = record.stored_configuration(directory)
@@ -275,9 +277,9 @@ def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Wat
         verdicts = evaluate_requirements(read_frame(directory), settings["requirements"], design)
         next_cases = next_look(verdicts, design, cases)
         if next_cases is None:
-            watch.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
+            observer.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
             return
-        append_cases(directory, next_cases - cases, executor, watch)
+        append_cases(directory, next_cases - cases, executor, observer)
 
 
 class _SiteHandler(SimpleHTTPRequestHandler):

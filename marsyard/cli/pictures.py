@@ -144,15 +144,15 @@ def render_images(request: ImageRequest, *, detector: bool = True, both: bool = 
     pose = camera_pose(ground.surface, preset.design, *position, request.azimuth_deg, request.elevation_deg)
     towards_sun = direction(np.radians(request.sun_azimuth_deg), np.radians(request.sun_elevation_deg))
     sun = Sun(towards_sun, ground.site.environment.sun_radius_rad)
-    selected = cameras if both else cameras[:1]
-    rays = [PixelRays.of(camera) for camera in selected]
+    rendered_cameras = cameras if both else cameras[:1]
+    rays = [PixelRays.of(camera) for camera in rendered_cameras]
     # The baseline of a stereo pair is short: both cameras use the scene built for the left camera.
     eye = Eye.of(rays[0], pose, ground.surface)
     scene = _add_rover(site_scene(ground, eye, sun), request, ground)
     smallest_rad = smallest_rock_rad(ground.rocks, eye) if ground.rocks is not None else 0.0
     rms_slope = math.tan(math.radians(ground.terrain.rms_slope_deg))
     images = []
-    for number, camera in enumerate(selected):
+    for number, camera in enumerate(rendered_cameras):
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
         frame = add_unresolved_rocks(frame, scene, ground.rocks, smallest_rad, rms_slope)
         exposure, counts = _expose(request, ground, camera, number, frame, sun) if detector else (None, None)

@@ -1,6 +1,6 @@
 """Progress of a running campaign: bars with rate and remaining time on a terminal, text lines otherwise, and `run.log`.
 
-The public classes implement the protocol `Watch` of `marsyard.campaigns.running.engine`.
+The public classes implement the protocol `ProgressObserver` of `marsyard.campaigns.running.engine`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from marsyard.campaigns.running.engine import Watch
+    from marsyard.campaigns.running.engine import ProgressObserver
 
 LOG_FILE = "run.log"
 #: Time between two progress lines of a stage, on the console and in the log, seconds.
@@ -80,16 +80,16 @@ class BarProgress:
         self._task = self.bars.add_task("starting", visible=False)
 
     def begin(self, stage: str, total: int) -> None:
-        """See `marsyard.campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
         self.bars.stop_task(self._task)
         self._task = self.bars.add_task(stage, total=total)
 
     def step(self) -> None:
-        """See `marsyard.campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
         self.bars.advance(self._task)
 
     def note(self, text: str) -> None:
-        """See `marsyard.campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
         self.bars.console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -102,13 +102,13 @@ class LineProgress:
         self._start_s = self._last_print_s = 0.0
 
     def begin(self, stage: str, total: int) -> None:
-        """See `marsyard.campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
         self._stage, self._total, self._done = stage, total, 0
         self._start_s = self._last_print_s = time.monotonic()
         self._print(f"{stage}: {total}")
 
     def step(self) -> None:
-        """See `marsyard.campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
         self._done += 1
         now_s = time.monotonic()
         if self._done < self._total and now_s - self._last_print_s < LINE_INTERVAL_S:
@@ -119,7 +119,7 @@ class LineProgress:
         self._print(f"{text}, {remaining:.0f} s left" if self._done < self._total else f"{text}, {elapsed_s:.1f} s")
 
     def note(self, text: str) -> None:
-        """See `marsyard.campaigns.running.engine.Watch`."""
+        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
         self._print(f"note: {text}")
 
     def _print(self, text: str) -> None:
@@ -127,10 +127,10 @@ class LineProgress:
 
 
 class RunLog:
-    """`Watch` that writes `run.log` and forwards each call to `watch`; errors in writing the log are ignored."""
+    """Observer that writes `run.log` and forwards each call to `observer`; errors in writing the log are ignored."""
 
-    def __init__(self, directory: Path, watch: Watch) -> None:
-        self._path, self._watch = directory / LOG_FILE, watch
+    def __init__(self, directory: Path, observer: ProgressObserver) -> None:
+        self._path, self._observer = directory / LOG_FILE, observer
         self._stage, self._total, self._done = "", 0, 0
         self._start_s, self._last_write_s, self._has_entries = time.monotonic(), 0.0, False
 
@@ -150,19 +150,19 @@ class RunLog:
         """Log the start of a stage."""
         self._stage, self._total, self._done = stage, total, 0
         self._write(f"{stage}: {total}")
-        self._watch.begin(stage, total)
+        self._observer.begin(stage, total)
 
     def step(self) -> None:
         """Count a step; log the progress at intervals."""
         self._done += 1
         if self._done == self._total or time.monotonic() - self._last_write_s > LOG_INTERVAL_S:
             self._write(f"{self._stage}: {self._done}/{self._total}")
-        self._watch.step()
+        self._observer.step()
 
     def note(self, text: str) -> None:
         """Log a note."""
         self._write(f"note: {text}")
-        self._watch.note(text)
+        self._observer.note(text)
 
     def _write(self, text: str) -> None:
         self._last_write_s, lines = time.monotonic(), [text]
@@ -176,7 +176,7 @@ class RunLog:
 
 
 @contextmanager
-def campaign_progress(console: Console) -> Iterator[Watch]:
+def campaign_progress(console: Console) -> Iterator[ProgressObserver]:
     """Report progress by bars on a terminal, and by text lines otherwise."""
     if not console.is_terminal:
         yield LineProgress(console)

@@ -51,13 +51,13 @@ def report(
 
     if gallery:
         outcome.rerun_notable_cases(directory)
-    selected = None
+    applicable_requirements = None
     if requirements is not None:
         name = str(record.read(directory)["name"])
-        selected = select_applicable(read_requirements(requirements), name)
-        if not selected:
+        applicable_requirements = select_applicable(read_requirements(requirements), name)
+        if not applicable_requirements:
             raise CampaignError(f"{requirements}: no requirement lists the campaign '{name}' in its campaigns")
-    status = outcome.evaluate_and_report(directory, console(), selected)
+    status = outcome.evaluate_and_report(directory, console(), applicable_requirements)
     if csv:
         typer.echo(f"rows: {outcome.write_csv(directory)}")
     if pdf:
@@ -183,18 +183,18 @@ def nightly(
         # write a first page in case this run is killed
         plans.write_page(history, night, out, ())
         try:
-            with stop_on_signals(), campaign_progress(console(stderr=True)) as watch:
+            with stop_on_signals(), campaign_progress(console(stderr=True)) as observer:
                 run = plans.NightlyRun(history, night, out, executor, plan_definition)
                 for planned in plan_definition.campaigns:
-                    plans.run_scheduled_campaign(run, planned, path.parent, watch)
+                    plans.run_scheduled_campaign(run, planned, path.parent, observer)
         except KeyboardInterrupt:
             history.finish(night, INTERRUPTED)
             plans.publish_page(history, night, out, ())
             raise typer.Exit(Exit.INTERRUPTED) from None
         significant = find_changes(list_comparisons(history, night))
-        rows = [(change.campaign, change.metric, change.p_value, change.worse) for change in significant]
+        rows = [(change.campaign, change.metric, change.p_value, change.is_regression) for change in significant]
         history.finish(night, FINISHED, rows)
         plans.publish_page(history, night, out, significant)
         statuses = {campaign.exit_code for campaign in history.campaigns(night)}
-    statuses |= {int(Exit.FAILED) for change in significant if change.worse}
+    statuses |= {int(Exit.FAILED) for change in significant if change.is_regression}
     raise typer.Exit(next((status for status in (Exit.FAILED, Exit.INSUFFICIENT) if status in statuses), Exit.MET))

@@ -20,7 +20,7 @@ from marsyard.cli.options import (
     OverwriteOption,
     SiteArgument,
     console,
-    fail,
+    exit_with_error,
     with_options,
 )
 
@@ -86,7 +86,7 @@ def stats(
         if picture is not None:
             write_terrain_image(picture, surface, dtm)
     except ValueError as error:
-        fail(error)
+        exit_with_error(error)
     statistics = terrain_statistics(surface, None if dtm is None else dtm.real_samples(parameters.samples))
     extent = None if dtm is None else dtm.extent
     if not as_json:
@@ -263,9 +263,9 @@ def report_image_errors(out: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, RenderingError) as error:
-        fail(error)
+        exit_with_error(error)
     except OSError as error:
-        fail(f"cannot write to {out}: {error}")
+        exit_with_error(f"cannot write to {out}: {error}")
 
 
 def gallery(

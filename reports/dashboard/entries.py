@@ -16,7 +16,7 @@ from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.campaigns.errors import CampaignError
 from marsyard.reports.campaign import REPORT_JSON, SCHEMA, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
-from marsyard.reports.traceability import Algorithm, format_tested_algorithms, tested_algorithms
+from marsyard.reports.traceability import Algorithm, format_tested_algorithms, read_algorithms
 from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH
 from marsyard.reports.wording import NOTHING, percent
 from marsyard.scenarios.systems import find_system
@@ -134,7 +134,7 @@ def _read_entry(path: Path) -> Entry:
         system="other" if system is None else system.name,
         sites=_read_names(report, "sites", parameters, "site"),
         algorithms=_read_names(report, "algorithms", parameters, "algorithm"),
-        tested=tuple(tested_algorithms(record)),
+        tested=tuple(read_algorithms(record)),
         commit=str(report.get("git_commit") or "")[:10],
         evidence=str(table(report.get("evidence")).get("title") or ""),
         started=str(report.get("started_utc") or ""),
@@ -155,7 +155,7 @@ def _read_verdict(verdict: Mapping[str, Any]) -> RequirementVerdict:
         name: str(verdict.get(name) or "") for name in ("statement", "status", "decide_by", "note")
     }
     for name in ("estimate", "lower", "probability", "margin", "confidence"):
-        values[name] = _number(verdict.get(name))
+        values[name] = _to_float(verdict.get(name))
     all_cases = table(verdict.get("all_cases"))
     values["all_cases"] = f"over all cases {all_cases['failures']:,} of {all_cases['n']:,}" if all_cases else ""
     if all_cases and all_cases["n"] == verdict.get("n"):
@@ -189,7 +189,7 @@ def _find_text(parameters: Mapping[str, Any], key: str) -> str:
     return ""
 
 
-def _number(value: Any) -> float:
+def _to_float(value: Any) -> float:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
 

@@ -119,7 +119,7 @@ def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
 
 
 def _rank_among_worst(entry: Entry, case: int) -> int:
-    """Index of a case among the cases with the largest errors; the number of these cases if it is not one of them."""
+    """Return the rank (from 0) of a case by its error; the number of ranked cases if the case has no rank."""
     return entry.worst.index(str(case)) if str(case) in entry.worst else len(entry.worst)
 
 

@@ -146,11 +146,11 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
                 for axes in panels:
                     axes.set_axis_off()
     delivered_cells = grid["delivered"].subgridspec(1, 2)
-    for side, (image, stem, colour) in enumerate(zip(images, ("template", "match"), (TEMPLATE, MATCH), strict=True)):
+    for side, (image, prefix, colour) in enumerate(zip(images, ("template", "match"), (TEMPLATE, MATCH), strict=True)):
         axes = figure.add_subplot(delivered_cells[side])
         show_subframe(axes, image)
         axes.set_facecolor(INK)
-        _mark_tracks(axes, pair_tracks, stem, colour)
+        _mark_tracks(axes, pair_tracks, prefix, colour)
         _outline_overlap(axes, products, pair, side)
         axes.set_title(f"Image {pair + side + 1}: {'templates' if side == 0 else 'tracked'}", fontsize=9)
 
@@ -166,11 +166,12 @@ def _draw_rectified(
     rectified = _rectify(image, lattice)
     show_subframe(axes, rectified)
     axes.set_facecolor(INK)
-    step = float(frame[2]) * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
+    west, north, lattice_spacing = (float(value) for value in frame.ravel())
+    step = lattice_spacing * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
     spacing_m = float(gsd[0]) if gsd is not None and gsd.size == 1 else np.nan
 
     def draw_square(ground: Float[np.ndarray, "2"], side_px: int, colour: str, valid: bool) -> None:
-        centre = ((ground[0] - frame[0]) / step, (frame[1] - ground[1]) / step)
+        centre = ((ground[0] - west) / step, (north - ground[1]) / step)
         _draw_square(axes, centre, side_px * spacing_m / step, colour, valid)
 
     for track in pair_tracks:
@@ -215,10 +216,10 @@ def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
         _draw_square(axes[1], track.position[::-1], float(len(track.patch)), MATCH, track.valid)
 
 
-def _mark_tracks(axes: Axes, pair_tracks: Sequence[Track], stem: str, colour: str) -> None:
+def _mark_tracks(axes: Axes, pair_tracks: Sequence[Track], prefix: str, colour: str) -> None:
     box = {"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0}
     for track in pair_tracks:
-        u, v = track.values.get(f"{stem}_u", np.nan), track.values.get(f"{stem}_v", np.nan)
+        u, v = track.values.get(f"{prefix}_u", np.nan), track.values.get(f"{prefix}_v", np.nan)
         side = track.values.get("template_side_px", _DEFAULT_SIDE_PX)
         if np.isfinite((u, v)).all():
             _draw_square(axes, (u, v), side, colour, track.valid)

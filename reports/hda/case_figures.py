@@ -1,8 +1,9 @@
 """Figures of one landing as Figs. 1 to 5 and 7 of `papers/vision-guided-landing.txt`.
 
-Colours follow the paper's text, in tones for colour-blind readers: cameras red and green, features white; structure
-pixels red, segments green, matches blue; maps green, yellow and red. A black X marks the a-priori site, a purple plus
-the safe site. The true maps in Fig. 5 and the true motion in Fig. 2 are additions. Missing products raise ValueError.
+Colours are those of the paper's text, in shades that colour-blind readers can distinguish. Fig. 2: cameras red and
+green, features white. Fig. 3: structure pixels red, segments green, matches blue. Maps: green, yellow and red. A black
+X marks the a-priori site, a purple plus the safe site. The true maps in Fig. 5 and the true motion in Fig. 2 are
+additions. Missing products raise ValueError.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from marsyard.reports.hda import products as stages
 from marsyard.reports.presentation import save_figures
 from marsyard.reports.section import MUTED, in_page_style, show_image
 
-T = TypeVar("T")
+Part = TypeVar("Part")
 
 #: Green, yellow and red that readers with any colour vision can distinguish (after Okabe & Ito).
 GREEN, YELLOW, RED = "#009e73", "#f0e442", "#c83a12"
@@ -214,7 +215,7 @@ def write_hda_figures(directory: Path, products: Mapping[str, Any]) -> list[Path
     return save_figures(directory, {name: FIGURES[name](products) for name in available_figures(products)}, dpi=130)
 
 
-def _require(part: T | None, name: str) -> T:
+def _require(part: Part | None, name: str) -> Part:
     if part is None:
         raise ValueError(f"the products contain no {name}")
     return part

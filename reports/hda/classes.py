@@ -78,8 +78,10 @@ def count_hazard_classes(frame: Rows) -> list[HazardClass]:
         for name, low, high in zip(CLASS_NAMES, edges[:-1], edges[1:], strict=True):
             column = f"footprints_{kind}_{name}"
             if column in frame:
-                called, unflagged = (pooled_rate(frame, f"{column}_{part}", column) for part in ("safe", "unflagged"))
-                rows.append(HazardClass(kind, low, high, called, unflagged))
+                called_safe, unflagged = (
+                    pooled_rate(frame, f"{column}_{part}", column) for part in ("safe", "unflagged")
+                )
+                rows.append(HazardClass(kind, low, high, called_safe, unflagged))
     return rows
 
 
@@ -99,8 +101,8 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
             "Footprints (flights)": lambda item: f"{item.called_safe.of:,} ({item.called_safe.flights:,})",
             "Classified as safe": lambda item: rate_text(item.called_safe),
             "Not detected": lambda item: rate_text(item.unflagged) if item.is_hazard else NOTHING,
-            "Flights with an undetected hazard": lambda x: (
-                f"{x.unflagged.flights_hit:,} of {x.unflagged.flights:,}" if x.is_hazard else NOTHING
+            "Flights with an undetected hazard": lambda item: (
+                f"{item.unflagged.flights_hit:,} of {item.unflagged.flights:,}" if item.is_hazard else NOTHING
             ),
         },
     )
@@ -121,11 +123,11 @@ def class_figure(classes: Sequence[HazardClass]) -> Figure:
     for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("roughness", "slope"), strict=True):
         kind_classes = [item for item in classes if item.kind == kind]
         positions = np.arange(len(kind_classes))
-        called = RateLine(
+        called_safe = RateLine(
             "classified as safe", (positions - 0.08).tolist(), [item.called_safe for item in kind_classes]
         )
         unflagged = RateLine("not detected", (positions + 0.08).tolist(), [item.unflagged for item in kind_classes])
-        draw_rates(axes, (called, unflagged), linestyle="")
+        draw_rates(axes, (called_safe, unflagged), linestyle="")
         axes.set_xticks(positions, [item.name for item in kind_classes])
         axes.set(title=f"by {kind}", xlabel="size divided by the lander's limit")
     figure.axes[0].set_ylabel("fraction of footprints")
@@ -183,11 +185,11 @@ class TrackingCurve:
 def limits_section(subject: Subject) -> Section | None:
     """Create the section on tracked features by change; None unless each flight changes at most one condition."""
     frame = landing_rows(subject)
-    class_curves = [] if frame is None else tracking_curves(frame)
-    if not class_curves:
+    curves = [] if frame is None else tracking_curves(frame)
+    if not curves:
         return None
     knee_grid = build_grid(
-        class_curves,
+        curves,
         {
             "Change": lambda curve: curve.change["name"],
             "Paper's limit": lambda curve: f"{curve.change['paper']:g} {curve.change['unit']}",
@@ -197,7 +199,7 @@ def limits_section(subject: Subject) -> Section | None:
         },
     )
     size_grid = build_grid(
-        [(curve.change, point) for curve in class_curves for point in curve.points],
+        [(curve.change, point) for curve in curves for point in curve.points],
         {
             "Change": lambda pair: pair[0]["name"],
             "Size": lambda pair: f"{pair[1].size:g} {pair[0]['unit']}",
@@ -209,13 +211,13 @@ def limits_section(subject: Subject) -> Section | None:
     caption = (
         "Fraction of the features in both images that are correctly tracked. Red: limits of the paper. Grey: 90 %."
     )
-    figure = section.svg_figure(limits_figure(class_curves), "limits", caption, wide=True)
+    figure = section.svg_figure(limits_figure(curves), "limits", caption, wide=True)
     blocks = [
         Block(text=note_text("hda.limits_text"), figures=[figure]),
         Block(heading="Knees", grid=knee_grid, note=note_text("hda.limits")),
         Block(heading="By size", grid=size_grid),
     ]
-    data = {"curves": [asdict(curve) for curve in class_curves]}
+    data = {"curves": [asdict(curve) for curve in curves]}
     return Section("limits", "Limits", "Tracking by change between the images", blocks, data)
 
 
@@ -230,10 +232,10 @@ def tracking_curves(frame: pd.DataFrame) -> list[TrackingCurve]:
     is_complete = np.isfinite(np.stack(sizes)).all(axis=0)
     if not is_complete.any() or np.any(is_changed[:, is_complete].sum(axis=0) > 1):
         return []
-    without_change = is_complete & ~is_changed.any(axis=0)
+    is_unchanged = is_complete & ~is_changed.any(axis=0)
     result = []
     for change, size, has_change in zip(changes, sizes, is_changed, strict=True):
-        selected = is_complete & (has_change | without_change)
+        selected = is_complete & (has_change | is_unchanged)
         rounded = np.where(has_change, np.round(size, 1), 0.0)
         if np.unique(rounded[selected]).size >= _MIN_SIZES:
             points = []

@@ -330,7 +330,7 @@ def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.Bloc
 
 
 def hazard_distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
-    """Distances of reported sites and of touchdowns to the nearest true hazard, metres."""
+    """Collect the distances of reported sites and of touchdowns to the nearest true hazard, metres."""
     reported = frame[rates.flag_mask(frame, "site_reported")]
     return {
         "reported site": rates.finite_values(reported, "site_hazard_distance_m"),

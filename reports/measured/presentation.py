@@ -176,7 +176,7 @@ MEASURED = Presentation(
 _MAX_COLOUR_PX = 3.0
 _COLOURS = "plasma"
 _OUTLIER_COLOUR = "#c9d1d9"
-#: Numbers of a case's images.
+#: Possible numbers of a case's images.
 _IMAGE_NUMBERS = range(1, 100)
 
 
@@ -211,11 +211,12 @@ class MatchedPair:
 
 
 def read_matched_pairs(products: Mapping[str, Any]) -> list[MatchedPair]:
-    """Read the valid pairs of a case's products."""
+    """Read the valid pairs of a case's products (`marsyard.scenarios.measured.consistency.agreement_products`)."""
     pairs = []
     for k in _IMAGE_NUMBERS:
         table = numeric_product(products.get(f"matches_{k}"))
         first, second = (to_matrix(products.get(f"image_{number}")) for number in (k, k + 1))
+        # columns of the table: (u, v) in both images, offset (u, v), and 1 for inliers
         if table is not None and table.ndim == 2 and table.shape[1] == 7 and first is not None and second is not None:
             pixels, inlier = table[:, :4].reshape(-1, 2, 2), table[:, 6] > 0.0
             pairs.append(MatchedPair(k, (first, second), pixels, table[:, 4:6], inlier))

@@ -5,8 +5,8 @@ within each terrain, where cases are independent. Rates are compared by the exac
 sum of hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int.
 Statist. 37, 1960). If they have few terrains in common, each terrain is one unit with the mean of equally many cases.
 
-Small p-values of ranks are computed by permutation: with many ties (rates of a few cases per terrain, for example), the
-rank sum is skewed, and the p-value of its normal approximation is too small by a factor of two to three at 0.001.
+Small p-values of ranks are computed by permutation. With many ties (rates of a few cases per terrain, for example), the
+rank sum is skewed. At 0.001 the p-value of its normal approximation is then too small by a factor of two to three.
 
 Paired cases (two algorithms, or two campaigns with the same draws): successes are compared by McNemar's test with the
 exact binomial distribution (Psychometrika 12, 1947), errors by Wilcoxon's signed-rank test of their differences. If
@@ -33,7 +33,7 @@ _MIN_COMMON_FRACTION = 0.5
 _MIN_RANKED = 8
 #: Maximum size of an exact distribution; for larger ones the normal approximation is sufficiently accurate.
 _MAX_EXACT = 20_000
-#: Minimum fraction of the terrains of each set with at least as many cases as a comparison of terrains uses.
+#: Minimum fraction of each set's terrains that have enough cases for the terrain means of a comparison.
 _FULL_FRACTION = 0.8
 #: p-value of the normal approximation below which permutations are used.
 _PERMUTATION_LIMIT = 0.05
@@ -68,22 +68,23 @@ class Sample:
         return np.asarray(self.values[order][indices].mean(axis=1))
 
 
-def difference_p_value(now: Sample, before: Sample, permutations: int = 10_000) -> float:
+def difference_p_value(first: Sample, second: Sample, permutations: int = 10_000) -> float:
     """Compute the two-sided p-value of the difference of two sets; NaN for too few cases.
 
-    Values of only 0 and 1 are compared as rates. The minimum p-value of ranks is 1 divided by the permutations.
+    Values of only 0 and 1 are compared as rates, other values by ranks. The minimum p-value of ranks is about
+    1 / `permutations`.
     """
-    now, before = now.finite_cases(), before.finite_cases()
-    if min(now.values.size, before.values.size) == 0:
+    first, second = first.finite_cases(), second.finite_cases()
+    if min(first.values.size, second.values.size) == 0:
         return math.nan
-    common = np.intersect1d(now.terrains, before.terrains)
-    if min(float(np.isin(s.terrains, common).mean()) for s in (now, before)) < _MIN_COMMON_FRACTION:
+    common = np.intersect1d(first.terrains, second.terrains)
+    if min(float(np.isin(s.terrains, common).mean()) for s in (first, second)) < _MIN_COMMON_FRACTION:
         # equally many cases on each terrain, since the variance of a mean depends on their number
-        counts = (np.quantile(s.cases_on_terrains(), 1.0 - _FULL_FRACTION, method="lower") for s in (now, before))
+        counts = (np.quantile(s.cases_on_terrains(), 1.0 - _FULL_FRACTION, method="lower") for s in (first, second))
         cases = int(min(counts))
-        pairs = [(now.terrain_means(cases), before.terrain_means(cases))]
+        pairs = [(first.terrain_means(cases), second.terrain_means(cases))]
     else:
-        pairs = [(now.values[now.terrains == k], before.values[before.terrains == k]) for k in common]
+        pairs = [(first.values[first.terrains == k], second.values[second.terrains == k]) for k in common]
     are_rates = all(np.isin(values, (0.0, 1.0)).all() for pair in pairs for values in pair)
     return _test_rates(pairs) if are_rates else _test_ranks(pairs, permutations)
 
@@ -94,6 +95,7 @@ Pairs = Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]
 
 def _test_rates(pairs: Pairs) -> float:
     """Compute the exact two-sided p-value for values of 0 and 1, given the sum of each pair: twice the smaller tail."""
+    # per pair: successes and cases of the first set, successes and cases of both sets
     tables = [(int(a.sum()), a.size, int(a.sum() + b.sum()), a.size + b.size) for a, b in pairs]
     tables = [table for table in tables if 0 < table[2] < table[3]]
     if not tables:

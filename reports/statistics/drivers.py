@@ -1,8 +1,8 @@
 """Dependence of a response on a condition: rank correlation and fraction of variance, each with an interval.
 
-If cases share terrains and both condition and response depend on the terrain, the number of cases is divided by
-1 + (m - 1) r_x r_y, with m cases per terrain and the intraclass correlations r_x and r_y of condition and response
-(Scott & Holt, "The effect of two-stage sampling on ordinary least squares methods", J. Amer. Statist. Assoc. 77, 1982).
+If cases share terrains, the number of cases is divided by 1 + (m - 1) r_x r_y. Here m is the number of cases per
+terrain, and r_x and r_y are the intraclass correlations of condition and response. Source: Scott & Holt, "The effect of
+two-stage sampling on ordinary least squares methods", J. Amer. Statist. Assoc. 77, 1982.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Driver:
 
     - n, effective_n: number of cases with condition and response, and the equivalent number of independent cases
     - correlation, lower, upper: Spearman's rank correlation and its interval
-    - share, share_lower, share_upper: fraction (0 to 1) of the variance of the response's ranks that the condition
-      alone explains, for any form of the curve, and its interval (first-order index of a variance-based analysis)
+    - share, share_lower, share_upper: first-order sensitivity index and its interval: the fraction (0 to 1) of the
+      variance of the response's ranks that the condition alone explains, for any form of the curve
     - p_value: p-value of the null hypothesis that the condition has no effect
     """
 
@@ -64,23 +64,25 @@ def estimate_driver(
     if n < MIN_CASES or np.ptp(condition[finite]) == 0.0 or np.ptp(response[finite]) == 0.0:
         return None
     x, y = stats.rankdata(condition[finite]), stats.rankdata(response[finite])
-    effective = float(n)
+    effective_n = float(n)
     if groups is not None:
         index = np.unique(groups[finite], return_inverse=True)[1]
         sizes = np.bincount(index).astype(np.float64)
         size = float((sizes**2).sum() / sizes.sum())
         r_x, r_y = (_estimate_intraclass_correlation(values, index, sizes) for values in (x, y))
-        effective = n / max(1.0, 1.0 + (size - 1.0) * r_x * r_y)
+        effective_n = n / max(1.0, 1.0 + (size - 1.0) * r_x * r_y)
     correlation = float(np.corrcoef(x, y)[0, 1])
     half_width = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
-    half_width *= math.sqrt((1.0 + 0.5 * correlation**2) / max(effective - 3.0, 1.0))
+    half_width *= math.sqrt((1.0 + 0.5 * correlation**2) / max(effective_n - 3.0, 1.0))
     centre = math.atanh(float(np.clip(correlation, -1.0 + 1e-12, 1.0 - 1e-12)))
     lower, upper = math.tanh(centre - half_width), math.tanh(centre + half_width)
-    return Driver(n, effective, correlation, lower, upper, *_estimate_explained_fraction(x, y, effective, confidence))
+    return Driver(
+        n, effective_n, correlation, lower, upper, *_estimate_explained_fraction(x, y, effective_n, confidence)
+    )
 
 
 def _estimate_explained_fraction(
-    x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], effective: float, confidence: float
+    x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], effective_n: float, confidence: float
 ) -> tuple[float, float, float, float]:
     """Estimate the fraction of variance between bins, its interval, and the p-value of the F-test."""
     n = x.size
@@ -96,7 +98,7 @@ def _estimate_explained_fraction(
     between = float((np.bincount(index) * (means - y.mean()) ** 2).sum())
     if between >= (1.0 - 1e-9) * total:
         return 1.0, 1.0, 1.0, 0.0
-    degrees = max(effective - bins, 1.0)
+    degrees = max(effective_n - bins, 1.0)  # degrees of freedom within bins
     within = total - between
     ratio = between / (bins - 1.0) / (within / degrees)
     fraction = max(0.0, (between - (bins - 1.0) * within / degrees) / total)
@@ -115,7 +117,7 @@ def _estimate_explained_fraction(
         noncentrality = 0.0
         if cdf_minus_level(0.0, level) > 0.0:
             root = float(optimize.brentq(cdf_minus_level, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4))
-            noncentrality = root / effective
+            noncentrality = root / effective_n
         bounds.append(noncentrality / (1.0 + noncentrality))
     return fraction, bounds[0], bounds[1], float(stats.f.sf(ratio, bins - 1.0, degrees))
 

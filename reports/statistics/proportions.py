@@ -226,10 +226,10 @@ class LaterLook:
     """Test for one verdict (PASS or FAIL) on a requirement of a campaign that was evaluated with fewer cases before.
 
     Events are failures for PASS, successes for FAIL: few events support the verdict. If the probability of an event is
-    `rate`, the likelihood ratio (`_log_likelihood_ratio`) is a martingale; if it is higher, a supermartingale. By
-    Ville's inequality, the probability that the ratio ever reaches a threshold c is at most its value at the first look
-    divided by c, for any stopping rule. The threshold c is chosen so that the probabilities of a false verdict at the
-    first look (by the Clopper-Pearson bound) and at all later looks add up to `risk`.
+    `rate`, the likelihood ratio (`_log_likelihood_ratio`) is a martingale; if it is higher, a supermartingale. Ville's
+    inequality holds for any stopping rule: the probability that the ratio ever reaches a threshold c is at most its
+    value at the first look divided by c. The first look uses the Clopper-Pearson bound. The threshold c is chosen so
+    that the probabilities of a false verdict at the first and at all later looks add up to `risk`.
 
     - rate: probability of an event at the limit of the requirement: 1 - probability for PASS, probability for FAIL
     - risk: probability of a false verdict at all looks together: 1 - confidence

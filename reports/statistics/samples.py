@@ -88,18 +88,19 @@ def _student_quantile(confidence: float, n: int) -> float:
 
 
 def _standard_error(residuals: Float[np.ndarray, " terrains"], n: int) -> float:
+    """Standard error of a mean of n values from the residual sums of the terrains (Taylor linearisation)."""
     terrains = residuals.size
     return math.sqrt(terrains / (terrains - 1.0) * float((residuals**2).sum())) / n
 
 
-def _union(first: Interval, second: Interval) -> Interval:
+def _unite_intervals(first: Interval, second: Interval) -> Interval:
     return float(np.fmin(first[0], second[0])), float(np.fmax(first[1], second[1]))
 
 
 def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
     """Two-sided interval of the mean: BCa bootstrap, or the central limit theorem in large samples.
 
-    NaN for fewer than two values, or five terrains; the value itself if all are equal.
+    NaN for fewer than two values or, if terrains are shared, fewer than five terrains. Equal values: that value.
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
@@ -125,13 +126,13 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Gr
     def ratio(sums: Float[np.ndarray, "*n"], sizes: Float[np.ndarray, "*n"], axis: int = -1) -> np.ndarray:
         return np.asarray(sums.sum(axis=axis) / sizes.sum(axis=axis))
 
-    return _union((mean - half_width, mean + half_width), _bootstrap((sums, sizes), ratio, confidence))
+    return _unite_intervals((mean - half_width, mean + half_width), _bootstrap((sums, sizes), ratio, confidence))
 
 
 def standard_deviation_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
     """Two-sided interval of the standard deviation: union of BCa bootstrap and Bonett's; in large samples Bonett's.
 
-    NaN for fewer than eight values, or five terrains; 0 if all are equal.
+    NaN for fewer than eight values or, if terrains are shared, fewer than five terrains; 0 if all are equal.
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
@@ -144,7 +145,7 @@ def standard_deviation_interval(sample: Float[np.ndarray, " n"], confidence: flo
     interval = _bonett_interval(values, confidence)
     if values.size > _MAX_BOOTSTRAP:
         return interval
-    return _union(interval, _bootstrap((values,), partial(np.std, ddof=1), confidence))
+    return _unite_intervals(interval, _bootstrap((values,), partial(np.std, ddof=1), confidence))
 
 
 def _clustered_deviation_interval(
@@ -172,7 +173,7 @@ def _clustered_deviation_interval(
         squares, sums, n = (column.sum(axis=axis) for column in columns)
         return np.asarray(np.sqrt(np.maximum(squares - sums**2 / n, 0.0) / (n - 1.0)))
 
-    return _union(interval, _bootstrap((squares, sums, sizes), standard_deviation, confidence))
+    return _unite_intervals(interval, _bootstrap((squares, sums, sizes), standard_deviation, confidence))
 
 
 def _bonett_interval(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
@@ -339,10 +340,10 @@ class ErrorEllipse:
 def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> ErrorEllipse | None:
     """Compute the prediction ellipse of two-dimensional errors; None for fewer than five errors or if all are equal.
 
-    For a new error e of the same normal distribution, (e - m)' S^-1 (e - m) with the sample's mean and covariance is
-    distributed as 2 (n - 1) (n + 1) / (n (n - 2)) times F with 2 and n - 2 degrees of freedom (Hotelling; Chew,
+    The sample has the mean m and the covariance S. For a new error e of the same normal distribution,
+    (e - m)' S^-1 (e - m) is distributed as 2 (n - 1) (n + 1) / (n (n - 2)) times F(2, n - 2) (Hotelling; Chew,
     "Confidence, prediction and tolerance regions for the multivariate normal distribution", J. Amer. Statist. Assoc.
-    61, 1966): the fraction of future errors inside is the probability on average, however small n is.
+    61, 1966). On average, the fraction of future errors inside equals the probability, also for small n.
     """
     finite = errors[np.isfinite(errors).all(axis=1)]
     n = len(finite)

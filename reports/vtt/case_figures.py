@@ -1,8 +1,8 @@
 """Figures of one tracking case as Figs. 15, 17 and 16b of `papers/visual-target-tracking.txt`.
 
-The first figure contains for every stop: the left subframe with search window and match, the enlarged match (the next
-template), the right subframe with the stereo match, and above them the quantities of the update. The second figure
-contains a top view of the path, and an enlarged view of the target's estimated positions.
+The first figure contains for every stop the left subframe with search window and match, the enlarged match (the next
+template), and the right subframe with the stereo match. The title contains the quantities of the update. The second
+figure contains a top view of the path, and an enlarged view of the target's estimated positions.
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ def _draw_path_axes(axes: Axes, run: RoverPath) -> None:
     for position, direction in zip(run.stops, 0.045 * width * directions, strict=True):
         axes.plot(*np.column_stack([position, position + direction]), "-", color=MUTED, linewidth=1.1, zorder=1)
     for number in _choose_labelled(run.stops, width):
-        _write_number(axes, run.stops[number], number + 1)
+        _annotate_number(axes, run.stops[number], number + 1)
 
 
 def _draw_estimates(axes: Axes, run: RoverPath) -> None:
@@ -299,7 +299,7 @@ def _draw_estimates(axes: Axes, run: RoverPath) -> None:
     axes.set_title("Estimated target positions")
     width = _set_limits(axes, np.vstack([offsets[finite], np.zeros((1, 2))]), 2.0)
     for index in _choose_labelled(offsets[finite], width):
-        _write_number(axes, offsets[finite[index]], int(finite[index]) + 1)
+        _annotate_number(axes, offsets[finite[index]], int(finite[index]) + 1)
 
 
 def _choose_labelled(points: Float[np.ndarray, "n 2"], width: float) -> list[int]:
@@ -311,7 +311,7 @@ def _choose_labelled(points: Float[np.ndarray, "n 2"], width: float) -> list[int
     return indices
 
 
-def _write_number(axes: Axes, point: Point, number: int) -> None:
+def _annotate_number(axes: Axes, point: Point, number: int) -> None:
     offset: dict[str, Any] = {"xytext": (5, 4), "textcoords": "offset points"}
     outline = [patheffects.withStroke(linewidth=2.0, foreground="#ffffff")]
     axes.annotate(str(number), (point[0], point[1]), fontsize=8, color=INK, path_effects=outline, **offset)

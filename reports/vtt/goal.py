@@ -43,7 +43,7 @@ def is_closed_loop(frame: pd.DataFrame) -> bool:
 
 
 def selectable_targets(frame: pd.DataFrame) -> pd.DataFrame:
-    """Select rows with selectable targets: sunlit, not on the rock's edge, in both images to the end, on the face."""
+    """Select rows with selectable targets: sunlit, in both images to the end, on the rock's face, not on its edge."""
     return frame[rates.all_flags(frame, "selectable", "in_view", "on_face")]
 
 

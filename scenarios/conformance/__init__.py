@@ -48,7 +48,7 @@ class Subject:
         if task is TRACKING:
             return trackers.TrackerSuite(create, self.spec, is_program, self.limit_s)
         protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
-        if task.takes_stream(self.spec):
+        if task.accepts_stream(self.spec):
             protocol = estimators.STREAM
         return estimators.EstimatorSuite(create, self.spec, is_program, self.limit_s, protocol)
 

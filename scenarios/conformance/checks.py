@@ -18,8 +18,8 @@ from marsyard.algorithms.answers import AlgorithmError
 from marsyard.scenarios.algorithm_run import copy_inputs, hash_inputs
 from marsyard.scenarios.estimators import algorithm_sources
 
-#: Modules of `marsyard` that an algorithm may import (docs/architecture.md).
-OPEN_MODULES = ("marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements", "marsyard.algorithms")
+#: Modules of `marsyard` that an algorithm may import, with their submodules (docs/architecture.md).
+ALLOWED_MODULES = ("marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements", "marsyard.algorithms")
 _SCENARIOS = Path(__file__).resolve().parents[1]
 
 
@@ -70,8 +70,8 @@ class Check:
         except Exception as error:
             # report the last line of the user's code in the traceback
             frames = traceback.extract_tb(error.__traceback__)
-            user = [frame for frame in frames if not Path(frame.filename).resolve().is_relative_to(_SCENARIOS)]
-            location = f" ({Path(user[-1].filename).name}, line {user[-1].lineno})" if user else ""
+            user_frames = [frame for frame in frames if not Path(frame.filename).resolve().is_relative_to(_SCENARIOS)]
+            location = f" ({Path(user_frames[-1].filename).name}, line {user_frames[-1].lineno})" if user_frames else ""
             problem = f"it raised {type(error).__name__}: {error}{location}"
         return Finding(self.name, self.requirement, problem, self.advice)
 
@@ -139,7 +139,7 @@ class Suite(ABC):
         advice = "reduce the computation time, or raise the limit with --time-limit"
         yield Check("time", f"{self.time_verb} within {self.limit_s:g} s", advice, self._check_time)
         if self.forbids_truth and not self.is_program:
-            advice = f"use only the inputs; from marsyard import only {', '.join(OPEN_MODULES)}"
+            advice = f"use only the inputs; from marsyard import only {', '.join(ALLOWED_MODULES)}"
             yield Check("truth", "imports no module with access to the truth", advice, self._check_imports)
 
     def _check_inputs(self) -> str:
@@ -181,7 +181,7 @@ class Suite(ABC):
         return measure_time_s(lambda: self._answer(case))
 
     def _check_imports(self) -> str:
-        forbidden, allowed = [], tuple(f"{module}." for module in OPEN_MODULES)
+        forbidden, allowed = [], tuple(f"{module}." for module in ALLOWED_MODULES)
         for name, path in algorithm_sources(self.spec):
             try:
                 nodes = list(ast.walk(ast.parse(path.read_bytes())))

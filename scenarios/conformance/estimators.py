@@ -16,16 +16,21 @@ from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
 from marsyard.sim.measurements import DescentMeasurements
 
-#: Numbers of images: of an ordinary stream, of streams too short for an answer, of short streams, of a long stream.
-_IMAGES, _TOO_SHORT, _SHORT, _LONG = 5, (0, 1), (2, 3), 10
+#: Number of images of an ordinary stream, and of a long stream.
+_STREAM_LENGTH, _LONG_LENGTH = 5, 10
+#: Numbers of images of streams that are too short for a velocity, and of short but sufficient streams.
+_INSUFFICIENT_LENGTHS, _SHORT_LENGTHS = (0, 1), (2, 3)
 
 
 @dataclass(frozen=True)
 class Protocol:
     """Measurements of a task, and the rules for its answers.
 
-    `measurements` creates the input of an ordinary case; `check` checks an answer against the interface
-    (AlgorithmError); `failures` lists the outcomes without a result.
+    - measurements: creates the input of an ordinary case
+    - check: returns a valid answer; raises AlgorithmError for an answer that does not conform to the interface
+    - is_valid: whether an answer contains a result
+    - describe: formats an answer
+    - failures: outcomes without a result, as text
     """
 
     measurements: Callable[[], Any]
@@ -50,7 +55,7 @@ VELOCITY = Protocol(
     describe=describe_velocity,
     failures=", ".join(outcome.name for outcome in VelocityOutcome if outcome is not VelocityOutcome.VALID),
 )
-STREAM = replace(VELOCITY, measurements=partial(inputs.descent, _IMAGES))
+STREAM = replace(VELOCITY, measurements=partial(inputs.descent, _STREAM_LENGTH))
 LANDING = Protocol(
     measurements=inputs.landing,
     check=check_site,
@@ -86,9 +91,9 @@ class EstimatorSuite(Suite):
         if protocol is STREAM:
             advice = f"return one of the failures from finish: {VELOCITY.failures}"
             yield Check("few", "returns a failure for zero images and for one image", advice, self._check_short_streams)
-            rule = f"returns a well-formed answer to {', '.join(map(str, _SHORT))} and {_LONG} images"
+            rule = f"returns a well-formed answer to {', '.join(map(str, _SHORT_LENGTHS))} and {_LONG_LENGTH} images"
             advice = "accept any number: see VelocityStream in algorithms/interface.py"
-            streams = (*map(_select_first_images, _SHORT), inputs.descent(_LONG))
+            streams = (*map(_select_first_images, _SHORT_LENGTHS), inputs.descent(_LONG_LENGTH))
             yield Check("number", rule, advice, lambda: "; ".join(describe_velocity(self._answer(s)) for s in streams))
             rule, advice = "resets its state after an interrupted descent", "reset the whole state in start"
             yield Check("start", rule, advice, self._check_restart)
@@ -117,7 +122,7 @@ class EstimatorSuite(Suite):
 
     def _check_short_streams(self) -> str:
         outcomes = []
-        for number in _TOO_SHORT:
+        for number in _INSUFFICIENT_LENGTHS:
             answer = self._answer(_select_first_images(number))
             if VELOCITY.is_valid(answer):
                 raise BreachError(f"it answers {answer.outcome.name} to {number or 'no'} image: no motion is visible")
@@ -137,4 +142,4 @@ class EstimatorSuite(Suite):
 
 
 def _select_first_images(number: int) -> DescentMeasurements:
-    return inputs.descent(_IMAGES).select(tuple(range(number)))
+    return inputs.descent(_STREAM_LENGTH).select(tuple(range(number)))

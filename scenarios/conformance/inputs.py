@@ -34,8 +34,8 @@ Measurements = TypeVar("Measurements", DescentMeasurements, LandingMeasurements)
 
 #: Mean radiance factor of the plane, and radiance factor outside the plane.
 MEAN, BACKGROUND = 0.2, 0.1
-#: Side of the periodic texture, samples, and its standard deviation relative to the mean.
-_SIZE, _CONTRAST = 1024, 0.2
+#: Side of the periodic texture in samples, and standard deviation of its values relative to their mean.
+_TEXTURE_SIZE, _TEXTURE_CONTRAST = 1024, 0.2
 #: Mean velocity of the descent, east, north, up, m/s.
 DESCENT_VELOCITY_M_S = np.array([12.0, -7.0, -75.0])
 #: Maximum time between images, and from the first to the last image, s.
@@ -44,7 +44,7 @@ _INTERVAL_S, _DURATION_S = 3.75, 7.5
 _ATTITUDES_DEG = ((40, 4, -3), (44, 2, 3), (41, -3, 5))
 _START_POSITION_M = np.array([0.0, 0.0, 1900.0])
 #: Positions of the two landing images, metres.
-_HOVER_M = np.array([[0.0, 0.0, 30.0], [1.2, 0.2, 29.8]])
+_LANDING_POSITIONS_M = np.array([[0.0, 0.0, 30.0], [1.2, 0.2, 29.8]])
 
 #: Function of the detector's calibration that returns the count of all pixels of a blank image.
 Blank = Callable[[DetectorCalibration], int]
@@ -71,9 +71,9 @@ class TexturedPlane:
         origins, directions = camera.rays(camera.pixel_grid())
         normal = np.cross(*self.axes)
         offset = (self.origin - origins) @ normal
-        slope = directions @ normal
+        normal_component = directions @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
-            ranges = offset / slope
+            ranges = offset / normal_component
         visible = np.isfinite(ranges) & (ranges > 0.0)
         points = origins + np.where(visible, ranges, 1.0)[..., None] * directions - self.origin
         columns, rows = np.moveaxis(points @ self.axes.T, -1, 0) / self.step_m
@@ -85,11 +85,12 @@ class TexturedPlane:
 def texture() -> Float32[np.ndarray, "rows columns"]:
     """Create periodic noise of mean 1; its amplitudes decrease with frequency, as on natural surfaces."""
     rng = np.random.default_rng(20040103)
-    frequency = np.hypot(*np.meshgrid(fft.fftfreq(_SIZE), fft.rfftfreq(_SIZE), indexing="ij"))
+    frequency = np.hypot(*np.meshgrid(fft.fftfreq(_TEXTURE_SIZE), fft.rfftfreq(_TEXTURE_SIZE), indexing="ij"))
     frequency[0, 0] = np.inf
-    amplitude = np.where(frequency < 0.3, frequency**-1.2, 0.0) * (frequency > 4.0 / _SIZE)
-    values = fft.irfft2(amplitude * fft.rfft2(rng.standard_normal((_SIZE, _SIZE))), (_SIZE, _SIZE))
-    return np.asarray(1.0 + _CONTRAST * values / values.std(), dtype=np.float32)
+    amplitude = np.where(frequency < 0.3, frequency**-1.2, 0.0) * (frequency > 4.0 / _TEXTURE_SIZE)
+    shape = (_TEXTURE_SIZE, _TEXTURE_SIZE)
+    values = fft.irfft2(amplitude * fft.rfft2(rng.standard_normal(shape)), shape)
+    return np.asarray(1.0 + _TEXTURE_CONTRAST * values / values.std(), dtype=np.float32)
 
 
 @cache
@@ -103,7 +104,7 @@ def descent(image_count: int = 3) -> DescentMeasurements:
     # constant horizontal error of the inertial velocity, m/s
     inertial = DESCENT_VELOCITY_M_S + np.array([9.0, -4.0, 0.0])
     return DescentMeasurements(
-        images=tuple(_take_images(preset("mer-descent-flown"), positions, attitudes, times, 2.0)),
+        images=tuple(_take_images(preset("mer-descent-flown"), positions, attitudes, times, step_m=2.0)),
         attitudes=tuple(AttitudeMeasurement(attitude, time) for attitude, time in zip(attitudes, times, strict=True)),
         altitudes=tuple(AltitudeMeasurement(float(z), time) for z, time in zip(positions[:, 2], times, strict=True)),
         interval_velocities_m_s=np.tile(inertial, (image_count - 1, 1)),
@@ -117,22 +118,23 @@ def landing() -> LandingMeasurements:
     """Create the measurements of two helicopter images of level, textured ground; all instruments are exact."""
     attitudes = [Rotation.from_euler("ZYX", angles, degrees=True) for angles in ((10, 3, -2), (10.2, 2.8, -1.9))]
     times = [0.0, 2.0]
-    first, second = _take_images(preset("xc-55"), _HOVER_M, attitudes, times, 0.03)
-    poses = [PoseMeasurement(rigid(attitudes[k], _HOVER_M[k]), times[k]) for k in (0, 1)]
+    first, second = _take_images(preset("xc-55"), _LANDING_POSITIONS_M, attitudes, times, step_m=0.03)
+    poses = [PoseMeasurement(rigid(attitudes[k], _LANDING_POSITIONS_M[k]), times[k]) for k in (0, 1)]
     axis = attitudes[0].apply(first.camera.a.copy())
-    slant = -_HOVER_M[0, 2] / axis[2]
+    slant = -_LANDING_POSITIONS_M[0, 2] / axis[2]
     return LandingMeasurements(
         images=(first, second),
         poses=(poses[0], poses[1]),
         slant_range_m=float(slant),
         up_body=np.asarray(attitudes[0].inv().apply([0.0, 0.0, 1.0])),
-        apriori_site_world=np.asarray(_HOVER_M[0] + slant * axis),
+        apriori_site_world=np.asarray(_LANDING_POSITIONS_M[0] + slant * axis),
     )
 
 
 def _take_images(
     detector_preset: Preset, positions: np.ndarray, attitudes: Sequence[Rotation], times: Sequence[float], step_m: float
 ) -> list[DetectorImage]:
+    """Take images of level, textured ground; `step_m` is the spacing of the texture's samples."""
     (camera,) = detector_preset.cameras()
     ground = TexturedPlane(np.zeros(3), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), step_m)
     rng = np.random.default_rng(1)

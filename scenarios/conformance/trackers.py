@@ -23,10 +23,12 @@ from marsyard.sim.sensor import stereo_mast
 
 #: Largest count of the 12-bit cameras, and mean count of the wall.
 FULL_SCALE_DN, _MEAN_DN = 4095, 1500.0
-#: Distance of the wall from the start, length of a step, number of stops of the drive.
-_WALL_M, _STEP_M, _STOPS = 8.0, 0.4, 4
-#: The designated point on the wall, world axes.
-TARGET_M = np.array([_WALL_M, 0.3, 1.2])
+#: Distance of the wall from the start, length of a step, metres, and number of stops of the drive.
+_WALL_DISTANCE_M, _STEP_M, _STOPS = 8.0, 0.4, 4
+#: Spacing of the texture's samples on the wall, metres.
+_TEXTURE_STEP_M = 0.006
+#: The designated point on the wall, world axes, metres.
+TARGET_M = np.array([_WALL_DISTANCE_M, 0.3, 1.2])
 #: Count of all pixels of the blank images.
 BLANKS = {"featureless": 1500, "dark": 0, "saturated": FULL_SCALE_DN}
 
@@ -63,7 +65,8 @@ def take_images(aim: MastAim, world_from_rover: RigidTransform, blank: int | Non
 def _take_image(camera: CameraModel, box: PixelBox, blank: int | None) -> MastImage:
     if blank is not None:
         return MastImage(np.full(box.size[::-1], blank, np.uint16), box.corner)
-    wall = TexturedPlane(np.array([_WALL_M, 0.0, 0.0]), np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]), 0.006)
+    wall_axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+    wall = TexturedPlane(np.array([_WALL_DISTANCE_M, 0.0, 0.0]), wall_axes, _TEXTURE_STEP_M)
     radiance = wall.radiance(camera.crop(*box.corner, box.size))
     return MastImage(np.clip(np.rint(_MEAN_DN / MEAN * radiance), 0, FULL_SCALE_DN).astype(np.uint16), box.corner)
 
@@ -80,7 +83,7 @@ class TrackerSuite(Suite):
         """See `Suite`."""
         advice = "see algorithms/interface.py for aim, update and state"
         rule = "returns a well-formed aim and answer at every stop of a drive"
-        yield Check("answer", rule, advice, lambda: ", ".join(update.state.name for update in drive(self.make())))
+        yield Check("answer", rule, advice, self._list_states)
         yield Check("states", "has no target before the designation and after clear", advice, self._check_states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
@@ -95,12 +98,15 @@ class TrackerSuite(Suite):
         return [designation()]
 
     def _call(self, algorithm: Any, case: PixelTarget, seed: int) -> Sequence[TargetUpdate]:
-        updates = drive(algorithm)
+        updates = drive_to_target(algorithm)
         algorithm.clear()
         return updates
 
     def _check_answer(self, answer: Any, case: PixelTarget) -> Any:
-        return answer  # checked by `drive`
+        return answer  # checked by `drive_to_target`
+
+    def _list_states(self) -> str:
+        return ", ".join(update.state.name for update in drive_to_target(self.make()))
 
     def _check_states(self) -> str:
         tracker = self.make()
@@ -116,8 +122,8 @@ class TrackerSuite(Suite):
 
     def _check_loss(self, name: str, blank: int) -> str:
         tracker = self.make()
-        drive(tracker)
-        update = stop(tracker, pose(_STOPS * _STEP_M), blank)
+        drive_to_target(tracker)
+        update = update_tracker(tracker, pose(_STOPS * _STEP_M), blank)
         if update is None:
             return "no aim"
         if update.found:
@@ -128,7 +134,7 @@ class TrackerSuite(Suite):
 
     def _check_pose_jump(self) -> str:
         tracker = self.make()
-        drive(tracker)
+        drive_to_target(tracker)
         measurements = replace(take_images(aim_ahead(), pose(0.0)), world_from_rover=pose(3.0))
         return check_update(tracker.update(copy_inputs(measurements))).state.name
 
@@ -145,7 +151,7 @@ class TrackerSuite(Suite):
 
     def _answer_time_s(self) -> float:
         """Measure the maximum time of an update in a second drive; the first drive compiles kernels."""
-        drive(self.make())
+        drive_to_target(self.make())
         tracker = self.make()
         tracker.designate(copy_inputs(designation()), pose(0.0))
         times = []
@@ -156,12 +162,12 @@ class TrackerSuite(Suite):
         return max(times)
 
 
-def drive(tracker: Any) -> Sequence[TargetUpdate]:
+def drive_to_target(tracker: Any) -> Sequence[TargetUpdate]:
     """Designate the target and drive towards it; return the updates at the stops, up to a failure."""
     tracker.designate(copy_inputs(designation()), pose(0.0))
     updates: list[TargetUpdate] = []
     for number in range(_STOPS):
-        update = stop(tracker, pose(number * _STEP_M))
+        update = update_tracker(tracker, pose(number * _STEP_M))
         if update is None:
             break
         updates.append(update)
@@ -170,7 +176,7 @@ def drive(tracker: Any) -> Sequence[TargetUpdate]:
     return updates
 
 
-def stop(tracker: Any, rover_pose: RigidTransform, blank: int | None = None) -> TargetUpdate | None:
+def update_tracker(tracker: Any, rover_pose: RigidTransform, blank: int | None = None) -> TargetUpdate | None:
     """Aim, take images and update the tracker; check its answers against the interface. None without an aim."""
     aim = check_aim(tracker.aim(rover_pose, copy_inputs(mast())), mast())
     if aim is None:

@@ -67,31 +67,31 @@ class World:
         ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.location.terrain))
         return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
-    def scene(self, east_m: float, north_m: float, lowest_m: float, pixel_rad: float) -> Scene:
+    def scene(self, east_m: float, north_m: float, last_height_m: float, pixel_rad: float) -> Scene:
         """Create the scene of all images of a descent, without the lander's shadow and clouds.
 
         - east_m, north_m: position below the first image
-        - lowest_m: height above ground of the last image; determines the smallest rocks of the scene
+        - last_height_m: height above ground of the last image; determines the smallest rocks of the scene
         - pixel_rad: angle of a pixel
         """
         if self.ground is None:
-            finest = min(MESH_FINEST_M, MESH_FINEST_FRACTION * lowest_m)
-            scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry(), mesh_finest_m=finest)
+            mesh_finest_m = min(MESH_FINEST_M, MESH_FINEST_FRACTION * last_height_m)
+            scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry(), mesh_finest_m=mesh_finest_m)
         else:
-            scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
+            scene = site_scene(self.ground, Eye(east_m, north_m, last_height_m, pixel_rad), self.sun)
         return add_meshes(scene, self.meshes, (east_m, north_m))
 
 
 #: Path length to which the optical depth of the haze fault refers, m: about the height of the first image.
-HAZE_HEIGHT_M = 2000.0
+HAZE_PATH_M = 2000.0
 #: Diameter of MER's aeroshell (Desai & Knocke 2004), m.
 SHIELD_DIAMETER_M = 2.65
 #: Heat shield relative to the lander: horizontal speed, m/s, and tumble rate, rad/s (assumed).
-DRIFT_M_S, TUMBLE_RAD_S = 2.0, 1.0
+SHIELD_DRIFT_M_S, SHIELD_TUMBLE_RAD_S = 2.0, 1.0
 #: Largest angle of the heat shield from nadir in the first image, radians (assumed).
-MAX_OFF_NADIR_RAD = 0.2
+SHIELD_MAX_OFF_NADIR_RAD = 0.2
 #: Assumed albedos of the shield: charred outside, insulated inside.
-OUTSIDE_ALBEDO, INSIDE_ALBEDO = 0.1, 0.5
+SHIELD_OUTSIDE_ALBEDO, SHIELD_INSIDE_ALBEDO = 0.1, 0.5
 
 
 def take_exposures(
@@ -121,7 +121,7 @@ def take_exposures(
         frame, motion = render_state(p.render.backend, scene, optics, state, mounting)
         height = float(state.position_m[2]) - float(world.surface.height(*state.position_m[:2]))
         extinction = world.air.mean_extinction_m(height) if world.ground else 0.0
-        radiance = add_haze(frame, world.air, world.sun, extinction + p.faults.haze / HAZE_HEIGHT_M)
+        radiance = add_haze(frame, world.air, world.sun, extinction + p.faults.haze / HAZE_PATH_M)
         if shield is not None:
             radiance = shield.paint_over(radiance, frame, world.sun, state.time_s)
         yield detector.expose(radiance * np.float32(world.brightness), noise, motion), frame
@@ -143,16 +143,17 @@ class HeatShield:
     @classmethod
     def draw(cls, first: State, angle_rad: float, rng: np.random.Generator) -> HeatShield:
         """Draw a shield below the lander at its first image; `angle_rad` is its angular diameter seen face on."""
-        limits = [2 * np.pi, MAX_OFF_NADIR_RAD, 2 * np.pi, 2 * np.pi]
+        limits = [2 * np.pi, SHIELD_MAX_OFF_NADIR_RAD, 2 * np.pi, 2 * np.pi]
         azimuth, off_nadir, drift_azimuth, axis_azimuth = rng.uniform(size=4) * limits
         ray = np.array([np.sin(azimuth) * np.sin(off_nadir), np.cos(azimuth) * np.sin(off_nadir), -np.cos(off_nadir)])
-        drift = np.array([DRIFT_M_S * np.sin(drift_azimuth), DRIFT_M_S * np.cos(drift_azimuth), -SHIELD_FALL_M_S])
+        drift_direction = np.array([np.sin(drift_azimuth), np.cos(drift_azimuth)])
+        drift = np.array([*(SHIELD_DRIFT_M_S * drift_direction), -SHIELD_FALL_M_S])
         axis = np.array([np.cos(axis_azimuth), np.sin(axis_azimuth), 0.0])
         return cls(
             centre_m=first.position_m + SHIELD_DIAMETER_M / (2.0 * np.tan(0.5 * angle_rad)) * ray,
             velocity_m_s=first.velocity_m_s + drift,
             normal=Rotation.from_rotvec(rng.uniform(-np.pi, np.pi) * axis).apply([0.0, 0.0, -1.0]),
-            spin_rad_s=TUMBLE_RAD_S * axis,
+            spin_rad_s=SHIELD_TUMBLE_RAD_S * axis,
             start_s=first.time_s,
         )
 
@@ -171,7 +172,7 @@ class HeatShield:
         is_hit = (distance > 0.0) & (centre_distance < 0.5 * SHIELD_DIAMETER_M)
         # the visible side faces the camera
         sun_cosine = np.maximum(-np.sign(cosines) * float(normal @ sun.direction), 0.0)
-        reflected = np.where(cosines < 0.0, OUTSIDE_ALBEDO, INSIDE_ALBEDO) * sun_cosine
+        reflected = np.where(cosines < 0.0, SHIELD_OUTSIDE_ALBEDO, SHIELD_INSIDE_ALBEDO) * sun_cosine
         combined = np.where(is_hit, reflected, radiance.reshape(-1))
         return combined.astype(np.float32).reshape(radiance.shape)
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_time_fault
-from marsyard.scenarios.descent.recorded import AFTER_S, check_looks_down
+from marsyard.scenarios.descent.recorded import END_MARGIN_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import CustomMotion, DescentPlace
 from marsyard.sim.dynamics import State, SwingDescent, Trajectory
@@ -20,9 +20,9 @@ from marsyard.sim.terrain import Surface
 #: Gravity on Mars, m/s^2, used for a generic terrain.
 MARS_GRAVITY_M_S2 = 3.72
 #: Duration of a simulated descent before the first image, s.
-LEAD_S = 5.0
+SIMULATED_LEAD_S = 5.0
 #: Margin of the inertial unit's data: after the start of the motion and after the thrusters' firing, s.
-MARGIN_S = 0.1
+IMU_MARGIN_S = 0.1
 #: Number of times at which the height of a recorded or custom flight is compared with the firing height.
 _SEARCH_TIMES = 2000
 
@@ -64,10 +64,10 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
             streams.generator("gusts"),
             ground_height_m=ground,
             gravity_m_s2=gravity_m_s2(p),
-            lead_s=LEAD_S,
+            lead_s=SIMULATED_LEAD_S,
         )
         columns = {f"descent_{name}": value for name, value in descent.parameters.model_dump().items()}
-        return DescentFlight(descent, LEAD_S, descent.thruster_firing_s, columns)
+        return DescentFlight(descent, SIMULATED_LEAD_S, descent.thruster_firing_s, columns)
     motion: RecordedMotion
     row: Mapping[str, Scalar]
     if isinstance(p.flight, CustomMotion):
@@ -76,7 +76,7 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
             gravity_m_s2=gravity_m_s2(p),
             pictures_s=tuple(times),
             from_s=-p.flight.lead_s,
-            until_s=max(times) + AFTER_S,
+            until_s=max(times) + END_MARGIN_S,
             firing_height_m=p.descent.thruster_firing_m,
         )
         motion, row = p.flight.compute(place, site_m, streams.generator("own motion"))
@@ -97,12 +97,13 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
 
 def _find_firing_time(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
     """Return the first time at the firing height, relative to the ground below the first image, or the last time."""
-    times = np.linspace(max(p.image_times_s), motion.span_s[1] - MARGIN_S, _SEARCH_TIMES)
+    times = np.linspace(max(p.image_times_s), motion.span_s[1] - IMU_MARGIN_S, _SEARCH_TIMES)
     first = motion.state(0.0).position_m
     heights = motion.motion(times).positions_m[:, 2] - float(surface.height(first[0], first[1]))
     indices = np.flatnonzero(heights <= p.descent.thruster_firing_m)
     if not indices.size or indices[0] == 0:
         return float(times[0 if indices.size else -1])
+    # the height decreases; `np.interp` needs increasing values
     crossing = slice(indices[0] - 1, indices[0] + 1)
     return float(np.interp(-p.descent.thruster_firing_m, -heights[crossing], times[crossing]))
 

@@ -11,7 +11,7 @@ from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.descent.exposure import World, calibrated_camera, camera_optics
-from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2, mean_velocities
+from marsyard.scenarios.descent.flight import IMU_MARGIN_S, DescentFlight, gravity_m_s2, mean_velocities
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_altitude_faults, add_attitude_faults
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (
@@ -59,13 +59,13 @@ class Instruments:
     @classmethod
     def draw(cls, p: DescentScenarioParameters, world: World, flight: DescentFlight, streams: Streams) -> Instruments:
         """Draw the instruments of a case, propagate the navigation, and read the custom instruments."""
-        start, end = -flight.lead_s + MARGIN_S, flight.firing_s + MARGIN_S
+        start, end = -flight.lead_s + IMU_MARGIN_S, flight.firing_s + IMU_MARGIN_S
         approach = Approach(p.approach, start)
         uncalibrated_imu = Imu.draw(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
         imu = approach.calibrate(uncalibrated_imu, streams.generator("inertial unit's calibration"))
         clock = Clock.draw(p.clock, streams.generator("image clock"))
         surface, motion = world.surface, flight.motion
-        # readings and columns of the custom instruments, by parameter table
+        # readings and result columns of the custom instruments, by parameter table
         custom: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
         tags = clock.tags(np.array(p.image_times_s), streams.generator("image time tags"))
         for table, times in (("altimeter", np.array(p.image_times_s)), ("attitude_source", tags)):

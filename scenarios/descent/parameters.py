@@ -303,7 +303,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         if self.triple is not None and not 1 <= self.triple[0] < self.triple[1] < self.triple[2] <= self.pictures:
             raise ValueError(f"triple is {list(self.triple)}; allowed: three in ascending order, 1 to {self.pictures}")
         if self.pictures < TRIPLE_SIZE:
-            specs = [spec for spec in self.algorithms if VELOCITY.takes_stream(spec) is False]
+            specs = [spec for spec in self.algorithms if VELOCITY.accepts_stream(spec) is False]
             if specs:
                 raise ValueError(
                     f"pictures is {self.pictures}, but '{specs[0]}' needs {TRIPLE_SIZE}; allowed: {TRIPLE_SIZE} to 100"

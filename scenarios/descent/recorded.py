@@ -15,7 +15,7 @@ from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, 
 from marsyard.sim.parameters import bounded_field
 
 #: Required duration of the flight after the last image, s.
-AFTER_S = 0.5
+END_MARGIN_S = 0.5
 
 
 class FlightFile(UserFile, RecordedAxes):
@@ -52,12 +52,12 @@ class FlightFile(UserFile, RecordedAxes):
         """Raise ValueError if the flight does not cover the images, or its camera looks up or is below the ground."""
         motion = self.motion(np.zeros(3), 0.0)
         first, last = motion.span_s
-        if first > -self.lead_s + 1e-9 or last < max(pictures_s) + AFTER_S:
+        if first > -self.lead_s + 1e-9 or last < max(pictures_s) + END_MARGIN_S:
             begin, end = read_poses(self.file).times_s[[0, -1]]
             raise TrajectoryFileError(
                 f"{self.file}: covers {begin:.3f} to {end:.3f} s; images from {self.start_s:.3f} to "
-                f"{self.start_s + max(pictures_s):.3f} s, lead_s {self.lead_s:g} s before and {AFTER_S:g} s after them "
-                "are needed"
+                f"{self.start_s + max(pictures_s):.3f} s, lead_s {self.lead_s:g} s before and {END_MARGIN_S:g} s after "
+                "them are needed"
             )
         check_looks_down(self.file, motion, pictures_s)
         for number, position in enumerate(motion.motion(np.array(pictures_s)).positions_m, start=1):

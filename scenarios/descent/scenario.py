@@ -131,6 +131,7 @@ def draw_detector(p: DescentScenarioParameters, optics: Optics, streams: Streams
 class Descent:
     """A simulated descent and its measurements, which all algorithms of a case use.
 
+    - p: parameters of the case
     - states, images: true states at the images, and the delivered images
     - overlap: columns of `feasible_overlap_row`, empty if there are fewer than three images
     """

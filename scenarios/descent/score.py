@@ -28,7 +28,7 @@ from marsyard.sim.sensor import height_above_ground
 Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 #: Width of the ground patch whose mean height is the reference of DIMES' altitude, m.
-PATCH_M = 200.0
+GROUND_PATCH_M = 200.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def conditions(
         "location_north_m": float(states[0].position_m[1]),
         **sun_columns(world.sun.direction),
         "horizontal_speed_m_s": float(np.hypot(*states[-1].velocity_m_s[:2])),
-        "descent_rate_m_s": float(-np.diff([states[0].position_m[2], states[-1].position_m[2]])[0])
+        "descent_rate_m_s": float(states[0].position_m[2] - states[-1].position_m[2])
         / (states[-1].time_s - states[0].time_s),
         "firing_after_s": at_firing.time_s - states[-1].time_s,
     }
@@ -169,7 +169,7 @@ def feasible_overlap_row(
     of images has no such point, the geometry makes DIMES fail.
     """
     columns, rows = bin_factors(camera.size[::-1], options.binned_size)
-    patch_samples = PATCH_M / world.surface.spacing_m
+    patch_samples = GROUND_PATCH_M / world.surface.spacing_m
     level = int(np.clip(np.rint(np.log2(max(patch_samples, 1.0))), 0, len(world.surface.levels) - 1))
     blank = np.zeros(options.binned_size[::-1], dtype=np.float32)
     views = []

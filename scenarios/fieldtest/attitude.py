@@ -1,8 +1,8 @@
 """Estimate the attitude at the images of a flight from surveyed targets and gyros (paper, III.D.2).
 
-Directions are related in an inertial frame that coincides with the surface-fixed world axes at time 0, because gyros
-measure the rotation relative to inertial space: 15 deg/h more than relative to the ground. The Earth's rotation rate
-maps the directions from survey and GPS into this frame, and the estimated attitudes back.
+Gyros measure the rotation relative to inertial space, which includes the Earth's rotation of 15 deg/h. Directions are
+therefore compared in an inertial frame that coincides with the surface-fixed world axes at time 0. The Earth's rotation
+rate maps the directions from survey and GPS into this frame, and the estimated attitudes back.
 
 The helicopter passes over the targets at the start and at the end of the flight. The gyros map the target directions of
 all images of a pass to one instant. The directions in the images, and those from survey and GPS, determine the attitude
@@ -60,7 +60,7 @@ class EarthRotation:
 
 @dataclass(frozen=True)
 class InertialTrajectory(Trajectory):
-    """A trajectory with attitudes relative to inertial axes, as gyros measure it; positions, forces are unchanged."""
+    """A trajectory with attitudes relative to inertial axes, as gyros measure them; other states are unchanged."""
 
     trajectory: Trajectory
     earth: EarthRotation
@@ -113,15 +113,16 @@ def solve_attitude(
     - earth: rotation that maps the attitudes from inertial axes to world axes
     """
     times = np.concatenate([first.times_s, second.times_s])
-    camera = np.concatenate([first.camera, second.camera])
-    world = earth.to_inertial(times).apply(np.concatenate([first.world, second.world]))
+    body_directions = np.concatenate([first.body_directions, second.body_directions])
+    world_directions = np.concatenate([first.world_directions, second.world_directions])
+    inertial_directions = earth.to_inertial(times).apply(world_directions)
     bias = np.zeros(3)
     # attitude at the start of the flight
-    measured_directions = _propagate(increments, bias).attitude(first.times_s).apply(first.camera)
-    start, _ = Rotation.align_vectors(world[: len(measured_directions)], measured_directions)
+    measured_directions = _propagate(increments, bias).attitude(first.times_s).apply(first.body_directions)
+    start, _ = Rotation.align_vectors(inertial_directions[: len(measured_directions)], measured_directions)
     for _ in range(_ITERATIONS):
         propagated = _propagate(increments, bias)
-        predicted = (start * propagated.attitude(times)).apply(camera)
+        predicted = (start * propagated.attitude(times)).apply(body_directions)
         # cross-product matrices of the predicted directions v: M w = v x w
         (x, y, z), zero = predicted.T, np.zeros(len(predicted))
         cross = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), 2, 0)
@@ -131,7 +132,7 @@ def solve_attitude(
         bias_jacobian = np.einsum("nij,jk,nkl->nil", cross, start.as_matrix(), -integral[indices])
         rows = np.concatenate([-cross, -bias_jacobian], axis=2).reshape(-1, 6) / sighting_sd_rad
         prior = np.concatenate([np.zeros((3, 3)), np.eye(3)], axis=1) / bias_sd_rad_s
-        residuals = np.concatenate([(world - predicted).ravel() / sighting_sd_rad, -bias / bias_sd_rad_s])
+        residuals = np.concatenate([(inertial_directions - predicted).ravel() / sighting_sd_rad, -bias / bias_sd_rad_s])
         change = np.linalg.lstsq(np.concatenate([rows, prior]), residuals, rcond=None)[0]
         start = Rotation.from_rotvec(change[:3]) * start
         bias = bias + change[3:]

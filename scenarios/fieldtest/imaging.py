@@ -152,8 +152,7 @@ def sun_at(run: FlownRun, time_s: float) -> Sun:
 def scene_at(run: FlownRun, start_scene: Scene, ground: SiteGround, time_s: float) -> Scene:
     """Return the run's scene with the sun at a given time.
 
-    The sun is updated for every image, because its motion moves the shadows of clouds at 2.5 km height by a third of a
-    metre per second.
+    The sun is updated for every image: its motion moves the shadows of clouds at 2.5 km height by 0.3 m/s.
     """
     sun = sun_at(run, time_s)
     return start_scene.with_light(sun, ground.photometry(sun))

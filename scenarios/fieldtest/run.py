@@ -39,7 +39,7 @@ from marsyard.sim.terrain import Surface, site
 #: Number of points on the flight line whose mean ground height is the reference of the flight's heights.
 _GROUND_POINTS = 256
 #: Margin of the elevation model around the requested points, posts.
-_MARGIN = 2
+_MARGIN_POSTS = 2
 #: Rays along each side of a pixel at the edges of the targets.
 _TARGET_EDGE_RAYS = 4
 #: Minimum number of sightings of a pass: two directions determine an attitude, one more checks it.
@@ -94,9 +94,9 @@ def draw_triples(
     min_altitude = np.minimum(images.altitude_m[:, None], images.altitude_m)
     is_pair = _pairwise_distances(images.centre_m) <= parameters.overlap_fraction * min_altitude
     is_pair &= _pairwise_distances(images.position_m[:, :2]) <= parameters.max_speed_m_s * parameters.virtual_interval_s
-    first = np.arange(len(images.pass_number) - 2)
-    in_one_pass = images.pass_number[first] == images.pass_number[first + 2]
-    consecutive = first[in_one_pass & is_pair[first, first + 1] & is_pair[first + 1, first + 2]]
+    start = np.arange(len(images.pass_number) - 2)
+    in_one_pass = images.pass_number[start] == images.pass_number[start + 2]
+    consecutive = start[in_one_pass & is_pair[start, start + 1] & is_pair[start + 1, start + 2]]
     # all triples whose GPS height decreases by a permitted step from image to image
     step = images.position_m[:, 2][:, None] - images.position_m[:, 2]
     is_step = is_pair & (step >= parameters.min_step_m) & (step <= parameters.max_step_m)
@@ -144,7 +144,7 @@ class Run(FlownRun):
     triples: tuple[Triple, ...]
 
 
-def survey_ground(
+def simulate_elevation_model(
     p: ElevationParameters, surface: Surface, points_m: Float64[np.ndarray, "n 2"], rng: np.random.Generator
 ) -> RegularGridInterpolator:
     """Simulate an elevation model of the ground around points; heights are linear between posts (paper, III.D.1).
@@ -152,8 +152,8 @@ def survey_ground(
     The height of a post is the mean height of its cell plus a correlated error.
     """
     x, y = (
-        p.posting_m * np.arange(np.floor(low / p.posting_m) - _MARGIN, np.ceil(high / p.posting_m) + _MARGIN + 1.0)
-        for low, high in zip(points_m.min(axis=0), points_m.max(axis=0), strict=True)
+        p.posting_m * np.arange(np.floor(low) - _MARGIN_POSTS, np.ceil(high) + _MARGIN_POSTS + 1.0)
+        for low, high in zip(points_m.min(axis=0) / p.posting_m, points_m.max(axis=0) / p.posting_m, strict=True)
     )
     level = int(np.clip(np.rint(np.log2(p.posting_m / surface.spacing_m)), 0, len(surface.levels) - 1))
     ground = surface.height(*np.meshgrid(x, y, indexing="ij"), level)
@@ -190,7 +190,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     solution = _estimate_attitudes(flown, ground, clock, gps)
     attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
-    elevation_model = survey_ground(p.elevation, surface, horizontal, generator("elevation model"))
+    elevation_model = simulate_elevation_model(p.elevation, surface, horizontal, generator("elevation model"))
     interpolation = generator("elevation interpolation").standard_normal(len(horizontal))
     altitude = position[:, 2] - (elevation_model(horizontal) + p.elevation.interpolation_m * interpolation)
     down = attitudes.apply(np.array([0.0, 0.0, -1.0]))
@@ -222,11 +222,11 @@ def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gp
         tags = clock.tags(times, noise)
         fixes = gps.measure(flight, times, noise).values
         if p.targets.sightings == "rendered":
-            centroids = photograph_targets(run, ground, targets, times, fixes)
+            centroids = render_and_detect_targets(run, ground, targets, times, fixes)
         else:
             true_camera = field_camera().bin(columns=1, rows=p.detector.rows_summed)
             centroids = project_targets(targets, true_camera, flight.motion(times), p.targets.centroid_px, noise)
-        sightings.append(Sightings.of_images(targets, camera, tags, fixes, centroids))
+        sightings.append(Sightings.from_centroids(targets, camera, tags, fixes, centroids))
         if (count := len(sightings[-1].times_s)) < _MIN_SIGHTINGS:
             raise ValueError(
                 f"{run.parameters.name}: {count} sightings of targets in a pass; the attitude needs {_MIN_SIGHTINGS}"
@@ -236,13 +236,13 @@ def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gp
     imu = Imu.draw(p.imu, flight.span_s, generator("imu errors"))
     increments = imu.increments(InertialTrajectory(flight, earth), *flight.span_s, generator("imu noise"))
     increments = add_thermal_drift(increments, p.drift, flight, flight.span_s[0])
-    # the larger of a centroid's error and the remaining GPS error, as angles
+    # standard deviation of a direction: the larger of the centroid's error and the remaining GPS error, as angles
     pixel_rad = 1.0 / camera.focal_lengths[0]
-    sd = max(p.targets.centroid_px * pixel_rad, p.gps.horizontal_wander_m / p.helicopter.fly_over_m)
-    return solve_attitude(increments, first, second, sd, p.imu.gyro_bias_deg_h * DEG_H, earth)
+    sighting_sd_rad = max(p.targets.centroid_px * pixel_rad, p.gps.horizontal_wander_m / p.helicopter.fly_over_m)
+    return solve_attitude(increments, first, second, sighting_sd_rad, p.imu.gyro_bias_deg_h * DEG_H, earth)
 
 
-def photograph_targets(
+def render_and_detect_targets(
     run: FlownRun,
     ground: SiteGround,
     targets: Targets,

@@ -131,6 +131,7 @@ def _find_triple(p: FieldTestParameters, case: int) -> tuple[int, int]:
 
 def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
     """Return the run and triple of each case; the first n cases contain all runs and categories in proportion."""
+    # the fraction of a category's triples up to and including half of this one determines the order
     ranked = []
     for number, run in enumerate(p.runs):
         start = 0

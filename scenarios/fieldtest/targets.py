@@ -35,7 +35,7 @@ _THRESHOLD_SD = 5.0
 #: Half side of the window of a centroid, divided by the side length of a target in the image.
 _WINDOW_SIDES = 1.5
 #: Maximum distance of a candidate from a predicted target, in metres on the ground: in the vote, and after the fit.
-_VOTE_M, _FIT_M = 3.0, 1.2
+_MAX_VOTE_DISTANCE_M, _MAX_FIT_DISTANCE_M = 3.0, 1.2
 #: Iterations of assignment and fit, and minimum number of detected targets in a valid image.
 _ITERATIONS, _MIN_TARGETS = 3, 5
 #: Height of a panel above the ground, metres.
@@ -86,16 +86,16 @@ class Sightings:
     """Target directions measured in the images of a pass: one row per target and image.
 
     - times_s: time tag of the image
-    - camera: unit vector to the target in body axes, from its centroid in the image
-    - world: unit vector to the target in world axes, from the survey and the helicopter's GPS position
+    - body_directions: unit vector to the target in body axes, from its centroid in the image
+    - world_directions: unit vector to the target in world axes, from the survey and the helicopter's GPS position
     """
 
     times_s: Float64[np.ndarray, "n"]
-    camera: Float64[np.ndarray, "n 3"]
-    world: Float64[np.ndarray, "n 3"]
+    body_directions: Float64[np.ndarray, "n 3"]
+    world_directions: Float64[np.ndarray, "n 3"]
 
     @classmethod
-    def of_images(
+    def from_centroids(
         cls,
         targets: Targets,
         camera: CameraModel,
@@ -155,31 +155,32 @@ def detect_targets(
     - prior: approximate attitude from the platform, world from body
     - prior_sd_rad: standard deviation of the prior per axis
     """
-    none = np.full((len(targets.surveyed_m), 2), np.nan)
+    no_centroids = np.full((len(targets.surveyed_m), 2), np.nan)
     height = float(position_m[2] - targets.surveyed_m[:, 2].mean())
     px_per_m = np.array(camera.focal_lengths) / height
     candidates = find_bright_spots(image, targets.side_m * px_per_m)
     offsets = targets.surveyed_m - position_m
     if len(candidates) < _MIN_TARGETS:
-        return none
+        return no_centroids
     # distances in metres on the ground, as pixels need not be square
     tree = cKDTree(candidates / px_per_m)
     predicted = camera.project(prior.inv().apply(offsets))[0] / px_per_m
-    displacement = _vote(tree, predicted, 4.0 * prior_sd_rad * height)
-    attitude, limit_m = prior, _VOTE_M
+    # search within four standard deviations of the prior
+    displacement = _find_displacement(tree, predicted, 4.0 * prior_sd_rad * height)
+    attitude, limit_m = prior, _MAX_VOTE_DISTANCE_M
     predicted = predicted + displacement
     for _ in range(_ITERATIONS):
         distances, nearest = tree.query(predicted)
         matched = np.flatnonzero(distances < limit_m)
         if len(matched) < _MIN_TARGETS:
-            return none
+            return no_centroids
         measured_directions = camera.rays(candidates[np.asarray(nearest)[matched]])[1]
         attitude = Rotation.align_vectors(_normalize(offsets[matched]), _normalize(measured_directions))[0]
-        predicted, limit_m = camera.project(attitude.inv().apply(offsets))[0] / px_per_m, _FIT_M
+        predicted, limit_m = camera.project(attitude.inv().apply(offsets))[0] / px_per_m, _MAX_FIT_DISTANCE_M
     distances, nearest = tree.query(predicted)
     is_target = (distances < limit_m) & _is_inside(predicted * px_per_m, camera)
     if is_target.sum() < _MIN_TARGETS:
-        return none
+        return no_centroids
     return np.where(is_target[:, None], candidates[nearest], np.nan)
 
 
@@ -195,10 +196,10 @@ def find_bright_spots(
     median, high = np.percentile(top_hat, (50.0, 84.13))
     labels, count = ndimage.label(top_hat > median + _THRESHOLD_SD * (high - median), np.ones((3, 3)))
     peaks = np.array(ndimage.maximum_position(top_hat, labels, np.arange(1, count + 1)), dtype=np.int64).reshape(-1, 2)
-    return _centroids(top_hat, peaks, np.ceil(_WINDOW_SIDES * side_px[::-1]).astype(np.int64))
+    return _compute_centroids(top_hat, peaks, np.ceil(_WINDOW_SIDES * side_px[::-1]).astype(np.int64))
 
 
-def _centroids(
+def _compute_centroids(
     top_hat: np.ndarray, peaks: Int64[np.ndarray, "spots 2"], half_size: Int64[np.ndarray, "2"]
 ) -> Float64[np.ndarray, "spots 2"]:
     """Compute the centroids (column, row) of intensity in windows around peaks (row, column)."""
@@ -214,14 +215,19 @@ def _centroids(
     return np.asarray(peaks[is_inside, ::-1] + shift)
 
 
-def _vote(tree: cKDTree, predicted_m: Float64[np.ndarray, "targets 2"], radius_m: float) -> Float64[np.ndarray, "2"]:
-    """Find the displacement of the predicted targets that brings most of them to a candidate."""
+def _find_displacement(
+    tree: cKDTree, predicted_m: Float64[np.ndarray, "targets 2"], radius_m: float
+) -> Float64[np.ndarray, "2"]:
+    """Find the displacement that moves the largest number of predicted targets to a candidate.
+
+    The displacements from each target to the candidates within `radius_m` are tried.
+    """
     neighbours = tree.query_ball_point(predicted_m, radius_m)
     displacements = np.concatenate(
-        [tree.data[found] - point for found, point in zip(neighbours, predicted_m, strict=True)]
+        [tree.data[indices] - point for indices, point in zip(neighbours, predicted_m, strict=True)]
     )
     if len(displacements) == 0:
         return np.zeros(2)
     distances, _ = tree.query(predicted_m + displacements[:, None])
-    votes = np.count_nonzero(distances < _VOTE_M, axis=1)
+    votes = np.count_nonzero(distances < _MAX_VOTE_DISTANCE_M, axis=1)
     return np.asarray(displacements[np.argmax(votes)])

@@ -111,11 +111,11 @@ def measure_poses(
     p: LandingScenarioParameters, states: tuple[State, State], streams: Streams
 ) -> tuple[PoseMeasurement, PoseMeasurement]:
     """Draw the filter's poses with an error common to both poses, and an error of the motion between them."""
-    n, rng = p.navigation, streams.generator("navigation")
-    position = n.position_m * rng.standard_normal(3)
-    motion = n.motion_m * rng.standard_normal(3)
-    tilt, azimuth = np.radians(n.tilt_deg) * rng.standard_normal(2), np.radians(n.azimuth_deg) * rng.standard_normal()
-    rotation_error = np.radians(n.turn_deg) * rng.standard_normal(3)
+    sd, rng = p.navigation, streams.generator("navigation")
+    position = sd.position_m * rng.standard_normal(3)
+    motion = sd.motion_m * rng.standard_normal(3)
+    tilt, azimuth = np.radians(sd.tilt_deg) * rng.standard_normal(2), np.radians(sd.azimuth_deg) * rng.standard_normal()
+    rotation_error = np.radians(sd.turn_deg) * rng.standard_normal(3)
     common = Rotation.from_rotvec(np.array([tilt[0], tilt[1], azimuth]))
     positions = (position, position + motion)
     rotations = (common, Rotation.from_rotvec(rotation_error) * common)
@@ -146,8 +146,8 @@ def choose_pair(
     """Choose the pair with the highest score; among equal scores, the earliest pair (landing paper, section V).
 
     The choice uses on-board data: poses of the filter, ranges of the laser, and the calibrated camera; level ground is
-    assumed. The commanded height replaces a missing range. Pairs with an overlap below `min_overlap`, or with a motion
-    of the ground in the image above `max_shift_px`, are used only if there are no other pairs.
+    assumed. The commanded height replaces a missing range. A pair is usable if its overlap is at least `min_overlap`
+    and the motion of the ground in the image is at most `max_shift_px`. Other pairs are used only if no pair is usable.
 
     Raises ValueError if there are fewer than two images.
     """

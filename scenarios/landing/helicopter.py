@@ -1,9 +1,9 @@
 """Simulate a helicopter flight with on-board navigation: a transit with images, then the landing at the site.
 
 The filter's estimate controls the landing, and the filter's errors depend slightly on the flight. Picard iteration
-solves for both. Each iteration flies with the errors of the previous iteration, then simulates instruments and filter
-on this flight with the same random numbers, until the path converges. The fixed point is unique because the filter is
-causal. The change of the path in the last iteration is reported.
+solves for both. Each iteration flies with the errors of the previous iteration. It then simulates instruments and
+filter on this flight with the same random numbers. The iterations end when the path converges. The fixed point is
+unique because the filter is causal. The change of the path in the last iteration is reported.
 
 "The paper" is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
@@ -135,12 +135,12 @@ class NavigatedLeg:
 
     def errors(self, trajectory: Trajectory) -> Float64[np.ndarray, "m 9"]:
         """Compute estimated minus true position, velocity and angles (yaw, pitch, roll) at the boundaries."""
-        true = trajectory.motion(self.boundaries_s)
-        angles = self.solution.attitudes.as_euler("ZYX") - true.attitudes.as_euler("ZYX")
+        true_motion = trajectory.motion(self.boundaries_s)
+        angles = self.solution.attitudes.as_euler("ZYX") - true_motion.attitudes.as_euler("ZYX")
         components = [
-            self.solution.positions_m - true.positions_m,
-            self.solution.velocities_m_s - true.velocities_m_s,
-            np.angle(np.exp(1j * angles)),
+            self.solution.positions_m - true_motion.positions_m,
+            self.solution.velocities_m_s - true_motion.velocities_m_s,
+            np.angle(np.exp(1j * angles)),  # wraps the angles to -pi to pi
         ]
         return np.concatenate(components, axis=1)
 
@@ -215,7 +215,7 @@ class Touchdown:
     gps_deviation_m: Float64[np.ndarray, "3"]
     gps_solutions: int  #: number of averaged solutions
     iterations: int  #: number of iterations of flight and filter
-    change_m: float  #: change of the path in the last iteration
+    path_change_m: float  #: change of the path in the last iteration
 
 
 def horizontal_distance_m(first_m: Float64[np.ndarray, "3"], second_m: Float64[np.ndarray, "3"]) -> float:
@@ -242,15 +242,15 @@ def land(
     start = float(transit.navigated.boundaries_s[-1])
     transit_errors = _interpolate_at_knots(path, transit.navigated.boundaries_s, transit.navigated.errors(path))
     errors, previous, end = transit_errors, None, None
-    iterations, change_m, initial = 0, np.inf, transit.navigated.solution.end
-    while iterations < MAX_ITERATIONS and change_m > CONVERGED_M:
+    iterations, path_change_m, initial = 0, np.inf, transit.navigated.solution.end
+    while iterations < MAX_ITERATIONS and path_change_m > CONVERGED_M:
         flight = simulate_landing(transit.flight, p.guidance, site_m[:2], errors, transit.air, ground, altimeter, end)
         path = flight.path
-        end = path.span_s[1] if end is None else end
+        end = path.span_s[1] if end is None else end  # all iterations have the duration of the first one
         navigated = NavigatedLeg.simulate(path, start, end, transit.instruments, streams, "landing", initial)
         leg_errors = _interpolate_at_knots(path, navigated.boundaries_s, navigated.errors(path))
         errors = np.concatenate([transit_errors, leg_errors[len(transit_errors) :]])
-        change_m = np.inf if previous is None else float(np.abs(path.rows[:, :3] - previous.rows[:, :3]).max())
+        path_change_m = np.inf if previous is None else float(np.abs(path.rows[:, :3] - previous.rows[:, :3]).max())
         previous, iterations = path, iterations + 1
     time = flight.phase_start_s(Phase.ON_GROUND)
     if time is None:
@@ -275,7 +275,7 @@ def land(
         gps_deviation_m=solutions.reported_m[is_valid].mean(axis=0) if count else missing,
         gps_solutions=count,
         iterations=iterations,
-        change_m=change_m,
+        path_change_m=path_change_m,
     )
 
 

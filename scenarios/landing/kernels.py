@@ -27,6 +27,7 @@ def raise_by_triangles(heights: Array, west: float, south: float, spacing: float
     rows, columns = heights.shape
     for k in range(faces.shape[0]):
         a, b, c = vertices[faces[k, 0]], vertices[faces[k, 1]], vertices[faces[k, 2]]
+        # edges u = b - a and v = c - a in the horizontal plane, and twice the area
         ux, uy, vx, vy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
         area = ux * vy - uy * vx
         if area <= 0.0:  # triangle faces down, or is vertical
@@ -39,6 +40,7 @@ def raise_by_triangles(heights: Array, west: float, south: float, spacing: float
             y = south + i * spacing - a[1]
             for j in range(first_column, last_column + 1):
                 x = west + j * spacing - a[0]
+                # the point is a + s u + t v
                 s = (x * vy - y * vx) / area
                 t = (ux * y - uy * x) / area
                 if s >= 0.0 and t >= 0.0 and s + t <= 1.0:

@@ -57,7 +57,7 @@ class World:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two images of a flight."""
+    """The two images of a landing case, and their rendered frames."""
 
     images: tuple[DetectorImage, DetectorImage]  #: delivered images with the true camera
     frames: tuple[Frame, Frame]  #: rendered radiance and ground truth
@@ -172,7 +172,7 @@ class GroundTruth:
         spacing = SPACING_DIAMETERS * limits.diameter_m
         relief = Relief.from_ground(world.ground, west_south, east_north, spacing, world.meshes)
         heights = relief.average(positions, relief.spacing_m)
-        # ground points that both images show
+        # grid points on the ground; `visible`: whether both images show them
         points = np.concatenate([flat_positions, heights.reshape(-1, 1)], axis=1)
         visible = np.ones(len(points), dtype=bool)
         for image, state in zip(pair.images, flight.states, strict=True):
@@ -283,10 +283,14 @@ class SampledMap:
 def count_hazards(ground: Ground, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
     """Count footprints by truth and map; sums over cases give rates.
 
-    Footprints are classified by roughness / limit and slope / limit. For each class, `footprints_*` is the number of
-    footprints, `footprints_*_safe` the number that the map classifies as safe, `footprints_*_unflagged` the number
-    without a hazard cell before growth. `gross_*` hazards have at least twice the roughness limit and a diameter of at
-    least three cells; `false_alarms` are safe footprints with a hazard cell.
+    Footprints are classified by roughness / limit and slope / limit. For each class:
+
+    - `footprints_*`: number of footprints
+    - `footprints_*_safe`: number that the map classifies as safe
+    - `footprints_*_unflagged`: number without a hazard cell before growth
+
+    `gross_*` hazards have at least twice the roughness limit and a diameter of at least three cells. `false_alarms` are
+    safe footprints with a hazard cell; `missed` are unsafe footprints without one.
     """
     footprints, valid, safe = truth.footprints, sampled.valid, sampled.safe
     ratios = {

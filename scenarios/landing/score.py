@@ -139,7 +139,7 @@ def landing_row(
         float(touchdown.gps_deviation_m[0]),
         touchdown.gps_solutions,
         touchdown.iterations,
-        touchdown.change_m,
+        touchdown.path_change_m,
         touchdown.time_s - flight.states[1].time_s,
         -float(velocity[2]),
         float(np.hypot(*velocity[:2])),
@@ -196,6 +196,7 @@ def motion_errors(estimated: RigidTransform, true: RigidTransform) -> dict[str, 
         (np.array(motion.translation), float(np.linalg.norm(motion.translation))) for motion in (estimated, true)
     )
     is_defined = length and true_length
+    # chord between the unit vectors of both directions
     chord = float(np.linalg.norm(translation / length - true_translation / true_length)) if is_defined else NAN
     error = float(np.linalg.norm(translation - true_translation))
     return {
@@ -256,6 +257,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     height = float(height_above_ground(case.world.ground.surface, positions)[0])
     up = first.attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
     rotation_deg = (first.attitude.inv() * second.attitude).as_rotvec(degrees=True)
+    # the tolerances include flights that are exactly at the limits
     within_limits = (
         roll < MAX_ROLL_DEG + 0.5
         and max(pitch, yaw) < MAX_TILT_DEG + 0.5
@@ -331,10 +333,10 @@ def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
     arrays: dict[str, Any] = {"image_1": pair.counts[0], "image_2": pair.counts[1]}
     if isinstance(estimate.details, HdaDetails):
         arrays |= hda_products(estimate.details)
-    true = true_motion(flight, pair)
+    second_from_first = true_motion(flight, pair)
     arrays |= {
-        "true_rotation": true.rotation.as_matrix(),
-        "true_translation": np.array(true.translation),
+        "true_rotation": second_from_first.rotation.as_matrix(),
+        "true_translation": np.array(second_from_first.translation),
         "true_places": truth.positions,
         "true_slope": truth.footprints.slope_rad,
         "true_roughness": truth.footprints.roughness_m,

@@ -25,7 +25,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import DetectorImage
 
 #: Maximum number of features of an image; maximum distance of the best match / second-best match (Lowe, Fig. 11).
-_MAX_FEATURES, _RATIO = 4000, 0.8
+_MAX_FEATURES, _MAX_DISTANCE_RATIO = 4000, 0.8
 #: RANSAC: maximum distance of an inlier from its epipolar line, pixels, and probability of a sample without outlier.
 _MAX_DISTANCE_PX, _CONFIDENCE = 2.0, 0.9999
 #: Minimum number of matches; five matches always have an essential matrix without residuals.
@@ -33,7 +33,7 @@ MIN_MATCHES = 15
 #: Distance that represents infinity, m.
 _INFINITY_M = 1e7
 #: Quantiles of the counts that are mapped to black and white before feature detection.
-_STRETCH = (0.005, 0.995)
+_CONTRAST_QUANTILES = (0.005, 0.995)
 
 _Features: TypeAlias = tuple[Float64[np.ndarray, "n 2"], np.ndarray]
 
@@ -101,8 +101,7 @@ def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
 def agreement_products(images: Sequence[DetectorImage], pairs: Sequence[PairAgreement]) -> dict[str, object]:
     """Return arrays for figures: `image_<k>`, and `matches_<k>` of each pair of images k and k + 1.
 
-    The columns of `matches_<k>` are u and v in the earlier and in the later image, the offset in u and v, and 1 for
-    inliers.
+    Columns of `matches_<k>`: (u, v) in the earlier image, (u, v) in the later image, offset (u, v), 1 for inliers.
     """
     products: dict[str, object] = {f"image_{number}": image.counts for number, image in enumerate(images, start=1)}
     for number, pair in enumerate(pairs, start=1):
@@ -118,7 +117,7 @@ def _detect_features(image: DetectorImage) -> _Features:
     column_bin, row_bin = _square_pixel_factor(fu / fv, columns), _square_pixel_factor(fv / fu, rows)
     signal = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
     binned = signal.reshape(rows // row_bin, row_bin, columns // column_bin, column_bin).mean(axis=(1, 3))
-    black, white = np.quantile(binned, _STRETCH)
+    black, white = np.quantile(binned, _CONTRAST_QUANTILES)
     grey = np.clip((binned - black) / max(white - black, 1e-9) * 255.0, 0.0, 255.0).astype(np.uint8)
     points, descriptors = cv2.SIFT.create(nfeatures=_MAX_FEATURES).detectAndCompute(grey, None)
     if descriptors is None:
@@ -147,7 +146,7 @@ def _match_pair(images: tuple[DetectorImage, DetectorImage], features: tuple[_Fe
         matches = {
             tuple(earlier[best.queryIdx].tolist()): (best.queryIdx, best.trainIdx)
             for best, next_best in matcher.knnMatch(descriptors, later_descriptors, k=2)
-            if best.distance < _RATIO * next_best.distance and reverse.get(best.trainIdx) == best.queryIdx
+            if best.distance < _MAX_DISTANCE_RATIO * next_best.distance and reverse.get(best.trainIdx) == best.queryIdx
         }
     indices = np.array(list(matches.values()), dtype=np.intp).reshape(-1, 2)
     pixels = np.stack([earlier[indices[:, 0]], later[indices[:, 1]]])
@@ -176,10 +175,10 @@ def epipolar_offsets_px(
 ) -> Float64[np.ndarray, "n 2"]:
     """Return the offsets of matches from the nearest points of their epipolar curves in the second image, pixels.
 
-    The cameras are in one frame. NaN if the second camera cannot see the point. From the second camera, a ray of the
-    first camera spans the arc from the direction of the first camera, `baseline`, to the direction of the ray. The
-    nearest point p, in angle, is the intersection of the first ray with the second camera's ray, projected onto the
-    plane of the arc: ``p x (baseline + s direction) = 0``.
+    The cameras are in one frame. NaN if the second camera cannot see the point. Seen from the second camera, a ray of
+    the first camera is an arc. It starts at the direction to the first camera, `baseline`, and ends at the direction of
+    the ray. The second camera's ray p of the match is projected onto the plane of the arc. The nearest point of the arc
+    is the intersection of the projected ray with the first ray: ``p x (baseline + s direction) = 0``.
     """
     origins, directions = first.rays(pixels)
     later_origins, later_directions = second.rays(later_pixels)

@@ -38,8 +38,8 @@ from marsyard.sim.camera.pds import is_pds3
 from marsyard.sim.frames import SITE_FROM_WORLD
 
 _POSITION = ("x_m", "y_m", "z_m")
-#: Maximum number of rows that a detector sums, and maximum relative deviation of a ratio of focal lengths from a whole
-#: number. Calibrated focal lengths are accurate to 1 %; the next whole number after 8 differs by 12 %.
+#: Maximum number of rows that a detector sums, and maximum relative deviation of the ratio of the focal lengths from a
+#: whole number. Calibrated focal lengths are accurate to 1 %; the next whole number after 8 differs by 12 %.
 _MAX_SUMMED_ROWS, _RATIO_TOLERANCE = 64, 0.05
 _DESCRIPTIONS = {
     "velocity": "Real descents: horizontal velocity from three images.",
@@ -65,7 +65,8 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
             f"rows_summed = {rows_summed}: computed from the camera, whose pixels are longer than wide by "
             f"that factor; rows_summed under [detector] of {INGEST_FILE} overrides it"
         )
-    if stored.task == VELOCITY:  # DIMES bins the delivered images, whose rows are already summed
+    if stored.task == VELOCITY:
+        # DIMES bins delivered images, whose rows are already summed; without square bins, a bin is one pixel
         columns, rows = stored.cases[0].pictures[0].size
         binned_size = binned_size_for(columns, rows * rows_summed)
         binned_size = binned_size if rows % binned_size[1] == 0 else (columns, rows)

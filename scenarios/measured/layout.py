@@ -175,6 +175,9 @@ _HEADER_BYTES = 4096
 _MAX_SIDE = 16384
 #: Maximum relative response: noise raises the response of the brightest pixel slightly above 1.
 _MAX_RESPONSE = 1.5
+#: Tags of a TIFF file (image width and image length), and the type of 16-bit values.
+_TIFF_WIDTH, _TIFF_LENGTH, _TIFF_SHORT = 256, 257, 3
+#: Header of a PGM file: width and height, with comments between them.
 _PGM = re.compile(rb"\AP[25]\s+(?:#[^\n]*\n\s*)*(\d+)\s+(?:#[^\n]*\n\s*)*(\d+)\s")
 _ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 product"
 
@@ -312,15 +315,15 @@ def read_image_size(path: Path) -> tuple[int, int]:
                 file.seek(4)
                 file.seek(struct.unpack(f"{order}I", file.read(4))[0])
                 (entries,) = struct.unpack(f"{order}H", file.read(2))
-                for _ in range(entries):  # of the first directory; tags 256 and 257: width and length, 16 or 32 bits
+                for _ in range(entries):  # of the first directory
                     tag, kind, _count, value = struct.unpack(f"{order}HHI4s", file.read(12))
-                    if tag in (256, 257):
-                        (extents[tag],) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", value)
+                    if tag in (_TIFF_WIDTH, _TIFF_LENGTH):
+                        (extents[tag],) = struct.unpack_from(f"{order}{'H' if kind == _TIFF_SHORT else 'I'}", value)
         except (OSError, struct.error) as error:
             raise IngestError(f"{path}: is a damaged TIFF: {error}") from error
         if len(extents) != 2:
             raise IngestError(f"{path}: is a damaged TIFF: its first directory contains no size")
-        return extents[256], extents[257]
+        return extents[_TIFF_WIDTH], extents[_TIFF_LENGTH]
     raise IngestError(f"{path}: is not a supported image; {_ALLOWED}")
 
 

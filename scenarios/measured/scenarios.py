@@ -177,9 +177,9 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
             row: dict[str, Scalar] = {
                 "velocity_estimated_x_m_s": float(reported[0]),
                 "velocity_estimated_y_m_s": float(reported[1]),
-                # includes the unknown error of the inertial velocity
+                # this difference includes the unknown error of the inertial velocity
                 "inertial_difference_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
-                # without that error: velocity change between the intervals, compared with the inertial unit's change
+                # this difference excludes it: velocity change between the intervals minus the inertial velocity change
                 "pair_discrepancy_m_s": NAN if velocity_pair is None else velocity_pair.discrepancy_m_s,
             }
             if true_velocity is not None:

@@ -65,7 +65,7 @@ class StoredImage(Parameters):
 
     @property
     def pose(self) -> RigidTransform:
-        """The body's measured pose; its position is the origin if no position was measured."""
+        """The body's measured pose in world axes; its position is the origin if no position was measured."""
         return body_pose(self.position_m or (0.0, 0.0, 0.0), self.world_from_body_xyzw)
 
 
@@ -134,6 +134,7 @@ def _load(file: str) -> tuple[StoredCases, str]:
 
 @lru_cache(maxsize=4)
 def _read(file: str, _changed_ns: int, _size: int) -> tuple[StoredCases, str]:
+    """Read and check `cases.json`; time and size are part of the cache's key, so that a changed file is read again."""
     try:
         contents = Path(file).read_bytes()
         stored = StoredCases.model_validate_json(contents)

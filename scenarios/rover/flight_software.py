@@ -23,19 +23,22 @@ from marsyard.sim.measurements import DriveCommand, StereoMeasurement
 
 #: Maximum distance from the goal at the end of an approach or back-off, metres.
 GOAL_TOLERANCE_M = 0.03
-#: Maximum angle of the goal from straight ahead for an arc; for a larger angle the rover first turns in place.
+#: Maximum angle of the goal from straight ahead for an arc, radians. For a larger angle the rover first turns in place.
 MAX_ARC_RAD = np.radians(15.0)
 #: Radius around the target without hazards, if the navigator ignores the target's rock, metres.
 TARGET_RADIUS_M = 1.0
-#: Maximum height of mapped points above or below the plane of the wheels: a step, and a slope times the distance.
+#: Maximum height of mapped points above or below the plane of the wheels: GROUND_STEP_M + GROUND_SLOPE * distance.
 GROUND_STEP_M, GROUND_SLOPE = 0.3, 0.5
-#: Largest x and |y| of the rover's body and wheels, metres.
+#: Maximum x and maximum |y| of the rover's body and wheels in the rover frame, metres.
 BODY_M = (0.95, 1.2)
-#: Margin around the rover that operators know at the start, metres.
+#: Width of the known ground around the rover at the start, metres.
 START_MARGIN_M = 0.3
 #: Parameters of the planner by the cameras of its map (not published; assumed): the swept disc contains the wheels of a
 #: MER without its panels; the body cameras map less ground ahead.
-NAVIGATION = {"mast": NavigationOptions(half_width_m=0.6), "body": NavigationOptions(half_width_m=0.6, lookahead_m=2.0)}
+NAVIGATION_OPTIONS = {
+    "mast": NavigationOptions(half_width_m=0.6),
+    "body": NavigationOptions(half_width_m=0.6, lookahead_m=2.0),
+}
 
 
 @dataclass(frozen=True)
@@ -56,9 +59,9 @@ def goal_position(leg: LegParameters, target: TargetEstimate) -> Float64[np.ndar
 
     The goal is on the line to the target, `goal_m` in front of the target, shifted to the right by `offset_right_m`.
     """
-    ahead = target.position_rover[:2] / target.distance_m
-    right = np.array([ahead[1], -ahead[0]])
-    return np.asarray((target.distance_m - leg.goal_m) * ahead + leg.offset_right_m * right)
+    to_target = target.position_rover[:2] / target.distance_m
+    right = np.array([to_target[1], -to_target[0]])
+    return np.asarray((target.distance_m - leg.goal_m) * to_target + leg.offset_right_m * right)
 
 
 def step_length_m(leg: LegParameters, target: TargetEstimate) -> float:
@@ -95,7 +98,7 @@ def plan_step(leg: LegParameters, step_count: int, target: TargetEstimate) -> It
 
 
 def plan_drive(position: Float64[np.ndarray, "2"], max_length_m: float) -> Iterator[DriveCommand]:
-    """Plan a step to a position (forward, left): an arc, or a turn in place and a straight drive."""
+    """Plan a step to a position (forward, left; metres): an arc, or a turn in place and a straight drive."""
     angle = float(np.arctan2(position[1], position[0]))
     chord = float(np.hypot(*position))
     if abs(angle) > MAX_ARC_RAD:
@@ -115,7 +118,7 @@ class Navigator:
     terrain: TerrainMap | None = None
 
     def map_start(self, world_from_rover: RigidTransform, radius_m: float) -> None:
-        """Create the map at its first update, with the ground under the rover as operators know it."""
+        """Create the map at its first update: a plane under the wheels, within `radius_m` and a margin."""
         if self.terrain is None:
             origin, up = world_from_rover.translation, world_from_rover.rotation.as_matrix()[:, 2]
             terrain = TerrainMap.empty(np.asarray(origin[:2]))
@@ -124,7 +127,7 @@ class Navigator:
     def map_pair(
         self, pair: StereoMeasurement, world_from_rover: RigidTransform, ranges_m: tuple[float, float]
     ) -> None:
-        """Add the points of a stereo pair, taken at an estimated pose, with a depth between the limits."""
+        """Add the points of a stereo pair, taken at an estimated pose, with depths within `ranges_m`."""
         points = RectifiedPair.of(pair).points(*ranges_m)
         # steeper points, seen from the rover, are false matches; the body cameras also see the rover
         is_ground = np.abs(points[:, 2]) <= GROUND_STEP_M + GROUND_SLOPE * np.hypot(points[:, 0], points[:, 1])
@@ -148,5 +151,5 @@ class Navigator:
         if leg.target_is_no_obstacle:
             position = origin + axes @ target.position_rover
             terrain = terrain.without_hazards(np.asarray(position[:2]), TARGET_RADIUS_M)
-        options = NAVIGATION[leg.map_by]
+        options = NAVIGATION_OPTIONS[leg.map_by]
         return navigate(terrain, world_from_rover, np.asarray(goal[:2]), step_length_m(leg, target), options)

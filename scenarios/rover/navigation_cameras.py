@@ -21,19 +21,22 @@ from marsyard.sim.render import PixelRays
 from marsyard.sim.sensor import Detector, StereoHead, natural_fall_off, preset, stereo_mast
 from marsyard.sim.streams import Streams
 
-#: Camera presets of the navigation on the mast, by the preset of the tracking cameras; and those on the body.
+#: Preset of the mast's navigation cameras by the preset of the tracking cameras, and preset of the body's cameras.
 NAVCAMS = {"mer-navcam": "mer-navcam", "research-navcam": "research-navcam", "research-pancam": "research-navcam"}
 HAZCAM = "mer-hazcam"
-#: Rays along each side of a pixel at an edge, for odometry and for the map: block matching needs no smooth edges.
+#: Rays along each side of a pixel at an edge, for odometry and for the map. Block matching does not need antialiasing.
 ODOMETRY_EDGE_RAYS, MAP_EDGE_RAYS = 2, 1
-#: Distance ahead and radius of the ground in these images that the rover's shadow may reach, metres.
+#: Circle that contains the imaged ground near the rover, for the test of the rover's shadow: distance ahead and radius,
+#: metres.
 _SHADOW_AHEAD_M, _SHADOW_RADIUS_M = 4.0, 4.0
-#: Spacing of the points of the oracle's heights, metres, and half angles of a navcam and a hazcam.
-_ORACLE_SPACING_M, _MAST_HALF_RAD, _BODY_HALF_RAD = 0.05, float(np.radians(22.5)), float(np.radians(60.0))
+#: Spacing of the points of the oracle's heights, metres.
+_ORACLE_SPACING_M = 0.05
+#: Half of the horizontal field of view of a navcam and of a hazcam, radians.
+_MAST_HALF_RAD, _BODY_HALF_RAD = float(np.radians(22.5)), float(np.radians(60.0))
 
 
 @dataclass(frozen=True)
-class _Pair:
+class _StereoPair:
     """A binned stereo pair: detectors, and true and calibrated cameras in the frame of the mast's head or the rover."""
 
     camera: StereoCamera
@@ -41,7 +44,7 @@ class _Pair:
     calibrated: tuple[CameraModel, CameraModel]
 
     @classmethod
-    def draw(cls, p: RoverScenarioParameters, name: str, head: StereoHead, streams: Streams) -> _Pair:
+    def draw(cls, p: RoverScenarioParameters, name: str, head: StereoHead, streams: Streams) -> _StereoPair:
         """Draw the detectors of a pair with these true and calibrated cameras."""
         factor = 1.0 / p.navigation.binning
         binned = [(mast.left.scale(factor), mast.right.scale(factor)) for mast in (head.true, head.calibrated)]
@@ -61,7 +64,7 @@ class _Pair:
         time_s: float,
         edge_rays: int,
     ) -> StereoMeasurement:
-        """Take a pair; `mounts` are the true and the measured pose of the pair's frame in the rover frame."""
+        """Take a pair; `mounts` are the true and the measured pose of the head or rover frame, in the rover frame."""
         world_from_mount = compose(vehicle.stance.world_from_rover, mounts[0])
         rays = PixelRays.of(self.true[0])
         scene = replace(world.navigation_scene(rays, world_from_mount, time_s), edge_rays=edge_rays)
@@ -84,8 +87,8 @@ class _Pair:
 class NavigationCameras:
     """The stereo pairs of a run; None if no leg uses them."""
 
-    mast: _Pair | None
-    body: _Pair | None
+    mast: _StereoPair | None
+    body: _StereoPair | None
     rover_from_body: RigidTransform  #: pose of the body pair's frame, known without error
 
     @classmethod
@@ -100,12 +103,12 @@ class NavigationCameras:
             name, head = NAVCAMS[p.camera.preset], rig.head
             if name != p.camera.preset or p.camera.custom is not None:
                 head = StereoHead.draw(stereo_mast(name), p.stereo, streams.generator("navcam calibration"))
-            mast = _Pair.draw(p, name, head, streams)
+            mast = _StereoPair.draw(p, name, head, streams)
         if uses_map and any((leg.autonav or leg.maps_first) and leg.map_by == "body" for leg in p.legs):
             left, right = preset(HAZCAM).cameras()
             design = MastCalibration(rig.calibrated.geometry, left, right)
             head = StereoHead.draw(design, p.stereo, streams.generator("hazcam calibration"))
-            body = _Pair.draw(p, HAZCAM, head, streams)
+            body = _StereoPair.draw(p, HAZCAM, head, streams)
         stance = STANCES[HAZCAM]
         tilt = Rotation.from_rotvec([0.0, -np.radians(stance.elevation_deg), 0.0])
         return cls(mast, body, rigid(tilt, np.array(stance.on_rover_m)))
@@ -151,6 +154,6 @@ def oracle_heights(
     angle = np.arctan2(x, y) - (stance.azimuth_rad + azimuth_rad)
     angle = np.abs((angle + np.pi) % (2.0 * np.pi) - np.pi)
     distance = np.hypot(x, y)
-    inside = (angle <= half_rad) & (distance >= ranges_m[0]) & (distance <= ranges_m[1])
-    x, y = east + x[inside], north + y[inside]
+    is_inside = (angle <= half_rad) & (distance >= ranges_m[0]) & (distance <= ranges_m[1])
+    x, y = east + x[is_inside], north + y[is_inside]
     return np.column_stack([x, y, world.route_ground.height(x, y)])

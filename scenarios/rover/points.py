@@ -23,7 +23,7 @@ _OUTLINE_ROWS = 96
 _MIN_GAP_M = 1e-3
 #: Number of rays along a side of the patch whose normals are averaged.
 _PATCH_RAYS = 5
-#: Sample points of a template: number of directions around its centre, and radii as fractions of its half side.
+#: Sample points of a template: number of directions around its centre, and radii in units of half its side.
 _RING_POINTS, _RING_RADII = 8, (0.5, 1.0)
 
 
@@ -40,7 +40,8 @@ def intersect_rays(
 ) -> tuple[Float64[np.ndarray, "rays"], Int64[np.ndarray, "rays"]]:
     """Compute the distance to the first triangle on each ray and its index; infinite and -1 without an intersection.
 
-    Method: Moeller & Trumbore, "Fast, Minimum Storage Ray/Triangle Intersection", J. Graphics Tools 2(1), 1997.
+    Method and symbols q, u, v, t: Moeller & Trumbore, "Fast, Minimum Storage Ray/Triangle Intersection", J. Graphics
+    Tools 2(1), 1997.
     """
     corner = triangles[:, 0]
     edge_1, edge_2 = triangles[:, 1] - corner, triangles[:, 2] - corner

@@ -3,7 +3,7 @@
 A guide points the mast at each stop and estimates the target's position. `TrackerGuide` uses a tracker;
 `DesignationGuide` uses the position designated at the start and odometry, for drives whose images are used by many
 trackers. Visual odometry and the navigator's map use rendered stereo pairs. Parameters with values `oracle-...` replace
-them by the truth with errors, which is faster and isolates causes.
+these measurements by the truth with errors, which is faster and isolates the causes of failures.
 
 Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
@@ -57,10 +57,12 @@ from marsyard.sim.streams import Streams
 #: Radius of the ground in a subframe around the target, divided by the target's distance: 8 deg, more than half the
 #: diagonal of the subframe of a navcam's right camera.
 SUBFRAME_RADIUS_FRACTION = 0.14
-#: Maximum turn in place between two stereo pairs of visual odometry (MER: Maimone, Cheng & Matthies 2007).
+#: Maximum turn in place between two stereo pairs of visual odometry, radians (MER: Maimone, Cheng & Matthies 2007).
 VISUAL_TURN_RAD = np.radians(18.0)
-#: Mapped depths of the mast's cameras and of the body cameras, metres, and angle between two pairs of the mast.
-MAST_RANGES_M, BODY_RANGES_M, MAST_SPACING_RAD = (1.4, 8.0), (0.35, 3.0), np.radians(40.0)
+#: Minimum and maximum depth of mapped points, metres, for the mast's cameras and the body cameras.
+MAST_RANGES_M, BODY_RANGES_M = (1.4, 8.0), (0.35, 3.0)
+#: Azimuth between successive stereo pairs of the mast in a navigation update, radians.
+MAST_SPACING_RAD = np.radians(40.0)
 
 
 @dataclass
@@ -104,7 +106,7 @@ class Run(Setup):
         """Create a run with a target, at its start."""
         return cls(setup.world, setup.rig, setup.vehicle, setup.camera, setup.navigation_cameras, target)
 
-    def estimate_at(self, position_rover: Float64[np.ndarray, "3"]) -> TargetEstimate:
+    def create_target_estimate(self, position_rover: Float64[np.ndarray, "3"]) -> TargetEstimate:
         """Create a target estimate from a position in the rover frame; add its range from the camera."""
         position = np.asarray(position_rover)
         return TargetEstimate(position, self.rig.range_m(position))
@@ -153,7 +155,7 @@ class TrackerGuide:
         if stop.update.position_rover is None:
             raise ValueError("the tracker has not reported a target position yet")
         current_from_stop = compose(run.vehicle.estimated.inv(), stop.estimated)
-        return run.estimate_at(current_from_stop.apply(np.array(stop.update.position_rover)))
+        return run.create_target_estimate(current_from_stop.apply(np.array(stop.update.position_rover)))
 
 
 @dataclass(frozen=True)
@@ -197,8 +199,9 @@ class DesignationGuide:
     def target(self, run: Run) -> TargetEstimate:
         """Return the designated position in the rover frame of the estimated pose, or the true target position."""
         if self.position_world is None:
-            return run.estimate_at(run.vehicle.stance.world_from_rover.inv().apply(run.target.point_world.copy()))
-        return run.estimate_at(run.vehicle.estimated.inv().apply(self.position_world.copy()))
+            true_pose = run.vehicle.stance.world_from_rover
+            return run.create_target_estimate(true_pose.inv().apply(run.target.point_world.copy()))
+        return run.create_target_estimate(run.vehicle.estimated.inv().apply(self.position_world.copy()))
 
     @classmethod
     def designate(cls, run: Run, margin_px: float, oracle: bool) -> DesignationGuide:

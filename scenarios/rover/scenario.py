@@ -286,8 +286,8 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
 
     def input_terrain(self, p: SharedDriveParameters, shared_input: int) -> tuple[TerrainBank, int]:
         """Return the terrain bank and the index of a terrain in it."""
-        w = p.drive.world
-        return TerrainBank(terrain_parameters(w), w.bank_seed), shared_input
+        world = p.drive.world
+        return TerrainBank(terrain_parameters(world), world.bank_seed), shared_input
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Track one target of one run with one step size; all algorithms use the same images."""

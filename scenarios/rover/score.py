@@ -56,34 +56,34 @@ def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     - `false_updates`: number of updates that report the target farther than `tracked_px` from the true projection
     """
     errors = errors_px(run)
-    sizes = np.hypot(*errors.T)
+    error_sizes_px = np.hypot(*errors.T)
     is_completed = run.outcome is RunOutcome.COMPLETED
-    last, error, range_error, cross_error = np.full(2, np.nan), np.full(3, np.nan), NAN, NAN
+    last_error_px, error_m, range_error, cross_error = np.full(2, np.nan), np.full(3, np.nan), NAN, NAN
     if is_completed:
         # components along the line of sight (positive: too far) and perpendicular to it
-        stop, last = run.stops[-1], errors[-1]
-        error = stop.error_m()
+        stop, last_error_px = run.stops[-1], errors[-1]
+        error_m = stop.error_m()
         eye = stop.stance.world_from_rover.inv().apply(stop.world_from_head.apply(run.rig.left.c.copy()))
-        sight = stop.point_rover - eye
-        range_error = float(error @ sight / np.linalg.norm(sight))
-        cross_error = float(np.sqrt(np.maximum(float(error @ error) - range_error * range_error, 0.0)))
-    false_updates = int(np.count_nonzero(sizes > p.score.tracked_px))
-    drift = float(np.hypot(*last))
+        line_of_sight = stop.point_rover - eye
+        range_error = float(error_m @ line_of_sight / np.linalg.norm(line_of_sight))
+        cross_error = float(np.sqrt(np.maximum(float(error_m @ error_m) - range_error * range_error, 0.0)))
+    false_updates = int(np.count_nonzero(error_sizes_px > p.score.tracked_px))
+    drift = float(np.hypot(*last_error_px))
     is_tracked = is_completed and drift <= p.score.tracked_px
-    losses = next((stop.update.losses for stop in run.stops if stop.update.losses), ())
+    loss_reasons = next((stop.update.losses for stop in run.stops if stop.update.losses), ())
     return {
         "tracked": is_tracked,
         "not_tracked": not is_tracked,
         "true_track": false_updates == 0,
         "false_updates": false_updates,
-        "position_error_m": float(np.linalg.norm(error)),
+        "position_error_m": float(np.linalg.norm(error_m)),
         "range_error_m": range_error,
         "cross_error_m": cross_error,
         "drift_px": drift,
-        "drift_u_px": float(last[0]),
-        "drift_v_px": float(last[1]),
-        "worst_error_px": _max(sizes),
-        "losses": ", ".join(loss.name for loss in losses) or "none",
+        "drift_u_px": float(last_error_px[0]),
+        "drift_v_px": float(last_error_px[1]),
+        "worst_error_px": _max(error_sizes_px),
+        "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
         "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.found), NAN),
         "handed_over": run.handed_over,
     }
@@ -98,14 +98,16 @@ def tracking_row(run: Run) -> dict[str, Scalar]:
     """Compute the columns of tracking: extremes of Table III's quantities, drift, and designation errors."""
     quantities = update_quantities(run)
     tracked_stops = [stop for stop in run.stops if stop.update.found]
-    drift_m = seed_error = seed_3_sigma = NAN
+    drift_m = designation_error = designation_3_sigma = NAN
     if tracked_stops:
         first_stop, last_stop = tracked_stops[0], tracked_stops[-1]
-        ends = (first_stop, last_stop)
-        seed, last = (stop.estimated.apply(np.asarray(stop.update.position_rover).copy()) for stop in ends)
-        drift_m, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(first_stop.error_m()))
+        first_m, last_m = (
+            stop.estimated.apply(np.asarray(stop.update.position_rover).copy()) for stop in (first_stop, last_stop)
+        )
+        drift_m = float(np.linalg.norm(last_m - first_m))
+        designation_error = float(np.linalg.norm(first_stop.error_m()))
         scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
-        seed_3_sigma = stereo_range_error_m(first_stop.range_m, scale, 1.0)
+        designation_3_sigma = stereo_range_error_m(first_stop.range_m, scale, 1.0)
     return {
         "updates": len(run.stops),
         "lost_updates": len(run.stops) - len(tracked_stops),
@@ -119,8 +121,8 @@ def tracking_row(run: Run) -> dict[str, Scalar]:
         "roll_total_deg": float(np.nansum(quantities["roll_change_deg"])),
         "azimuth_total_deg": float(np.nansum(quantities["azimuth_change_deg"])),
         "target_motion_m": drift_m,
-        "designation_error_m": seed_error,
-        "designation_3_sigma_m": seed_3_sigma,
+        "designation_error_m": designation_error,
+        "designation_3_sigma_m": designation_3_sigma,
         "update_time_s": float(np.mean([stop.track_time_s for stop in run.stops])) if run.stops else NAN,
     }
 

@@ -38,7 +38,7 @@ from marsyard.sim.render import Objects, PixelRays, Scene, process_renderer
 from marsyard.sim.sensor import Detector, auto_expose, natural_fall_off
 from marsyard.sim.streams import Streams
 
-#: Factor by which full-frame auto-exposure reduces the image size.
+#: Factor by which the full frame is reduced for auto-exposure.
 _BINNING = 16
 #: Fall-off of a lens; cached because all runs of a process use the same camera designs.
 _cached_fall_off = lru_cache(maxsize=8)(natural_fall_off)
@@ -109,21 +109,24 @@ class StereoCamera:
         radiances, exposure_s = [render(local_scene, rays) for rays in pixel_rays], 0.0
         if p.camera.detector_noise:
             windows = [unit.window(*box.corner, box.size) for unit, box in zip(self.detectors, boxes, strict=True)]
-            meter, light = windows[0], radiances[0]
-            exposure_s = meter.parameters.exposure_s
+            detector, metering_radiance = windows[0], radiances[0]
+            exposure_s = detector.parameters.exposure_s
             if p.exposure.of == "full-frame":
-                # one pixel per block with its mean light, and a detector of the same size
-                light = render(replace(add_rover(scene), edge_rays=1), PixelRays.of(cameras[0].scale(1.0 / _BINNING)))
-                response = np.resize(meter.response[: len(light), : light.shape[1]], light.shape)
-                meter = replace(meter, response=response, hot_e_s=None)
+                # reduced full frame, and a detector of its size
+                reduced_rays = PixelRays.of(cameras[0].scale(1.0 / _BINNING))
+                metering_radiance = render(replace(add_rover(scene), edge_rays=1), reduced_rays)
+                rows, columns = metering_radiance.shape
+                response = np.resize(detector.response[:rows, :columns], (rows, columns))
+                detector = replace(detector, response=response, hot_e_s=None)
             if p.exposure.of != "fixed":
-                exposure_s = auto_expose(meter, light, p.exposure.auto, self.noise).detector.parameters.exposure_s
+                exposed = auto_expose(detector, metering_radiance, p.exposure.auto, self.noise)
+                exposure_s = exposed.detector.parameters.exposure_s
             counts = [
                 window.with_exposure(exposure_s).expose(radiance, self.noise)
                 for window, radiance in zip(windows, radiances, strict=True)
             ]
         else:
-            # 12-bit counts; the 98 % percentile of the left subframe is at three quarters of full scale
+            # 12-bit counts: the 98th percentile of the left subframe is 3071, three quarters of full scale
             gain = 3071.0 / max(float(np.percentile(radiances[0], 98.0)), 1e-9)
             counts = [np.clip(np.rint(gain * radiance), 0, 4095).astype(np.uint16) for radiance in radiances]
         left, right = (MastImage(values, box.corner) for values, box in zip(counts, boxes, strict=True))
@@ -302,9 +305,9 @@ def evaluate_visibility(
     half_rad, triangles = 0.5 * options.template_px * rig.pixel_rad, world.target_triangles
     eyes = [rig.eyes(head) for head in heads]
     normal = points.patch_normal(triangles, eyes[0][0], point, half_rad)
-    lines = np.array([left - point for left, _ in eyes])
-    lines /= np.linalg.norm(lines, axis=1, keepdims=True)
-    obliquity_deg = np.degrees(np.arccos(np.clip(lines @ normal, -1.0, 1.0)))
+    to_eyes = np.array([left - point for left, _ in eyes])
+    to_eyes /= np.linalg.norm(to_eyes, axis=1, keepdims=True)
+    obliquity_deg = np.degrees(np.arccos(np.clip(to_eyes @ normal, -1.0, 1.0)))
     foot = float(world.rocks.position_m[world.target_number, 2])
 
     def is_clear(eye: Vector) -> bool:
@@ -324,6 +327,6 @@ def _is_on_edge(triangles: Triangles, foot_m: float, eye: Vector, point: Vector,
     ring = axis + half_rad * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * up)
     ring /= np.linalg.norm(ring, axis=1, keepdims=True)
     # the ground around the rock is assumed level with its foot
-    descents = np.maximum(-ring[:, 2], 1e-9)
-    visible_m = np.minimum(points.ray_distances(triangles, eye, ring), (eye[2] - foot_m) / descents)
-    return bool(np.any(visible_m > (1.0 + BEHIND_FRACTION) * distance))
+    descent_rates = np.maximum(-ring[:, 2], 1e-9)
+    visible_range_m = np.minimum(points.ray_distances(triangles, eye, ring), (eye[2] - foot_m) / descent_rates)
+    return bool(np.any(visible_range_m > (1.0 + BEHIND_FRACTION) * distance))

@@ -47,17 +47,17 @@ NAVIGATION_ROCKS_M, NAVIGATION_REACH_M = 25.0, 60.0
 ROUTE_MARGIN_M = 1.5
 
 
-def terrain_parameters(w: WorldParameters) -> TerrainParameters:
+def terrain_parameters(world: WorldParameters) -> TerrainParameters:
     """Return the site's terrain parameters with the changes of the campaign."""
-    changes: dict[str, object] = {"samples": w.samples}
-    if w.rms_slope_deg is not None:
-        changes["rms_slope_deg"] = w.rms_slope_deg
-    base = site(w.site).terrain("ground")
-    if w.rock_abundance is not None:
-        changes["rocks"] = (base.rocks or RockParameters()).model_dump() | {"abundance": w.rock_abundance}
-    if w.incline.slope_deg:
-        length_m = RAMP_FRACTION * w.samples * base.spacing_m
-        changes["ramp"] = Ramp(slope_deg=w.incline.slope_deg, length_m=length_m).model_dump()
+    changes: dict[str, object] = {"samples": world.samples}
+    if world.rms_slope_deg is not None:
+        changes["rms_slope_deg"] = world.rms_slope_deg
+    base = site(world.site).terrain("ground")
+    if world.rock_abundance is not None:
+        changes["rocks"] = (base.rocks or RockParameters()).model_dump() | {"abundance": world.rock_abundance}
+    if world.incline.slope_deg:
+        length_m = RAMP_FRACTION * world.samples * base.spacing_m
+        changes["ramp"] = Ramp(slope_deg=world.incline.slope_deg, length_m=length_m).model_dump()
     return base.with_changes(changes)
 
 
@@ -80,16 +80,16 @@ class RunWorld:
         cls, p: RoverScenarioParameters, pixel_rad: float, streams: Streams, load_ground: LoadGround
     ) -> RunWorld:
         """Create the world of a run."""
-        w = p.world
-        site_ground = load_ground(site(w.site), terrain_parameters(w), w.bank_seed, w.terrain)
-        site_ground = replace(site_ground, site=site(w.site).with_dust(w.dust_opacity))
+        world = p.world
+        site_ground = load_ground(site(world.site), terrain_parameters(world), world.bank_seed, world.terrain)
+        site_ground = replace(site_ground, site=site(world.site).with_dust(world.dust_opacity))
         ground, rocks = place_rocks(p, site_ground, streams.generator("placed rocks"))
         radius = p.start.distance_m + BACKGROUND_M
-        azimuth, half_angle = p.bearing_rad + np.pi, np.radians(w.background_half_deg)
-        eye = Eye(w.east_m, w.north_m, EYE_HEIGHT_M, pixel_rad, float(azimuth), float(half_angle), radius)
+        azimuth, half_angle = p.bearing_rad + np.pi, np.radians(world.background_half_deg)
+        eye = Eye(world.east_m, world.north_m, EYE_HEIGHT_M, pixel_rad, float(azimuth), float(half_angle), radius)
         clouds = None
         if p.clouds is not None:
-            height = float(ground.surface.height(w.east_m, w.north_m))
+            height = float(ground.surface.height(world.east_m, world.north_m))
             clouds = CloudLayer.draw(p.clouds, streams.generator("clouds"), ground_m=height)
         scene = replace(
             site_scene(ground, eye, p.sun.sun_in_interval(0, ground.site.environment.sun_radius_rad)),
@@ -198,7 +198,7 @@ class Rig:
     right: CameraModel  #: true right camera in the head's frame
     mast: Mast
     state: MastState  #: current angles: true, and read by the encoders
-    motors: np.random.Generator  #: stream of the motors' stopping errors
+    motors: np.random.Generator  #: random stream of the motors' stopping errors
 
     @classmethod
     def draw(cls, p: RoverScenarioParameters, streams: Streams) -> Rig:
@@ -282,7 +282,10 @@ class Vehicle:
         self.estimate = replace(self.estimate, world_from_rover=pose)
 
     def drive(self, command: DriveCommand, visual: bool) -> Drive:
-        """Execute a drive command and update the estimated pose; `visual`: by the true motion with errors."""
+        """Execute a drive command and update the estimated pose.
+
+        With `visual`, the update uses the true motion with the errors of visual odometry, else wheel odometry.
+        """
         result = drive(self.rover, self.ground, self.soil, self.stance, command, self.slip_stream)
         self.estimate = self.odometer.step(self.estimate, result, self.odometry_stream, visual)
         self.stance = result.end

@@ -48,8 +48,9 @@ MAX_RMS_PX, MAX_PX = 0.3, 3.0
 #: Tolerance on the elements of R R^T - I for a chain's rotation matrix R.
 _ORTHONORMAL_TOLERANCE = 1e-4
 
-#: First bytes of a YAML or JSON file; the YAML version line; names of the cameras in a Kalibr chain.
+#: First bytes of a YAML or JSON file.
 _START = re.compile(rb"\A(\xef\xbb\xbf)?\s*(#[^\n]*\n\s*)*(%YAML|---|\{|[A-Za-z_]\w*\s*:)")
+#: Line with the YAML version, and names of the cameras in a Kalibr chain.
 _DIRECTIVE = re.compile(r"^%YAML[^\n]*$", re.MULTILINE)
 _CHAIN = re.compile(r"cam\d+$")
 #: Names of the two lens models in the formats.
@@ -338,11 +339,11 @@ def _fit_camera(
     if residual.max_px <= _EXACT_PX:
         return start, residual
 
-    def differences(change: Array) -> Array:
+    def compute_differences(change: Array) -> Array:
         projected = _project_directions(modify_camera(change), directions)
         return np.nan_to_num(projected - pixels, nan=_INVISIBLE_PX).ravel()
 
-    fit = least_squares(differences, np.zeros(len(scales)), x_scale=scales, xtol=1e-14, ftol=1e-14, **options)
+    fit = least_squares(compute_differences, np.zeros(len(scales)), x_scale=scales, xtol=1e-14, ftol=1e-14, **options)
     camera = modify_camera(np.asarray(fit.x))
     return camera, _compute_residual(_project_directions(camera, directions) - pixels)
 
@@ -412,15 +413,14 @@ def _apply_pinhole_distortion(points: Array, coefficients: Array) -> tuple[Array
     """Apply OpenCV's pinhole distortion to (x, y), shape (n, 2); return also its derivative, shape (n, 2, 2)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     x, y = points.T
-    square = x * x + y * y
-    numerator = 1 + square * (k1 + square * (k2 + square * k3))
-    denominator = 1 + square * (k4 + square * (k5 + square * k6))
+    r2 = x * x + y * y
+    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     gain = numerator / denominator
-    slope = (k1 + square * (2 * k2 + square * 3 * k3) - gain * (k4 + square * (2 * k5 + square * 3 * k6))) / denominator
+    slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - gain * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
     mixed = 2 * (x * y * slope + p1 * x + p2 * y)
     distorted = np.stack(
-        [x * gain + 2 * p1 * x * y + p2 * (square + 2 * x * x), y * gain + p1 * (square + 2 * y * y) + 2 * p2 * x * y],
-        axis=-1,
+        [x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * gain + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], axis=-1
     )
     by_x = np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=-1)
     by_y = np.stack([mixed, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1)

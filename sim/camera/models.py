@@ -20,6 +20,7 @@ from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel, Gradient, Numb
 _ORIGIN = (0.0, 0.0, 0.0)
 #: A chi^2 above this is treated as infinite.
 _INFINITE_TAU = 1e30
+#: Maximum number of Newton steps for the angle of a ray.
 _NEWTON_STEPS = 30
 #: A linearity of at most this magnitude is treated as 0, as in JPL's cmod.
 _ZERO_LINEARITY = 1e-15
@@ -341,16 +342,16 @@ class Cahvore(RadialModel):
         return min(float(self._theta_from_chi(np.array([chi]))[0]), np.pi)
 
     def _chi_from_theta(self, theta: Vector) -> Vector:
-        scale = self.linearity
-        if scale > _ZERO_LINEARITY:
-            return np.tan(scale * theta) / scale
-        return np.sin(scale * theta) / scale if scale < -_ZERO_LINEARITY else theta
+        linearity = self.linearity
+        if linearity > _ZERO_LINEARITY:
+            return np.tan(linearity * theta) / linearity
+        return np.sin(linearity * theta) / linearity if linearity < -_ZERO_LINEARITY else theta
 
     def _theta_from_chi(self, chi: Vector) -> Vector:
-        scale = self.linearity
-        if scale > _ZERO_LINEARITY:
-            return np.arctan(scale * chi) / scale
-        return np.arcsin(np.maximum(scale * chi, -1)) / scale if scale < -_ZERO_LINEARITY else chi
+        linearity = self.linearity
+        if linearity > _ZERO_LINEARITY:
+            return np.arctan(linearity * chi) / linearity
+        return np.arcsin(np.maximum(linearity * chi, -1)) / linearity if linearity < -_ZERO_LINEARITY else chi
 
     def _pupil_series(self, theta: Vector) -> tuple[Vector, Vector]:
         """Compute e0 + e1 theta^2 + e2 theta^4, metres, and its derivative with respect to theta."""
@@ -359,10 +360,11 @@ class Cahvore(RadialModel):
         return series, theta * (2 * self.e[1] + 4 * self.e[2] * theta2)
 
     def _solve_theta(self, axial: Vector, radius: Vector) -> tuple[Vector, Vector]:
-        """Compute the angle theta of the ray through a point (NaN if there is none), and upsilon.
+        """Compute the angle theta of the ray through a point (NaN if there is none), and the slope upsilon there.
 
-        The point has the coordinate `axial` along the axis and the distance `radius` from it. Newton's method on
-        axial sin theta - radius cos theta - (theta - sin theta) (e0 + e1 theta^2 + e2 theta^4) = 0; upsilon: slope.
+        The point has the coordinate `axial` along the axis and the distance `radius` from it. Newton's method finds the
+        root of axial sin theta - radius cos theta - (theta - sin theta) (e0 + e1 theta^2 + e2 theta^4); upsilon is the
+        derivative of this function.
         """
         theta = np.arctan2(radius, axial)
         upsilon = step = np.zeros_like(theta)

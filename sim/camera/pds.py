@@ -54,6 +54,7 @@ _CLOCK = re.compile(r"^[ \t]*SPACECRAFT_CLOCK_(START|STOP)_COUNT[ \t]*=[ \t]*\"?
 _BYTE_ORDERS = {"MSB": ">", "LSB": "<", "PC": "<", "SUN": ">", "UNSIGNED": ">", "INTEGER": ">"}
 #: Tolerance on the length of a quaternion.
 _QUATERNION_TOLERANCE = 1e-3
+#: End of the message for images that are refused by default.
 _SUBFRAME = "of a part of the detector or of averaged pixels"
 
 _XML_START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|[A-Za-z_][\w:.-]*[\s>])")

@@ -14,6 +14,7 @@ values Hs, Hc, Vs, Vc and Theta, the covariance matrices ``S`` and ``S internal`
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -155,5 +156,5 @@ def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, fr
     for letter in type(camera).__name__.upper():
         lines.append(f"{letter} = " + " ".join(repr(float(number)) for number in getattr(camera, letter.lower())))
     lines += ["", f"Hs    = {hs!r}", f"Hc    = {hc!r}", f"Vs    = {vs!r}", f"Vc    = {vc!r}"]
-    lines += [f"Theta = {theta!r} ({theta * 57.29577951308232:.6f} deg)"]
+    lines += [f"Theta = {theta!r} ({math.degrees(theta):.6f} deg)"]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")

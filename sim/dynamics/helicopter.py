@@ -87,7 +87,7 @@ class HelicopterParameters(Parameters):
 
 
 @dataclass(frozen=True)
-class FlownPass:
+class FlightPass:
     """A pass along the line: its number, start and end, and its direction, +1 or -1 along the line."""
 
     number: int
@@ -137,7 +137,7 @@ class HelicopterFlight(Trajectory):
     platform: BPoly
     tilt_along: Tilt
     tilt_across: Tilt
-    passes: tuple[FlownPass, ...]
+    passes: tuple[FlightPass, ...]
     fly_overs_s: tuple[tuple[float, float], tuple[float, float]]
     gravity_m_s2: float
     vibration: Vibration
@@ -175,7 +175,7 @@ def draw_helicopter_flight(
     half_s = 0.5 * p.fly_over_s
     first_s = half_s + p.approach_s
     starts = [first_s + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
-    passes = tuple(FlownPass(k, start, start + p.pass_s, 1 - 2 * (k % 2)) for k, start in enumerate(starts))
+    passes = tuple(FlightPass(k, start, start + p.pass_s, 1 - 2 * (k % 2)) for k, start in enumerate(starts))
     fly_overs = ((-half_s, half_s), (p.between_s - half_s, p.between_s + half_s))
     times = np.arange(fly_overs[0][0], fly_overs[1][1] + 15.0, 15.0)
     # points of the curves: (time, value, rate) or (time, value). Height and platform angle are constant over the
@@ -186,17 +186,17 @@ def draw_helicopter_flight(
     angles = [(time, 0.0) for times_s in fly_overs for time in times_s]
     climb_m = p.climb_m_s * p.pass_s
     fraction = np.linspace(0.0, 1.0, _SPEED_CHANGES + 2)
-    for flown in passes:
+    for flight_pass in passes:
         changes = p.speed_change_m_s * rng.standard_normal(fraction.size)
         changes[[0, -1]] = 0.0
-        distances = flown.direction * p.length_m * (fraction - 0.5)
-        speeds = flown.direction * (p.speed_m_s + changes)
-        pass_times = flown.start_s + fraction * (flown.end_s - flown.start_s)
+        distances = flight_pass.direction * p.length_m * (fraction - 0.5)
+        speeds = flight_pass.direction * (p.speed_m_s + changes)
+        pass_times = flight_pass.start_s + fraction * (flight_pass.end_s - flight_pass.start_s)
         positions += list(zip(pass_times.tolist(), distances.tolist(), speeds.tolist(), strict=True))
-        height = p.lowest_m + flown.number * climb_m
-        heights += [(flown.start_s, height, p.climb_m_s), (flown.end_s, height + climb_m, p.climb_m_s)]
-        angle = np.pi if flown.direction < 0 and p.turns_with_flight else 0.0
-        angles += [(flown.start_s, angle), (flown.end_s, angle)]
+        height = p.lowest_m + flight_pass.number * climb_m
+        heights += [(flight_pass.start_s, height, p.climb_m_s), (flight_pass.end_s, height + climb_m, p.climb_m_s)]
+        angle = np.pi if flight_pass.direction < 0 and p.turns_with_flight else 0.0
+        angles += [(flight_pass.start_s, angle), (flight_pass.end_s, angle)]
     tilt_along, tilt_across = _draw_tilts(p, passes, times, rng)
     return HelicopterFlight(
         origin_m=origin_m,
@@ -215,19 +215,19 @@ def draw_helicopter_flight(
 
 
 def _draw_tilts(
-    p: HelicopterParameters, passes: Sequence[FlownPass], times: Float64[np.ndarray, "n"], rng: np.random.Generator
+    p: HelicopterParameters, passes: Sequence[FlightPass], times: Float64[np.ndarray, "n"], rng: np.random.Generator
 ) -> tuple[Tilt, Tilt]:
     """Draw the gimbal's angles over time: pointing and swing on the passes; elsewhere only residual motion.
 
     Pointing that would exceed the maximum angle off nadir together with the swing is reduced to it.
     """
-    on_pass = np.any([(times > flown.start_s) & (times < flown.end_s) for flown in passes], axis=0)
+    on_pass = np.any([(times > flight_pass.start_s) & (times < flight_pass.end_s) for flight_pass in passes], axis=0)
     swing_rad_s = 2.0 * np.pi * p.swing_hz
     # both axes swing: the maximum rate of each is the parameter divided by sqrt(2)
     max_amplitude = np.radians(p.swing_rate_deg_s) / np.sqrt(2.0) / swing_rad_s
     amplitudes = np.zeros((2, times.size))
-    for flown in passes:
-        is_inside = (times > flown.start_s) & (times < flown.end_s)
+    for flight_pass in passes:
+        is_inside = (times > flight_pass.start_s) & (times < flight_pass.end_s)
         for axis in range(2):
             has_swing = rng.uniform() < p.swinging_fraction
             amplitude = max_amplitude * rng.uniform(0.2, 1.0)

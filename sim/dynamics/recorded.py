@@ -57,13 +57,13 @@ MAX_ROWS = 5_000_000
 #: Maximum number of poses sampled from SPICE kernels: five hours at 50 Hz.
 MAX_SPICE_POSES = 1_000_000
 #: End of the name of a file that lists SPICE kernels.
-SUFFIX = ".spice.toml"
+SPICE_SUFFIX = ".spice.toml"
 _MAX_CACHED_FILES = 4
 #: Texts for a missing number in a text table.
 _MISSING = ("na", "NA", "n/a", "N/A", "null", "NULL", "none", "None")
 _ALLOWED = (
     f"a CSV or Parquet table with the columns {', '.join(COLUMNS)}; TUM's lines of timestamp tx ty tz qx qy qz qw; "
-    f"EuRoC's ground truth, whose header begins with #timestamp; or SPICE kernels, named in a file *{SUFFIX}"
+    f"EuRoC's ground truth, whose header begins with #timestamp; or SPICE kernels, named in a file *{SPICE_SUFFIX}"
 )
 
 
@@ -91,9 +91,11 @@ class RecordedMotion(Trajectory):
             raise ValueError(f"has {self.times_s.size} poses; allowed: at least {MIN_POSES}")
         if not (np.all(np.isfinite(self.times_s)) and np.all(np.isfinite(self.positions_m))):
             raise ValueError("contains a value that is not finite")
-        stops = np.flatnonzero(np.diff(self.times_s) <= 0.0)
-        if stops.size:
-            raise ValueError(f"time does not increase after {self.times_s[stops[0]]:.6f} s (pose {stops[0] + 1})")
+        not_increasing = np.flatnonzero(np.diff(self.times_s) <= 0.0)
+        if not_increasing.size:
+            raise ValueError(
+                f"time does not increase after {self.times_s[not_increasing[0]]:.6f} s (pose {not_increasing[0] + 1})"
+            )
         angles = np.degrees((self.attitudes[:-1].inv() * self.attitudes[1:]).magnitude())
         too_large = np.flatnonzero(angles > MAX_ROTATION_DEG)
         if too_large.size:
@@ -153,8 +155,9 @@ def read_poses(path: str | Path) -> RecordedPoses:
 
 
 @lru_cache(maxsize=_MAX_CACHED_FILES)
-def _read_file(path: str, _changed_ns: int, size: int) -> RecordedPoses:
-    if path.endswith(SUFFIX):
+def _read_file(path: str, _modified_ns: int, size: int) -> RecordedPoses:
+    """Read and check a file; the modification time is a key of the cache."""
+    if path.endswith(SPICE_SUFFIX):
         try:
             return _check_poses(path, *_sample_kernels(path))
         except ImportError as fault:
@@ -259,17 +262,18 @@ def _check_poses(path: str, digest: str, values: Float64[np.ndarray, "n 8"]) -> 
     if faulty.size:
         names = [COLUMNS[column] for column in np.flatnonzero(~np.isfinite(values[faulty[0]]))]
         raise TrajectoryFileError(f"{path}: pose {faulty[0] + 1}: {', '.join(names)} is not finite; allowed: numbers")
-    stops = np.flatnonzero(np.diff(values[:, 0]) <= 0.0)
-    if stops.size:
-        before, after = values[stops[0] : stops[0] + 2, 0]
+    not_increasing = np.flatnonzero(np.diff(values[:, 0]) <= 0.0)
+    if not_increasing.size:
+        first = not_increasing[0]
+        before, after = values[first : first + 2, 0]
         raise TrajectoryFileError(
-            f"{path}: pose {stops[0] + 2}: time goes from {before:.6f} to {after:.6f} s; allowed: times that increase"
+            f"{path}: pose {first + 2}: time goes from {before:.6f} to {after:.6f} s; allowed: times that increase"
         )
     lengths = np.linalg.norm(values[:, 4:], axis=1)
-    wrong = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE)
-    if wrong.size:
+    not_unit = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE)
+    if not_unit.size:
         raise TrajectoryFileError(
-            f"{path}: pose {wrong[0] + 1}: the quaternion's length is {lengths[wrong[0]]:.4g}; "
+            f"{path}: pose {not_unit[0] + 1}: the quaternion's length is {lengths[not_unit[0]]:.4g}; "
             f"allowed: 1 within {UNIT_TOLERANCE:g}"
         )
     # copies, because the table can be read-only, and SciPy's rotations do not accept read-only arrays

@@ -230,7 +230,7 @@ def build_chain(p: SwingParameters, modes: Modes, gravity_m_s2: float, canopy_he
 
 
 @dataclass(frozen=True)
-class Path:
+class DescentPath:
     """Solution of the equations of motion as polynomials, one for each integration step of SciPy's DOP853.
 
     - knots_s: earliest time of each step, increasing
@@ -248,7 +248,7 @@ class Path:
     @classmethod
     def integrate(
         cls, state: StateVector, lead_s: float, max_s: float, event: Callable[..., float], constants: Constants
-    ) -> Path:
+    ) -> DescentPath:
         """Integrate from a state at time 0: back by `lead_s`, and forward until `event` is zero or for `max_s`.
 
         `constants` are from `kernels.pack_constants`. Raises ValueError if the integration fails.
@@ -312,7 +312,7 @@ class SwingDescent(Trajectory):
     wind: Wind
     ground_height_m: float
     chain: Chain
-    path: Path
+    path: DescentPath
 
     @classmethod
     def simulate(
@@ -351,7 +351,7 @@ class SwingDescent(Trajectory):
             return _compute_camera_height(y, chain) - firing_m + BELOW_FIRING_M
 
         max_s = 3.0 * (start_m[2] - ground_height_m) / p.descent_rate_m_s
-        path = Path.integrate(state, lead_s, max_s, remaining_height, kernels.pack_constants(chain, wind.field))
+        path = DescentPath.integrate(state, lead_s, max_s, remaining_height, kernels.pack_constants(chain, wind.field))
         return cls(p, start_m, wind, ground_height_m, chain, path)
 
     @property

@@ -105,25 +105,25 @@ class Objects:
 
     def in_cone(
         self, apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_angle_rad: float
-    ) -> Int64[np.ndarray, "kept"]:
+    ) -> Int64[np.ndarray, "selected"]:
         """Numbers of the triangles that face a cone's apex, for bodies whose bounding spheres intersect the cone."""
-        kept = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
-        return np.asarray(select_facing(self.triangles, self._triangles_of(kept), *apex))
+        is_selected = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
+        return np.asarray(select_facing(self.triangles, self._triangles_of(is_selected), *apex))
 
-    def only(self, kept: Bool[np.ndarray, "bodies"]) -> Objects:
+    def only(self, is_selected: Bool[np.ndarray, "bodies"]) -> Objects:
         """Return the selected bodies, renumbered."""
-        triangles = self._triangles_of(kept)
+        triangles = self._triangles_of(is_selected)
         return self._of_bodies(
             np.take(self.triangles, triangles, axis=0),
             np.take(self.normals, triangles, axis=0),
-            np.diff(self.first_triangle)[kept],
-            self.albedo[kept],
-            self.names[kept],
-            self.spheres[kept],
+            np.diff(self.first_triangle)[is_selected],
+            self.albedo[is_selected],
+            self.names[is_selected],
+            self.spheres[is_selected],
         )
 
-    def _triangles_of(self, kept: Bool[np.ndarray, "bodies"]) -> Int64[np.ndarray, "kept"]:
-        return np.flatnonzero(np.repeat(kept, np.diff(self.first_triangle)))
+    def _triangles_of(self, is_selected: Bool[np.ndarray, "bodies"]) -> Int64[np.ndarray, "selected"]:
+        return np.flatnonzero(np.repeat(is_selected, np.diff(self.first_triangle)))
 
     @cached_property
     def hierarchy(self) -> Hierarchy:
@@ -155,6 +155,7 @@ ROVER_NAME = -3
 _LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
 #: The head: depth, height, width minus the cameras' baseline; distance of its front behind the cameras' centres, m.
 _HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
+#: Number of sides of the prism that represents a cylinder.
 _SIDES = 24
 #: The stowed instrument arm, assumed: joints relative to the front edge of the body at the height of the deck, m (x
 #: forward, y left, z up); radii of the links and of the instrument turret, and length of the turret, m.
@@ -257,7 +258,7 @@ def _box(size_m: tuple[float, float, float], middle_m: tuple[float, float, float
 
 @cache
 def _unit_box() -> Triangles:
-    import trimesh  # imported late, here and below, because the import is slow
+    import trimesh  # imported at the first use, here and below, because the import is slow
 
     return np.asarray(trimesh.creation.box().triangles, dtype=np.float64)
 

@@ -68,8 +68,8 @@ class DustySky:
         depth = (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
         scale = self.single_scattering_albedo * self.optical_depth / (4.0 * depth)
         without_peak = 1.0 - self.asymmetry**2
-        single = without_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
-        return max(sky_fraction - single, 0.0), scale * min(sky_fraction / single, 1.0), depth, self.asymmetry
+        scattered = without_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
+        return (max(sky_fraction - scattered, 0.0), scale * min(sky_fraction / scattered, 1.0), depth, self.asymmetry)
 
 
 @dataclass(frozen=True)
@@ -228,14 +228,14 @@ class CloudLayer:
         # squared wave numbers of the real transform's terms, rad2/m2
         spacing = parameters.size_m * PERIOD_SIZES / CELLS
         y, x = 2.0 * np.pi * np.fft.fftfreq(CELLS, spacing), 2.0 * np.pi * np.fft.rfftfreq(CELLS, spacing)
-        wave = y[:, None] ** 2 + x**2
+        wave2 = y[:, None] ** 2 + x**2
         threshold = float(ndtri(1.0 - parameters.cover))
-        total = sum(variance for _, variance in OCTAVES)
-        mean_square_slope = sum(variance / (2.0 * scale**2) for scale, variance in OCTAVES) / total
+        total_variance = sum(variance for _, variance in OCTAVES)
+        mean_square_slope = sum(variance / (2.0 * scale**2) for scale, variance in OCTAVES) / total_variance
         length = parameters.size_m * np.sqrt(mean_square_slope) * np.exp(-0.5 * threshold**2)
         length /= 2.0 * np.pi * parameters.cover
         power = sum(
-            variance * (scale * length) ** 2 * np.exp(-wave * (scale * length) ** 2) for scale, variance in OCTAVES
+            variance * (scale * length) ** 2 * np.exp(-wave2 * (scale * length) ** 2) for scale, variance in OCTAVES
         )
         field = np.fft.irfft2(noise * np.sqrt(power), s=(CELLS, CELLS))
         excess = field - np.quantile(field, 1.0 - parameters.cover)
@@ -243,7 +243,7 @@ class CloudLayer:
         slope = np.hypot(*(0.5 * (np.roll(excess, -1, k) - np.roll(excess, 1, k)) for k in (0, 1)))
         cloud_fraction = np.clip(0.5 + excess / np.maximum(slope, 1e-12), 0.0, 1.0)
         smoothed = np.fft.irfft2(
-            np.fft.rfft2(cloud_fraction) * np.exp(-0.5 * wave * parameters.edge_m**2), s=(CELLS, CELLS)
+            np.fft.rfft2(cloud_fraction) * np.exp(-0.5 * wave2 * parameters.edge_m**2), s=(CELLS, CELLS)
         )
         return cls(parameters, ground_m + parameters.base_m, _read_only(np.clip(smoothed, 0.0, 1.0)))
 
@@ -270,10 +270,10 @@ class CloudLayer:
         distance = np.maximum(height - points[..., 2], 0.0) / direction[2]
         drifts = ((0, east), (1, north))
         x, y = ((points[..., k] + distance * direction[k] - drift) / self.cell_m for k, drift in drifts)
-        finite = np.isfinite(x) & np.isfinite(y)
-        cells = np.where(finite, np.stack([y, x]), 0.0)
+        is_finite = np.isfinite(x) & np.isfinite(y)
+        cells = np.where(is_finite, np.stack([y, x]), 0.0)
         cover = map_coordinates(self.cover.astype(np.float64), cells, order=1, mode="grid-wrap")
-        return np.asarray(np.where(finite, 1.0 - opacity * cover, np.nan))
+        return np.asarray(np.where(is_finite, 1.0 - opacity * cover, np.nan))
 
 
 def no_cover() -> Float32[np.ndarray, "one one"]:

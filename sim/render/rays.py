@@ -83,7 +83,7 @@ class PixelRays:
     def of(cls, camera: CameraModel) -> PixelRays:
         """Compute the rays of a camera in the body frame. Raises RenderingError where pixels have no ray."""
         columns, rows = camera.size
-        starts, directions = camera.rays(camera.pixel_grid())
+        ray_origins, directions = camera.rays(camera.pixel_grid())
         if not np.isfinite(directions).all():
             raise RenderingError("the camera model has pixels without a ray")
         side = next((size for size in VIEW_SIDES_PX if max(columns, rows) <= size - _SPARE_PX), VIEW_SIDE_PX)
@@ -107,11 +107,11 @@ class PixelRays:
             row, column = (top + bottom) // 2, (left + right) // 2
             quarters = product((slice(top, row), slice(row, bottom)), (slice(left, column), slice(column, right)))
             pending += list(quarters)
-        if starts.strides[:2] == (0, 0):
-            centre, origins = starts[0, 0].copy(), np.zeros((rows * columns, 3), dtype=np.float32)
+        if ray_origins.strides[:2] == (0, 0):
+            centre, origins = ray_origins[0, 0].copy(), np.zeros((rows * columns, 3), dtype=np.float32)
         else:
-            centre = starts.reshape(-1, 3).mean(axis=0)
-            origins = (starts - centre).reshape(-1, 3).astype(np.float32)
+            centre = ray_origins.reshape(-1, 3).mean(axis=0)
+            origins = (ray_origins - centre).reshape(-1, 3).astype(np.float32)
         return cls(
             centre=centre,
             origins=origins,

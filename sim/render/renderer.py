@@ -29,7 +29,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.backend import Backend, DepthRenderer, RenderingError
 from marsyard.sim.render.kernels.edges import mark_edges, split_rays, trace_subpixel_rays
-from marsyard.sim.render.kernels.primary import GRAZING, trace_primary_rays
+from marsyard.sim.render.kernels.primary import MAX_GRAZING_SINE, trace_primary_rays
 from marsyard.sim.render.kernels.shading import shade
 from marsyard.sim.render.kernels.strips import STRIP
 from marsyard.sim.render.kernels.structs import Array32, Extent, Ground, Hits, Light, Picture, Pose, Rays, Views
@@ -137,8 +137,8 @@ class Renderer:
         views = self._draw_views(scene, rays, pose, clearance)
         columns, rows = rays.size
         highest_ray = np.arcsin(np.clip((pose.rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
-        grazing = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -GRAZING)
-        ground = ground_struct(scene.surface, scene.extent_m, ceilings=grazing)
+        is_grazing = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -MAX_GRAZING_SINE)
+        ground = ground_struct(scene.surface, scene.extent_m, ceilings=is_grazing)
         hits, light, tree = _empty_hits(rows * columns, scene), scene.light(time_s), scene.objects.hierarchy
 
         def trace_part(part: slice) -> None:
@@ -240,19 +240,19 @@ def process_renderer(backend: Backend) -> Renderer:
     return Renderer(backend)
 
 
-def run_in_parts(work: Callable[[slice], None], pixels: int, threads: int | None = None) -> None:
-    """Run `work` on slices of all pixels in threads; the result does not depend on the number of threads.
+def run_in_parts(process_part: Callable[[slice], None], pixels: int, threads: int | None = None) -> None:
+    """Call `process_part` on slices of all pixels in threads; the result does not depend on the number of threads.
 
     The default of `threads` is numba's `NUMBA_NUM_THREADS` (1 in a campaign's worker). Kernels release the GIL.
     """
     count = config.NUMBA_NUM_THREADS if threads is None else threads
     if count == 1 or pixels < MIN_PIXELS:
-        work(slice(0, pixels))
+        process_part(slice(0, pixels))
         return
     # align the slices with the kernels' pixel strips
     size = -(-pixels // count // STRIP) * STRIP
     parts = [slice(first, min(first + size, pixels)) for first in range(0, pixels, size)]
-    list(_pool(count).map(work, parts))
+    list(_pool(count).map(process_part, parts))
 
 
 @cache
@@ -298,7 +298,7 @@ def ground_mesh(
     To avoid aliasing, each vertex takes its height from the terrain level with about the same spacing as the grid.
     `spans` contains the first cell and the end of the cells in each strip between two lines of y; by default all cells.
     """
-    import trimesh  # imported late, because the import is slow
+    import trimesh  # imported at the first use, because the import is slow
 
     if spans is None:
         spans = np.tile([0, x.size - 1], (y.size - 1, 1))

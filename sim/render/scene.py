@@ -184,8 +184,8 @@ def graded_offsets(half_width_m: float, finest_m: float, count: int) -> Float[np
     last = steps[-1]
     if finest_m * last >= half_width_m:
         raise ValueError(f"{count} offsets with a spacing of {finest_m:g} m exceed {half_width_m:g} m")
-    target = np.log(half_width_m / finest_m)
-    b = brentq(lambda b: np.log(np.sinh(b * last) / np.sinh(b)) - target, 1e-6 / last, 500.0 / last, xtol=1e-15)
+    log_ratio = np.log(half_width_m / finest_m)
+    b = brentq(lambda x: np.log(np.sinh(x * last) / np.sinh(x)) - log_ratio, 1e-6 / last, 500.0 / last, xtol=1e-15)
     return np.asarray(finest_m / np.sinh(b) * np.sinh(b * steps))
 
 
@@ -244,7 +244,7 @@ def potentially_visible(
 def slope_bounds(surface: Surface, sun: Sun) -> tuple[float, float]:
     """Compute upper bounds of the slope along x and y; infinite if ground may hide part of the sun."""
     east, north, _ = np.abs(sun.direction)
-    rises = max_rises(surface.levels[0], _lowest_ray(sun) * surface.spacing_m, float(east), float(north))
+    rises = max_rises(surface.levels[0], _lower_edge_rise(sun) * surface.spacing_m, float(east), float(north))
     return rises[0] / surface.spacing_m, rises[1] / surface.spacing_m
 
 
@@ -254,10 +254,10 @@ def is_sun_above_slopes(sun: Sun, max_slopes: tuple[float, float]) -> bool:
     No line between two points of the ground is then as steep as the rays to the lower edge of the disc.
     """
     east, north, _ = np.abs(sun.direction)
-    return bool(max_slopes[0] * east + max_slopes[1] * north < _lowest_ray(sun))
+    return bool(max_slopes[0] * east + max_slopes[1] * north < _lower_edge_rise(sun))
 
 
-def _lowest_ray(sun: Sun) -> float:
+def _lower_edge_rise(sun: Sun) -> float:
     """Rise of a ray to the lower edge of the sun's disc, per unit length of the ray to its centre."""
     horizontal = float(np.hypot(sun.direction[0], sun.direction[1]))
     elevation = np.arctan2(sun.direction[2], horizontal) - sun.angular_radius_rad
@@ -276,16 +276,16 @@ def ground_shadow(
     field, spacing = surface.levels[level], surface.spacing_m * 2.0**level
     east, north, up = (float(component) for component in sun.direction)
     along_x = abs(east) > abs(north)
-    main, side = (east, north) if along_x else (north, east)
-    if main == 0.0:
+    along, across = (east, north) if along_x else (north, east)
+    if along == 0.0:
         return NO_SHADOW
-    drop, shift = spacing * up / abs(main), side / abs(main)
+    drop, shift = spacing * up / abs(along), across / abs(along)
     rows = columns = np.arange(len(field))
     max_rows = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, len(field)))
     if visible_m is not None:
         # a path towards the sun, and the shadows that are cast on its end
         path_rows = 2.2 * max_rows + _BORDER_SAMPLES
-        path = spacing * path_rows * np.array([np.sign(main), shift] if along_x else [shift, np.sign(main)])
+        path = spacing * path_rows * np.array([np.sign(along), shift] if along_x else [shift, np.sign(along)])
         bounds = np.reshape(visible_m, (2, 2)) + np.stack([np.minimum(path, 0.0), np.maximum(path, 0.0)], axis=1)
         first = np.floor(bounds[:, 0] / spacing).astype(int) - _BORDER_SAMPLES
         last = np.ceil(bounds[:, 1] / spacing).astype(int) + _BORDER_SAMPLES
@@ -295,8 +295,8 @@ def ground_shadow(
             entries = np.arange(count)
             columns, rows = ((start + ((entries - start) & (count - 1))) & (len(field) - 1) for start in first)
     height = heights_in_rows(field, rows, columns, along_x)
-    swept, casters = sweep_shadow(height, float(np.sign(main)), drop, shift, max_rows)
-    row_m, cos_elevation = spacing / abs(main), float(np.hypot(east, north))
+    swept, casters = sweep_shadow(height, float(np.sign(along)), drop, shift, max_rows)
+    row_m, cos_elevation = spacing / abs(along), float(np.hypot(east, north))
     return GroundShadow(swept, casters, along_x, spacing, level, row_m, cos_elevation, height_range_m[1])
 
 

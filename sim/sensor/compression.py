@@ -25,7 +25,7 @@ def compress(
     if not MIN_BITS <= bits_per_pixel <= MAX_BITS:
         raise ValueError(f"{bits_per_pixel:g} bits per pixel; allowed: {MIN_BITS:g} to {MAX_BITS:g}")
     # the unit of this option is 16/1000 bits per pixel
-    target = [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, max(1, round(1000.0 * bits_per_pixel / 16.0))]
-    _, encoded = cv2.imencode(".jp2", counts, target)
+    options = [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, max(1, round(1000.0 * bits_per_pixel / 16.0))]
+    _, encoded = cv2.imencode(".jp2", counts, options)
     decoded = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED), dtype=np.uint16)
     return np.minimum(decoded, np.uint16(full_scale_dn))

@@ -92,12 +92,12 @@ class DetectorParameters(Parameters):
     def bin(self, side: int) -> DetectorParameters:
         """Return the parameters of a detector whose pixels are the sums of blocks of side x side pixels.
 
-        One count is then that many times more electrons, so that the counts of a uniform scene are unchanged. The
-        blur of the lens is a smaller fraction of a pixel. Defects are omitted.
+        The electrons per count grow by the number of pixels in a block: the counts of a uniform scene are unchanged.
+        The blur of the lens is a smaller fraction of a pixel. Defects are omitted.
         """
-        pixels = side * side
+        area = side * side
         factors = {
-            "responsivity_e_s": pixels, "full_well_e": pixels, "gain_e_dn": pixels, "dark_e_s": pixels,
+            "responsivity_e_s": area, "full_well_e": area, "gain_e_dn": area, "dark_e_s": area,
             "read_noise_e": side, "transfer_row_s": side, "clear_row_s": side, "readout_row_s": side,
             "response_spread": 1.0 / side, "calibration_error": 1.0 / side,
         }  # fmt: skip
@@ -197,22 +197,22 @@ class Detector:
         """Return the part of the detector that a subframe reads: upper left pixel and size (columns, rows).
 
         The pixel responses are those of the full detector. The smear includes only the rows of the subframe: the
-        smear of the rows above, about ``row * transfer_row_s / exposure_s`` of their mean radiance, is missing, and
-        likewise that of the rows below with `clear_row_s`. The result is exact for a detector without smear, such as
-        the XC-55. If smear is relevant, expose the full image and crop it. Raises ValueError if the subframe is empty,
-        extends beyond the detector or splits summed rows.
+        smear of the rows above, about ``row * transfer_row_s / exposure_s`` of their mean radiance, is missing. The
+        smear of the rows below, with `clear_row_s`, is also missing. The result is exact for a detector without smear,
+        such as the XC-55. If smear is relevant, expose the full image and crop it. Raises ValueError if the subframe is
+        empty, extends beyond the detector or splits summed rows.
         """
         rows, columns = self.response.shape
-        count = self.parameters.rows_summed
-        if row % count or size[1] % count:
-            raise ValueError(f"a subframe of {size[1]} rows from row {row} splits groups of {count} summed rows")
+        rows_summed = self.parameters.rows_summed
+        if row % rows_summed or size[1] % rows_summed:
+            raise ValueError(f"a subframe of {size[1]} rows from row {row} splits groups of {rows_summed} summed rows")
         if min(row, column) < 0 or min(size) < 1 or column + size[0] > columns or row + size[1] > rows:
             raise ValueError(
                 f"a subframe of {size[0]} x {size[1]} pixels at ({column}, {row}) is not inside the detector of "
                 f"{columns} x {rows}"
             )
         part = np.s_[row : row + size[1], column : column + size[0]]
-        summed = np.s_[row // count : (row + size[1]) // count, part[1]]
+        summed = np.s_[row // rows_summed : (row + size[1]) // rows_summed, part[1]]
         hot = None if self.hot_e_s is None else self.hot_e_s[part]
         listed = None if self.listed is None else self.listed[summed]
         calibration = replace(self.calibration, flat_field=self.calibration.flat_field[summed])
@@ -242,17 +242,17 @@ class Detector:
     def charge(self, radiance: Image, motion: ImageMotion | None = None) -> Image:
         """Compute the mean photo charge in electrons of each physical pixel at the end of the transfer.
 
-        In addition to the exposure, a charge packet collects light in the rows that it passes: in the rows after its
-        own row during the clearing before the exposure, and in the rows before its own row during the transfer to the
-        storage area. The radiance of each row is that at the time when the packet passes it.
+        A charge packet is the charge of one pixel. It also collects light in the rows through which it is shifted:
+        in the rows after its own row during the clearing before the exposure, and in the rows before its own row
+        during the transfer to the storage area. The radiance of each row is that at the time when the packet passes it.
         """
         p = self.parameters
         scene = apply_point_spread(radiance, p.optics)
         duration = p.exposure_s + len(radiance) * (p.transfer_row_s + p.clear_row_s)
         if motion is not None and not motion.is_still(duration):
-            seconds = moving_exposure(scene, self.response, motion, p.exposure_s, p.transfer_row_s, p.clear_row_s)
-            seconds *= np.float32(p.responsivity_e_s)
-            return seconds
+            exposure = moving_exposure(scene, self.response, motion, p.exposure_s, p.transfer_row_s, p.clear_row_s)
+            exposure *= np.float32(p.responsivity_e_s)
+            return exposure
         rate = scene * self.response * np.float32(p.responsivity_e_s)
         charge: Image = np.float32(p.exposure_s) * rate
         if p.transfer_row_s > 0.0 or p.clear_row_s > 0.0:
@@ -265,11 +265,11 @@ class Detector:
         """Compute the mean dark charge in electrons of each delivered pixel; one column if all columns are equal."""
         p = self.parameters
         rows = len(self.response)
-        current = np.full((rows // p.rows_summed, 1), p.rows_summed * p.dark_e_s, dtype=np.float32)
+        current_e_s = np.full((rows // p.rows_summed, 1), p.rows_summed * p.dark_e_s, dtype=np.float32)
         if self.hot_e_s is not None:
-            current = current + _sum_rows(self.hot_e_s, p.rows_summed)
-        seconds = dark_seconds(p, rows)[:, None].astype(np.float32)
-        return np.asarray(np.float32(p.dark_growth) * current * seconds)
+            current_e_s = current_e_s + _sum_rows(self.hot_e_s, p.rows_summed)
+        times_s = dark_seconds(p, rows)[:, None].astype(np.float32)
+        return np.asarray(np.float32(p.dark_growth) * current_e_s * times_s)
 
 
 def dark_seconds(parameters: DetectorParameters, rows: int) -> Float64[np.ndarray, "delivered_rows"]:
@@ -357,8 +357,8 @@ def auto_expose(
     - rng: random generator for the noise of the test images
     - region: rows and columns of the delivered image in which the percentile is computed; all by default
 
-    Each test image changes the exposure time by a factor from 1/8 to 8, or by 1/4 if the counts saturate. Raises
-    ValueError if the region is empty.
+    After each test image the exposure time is multiplied by a factor from 1/8 to 8. The factor is 1/4 if the percentile
+    is saturated (99 % of full scale or full well). Raises ValueError if the region is empty.
     """
     exposures: list[float] = []
     p = detector.parameters

@@ -34,7 +34,7 @@ Quaternions = Float64[np.ndarray, "n 4"]  #: In the order x, y, z, w.
 
 
 class WarmUp(Parameters):
-    """Temperature of the unit minus that of its calibration: zero until `start_s`, then exponentially to `change_k`."""
+    """Temperature of the unit minus that of its calibration: zero until `start_s`, then approaches `change_k`."""
 
     start_s: Annotated[float, Field(description="time at which the change begins, s")] = 0.0
     change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="temperature change of the IMU, K")] = 0.0
@@ -188,7 +188,8 @@ class Imu:
 
     def boundaries(self, start_s: float, end_s: float) -> Boundaries:
         """Compute the true times of the sample boundaries from start to end."""
-        count = int(np.floor((end_s - start_s) * self.parameters.rate_hz + 1e-9))
+        rounding_tolerance = 1e-9
+        count = int(np.floor((end_s - start_s) * self.parameters.rate_hz + rounding_tolerance))
         if count < 1:
             raise ValueError(f"no sample lies between {start_s} s and {end_s} s at {self.parameters.rate_hz} Hz")
         return np.asarray(start_s + np.arange(count + 1) / self.parameters.rate_hz)

@@ -101,7 +101,7 @@ class InertialSolution:
                 f"requested times {times_s.min():.4f} s to {times_s.max():.4f} s are outside the navigation solution, "
                 f"{tags[0]:.4f} s to {tags[-1]:.4f} s"
             )
-        # if several tags are equal, the last one is used, so that no interval has zero length
+        # use the last of several equal tags, so that no interval has zero length
         interval = np.minimum(np.searchsorted(tags, times_s, side="right"), tags.size - 1) - 1
         length = np.maximum(tags[interval + 1] - tags[interval], np.finfo(float).tiny)
         return interval, np.minimum((times_s - tags[interval]) / length, 1.0)
@@ -167,8 +167,8 @@ class Approach:
         attitudes, rates, forces = self.attitudes(times), self.body_rates(times), self.specific_forces(times)
         attitude_increments = attitudes.apply(imu.gyro.bias_at(times) + rates @ imu.gyro.sensitivity_error.T) * step
         attitude_increments += imu.gyro.random_walk * np.sqrt(step) * rng.standard_normal(attitude_increments.shape)
-        reference = np.radians(p.attitude_sd_deg) * rng.standard_normal(3)
-        attitude = reference + np.cumsum(attitude_increments, axis=0)
+        initial_attitude = np.radians(p.attitude_sd_deg) * rng.standard_normal(3)
+        attitude = initial_attitude + np.cumsum(attitude_increments, axis=0)
         force_errors = imu.accelerometer.bias_at(times) + forces @ imu.accelerometer.sensitivity_error.T
         midpoint_attitude = attitude - 0.5 * attitude_increments
         increments = (np.cross(midpoint_attitude, attitudes.apply(forces)) + attitudes.apply(force_errors)) * step

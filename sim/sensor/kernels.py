@@ -2,7 +2,8 @@
 
 The scene is the radiance at mid exposure, extended by `pad` rows and columns beyond each border. The image velocity
 (rows and columns per second) is defined on a coarse grid. A point that is at pixel x at time t after mid exposure was
-at x - velocity * t at mid exposure. The velocity is constant within tiles of `TILE` x `TILE` pixels.
+at x - velocity * t at mid exposure. The velocity is constant within tiles of `TILE` x `TILE` pixels. A packet is the
+charge of one pixel, which is shifted through all rows above it during the transfer.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ class Transfer(NamedTuple):
     """A moving scene during the charge transfer.
 
     - padded, pad: scene with border, and width of the border in pixels
+    - response: relative response of each pixel
     - edges: first row of each block of rows, and the number of rows, shape (blocks + 1,)
     - field, step: image velocity, as in `blur`
     - start_s, row_s: start time of the transfer relative to mid exposure, and time per row

@@ -108,7 +108,7 @@ class Mast:
     @property
     def rest(self) -> MastState:
         """State at azimuth and elevation zero, with the axes in the middle of the backlash."""
-        return self._state(np.zeros(2), np.zeros(2))
+        return self._create_state(np.zeros(2), np.zeros(2))
 
     def point(self, state: MastState, azimuth_rad: float, elevation_rad: float, rng: np.random.Generator) -> MastState:
         """Move the mast to commanded angles (see `MastGeometry`) within its limits; `rng` draws the motor stops."""
@@ -117,13 +117,14 @@ class Mast:
         settling_errors = np.radians(p.settling_deg) * rng.standard_normal(2)
         motors = np.clip(np.clip(np.array([azimuth_rad, elevation_rad]), lower, upper) + settling_errors, lower, upper)
         half_backlash = 0.5 * np.radians(p.backlash_deg)
-        return self._state(motors, np.clip(state.axes_rad, motors - half_backlash, motors + half_backlash))
+        return self._create_state(motors, np.clip(state.axes_rad, motors - half_backlash, motors + half_backlash))
 
     def rover_from_head(self, state: MastState) -> RigidTransform:
         """Return the true pose of the head in the rover frame."""
         return self.geometry.rover_from_head(*state.true_rad)
 
-    def _state(self, motors_rad: Angles, axes_rad: Angles) -> MastState:
+    def _create_state(self, motors_rad: Angles, axes_rad: Angles) -> MastState:
+        """Create the state for angles of motors and axes, with encoder readings in whole counts."""
         count = np.radians(self.parameters.count_deg)
         readings = count * np.rint(motors_rad / count) if count > 0.0 else motors_rad
         true_angles = axes_rad - self.zeros_rad

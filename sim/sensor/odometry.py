@@ -135,20 +135,20 @@ class Odometer:
     ) -> PoseEstimate:
         """Update the estimate after a drive, with or without visual odometry, with the same number of draws."""
         p = self.parameters
-        wheels, walk, *tilt = np.split(rng.standard_normal(8), [2, 3, 5])
+        wheel_noise, heading_noise, tilt_noise, visual_noise = np.split(rng.standard_normal(8), [2, 3, 5])
         has_failed = bool(rng.random() < p.visual.failure_fraction)
         if visual and not has_failed:
             start, end = drive.start.world_from_rover, drive.end.world_from_rover
-            error = np.hypot(p.visual.walk_m * np.sqrt(drive.length_m), p.visual.floor_m) * tilt[1]
+            error = np.hypot(p.visual.walk_m * np.sqrt(drive.length_m), p.visual.floor_m) * visual_noise
             path = (1.0 + self.visual_scale) * (start.inv() * end).translation + error
             displacement = self._estimate_attitude(start, estimate.heading_error_rad).apply(path)
         else:
-            noise_m = p.walk_m * np.sqrt(drive.command.length_m) * wheels
+            noise_m = p.walk_m * np.sqrt(drive.command.length_m) * wheel_noise
             displacement = self._compute_wheel_displacement(estimate, drive, noise_m)
         heading = estimate.heading_error_rad + self.heading_scale * drive.turn_left_rad
         heading += self.heading_drift_rad_m * drive.length_m
-        heading += float(np.radians(p.heading_walk_deg) * np.sqrt(drive.length_m) * walk[0])
-        noise = Rotation.from_rotvec(np.radians(p.tilt_noise_deg) * np.array([*tilt[0], 0.0]))
+        heading += float(np.radians(p.heading_walk_deg) * np.sqrt(drive.length_m) * heading_noise[0])
+        noise = Rotation.from_rotvec(np.radians(p.tilt_noise_deg) * np.array([*tilt_noise, 0.0]))
         attitude = self._estimate_attitude(drive.end.world_from_rover, heading) * noise
         return PoseEstimate(
             rigid(attitude, estimate.world_from_rover.translation + displacement), heading, visual and has_failed

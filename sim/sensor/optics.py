@@ -58,7 +58,7 @@ BRIGHT_RADIANCE_FACTOR, BRIGHT_FILL = 0.3, 0.6
 KERNEL_HALF_SIZE_PX = 6  #: Half size of the point spread kernel, pixels.
 Image = Float32[np.ndarray, "rows columns"]
 #: Factor q of the field angle in the projected pupil area of a fisheye, cos(q theta): from a MER front hazcam, the sky
-#: of Opportunity image 1F483288473EFFCMUFP1214L0M1, 60 to 85 deg off axis (not flat-fielded; to 10 %).
+#: of Opportunity image 1F483288473EFFCMUFP1214L0M1, 60 to 85 deg off axis (not flat-fielded; accuracy 10 %).
 PUPIL_FRACTION = 0.95
 Spectrum = Float64[np.ndarray, "n"]  #: One value per wavelength.
 
@@ -194,7 +194,7 @@ def natural_fall_off(camera: CameraModel) -> Image:
     axis, fraction = (camera.o, PUPIL_FRACTION) if isinstance(camera, Cahvore) else (camera.a, 1.0)
     off_axis = np.arccos(np.clip(directions @ (axis / np.linalg.norm(axis)), -1.0, 1.0))
     brightness = solid_angle * np.clip(np.cos(fraction * off_axis), 0.0, None)
-    # pixels without a ray are dark
+    # a pixel outside the camera's field of view has no ray; its brightness is zero
     return np.asarray(np.nan_to_num(brightness / np.nanmax(brightness)).astype(np.float32))
 
 
@@ -204,11 +204,12 @@ def dust_transmission(shape: tuple[int, int], parameters: OpticsParameters, rng:
     for _ in range(parameters.dust_discs):
         centre = rng.uniform(0.0, 1.0, 2) * shape
         radius = parameters.dust_radius_px * rng.uniform(2.0 / 3.0, 4.0 / 3.0)
-        half = radius * (1.0 + parameters.dust_softness)
-        first, last = np.maximum(centre - half, 0.0).astype(int), np.minimum(centre + half + 1.0, shape).astype(int)
+        outer = radius * (1.0 + parameters.dust_softness)
+        first, last = np.maximum(centre - outer, 0.0).astype(int), np.minimum(centre + outer + 1.0, shape).astype(int)
         row, column = np.ogrid[first[0] : last[0], first[1] : last[1]]
         distance = np.hypot(row - centre[0], column - centre[1]) / radius
         coverage = np.clip((1.0 + parameters.dust_softness - distance) / (2.0 * parameters.dust_softness), 0.0, 1.0)
+        # smooth step from the edge to the centre
         shade = 1.0 - parameters.dust_depth * coverage**2 * (3.0 - 2.0 * coverage)
         transmission[first[0] : last[0], first[1] : last[1]] *= shade.astype(np.float32)
     return transmission
@@ -289,6 +290,7 @@ def moving_exposure(
     - transfer_row_s, clear_row_s: time per row during the transfer and the clearing
     """
     max_time_s = 0.5 * exposure_s + len(scene) * max(transfer_row_s, clear_row_s)
+    # margins of 3 and 2 pixels for the interpolation kernels
     pad = int(np.ceil(motion.max_px_s * max_time_s)) + 3
     blur_pad = int(np.ceil(0.5 * motion.max_px_s * exposure_s)) + 2
     padded = np.pad(scene, pad, mode="edge")

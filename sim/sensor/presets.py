@@ -63,11 +63,11 @@ class CameraDesign:
     def cameras(self) -> tuple[CameraModel, ...]:
         """Create the camera, or the left and the right camera of the pair."""
         if self.baseline_m is None:
-            return (self._camera(0.0, 0.0),)
+            return (self._create_camera(0.0, 0.0),)
         left_m, toe_in = 0.5 * self.baseline_m, np.radians(self.toe_in_deg)
-        return (self._camera(left_m, -toe_in), self._camera(-left_m, toe_in))
+        return (self._create_camera(left_m, -toe_in), self._create_camera(-left_m, toe_in))
 
-    def _camera(self, left_m: float, azimuth_rad: float) -> CameraModel:
+    def _create_camera(self, left_m: float, azimuth_rad: float) -> CameraModel:
         rotation = Rotation.from_rotvec([0.0, 0.0, azimuth_rad])
         pinhole = Cahv.from_focal_length(
             focal_m=self.focal_length_mm * 1e-3,
@@ -132,7 +132,7 @@ def _create_mer_rover(design: CameraDesign, f_number: float) -> Preset:
 
 
 def _create_interline_preset(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
-    """Create an interline CCD without smear, on Earth at +20 deg C. Assumed: f/4, passband, full well, noise, dark."""
+    """Create an interline CCD without smear, on Earth at +20 deg C. Assumed: f/4, passband, noise."""
     light = LightPath(4.0, design.pixel_pitch_um, (400.0, 700.0))
     responsivity = light.responsivity_e_s(1.0)
     detector = DetectorParameters(

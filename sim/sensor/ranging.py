@@ -1,7 +1,7 @@
 """Ranging instruments: common errors, laser ranges along a ray, radar altimeter, and true height above ground.
 
 The radar measures the range to the nearest ground point within a cone fixed to the body. On a slope this is the foot of
-the perpendicular, over relief a crest, and with a tilt of more than half the beam width a point at the beam's edge. A
+the perpendicular. Over relief it is a crest. With a tilt of more than half the beam width it is at the beam's edge. A
 fraction of the readings can be from the wider cone of the side lobes. Ground reflectivity is not modelled.
 """
 
@@ -192,6 +192,7 @@ def first_return(
     tilt = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))
     max_sine = np.sin(min(tilt + half_angle_rad, 0.5 * np.pi))
     min_angle = max(tilt - half_angle_rad, 0.0)
+    # initial value: 20 % above the range to flat ground at the cone's edge nearest to nadir
     search_range = min(1.2 * clearance / max(np.cos(min_angle), 0.05), max_range_m)
     while True:
         # the step grows with the search range, which limits the number of nodes

@@ -177,8 +177,8 @@ class RtkReceiver:
 
     def is_floating(self, times_s: Times) -> Bool[np.ndarray, "n"]:
         """Return whether the solution is floating at true times."""
-        is_odd_change = np.searchsorted(self.changes_s, times_s, side="right") % 2 == 1
-        return np.asarray(is_odd_change != self.starts_floating)
+        has_changed = np.searchsorted(self.changes_s, times_s, side="right") % 2 == 1
+        return np.asarray(has_changed != self.starts_floating)
 
     def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> RtkSolutions:
         """Simulate one solution per true time."""

@@ -108,8 +108,8 @@ class TiltCompass:
         if p.count_deg > 0.0:
             headings = np.radians(p.count_deg) * np.rint(headings / np.radians(p.count_deg))
         up = _add_offset(biased_up, np.radians(p.tilt_noise_deg) * noise[:, :2])
-        headings = _apply_stuck(np.mod(headings, 2.0 * np.pi), times_s, p.heading_stuck_s)
-        return TiltCompassReadings(tags, _apply_stuck(up, times_s, p.tilt_stuck_s), headings)
+        headings = _hold_stuck_readings(np.mod(headings, 2.0 * np.pi), times_s, p.heading_stuck_s)
+        return TiltCompassReadings(tags, _hold_stuck_readings(up, times_s, p.tilt_stuck_s), headings)
 
     def deviation_rad(self, azimuths_rad: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         """Compute the noise-free heading error of a level unit at rest, at true azimuths."""
@@ -117,7 +117,7 @@ class TiltCompass:
         return np.asarray(self.heading_bias_rad + self.iron_rad @ harmonics)
 
     def _compute_lagged_up(self, trajectory: Trajectory, times_s: Times) -> Vectors:
-        """Compute the directions of the pendulums: specific force with a lag."""
+        """Compute the up directions of the pendulums, body axes: unit specific force with a lag."""
         if times_s.size == 0:
             return np.zeros((0, 3))
         lag = self.parameters.lag_s
@@ -145,8 +145,8 @@ def _add_offset(up: Vectors, offset: Float64[np.ndarray, "*any 2"]) -> Vectors:
     return _normalize(tilted)
 
 
-def _apply_stuck(values: ReadingArray, times_s: Times, stuck_s: float | None) -> ReadingArray:
-    """Repeat the last value before `stuck_s` (or the first value) at all later times."""
+def _hold_stuck_readings(values: ReadingArray, times_s: Times, stuck_s: float | None) -> ReadingArray:
+    """Replace the readings after `stuck_s` by the last reading before it (or by the first reading)."""
     if stuck_s is None or values.size == 0:
         return values
     stuck_values = values.copy()

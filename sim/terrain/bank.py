@@ -12,17 +12,17 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
-from marsyard.sim.terrain.imported import blend_into_ground, detail_below_posting, embed
+from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
 from marsyard.sim.terrain.landforms.ground import Ground, Spectrum, refine, substream
-from marsyard.sim.terrain.landforms.kernels import pack, stamp_craters
-from marsyard.sim.terrain.landforms.relief import EJECTA_REACH_RADII, draw_craters
+from marsyard.sim.terrain.landforms.kernels import interleave_samples, stamp_craters
+from marsyard.sim.terrain.landforms.relief import EJECTA_EXTENT_RADII, draw_craters
 from marsyard.sim.terrain.landforms.units import COVER_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
 from marsyard.sim.terrain.surface import ROUGHNESS, SMALLEST_LEVEL, TEXTURE, UNIFORM, Surface
 
-#: Modules that a terrain's samples do not depend on, except through its parameters.
-MODULES_WITHOUT_SAMPLES = ("rocks", "sites.py", "statistics.py")
+#: Modules without effect on the samples of a terrain, except through its parameters.
+_MODULES_NOT_HASHED = ("rocks", "sites.py")
 #: Samples of the terrains that this process uses, by file: the cache does not evict these files.
 _IN_USE: WeakValueDictionary[Path, np.ndarray] = WeakValueDictionary()
 
@@ -43,41 +43,43 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     cover = UNIFORM
     if p.units is None:
         height = relief.draw_field(substream(rng, "relief"), relief_m)
-        tone = albedo.draw_field(substream(rng, "albedo"), contrast)
-        ground = Ground(height, tone, p.spacing_m)
+        log_albedo = albedo.draw_field(substream(rng, "albedo"), contrast)
+        ground = Ground(height, log_albedo, p.spacing_m)
     else:
-        height, rough = relief.draw_split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
-        tone, fine = albedo.draw_split_field(substream(rng, "albedo"), contrast, p.fine_below_m)
-        ground = Ground(height, tone, p.spacing_m)
+        height, fine_relief = relief.draw_split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
+        log_albedo, fine_albedo = albedo.draw_split_field(substream(rng, "albedo"), contrast, p.fine_below_m)
+        ground = Ground(height, log_albedo, p.spacing_m)
         cover = p.units.apply(ground, craters, substream(rng, "units"))
-        height += rough * refine(np.ascontiguousarray(cover[..., ROUGHNESS]), ground.side)
-        tone += fine * refine(np.ascontiguousarray(cover[..., TEXTURE]), ground.side)
+        height += fine_relief * refine(np.ascontiguousarray(cover[..., ROUGHNESS]), ground.side)
+        log_albedo += fine_albedo * refine(np.ascontiguousarray(cover[..., TEXTURE]), ground.side)
     dtm = None
     if p.source is not None:
         dtm = embed(p.source, ground.side, ground.spacing_m)
-        detail = detail_below_posting(ground, dtm) if p.source.roughen else None
+        detail = extract_fine_detail(ground, dtm) if p.source.roughen else None
     for name in LANDFORMS:
         landform = getattr(p, name)
         if landform is not None:
             landform.apply(ground, substream(rng, name))
     if len(craters):
-        stamp_craters(ground.height, ground.tone, ground.spacing_m, craters, EJECTA_REACH_RADII)
+        stamp_craters(ground.height, ground.log_albedo, ground.spacing_m, craters, EJECTA_EXTENT_RADII)
     if dtm is not None:
         blend_into_ground(ground, dtm, detail)
-    relative = np.exp(ground.tone, out=ground.tone)
+    relative_albedo = np.exp(ground.log_albedo, out=ground.log_albedo)
     samples = np.empty((ground.side, ground.side, 2), dtype=np.float32)
-    pack(ground.height, relative, p.albedo / float(relative.mean(dtype=np.float64)), samples)
+    interleave_samples(
+        ground.height, relative_albedo, p.albedo / float(relative_albedo.mean(dtype=np.float64)), samples
+    )
     return Surface.from_samples(samples, ground.spacing_m, cover)
 
 
 @cache
 def _code_version(*, has_tails: bool) -> str:
-    """Hash of the code that synthesises terrains: after a change of the code, cached terrains are built again."""
+    """Compute a hash of the code that synthesises terrains: a change of the code invalidates cached terrains."""
     digest = hashlib.sha256(np.__version__.encode())
     folder = Path(__file__).parent
     for path in sorted(folder.rglob("*.py")):
         part = path.relative_to(folder).parts[0]
-        if part not in MODULES_WITHOUT_SAMPLES or (has_tails and part == "rocks"):
+        if part not in _MODULES_NOT_HASHED or (has_tails and part == "rocks"):
             digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -86,7 +88,8 @@ def _code_version(*, has_tails: bool) -> str:
 class TerrainBank:
     """Numbered terrains of one kind, cached on disk. Wind tails of rocks are part of the surface.
 
-    Terrain k is a pure function of the parameters, the seed and k. The file of a terrain is one array of all levels.
+    Terrain k is a pure function of the parameters, the seed and k. The file of a terrain is one array: all levels, then
+    the cover.
     Workers memory-map it and therefore share its pages. The size of the cache is limited (see
     `marsyard.sim.cache.evict_files`).
     """
@@ -110,11 +113,10 @@ class TerrainBank:
                 warnings.warn(f"terrain {number} is not kept: {path}: {error.strerror}", CacheWarning, stacklevel=2)
                 flat.flags.writeable = False
         _IN_USE[path] = flat
-        sides = self._sides()
+        sides, cover_side = self._sides(), self._cover_side()
         *parts, cover = np.split(flat, np.cumsum([2 * side**2 for side in sides]))
         levels = tuple(part.reshape(side, side, 2) for part, side in zip(parts, sides, strict=True))
-        side = self._cover_side()
-        return Surface(levels, self.parameters.spacing_m, cover.reshape(side, side, 3))
+        return Surface(levels, self.parameters.spacing_m, cover.reshape(cover_side, cover_side, 3))
 
     def _build(self, number: int) -> Surface:
         surface, rocks = synthesise(self.parameters, self._rng(number)), self.parameters.rocks
@@ -137,7 +139,7 @@ class TerrainBank:
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
 
     def _path(self, number: int) -> Path:
-        # the name contains hashes of the DTM's files, because their content may change under the same name
+        # the name contains hashes of the DTM's files: files with the same name can have other contents
         source, rocks = self.parameters.source, self.parameters.rocks
         has_tails = rocks is not None and rocks.tails is not None
         parameters = self.parameters.model_dump_json(exclude=None if has_tails else {"rocks"})
@@ -151,6 +153,7 @@ class TerrainBank:
         return [self.parameters.samples >> level for level in range(levels)]
 
     def _size(self) -> int:
+        """Return the number of float32 values in the file of a terrain."""
         return 2 * sum(side**2 for side in self._sides()) + 3 * self._cover_side() ** 2
 
     def _cover_side(self) -> int:

@@ -46,7 +46,7 @@ class RealTerrain(Parameters):
     roughen: Annotated[bool, Field(description="add fractal detail finer than twice the DTM's posting")] = True
 
     def input_files(self) -> tuple[str, ...]:
-        """Paths of the DTM's files."""
+        """Return the paths of the DTM's files."""
         return tuple(str(path) for path in (self.dtm, self.ortho) if path is not None)
 
 
@@ -92,17 +92,17 @@ def _read_npz(path: Path) -> tuple[Raster, Raster | None]:
         if missing:
             allowed = "dem, dem_gsd, ortho, ortho_gsd, ortho_valid"
             raise TerrainFileError(f"{path} does not contain {', '.join(missing)}; allowed: {allowed}")
-        heights = _from_north(file["dem"], float(file["dem_gsd"]), path)
+        heights = _create_raster(file["dem"], float(file["dem_gsd"]), path)
         if "ortho" not in file:
             return heights, None
         brightness = np.asarray(file["ortho"], dtype=np.float64)
         if "ortho_valid" in file:
             brightness = np.where(file["ortho_valid"], brightness, np.nan)
-        return heights, _from_north(brightness, float(file["ortho_gsd"]), path)
+        return heights, _create_raster(brightness, float(file["ortho_gsd"]), path)
 
 
-def _from_north(values: Any, posting_m: float, path: Path) -> Raster:
-    """Make a raster from rows in north-to-south order; the origin is the outer corner of the north-western cell."""
+def _create_raster(values: Any, posting_m: float, path: Path) -> Raster:
+    """Create a raster from rows in north-to-south order, with the outer corner of the north-western cell at (0, 0)."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 2 or min(array.shape) < 4:
         raise TerrainFileError(f"{path} has a grid of shape {array.shape}; at least 4 x 4 values are needed")
@@ -126,7 +126,7 @@ def _read_geotiff(path: Path) -> Raster:
         raise TerrainFileError(f"{path} has rotated or oblong cells; square cells, north up, are needed")
     factor = 1.0 if crs is None else float(crs.linear_units_factor[1])
     posting = float(transform.a) * factor
-    raster = _from_north(values, posting, path)
+    raster = _create_raster(values, posting, path)
     return Raster(raster.values, posting, transform.c * factor + raster.west_m, transform.f * factor + raster.south_m)
 
 
@@ -141,7 +141,7 @@ def fill_holes(values: Grid) -> tuple[Grid, int]:
         return values, 0
     nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
     filled = values[tuple(nearest)]
-    for _ in range(200):
+    for _ in range(_HOLE_ITERATIONS):
         padded = np.pad(filled, 1, mode="edge")
         neighbour_mean = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
         filled[missing] = neighbour_mean[missing]
@@ -149,6 +149,9 @@ def fill_holes(values: Grid) -> tuple[Grid, int]:
 
 
 MEMBRANE_SIDE = 128  #: Cells along a side of the grid on which the synthetic terrain is deformed to meet the DTM.
+#: Iterations of the relaxation in holes, and of that on each grid outside the DTM.
+_HOLE_ITERATIONS, _BORDER_ITERATIONS = 200, 60
+MIN_RELATIVE_BRIGHTNESS = 0.2  #: Lower limit of an orthoimage's brightness divided by its mean.
 MAX_SIDE = 8192  #: Maximum number of samples along a side of a terrain.
 ORTHO_EDGE_MARGIN_PX = 3  #: Width of the margin around missing pixels where resampling has mixed values with black.
 
@@ -177,7 +180,7 @@ class EmbeddedDtm:
 
     - rows, columns: the part of the grid that the DTM covers
     - height: control values of the B-spline through the DTM's interpolated heights
-    - tone: natural logarithm of brightness divided by its mean
+    - log_brightness: natural logarithm of brightness divided by its mean
     - weight: blending weight, 1 inside, decreasing to 0 at the border
     - has_data: whether the DTM has a height at the post nearest to each sample
     """
@@ -185,27 +188,27 @@ class EmbeddedDtm:
     rows: slice
     columns: slice
     height: GridPatch
-    tone: GridPatch | None
+    log_brightness: GridPatch | None
     weight: GridPatch
     has_data: Mask
     extent: RealExtent
 
     def real_samples(self, side: int) -> Bool[np.ndarray, "side side"]:
-        """Mask of the terrain's samples at posts with a height, which are used for statistics."""
-        return self._mask(side, self.has_data)
+        """Return a mask of the terrain's samples at posts with a height; statistics use only these samples."""
+        return self._create_mask(side, self.has_data)
 
     def filled_samples(self, side: int) -> Bool[np.ndarray, "side side"]:
-        """Mask of the terrain's samples in filled holes of the DTM."""
-        return self._mask(side, ~self.has_data)
+        """Return a mask of the terrain's samples in filled holes of the DTM."""
+        return self._create_mask(side, ~self.has_data)
 
-    def _mask(self, side: int, dtm_mask: Mask) -> Bool[np.ndarray, "side side"]:
+    def _create_mask(self, side: int, dtm_mask: Mask) -> Bool[np.ndarray, "side side"]:
         mask = np.zeros((side, side), dtype=np.bool_)
         mask[self.rows, self.columns] = dtm_mask
         return mask
 
 
 def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
-    """Resample the DTM at the centre of a grid with this side, in samples, and spacing. Raises TerrainFileError."""
+    """Resample the DTM at the centre of a terrain grid of `side` x `side` samples. Raises TerrainFileError."""
     raster, ortho = read_rasters(source)
     period = side * spacing_m
     rows, columns = raster.values.shape
@@ -221,7 +224,7 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
             f"it must be wider than twice the border ({source.border_m:g} m)"
         )
     heights, holes = fill_holes(raster.values)
-    # aligned with the grid, so that posts coincide with samples if the posting is a multiple of the spacing
+    # align the DTM with the grid: posts coincide with samples if the posting is a multiple of the spacing
     west, south = (round(0.5 * (period - span) / spacing_m) * spacing_m for span in (width, length))
     i = np.arange(int(np.ceil(south / spacing_m)), int(np.floor((south + length) / spacing_m)) + 1)
     j = np.arange(int(np.ceil(west / spacing_m)), int(np.floor((west + width) / spacing_m)) + 1)
@@ -233,7 +236,9 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
     margin_y, margin_x = np.minimum(y - south, south + length - y), np.minimum(x - west, west + width - x)
     fraction = np.clip(np.minimum(margin_y[:, None], margin_x[None, :]) / source.border_m, 0.0, 1.0)
     weight = (fraction * fraction * (3.0 - 2.0 * fraction)).astype(np.float32)
-    tone, ortho_holes = (None, 0) if ortho is None else _log_brightness(source, raster, ortho, x - west, y - south)
+    log_brightness, ortho_holes = (
+        (None, 0) if ortho is None else _resample_log_brightness(source, raster, ortho, x - west, y - south)
+    )
     borders = (west, south, west + width, south + length)
     extent = RealExtent(*borders, raster.posting_m, holes, ortho_holes, holes / heights.size)
     nearest = (
@@ -241,29 +246,31 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
         for offset, count in ((y - south, rows), (x - west, columns))
     )
     has_data = np.isfinite(raster.values)[np.ix_(*nearest)]
-    return EmbeddedDtm(slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, tone, weight, has_data, extent)
+    return EmbeddedDtm(
+        slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, log_brightness, weight, has_data, extent
+    )
 
 
-def _log_brightness(
+def _resample_log_brightness(
     source: RealTerrain, raster: Raster, ortho: Raster, x: Coordinates, y: Coordinates
 ) -> tuple[GridPatch, int]:
-    """Logarithm of the orthoimage's brightness divided by its mean, and the number of missing pixels.
+    """Resample the logarithm of the orthoimage's brightness divided by its mean; count missing pixels.
 
     Positions are relative to the DTM's south-western post, metres. Shading in the image is not removed: it becomes part
-    of the albedo. Values are clipped from below at 0.2 of the mean.
+    of the albedo. Values below `MIN_RELATIVE_BRIGHTNESS` are clipped.
     """
     missing = ~(ortho.values > 0.0)
     holes = int(missing.sum())
     if holes:
         missing = binary_dilation(missing, iterations=ORTHO_EDGE_MARGIN_PX)
     brightness, _ = fill_holes(np.where(missing, np.nan, ortho.values))
-    logarithm = np.log(np.maximum(brightness / float(brightness.mean()), 0.2))
+    logarithm = np.log(np.maximum(brightness / float(brightness.mean()), MIN_RELATIVE_BRIGHTNESS))
     rows, columns = logarithm.shape
     posts_x = ortho.west_m - raster.west_m - source.ortho_east_m + ortho.posting_m * np.arange(columns)
     posts_y = ortho.south_m - raster.south_m - source.ortho_north_m + ortho.posting_m * np.arange(rows)
     spline = RectBivariateSpline(posts_y, posts_x, logarithm, kx=1, ky=1)
-    tone = spline(np.clip(y, posts_y[0], posts_y[-1]), np.clip(x, posts_x[0], posts_x[-1]))
-    return tone.astype(np.float32), holes
+    log_brightness = spline(np.clip(y, posts_y[0], posts_y[-1]), np.clip(x, posts_x[0], posts_x[-1]))
+    return log_brightness.astype(np.float32), holes
 
 
 def choose_grid(source: RealTerrain) -> tuple[int, float]:
@@ -273,32 +280,35 @@ def choose_grid(source: RealTerrain) -> tuple[int, float]:
     """
     raster, _ = read_rasters(source)
     longest = max(raster.values.shape)
+    # the terrain's side is the power of two that is at least 1.5 times that of the DTM
     samples = max(64, 1 << int(np.ceil(np.log2(1.5 * longest))))
     if samples > MAX_SIDE:
         raise TerrainFileError(f"{source.dtm} has {longest} posts along a side; maximum: 5461")
     return samples, raster.posting_m
 
 
-#: Height and tone detail below a DTM's posting.
+#: Detail of height and of the logarithm of albedo below a DTM's posting.
 Detail = tuple[GridPatch, GridPatch]
 
 
-def detail_below_posting(ground: Ground, dtm: EmbeddedDtm) -> Detail:
+def extract_fine_detail(ground: Ground, dtm: EmbeddedDtm) -> Detail:
     """Extract the synthetic ground's wavelengths below twice the DTM's posting, in the area of the DTM.
 
     This is a Gaussian high-pass filter with an amplitude of 0.5 at that wavelength.
     """
     sigma = dtm.extent.posting_m * np.sqrt(2.0 * np.log(2.0)) / np.pi / ground.spacing_m
-    grids = (ground.height, ground.tone)
-    height, tone = ((grid - gaussian_filter(grid, sigma, mode="wrap"))[dtm.rows, dtm.columns] for grid in grids)
-    return height, tone
+    grids = (ground.height, ground.log_albedo)
+    height, log_brightness = (
+        (grid - gaussian_filter(grid, sigma, mode="wrap"))[dtm.rows, dtm.columns] for grid in grids
+    )
+    return height, log_brightness
 
 
 def blend_into_ground(ground: Ground, dtm: EmbeddedDtm, detail: Detail | None) -> None:
     """Blend the DTM into the synthetic ground, in place.
 
-    First the synthetic ground is deformed to meet the DTM at its border. The deformation continues the height
-    difference at the border by Laplace's equation on a coarse periodic grid.
+    First the synthetic ground is deformed to meet the DTM at its border. The deformation is the height difference at
+    the border, extrapolated by Laplace's equation on a coarse periodic grid.
     """
     height = dtm.height if detail is None else dtm.height + detail[0]
     step = max(ground.side // MEMBRANE_SIDE, 1)
@@ -310,22 +320,22 @@ def blend_into_ground(ground: Ground, dtm: EmbeddedDtm, detail: Detail | None) -
     np.add(ground.height, refine(deformation.astype(np.float32), ground.side), out=ground.height)
     area = ground.height[dtm.rows, dtm.columns]
     area += dtm.weight * (height - area)
-    if dtm.tone is not None:
-        tone = dtm.tone if detail is None else dtm.tone + detail[1]
-        area = ground.tone[dtm.rows, dtm.columns]
-        area += dtm.weight * (tone - area)
+    if dtm.log_brightness is not None:
+        log_brightness = dtm.log_brightness if detail is None else dtm.log_brightness + detail[1]
+        area = ground.log_albedo[dtm.rows, dtm.columns]
+        area += dtm.weight * (log_brightness - area)
 
 
 def _extrapolate_smoothly(
     values: Float64[np.ndarray, "side side"], has_value: Bool[np.ndarray, "side side"]
 ) -> Float64[np.ndarray, "side side"]:
-    """Continue values on a periodic grid by Laplace's equation, relaxed on successively finer grids."""
+    """Extrapolate values on a periodic grid by Laplace's equation, with relaxation on successively finer grids."""
     if has_value.shape[0] > 8 and has_value[::2, ::2].any():
         coarse = _extrapolate_smoothly(values[::2, ::2], has_value[::2, ::2])
         field = np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)
     else:
         field = np.full(values.shape, float(values[has_value].mean()))
-    for _ in range(60):
+    for _ in range(_BORDER_ITERATIONS):
         neighbour_sum = np.roll(field, 1, 0) + np.roll(field, -1, 0) + np.roll(field, 1, 1) + np.roll(field, -1, 1)
         field = np.where(has_value, values, 0.25 * neighbour_sum)
     return field

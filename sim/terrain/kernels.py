@@ -17,7 +17,7 @@ WeightsAndDerivatives = tuple[float, float, float, float, float, float, float, f
 
 @njit(cache=True, inline="always")
 def bspline_weights(t: float) -> WeightsAndDerivatives:
-    """Weights of the four control values around a point at fraction t of its cell, and their derivatives."""
+    """Compute the weights of the four control values around a point at fraction t of a cell, and their derivatives."""
     s = 1.0 - t
     t2 = t * t
     s2 = s * s
@@ -89,7 +89,7 @@ CEILING_BLOCK = 4
 
 @njit(cache=True)
 def block_ceilings(field: Level) -> NDArray[np.float32]:
-    """Upper height bound of each block of samples: the maximum of all control values that affect the block.
+    """Compute an upper height bound of each block of samples: the maximum of all control values that affect it.
 
     Block (a, b) covers the samples ``CEILING_BLOCK * a`` to ``CEILING_BLOCK * (a + 1)`` along y; b is the same along x.
     """
@@ -105,10 +105,10 @@ def block_ceilings(field: Level) -> NDArray[np.float32]:
             for j in range(side):
                 highest[j] = max(highest[j], row[j, 0])
         for b in range(count):
-            top = highest[(b * CEILING_BLOCK - 1) & mask]
+            bound = highest[(b * CEILING_BLOCK - 1) & mask]
             for k in range(CEILING_BLOCK + 2):
-                top = max(top, highest[(b * CEILING_BLOCK + k) & mask])
-            ceiling[a, b] = top
+                bound = max(bound, highest[(b * CEILING_BLOCK + k) & mask])
+            ceiling[a, b] = bound
     return ceiling
 
 

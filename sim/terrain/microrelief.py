@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from scipy.special import gamma, kv
 
 #: Frequency of the coarsest octave divided by the Nyquist frequency of the samples; size of the finest cells, metres.
-_FIRST_WAVE, FINEST_M = 1.0, 0.001
+_FIRST_FREQUENCY, FINEST_M = 1.0, 0.001
 #: Median frequency of the noise power, cycles per lattice cell; mean square of the noise.
 WAVES_PER_CELL, NOISE_VARIANCE = 0.61, 0.0464
 
@@ -29,7 +29,7 @@ def octave_heights(
     lag = k0 * baseline_m
     correlation = 2.0 ** (1.0 - hurst) / gamma(hurst) * lag**hurst * kv(hurst, lag)
     variance = (np.tan(slope_rad) * baseline_m) ** 2 / (2.0 * (1.0 - correlation))
-    coarsest = WAVES_PER_CELL * 2.0 * spacing_m / _FIRST_WAVE
+    coarsest = WAVES_PER_CELL * 2.0 * spacing_m / _FIRST_FREQUENCY
     octaves = max(int(np.log2(coarsest / FINEST_M)) + 1, 0)
     wavenumber = 2.0 * np.pi * WAVES_PER_CELL / (coarsest * 0.5 ** np.arange(octaves))
     fraction_above_k1, fraction_above_k2 = (

@@ -37,13 +37,9 @@ class TerrainParameters(Parameters):
     crater_ejecta_contrast: Annotated[Fraction, Field(description="log albedo of the freshest ejecta, + or -")] = 0.12
     albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="mean albedo")] = 0.2
     albedo_contrast: Annotated[Fraction, Field(description="RMS of the fractal albedo's logarithm, all scales")] = 0.12
-    contrast_spread: Annotated[NonNegative, Field(description="SD of that RMS' logarithm from terrain to terrain")] = (
-        0.0
-    )
+    contrast_spread: Annotated[NonNegative, Field(description="SD of log albedo_contrast between terrains")] = 0.0
     albedo_hurst: Annotated[float, Field(ge=-0.5, lt=1.0, description="Hurst exponent; 0: equal in all octaves")] = 0.0
-    units: Annotated[
-        SurfaceUnits | None, Field(description="surface units; without, the ground is alike everywhere")
-    ] = None
+    units: Annotated[SurfaceUnits | None, Field(description="surface units; None: uniform ground")] = None
     fine_below_m: Annotated[Positive, Field(description="wavelength below which units scale relief and albedo, m")] = (
         60.0
     )
@@ -55,12 +51,12 @@ class TerrainParameters(Parameters):
     swell: Annotated[Swell | None, Field(description="broad relief")] = None
     ramp: Annotated[Ramp | None, Field(description="an even slope")] = None
     gullies: Annotated[Gullies | None, Field(description="steep-walled gullies")] = None
-    source: Annotated[RealTerrain | None, Field(description="real terrain; all else is its surround")] = None
+    source: Annotated[RealTerrain | None, Field(description="real terrain; the synthetic terrain surrounds it")] = None
     rocks: Annotated[RockParameters | None, Field(description="rocks on the ground")] = None
 
     @field_validator("samples")
     @classmethod
-    def _is_a_power_of_two(cls, samples: int) -> int:
+    def _check_power_of_two(cls, samples: int) -> int:
         if samples & (samples - 1):
             raise ValueError(f"{samples} is not a power of two")
         return samples

@@ -37,7 +37,7 @@ class Environment(Parameters):
         return float(SUN_RADIUS_AT_1_AU_RAD * np.sqrt(self.solar_irradiance))
 
     def direct_fraction(self, sun_elevation_rad: float) -> float:
-        """Fraction of sunlight that reaches a plane facing the sun, including light scattered by a few degrees.
+        """Compute the fraction of sunlight on a plane facing the sun, including light scattered by a few degrees.
 
         ``exp(-tau' / sin elevation)``, where tau' is the optical depth without the forward peak of scattering (delta
         scaling, Joseph et al. 1976).
@@ -45,7 +45,7 @@ class Environment(Parameters):
         return float(np.exp(-self._delta_scaled()[0] / max(np.sin(sun_elevation_rad), MIN_SUN_SINE)))
 
     def sky_fraction(self, sun_elevation_rad: float) -> float:
-        """Diffuse irradiance of level ground, divided by that of direct sunlight on a plane facing the sun.
+        """Compute the diffuse irradiance of level ground / that of direct sunlight on a plane facing the sun.
 
         Delta-Eddington approximation (Joseph, Wiscombe & Weinman 1976) over black ground, without light that the ground
         reflects to the atmosphere. The value is also the radiance factor of a uniform sky with this irradiance.
@@ -76,7 +76,7 @@ class Environment(Parameters):
         return float(-self.optical_depth * np.expm1(-height_m / self.scale_height_m) / height_m)
 
     def _delta_scaled(self) -> tuple[float, float, float]:
-        """Optical depth, single-scattering albedo and asymmetry without the forward peak (fraction g**2)."""
+        """Compute optical depth, single-scattering albedo and asymmetry without the forward peak (fraction g**2)."""
         peak = self.asymmetry**2
         remainder = 1.0 - self.single_scattering_albedo * peak
         albedo = self.single_scattering_albedo * (1.0 - peak) / remainder
@@ -131,11 +131,11 @@ class Site(Parameters):
     hills: tuple[Hill, ...] = ()
 
     def with_dust(self, optical_depth: float | None) -> Site:
-        """Return the site with another optical depth of its air; None: no change."""
+        """Return the site with another optical depth of the atmosphere; None: no change."""
         if optical_depth is None:
             return self
-        air = self.environment.model_copy(update={"optical_depth": optical_depth})
-        return self.model_copy(update={"environment": air})
+        environment = self.environment.model_copy(update={"optical_depth": optical_depth})
+        return self.model_copy(update={"environment": environment})
 
     def terrain(self, scale: str | None = None, changes: Mapping[str, Any] | None = None) -> TerrainParameters:
         """Return the terrain parameters at a scale, 'descent' or 'ground'; the default is the coarsest scale.
@@ -178,9 +178,9 @@ def sites() -> dict[str, Site]:
     tables = tomllib.loads(Path(__file__).with_name("sites.toml").read_text("utf-8"))
     loaded = {}
     for name, entry in tables["sites"].items():
-        entry["environment"] = _with_base(tables["environments"][entry["environment"]], tables["environments"])
+        entry["environment"] = _merge_base(tables["environments"][entry["environment"]], tables["environments"])
         for scale in {"descent", "ground"} & set(entry):
-            entry[scale] = _with_base(entry[scale], tables["grounds"])
+            entry[scale] = _merge_base(entry[scale], tables["grounds"])
         for texture, coarsest_m in (("ground_texture", 3.0), ("rock_texture", 0.2)):
             # octaves down to 1 mm; amplitudes decrease by the factor `decay`
             first_amplitude, decay = entry[texture]["amplitude"], entry[texture]["decay"]
@@ -191,10 +191,10 @@ def sites() -> dict[str, Site]:
     return loaded
 
 
-def _with_base(entry: dict[str, Any], bases: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _merge_base(entry: dict[str, Any], bases: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Merge an entry with the values of its base."""
     values = {key: value for key, value in entry.items() if key != "base"}
-    return {**_with_base(bases[entry["base"]], bases), **values} if "base" in entry else values
+    return {**_merge_base(bases[entry["base"]], bases), **values} if "base" in entry else values
 
 
 def site(name: str) -> Site:

@@ -68,15 +68,15 @@ class Surface:
         return tuple(block_ceilings(level) for level in self.levels)
 
     def height(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
-        """Height above the datum, metres, at world positions."""
+        """Evaluate the height above the datum, metres, at world positions."""
         return self._evaluate(x, y, level)[..., 0]
 
     def gradient(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch 2"]:
-        """Slope (dz/dx, dz/dy) at world positions."""
+        """Evaluate the slope (dz/dx, dz/dy) at world positions."""
         return self._evaluate(x, y, level)[..., 1:3]
 
     def albedo(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
-        """Albedo at world positions."""
+        """Evaluate the albedo at world positions."""
         return self._evaluate(x, y, level)[..., 3]
 
     def _evaluate(self, x: Coordinate, y: Coordinate, level: int) -> Float[np.ndarray, "*batch 4"]:
@@ -123,7 +123,7 @@ def terrain_statistics(surface: Surface, samples: Samples | None = None) -> Terr
 
 
 def _heights(surface: Surface) -> Heights:
-    """Heights of the surface at its samples: the spline's values, not its control values."""
+    """Evaluate the heights of the surface at its samples: the spline's values, not its control values."""
     heights = surface.levels[0][..., HEIGHT]
     for axis in (0, 1):
         heights = correlate1d(heights, _SPLINE_AT_KNOTS, axis=axis, mode="wrap")
@@ -142,12 +142,13 @@ def mean_slope_deg(surface: Surface, baseline_m: float, samples: Samples | None 
 
 
 def _slope_deg(heights: Heights, spacing_m: float, baseline_m: float, samples: Samples | None) -> float:
+    # decimate to a spacing of 1/16 to 1/8 of the baseline
     step = 1
     while spacing_m * 2 * step <= baseline_m / 8.0:
         step *= 2
     z, mask = heights[::step, ::step], None if samples is None else samples[::step, ::step]
     if mask is not None:
-        # within the bounding box of the samples
+        # crop to the bounding box of the samples
         occupied = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
         box = tuple(slice(int(indices[0]), int(indices[-1]) + 1) if indices.size else slice(0) for indices in occupied)
         z, mask = z[box], mask[box]
@@ -184,11 +185,12 @@ def image_contrast(surface: Surface, pixel_m: float, samples: Samples | None = N
 def nadir_picture(
     surface: Surface, level: int, sun_azimuth_rad: float, sun_elevation_rad: float
 ) -> Float64[np.ndarray, "rows columns"]:
-    """Radiance factor of one level's samples in nadir view; row 0 is the terrain's southern edge."""
+    """Compute the radiance factor of one level's samples in nadir view; row 0 is the terrain's southern edge."""
     field = surface.levels[level].astype(np.float64)
     spacing = surface.spacing_m * 2.0**level
     height = field[..., HEIGHT]
     slope_x, slope_y = ((np.roll(height, -1, axis) - np.roll(height, 1, axis)) / (2.0 * spacing) for axis in (1, 0))
+    # cosines of the emission angle and of the incidence angle
     cos_e = 1.0 / np.sqrt(1.0 + slope_x**2 + slope_y**2)
     east, north = np.sin(sun_azimuth_rad), np.cos(sun_azimuth_rad)
     horizontal, up = np.cos(sun_elevation_rad), np.sin(sun_elevation_rad)

@@ -57,12 +57,12 @@ class Texture:
 def draw_terrain(
     seed: int = 1, contrast: float = 0.15, slope: float = 1.2, size: int = 2048, step_m: float = 1.5
 ) -> Texture:
-    """Random texture with mean 1, RMS `contrast` and amplitudes proportional to frequency to the power -`slope`."""
+    """Draw a random texture with mean 1, RMS `contrast` and amplitudes proportional to frequency**-slope."""
     rng = np.random.default_rng(seed)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(size), fft.rfftfreq(size), indexing="ij"))
     frequency[0, 0] = np.inf
-    shape = np.where(frequency > 4.0 / size, frequency**-slope, 0.0) * (frequency < 0.3)
-    values = fft.irfft2(shape * fft.rfft2(rng.standard_normal((size, size)), workers=1), (size, size))
+    amplitude = np.where(frequency > 4.0 / size, frequency**-slope, 0.0) * (frequency < 0.3)
+    values = fft.irfft2(amplitude * fft.rfft2(rng.standard_normal((size, size)), workers=1), (size, size))
     return Texture((1.0 + contrast * values / values.std()).astype(np.float32), step_m)
 
 
@@ -114,7 +114,10 @@ def trace_scene(texture: Texture, world_from_body: Rotation, position: np.ndarra
 def expose_scene(
     radiance: np.ndarray, detector: DetectorCalibration, noise: np.random.Generator | None = None, level: float = 1600.0
 ) -> np.ndarray:
-    """Counts of a static scene; `level`: counts of radiance 1 on the axis. Noise: 50 e, and shot noise at 6.9 e/DN."""
+    """Expose a static scene; return counts. `level`: counts of radiance 1 on the axis.
+
+    Noise: 50 electrons, and shot noise at 6.9 (11000 / 1600) electrons per count.
+    """
     rate = radiance * compute_fall_off()
     rate_above = np.cumsum(rate, axis=0) - rate  # float64, as the fall-off
     rate_below = rate.sum(axis=0) - rate_above - rate
@@ -147,16 +150,19 @@ def tilt_body(tilt_deg: float, azimuth_deg: float, roll_deg: float) -> Rotation:
 
 
 def draw_flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float = 30.0) -> Flight:
-    """Random rolls, tilts within 5 deg of a random mean tilt, and a random wind that changes between the intervals."""
-    wind = max_wind * np.sqrt(rng.uniform()) * np.array([*_unit(rng), 0.0])
+    """Draw random rolls, tilts within 5 deg of a random mean tilt, and a wind that changes between the intervals.
+
+    - max_wind: maximum horizontal velocity, m/s
+    """
+    wind = max_wind * np.sqrt(rng.uniform()) * np.array([*_draw_unit_vector(rng), 0.0])
     change = np.array([*rng.normal(0.0, 1.0, 2), 0.0])
     first = np.array([*rng.uniform(0.0, 3000.0, 2), rng.uniform(1900.0, 2100.0)])
     descent = np.array([0.0, 0.0, -75.0])
     steps = np.stack([np.zeros(3), wind + descent, 2.0 * (wind + descent) + change])
-    base = max_tilt_deg * np.sqrt(rng.uniform()) * _unit(rng)
+    mean_tilt_deg = max_tilt_deg * np.sqrt(rng.uniform()) * _draw_unit_vector(rng)
     attitudes = []
     for _ in range(3):
-        x, y = base + rng.uniform(-5.0, 5.0, 2)
+        x, y = mean_tilt_deg + rng.uniform(-5.0, 5.0, 2)
         attitudes.append(tilt_body(np.hypot(x, y), np.degrees(np.arctan2(y, x)), rng.uniform(0.0, 360.0)))
     return Flight(first + INTERVAL_S * steps, (attitudes[0], attitudes[1], attitudes[2]))
 
@@ -167,18 +173,18 @@ LEVEL_FLIGHT = (Rotation.identity(), Rotation.identity(), Rotation.identity())
 def steady_flight(
     velocity: tuple[float, float], attitudes: tuple[Rotation, Rotation, Rotation] = LEVEL_FLIGHT
 ) -> Flight:
-    """A descent at 75 m/s with a steady horizontal velocity (east, north)."""
+    """Create a descent at 75 m/s with a steady horizontal velocity (east, north), m/s."""
     step = INTERVAL_S * np.array([*velocity, -75.0])
     return Flight(np.array([900.0, 1400.0, 2000.0]) + np.outer(np.arange(3), step), attitudes)
 
 
-def _unit(rng: np.random.Generator) -> np.ndarray:
+def _draw_unit_vector(rng: np.random.Generator) -> np.ndarray:
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(angle), np.sin(angle)])
 
 
 def make_measurements(path: Flight, counts: list[np.ndarray], detector: DetectorCalibration) -> DescentMeasurements:
-    """Exact measurements of a flight with these images; the inertial velocities have a common error of (40, -25)."""
+    """Create exact measurements of a flight; the inertial velocities have a common error of (40, -25) m/s."""
     camera = CAMERA.bin(1, detector.rows_summed)
     times = [100.0 + INTERVAL_S * i for i in range(3)]
     return DescentMeasurements(
@@ -193,7 +199,7 @@ def make_measurements(path: Flight, counts: list[np.ndarray], detector: Detector
 def render(
     path: Flight, texture: Texture | None = None, noise: np.random.Generator | None = None, level: float = 1600.0
 ) -> DescentMeasurements:
-    """Images and exact measurements of a flight."""
+    """Render the images of a flight; return them with exact measurements."""
     detector = make_calibration()
     ground = draw_terrain() if texture is None else texture
     counts = [
@@ -204,6 +210,6 @@ def render(
 
 
 def valid_velocity(estimate: VelocityEstimate) -> np.ndarray:
-    """The velocity of an estimate that has one."""
+    """Return the velocity of an estimate. Fails without a velocity."""
     assert estimate.velocity_m_s is not None
     return estimate.velocity_m_s

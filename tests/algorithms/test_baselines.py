@@ -28,8 +28,7 @@ from tests.algorithms.synthetic_descent import (
 ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
 with_baselines = pytest.mark.parametrize("name", ESTIMATORS)
 with_dimes = pytest.mark.parametrize("estimator", [*ESTIMATORS.values(), DimesEstimator()], ids=[*ESTIMATORS, "dimes"])
-
-
+#: Attitudes at the three images.
 ATTITUDES = (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
 
 

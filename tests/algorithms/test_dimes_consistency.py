@@ -32,8 +32,10 @@ METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_r
 
 
 def make_track(pair: int, index: int, velocity: np.ndarray, failed: tuple[ValidityCheck, ...] = ()) -> Track:
-    none = np.zeros((3, 3))
-    return Track(pair, index, *(np.zeros(2),) * 3, none, none, np.ones(2), none, METRICS, failed, np.asarray(velocity))
+    blank = np.zeros((3, 3))
+    return Track(
+        pair, index, *(np.zeros(2),) * 3, blank, blank, np.ones(2), blank, METRICS, failed, np.asarray(velocity)
+    )
 
 
 @cache
@@ -43,7 +45,7 @@ def make_nadir_view() -> View:
 
 
 def make_pair(*tracks: Track) -> PairDetails:
-    """Tracks of a pair; the images are not used."""
+    """Create the details of a pair with these tracks; the images are not used."""
     nadir = make_nadir_view()
     return PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, 1, tracks, (nadir, nadir))
 
@@ -104,7 +106,7 @@ def test_invalid_tracks_are_ignored(invalid_pair: int) -> None:
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK
 
 
-def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
+def draw_track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
     """Draw velocity errors of four tracks per case from error formulas, m/s, shape (cases, pair, template, 2).
 
     The tracks of an image have common errors of altitude, 1 % (3 sigma), and attitude, 0.03 deg (0.5 ms at 60 deg/s).
@@ -134,8 +136,8 @@ def test_one_wrong_track_rarely_causes_a_wrong_velocity(tracks_per_pair: int, wr
     # With one of four tracks wrong by at least 10 m/s, 99.5 % of cases report a correct velocity or none.
     rng = np.random.default_rng(12)
     cases = 1000
-    errors = track_errors(rng, cases)[:, :, :tracks_per_pair]
-    not_wrong = 0
+    errors = draw_track_errors(rng, cases)[:, :, :tracks_per_pair]
+    acceptable_count = 0
     for case in range(cases):
         angle = rng.uniform(0.0, 2.0 * np.pi)
         tracks = errors[case].copy()
@@ -145,8 +147,8 @@ def test_one_wrong_track_rarely_causes_a_wrong_velocity(tracks_per_pair: int, wr
         inertial[:, :2] = truth + np.array([[7.0, -4.0]]) + np.array([[0.0, 0.0], change])
         answer = combine_tracks(list(truth + tracks[0]), list(truth + change + tracks[1]), inertial)
         error = 0.0 if answer.velocity_m_s is None else np.hypot(*(answer.velocity_m_s - truth - change))
-        not_wrong += bool(error <= 5.0)
-    assert not_wrong >= 0.995 * cases
+        acceptable_count += bool(error <= 5.0)
+    assert acceptable_count >= 0.995 * cases
 
 
 def test_propagation_removes_the_inertial_bias() -> None:
@@ -172,9 +174,9 @@ def test_each_metric_beyond_its_limit_fails_its_check(change: dict[str, Any], ch
 
 
 def test_track_at_each_limit_is_valid() -> None:
-    o = DimesOptions()
-    limit = TrackMetrics(o.min_contrast, o.min_peak, o.max_peak_width_px, o.max_second_peak_ratio, on_border=False)
-    assert failed_checks(limit, o) == ()
+    options = DimesOptions()
+    limits = (options.min_contrast, options.min_peak, options.max_peak_width_px, options.max_second_peak_ratio)
+    assert failed_checks(TrackMetrics(*limits, on_border=False), options) == ()
 
 
 @pytest.mark.parametrize(

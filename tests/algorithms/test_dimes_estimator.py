@@ -35,23 +35,25 @@ from tests.algorithms.synthetic_descent import (
 ESTIMATOR: VelocityEstimator = DimesEstimator(DimesOptions(**IMPROVEMENTS))
 
 
-def details_of(estimate: VelocityEstimate) -> DimesDetails:
+def get_details(estimate: VelocityEstimate) -> DimesDetails:
     assert isinstance(estimate.details, DimesDetails)
     return estimate.details
 
 
-def track_errors(flights: list[Flight], estimates: list[VelocityEstimate], valid_only: bool = True) -> np.ndarray:
+def compute_track_errors(
+    flights: list[Flight], estimates: list[VelocityEstimate], valid_only: bool = True
+) -> np.ndarray:
     return np.array(
         [
             track.velocity_m_s - truth.velocities[track.pair, :2]
             for truth, estimate in zip(flights, estimates, strict=True)
-            for track in details_of(estimate).tracks
+            for track in get_details(estimate).tracks
             if track.valid or not valid_only
         ]
     )
 
 
-def rms(errors: np.ndarray) -> float:
+def compute_rms(errors: np.ndarray) -> float:
     """Root mean square length of vectors."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
@@ -63,11 +65,11 @@ def test_noise_free_velocity_error_is_within_requirement() -> None:
     estimates = [ESTIMATOR.estimate(render(truth)) for truth in flights]
     assert [e.outcome for e in estimates] == [VelocityOutcome.VALID] * len(flights)
     errors = np.array([e.velocity_m_s - f.velocities[1, :2] for e, f in zip(estimates, flights, strict=True)])
-    assert rms(errors) < 0.05
-    of_tracks = track_errors(flights, estimates)
-    assert len(of_tracks) >= 0.9 * 4 * len(flights)
-    assert rms(of_tracks) < 0.05
-    assert np.linalg.norm(of_tracks, axis=1).max() < 0.15
+    assert compute_rms(errors) < 0.05
+    errors_of_tracks = compute_track_errors(flights, estimates)
+    assert len(errors_of_tracks) >= 0.9 * 4 * len(flights)
+    assert compute_rms(errors_of_tracks) < 0.05
+    assert np.linalg.norm(errors_of_tracks, axis=1).max() < 0.15
 
 
 def test_published_algorithm_has_the_errors_of_its_peak_fit() -> None:
@@ -75,7 +77,7 @@ def test_published_algorithm_has_the_errors_of_its_peak_fit() -> None:
     flights = [draw_flight(rng) for _ in range(6)]
     estimates = [DimesEstimator().estimate(render(truth)) for truth in flights]
     # The fit is biased by up to 0.12 px of 5.6 m in 3.75 s (0.18 m/s) on each axis.
-    assert 0.03 < rms(track_errors(flights, estimates)) < 0.18
+    assert 0.03 < compute_rms(compute_track_errors(flights, estimates)) < 0.18
 
 
 def test_velocity_is_accurate_with_flight_camera_noise() -> None:
@@ -83,7 +85,7 @@ def test_velocity_is_accurate_with_flight_camera_noise() -> None:
     flights = [draw_flight(rng) for _ in range(6)]
     estimates = [ESTIMATOR.estimate(render(truth, noise=rng)) for truth in flights]
     assert [e.outcome for e in estimates] == [VelocityOutcome.VALID] * len(flights)
-    assert rms(track_errors(flights, estimates)) < 0.06
+    assert compute_rms(compute_track_errors(flights, estimates)) < 0.06
 
 
 @pytest.mark.parametrize("velocity", [(20.0, 0.0), (0.0, 20.0), (-15.0, 25.0)])
@@ -98,7 +100,7 @@ def test_template_and_match_show_the_same_ground() -> None:
         (12.0, -7.0), (tilt_body(3.0, 0.0, 40.0), tilt_body(8.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
     )
     measured = render(truth)
-    tracks = details_of(ESTIMATOR.estimate(measured)).tracks
+    tracks = get_details(ESTIMATOR.estimate(measured)).tracks
     assert len(tracks) == 4
     for track in tracks:
         ground = []
@@ -116,7 +118,7 @@ def test_subpixel_refinement_reduces_velocity_error() -> None:
 
     def rms_error(options: DimesOptions) -> float:
         estimates = [DimesEstimator(options).estimate(m) for m in measured]
-        return rms(track_errors(flights, estimates, valid_only=False))
+        return compute_rms(compute_track_errors(flights, estimates, valid_only=False))
 
     whole_pixel, fitted, aligned = (
         rms_error(DimesOptions(full_camera=True, subpixel=subpixel, align=align))
@@ -162,7 +164,7 @@ def test_featureless_terrain_has_no_contrast() -> None:
     answer = ESTIMATOR.estimate(render(steady_flight((10.0, 0.0)), draw_terrain(3, 0.0), np.random.default_rng(4)))
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK
     assert answer.velocity_m_s is None
-    tracks = details_of(answer).tracks
+    tracks = get_details(answer).tracks
     assert len(tracks) == 4
     assert all(ValidityCheck.CONTRAST in track.failed for track in tracks)
 
@@ -171,7 +173,7 @@ def test_featureless_terrain_has_no_contrast() -> None:
 def test_repetitive_terrain_is_rejected_by_second_peak(wavelength_m: float) -> None:
     answer = ESTIMATOR.estimate(render(steady_flight((10.0, 5.0)), make_waves(wavelength_m), np.random.default_rng(4)))
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK
-    assert all(ValidityCheck.SECOND_PEAK in track.failed for track in details_of(answer).tracks)
+    assert all(ValidityCheck.SECOND_PEAK in track.failed for track in get_details(answer).tracks)
 
 
 def test_disagreement_with_imu_rejects_the_velocity() -> None:
@@ -179,8 +181,8 @@ def test_disagreement_with_imu_rejects_the_velocity() -> None:
     velocities = measured.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
     answer = ESTIMATOR.estimate(replace(measured, interval_velocities_m_s=velocities))
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
-    assert details_of(answer).chosen is None
-    assert details_of(answer).combinations[0].discrepancy_m_s == pytest.approx(10.0, abs=0.2)
+    assert get_details(answer).chosen is None
+    assert get_details(answer).combinations[0].discrepancy_m_s == pytest.approx(10.0, abs=0.2)
 
 
 def _set_counts(measured: DescentMeasurements, change: Callable[[int, np.ndarray], np.ndarray]) -> DescentMeasurements:
@@ -215,7 +217,7 @@ def test_any_image_returns_an_estimate(
     answer = ESTIMATOR.estimate(_set_counts(measurements, change))
     assert answer.outcome is not VelocityOutcome.VALID
     assert answer.velocity_m_s is None
-    dimes_products(details_of(answer))
+    dimes_products(get_details(answer))
 
 
 @pytest.mark.parametrize("altitude_m", [1e-300, 1e-3, 3.0, 120.0, 2e4, 9e5, 1e300, -10.0, np.nan, np.inf])
@@ -256,7 +258,7 @@ def test_velocity_is_correct_with_one_corrupted_template_per_pair() -> None:
     rng = np.random.default_rng(12)
     truth = draw_flight(rng, max_tilt_deg=10.0)
     measured = render(truth)
-    reference = details_of(ESTIMATOR.estimate(measured))
+    reference = get_details(ESTIMATOR.estimate(measured))
     corrupted = {t.pair: t.template_pixel for t in reference.tracks if t.index == 0}
 
     def add_dust(k: int, counts: np.ndarray) -> np.ndarray:
@@ -267,7 +269,7 @@ def test_velocity_is_correct_with_one_corrupted_template_per_pair() -> None:
         return counts
 
     answer = ESTIMATOR.estimate(_set_counts(measured, add_dust))
-    assert not all(track.valid for track in details_of(answer).tracks)
+    assert not all(track.valid for track in get_details(answer).tracks)
     assert answer.outcome is VelocityOutcome.VALID
     np.testing.assert_allclose(valid_velocity(answer), truth.velocities[1, :2], atol=0.3)
 
@@ -290,13 +292,13 @@ def test_opposition_surge_does_not_bias_velocity() -> None:
     # Without a mask the templates are at the surge, which has the highest contrast. Its distance from the nadir
     # decreases with altitude. The apparent velocity is the descent rate times the cotangent of the sun's elevation.
     apparent_velocity = -75.0 * sun[:2] / sun[2]
-    unmasked = details_of(DimesEstimator(DimesOptions(**IMPROVEMENTS, zero_phase_radius_rad=0.0)).estimate(measured))
+    unmasked = get_details(DimesEstimator(DimesOptions(**IMPROVEMENTS, zero_phase_radius_rad=0.0)).estimate(measured))
     assert np.hypot(*(apparent_velocity - truth.velocities[1, :2])) > 10.0
     assert min(np.hypot(*(t.velocity_m_s - apparent_velocity)) for t in unmasked.tracks) < 5.0
 
 
 def test_products_contain_the_keys_used_by_reports(measurements: DescentMeasurements) -> None:
-    details = details_of(ESTIMATOR.estimate(measurements))
+    details = get_details(ESTIMATOR.estimate(measurements))
     products = dimes_products(details)
     assert products["tracks_columns"] == [
         "pair", "template", "template_u", "template_v", "match_u", "match_v", "contrast", "peak", "peak_width",
@@ -318,11 +320,11 @@ def test_products_contain_the_keys_used_by_reports(measurements: DescentMeasurem
 
 
 def test_products_report_failures_and_selection(measurements: DescentMeasurements) -> None:
-    details = details_of(ESTIMATOR.estimate(measurements))
+    details = get_details(ESTIMATOR.estimate(measurements))
     assert details.chosen is not None
     products = dimes_products(details)
     np.testing.assert_array_equal(products["chosen"], [details.chosen.first, details.chosen.second])
-    flat = details_of(ESTIMATOR.estimate(_set_counts(measurements, lambda k, c: np.full_like(c, 1000))))
+    flat = get_details(ESTIMATOR.estimate(_set_counts(measurements, lambda k, c: np.full_like(c, 1000))))
     products = dimes_products(flat)
     assert products["chosen"].size == 0
     column = products["tracks_columns"].index("failed_contrast")
@@ -330,7 +332,7 @@ def test_products_report_failures_and_selection(measurements: DescentMeasurement
 
 
 def test_rectified_lattice_matches_track_pixels(measurements: DescentMeasurements) -> None:
-    details = details_of(ESTIMATOR.estimate(measurements))
+    details = get_details(ESTIMATOR.estimate(measurements))
     products = dimes_products(details)
     for track in details.tracks:
         west, north, step = products[f"rectified_frame_{track.pair}"]
@@ -347,7 +349,7 @@ def test_rectified_lattice_matches_track_pixels(measurements: DescentMeasurement
 
 def test_inputs_are_unchanged_and_estimates_are_deterministic(measurements: DescentMeasurements) -> None:
     copies = [image.counts.copy() for image in measurements.images]
-    first, second = (dimes_products(details_of(ESTIMATOR.estimate(measurements))) for _ in range(2))
+    first, second = (dimes_products(get_details(ESTIMATOR.estimate(measurements))) for _ in range(2))
     for image, copy in zip(measurements.images, copies, strict=True):
         np.testing.assert_array_equal(image.counts, copy)
     assert first.keys() == second.keys()
@@ -364,7 +366,7 @@ def test_altitude_error_causes_predicted_velocity_error() -> None:
         *measured.altitudes[:2],
         replace(measured.altitudes[2], altitude_m=measured.altitudes[2].altitude_m + error),
     )
-    tracks = [t for t in details_of(ESTIMATOR.estimate(replace(measured, altitudes=altitudes))).tracks if t.pair == 1]
+    tracks = [t for t in get_details(ESTIMATOR.estimate(replace(measured, altitudes=altitudes))).tracks if t.pair == 1]
     assert len(tracks) == 2
     for track in tracks:
         earlier, later = (truth.positions[k, 2] for k in (1, 2))

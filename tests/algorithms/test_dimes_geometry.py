@@ -50,7 +50,7 @@ from tests.algorithms.synthetic_descent import (
 )
 
 OPTIONS = DimesOptions()
-LIMIT = OPTIONS.max_off_nadir_rad
+MAX_OFF_NADIR_RAD = OPTIONS.max_off_nadir_rad
 SUN_BELOW_HORIZON = direction(0.0, -1.0)  # no zero-phase spot on the ground
 
 
@@ -76,7 +76,7 @@ def find_candidates(first: View, second: View, sun: np.ndarray = SUN_BELOW_HORIZ
 def test_ground_and_pixel_projections_are_inverse() -> None:
     view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     pixels = grid_pixels(view.size, 16)
-    ground, is_within_limit = ground_from_pixels(view, pixels, LIMIT)
+    ground, is_within_limit = ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
     reprojected, visible = pixels_from_ground(view, ground)
     assert is_within_limit.sum() > 200
     assert np.all(visible[is_within_limit])
@@ -86,24 +86,24 @@ def test_ground_and_pixel_projections_are_inverse() -> None:
 def test_distant_rays_are_clipped_at_the_off_nadir_limit() -> None:
     view = make_blank_view(tilt_body(80.0, 0.0, 0.0), 1500.0)  # tilted: half of the image is sky
     pixels = border_pixels(view.size)
-    ground, is_within_limit = ground_from_pixels(view, pixels, LIMIT)
+    ground, is_within_limit = ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
     _, directions = view.camera.rays(pixels)
     assert np.any(directions[:, 2] > 0.0)
     assert not is_within_limit.all()
     off_nadir = np.hypot(*ground.T) / view.centre[2]
-    np.testing.assert_allclose(off_nadir[~is_within_limit], np.tan(LIMIT))
+    np.testing.assert_allclose(off_nadir[~is_within_limit], np.tan(MAX_OFF_NADIR_RAD))
     dot_products = np.sum(ground * directions[:, :2], axis=1)
     np.testing.assert_allclose(dot_products, np.hypot(*ground.T) * np.hypot(*directions[:, :2].T))
 
 
 def test_camera_is_above_origin_for_any_mounting_position() -> None:
     attitude = tilt_body(30.0, 45.0, 10.0)
-    lever = np.array([0.5, -1.0, -2.0])
-    camera = CAMERA.bin(1, ROWS_SUMMED).transform(RigidTransform.from_translation(lever))
+    lever_arm_m = np.array([0.5, -1.0, -2.0])
+    camera = CAMERA.bin(1, ROWS_SUMMED).transform(RigidTransform.from_translation(lever_arm_m))
     image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, camera, make_calibration())
     view = build_view(image, attitude, 1400.0, (256, 256))
     np.testing.assert_allclose(view.camera.c, view.centre, atol=1e-9)
-    np.testing.assert_allclose(view.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever)[2]], atol=1e-9)
+    np.testing.assert_allclose(view.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever_arm_m)[2]], atol=1e-9)
 
 
 def test_pixel_angle_and_search_geometry_match_the_paper() -> None:
@@ -139,8 +139,8 @@ def test_candidates_lie_within_the_overlap_polygon() -> None:
     polygon = overlap_polygon(first, second, OPTIONS).astype(np.float32)
     positions = find_candidates(first, second).pixels
     assert len(positions) > 20
-    inside = [cv2.pointPolygonTest(polygon, (float(u), float(v)), True) for u, v in positions]
-    assert min(inside) > 0.5 * OPTIONS.template_px * 0.7  # half the window width in the first image
+    border_distances = [cv2.pointPolygonTest(polygon, (float(u), float(v)), True) for u, v in positions]
+    assert min(border_distances) > 0.5 * OPTIONS.template_px * 0.7  # half the window width in the first image
 
 
 def test_each_candidate_fits_template_and_window() -> None:
@@ -152,8 +152,12 @@ def test_each_candidate_fits_template_and_window() -> None:
         result = find_candidates(first, second).ground
         assert len(result) > 0
         for ground in result:
-            assert inside_frame(first, ground + square_outline(geometry.template_half_m, 15), 0.0, LIMIT).all()
-            assert inside_frame(second, ground + square_outline(geometry.window_half_m, 15), 0.0, LIMIT).all()
+            assert inside_frame(
+                first, ground + square_outline(geometry.template_half_m, 15), 0.0, MAX_OFF_NADIR_RAD
+            ).all()
+            assert inside_frame(
+                second, ground + square_outline(geometry.window_half_m, 15), 0.0, MAX_OFF_NADIR_RAD
+            ).all()
 
 
 @pytest.mark.parametrize(
@@ -209,12 +213,12 @@ def test_grid_has_the_given_step_and_is_centred() -> None:
 def test_candidates_with_highest_contrast_are_selected_with_min_spacing() -> None:
     pixels = np.array([[10.0, 10.0], [20.0, 12.0], [60.0, 10.0], [10.0, 90.0]])
     contrasts = np.array([0.9, 0.8, 0.1, 0.5])
-    everywhere = np.ones(4, dtype=bool)
-    assert best_candidates(contrasts, pixels, everywhere, 2, 31.0) == [0, 3]
-    assert best_candidates(contrasts, pixels, everywhere, 4, 31.0) == [0, 3, 2]
-    assert best_candidates(contrasts, pixels, everywhere, 2, 5.0) == [0, 1]
-    # a candidate at exactly the exclusion distance is available
-    assert best_candidates(contrasts, pixels, everywhere, 2, 10.0) == [0, 1]
+    all_preferred = np.ones(4, dtype=bool)
+    assert best_candidates(contrasts, pixels, all_preferred, 2, 31.0) == [0, 3]
+    assert best_candidates(contrasts, pixels, all_preferred, 4, 31.0) == [0, 3, 2]
+    assert best_candidates(contrasts, pixels, all_preferred, 2, 5.0) == [0, 1]
+    # A candidate at exactly the minimum spacing is available.
+    assert best_candidates(contrasts, pixels, all_preferred, 2, 10.0) == [0, 1]
     assert best_candidates(contrasts, pixels, np.array([False, True, False, False]), 2, 31.0) == [1, 3]
     assert best_candidates(np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=bool), 2, 31.0) == []
 
@@ -257,7 +261,7 @@ def test_rectified_patch_shows_its_lattice_positions(attitude: Rotation) -> None
     position = np.array([700.0, -300.0, 1700.0])
     counts = expose_scene(trace_scene(make_wave_texture(), attitude, position), make_calibration(), level=1600.0)
     view = make_blank_view(attitude, 1700.0, 0.0, counts)
-    centre, is_within_limit = ground_from_pixels(view, np.array([[150.0, 90.0]]), LIMIT)
+    centre, is_within_limit = ground_from_pixels(view, np.array([[150.0, 90.0]]), MAX_OFF_NADIR_RAD)
     assert is_within_limit[0]
     patch = rectify_patch(view, centre[0], 61, 5.5)
     lattice = ground_lattice(centre[0], 61, 5.5) + position[:2]
@@ -284,9 +288,9 @@ def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
     view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     lattice = ground_lattice(np.array([-150.0, 200.0]), 31, 5.5)
     exact, visible = pixels_from_ground(view, lattice)
-    pixels, flags = homography_lattice(view, lattice)
+    pixels, is_visible = homography_lattice(view, lattice)
     assert visible.all()
-    assert flags.all()
+    assert is_visible.all()
     np.testing.assert_allclose(pixels[[0, 0, -1, -1], [0, -1, 0, -1]], exact[[0, 0, -1, -1], [0, -1, 0, -1]], atol=1e-4)
     differences_px = np.hypot(*np.moveaxis(pixels - exact, -1, 0))
     # 31 px span a seventh of the image; the lens shifts its corners by 5 % of a pixel more than its centre.
@@ -299,5 +303,5 @@ def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
 
 def test_homography_of_an_invisible_corner_is_invisible() -> None:
     view = make_blank_view(tilt_body(75.0, 0.0, 0.0), 1500.0)
-    _, flags = homography_lattice(view, ground_lattice(np.array([0.0, -40000.0]), 5, 5.5))
-    assert not flags.any()
+    _, is_visible = homography_lattice(view, ground_lattice(np.array([0.0, -40000.0]), 5, 5.5))
+    assert not is_visible.any()

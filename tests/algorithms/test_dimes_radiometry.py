@@ -21,12 +21,13 @@ from tests.algorithms.synthetic_descent import (
     trace_scene,
 )
 
-LEVEL = 1600.0
+LEVEL = 1600.0  #: Counts of radiance 1.
+#: Times per row of the transfer and of the clearing.
 ROW_TIMES_S = [(5e-6, 2e-6), (5e-6, 0.0), (0.0, 2e-6), (3e-6, 3e-6), (1e-6, 5e-6), (0.0, 0.0)]
 
 
 def simulate_transfer(rates: np.ndarray, exposure_s: float, transfer_row_s: float, clear_row_s: float) -> np.ndarray:
-    """Charge of each physical row: its exposure plus the smear of the rows passed in clearing and in transfer."""
+    """Compute the charge of each physical row: its exposure, and the smear of rows passed in clearing and transfer."""
     charge = exposure_s * rates
     for r in range(len(rates)):
         for passed in range(len(rates) - 1, r, -1):
@@ -64,7 +65,7 @@ def test_exposure_is_optional_without_frame_transfer() -> None:
 
 
 def render_view(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, View]:
-    """Radiance of a textured scene and the DIMES view of its image."""
+    """Render a textured scene; return its radiance and the DIMES view of its image."""
     attitude = Rotation.from_euler("zy", [30.0, 12.0], degrees=True)
     radiance = trace_scene(draw_terrain(), attitude, np.array([500.0, 300.0, 1700.0]))
     detector = make_calibration(transfer_row_s, clear_row_s)

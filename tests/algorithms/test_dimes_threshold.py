@@ -20,6 +20,7 @@ from benchmarks.threshold_derivation import (
 from marsyard.algorithms.dimes.options import DimesOptions
 
 STORED = json.loads(dimes_threshold.STORED.read_text())
+#: Inputs without measurement errors.
 EXACT = ThresholdInputs(
     descents=20,
     altitude_sd=0.0,

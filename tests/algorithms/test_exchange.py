@@ -162,7 +162,7 @@ def test_program_answer_and_stderr_are_stored(measurements: DescentMeasurements,
         ("while True: pass", Fault.TIMED_OUT, "no answer within 2 s"),
         ("import subprocess; subprocess.Popen(['sleep', '60'])", Fault.TIMED_OUT, "no answer within 2 s"),
         ("x = bytearray(400_000_000); time.sleep(60)", Fault.OUT_OF_MEMORY, "0.2 GB"),
-        ("while True: print('and another thing')", Fault.TOO_MUCH_OUTPUT, "1 MB"),
+        ("while True: print('more output')", Fault.TOO_MUCH_OUTPUT, "1 MB"),
         ("", Fault.BAD_ANSWER, "not one JSON object"),
         ("print('[1]')", Fault.BAD_ANSWER, "not one JSON object"),
         ("print('{}')", Fault.BAD_ANSWER, "exchange is None; allowed: 1"),
@@ -190,7 +190,7 @@ def test_program_errors_are_reported_as_faults(
         )
     assert caught.value.fault is fault
     assert caught.value.stderr.startswith("!")
-    assert time.monotonic() - started < 59.0  # child processes are not waited for
+    assert time.monotonic() - started < 59.0  # the test does not wait for child processes
 
 
 SERVER = f"""
@@ -240,7 +240,7 @@ def test_late_second_answer_is_not_used_for_the_next_case(
     spec = f"serve:{write_program(tmp_path, format_double_answers(version))}"
     first = run_program(spec, measurements).velocity_m_s
     assert first is not None
-    time.sleep(0.5)  # the second line is now in the pipe
+    time.sleep(0.5)  # the second line is in the pipe
     with pytest.raises(AlgorithmError, match="before the request; expected one line") as caught:
         run_program(spec, measurements)
     assert caught.value.fault is Fault.BAD_ANSWER

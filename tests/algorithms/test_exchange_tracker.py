@@ -75,7 +75,7 @@ def write_server(folder: Path, text: str = SERVER) -> str:
     return f"{sys.executable} {path}"
 
 
-def process_id(update: TargetUpdate) -> int:
+def get_process_id(update: TargetUpdate) -> int:
     assert isinstance(update.details, ProgramDetails)
     return int(update.details.stderr)
 
@@ -89,16 +89,18 @@ def import_path(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("import_path")
 def test_program_matches_python_tracker(tmp_path: Path) -> None:
     python_tracker = VisualTargetTracker(VttOptions())
-    reference = trackers.drive(python_tracker)
+    reference = trackers.drive_to_target(python_tracker)
     program = make_tracker(f"serve:{write_server(tmp_path)}")
-    actual = trackers.drive(program)
+    actual = trackers.drive_to_target(program)
     assert [update.state for update in actual] == [TrackingState.NORMAL] * len(reference)
     for expected_update, update in zip(reference, actual, strict=True):
         assert expected_update.position_rover is not None
         assert update.position_rover is not None
         # Numbers are exchanged exactly; quaternions are normalised again.
         np.testing.assert_allclose(update.position_rover, expected_update.position_rover, rtol=0.0, atol=1e-12)
-    lost, expected = (trackers.stop(tracker, trackers.pose(2.0), blank=0) for tracker in (program, python_tracker))
+    lost, expected = (
+        trackers.update_tracker(tracker, trackers.pose(2.0), blank=0) for tracker in (program, python_tracker)
+    )
     assert lost is not None
     assert expected is not None
     assert lost.state is program.state is TrackingState.LOST
@@ -116,7 +118,7 @@ def test_persistent_process_serves_many_runs(tmp_path: Path) -> None:
         processes = []
         for _ in range(2):
             tracker = make_tracker(f"{prefix}:{command}")
-            processes.append({process_id(update) for update in trackers.drive(tracker)})
+            processes.append({get_process_id(update) for update in trackers.drive_to_target(tracker)})
             del tracker
             gc.collect()
         assert all(len(process_ids) == 1 for process_ids in processes)
@@ -128,7 +130,7 @@ def test_persistent_process_serves_many_runs(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("import_path")
 def test_example_tracks_the_target() -> None:
-    updates = trackers.drive(make_tracker(f"exec:{sys.executable} {EXAMPLE}"))
+    updates = trackers.drive_to_target(make_tracker(f"exec:{sys.executable} {EXAMPLE}"))
     assert [update.state for update in updates] == [TrackingState.NORMAL] * 4
     for number, update in enumerate(updates):
         true_position = trackers.pose(0.4 * number).inv().apply(trackers.TARGET_M)
@@ -139,14 +141,14 @@ def test_example_tracks_the_target() -> None:
 
 
 READY = 'import json, sys\nprint(json.dumps({"exchange": 1, "ready": True}), flush=True)\n'
-#: Writes the answers without reading the requests.
+#: A program that prints fixed answers without evaluating the requests.
 ANSWERING = (
     READY
     + """
 OK = '{"exchange": 1, "state": "NORMAL"}'
 AIM = '{"exchange": 1, "aim": {"azimuth_rad": 0, "elevation_rad": 0, "left": BOX, "right": BOX}}'
 WIDE, SMALL = '{"corner": [0, 0], "size": [9999, 64]}', '{"corner": [0, 0], "size": [64, 64]}'
-SEEN = AIM.replace("BOX", SMALL)
+VALID_AIM = AIM.replace("BOX", SMALL)
 for answer in ANSWERS:
     sys.stdin.readline()
     print("hm", file=sys.stderr, flush=True)
@@ -167,14 +169,14 @@ for answer in ANSWERS:
         ("[OK, AIM.replace('BOX', '[0, 0, 1024, 1024]')]", r"left is \[0, 0, 1024, 1024\]; allowed"),
         ("[OK, AIM.replace('_rad\": 0', '_rad\": 9')]", "azimuth_rad is 9.0; allowed"),
         ("[OK, AIM.replace('BOX', WIDE)]", "allowed: whole pixels inside the frame"),
-        ('[OK, SEEN, \'{"exchange": 1, "state": "FOUND"}\']', "state is 'FOUND'"),
-        ('[OK, SEEN, \'{"exchange": 1, "state": "NORMAL"}\']', "position_rover is None"),
+        ('[OK, VALID_AIM, \'{"exchange": 1, "state": "FOUND"}\']', "state is 'FOUND'"),
+        ('[OK, VALID_AIM, \'{"exchange": 1, "state": "NORMAL"}\']', "position_rover is None"),
         (
-            '[OK, SEEN, \'{"exchange": 1, "state": "LOST", "losses": ["TIRED"]}\']',
+            '[OK, VALID_AIM, \'{"exchange": 1, "state": "LOST", "losses": ["TIRED"]}\']',
             "a loss is 'TIRED'; allowed: LOW_MATCH_SCORE",
         ),
         (
-            '[OK, SEEN, \'{"exchange": 1, "state": "NORMAL", "position_rover": [1, 2]}\']',
+            '[OK, VALID_AIM, \'{"exchange": 1, "state": "NORMAL", "position_rover": [1, 2]}\']',
             r"position_rover is '\[1, 2\]'",
         ),
     ],
@@ -182,7 +184,7 @@ for answer in ANSWERS:
 def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: str, message: str) -> None:
     fault = Fault.CRASHED if answers == "[]" else Fault.BAD_ANSWER
     with pytest.raises(AlgorithmError, match=message) as caught:
-        trackers.drive(make_tracker(f"exec:{write_server(tmp_path, ANSWERING.replace('ANSWERS', answers))}"))
+        trackers.drive_to_target(make_tracker(f"exec:{write_server(tmp_path, ANSWERING.replace('ANSWERS', answers))}"))
     assert caught.value.fault is fault
     assert caught.value.stderr == ("" if fault is Fault.CRASHED else "hm\n")
 

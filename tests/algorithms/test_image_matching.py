@@ -12,7 +12,8 @@ from marsyard.algorithms.image.registration import Warp, register_template, simi
 WARPS: tuple[Warp, ...] = ("shift", "stretch", "bend")
 
 
-def correlate(template: np.ndarray, window: np.ndarray) -> np.ndarray:
+def correlate_directly(template: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """Correlate with a loop over all positions."""
     n, m = template.shape
     result = np.zeros((window.shape[0] - n + 1, window.shape[1] - m + 1))
     for i, j in np.ndindex(*result.shape):
@@ -21,7 +22,7 @@ def correlate(template: np.ndarray, window: np.ndarray) -> np.ndarray:
 
 
 def draw_natural_image(seed: int, size: int, blur: float = 1.2) -> np.ndarray:
-    """Counts of a random texture with about 10 % contrast, blurred as by optics."""
+    """Draw counts of a random texture with about 10 % contrast, blurred as by optics."""
     noise = np.random.default_rng(seed).normal(size=(size, size))
     image = ndimage.gaussian_filter(noise, blur) + 2.0 * ndimage.gaussian_filter(noise, 4.0 * blur)
     return np.asarray(1500.0 + 150.0 * image / image.std())
@@ -32,7 +33,9 @@ def test_correlation_equals_its_definition(n: int, m: int, rows: int, columns: i
     rng = np.random.default_rng(n * rows)
     template, window = 1000.0 + 30.0 * rng.normal(size=(n, m)), 1500.0 + 50.0 * rng.normal(size=(rows, columns))
     # Sums of products are computed in float32: relative errors of 1e-7.
-    np.testing.assert_allclose(normalized_correlation(template, window), correlate(template, window), atol=1e-5)
+    np.testing.assert_allclose(
+        normalized_correlation(template, window), correlate_directly(template, window), atol=1e-5
+    )
 
 
 def test_correlation_ignores_gain_and_offset() -> None:
@@ -78,7 +81,7 @@ def test_coarse_to_fine_search_equals_full_search() -> None:
 
 
 def render_blobs(seed: int, points: np.ndarray, width: float = 2.0) -> np.ndarray:
-    """An analytic image at points (..., 2) of (u, v): a sum of Gaussians."""
+    """Evaluate an analytic image at points (..., 2) of (u, v): a sum of Gaussians."""
     rng = np.random.default_rng(seed)
     image = np.zeros(points.shape[:-1])
     for (u, v), height in zip(rng.uniform(-10.0, 90.0, (600, 2)), rng.normal(size=600), strict=True):
@@ -108,7 +111,7 @@ def test_patches_are_scaled_and_rolled_about_the_point(magnification: float, rol
     np.testing.assert_allclose(patch, render_blobs(4, centre + offsets @ rotation.T), atol=2e-3 * image.std())
 
 
-def test_registration_finds_subpixel_shifts() -> None:
+def test_registration_recovers_subpixel_shifts() -> None:
     image = render_blobs(6, pixel_grid(80))
     for centre in np.random.default_rng(1).uniform(35.0, 45.0, (10, 2)):
         template = 0.7 * render_blobs(6, centre + pixel_grid(21) - 10.0) + 3.0
@@ -155,13 +158,11 @@ def test_registration_rejects_undetermined_shifts() -> None:
     template = image[30:51, 30:51]
     assert register_template(np.full((21, 21), 5.0), image, np.array([30.0, 30.0]), "shift") is None
     stripes = np.broadcast_to(np.sin(0.4 * np.arange(80.0)), (80, 80)).copy()
-    assert (
-        register_template(stripes[30:51, 30:51], stripes, np.array([30.0, 30.0]), "shift") is None
-    )  # undetermined along the stripes
-    assert register_template(template, image, np.array([26.0, 27.0]), "shift") is None  # beyond the limit
-    assert (
-        register_template(image[:21, :21], image, np.array([0.0, 0.0]), "shift") is None
-    )  # the spline needs neighbours
-    assert (
-        register_template(template, -image, np.array([30.0, 30.0]), "shift") is None
-    )  # only the negative image is present
+    # The shift along the stripes is undetermined.
+    assert register_template(stripes[30:51, 30:51], stripes, np.array([30.0, 30.0]), "shift") is None
+    # The match is farther from the start than the limit.
+    assert register_template(template, image, np.array([26.0, 27.0]), "shift") is None
+    # The spline needs neighbours.
+    assert register_template(image[:21, :21], image, np.array([0.0, 0.0]), "shift") is None
+    # The image contains only the negative of the template.
+    assert register_template(template, -image, np.array([30.0, 30.0]), "shift") is None

@@ -23,6 +23,7 @@ from marsyard.algorithms.image.registration import refine_shift, shifted_patch, 
 
 
 def correlate_directly(template: np.ndarray, window: np.ndarray) -> np.ndarray:
+    """Correlate with a loop over all positions."""
     n, m = template.shape
     a = template - template.mean()
     result = np.zeros((window.shape[0] - n + 1, window.shape[1] - m + 1))
@@ -73,7 +74,7 @@ def test_correlation_is_bounded_and_finite(window: np.ndarray, n: int, m: int) -
 
 
 def render_blobs(seed: int, shift: tuple[float, float] = (0.0, 0.0), size: int = 55, width: float = 1.2) -> np.ndarray:
-    """An analytic image: a sum of Gaussians, shifted by `shift` (row, column)."""
+    """Evaluate an analytic image: a sum of Gaussians, shifted by `shift` (row, column)."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[:size, :size].astype(float)
     image = np.zeros((size, size))
@@ -82,8 +83,8 @@ def render_blobs(seed: int, shift: tuple[float, float] = (0.0, 0.0), size: int =
     return image
 
 
-def subpixel_errors(align: bool) -> np.ndarray:
-    """Errors (row, column) of measured shifts for a table of fractions of a pixel."""
+def compute_subpixel_errors(align: bool) -> np.ndarray:
+    """Compute the errors (row, column) of measured shifts, pixels, for a table of fractions of a pixel."""
     fractions = np.linspace(-0.5, 0.5, 6)
     errors = []
     for k, (fy, fx) in enumerate((a, b) for a in fractions[::2] for b in fractions):
@@ -101,8 +102,8 @@ def subpixel_errors(align: bool) -> np.ndarray:
 def test_subpixel_bias_is_within_limits() -> None:
     # The biquadratic fit is biased by up to 0.09 px on sharp texture (design notes). Alignment on quintic splines must
     # be better than 0.005 px.
-    assert np.abs(subpixel_errors(align=False)).max() < 0.12
-    assert np.abs(subpixel_errors(align=True)).max() < 0.005
+    assert np.abs(compute_subpixel_errors(align=False)).max() < 0.12
+    assert np.abs(compute_subpixel_errors(align=True)).max() < 0.005
 
 
 def test_undetermined_alignment_returns_none() -> None:
@@ -166,9 +167,9 @@ def test_biquadratic_offset_is_zero_without_maximum() -> None:
     assert np.all(biquadratic_offset(rows, ramp) == 0.0)
 
 
-def make_gaussian(rows: float, columns: float, widths: tuple[float, float] = (1.5, 1.5)) -> np.ndarray:
+def make_gaussian(row: float, column: float, widths: tuple[float, float] = (1.5, 1.5)) -> np.ndarray:
     y, x = np.mgrid[:41, :41]
-    return np.asarray(np.exp(-((y - rows) ** 2) / (2 * widths[0] ** 2) - (x - columns) ** 2 / (2 * widths[1] ** 2)))
+    return np.asarray(np.exp(-((y - row) ** 2) / (2 * widths[0] ** 2) - (x - column) ** 2 / (2 * widths[1] ** 2)))
 
 
 def test_peak_width_uses_the_widest_direction() -> None:

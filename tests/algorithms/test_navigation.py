@@ -20,7 +20,7 @@ def _make_pose(east: float, north: float, yaw_deg: float = 0.0) -> RigidTransfor
 
 
 def _sample_ground(rocks: tuple[tuple[float, float, float, float], ...] = (), slope_deg: float = 0.0) -> np.ndarray:
-    """Points of a plane that rises to the east, with rocks (east, north, radius, height) as cylinders."""
+    """Sample a plane that rises to the east, with rocks (east, north, radius, height) as cylinders."""
     axis = np.arange(-9.0, 9.0, SPACING_M)
     east, north = (values.ravel() for values in np.meshgrid(axis, axis))
     height = np.tan(np.radians(slope_deg)) * east
@@ -29,12 +29,12 @@ def _sample_ground(rocks: tuple[tuple[float, float, float, float], ...] = (), sl
     return np.column_stack([east, north, height])
 
 
-def _map_everywhere(*rocks: tuple[float, float, float, float], slope_deg: float = 0.0) -> TerrainMap:
+def _map_ground(*rocks: tuple[float, float, float, float], slope_deg: float = 0.0) -> TerrainMap:
     return TerrainMap.empty(np.zeros(2)).add_points(_sample_ground(rocks, slope_deg))
 
 
 def _apply_command(pose: RigidTransform, command: DriveCommand) -> RigidTransform:
-    """The pose after a command on level ground, without slip."""
+    """Return the pose after a command on level ground, without slip."""
     translation = np.array([*command.displacement_m, 0.0])
     return pose * rigid(Rotation.from_rotvec([0.0, 0.0, command.turn_left_rad]), translation)
 
@@ -42,7 +42,7 @@ def _apply_command(pose: RigidTransform, command: DriveCommand) -> RigidTransfor
 def _drive_to_goal(
     terrain: TerrainMap, pose: RigidTransform, goal: np.ndarray, step_m: float, backwards: bool = False
 ) -> np.ndarray:
-    """Positions (east, north) of the rover with a new plan at each step, until it reaches the goal."""
+    """Drive with a new plan at each step until the goal; return the positions (east, north), metres."""
     positions = [pose.translation[:2]]
     for _ in range(60):
         plan = navigate(terrain, pose, goal, step_m, OPTIONS, backwards)
@@ -56,28 +56,28 @@ def _drive_to_goal(
     raise AssertionError("the goal was not reached")
 
 
-def _path_length_m(plan: NavigationPlan) -> float:
+def _compute_path_length_m(plan: NavigationPlan) -> float:
     return sum(command.length_m for command in plan.commands)
 
 
 def test_free_ground_is_crossed_in_a_straight_line() -> None:
-    plan = navigate(_map_everywhere(), _make_pose(0.0, 0.0), np.array([5.0, 0.0]), 0.5, OPTIONS)
+    plan = navigate(_map_ground(), _make_pose(0.0, 0.0), np.array([5.0, 0.0]), 0.5, OPTIONS)
     assert plan.outcome is NavigationOutcome.PATH
     assert plan.commands == (DriveCommand(forward_m=0.5),)
     assert plan.path_m[-1] == pytest.approx([5.0, 0.0])
 
 
 def test_lateral_goal_is_reached_along_gentle_arcs() -> None:
-    plan = navigate(_map_everywhere(), _make_pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3, OPTIONS)
+    plan = navigate(_map_ground(), _make_pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3, OPTIONS)
     # The circle through the origin along x and (4, 1) has the curvature 2 y / (x^2 + y^2) = 2 / 17. A pair of arcs may
     # have more curvature first and less later.
     assert plan.commands[0].turn_left_rad / plan.commands[0].forward_m == pytest.approx(2.0 / 17.0, abs=0.05)
-    positions = _drive_to_goal(_map_everywhere(), _make_pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3)
+    positions = _drive_to_goal(_map_ground(), _make_pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3)
     assert positions[-1] == pytest.approx([4.0, 1.0], abs=0.02)
 
 
 def test_goal_behind_requires_turn_or_reverse_drive() -> None:
-    goal, terrain = np.array([-3.0, 0.0]), _map_everywhere()
+    goal, terrain = np.array([-3.0, 0.0]), _map_ground()
     turn_plan = navigate(terrain, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS)
     assert turn_plan.commands[0].length_m == 0.0
     assert abs(turn_plan.commands[0].turn_left_rad) > np.radians(90.0)
@@ -95,27 +95,27 @@ def test_hazard_is_passed_with_clearance(offset_m: float, yaw_deg: float) -> Non
     rotation = Rotation.from_euler("Z", yaw_deg, degrees=True).as_matrix()[:2, :2]
     rock = rotation @ np.array([3.0, offset_m])
     goal = rotation @ np.array([7.0, 0.0])
-    positions = _drive_to_goal(_map_everywhere((*rock, 0.25, 0.4)), _make_pose(0.0, 0.0, yaw_deg), goal, 0.5)
+    positions = _drive_to_goal(_map_ground((*rock, 0.25, 0.4)), _make_pose(0.0, 0.0, yaw_deg), goal, 0.5)
     assert positions[-1] == pytest.approx(goal, abs=0.02)
     closest = np.hypot(*(positions - rock).T).min()
-    # the rock's cells are within half a diagonal of a cell of its outline
+    # Cells of the rock extend beyond its outline by at most half the diagonal of a cell.
     assert closest > OPTIONS.half_width_m + 0.25
     assert np.hypot(*np.diff(positions, axis=0).T).sum() < 1.25 * 7.0
 
 
 def test_low_rocks_are_driven_over() -> None:
-    terrain = _map_everywhere((3.0, 0.0, 0.25, 0.1))
+    terrain = _map_ground((3.0, 0.0, 0.25, 0.1))
     assert navigate(terrain, _make_pose(0.0, 0.0), np.array([6.0, 0.0]), 0.5, OPTIONS).commands == (DriveCommand(0.5),)
 
 
 def test_ramp_is_climbed_up_to_the_maximum_tilt() -> None:
     goal = np.array([5.0, 0.0])
     outcomes = [
-        navigate(_map_everywhere(slope_deg=slope), _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome
+        navigate(_map_ground(slope_deg=slope), _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome
         for slope in (25.0, 29.0)
     ]
     assert outcomes == [NavigationOutcome.PATH] * 2
-    # a ramp of 35 deg from 2 m on may not be entered
+    # The plan must not enter a ramp of 35 deg, which starts at 2 m.
     points = _sample_ground()
     points[:, 2] = np.tan(np.radians(35.0)) * np.maximum(points[:, 0] - 2.0, 0.0)
     steep = TerrainMap.empty(np.zeros(2)).add_points(points)
@@ -123,21 +123,21 @@ def test_ramp_is_climbed_up_to_the_maximum_tilt() -> None:
 
 
 def test_target_rock_is_avoided_unless_it_is_excluded() -> None:
-    terrain, goal, pose = _map_everywhere((6.0, 0.0, 0.6, 0.8)), np.array([4.8, 0.0]), _make_pose(3.0, 0.0)
+    terrain, goal, pose = _map_ground((6.0, 0.0, 0.6, 0.8)), np.array([4.8, 0.0]), _make_pose(3.0, 0.0)
     assert navigate(terrain, pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
     plan = navigate(terrain.without_hazards(np.array([6.0, 0.0]), 0.8), pose, goal, 0.5, OPTIONS)
     assert plan.commands == (DriveCommand(forward_m=0.5),)
 
 
 def _map_wedges(apex_east: float, azimuths_deg: tuple[float, ...], *rocks: tuple[float, ...]) -> TerrainMap:
-    """Map of navcam pairs, 45 deg wide, that show the ground from 1.8 m on."""
+    """Map the ground from 1.8 m on in navcam pairs, 45 deg wide, at these azimuths of the cameras."""
     points = _sample_ground(rocks)  # type: ignore[arg-type]
     offset = points[:, :2] - (apex_east, 0.0)
     azimuth = np.degrees(np.arctan2(offset[:, 0], offset[:, 1]))
-    is_seen = np.zeros(len(points), dtype=np.bool_)
+    is_mapped = np.zeros(len(points), dtype=np.bool_)
     for centre in azimuths_deg:
-        is_seen |= np.abs(azimuth - centre) <= 22.5
-    return TerrainMap.empty(np.zeros(2)).add_points(points[is_seen & (np.hypot(*offset.T) >= 1.8)])
+        is_mapped |= np.abs(azimuth - centre) <= 22.5
+    return TerrainMap.empty(np.zeros(2)).add_points(points[is_mapped & (np.hypot(*offset.T) >= 1.8)])
 
 
 def test_passing_a_hazard_needs_two_pairs() -> None:
@@ -158,10 +158,10 @@ def test_path_starts_on_mapped_ground_after_some_metres() -> None:
 
 
 def test_one_step_may_cover_both_arcs() -> None:
-    plan = navigate(_map_everywhere((3.0, 0.0, 0.25, 0.4)), _make_pose(0.0, 0.0), np.array([6.0, 0.0]), 20.0, OPTIONS)
+    plan = navigate(_map_ground((3.0, 0.0, 0.25, 0.4)), _make_pose(0.0, 0.0), np.array([6.0, 0.0]), 20.0, OPTIONS)
     curvatures = [command.turn_left_rad / command.forward_m for command in plan.commands if command.forward_m]
     assert len(curvatures) == 2
-    assert _path_length_m(plan) == pytest.approx(np.hypot(*np.diff(plan.path_m, axis=0).T).sum(), rel=1e-3)
+    assert _compute_path_length_m(plan) == pytest.approx(np.hypot(*np.diff(plan.path_m, axis=0).T).sum(), rel=1e-3)
 
 
 def test_invalid_options_are_rejected() -> None:

@@ -1,4 +1,4 @@
-"""Tests of the navigator's terrain map: cells, new data, and goodness of the ground."""
+"""Tests of the navigator's terrain map: cells, new data, and goodness of the ground (0: hazard, 1: level)."""
 
 from __future__ import annotations
 

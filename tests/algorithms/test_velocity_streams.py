@@ -41,17 +41,17 @@ class RecordingStream:
     """A stream that records its calls and returns an estimate from the second image on."""
 
     def __init__(self) -> None:
-        self.called: list[object] = []
+        self.calls: list[object] = []
 
     def start(self) -> None:
-        self.called.append("start")
+        self.calls.append("start")
 
     def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
-        self.called.append(frame)
-        return make_estimate() if len(self.called) > 2 else None
+        self.calls.append(frame)
+        return make_estimate() if len(self.calls) > 2 else None
 
     def finish(self) -> VelocityEstimate:
-        self.called.append("finish")
+        self.calls.append("finish")
         return make_estimate(100.5, 101.0)
 
 
@@ -60,8 +60,8 @@ def test_stream_receives_measurements_of_each_image() -> None:
     velocities = measurements.interval_velocities_m_s + np.arange(4.0)[:, None]
     measurements = replace(measurements, interval_velocities_m_s=velocities)
     answer = StreamedEstimator(stream).estimate(measurements)
-    assert (stream.called[0], stream.called[-1]) == ("start", "finish")
-    frames = [call for call in stream.called if isinstance(call, DescentFrame)]
+    assert (stream.calls[0], stream.calls[-1]) == ("start", "finish")
+    frames = [call for call in stream.calls if isinstance(call, DescentFrame)]
     assert [frame.image for frame in frames] == list(measurements.images)
     assert [frame.altitude for frame in frames] == list(measurements.altitudes)
     assert [frame.attitude for frame in frames] == list(measurements.attitudes)
@@ -125,12 +125,12 @@ def test_missing_span_defaults_to_last_interval() -> None:
 
 
 def test_answer_of_a_stream_with_after_pictures_is_rejected() -> None:
-    class StreamThatSetsAfterPictures(RecordingStream):
+    class StreamWithAfterPictures(RecordingStream):
         def finish(self) -> VelocityEstimate:
             return replace(make_estimate(), after_pictures=(make_estimate(),))
 
     with pytest.raises(AlgorithmError, match="after_pictures is given"):
-        StreamedEstimator(StreamThatSetsAfterPictures()).estimate(inputs.descent())
+        StreamedEstimator(StreamWithAfterPictures()).estimate(inputs.descent())
 
 
 @pytest.mark.parametrize("altitude_m", [1500.0, float("nan")])

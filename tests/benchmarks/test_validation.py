@@ -92,8 +92,8 @@ def test_limits_are_close_to_the_measured_values() -> None:
 def test_unmet_requirements_keep_their_original_limit() -> None:
     rows = {row.claim: row for row in read_measures()}
     required = {"deg": landing_checks.ROTATION_LIMIT_DEG, "": 0.95}
-    for start in ("rotation error with the paper's features", "nights that detect a regression"):
-        selected = [row for claim, row in rows.items() if claim.startswith(start)]
+    for claim_start in ("rotation error with the paper's features", "nights that detect a regression"):
+        selected = [row for claim, row in rows.items() if claim.startswith(claim_start)]
         assert selected
         assert all(row.limit == required[row.unit] for row in selected)
 
@@ -105,27 +105,27 @@ def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch)
         return 0.5 * draw_correct_track_errors(inputs, rng)
 
     monkeypatch.setattr(dimes_checks, "draw_correct_track_errors", halve_errors, raising=False)
-    real = dimes_checks.DimesOptions
-    monkeypatch.setattr(dimes_checks, "DimesOptions", lambda: real(imu_threshold_m_s=2.3))
+    options = dimes_checks.DimesOptions(imu_threshold_m_s=2.3)
+    monkeypatch.setattr(dimes_checks, "DimesOptions", lambda: options)
     failed = failed_claims(list(dimes_checks.check_imu_threshold(quick=True)))
     assert "discrepancy of correct tracks: 99.5 % quantile against the threshold" in failed
     assert "descents with one correct track per pair that pass the IMU check" in failed
 
 
 def test_reference_implementation_has_the_matching_error_only_without_instrument_errors() -> None:
-    # without instrument errors only the matching error remains, 0.1 m/s per axis and track
     inputs = ThresholdInputs(
         altitude_sd=0.0, common_attitude_sd_deg=0.0, attitude_sd_deg=0.0, tag_sd_s=0.0, feature_height_sd_m=0.0
     )
     reference = Reference.draw(inputs, 300, np.random.default_rng(1))
     np.testing.assert_allclose(reference.tracks.std(), inputs.match_sd_m_s, rtol=0.1)
-    # discrepancy of two tracks and the IMU: median of a Rayleigh distribution
+    # The discrepancy of two tracks and the IMU has a Rayleigh distribution; this is its median.
     sd = math.sqrt(2.0 * inputs.match_sd_m_s**2 + inputs.imu_sd_m_s**2)
     assert np.median(reference.single()) == pytest.approx(sd * math.sqrt(2.0 * math.log(2.0)), rel=0.15)
 
 
 def test_profiled_stages_name_existing_functions() -> None:
-    folder = Path(__file__).parents[2]
+    root = Path(__file__).parents[2]
     for file, function in {pair for pairs in (*STAGES.values(), *CALLS.values()) for pair in pairs}:
-        texts = [path.read_text() for path in folder.glob(f"[sac]*/**/{file}")]
+        # folders sim, scenarios, algorithms and campaigns
+        texts = [path.read_text() for path in root.glob(f"[sac]*/**/{file}")]
         assert any(f"def {function}(" in text for text in texts), (file, function)

@@ -19,7 +19,7 @@ class PageLog:
     messages: list[str] = field(default_factory=list)
 
 
-Open = Callable[..., tuple[Page, PageLog]]
+OpenPage = Callable[..., tuple[Page, PageLog]]
 
 
 @pytest.fixture(scope="session")
@@ -34,7 +34,7 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def open_page(browser: Browser) -> Iterator[Open]:
+def open_page(browser: Browser) -> Iterator[OpenPage]:
     """Return a function that opens a file in a new window; it returns the page and its log."""
     contexts = []
 

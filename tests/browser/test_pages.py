@@ -15,7 +15,7 @@ from playwright.sync_api import Page
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.site import write_site
 
-Open = Callable[..., tuple[Page, Any]]
+OpenPage = Callable[..., tuple[Page, Any]]
 #: Rule sets of axe-core for WCAG 2.2, levels A and AA.
 LEVELS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22a", "wcag22aa"]
 
@@ -63,7 +63,7 @@ def _find_violations(page: Page) -> list[str]:
     return [f"{violation['id']}: {node['html']}" for violation in violations for node in violation["nodes"]]
 
 
-def test_verdict_is_visible_without_scrolling(campaigns: Path, open_page: Open) -> None:
+def test_verdict_is_visible_without_scrolling(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_report_path(campaigns))
     headline = page.locator(".headline")
     assert headline.is_visible()
@@ -75,7 +75,7 @@ def test_verdict_is_visible_without_scrolling(campaigns: Path, open_page: Open) 
     assert log.messages == []
 
 
-def test_case_is_shown_on_hover_and_opened_by_click(campaigns: Path, open_page: Open) -> None:
+def test_case_is_shown_on_hover_and_opened_by_click(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_report_path(campaigns))
     point = page.locator(".explorer-plot circle.point").nth(5)
     point.scroll_into_view_if_needed()
@@ -92,7 +92,7 @@ def test_case_is_shown_on_hover_and_opened_by_click(campaigns: Path, open_page: 
     assert log.messages == []
 
 
-def test_case_is_opened_by_keyboard(campaigns: Path, open_page: Open) -> None:
+def test_case_is_opened_by_keyboard(campaigns: Path, open_page: OpenPage) -> None:
     page, _ = open_page(_report_path(campaigns))
     page.locator("#explorer input").focus()
     page.keyboard.type("3")
@@ -108,7 +108,7 @@ def test_case_is_opened_by_keyboard(campaigns: Path, open_page: Open) -> None:
     assert "No such case" in page.locator(".explorer-detail").inner_text()
 
 
-def test_axes_of_the_explorer_are_selectable(campaigns: Path, open_page: Open) -> None:
+def test_axes_of_the_explorer_are_selectable(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_report_path(campaigns))
     axis_select = page.locator("#explorer select").first
     axis_labels = axis_select.locator("option").all_inner_texts()
@@ -119,7 +119,7 @@ def test_axes_of_the_explorer_are_selectable(campaigns: Path, open_page: Open) -
     assert log.messages == []
 
 
-def test_campaigns_are_filtered(campaigns: Path, open_page: Open) -> None:
+def test_campaigns_are_filtered(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_index_path(campaigns))
     rows = page.locator(".campaigns tbody tr:visible")
     latest = page.locator('tr[data-requirement="DIMES-VEL"] .evidence a').first
@@ -142,7 +142,7 @@ def test_campaigns_are_filtered(campaigns: Path, open_page: Open) -> None:
     assert log.messages == []
 
 
-def test_trends_follow_the_filtered_campaigns(campaigns: Path, open_page: Open) -> None:
+def test_trends_follow_the_filtered_campaigns(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_index_path(campaigns))
     trend = page.locator('tr[data-requirement="DIMES-VEL"] .trend svg')
     label_of_all_campaigns = trend.get_attribute("aria-label")
@@ -155,7 +155,7 @@ def test_trends_follow_the_filtered_campaigns(campaigns: Path, open_page: Open) 
     assert log.messages == []
 
 
-def test_filter_is_consistent_after_browser_back(campaigns: Path, open_page: Open) -> None:
+def test_filter_is_consistent_after_browser_back(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_index_path(campaigns))
     page.locator("select[name=site]").select_option("meridiani")
     page.locator(".campaigns tbody tr:visible a").first.click()
@@ -168,7 +168,7 @@ def test_filter_is_consistent_after_browser_back(campaigns: Path, open_page: Ope
     assert log.messages == []
 
 
-def test_two_clicks_lead_to_images_of_the_worst_case(campaigns: Path, open_page: Open) -> None:
+def test_two_clicks_lead_to_images_of_the_worst_case(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_index_path(campaigns))
     page.locator("input[name=until]").fill("2026-01-01")
     page.locator('tr[data-requirement="DIMES-VEL"] .evidence a').first.click()
@@ -181,17 +181,17 @@ def test_two_clicks_lead_to_images_of_the_worst_case(campaigns: Path, open_page:
     assert log.messages == []
 
 
-def test_report_sends_no_network_requests(campaigns: Path, open_page: Open) -> None:
+def test_report_sends_no_network_requests(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_report_path(campaigns))
     page.wait_for_load_state("networkidle")
     assert [url for url in log.requests if not url.startswith("data:")] == [_report_path(campaigns).resolve().as_uri()]
 
 
-# layout depends on the width, contrast on the scheme: two of the four pairs cover both
+# Layout depends on the width, contrast on the scheme: two of the four combinations cover both.
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "dark"), (390, "light")])
 @pytest.mark.parametrize("page_kind", ["report", "index", "campaign", "case"])
 def test_pages_are_accessible_and_fit_the_window(
-    campaigns: Path, open_page: Open, page_kind: str, width: int, scheme: str
+    campaigns: Path, open_page: OpenPage, page_kind: str, width: int, scheme: str
 ) -> None:
     site = campaigns / "site"
     case = next(site.rglob("case-3.html"))

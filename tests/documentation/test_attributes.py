@@ -1,4 +1,4 @@
-"""Tests of documented attributes: names that share a description are rendered separately."""
+"""Tests that the documentation shows attributes separately if one description covers several names."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-CONF = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 MODULE = '''
 class Mean:
     """A mean.
@@ -27,12 +27,12 @@ def test_attributes_in_one_line_are_rendered_separately(tmp_path: Path) -> None:
     source = tmp_path / "docs"
     source.mkdir()
     (tmp_path / "described.py").write_text(MODULE.replace("\\\n        ", "\n        "))
-    conf = (CONF / "conf.py").read_text()
-    # settings of the site without its pages and figures
+    conf = (DOCS / "conf.py").read_text()
+    # use the configuration of the site, but do not generate its pages and figures
     for call in ("    write_pages()\n", '    draw_figures(Path(__file__).parent / "generated")\n'):
         assert call in conf
         conf = conf.replace(call, "")
-    (source / "conf.py").write_text(conf.replace("Path(__file__).parent))", f"Path({str(CONF)!r})))"))
+    (source / "conf.py").write_text(conf.replace("Path(__file__).parent))", f"Path({str(DOCS)!r})))"))
     (source / "index.md").write_text("# Index\n\n```{eval-rst}\n.. automodule:: described\n```\n")
     # in a separate process because Sphinx itself gives warnings
     command = [sys.executable, "-m", "sphinx", "-q", "-b", "text", str(source), str(tmp_path / "out")]

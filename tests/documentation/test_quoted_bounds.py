@@ -23,9 +23,11 @@ def read_page(page: str) -> str:
     return " ".join((DOCS / page).read_text(encoding="utf-8").split())
 
 
-def find_cells(page: str, start: str) -> list[str]:
-    """Return the cells of the table row that starts with the text `start`."""
-    (row,) = [line for line in (DOCS / page).read_text(encoding="utf-8").splitlines() if line.startswith(f"| {start}")]
+def find_cells(page: str, row_start: str) -> list[str]:
+    """Return the cells of the table row that starts with the text `row_start`."""
+    (row,) = [
+        line for line in (DOCS / page).read_text(encoding="utf-8").splitlines() if line.startswith(f"| {row_start}")
+    ]
     return [cell.strip() for cell in row.strip("|").split("|")]
 
 
@@ -33,8 +35,8 @@ def parse_counts(cell: str) -> tuple[int, int]:
     """Return (k, n) of the first `k of n` in a cell; a single number n gives (n, n)."""
     match = re.search(r"(?:([\d,]+) of )?([\d,]+)", cell)
     assert match is not None
-    last = int(match[2].replace(",", ""))
-    return (last if match[1] is None else int(match[1].replace(",", "")), last)
+    total = int(match[2].replace(",", ""))
+    return (total if match[1] is None else int(match[1].replace(",", "")), total)
 
 
 def parse_percent(text: str) -> float:
@@ -68,11 +70,11 @@ def test_bound_of_landings_counts_terrains() -> None:
 
 
 @pytest.mark.parametrize(
-    "start",
+    "row_start",
     ["chosen sites truly safe", "safe sites exist, none with safe surroundings", "`no safe site` where there is none"],
 )
-def test_quoted_bounds_of_hazardous_flights_are_correct(start: str) -> None:
-    _, measured, interval = find_cells("hda.md", start)
+def test_quoted_bounds_of_hazardous_flights_are_correct(row_start: str) -> None:
+    _, measured, interval = find_cells("hda.md", row_start)
     successes, n = parse_counts(re.sub(r"^at least ", "", measured))
     lower = f"{100.0 * proportion_lower(successes, n, 0.9):.2f}"
     assert re.search(rf"\b({lower}|{float(lower):.1f}) %", measured), f"expected {lower} % at 90 % confidence"

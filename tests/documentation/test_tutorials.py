@@ -20,8 +20,8 @@ pytestmark = [
 ]
 
 TUTORIALS = sorted((Path(__file__).parents[2] / "docs" / "tutorials").glob("*.md"))
-FENCED = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-SAVED_AS = re.compile(r"Save it as `([\w./-]+)`:\s*\Z")
+CODE_BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FILE_NAME = re.compile(r"Save it as `([\w./-]+)`:\s*\Z")
 #: Files that exist after the tutorial.
 EXPECTED_FILES = {
     "first-campaign": (
@@ -39,8 +39,8 @@ EXPECTED_FILES = {
     "custom-system": ("fallen/report.html", "fallen/cases/2/altitude.png"),
 }
 #: Folder of the packages that a tutorial installs.
-INSTALLED = "installed"
-EXITS = re.compile(r"# exits with (\d)(?: or (\d))?")
+INSTALL_FOLDER = "installed"
+EXIT_CODES = re.compile(r"# exits with (\d)(?: or (\d))?")
 
 
 @pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
@@ -49,10 +49,10 @@ def test_tutorial_commands_succeed(tutorial: Path, tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     has_installation = "$ pip install" in text
-    commands = 0
-    for block in FENCED.finditer(text):
+    n_commands = 0
+    for block in CODE_BLOCK.finditer(text):
         language, body = block.groups()
-        match = SAVED_AS.search(text, 0, block.start())
+        match = FILE_NAME.search(text, 0, block.start())
         if match is not None:
             (tmp_path / match[1]).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / match[1]).write_text(body, encoding="utf-8")
@@ -63,30 +63,30 @@ def test_tutorial_commands_succeed(tutorial: Path, tmp_path: Path, monkeypatch: 
         elif language == "console":
             for line in body.splitlines():
                 assert line.startswith("$ "), line
-                commands += 1
-                allowed = {int(code) for codes in EXITS.findall(line) for code in codes if code} or {0}
-                words = shlex.split(line.removeprefix("$ ").split("#")[0])
-                if words[:2] == ["pip", "install"]:
-                    words[2:2] = ["--no-deps", "--no-build-isolation", "--target", INSTALLED]
-                run_words = (
-                    _invoke_in_process if words[0] == "marsyard" and not has_installation else _run_in_subprocess
+                n_commands += 1
+                allowed_codes = {int(code) for codes in EXIT_CODES.findall(line) for code in codes if code} or {0}
+                arguments = shlex.split(line.removeprefix("$ ").split("#")[0])
+                if arguments[:2] == ["pip", "install"]:
+                    arguments[2:2] = ["--no-deps", "--no-build-isolation", "--target", INSTALL_FOLDER]
+                run_command = (
+                    _invoke_in_process if arguments[0] == "marsyard" and not has_installation else _run_in_subprocess
                 )
-                run_words(words, allowed)
-    assert commands >= 3
+                run_command(arguments, allowed_codes)
+    assert n_commands >= 3
     for name in EXPECTED_FILES.get(tutorial.stem, ()):
         assert (tmp_path / name).stat().st_size > 0
 
 
-def _invoke_in_process(words: list[str], allowed: set[int]) -> None:
-    result = CliRunner().invoke(app, words[1:])
-    assert result.exit_code in allowed, f"{words}: {result.exit_code}\n{result.output}\n{result.exception!r}"
+def _invoke_in_process(arguments: list[str], allowed_codes: set[int]) -> None:
+    result = CliRunner().invoke(app, arguments[1:])
+    assert result.exit_code in allowed_codes, f"{arguments}: {result.exit_code}\n{result.output}\n{result.exception!r}"
 
 
-def _run_in_subprocess(words: list[str], allowed: set[int]) -> None:
+def _run_in_subprocess(arguments: list[str], allowed_codes: set[int]) -> None:
     # packages of a tutorial are not installed into the environment of the tests
-    search_path = os.pathsep.join((str(Path(__file__).parents[2]), str(Path(INSTALLED).resolve())))
+    search_path = os.pathsep.join((str(Path(__file__).parents[2]), str(Path(INSTALL_FOLDER).resolve())))
     environment = {**os.environ, "PYTHONPATH": search_path}
-    command = [str(Path(sys.executable).parent / words[0]), *words[1:]]
+    command = [str(Path(sys.executable).parent / arguments[0]), *arguments[1:]]
     result = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert result.returncode in allowed, f"{words}: {result.returncode}\n{result.stdout}\n{result.stderr}"
+    assert result.returncode in allowed_codes, f"{arguments}: {result.returncode}\n{result.stdout}\n{result.stderr}"
     assert "Traceback" not in result.stderr

@@ -51,8 +51,8 @@ PHRASES = {
 
 def list_python_files() -> list[Path]:
     """List the Python files of packages, benchmarks and tests, by git."""
-    listed = subprocess.run(["git", "ls-files", *PACKAGES], cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
-    return [ROOT / name for name in listed.stdout.split() if name.endswith(".py")]
+    result = subprocess.run(["git", "ls-files", *PACKAGES], cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
+    return [ROOT / name for name in result.stdout.split() if name.endswith(".py")]
 
 
 def find_names(tree: ast.AST) -> Iterator[tuple[str, int]]:
@@ -83,17 +83,17 @@ def find_prose(text: str) -> Iterator[tuple[str, int]]:
             yield token.string, token.start[0]
 
 
-def find_offences(text: str, line: int) -> Iterator[str]:
+def find_violations(text: str, line: int) -> Iterator[str]:
     """Yield a message for each rejected pattern in a text that starts at a line; quoted code is ignored."""
     for number, part in enumerate(text.splitlines()):
         plain = re.sub(r"`[^`]*`", "", part)
-        for pattern, instead in PHRASES.items():
+        for pattern, recommended in PHRASES.items():
             if re.search(pattern, plain, re.IGNORECASE):
-                yield f"{line + number}: {part.strip()[:80]!r}: use {instead}"
+                yield f"{line + number}: {part.strip()[:80]!r}: use {recommended}"
 
 
 def test_names_use_the_vocabulary() -> None:
-    wrong = [
+    violations = [
         f"{path.relative_to(ROOT)}:{line}: {name} ({word}: use {NAME_WORDS[word]})"
         for path in list_python_files()
         for name, line in find_names(ast.parse(path.read_text(encoding="utf-8")))
@@ -101,17 +101,17 @@ def test_names_use_the_vocabulary() -> None:
         for word in split_name(name)
         if word in NAME_WORDS
     ]
-    assert not wrong, "\n".join(wrong)
+    assert not violations, "\n".join(violations)
 
 
 def test_docstrings_and_comments_use_the_vocabulary() -> None:
-    wrong = [
-        f"{path.relative_to(ROOT)}:{found}"
+    violations = [
+        f"{path.relative_to(ROOT)}:{violation}"
         for path in list_python_files()
         for text, line in find_prose(path.read_text(encoding="utf-8"))
-        for found in find_offences(text, line)
+        for violation in find_violations(text, line)
     ]
-    assert not wrong, "\n".join(wrong)
+    assert not violations, "\n".join(violations)
 
 
 #: Pages of the documentation. Generated pages are excluded, because their texts are checked at their source.
@@ -123,4 +123,4 @@ def test_pages_use_the_vocabulary(page: Path) -> None:
     text = re.sub(
         r"^```.*?^```$", lambda block: "\n" * block[0].count("\n"), page.read_text(encoding="utf-8"), flags=re.M | re.S
     )
-    assert not list(find_offences(text, 1))
+    assert not list(find_violations(text, 1))

@@ -14,8 +14,8 @@ import marsyard
 from marsyard import api
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
-#: Part of each script's output.
-SCRIPTS = {
+#: Text in the output of each example script.
+EXPECTED_OUTPUT = {
     "draw_and_plan.py": "descent.altitude_first_m: 19",
     "run_one_case.py": "products: ",
     "custom_camera.py": "Cahvor: 0.03 px off (RMS)",
@@ -56,7 +56,7 @@ def test_changes_accept_python_values() -> None:
     assert len(marsyard.draws(campaign, 3)) == 3
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize("name", EXPECTED_OUTPUT)
 def test_example_scripts_run(tmp_path: Path, name: str) -> None:
     result = subprocess.run(
         [sys.executable, str(EXAMPLES / name)],
@@ -66,4 +66,4 @@ def test_example_scripts_run(tmp_path: Path, name: str) -> None:
         env={**os.environ, "PYTHONPATH": str(EXAMPLES.parents[1])},
     )
     assert result.returncode == 0, result.stderr
-    assert SCRIPTS[name] in result.stdout
+    assert EXPECTED_OUTPUT[name] in result.stdout

@@ -15,14 +15,14 @@ from typer.testing import CliRunner
 
 from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
-from tests.scenarios.measured.folders import read_rows, write_texts, write_velocity_folder
+from tests.scenarios.measured.folders import read_rows, write_text_rows, write_velocity_folder
 
 MARS = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
 DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")
 NO_DATA = -32767.0
 
 #: Function that writes a file to a path.
-Write = Callable[[Path], object]
+WriteFile = Callable[[Path], object]
 
 
 def write_dtm(path: Path, *, crs: CRS = MARS, unit: str = "m", nodata: float | None = NO_DATA, side: int = 40) -> None:
@@ -45,14 +45,14 @@ def write_flight(path: Path, row: int, column: int, value: float) -> None:
     poses[row, column] = value
     if column == 4:
         poses[:, 4:] = [1.0, 0.0, 0.0, 0.0]
-    head = "time_s,x_m,y_m,z_m,qx,qy,qz,qw"
-    np.savetxt(path, poses, delimiter=",", header=head, comments="")
+    header = "time_s,x_m,y_m,z_m,qx,qy,qz,qw"
+    np.savetxt(path, poses, delimiter=",", header=header, comments="")
 
 
-def write_gigabyte(path: Path, head: bytes = b"") -> None:
-    """Write a sparse file of 1 GiB that starts with `head`."""
+def write_gigabyte(path: Path, header: bytes = b"") -> None:
+    """Write a sparse file of 1 GiB that starts with `header`."""
     with path.open("wb") as file:
-        file.write(head)
+        file.write(header)
         file.truncate(1 << 30)
 
 
@@ -107,7 +107,7 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
     ids=lambda value: value if isinstance(value, str) and "." in value and "\n" not in value else "",
 )
 def test_campaign_with_invalid_file_is_rejected(
-    tmp_path: Path, table: str, name: str, write: Write, message: str
+    tmp_path: Path, table: str, name: str, write: WriteFile, message: str
 ) -> None:
     write(tmp_path / name)
     campaign = tmp_path / "campaign.toml"
@@ -127,7 +127,7 @@ def test_campaign_with_invalid_file_is_rejected(
         (write_empty, "is empty (0 bytes)"),
     ],
 )
-def test_invalid_image_is_rejected(tmp_path: Path, write: Write, message: str) -> None:
+def test_invalid_image_is_rejected(tmp_path: Path, write: WriteFile, message: str) -> None:
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write(folder / "drop-1.png")
     run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "drop-1.png", message)
@@ -145,12 +145,12 @@ def test_invalid_image_is_rejected(tmp_path: Path, write: Write, message: str) -
 )
 def test_invalid_table_is_rejected(tmp_path: Path, cells: dict[str, str], message: str) -> None:
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
-    write_texts(folder, [row | cells if index == 1 else row for index, row in enumerate(read_rows(folder))])
+    write_text_rows(folder, [row | cells if index == 1 else row for index, row in enumerate(read_rows(folder))])
     run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "pictures.csv", message)
 
 
-def run_and_expect_error(words: list[str], path: Path, message: str) -> None:
-    result = CliRunner().invoke(app, words)
+def run_and_expect_error(arguments: list[str], path: Path, message: str) -> None:
+    result = CliRunner().invoke(app, arguments)
     assert (result.exit_code, type(result.exception)) == (2, SystemExit)
     output = result.output
     assert output.startswith("error: ")

@@ -52,7 +52,7 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a small campaign with the installed command."""
     folder = tmp_path_factory.mktemp("campaign")
     path = write_campaign(folder, "unanswered_cases = [2]", requirement=REQUIREMENT.replace("0.99", "0.9"))
@@ -64,39 +64,39 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-def test_run_prints_table_verdict_and_report(finished: Path) -> None:
-    out = (finished.parent / "stdout.txt").read_text()
+def test_run_prints_table_verdict_and_report(finished_run: Path) -> None:
+    out = (finished_run.parent / "stdout.txt").read_text()
     assert "velocity" in out
     assert "1 of 6" in out
     lines = out.rstrip().splitlines()
     assert "verdict: INSUFFICIENT" in lines
-    assert lines[-1] == f"report: {finished / 'report.html'}"
-    assert (finished / "report.html").stat().st_size > 1000
-    assert json.loads((finished / "campaign.json").read_text())["exit_code"] == 3
-    progress = (finished.parent / "stderr.txt").read_text()
+    assert lines[-1] == f"report: {finished_run / 'report.html'}"
+    assert (finished_run / "report.html").stat().st_size > 1000
+    assert json.loads((finished_run / "campaign.json").read_text())["exit_code"] == 3
+    progress = (finished_run.parent / "stderr.txt").read_text()
     assert re.search(r"^cases: 6/6, [\d.]+ (/s|s per item), [\d.]+ s$", progress, re.MULTILINE)
     assert "\x1b" not in out + progress
 
 
-def test_report_evaluates_stored_rows(finished: Path, marsyard: Command) -> None:
-    (finished / "report.html").unlink()
-    result = marsyard("report", finished)
+def test_report_evaluates_stored_rows(finished_run: Path, marsyard: Command) -> None:
+    (finished_run / "report.html").unlink()
+    result = marsyard("report", finished_run)
     assert (result.status, result.err) == (3, "")
     assert "verdict: INSUFFICIENT" in result.out
-    assert (finished / "report.html").exists()
+    assert (finished_run / "report.html").exists()
 
 
-def test_replay_compares_with_the_stored_row(finished: Path, marsyard: Command, tmp_path: Path) -> None:
-    result = marsyard("replay", finished, 2, "--out", tmp_path / "products")
+def test_replay_compares_with_the_stored_row(finished_run: Path, marsyard: Command, tmp_path: Path) -> None:
+    result = marsyard("replay", finished_run, 2, "--out", tmp_path / "products")
     assert (result.status, result.err) == (0, "")
     assert "case 2: SILENT" in result.out
     assert "the row equals the stored one" in result.out
     assert (tmp_path / "products" / "products.npz").exists()
 
 
-def test_replay_fails_if_the_row_differs(finished: Path, marsyard: Command, tmp_path: Path) -> None:
-    (tmp_path / "campaign.json").write_bytes((finished / "campaign.json").read_bytes())
-    frame = pd.read_parquet(finished / "cases.parquet")
+def test_replay_fails_if_the_row_differs(finished_run: Path, marsyard: Command, tmp_path: Path) -> None:
+    (tmp_path / "campaign.json").write_bytes((finished_run / "campaign.json").read_bytes())
+    frame = pd.read_parquet(finished_run / "cases.parquet")
     frame["altitude_m"] += 1.0 * (frame.index == 1)
     frame.to_parquet(tmp_path / "cases.parquet")
     result = marsyard("replay", tmp_path, 1)
@@ -104,8 +104,8 @@ def test_replay_fails_if_the_row_differs(finished: Path, marsyard: Command, tmp_
     assert "the row differs from the stored one in: altitude_m" in result.out
 
 
-def test_stages_are_saved_as_separate_files(finished: Path, marsyard: Command, tmp_path: Path) -> None:
-    result = marsyard("replay", finished, 0, "--save-stages", "--out", tmp_path / "case")
+def test_stages_are_saved_as_separate_files(finished_run: Path, marsyard: Command, tmp_path: Path) -> None:
+    result = marsyard("replay", finished_run, 0, "--save-stages", "--out", tmp_path / "case")
     assert (result.status, result.err) == (0, "")
     stages = tmp_path / "case" / "stages"
     files = sorted(str(path.relative_to(stages)) for path in stages.rglob("*.*"))
@@ -119,22 +119,11 @@ def test_stages_are_saved_as_separate_files(finished: Path, marsyard: Command, t
 
 def _kill_after_first_rows(path: Path, directory: Path, cases: int) -> None:
     """Run a campaign and kill it when the first rows are stored."""
-    command = [
-        sys.executable,
-        "-m",
-        "marsyard",
-        "run",
-        str(path),
-        "-n",
-        str(cases),
-        "--jobs",
-        "1",
-        "--out",
-        str(directory),
-    ]
+    command = [sys.executable, "-m", "marsyard", "run", str(path), "-n", str(cases), "--jobs", "1"]
+    command += ["--out", str(directory)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     log = directory / "cases.sqlite-wal"
-    # more than the header and the pages of the empty table
+    # the write-ahead log of an empty table has two pages of 4 kB; a log of more than four pages contains rows
     while not (log.exists() and log.stat().st_size > 4 * 4200) and process.poll() is None:
         time.sleep(0.05)
     process.kill()
@@ -249,10 +238,10 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path, marsyard: Com
     ],
 )
 def test_invalid_arguments_are_rejected(
-    finished: Path, tmp_path: Path, marsyard: Command, arguments: list[str], message: str
+    finished_run: Path, tmp_path: Path, marsyard: Command, arguments: list[str], message: str
 ) -> None:
     file = write_campaign(tmp_path)
-    result = marsyard(*(part.format(file=file, run=finished, folder=tmp_path) for part in arguments))
+    result = marsyard(*(part.format(file=file, run=finished_run, folder=tmp_path) for part in arguments))
     # Typer prints usage errors in a box with line breaks
     text = re.sub(r"[\s│]+", " ", result.err)
     assert result.status == 2
@@ -262,8 +251,8 @@ def test_invalid_arguments_are_rejected(
     assert not (tmp_path / "runs").exists()
 
 
-def test_negative_case_numbers_are_rejected(finished: Path, marsyard: Command) -> None:
-    assert marsyard("replay", finished, "--", "-1").status == 2
+def test_negative_case_numbers_are_rejected(finished_run: Path, marsyard: Command) -> None:
+    assert marsyard("replay", finished_run, "--", "-1").status == 2
 
 
 def test_internal_error_has_status_2(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,19 +323,8 @@ def test_invalid_campaign_is_rejected_before_slow_imports(tmp_path: Path) -> Non
 
 def test_terminal_shows_a_progress_bar(tmp_path: Path) -> None:
     path = write_campaign(tmp_path, dispersions="", requirement="")
-    command = [
-        sys.executable,
-        "-m",
-        "marsyard",
-        "run",
-        str(path),
-        "-n",
-        "2",
-        "--jobs",
-        "1",
-        "--out",
-        str(tmp_path / "run"),
-    ]
+    command = [sys.executable, "-m", "marsyard", "run", str(path), "-n", "2", "--jobs", "1"]
+    command += ["--out", str(tmp_path / "run")]
     environment = {**os.environ, "FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "100"}
     result = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert result.returncode == 0, result.stderr

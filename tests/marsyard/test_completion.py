@@ -11,11 +11,11 @@ from marsyard.cli.app import app
 
 
 @pytest.mark.parametrize(
-    ("words", "index", "completions"),
+    ("command_line", "word_index", "completions"),
     [("marsyard confo", 1, {"conformance"}), ("marsyard clean --y", 2, {"--yes"}), ("marsyard terrain l", 2, {"list"})],
 )
-def test_words_are_completed(words: str, index: int, completions: set[str]) -> None:
-    environment = {"_MARSYARD_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(index)}
+def test_words_are_completed(command_line: str, word_index: int, completions: set[str]) -> None:
+    environment = {"_MARSYARD_COMPLETE": "complete_bash", "COMP_WORDS": command_line, "COMP_CWORD": str(word_index)}
     result = CliRunner().invoke(app, [], prog_name="marsyard", env=environment)
     assert set(result.output.split()) == completions
 

@@ -1,7 +1,7 @@
-"""Tests that seeds on which options were set give no PASS, and that confirmation runs are recorded and shown.
+"""Tests of confirmations: runs on calibration seeds give no PASS; confirmation runs are recorded and shown.
 
-A confirmation (`marsyard run --confirm`) evaluates fixed options on a new seed. Seeds follow from namespace, campaign
-and number.
+A confirmation (`marsyard run --confirm`) evaluates fixed options on a new seed. The seed is computed from namespace,
+campaign and number of the confirmation.
 """
 
 from __future__ import annotations
@@ -72,30 +72,30 @@ def campaign(tmp_path: Path) -> Path:
     )
 
 
-def _evidence(directory: Path) -> Evidence:
+def _read_evidence(directory: Path) -> Evidence:
     return Evidence.read(json.loads((directory / "campaign.json").read_text())["evidence"])
 
 
-def _statuses(directory: Path) -> list[str]:
+def _read_statuses(directory: Path) -> list[str]:
     return [verdict["status"] for verdict in json.loads((directory / "report.json").read_text())["verdicts"]]
 
 
 def test_run_on_a_seed_used_for_calibration_cannot_pass(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     status, out, _ = marsyard("run", campaign, "--out", tmp_path / "calibration", "--jobs", 1)
-    assert (status, _statuses(tmp_path / "calibration")) == (3, ["INSUFFICIENT"])
+    assert (status, _read_statuses(tmp_path / "calibration")) == (3, ["INSUFFICIENT"])
     assert "The verdict would be PASS. Calibrated on these cases" in " ".join(out.split())
     assert "error_scale" in out
-    assert _evidence(tmp_path / "calibration").kind is EvidenceKind.CALIBRATION
+    assert _read_evidence(tmp_path / "calibration").kind is EvidenceKind.CALIBRATION
     # a seed on which no option was calibrated can pass
     status, out, _ = marsyard("run", campaign, "--seed", 6, "--out", tmp_path / "unused-seed", "--jobs", 1)
-    assert (status, _statuses(tmp_path / "unused-seed")) == (0, ["PASS"])
+    assert (status, _read_statuses(tmp_path / "unused-seed")) == (0, ["PASS"])
     assert "evidence: Exploration" in out
 
 
 def test_run_on_a_seed_used_for_calibration_can_fail(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     out = tmp_path / "run"
     arguments = ("run", campaign, "--set", "error_scale=1e9", "--out", out, "--jobs", 1)
-    assert (marsyard(*arguments)[0], _statuses(out)) == (1, ["FAIL"])
+    assert (marsyard(*arguments)[0], _read_statuses(out)) == (1, ["FAIL"])
 
 
 def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
@@ -104,7 +104,7 @@ def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     folders = {name: tmp_path / name for name in ("first", "changed", "repeated", "second")}
     seed = confirmation_seed("review-board", "fake", 1)
     status, out, _ = marsyard("run", campaign, "--confirm", "--out", folders["first"], "--jobs", 1)
-    assert (status, _statuses(folders["first"])) == (0, ["PASS"])
+    assert (status, _read_statuses(folders["first"])) == (0, ["PASS"])
     assert "evidence: Confirmation 1 in the namespace 'review-board'" in out
     assert json.loads((folders["first"] / "campaign.json").read_text())["seed"] == seed
     (entry,) = read_confirmations(tmp_path / "confirmations.jsonl")
@@ -113,21 +113,21 @@ def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     # a run with another option on the same seed is marked as reuse of the seed and cannot be PASS
     arguments = ("run", campaign, "--set", "error_scale=0.5")
     status, out, _ = marsyard(*arguments, "--seed", seed, "--out", folders["changed"], "--jobs", 1)
-    assert (status, _statuses(folders["changed"])) == (3, ["INSUFFICIENT"])
+    assert (status, _read_statuses(folders["changed"])) == (3, ["INSUFFICIENT"])
     assert "parameters.error_scale (1.0, now 0.5)" in " ".join(out.split())
-    assert _evidence(folders["changed"]).kind is EvidenceKind.REUSED_SEED
+    assert _read_evidence(folders["changed"]).kind is EvidenceKind.REUSED_SEED
     page = (folders["changed"] / "report.html").read_text()
     assert "reused confirmation seed 1" in page
     assert "parameters.error_scale (1.0, now 0.5)" in page
 
     # a second run with the same options is a repetition
     assert marsyard("run", campaign, "--seed", seed, "--out", folders["repeated"], "--jobs", 1)[0] == 0
-    assert _evidence(folders["repeated"]).kind is EvidenceKind.REPETITION
+    assert _read_evidence(folders["repeated"]).kind is EvidenceKind.REPETITION
 
     # the changed option needs a new confirmation seed; the output states the correction for two confirmations
     status, out, _ = marsyard(*arguments, "--confirm", "--out", folders["second"], "--jobs", 1)
     output = " ".join(out.split())
-    assert (status, _evidence(folders["second"]).of_algorithm) == (0, 2)
+    assert (status, _read_evidence(folders["second"]).of_algorithm) == (0, 2)
     assert "up to 2 times that of one" in output
     assert "for all 2 confirmations together (each at 95.00 %): INSUFFICIENT" in output
     second = json.loads((folders["second"] / "campaign.json").read_text())
@@ -193,4 +193,4 @@ def test_interrupted_confirmation_stays_in_the_record(campaign: Path, marsyard: 
     path.write_text(path.read_text().splitlines()[0] + "\n")
     marsyard("run", campaign, "--confirm", "--out", tmp_path / "second", "--jobs", 1)
     first, second = read_confirmations(path)
-    assert (first.results, second.number, _evidence(tmp_path / "second").of_algorithm) == (None, 2, 2)
+    assert (first.results, second.number, _read_evidence(tmp_path / "second").of_algorithm) == (None, 2, 2)

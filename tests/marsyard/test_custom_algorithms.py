@@ -16,6 +16,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
 ]
 
+#: Estimator that never returns for a saturated image (counts above 4000) and aborts for a dark image.
 HOSTILE = """
 import os, re
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
@@ -44,9 +45,9 @@ confidence = 0.5
 
 
 def test_conformance_survives_crashes_and_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "hostile_here.py").write_text(HOSTILE)
+    (tmp_path / "hostile.py").write_text(HOSTILE)
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["conformance", "hostile_here:Hostile", "--time-limit", "1"])
+    result = CliRunner().invoke(app, ["conformance", "hostile:Hostile", "--time-limit", "1"])
     assert result.exit_code == 1
     assert "FAIL dark" in result.output
     assert "CRASHED: the worker process died: SIGABRT (-6)" in result.output
@@ -56,11 +57,12 @@ def test_conformance_survives_crashes_and_hangs(tmp_path: Path, monkeypatch: pyt
     assert "7 of 9 checks passed" in result.output
 
 
+#: Estimator that changes its working folder for uniform images, and starts a process and a thread for saturated ones.
 STATE_CHANGING = """
 import os, threading, time
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 
-class Leaving:
+class StateChanging:
     def estimate(self, measurements):
         level = int(measurements.images[0].counts.min())
         if level == measurements.images[0].counts.max():
@@ -75,9 +77,9 @@ class Leaving:
 
 
 def test_conformance_reports_changed_process_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "leaving_here.py").write_text(STATE_CHANGING)
+    (tmp_path / "state_changing.py").write_text(STATE_CHANGING)
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["conformance", "leaving_here:Leaving"])
+    result = CliRunner().invoke(app, ["conformance", "state_changing:StateChanging"])
     assert result.exit_code == 1, result.output
     assert result.output.count("it changed the state of its process: the working folder") == 3
     assert "child processes that are still running (python)" in result.output

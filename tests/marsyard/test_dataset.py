@@ -44,10 +44,10 @@ diameter_m = 1.0
 """
 
 
-def run_dataset(folder: Path, *words: str) -> tuple[int, str]:
+def run_dataset(folder: Path, *arguments: str) -> tuple[int, str]:
     (folder / "samples.toml").write_text(CAMPAIGN)
     result = CliRunner().invoke(
-        app, ["dataset", str(folder / "samples.toml"), "--out", str(folder / "set"), "--shard", "1", *words]
+        app, ["dataset", str(folder / "samples.toml"), "--out", str(folder / "set"), "--shard", "1", *arguments]
     )
     return result.exit_code, result.output
 
@@ -69,7 +69,7 @@ def test_only_terrains_of_the_cases_are_built(tmp_path: Path, monkeypatch: pytes
 
 
 def compute_points(sample: dict[str, Any], camera_file: Path, distance: np.ndarray) -> np.ndarray:
-    """World points of a sample's pixels, computed from pose, camera and ranges."""
+    """Compute world points (m) of the pixels from the pose of a sample, its camera and ranges `distance` (m)."""
     camera = read_cahvor(camera_file)
     origins, directions = camera.rays(camera.pixel_grid())
     world_from_body = Rotation.from_quat(sample["world_from_body_xyzw"])
@@ -122,9 +122,11 @@ def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> Non
 
 def test_descent_sample_has_three_images(tmp_path: Path) -> None:
     settings = ["terrain.samples=512", "location.bank=8"]
-    words = [part for setting in settings for part in ("--set", setting)]
+    arguments = [part for setting in settings for part in ("--set", setting)]
     out = tmp_path / "set"
-    result = CliRunner().invoke(app, ["dataset", "dimes-smoke", "-n", "1", "--jobs", "1", "--out", str(out), *words])
+    result = CliRunner().invoke(
+        app, ["dataset", "dimes-smoke", "-n", "1", "--jobs", "1", "--out", str(out), *arguments]
+    )
     assert result.exit_code == 0, result.output
     files = read_shard(out / "shard-000000.tar")
     kinds = {name.partition(".")[2] for name in files}
@@ -155,6 +157,6 @@ def test_scenarios_without_samples_are_rejected(tmp_path: Path) -> None:
     assert "provides no training samples; allowed: descent, landing" in result.output
 
 
-@pytest.mark.parametrize("words", [("--shard", "0"), ("--jobs", "0")])
-def test_invalid_numbers_are_rejected(tmp_path: Path, words: tuple[str, str]) -> None:
-    assert run_dataset(tmp_path, *words)[0] == 2
+@pytest.mark.parametrize("arguments", [("--shard", "0"), ("--jobs", "0")])
+def test_invalid_numbers_are_rejected(tmp_path: Path, arguments: tuple[str, str]) -> None:
+    assert run_dataset(tmp_path, *arguments)[0] == 2

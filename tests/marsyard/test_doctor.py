@@ -21,8 +21,10 @@ from rich.console import Console
 from marsyard import doctor, gl_probe
 from marsyard.doctor import Check, Probe, Verdict
 
-WORKING = Probe({"renderer": "r", "version": "v", "depth_error_m": 1e-5, "offset_px": [0.0, 0.0], "has_colour": True})
-ABSENT = Probe(None, "ImportError: no library")
+WORKING_BACKEND = Probe(
+    {"renderer": "r", "version": "v", "depth_error_m": 1e-5, "offset_px": [0.0, 0.0], "has_colour": True}
+)
+ABSENT_BACKEND = Probe(None, "ImportError: no library")
 
 
 def run_doctor(*, as_json: bool = False) -> tuple[int, str]:
@@ -48,16 +50,16 @@ def test_all_checks_pass_on_this_machine() -> None:
 def test_only_failures_change_the_exit_status(
     set_check: Callable[[Check], None], verdict: Verdict, status: int
 ) -> None:
-    set_check(Check("teeth", "three [left]", verdict, "see a dentist"))
+    set_check(Check("disk", "2 GB [free]", verdict, "see the manual"))
     exit_status, text = run_doctor()
     assert exit_status == status
-    assert "three [left]" in text
-    assert "teeth: see a dentist" in text
+    assert "2 GB [free]" in text
+    assert "disk: see the manual" in text
     exit_status, text = run_doctor(as_json=True)
     reported = json.loads(text)
     assert (exit_status, reported["can_run"]) == (status, status == 0)
     assert reported["checks"] == [
-        {"check": "teeth", "finding": "three [left]", "verdict": verdict.name.lower(), "remedy": "see a dentist"}
+        {"check": "disk", "finding": "2 GB [free]", "verdict": verdict.name.lower(), "remedy": "see the manual"}
     ]
 
 
@@ -69,8 +71,8 @@ def test_depth_error_of_a_plane_is_small() -> None:
     assert probe.measurements["depth_error_m"] < 2e-4
 
 
-def test_missing_backend_has_a_fault_message() -> None:
-    probe = doctor.probe_backend("nonesuch")
+def test_missing_backend_has_an_error_message() -> None:
+    probe = doctor.probe_backend("missing_module")
     assert probe.measurements is None
     assert probe.error
 
@@ -78,12 +80,12 @@ def test_missing_backend_has_a_fault_message() -> None:
 @pytest.mark.parametrize(
     ("osmesa", "egl", "backend", "verdict", "remedy"),
     [
-        (WORKING, WORKING, "osmesa", Verdict.OK, ""),
-        (WORKING, ABSENT, "osmesa", Verdict.OK, ""),
-        (ABSENT, WORKING, "egl", Verdict.OK, ""),
-        (ABSENT, WORKING, "osmesa", Verdict.WARN, "export MARSYARD_GL=egl"),
-        (ABSENT, ABSENT, "osmesa", Verdict.FAIL, "apt-get install libosmesa6"),
-        (WORKING, WORKING, "vulkan", Verdict.FAIL, "unset MARSYARD_GL"),
+        (WORKING_BACKEND, WORKING_BACKEND, "osmesa", Verdict.OK, ""),
+        (WORKING_BACKEND, ABSENT_BACKEND, "osmesa", Verdict.OK, ""),
+        (ABSENT_BACKEND, WORKING_BACKEND, "egl", Verdict.OK, ""),
+        (ABSENT_BACKEND, WORKING_BACKEND, "osmesa", Verdict.WARN, "export MARSYARD_GL=egl"),
+        (ABSENT_BACKEND, ABSENT_BACKEND, "osmesa", Verdict.FAIL, "apt-get install libosmesa6"),
+        (WORKING_BACKEND, WORKING_BACKEND, "vulkan", Verdict.FAIL, "unset MARSYARD_GL"),
     ],
 )
 def test_verdict_of_the_selected_backend(
@@ -96,9 +98,9 @@ def test_verdict_of_the_selected_backend(
 
 
 def test_backend_with_wrong_depth_fails() -> None:
-    assert WORKING.measurements is not None
-    wrong = Probe({**WORKING.measurements, "depth_error_m": 0.5})
-    first, *_, last = doctor.check_rendering({"osmesa": wrong})
+    assert WORKING_BACKEND.measurements is not None
+    inaccurate = Probe({**WORKING_BACKEND.measurements, "depth_error_m": 0.5})
+    first, *_, last = doctor.check_rendering({"osmesa": inaccurate})
     assert first.verdict is Verdict.WARN
     assert last.verdict is Verdict.FAIL
 
@@ -134,15 +136,15 @@ def test_conflicting_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_dependencies_are_checked_by_import_name() -> None:
     # installed metadata may be older than the file in a development environment
-    needs = tomllib.loads((doctor.ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
-    modules = [doctor._import_name(canonicalize_name(Requirement(need).name)) for need in needs]
+    requirements = tomllib.loads((doctor.ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    modules = [doctor._import_name(canonicalize_name(Requirement(requirement).name)) for requirement in requirements]
     assert [module for module in modules if importlib.util.find_spec(module) is None] == []
 
 
 def test_missing_old_and_broken_dependencies_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    needs = ["numpy>=2.2", "scipy>=1.17", "joblib>=1.5", "dask>=2025.9; extra == 'dask'", "rich>=14"]
+    requirements = ["numpy>=2.2", "scipy>=1.17", "joblib>=1.5", "dask>=2025.9; extra == 'dask'", "rich>=14"]
     versions = {"scipy": "1.9", "joblib": "1.6.0", "rich": "14.0"}
-    monkeypatch.setattr(importlib.metadata, "requires", lambda _: needs)
+    monkeypatch.setattr(importlib.metadata, "requires", lambda _: requirements)
     monkeypatch.setattr(doctor, "_find_version", versions.get)
     monkeypatch.setattr(doctor, "_read_pins", lambda: {"rich": "15.0.0"})
     checks = {check.name: check for check in doctor.check_dependencies({"joblib": "OSError: truncated"})}
@@ -158,13 +160,13 @@ def test_missing_old_and_broken_dependencies_are_reported(monkeypatch: pytest.Mo
 
 
 def test_module_that_exits_does_not_hide_other_failures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "deadly.py").write_text("import os; os._exit(3)")
-    (tmp_path / "faulty.py").write_text("import nonesuch")
+    (tmp_path / "exiting.py").write_text("import os; os._exit(3)")
+    (tmp_path / "faulty.py").write_text("import missing_module")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    failures = doctor.find_import_failures(["json", "deadly", "faulty", "math"])
+    failures = doctor.find_import_failures(["json", "exiting", "faulty", "math"])
     assert failures == {
-        "deadly": "the process ended with status 3",
-        "faulty": "ModuleNotFoundError: No module named 'nonesuch'",
+        "exiting": "the process ended with status 3",
+        "faulty": "ModuleNotFoundError: No module named 'missing_module'",
     }
 
 

@@ -30,7 +30,7 @@ pytestmark = [
 ALGORITHM = """
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 
-class Mine:
+class MyEstimator:
     version = "3.1"
     options = {"gain": 0.5}
 
@@ -55,10 +55,17 @@ population = "all"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a campaign with a custom algorithm in a folder whose name has a space."""
     path: Path = tmp_path_factory.mktemp("a folder")
-    (path / "mine.py").write_text(ALGORITHM)
+    (path / "my_module.py").write_text(ALGORITHM)
     (path / "custom file.toml").write_text(CAMPAIGN)
     command = [str(Path(sys.executable).with_name("marsyard")), "run", "custom file.toml", "-n", "3", "--seed", "9"]
-    command += ["--algorithm", "mine:Mine", "--algorithm", "homography", "--set", 'description="it\'s mine"']
+    command += [
+        "--algorithm",
+        "my_module:MyEstimator",
+        "--algorithm",
+        "homography",
+        "--set",
+        'description="it\'s quoted"',
+    ]
     result = subprocess.run(
         [*command, "--jobs", "1", "--out", "run"], cwd=path, capture_output=True, text=True, timeout=120, check=False
     )
@@ -73,7 +80,11 @@ def _read_record(folder: Path) -> Mapping[str, Any]:
 
 def test_record_describes_the_algorithms(folder: Path) -> None:
     tested, compared = _read_record(folder)["algorithms"]
-    assert (tested["spec"], tested["role"], tested["path"]) == ("mine:Mine", "tested", "mine:Mine")
+    assert (tested["spec"], tested["role"], tested["path"]) == (
+        "my_module:MyEstimator",
+        "tested",
+        "my_module:MyEstimator",
+    )
     assert (tested["version"], tested["options"]) == ("3.1", {"gain": 0.5})
     assert re.fullmatch("[0-9a-f]{16}", tested["source_hash"])
     assert (compared["spec"], compared["role"]) == ("homography", "compared")
@@ -86,20 +97,20 @@ def test_reports_name_the_evaluated_algorithm(folder: Path) -> None:
     source = _read_record(folder)["algorithms"][0]["source_hash"]
     page = html.unescape((folder / "run" / "report.html").read_text())
     header = page.partition("<nav")[0]
-    assert "mine:Mine" in header
+    assert "my_module:MyEstimator" in header
     assert "3.1" in header
     assert source[:10] in header
     provenance = page.partition('id="provenance"')[2]
     assert '{"gain": 0.5}' in provenance
     assert source in provenance
     (row,) = csv.DictReader(io.StringIO((folder / "run" / "verification.csv").read_text()))
-    assert (row["algorithm"], row["algorithm_version"]) == ("mine:Mine", "3.1")
+    assert (row["algorithm"], row["algorithm_version"]) == ("my_module:MyEstimator", "3.1")
     assert (row["algorithm_options"], row["algorithm_source"]) == ('{"gain": 0.5}', source)
     suite = Xml.parse(folder / "run" / "junit.xml").getroot()  # noqa: S314
     properties = {entry.get("name"): entry.get("value") for entry in suite.iter("property")}
-    assert (properties["algorithm"], properties["algorithm_source"]) == ("mine:Mine", source)
+    assert (properties["algorithm"], properties["algorithm_source"]) == ("my_module:MyEstimator", source)
     report = json.loads((folder / "run" / "report.json").read_text())
-    assert [entry["name"] for entry in report["algorithm_details"] if entry["tested"]] == ["mine:Mine"]
+    assert [entry["name"] for entry in report["algorithm_details"] if entry["tested"]] == ["my_module:MyEstimator"]
 
 
 def test_dashboard_names_the_evaluated_algorithm(folder: Path, tmp_path: Path) -> None:
@@ -107,12 +118,12 @@ def test_dashboard_names_the_evaluated_algorithm(folder: Path, tmp_path: Path) -
     index = site.index.read_text()
     evidence = re.search(r'data-requirement="v".*?</tr>', index, re.DOTALL)
     assert evidence is not None
-    assert "mine:Mine 3.1" in evidence[0]
+    assert "my_module:MyEstimator 3.1" in evidence[0]
     page = html.unescape(next((tmp_path / "site" / "c").glob("*/index.html")).read_text())
     source = _read_record(folder)["algorithms"][0]["source_hash"]
-    assert all(text in page for text in ("mine:Mine 3.1", source, '{"gain": 0.5}'))
+    assert all(text in page for text in ("my_module:MyEstimator 3.1", source, '{"gain": 0.5}'))
     matrix = list(csv.DictReader(io.StringIO((tmp_path / "site" / "verification.csv").read_text())))
-    assert next(row for row in matrix if row["requirement"] == "v")["algorithm"] == "mine:Mine"
+    assert next(row for row in matrix if row["requirement"] == "v")["algorithm"] == "my_module:MyEstimator"
 
 
 def test_command_in_the_report_repeats_the_campaign(folder: Path, tmp_path: Path) -> None:
@@ -165,4 +176,4 @@ def test_records_of_earlier_versions_are_reported(folder: Path, tmp_path: Path) 
     assert "marsyard run custom-campaign -n 3 --seed 9" in page
     assert "The original command was not recorded" in page
     (row,) = csv.DictReader(io.StringIO((old / "verification.csv").read_text()))
-    assert (row["algorithm"], row["algorithm_version"]) == ("mine:Mine", "")
+    assert (row["algorithm"], row["algorithm_version"]) == ("my_module:MyEstimator", "")

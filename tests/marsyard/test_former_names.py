@@ -21,7 +21,7 @@ from marsyard.scenarios.systems import row_columns, scenario, scenario_names
 from marsyard.sim import parameters
 from marsyard.sim.parameters import DeprecatedNameWarning
 
-TABLE = tomllib.loads(Path(parameters.__file__).with_name("renamed.toml").read_text())
+RENAMED_NAMES = tomllib.loads(Path(parameters.__file__).with_name("renamed.toml").read_text())
 CAMPAIGN = """
 name = "deprecated"
 scenario = "descent"
@@ -52,18 +52,19 @@ def replace_deprecated_names(text: str) -> str:
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> tuple[Path, Path]:
+def campaign_files(tmp_path: Path) -> tuple[Path, Path]:
+    """Write one campaign with deprecated names and one with current names; return their paths."""
     paths = tmp_path / "deprecated.toml", tmp_path / "current.toml"
     paths[0].write_text(CAMPAIGN)
     paths[1].write_text(replace_deprecated_names(CAMPAIGN))
     return paths
 
 
-def test_campaign_with_deprecated_names_equals_the_current_one(files: tuple[Path, Path]) -> None:
+def test_campaign_with_deprecated_names_equals_the_current_one(campaign_files: tuple[Path, Path]) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DeprecatedNameWarning)
-        campaign = load_campaign(str(files[0]))
-    expected = load_campaign(str(files[1]))
+        campaign = load_campaign(str(campaign_files[0]))
+    expected = load_campaign(str(campaign_files[1]))
     assert campaign.configuration == expected.configuration
     assert campaign.draws(1) == expected.draws(1)
     texts = {str(warning.message) for warning in caught}
@@ -80,22 +81,22 @@ def test_deprecated_value_of_an_option_sets_the_current_value() -> None:
         load_campaign("hda-benign", ["hda.track_seed=nothing"])
 
 
-def test_override_with_a_deprecated_name_sets_the_parameter(files: tuple[Path, Path]) -> None:
+def test_override_with_a_deprecated_name_sets_the_parameter(campaign_files: tuple[Path, Path]) -> None:
     with pytest.warns(DeprecatedNameWarning, match="'place' is now 'location'"):
-        campaign = load_campaign(str(files[1]), ["place.terrain=1"])
+        campaign = load_campaign(str(campaign_files[1]), ["place.terrain=1"])
     assert campaign.configuration.parameters["location"]["terrain"] == 1
     assert set(campaign.configuration.dispersions) == {"descent.cone_minor_fraction"}
 
 
-def test_renamed_parameters_keep_their_draws(files: tuple[Path, Path]) -> None:
-    campaign = load_campaign(str(files[1]))
+def test_renamed_parameters_keep_their_draws(campaign_files: tuple[Path, Path]) -> None:
+    campaign = load_campaign(str(campaign_files[1]))
     uniform = campaign.streams(0).generator("dispersion:descent.cone_minor_share").random()
     assert campaign.draws(0)["descent.cone_minor_fraction"] == pytest.approx(2.0 * uniform - 1.0, abs=1e-12)
 
 
-def test_stored_campaign_is_read_with_current_names(files: tuple[Path, Path], tmp_path: Path) -> None:
-    expected = load_campaign(str(files[1])).configuration
-    record.begin(tmp_path, expected, create_identity(expected), "test")
+def test_stored_campaign_is_read_with_current_names(campaign_files: tuple[Path, Path], tmp_path: Path) -> None:
+    expected = load_campaign(str(campaign_files[1])).configuration
+    record.write_first_record(tmp_path, expected, create_identity(expected), "test")
     text = (tmp_path / "campaign.json").read_text()
     for deprecated, current in (*NAMES, ("most_cases", "max_cases")):
         for character in '". ':
@@ -126,10 +127,10 @@ def test_current_names_exist_and_deprecated_names_do_not() -> None:
     """Each current key of the table is a parameter of a scenario, and each current column a column of a scenario."""
     schemas = " ".join(json.dumps(scenario(name).parameters_type.model_json_schema()) for name in scenario_names())
     schemas += json.dumps(type(load_campaign("dimes-smoke").configuration).model_json_schema())
-    for deprecated, current in TABLE["keys"].items():
+    for deprecated, current in RENAMED_NAMES["keys"].items():
         assert f'"{current}": {{' in schemas, current
         assert deprecated in ("own", "least", "most") or f'"{deprecated}": {{' not in schemas, deprecated
     column_sets = [columns for name in scenario_names() if (columns := row_columns(name)) is not None]
-    for deprecated, current in TABLE["columns"].items():
+    for deprecated, current in RENAMED_NAMES["columns"].items():
         assert any(current in (*columns.flags, *columns.numbers) for columns in column_sets), current
         assert not any(deprecated in (*columns.flags, *columns.numbers) for columns in column_sets), deprecated

@@ -28,7 +28,9 @@ from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
 
 
-class _Links(HTMLParser):
+class _PageParser(HTMLParser):
+    """Parser that collects link targets and alternative texts of images."""
+
     def __init__(self) -> None:
         super().__init__()
         self.targets: list[str] = []
@@ -65,27 +67,29 @@ def test_every_site_and_camera_is_shown(images: list[GalleryImage]) -> None:
 
 def test_page_links_only_to_its_images(images: list[GalleryImage], tmp_path: Path) -> None:
     page = write_gallery(images, tmp_path / "new" / "gallery")
-    links = _Links()
+    parser = _PageParser()
     text = page.read_text()
-    links.feed(text)
+    parser.feed(text)
     assert page.name == PAGE
-    for link in links.targets:
+    for link in parser.targets:
         if link.startswith("#"):
             assert f'id="{link[1:]}"' in text
         elif not link.startswith("data:image/jpeg;base64,"):
             assert (page.parent / link).is_file()
-    assert len(links.texts) == len(images)
-    assert all(image.caption in alternative for image, alternative in zip(images, links.texts, strict=True))
+    assert len(parser.texts) == len(images)
+    assert all(image.caption in alternative for image, alternative in zip(images, parser.texts, strict=True))
     for command in re.findall(r"<code>(marsyard render [^<]*)</code>", text):
         assert "--camera" in command
 
 
 def test_contact_sheet_is_small(images: list[GalleryImage]) -> None:
-    smooth = np.linspace(0.0, 255.0, 640 * 480).reshape(480, 640)
+    brightness_ramp = np.linspace(0.0, 255.0, 640 * 480).reshape(480, 640)
     rng = np.random.default_rng(2)
     smooth_images = [
         GalleryImage(
-            image.request, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), image.file
+            image.request,
+            np.clip(brightness_ramp + rng.normal(0.0, 6.0, brightness_ramp.shape), 0, 255).astype(np.uint8),
+            image.file,
         )
         for image in images
     ]
@@ -119,14 +123,14 @@ def test_uniform_images_can_be_displayed(image: np.ndarray) -> None:
 def test_existing_gallery_is_kept(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / name).write_text("mine")
+    (tmp_path / name).write_text("existing text")
     monkeypatch.setattr(gallery_command, "VIEWS", ())
     monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as raised:
         cli.main()
     assert raised.value.code == 2
     assert f"{tmp_path / name}: the file exists" in capfd.readouterr().err
-    assert (tmp_path / name).read_text() == "mine"
+    assert (tmp_path / name).read_text() == "existing text"
 
 
 def test_gallery_shows_a_terrain_model(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,7 +144,7 @@ def test_gallery_shows_a_terrain_model(shared_data: Path, tmp_path: Path, monkey
     assert image.std() > 5.0
 
 
-def test_gallery_rejects_a_file_that_is_no_terrain_model(
+def test_unknown_terrain_file_format_is_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path), "--terrain", "relief.txt"])

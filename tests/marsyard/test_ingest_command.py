@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
-from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_texts, write_velocity_folder
+from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder
 
 
-def run_command(*words: str) -> tuple[int, str]:
-    result = CliRunner().invoke(app, list(words))
+def run_command(*arguments: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(arguments))
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.output
@@ -68,14 +68,14 @@ def test_invalid_input_has_status_2_and_leaves_no_files(tmp_path: Path) -> None:
     folder = write_landing_folder(tmp_path / "in", inputs.landing(), "matching")
     rows = read_rows(folder)
     rows[1]["file"] = "lost.png"
-    write_texts(folder, rows)
+    write_text_rows(folder, rows)
     status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "out"))
     assert status == 2
     assert "lost.png: No such file or directory" in output
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "mine.txt").write_text("mine")
-    status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "full"))
+    (tmp_path / "occupied").mkdir()
+    (tmp_path / "occupied" / "notes.txt").write_text("notes")
+    status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "occupied"))
     assert (status, "is not empty" in output) == (2, True)
     status, output = run_command("ingest", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
     assert (status, "ingest.toml: cannot be read" in output) == (2, True)

@@ -1,4 +1,4 @@
-"""Tests of `marsyard new`, of `marsyard clean` and of lists in JSON."""
+"""Tests of `marsyard new` and `marsyard clean`, and of lists that are printed as JSON."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def run_command(*words: str) -> tuple[int, str]:
-    result = CliRunner().invoke(app, list(words))
+def run_command(*arguments: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(arguments))
     return result.exit_code, result.output
 
 
@@ -90,8 +90,8 @@ def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) 
     # more cases on the same terrains do not add evidence
     (terrains,) = evidence_limits(load_campaign("dimes-smoke", cases=1000))
     assert "only 8 stored terrains" in terrains
-    grid = evidence_limits(load_campaign("dimes-smoke", ["design.kind=sobol"], 32))
-    assert 'Set design.kind = "random", and run it again.' in grid[0]
+    sobol_limits = evidence_limits(load_campaign("dimes-smoke", ["design.kind=sobol"], 32))
+    assert 'Set design.kind = "random", and run it again.' in sobol_limits[0]
 
 
 def test_camera_file_is_used_in_the_new_campaign(working_folder: Path) -> None:
@@ -106,7 +106,7 @@ def test_camera_file_is_used_in_the_new_campaign(working_folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("arguments", "message"),
     [
         (("--system", "velocity", "--site", "venus"), "venus"),
         (
@@ -118,8 +118,8 @@ def test_camera_file_is_used_in_the_new_campaign(working_folder: Path) -> None:
         (("--system", "landing", "--flight", "flight.csv"), "only descents accept"),
     ],
 )
-def test_invalid_options_write_no_campaign(working_folder: Path, words: tuple[str, ...], message: str) -> None:
-    status, output = run_command("new", "mine", *words)
+def test_invalid_options_write_no_campaign(working_folder: Path, arguments: tuple[str, ...], message: str) -> None:
+    status, output = run_command("new", "mine", *arguments)
     assert status == 2
     assert message in output
     assert not (working_folder / "mine.toml").exists()
@@ -144,12 +144,12 @@ def test_invalid_answers_are_rejected_in_the_dialogue(working_folder: Path, monk
 
 
 def test_existing_campaign_file_is_kept(working_folder: Path) -> None:
-    (working_folder / "mine.toml").write_text("precious")
+    (working_folder / "mine.toml").write_text("existing text")
     status, output = run_command("new", "mine", "--system", "tracking")
     assert status == 2
     assert "mine.toml: the file exists; use --overwrite" in output
     assert run_command("new", "mine", "--system", "tracking", "--site", "venus", "--overwrite")[0] == 2
-    assert (working_folder / "mine.toml").read_text() == "precious"
+    assert (working_folder / "mine.toml").read_text() == "existing text"
 
 
 def test_clean_lists_and_then_removes_files(working_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,12 +65,12 @@ def test_regression_is_reported_with_its_metric(
 
 def test_invalid_campaign_does_not_stop_the_nightly_run(nightly: Nightly, tmp_path: Path) -> None:
     (tmp_path / "plan.toml").write_text(
-        '[[campaigns]]\ncampaign = "nonesuch"\n\n[[campaigns]]\ncampaign = "fake.toml"\ncases = 6\n'
+        '[[campaigns]]\ncampaign = "unknown-campaign"\n\n[[campaigns]]\ncampaign = "fake.toml"\ncases = 6\n'
     )
     status, report = nightly()
     assert status == 1
     assert "NOT RUN" in report
-    assert "nonesuch" in report
+    assert "unknown-campaign" in report
     assert "| fake |" in report
 
 
@@ -93,8 +93,12 @@ def test_killed_run_is_shown_and_not_compared(
     assert "Night 1, begun" in report
     assert "was interrupted" in report
     assert "No metric has a history" in report
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
-        patch.setattr(nightly_plan, "run_scheduled_campaign", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(nightly_plan, "run_scheduled_campaign", interrupt)
         status, report = nightly()
     assert (status, report.splitlines()[0]) == (130, "# Night 3: INTERRUPTED")
 

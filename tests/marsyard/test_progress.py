@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import re
 import time
 from pathlib import Path
@@ -19,7 +18,7 @@ from tests.campaigns.fake_campaign import RecordingWatch
 
 
 class Clock:
-    """A clock whose time the test sets."""
+    """A clock whose time is set by the test."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -47,8 +46,8 @@ def test_time_left_follows_the_rate_of_the_stage() -> None:
         bars.step()
     bars.begin("cases", 10)
     # the first case is slow because it fills the caches
-    for seconds in (90.0, 5.0, 5.0):
-        clock.now_s += seconds
+    for duration_s in (90.0, 5.0, 5.0):
+        clock.now_s += duration_s
         bars.step()
     first, second = (line for line in _render_bars(bars, clock) if line.strip())
     assert "5.0 s per item" in first
@@ -99,7 +98,7 @@ def test_compilation_is_reported_until_first_case_ends(tmp_path: Path, monkeypat
             time.sleep(0.01)
         first_case_ended()
     assert any("3 functions so far" in note for note in watch.notes)
-    assert re.fullmatch(r"numeric kernels are compiled, \d+ s", next(itertools.islice(reversed(watch.notes), 1)))
+    assert re.fullmatch(r"numeric kernels are compiled, \d+ s", watch.notes[-1])
     # compiled kernels give no notes
     mark_ready("descent")
     second_watch = RecordingWatch()

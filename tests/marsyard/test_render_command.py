@@ -33,7 +33,7 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 
 
 def _check_image(prefix: Path, size: tuple[int, int], multiple: int) -> None:
-    """Check that image, camera model, metadata and truth files of one image agree."""
+    """Check that image, camera model, metadata and truth files agree; pixel values are multiples of `multiple`."""
     columns, rows = size
     image = cv2.imread(f"{prefix}.png", cv2.IMREAD_UNCHANGED)
     assert image is not None
@@ -122,14 +122,14 @@ def test_missing_folder_is_reported(marsyard: Command, tmp_path: Path) -> None:
     assert "does not exist" in error
 
 
-@pytest.mark.parametrize("ending", SUFFIXES)
-def test_existing_files_are_kept(marsyard: Command, tmp_path: Path, ending: str) -> None:
-    existing = tmp_path / f"x{ending}"
-    existing.write_text("mine")
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_existing_files_are_kept(marsyard: Command, tmp_path: Path, suffix: str) -> None:
+    existing = tmp_path / f"x{suffix}"
+    existing.write_text("existing text")
     status, error = marsyard("render", "gusev", "--camera", "xc-55", "--out", tmp_path / "x")
     assert status == 2
     assert f"{existing}: files exist" in error
-    assert existing.read_text() == "mine"
+    assert existing.read_text() == "existing text"
 
 
 def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path) -> None:
@@ -150,8 +150,8 @@ def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path) -> 
         assert filled.any()
         assert not filled.all()
         # the DTM of 119 m is centred in 256 m; posts from column 90 have no height
-        west = round(0.5 * (256 - 119))
-        assert points[filled][:, 0].min() > west + 89.0
+        west_edge_m = round(0.5 * (256 - 119))
+        assert points[filled][:, 0].min() > west_edge_m + 89.0
         np.testing.assert_allclose(np.nanmean(points[..., :2], axis=(0, 1)), 128.0, atol=3.0)
     metadata = json.loads(Path(f"{prefix}.json").read_text())
     assert metadata["filled_fraction"] == pytest.approx(float(filled.mean()))

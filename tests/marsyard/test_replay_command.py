@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -22,18 +23,18 @@ from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 SCENARIO = """
 from tests.campaigns.fake_scenario import FakeScenario
 
-class Mine(FakeScenario):
+class MyScenario(FakeScenario):
     pass
 """
 
 
 @pytest.fixture(scope="module")
-def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stored_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a campaign whose scenario can be imported only from its own folder; keep all products."""
-    folder = tmp_path_factory.mktemp("mine")
+    folder = tmp_path_factory.mktemp("custom")
     (folder / "my_scenario.py").write_text(SCENARIO)
     path = write_campaign(folder)
-    path.write_text(path.read_text().replace("tests.campaigns.fake_scenario:FakeScenario", "my_scenario:Mine"))
+    path.write_text(path.read_text().replace("tests.campaigns.fake_scenario:FakeScenario", "my_scenario:MyScenario"))
     before = Path.cwd()
     os.chdir(folder)
     try:
@@ -44,8 +45,8 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-def run_command(*words: object) -> tuple[int, str]:
-    result = CliRunner().invoke(app, list(map(str, words)))
+def run_command(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(map(str, arguments)))
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, result.output
 
@@ -55,18 +56,18 @@ def _read_files(folder: Path) -> dict[str, bytes]:
 
 
 def test_missing_scenario_is_reported_and_changes_nothing(
-    stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stored_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.path", [entry for entry in sys.path if entry != str(stored.parent)])
+    monkeypatch.setattr("sys.path", [entry for entry in sys.path if entry != str(stored_run.parent)])
     monkeypatch.delitem(sys.modules, "my_scenario", raising=False)
-    before = _read_files(stored)
-    for command in (("replay", stored, 0), ("resume", stored, "--allow-changed")):
+    before = _read_files(stored_run)
+    for command in (("replay", stored_run, 0), ("resume", stored_run, "--allow-changed")):
         status, output = run_command(*command)
         assert status == 2
-        assert "cannot import scenario 'my_scenario:Mine': No module named 'my_scenario'" in output
+        assert "cannot import scenario 'my_scenario:MyScenario': No module named 'my_scenario'" in output
         assert "Traceback" not in output
-    assert {name: text for name, text in _read_files(stored).items() if name != "campaign.lock"} == {
+    assert {name: text for name, text in _read_files(stored_run).items() if name != "campaign.lock"} == {
         name: text for name, text in before.items() if name != "campaign.lock"
     }
 
@@ -83,7 +84,7 @@ def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monke
     parameters = {**configuration.parameters, "algorithm": "my_absent_module:Estimator"}
     create_store(folder / ROWS_FILE, {"identity": "x"})
     identity = create_identity(configuration)
-    record.begin(folder, configuration.model_copy(update={"parameters": parameters}), identity, "nobody")
+    record.write_first_record(folder, configuration.model_copy(update={"parameters": parameters}), identity, "nobody")
     before = _read_files(folder)
     status, output = run_command("replay", folder, 0)
     assert status == 2
@@ -92,10 +93,10 @@ def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monke
 
 
 def test_products_are_kept_if_the_replayed_case_fails(
-    stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stored_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    copy = shutil.copytree(stored, tmp_path / "run")
-    monkeypatch.chdir(stored.parent)
+    copy = shutil.copytree(stored_run, tmp_path / "run")
+    monkeypatch.chdir(stored_run.parent)
     before = _read_files(copy / "cases")
     text = (copy / "campaign.json").read_text()
     changed = json.loads(text)
@@ -111,11 +112,11 @@ def test_products_are_kept_if_the_replayed_case_fails(
 
 
 def test_read_only_folder_is_replayed_into_another(
-    stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stored_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rows are read from a copy because SQLite writes files. `os.access` is patched because tests may run as root."""
-    copy = shutil.copytree(stored, tmp_path / "run")
-    monkeypatch.chdir(stored.parent)
+    copy = shutil.copytree(stored_run, tmp_path / "run")
+    monkeypatch.chdir(stored_run.parent)
     access = os.access
 
     def deny_write_access(path: Path, mode: int, **options: bool) -> bool:
@@ -123,16 +124,15 @@ def test_read_only_folder_is_replayed_into_another(
         return not is_denied and access(path, mode, **options)
 
     opened_files: list[str] = []
-    connect = "marsyard.campaigns.store.rows.sqlite3.connect"
-    original = sqlite3.connect
+    connect = sqlite3.connect
     monkeypatch.setattr("os.access", deny_write_access)
 
     def record_open(name: str, **options: Any) -> sqlite3.Connection:
         opened_files.append(str(name))
-        connection: sqlite3.Connection = original(name, **options)
+        connection: sqlite3.Connection = connect(name, **options)
         return connection
 
-    monkeypatch.setattr(connect, record_open)
+    monkeypatch.setattr("marsyard.campaigns.store.rows.sqlite3.connect", record_open)
     status, output = run_command("replay", copy, 1, "--out", tmp_path / "out")
     assert (status, "the row equals the stored one" in output) == (0, True), output
     assert opened_files
@@ -143,14 +143,14 @@ def test_read_only_folder_is_replayed_into_another(
 def test_products_are_replaced_completely_or_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "case"
     save_packed(folder, pack_products({"x": np.arange(3)}), {"case": 0})
-    (folder / "note.txt").write_text("the user's own")
+    (folder / "note.txt").write_text("a file of the user")
     before = _read_files(folder)
-    write = Path.write_bytes
+    write_bytes = Path.write_bytes
 
     def raise_disk_full(path: Path, data: bytes) -> int:
         if path.name == "products.json":
-            raise OSError(28, "No space left on device")
-        return write(path, data)
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write_bytes(path, data)
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "write_bytes", raise_disk_full)

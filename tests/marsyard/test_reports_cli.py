@@ -1,4 +1,4 @@
-"""Tests of `marsyard report`, `compare` and `dashboard`, and of campaigns that stop when decided."""
+"""Tests of `marsyard report`, `compare` and `dashboard`, and of campaigns that stop after a decided verdict."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def make_run(tmp_path: Path) -> MakeRun:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
 
-    def write_synthetic_run(name: str, draws: int = 1, **changes: Any) -> Path:
-        frame = module.synthetic_frame(40, seed=draws)[COLUMNS]
+    def write_synthetic_run(name: str, seed_of_rows: int = 1, **changes: Any) -> Path:
+        frame = module.synthetic_frame(40, seed=seed_of_rows)[COLUMNS]
         directory: Path = module.write_run(tmp_path / name, frame, **changes)
         return directory
 
@@ -86,7 +86,7 @@ def test_stored_rows_are_evaluated_again(make_run: MakeRun, marsyard: Command, t
     assert json.loads((directory / "report.json").read_text())["verdicts"][0]["requirement_id"] == "STRICT"
     assert "STRICT" in (directory / "verification.csv").read_text()
     # the campaign's record is unchanged
-    assert "exit_code" not in json.loads((directory / "campaign.json").read_text())
+    assert "exit_code" not in _read_record(directory)
     rows = pd.read_csv(directory / "cases.csv")
     assert (len(rows), list(rows)) == (40, COLUMNS)
     requirements.write_text(REQUIREMENTS.replace("dimes-*", "vtt-*"))
@@ -124,14 +124,14 @@ def test_dashboard_is_written_and_served_locally(make_run: MakeRun, marsyard: Co
     assert (status, "campaigns: 1" in out) == (0, True)
     assert marsyard("dashboard", tmp_path / "none")[0] == 2
     (tmp_path / "secret.txt").write_text("secret")
-    (tmp_path / "site" / "way-out").symlink_to(tmp_path / "secret.txt")
+    (tmp_path / "site" / "outside-link").symlink_to(tmp_path / "secret.txt")
     with create_server(tmp_path / "site", "127.0.0.1", 0) as http_server:
         assert http_server.server_address[0] == "127.0.0.1"
         threading.Thread(target=http_server.serve_forever, daemon=True).start()
         root = f"http://127.0.0.1:{http_server.server_port}"
         with urllib.request.urlopen(f"{root}/") as answer:  # noqa: S310
             assert "Requirements and campaigns" in answer.read().decode()
-        for invalid_path in ("/c/", "/../secret.txt", "/%2e%2e/secret.txt", "/way-out"):
+        for invalid_path in ("/c/", "/../secret.txt", "/%2e%2e/secret.txt", "/outside-link"):
             with pytest.raises(urllib.error.HTTPError) as raised:
                 urllib.request.urlopen(root + invalid_path)  # noqa: S310
             assert raised.value.code == 404
@@ -195,13 +195,14 @@ def test_gallery_repeats_its_cases_once(tmp_path: Path, marsyard: Command) -> No
     _, out, err = marsyard("report", directory, "--gallery")
     stored = {int(folder.name) for folder in (directory / "cases").iterdir()}
     assert (expected - stored, err) == (set(), "")
-    assert out.count("rerun for its images") == len(expected - {json.loads(_read_record(directory))["showcase"]})
+    assert out.count("rerun for its images") == len(expected - {_read_record(directory)["showcase"]})
     # stored cases are not repeated
     assert "rerun for" not in marsyard("report", directory, "--gallery")[1]
 
 
-def _read_record(directory: Path) -> str:
-    return (directory / "campaign.json").read_text()
+def _read_record(directory: Path) -> dict[str, Any]:
+    stored_record: dict[str, Any] = json.loads((directory / "campaign.json").read_text())
+    return stored_record
 
 
 def test_undecidable_requirements_are_rejected(tmp_path: Path) -> None:

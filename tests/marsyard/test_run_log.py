@@ -10,7 +10,7 @@ import pytest
 from marsyard.cli.progress import LOG_FILE, RunLog
 
 
-class RecordingWatch:
+class CallRecorder:
     """A progress watch that records its calls."""
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ def read_log(folder: Path) -> list[str]:
 
 
 def test_session_is_logged_and_forwarded(tmp_path: Path) -> None:
-    watch = RecordingWatch()
+    watch = CallRecorder()
     with RunLog(tmp_path, watch) as log:
         log.begin("cases", 2)
         log.step()
@@ -48,7 +48,7 @@ def test_session_is_logged_and_forwarded(tmp_path: Path) -> None:
 
 
 def _run_and_interrupt(folder: Path) -> None:
-    with RunLog(folder, RecordingWatch()) as log:
+    with RunLog(folder, CallRecorder()) as log:
         log.begin("cases", 5)
         log.step()
         raise KeyboardInterrupt("SIGINT")
@@ -65,12 +65,12 @@ def test_interruption_is_logged_and_sessions_are_appended(tmp_path: Path) -> Non
 
 def test_unwritable_log_does_not_stop_the_campaign(tmp_path: Path) -> None:
     (tmp_path / LOG_FILE).mkdir()
-    with RunLog(tmp_path, RecordingWatch()) as log:
+    with RunLog(tmp_path, CallRecorder()) as log:
         log.begin("cases", 1)
         log.step()
 
 
 def test_log_is_not_written_if_the_folder_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="taken"), RunLog(tmp_path, RecordingWatch()):
-        raise ValueError("taken")
+    with pytest.raises(ValueError, match="rejected"), RunLog(tmp_path, CallRecorder()):
+        raise ValueError("rejected")
     assert not (tmp_path / LOG_FILE).exists()

@@ -23,7 +23,7 @@ from marsyard.cli import app as cli
 CAMPAIGN = """
 name = "fake"
 scenario = "tests.campaigns.fake_scenario:FakeScenario"
-description = "a campaign without a world"
+description = "a campaign without terrain"
 cases = 25
 seed = 5
 
@@ -161,14 +161,15 @@ def test_invalid_options_are_rejected(campaign: Path, arguments: list[str], mess
 
 
 def _walk_paths(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, inner_value in inner:
+    """Yield the paths (keys and indices) of all values in a document."""
+    children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner_value in children:
         yield (*path, key)
         yield from _walk_paths(inner_value, (*path, key))
 
 
 _DOCUMENT = tomllib.loads(CAMPAIGN)
-_PATHS = list(_walk_paths(_DOCUMENT))
+_VALUE_PATHS = list(_walk_paths(_DOCUMENT))
 _MISSING = object()
 _random_values = st.recursive(
     st.one_of(
@@ -185,11 +186,15 @@ _random_values = st.recursive(
 ) | st.just(_MISSING)
 
 
-def _toml(value: Any) -> str:
+def _format_toml(value: Any) -> str:
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(inner_value)}" for key, inner_value in value.items()) + "}"
+        return (
+            "{"
+            + ", ".join(f"{_format_toml(str(key))} = {_format_toml(inner_value)}" for key, inner_value in value.items())
+            + "}"
+        )
     if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
+        return "[" + ", ".join(map(_format_toml, value)) + "]"
     if isinstance(value, str):
         return '"' + "".join(f"\\U{ord(letter):08x}" for letter in value) + '"'
     return str(value).lower()
@@ -216,12 +221,12 @@ _REPORTING_KEYS = {
 }
 
 
-@given(path=st.sampled_from(_PATHS), value=_random_values)
+@given(path=st.sampled_from(_VALUE_PATHS), value=_random_values)
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_changes_are_shown_or_reported_by_key(campaign: Path, path: tuple[str | int, ...], value: Any) -> None:
     """One value of a valid file is replaced or removed: the file is shown or the error names that key."""
     document = _change_document(path, value)
-    campaign.write_text("\n".join(f"{key} = {_toml(entry)}" for key, entry in document.items()))
+    campaign.write_text("\n".join(f"{key} = {_format_toml(entry)}" for key, entry in document.items()))
     result = marsyard("show", campaign, "--draw", 2, "--json")
     assert "Traceback" not in result.err, result.err
     assert result.status in (0, 2)
@@ -265,8 +270,8 @@ def test_random_bytes_are_rejected_without_traceback(campaign: Path, text: bytes
     ],
 )
 def test_extreme_values_are_rejected(campaign: Path, line: str) -> None:
-    head = "name = 'fake'\nscenario = 'tests.campaigns.fake_scenario:FakeScenario'\ncases = 3\n"
-    campaign.write_text(head + line)
+    header = "name = 'fake'\nscenario = 'tests.campaigns.fake_scenario:FakeScenario'\ncases = 3\n"
+    campaign.write_text(header + line)
     result = marsyard("show", campaign)
     assert (result.status, result.out) == (2, "")
     assert "Traceback" not in result.err

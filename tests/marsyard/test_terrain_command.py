@@ -71,8 +71,8 @@ def test_holes_are_rejected_or_counted_and_marked(tmp_path: Path) -> None:
     is_red = (image[..., 2].astype(int) - image[..., 1]) > 40
     # 128 samples per side; the outline covers a few red pixels
     assert is_red.sum() == pytest.approx(31 * 64, rel=0.1)
-    west = np.flatnonzero(is_red.any(axis=0))
-    assert west[0] == pytest.approx(32, abs=1)
+    red_columns = np.flatnonzero(is_red.any(axis=0))
+    assert red_columns[0] == pytest.approx(32, abs=1)
     assert run_terrain_command("stats", str(path), "--max-holes", "0.5", "--picture", str(figure))[0] == 2
 
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-VerdictWord = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
+VerdictName = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
 
 
 class _Part(BaseModel):
@@ -31,7 +31,7 @@ class ClusterEvidence(_Part):
 class AllCases(_Part):
     """The same requirement on all cases."""
 
-    status: VerdictWord
+    status: VerdictName
     n: int
     failures: int
     estimate: float | None
@@ -74,9 +74,9 @@ class RequirementVerdict(_Part):
     confidence: float | None
     population: str
     decide_by: str = Field(description="`confidence`: by the bounds; `estimate`: by the observed rate")
-    status: VerdictWord
-    confident_status: VerdictWord = Field(description="verdict by the bounds, also where the observed rate decides")
-    plain_status: VerdictWord | None = Field(description="verdict for independent cases; null if no terrain is shared")
+    status: VerdictName
+    confident_status: VerdictName = Field(description="verdict by the bounds, also where the observed rate decides")
+    plain_status: VerdictName | None = Field(description="verdict for independent cases; null if no terrain is shared")
     n: int
     failures: int
     estimate: float | None
@@ -94,7 +94,7 @@ class RequirementVerdict(_Part):
     reason: str
     advice: str = Field(description="reason why more cases do not help, and the necessary change")
     accept_rate: bool = Field(description="true if MET BY RATE has exit status 0")
-    withheld_status: VerdictWord | None = Field(
+    withheld_status: VerdictName | None = Field(
         description="status without regard to the kind of evidence, if it was replaced by INSUFFICIENT"
     )
     all_cases: AllCases | None = Field(description="the requirement on all cases; null if its population is all cases")
@@ -182,7 +182,7 @@ class CampaignReport(_Part):
     )
     sampling: SamplingDescription
     evidence: Evidence
-    verdict: VerdictWord | Literal["NO REQUIREMENT"]
+    verdict: VerdictName | Literal["NO REQUIREMENT"]
     sentence: str
     exit_code: Literal[0, 1, 3]
     verdicts: list[RequirementVerdict]

@@ -25,38 +25,40 @@ MakeRun = Callable[..., Path]
 
 
 def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricComparison]]:
-    is_paired, contrasts = compare_campaigns(read_run(first), read_run(second))
-    return is_paired, {contrast.name: contrast for contrast in contrasts}
+    is_paired, comparisons = compare_campaigns(read_run(first), read_run(second))
+    return is_paired, {comparison.name: comparison for comparison in comparisons}
 
 
 def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) -> None:
     frame = make_rows(200, terrains=40)
     worse = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
-    is_paired, contrasts = _compare(make_run(frame), make_run(worse, name="other"))
+    is_paired, comparisons = _compare(make_run(frame), make_run(worse, name="other"))
     assert is_paired
     # errors larger by 2 %: the paired test detects them in spite of the large scatter
-    assert contrasts["velocity error (m/s)"].p_value < 1e-9
-    assert contrasts["answered"].p_value == 1.0
-    assert contrasts["came to an end"].second.summary_value == 1.0
+    assert comparisons["velocity error (m/s)"].p_value < 1e-9
+    assert comparisons["answered"].p_value == 1.0
+    assert comparisons["came to an end"].second.summary_value == 1.0
     # with four terrains the sign test has p = 2 / 2^4, times 4 (Holm's correction) for the 4 metrics
     four_terrains = make_rows(200)
     worse = four_terrains.assign(velocity_error_m_s=four_terrains["velocity_error_m_s"] * 1.02)
-    _, contrasts = _compare(make_run(four_terrains, name="four-terrains"), make_run(worse, name="four-terrains-worse"))
-    assert contrasts["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
+    _, comparisons = _compare(
+        make_run(four_terrains, name="four-terrains"), make_run(worse, name="four-terrains-worse")
+    )
+    assert comparisons["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
 
 
 def test_campaigns_with_different_draws_are_compared_as_two_samples(make_rows: Rows, make_run: MakeRun) -> None:
     first = make_run(make_rows(300))
-    is_paired, contrasts = _compare(first, make_run(make_rows(300, seed=2), name="same", seed=8))
+    is_paired, comparisons = _compare(first, make_run(make_rows(300, seed=2), name="same", seed=8))
     assert not is_paired
-    assert min(contrast.p_value for contrast in contrasts.values()) > 0.01
-    _, comparisons = _compare(
+    assert min(comparison.p_value for comparison in comparisons.values()) > 0.01
+    _, worse_comparisons = _compare(
         first, make_run(make_rows(300, seed=2, answered=0.6, error_scale=2.0), name="worse", seed=8)
     )
-    assert comparisons["answered"].p_value < 1e-6
+    assert worse_comparisons["answered"].p_value < 1e-6
     # no permutation of 10,000 has a larger difference
-    assert comparisons["velocity error (m/s)"].p_value < 1e-3
-    grid = campaign_diff_grid(["a", "b"], list(comparisons.values()))
+    assert worse_comparisons["velocity error (m/s)"].p_value < 1e-3
+    grid = campaign_diff_grid(["a", "b"], list(worse_comparisons.values()))
     assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
 
 
@@ -82,5 +84,5 @@ def _select_errors(run: StoredRun) -> tuple[pd.DataFrame, Metric]:
 
 def test_campaigns_without_common_metric_compare_completion(make_rows: Rows, make_run: MakeRun) -> None:
     first = make_run(make_rows(20)[["case", "outcome"]], [])
-    _, contrasts = _compare(first, make_run(make_rows(20), name="other", seed=8))
-    assert set(contrasts) == {"came to an end"}
+    _, comparisons = _compare(first, make_run(make_rows(20), name="other", seed=8))
+    assert set(comparisons) == {"came to an end"}

@@ -34,13 +34,13 @@ class Page(HTMLParser):
         self.ids: list[str] = []
         self.references: list[str] = []
         self.handlers: list[str] = []
-        self.open: list[str] = []
+        self.open_tags: list[str] = []
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
         if tag not in VOID_ELEMENTS:
-            self.open.append(tag)
+            self.open_tags.append(tag)
         self._record_attributes(attrs)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -49,8 +49,8 @@ class Page(HTMLParser):
 
     def handle_endtag(self, tag: str) -> None:
         if tag not in VOID_ELEMENTS:
-            assert self.open, f"</{tag}> closes nothing"
-            assert self.open.pop() == tag
+            assert self.open_tags, f"</{tag}> closes nothing"
+            assert self.open_tags.pop() == tag
 
     def _record_attributes(self, attrs: list[tuple[str, str | None]]) -> None:
         for name, value in attrs:
@@ -71,7 +71,7 @@ def _write_and_read(directory: Path) -> tuple[str, Page, dict[str, Any]]:
 
 def _check_page(text: str, page: Page) -> None:
     """Check that a page is well formed, self-contained, without external scripts, and that its links have targets."""
-    assert page.open == []
+    assert page.open_tags == []
     assert len(page.ids) == len(set(page.ids))
     # one data element per script; the content security policy names the script by its hash
     scripts = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
@@ -165,14 +165,14 @@ def test_report_without_requirements_has_exit_code_0(make_rows: Rows, make_run: 
 def test_requirement_met_by_rate_has_its_own_symbol(
     make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
 ) -> None:
-    rate = {**velocity, "probability": 0.9, "confidence": 0.999, "decide_by": "estimate"}
-    directory = make_run(make_rows(24)[MIN_COLUMNS], [rate])
+    requirement = {**velocity, "probability": 0.9, "confidence": 0.999, "decide_by": "estimate"}
+    directory = make_run(make_rows(24)[MIN_COLUMNS], [requirement])
     text, _, report = _write_and_read(directory)
     assert '<div class="headline status-met-by-rate">' in text
     assert ".status-met-by-rate { --status: var(--rate)" in text
     assert "evaluated by observed rate; bounds at" in text
-    diamond = "M12 1L23 12 12 23 1 12z"
-    assert diamond in text.split("<span>MET BY RATE</span>")[0].rsplit("<svg", 1)[1]
+    diamond_path = "M12 1L23 12 12 23 1 12z"
+    assert diamond_path in text.split("<span>MET BY RATE</span>")[0].rsplit("<svg", 1)[1]
     assert (report["verdict"], report["exit_code"]) == ("MET BY RATE", 3)
 
 

@@ -85,10 +85,10 @@ def test_missing_columns_give_no_section() -> None:
 
 def test_cumulative_curve_rises_and_complementary_curve_falls() -> None:
     values = {"ours": np.array([1.0, 2.0, 3.0, 4.0])}
-    for complementary, fraction_at_2 in ((False, 0.5), (True, 0.5)):
+    for complementary in (False, True):
         (line,) = cumulative_figure(values, ("", ""), complementary=complementary).axes[0].get_lines()
         heights = dict(np.column_stack([np.asarray(line.get_xdata()), np.asarray(line.get_ydata())]).tolist())
-        assert heights[2.0] == fraction_at_2
+        assert heights[2.0] == 0.5
         assert heights[4.0] == (0.0 if complementary else 1.0)
 
 
@@ -127,13 +127,13 @@ def test_paper_values_are_compared_with_results(tmp_path: Path) -> None:
 def register_altitude_system(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Return a function that registers a system with the given report."""
 
-    def install(report: str) -> None:
+    def register(report: str) -> None:
         system = System(name="altitude", title="Altitude", summary="", scenarios={}, report=report)
         monkeypatch.setattr(presentation, "systems", lambda: (system,))
         presentations.cache_clear()
         monkeypatch.setattr(presentation, "presentations", presentations)
 
-    return install
+    return register
 
 
 REPORT = Presentation(sections=(ALTITUDE,))

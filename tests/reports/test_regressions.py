@@ -19,28 +19,28 @@ from marsyard.reports.history import (
     NightCampaign,
     NightMetric,
     find_changes,
+    format_night_page,
     list_comparisons,
-    night_text,
 )
 from marsyard.reports.statistics.changes import Sample
 
-CASES, TERRAINS = 100, 12
+N_CASES, N_TERRAINS = 100, 12
 
 
 def _make_error_pool(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return errors in metres, shape (terrains, 200), and answer probabilities of terrains of different difficulty."""
     rng = np.random.default_rng(seed)
-    scale = rng.uniform(0.5, 2.0, TERRAINS)
-    return np.abs(rng.normal(size=(TERRAINS, 200))) * scale[:, None], rng.uniform(0.85, 1.0, TERRAINS)
+    scale = rng.uniform(0.5, 2.0, N_TERRAINS)
+    return np.abs(rng.normal(size=(N_TERRAINS, 200))) * scale[:, None], rng.uniform(0.85, 1.0, N_TERRAINS)
 
 
 def _draw_metrics(
     rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], error_factor: float = 1.0
 ) -> list[NightMetric]:
     """Draw the metrics of one nightly run from the pool; `error_factor` multiplies every error."""
-    terrains = rng.integers(0, TERRAINS, CASES)
-    errors = error_factor * pool[0][terrains, rng.integers(0, 200, CASES)]
-    answered = (rng.random(CASES) < pool[1][terrains]).astype(np.float64)
+    terrains = rng.integers(0, N_TERRAINS, N_CASES)
+    errors = error_factor * pool[0][terrains, rng.integers(0, 200, N_CASES)]
+    answered = (rng.random(N_CASES) < pool[1][terrains]).astype(np.float64)
     rates = [("within 2 m", (errors < 2.0).astype(np.float64)), ("answered", answered)]
     metrics = [NightMetric(name, True, float(values.mean()), Sample(values, terrains)) for name, values in rates]
     return [*metrics, NightMetric("error (m)", False, float(np.median(errors)), Sample(errors, terrains))]
@@ -71,7 +71,7 @@ def test_simulated_regression_is_detected() -> None:
     for _ in range(60):
         detected = _detect_changes(rng, pool, 1.75)
         n_detected += ("first", "error (m)", True) in {
-            (change.campaign, change.metric, change.worse) for change in detected
+            (change.campaign, change.metric, change.is_regression) for change in detected
         }
     assert n_detected >= 57
 
@@ -125,7 +125,9 @@ def test_reported_change_restarts_the_history(tmp_path: Path) -> None:
         regressions = find_changes(list_comparisons(history, night))
         assert "error (m)" in {entry.metric for entry in regressions}
         history.finish(
-            night, FINISHED, [(entry.campaign, entry.metric, entry.p_value, entry.worse) for entry in regressions]
+            night,
+            FINISHED,
+            [(entry.campaign, entry.metric, entry.p_value, entry.is_regression) for entry in regressions],
         )
         # after a reported change, later runs are compared with that run only
         next_night = _add_run(history, 6, error_factor=3.0)
@@ -166,13 +168,15 @@ def test_page_lists_regressions_and_interrupted_runs(tmp_path: Path) -> None:
         Change("first", "DIMES-VEL", True, 0.95, 0.7, 2e-6, 7),
         Change("first", "error (m)", False, 2.0, 1.0, 1e-3, 7),
     ]
-    text = night_text(later, [earlier], [NightCampaign(hostile, "d", "x", "FAIL", 1, hostile)], changes_of_night, 6)
+    text = format_night_page(
+        later, [earlier], [NightCampaign(hostile, "d", "x", "FAIL", 1, hostile)], changes_of_night, 6
+    )
     assert text.startswith("# Night 2: 1 FAIL, 1 regression\n")
     assert "- **first: DIMES-VEL**: 95.00 % in 7 earlier nights, 70.00 % now (p = 2e-06)" in text
     assert text.index("## Regressions") < text.index("DIMES-VEL") < text.index("## Improvements")
     assert "Night 1, begun" in text
     assert "<script>" not in text
     assert "| a&#124;b \\# &#60;script&#62;\\`\\* | FAIL |" in text
-    unchanged_text = night_text(later, [], [_make_campaign()], [], 6)
+    unchanged_text = format_night_page(later, [], [_make_campaign()], [], 6)
     assert "No metric has changed." in unchanged_text
     assert "no history" not in unchanged_text

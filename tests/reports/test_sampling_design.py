@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.evaluation import combine_verdicts, exit_code
+from marsyard.reports.evaluation import combine_verdicts, compute_exit_code
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Status, evaluate_requirements
@@ -57,8 +57,8 @@ def test_designs_without_independent_draws_have_no_confidence(
     verdicts = evaluate_requirements(frame, requirements, design)
     summary = combine_verdicts(verdicts, frame, design)
     assert (summary.word, message in summary.sentence) == ("INSUFFICIENT", True)
-    assert exit_code(verdicts, crashed=False) == 3
-    assert exit_code(verdicts, crashed=True) == 1
+    assert compute_exit_code(verdicts, crashed=False) == 3
+    assert compute_exit_code(verdicts, crashed=True) == 1
     output = io.StringIO()
     Console(file=output, width=200).print(verdict_table(verdicts))
     assert output.getvalue().count("No probability statement") == 1
@@ -79,8 +79,8 @@ def test_rate_decides_for_designs_without_independent_draws(
     assert math.isnan(met.lower)
     assert met.note.startswith("Decided by the rate of these cases. No probability statement: ")
     assert message in met.note
-    assert exit_code([met], crashed=False) == 3
-    assert exit_code([met, missed], crashed=False) == 1
+    assert compute_exit_code([met], crashed=False) == 3
+    assert compute_exit_code([met, missed], crashed=False) == 1
     summary = combine_verdicts([met, missed], frame, design)
     assert summary.word == "FAIL"
     assert summary.sentence.startswith("1 of 2 requirements met by the rate of these cases. No probability statement: ")
@@ -92,7 +92,7 @@ def test_rate_decides_for_designs_without_independent_draws(
 def test_design_without_requirements_has_no_verdict(make_rows: Rows) -> None:
     frame = make_rows(5)
     assert combine_verdicts([], frame, SamplingDesign("sobol")).status is None
-    assert exit_code([], crashed=False) == 0
+    assert compute_exit_code([], crashed=False) == 0
 
 
 def test_nominal_case_is_excluded_from_verdicts(make_rows: Rows, velocity: dict[str, Any]) -> None:

@@ -46,10 +46,10 @@ def assign_errors(frame: pd.DataFrame, components: np.ndarray) -> pd.DataFrame:
 def test_answer_rates_have_clopper_pearson_intervals() -> None:
     n = 200
     answered, has_overlap = np.arange(n) >= 30, np.arange(n) >= 20
-    magnitude = np.where(np.arange(n) == 100, 7.0, 1.0)
-    magnitude[~answered] = np.nan
+    errors = np.where(np.arange(n) == 100, 7.0, 1.0)
+    errors[~answered] = np.nan
     frame = pd.DataFrame(
-        {"answered": answered, "feasible_overlap": has_overlap, METRIC: magnitude, "terrain": np.arange(n) // 2}
+        {"answered": answered, "feasible_overlap": has_overlap, METRIC: errors, "terrain": np.arange(n) // 2}
     )
     rates = list(answer_fractions(make_subject(frame)).values())
     assert [(rate.hits, rate.n) for rate in rates] == [(170, 200), (170, 180), (20, 200), (1, 170)]

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marsyard.reports.evaluation import combine_verdicts, exit_code
+from marsyard.reports.evaluation import combine_verdicts, compute_exit_code
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.verdicts import Status, Verdict, evaluate_requirements
@@ -159,12 +159,12 @@ def test_boolean_metric_counts_true_as_success() -> None:
 
 def test_populations_combine_columns() -> None:
     frame = _make_rows(100, 20).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) < 50)
-    criterion = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    combined = _evaluate(frame, criterion, population="valid and feasible_overlap")
+    requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
+    combined = _evaluate(frame, requirement, population="valid and feasible_overlap")
     assert (combined.n, combined.failures) == (40, 10)
     assert (
         "feasible_overlap"
-        in _evaluate(frame.assign(feasible_overlap=np.arange(100.0)), criterion, population="feasible_overlap").note
+        in _evaluate(frame.assign(feasible_overlap=np.arange(100.0)), requirement, population="feasible_overlap").note
     )
 
 
@@ -173,12 +173,12 @@ def test_unknown_membership_counts_as_failure(outcome: str) -> None:
     frame = _make_rows(100, 0).assign(feasible_overlap=np.arange(100) < 50).astype({"feasible_overlap": object})
     frame.loc[90:93, "outcome"] = outcome
     frame.loc[90:93, "feasible_overlap"] = None
-    criterion = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    verdict = _evaluate(frame, criterion, population="feasible_overlap")
+    requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
+    verdict = _evaluate(frame, requirement, population="feasible_overlap")
     assert (verdict.n, verdict.failures) == (54, 4)
     # cases 92 and 93 are excluded by the second condition
     frame["is_near"] = np.arange(100) < 92
-    verdict = _evaluate(frame, criterion, population="feasible_overlap and is_near")
+    verdict = _evaluate(frame, requirement, population="feasible_overlap and is_near")
     assert (verdict.n, verdict.failures) == (52, 2)
 
 
@@ -186,41 +186,41 @@ def test_crashed_cases_are_failures_of_availability() -> None:
     """4 of 20 cases crash before their conditions are known; the other 16 succeed."""
     frame = _make_rows(20, 0).assign(feasible_overlap=True).astype({"feasible_overlap": object})
     frame.loc[:3, ["outcome", "answered", "feasible_overlap"]] = ["CRASHED", False, None]
-    criterion = {
+    requirement = {
         "id": "AVAIL",
         "metric": "answered",
         "probability": 0.95,
         "confidence": 0.9,
         "population": "feasible_overlap",
     }
-    verdict = _evaluate(frame, criterion, decide_by="estimate")
+    verdict = _evaluate(frame, requirement, decide_by="estimate")
     assert (verdict.status, verdict.n, verdict.failures) == (Status.FAIL, 20, 4)
 
 
 def test_crashed_case_with_a_small_error_fails() -> None:
     frame = _make_rows(20, 0).assign(outcome=["CRASHED"] * 2 + ["VALID"] * 18)
-    criterion = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.95, "confidence": 0.9}
-    assert _evaluate(frame, criterion, population="all", decide_by="estimate").failures == 2
+    requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.95, "confidence": 0.9}
+    assert _evaluate(frame, requirement, population="all", decide_by="estimate").failures == 2
 
 
 @pytest.mark.parametrize("population", ["valid", "completed", "valid and is_near"])
 def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) -> None:
     """The verdict is INSUFFICIENT if it depends on whether crashed cases belong to the population."""
-    criterion = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
+    requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
     frame = _make_rows(50, 0).assign(is_near=True)
     frame.loc[:9, "outcome"] = "CRASHED"
     frame.loc[:9, "answered"] = False
     for rule in ("confidence", "estimate"):
-        verdict = _evaluate(frame, criterion, population=population, decide_by=rule)
+        verdict = _evaluate(frame, requirement, population=population, decide_by=rule)
         assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 40, 0)
         assert "10 cases did not finish" in verdict.note
     # too few crashes, or crashes outside the population, do not change the verdict
     few_crashes = _make_rows(200, 0).assign(is_near=True)
     few_crashes.loc[:1, "outcome"] = "CRASHED"
     few_crashes.loc[:1, "answered"] = False
-    assert _evaluate(few_crashes, criterion, population=population).status is Status.PASS
+    assert _evaluate(few_crashes, requirement, population=population).status is Status.PASS
     outside = frame.assign(is_near=frame["answered"])
-    assert _evaluate(outside, criterion, population="valid and is_near").status is Status.PASS
+    assert _evaluate(outside, requirement, population="valid and is_near").status is Status.PASS
 
 
 def test_estimate_decides_with_shared_terrains(velocity: dict[str, Any]) -> None:
@@ -241,19 +241,19 @@ def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any
 
 def test_verdict_by_rate_is_not_pass(velocity: dict[str, Any]) -> None:
     """8 cases without failure have a rate of 100 %, but a consumer's risk of 97.6 % at a required rate of 99.7 %."""
-    probability_997 = {**velocity, "probability": 0.997, "decide_by": "estimate"}
-    eight_cases = _evaluate(_make_rows(8, 0), probability_997)
+    requirement_99_7 = {**velocity, "probability": 0.997, "decide_by": "estimate"}
+    eight_cases = _evaluate(_make_rows(8, 0), requirement_99_7)
     # a failure rate of 0.003 allows one failure in 1 / 0.003 = 334 cases
     assert (eight_cases.status, eight_cases.further_cases) == (Status.INSUFFICIENT, 334 - 8)
     assert "needs at least 334 cases" in eight_cases.note
-    assert _evaluate(_make_rows(333, 0), probability_997).status is Status.INSUFFICIENT
-    assert _evaluate(_make_rows(334, 1), probability_997).status is Status.MET_BY_RATE
-    assert _evaluate(_make_rows(334, 2), probability_997).status is Status.FAIL
+    assert _evaluate(_make_rows(333, 0), requirement_99_7).status is Status.INSUFFICIENT
+    assert _evaluate(_make_rows(334, 1), requirement_99_7).status is Status.MET_BY_RATE
+    assert _evaluate(_make_rows(334, 2), requirement_99_7).status is Status.FAIL
     # 99.7 % at 90 % confidence needs 767 cases without failure
-    assert _evaluate(_make_rows(767, 0), probability_997).status is Status.PASS
-    by_rate = _evaluate(_make_rows(334, 1), probability_997)
-    assert exit_code([by_rate], crashed=False) == 3
-    assert exit_code([_evaluate(_make_rows(334, 1), probability_997, accept_rate=True)], crashed=False) == 0
+    assert _evaluate(_make_rows(767, 0), requirement_99_7).status is Status.PASS
+    by_rate = _evaluate(_make_rows(334, 1), requirement_99_7)
+    assert compute_exit_code([by_rate], crashed=False) == 3
+    assert compute_exit_code([_evaluate(_make_rows(334, 1), requirement_99_7, accept_rate=True)], crashed=False) == 0
     passing = _evaluate(_make_rows(230, 0), velocity)
     assert combine_verdicts([passing, by_rate], _make_rows(334, 1)).word == "MET BY RATE"
     assert combine_verdicts([passing, by_rate, eight_cases], _make_rows(334, 1)).word == "INSUFFICIENT"
@@ -263,10 +263,10 @@ def test_verdict_by_rate_is_not_pass(velocity: dict[str, Any]) -> None:
 def test_minimum_cases_of_a_rate_allow_one_failure(
     velocity: dict[str, Any], probability: float, min_cases: int
 ) -> None:
-    criterion = {**velocity, "probability": probability, "decide_by": "estimate"}
-    assert _evaluate(_make_rows(min_cases, 1), criterion).status is Status.MET_BY_RATE
-    assert _evaluate(_make_rows(min_cases - 1, 1), criterion).status is Status.FAIL
-    assert _evaluate(_make_rows(min_cases - 1, 0), criterion).status is Status.INSUFFICIENT
+    requirement = {**velocity, "probability": probability, "decide_by": "estimate"}
+    assert _evaluate(_make_rows(min_cases, 1), requirement).status is Status.MET_BY_RATE
+    assert _evaluate(_make_rows(min_cases - 1, 1), requirement).status is Status.FAIL
+    assert _evaluate(_make_rows(min_cases - 1, 0), requirement).status is Status.INSUFFICIENT
 
 
 def test_appended_cases_share_the_risk_of_two_evaluations(velocity: dict[str, Any]) -> None:
@@ -431,12 +431,12 @@ def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
     frame = _make_rows(230, 0)
     passing, failing = _evaluate(frame, velocity), _evaluate(frame, velocity, bound=0.5)
     undecided = _evaluate(frame, velocity, probability=0.999)
-    assert exit_code([], crashed=False) == 0
-    assert exit_code([passing], crashed=False) == 0
-    assert exit_code([passing, undecided], crashed=False) == 3
-    assert exit_code([undecided, failing], crashed=False) == 1
-    assert exit_code([undecided], crashed=True) == 1
-    assert exit_code([], crashed=True) == 1
+    assert compute_exit_code([], crashed=False) == 0
+    assert compute_exit_code([passing], crashed=False) == 0
+    assert compute_exit_code([passing, undecided], crashed=False) == 3
+    assert compute_exit_code([undecided, failing], crashed=False) == 1
+    assert compute_exit_code([undecided], crashed=True) == 1
+    assert compute_exit_code([], crashed=True) == 1
 
 
 def test_crashed_cases_are_counted_in_the_summary(make_rows: Rows) -> None:

@@ -18,14 +18,14 @@ def _list_undeclared_columns(row: Any, declared: RowColumns, custom_prefixes: tu
     for name, value in row.items():
         column = name.rpartition(".")[2] if not name.startswith("footprints_") else name
         is_flag = isinstance(value, bool)
-        is_declared = declared.has_flag(column) or column == "answered" if is_flag else declared.has_number(column)
+        is_declared = (declared.has_flag(column) or column == "answered") if is_flag else declared.has_number(column)
         if not isinstance(value, str) and not is_declared and not column.startswith(custom_prefixes):
             undeclared_names.append(name)
     return undeclared_names
 
 
 def add_column_check(run: Callable[..., CaseResult], declared: RowColumns) -> Callable[..., CaseResult]:
-    """Wrap a scenario's `run` method: check the columns of each row."""
+    """Return a wrapper of a scenario's `run` method that checks the columns of each row."""
 
     def run_and_check(self: Any, parameters: Any, streams: Any) -> CaseResult:
         result = run(self, parameters, streams)

@@ -26,8 +26,9 @@ from marsyard.sim.measurements import (
     TargetDesignation,
 )
 
-#: Inputs of the algorithms, and the cases with the truth, in call order.
+#: Inputs of the algorithms, in call order.
 RECORDED_INPUTS: list[Any] = []
+#: Cases that the score receives, with the truth, in call order.
 RECORDED_CASES: list[Any] = []
 
 

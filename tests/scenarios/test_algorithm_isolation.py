@@ -38,8 +38,8 @@ def _clear_spies() -> Iterator[None]:
 
 
 def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), case: int = 0) -> CaseResult:
-    """Run a small case of a scenario."""
-    from tests.scenarios.descent.settings import DESCENT, WORLD
+    """Run a small case of a scenario; `compared` are the names of further algorithms of the spies module."""
+    from tests.scenarios.descent.settings import DESCENT, SMALL_WORLD
     from tests.scenarios.rover.short_run import SHORT_RUN
     from tests.scenarios.test_fieldtest import make_parameters
 
@@ -47,7 +47,7 @@ def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), ca
     algorithms: dict[str, Any] = {"algorithm": f"{SPY}:{algorithm}", "compared": compared_paths}
     circle = {"legs": [{"motion": "circle", "step_deg": 5.0, "steps": 1}]}
     parameters: dict[str, Any] = {
-        "descent": {**WORLD, "descent": DESCENT, **algorithms},
+        "descent": {**SMALL_WORLD, "descent": DESCENT, **algorithms},
         "fieldtest": {
             **make_parameters().model_dump(),
             "runs": [make_parameters().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}],
@@ -61,8 +61,10 @@ def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), ca
             "targets": [{"across": 0.0, "up": 0.5}],
         },
     }
-    selected = scenario(name)
-    return selected.run(selected.parameters_type.model_validate(parameters[name]), Streams(1, "handover", case))
+    selected_scenario = scenario(name)
+    return selected_scenario.run(
+        selected_scenario.parameters_type.model_validate(parameters[name]), Streams(1, "handover", case)
+    )
 
 
 def list_image_counts(inputs: Any) -> list[np.ndarray]:
@@ -143,7 +145,7 @@ def test_answers_are_converted_to_numpy_arrays_and_floats() -> None:
         check_site(SiteEstimate(SiteOutcome.SAFE_SITE, position)).site_world,
         check_update(TargetUpdate(TrackingState.NORMAL, (), position)).position_rover,
     )
-    assert len([entry for entry in arrays if type(entry) is np.ndarray and entry.dtype == np.float64]) == 3
+    assert all(type(array) is np.ndarray and array.dtype == np.float64 for array in arrays)
     assert [type(entry) for entry in check_velocity(velocity).span_s or ()] == [float, float]
 
 
@@ -165,23 +167,22 @@ def test_conditions_are_recorded_before_the_algorithm_runs(name: str, flags: set
 
 
 def test_runs_with_a_tracker_exception_count_as_failures() -> None:
-    """In 5 of 20 runs the tracker raises an exception; their rows lack the column of the metric."""
+    """The tracker raises an exception in 5 of 20 runs. Their rows have no column of the metric."""
     crashed_case, complete_case = (run_small_case("rover", spy, case=4) for spy in ("RaisingTracker", "TrackerSpy"))
     assert crashed_case.outcome == "CRASHED"
     assert crashed_case.row["selectable"] is complete_case.row["selectable"] is True
-    rows = (
+    crashed_row, complete_row = (
         {"outcome": case.outcome, "answered": case.answered, **case.row, "handed_over": True}
         for case in (crashed_case, complete_case)
     )
-    crashed, complete = rows
-    crashed.pop("handed_over")
-    frame = pd.DataFrame([crashed] * 5 + [complete] * 15)
+    crashed_row.pop("handed_over")
+    frame = pd.DataFrame([crashed_row] * 5 + [complete_row] * 15)
     requirement = {"id": "VTT-HANDED", "metric": "handed_over", "probability": 0.9, "confidence": 0.9}
     (result,) = evaluate_requirements(frame, [{**requirement, "population": "selectable", "decide_by": "estimate"}])
     assert (result.status, result.n, result.failures) == (Status.FAIL, 20, 5)
 
 
 def test_row_of_a_rejected_answer_has_no_site_columns() -> None:
-    """Without an accepted answer the columns are absent; a verdict then counts the case as a reported unsafe site."""
+    """If the columns are absent, a verdict counts the case as a reported unsafe site."""
     row = run_small_case("landing", "ForcedSiteWriter").row
     assert not {"site_reported", "no_site_reported", "converged"} & row.keys()

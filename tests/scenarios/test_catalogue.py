@@ -30,7 +30,7 @@ def _run_small_case(scenario: str) -> Row:
 
 
 def _make_short_drive() -> SharedDriveParameters:
-    """Return a drive of one step with the bands (column names) of all campaigns."""
+    """Return a drive of one step with the bands of all campaigns, because each band is a column."""
     band_names = {
         band["name"] for campaign in _list_campaigns("rover-drive") for band in _read_parameters(campaign)["bands"]
     }

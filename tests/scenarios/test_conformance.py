@@ -19,7 +19,7 @@ import os, random, signal, sys
 import numpy as np
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome as Outcome
 from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
-NOTHING = VelocityEstimate(Outcome.NO_VALID_TRACK, None)
+NO_ANSWER = VelocityEstimate(Outcome.NO_VALID_TRACK, None)
 def has_texture(m):
     return m.images[0].counts.std() > 5
 """
@@ -70,11 +70,11 @@ def format_estimator(lines: str) -> str:
             "covariance_m2_s2 is not finite",
         ),
         ("answer", "return 1 / 0", "it raised ZeroDivisionError: division by zero (bad_"),
-        ("answer", "m.images[0].counts[:] = m.images[0].counts\nreturn NOTHING", "read-only"),
+        ("answer", "m.images[0].counts[:] = m.images[0].counts\nreturn NO_ANSWER", "read-only"),
         ("featureless", "return VelocityEstimate(Outcome.VALID, np.zeros(2))", "it answers VALID to images that are"),
-        ("saturated", "return NOTHING if has_texture(m) else 1 / 0", "it raised ZeroDivisionError"),
-        ("inputs", "m.images[0].counts[:] = 0\nreturn NOTHING", "it changed its input"),
-        ("inputs", "m.interval_velocities_m_s[0] -= 1\nreturn NOTHING", "it changed its input"),
+        ("saturated", "return NO_ANSWER if has_texture(m) else 1 / 0", "it raised ZeroDivisionError"),
+        ("inputs", "m.images[0].counts[:] = 0\nreturn NO_ANSWER", "it changed its input"),
+        ("inputs", "m.interval_velocities_m_s[0] -= 1\nreturn NO_ANSWER", "it changed its input"),
         ("deterministic", "return VelocityEstimate(Outcome.VALID, np.random.random(2))", "differ between two calls"),
         (
             "deterministic",
@@ -82,8 +82,8 @@ def format_estimator(lines: str) -> str:
             "return VelocityEstimate(Outcome.VALID, np.full(2, previous))",
             "answer",
         ),
-        ("truth", "import marsyard.sim.terrain\nreturn NOTHING", "it imports modules with access to the truth: bad_"),
-        ("truth", "from marsyard.sim import sensor\nreturn NOTHING", ": marsyard.sim.sensor"),
+        ("truth", "import marsyard.sim.terrain\nreturn NO_ANSWER", "it imports modules with access to the truth: bad_"),
+        ("truth", "from marsyard.sim import sensor\nreturn NO_ANSWER", ": marsyard.sim.sensor"),
     ],
 )
 def test_estimator_defects_are_reported(
@@ -104,31 +104,31 @@ class Defective:
     def finish(self):
         {finish}
 """
-VALID_AFTER_TWO_IMAGES = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if len(self.frames) > 1 else NOTHING"
+VALID_AFTER_TWO_IMAGES = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if len(self.frames) > 1 else NO_ANSWER"
 
 
 @pytest.mark.parametrize(
     ("check", "picture", "finish", "problem"),
     [
-        ("answer", "return 3.0", "return NOTHING", "BAD_ANSWER: the answer is a float"),
+        ("answer", "return 3.0", "return NO_ANSWER", "BAD_ANSWER: the answer is a float"),
         ("answer", "return None", "return None", "BAD_ANSWER: the answer is a NoneType"),
-        ("answer", "return VelocityEstimate(Outcome.VALID, np.ones(2))", "return NOTHING", "no last interval"),
+        ("answer", "return VelocityEstimate(Outcome.VALID, np.ones(2))", "return NO_ANSWER", "no last interval"),
         (
             "answer",
             "return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(99.0, 101.0))",
-            "return NOTHING",
+            "return NO_ANSWER",
             "within the images' time tags, 100.0 to 100.0 s",
         ),
         ("answer", "return None", "return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(105.0, 101.0))", "first"),
         ("saturated", "return None", VALID_AFTER_TWO_IMAGES, "it answers VALID to images that are saturated"),
-        ("inputs", "frame.image.counts[:] = 0", "return NOTHING", "it changed its input"),
+        ("inputs", "frame.image.counts[:] = 0", "return NO_ANSWER", "it changed its input"),
         (
             "inputs",
             "frame.interval_velocity_m_s is None or frame.interval_velocity_m_s.fill(0)",
             VALID_AFTER_TWO_IMAGES,
             "it changed its input",
         ),
-        ("few", "return None", "return NOTHING if len(self.frames) == 1 else 1 / 0", "ZeroDivisionError"),
+        ("few", "return None", "return NO_ANSWER if len(self.frames) == 1 else 1 / 0", "ZeroDivisionError"),
         (
             "few",
             "return None",
@@ -136,7 +136,7 @@ VALID_AFTER_TWO_IMAGES = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if 
             "        return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(t, t))",
             "it answers VALID to no image",
         ),
-        ("number", "return None", "one, two, three = self.frames[:3]\n        return NOTHING", "not enough values"),
+        ("number", "return None", "one, two, three = self.frames[:3]\n        return NO_ANSWER", "not enough values"),
     ],
 )
 def test_stream_defects_are_reported(
@@ -215,7 +215,7 @@ def test_changed_process_state_is_reported(
 ) -> None:
     """Each check runs in its own process; the suite compares the state of the process before and after."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    spec = write_defective_module(tmp_path, monkeypatch, format_estimator(f"{lines}\nreturn NOTHING"))
+    spec = write_defective_module(tmp_path, monkeypatch, format_estimator(f"{lines}\nreturn NO_ANSWER"))
     first_check = next(iter(run_conformance_checks(Subject(spec, "velocity", 60.0))))
     assert (first_check.check, first_check.passed) == ("answer", False)
     assert problem in first_check.problem
@@ -231,7 +231,7 @@ def test_task_is_inferred_from_name_and_methods(tmp_path: Path, monkeypatch: pyt
     ]
     assert determine_task("marsyard.algorithms.hda:HdaEstimator") == "landing"
     assert determine_task("marsyard.algorithms.vtt:VisualTargetTracker") == "tracking"
-    spec = write_defective_module(tmp_path, monkeypatch, format_estimator("return NOTHING"))
+    spec = write_defective_module(tmp_path, monkeypatch, format_estimator("return NO_ANSWER"))
     assert determine_task(spec) == "velocity"
     with pytest.raises(ValueError, match="unknown algorithm 'vt'"):
         determine_task("vt")

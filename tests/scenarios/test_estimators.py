@@ -68,18 +68,20 @@ def test_labels_are_unique_column_names() -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "name", "key", "improved"),
+    ("task", "name", "key", "improved_value"),
     [(VELOCITY, "dimes", "align", True), (TRACKING, "vtt", "warp", "bend"), (LANDING, "hda", "check_footprints", True)],
 )
-def test_published_improved_and_custom_configurations(task: Task[Any, Any], name: str, key: str, improved: Any) -> None:
+def test_published_improved_and_custom_configurations(
+    task: Task[Any, Any], name: str, key: str, improved_value: Any
+) -> None:
     defaults = task.options()
-    changed = replace(defaults, **{key: improved})
+    changed = replace(defaults, **{key: improved_value})
     assert task.make(name, defaults, LIMITS).options == defaults
-    assert getattr(task.make(f"{name}-plus", defaults, LIMITS).options, key) == improved
+    assert getattr(task.make(f"{name}-plus", defaults, LIMITS).options, key) == improved_value
     assert task.make(f"{name}-custom", changed, LIMITS).options == changed
-    for fixed in (name, f"{name}-plus"):
+    for standard_name in (name, f"{name}-plus"):
         with pytest.raises(ValueError, match=f"define the option {key}; '{name}-custom' accepts it"):
-            task.make(fixed, changed, LIMITS)
+            task.make(standard_name, changed, LIMITS)
 
 
 def test_improvement_of_a_published_algorithm_is_rejected_before_the_campaign() -> None:
@@ -120,7 +122,7 @@ def test_failing_algorithm_does_not_affect_others() -> None:
 
 
 def test_normalised_error_uses_the_covariance() -> None:
-    # sd 3 and 2, correlation 0.5, error (3, 2): (1 + 1 - 2 * 0.5) / (1 - 0.25) = 4 / 3
+    # Standard deviations 3 and 2, correlation 0.5, error (3, 2): (1 + 1 - 2 * 0.5) / (1 - 0.5**2) = 4 / 3.
     covariance = np.array([[9.0, 3.0], [3.0, 4.0]])
     estimate = VelocityEstimate(VelocityOutcome.VALID, np.array([3.0, 2.0]), covariance_m2_s2=covariance)
     row = consistency_row(estimate, np.zeros(2))
@@ -143,10 +145,10 @@ def test_stream_and_three_image_estimators_are_distinguished(tmp_path: Path, mon
     for spec in ("stream_module:Mine", "stream_module:make", "installed", "exec-stream:cat", "serve-stream:cat -u"):
         VELOCITY.check(spec)
         assert isinstance(VELOCITY.make(spec, DimesOptions(), LIMITS), StreamedEstimator)
-    kinds = {spec: VELOCITY.takes_stream(spec) for spec in ("installed", "serve-stream:cat", "exec:cat", "dimes")}
+    kinds = {spec: VELOCITY.accepts_stream(spec) for spec in ("installed", "serve-stream:cat", "exec:cat", "dimes")}
     assert kinds == {"installed": True, "serve-stream:cat": True, "exec:cat": False, "dimes": False}
     # The result of a factory function is unknown without a call.
-    assert VELOCITY.takes_stream("stream_module:make") is None
+    assert VELOCITY.accepts_stream("stream_module:make") is None
     with pytest.raises(ValueError, match="is not a valid velocity estimator: missing members: finish"):
         VELOCITY.check("incomplete_stream:Mine")
     with pytest.raises(ValueError, match="a target tracker does not accept a stream of images; allowed: exec:, serve:"):

@@ -29,7 +29,7 @@ from marsyard.scenarios.fieldtest.imaging import (
     take_image,
 )
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters, TargetParameters
-from marsyard.scenarios.fieldtest.run import Category, Run, simulate_run, survey_ground
+from marsyard.scenarios.fieldtest.run import Category, Run, simulate_elevation_model, simulate_run
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario, case_order
 from marsyard.scenarios.fieldtest.targets import Targets, detect_targets
 from marsyard.scenarios.parts import ScoredFlight
@@ -49,7 +49,7 @@ N_PAPER_TRIPLES = 1913
 def make_parameters(**changes: Any) -> FieldTestParameters:
     """Return the campaign's parameters with a small terrain, a lower gyro rate and projected targets.
 
-    The lower rate changes nothing, as angle increments are exact.
+    The lower gyro rate does not change the attitudes, because the angle increments are exact.
     """
     parameters = tomllib.loads(CATALOGUE.read_text(encoding="utf-8"))["parameters"]
     small = {"samples": 512, "imu": IMU, "targets": {"sightings": "oracle-projection"}}
@@ -88,24 +88,25 @@ def test_attitude_error_without_drift_is_below_0_15_deg() -> None:
 
 
 def test_gyros_at_rest_measure_the_rotation_of_the_earth() -> None:
-    """A sidereal day has 86,164.1 s; at 35 deg of latitude the horizontal component points north."""
+    """A sidereal day has 86,164.1 s. At a latitude of 35 deg the horizontal component points north."""
     earth = EarthRotation.at_latitude(35.0)
     resting = InertialTrajectory(Resting(np.zeros(3), Rotation.from_euler("z", 90.0, degrees=True), 9.8), earth)
     angles, _ = true_increments(resting, np.linspace(0.0, 3600.0, 11))
     degrees_per_hour = np.degrees(angles.sum(axis=0))
     assert np.linalg.norm(degrees_per_hour) == pytest.approx(360.0 * 3600.0 / 86164.1, rel=1e-4)
-    # x of the body points north, z up
+    # The body x axis points north, z points up.
     assert degrees_per_hour == pytest.approx(15.041 * np.array([0.819, 0.0, 0.574]), abs=0.01)
 
 
-def test_attitudes_would_be_wrong_without_the_rotation_of_the_earth(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The axes turn by 10 deg between the passes over the targets.
+def test_attitude_fit_needs_the_rotation_of_the_earth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The Earth turns by 10 deg between the passes over the targets.
 
-    A constant bias can represent this rotation only on a platform that does not turn with the helicopter.
+    The fit can represent this rotation by a constant bias, except on a platform that turns with the helicopter.
     """
     rotating = {"turns_with_flight": True}
     run = make_ivanpah_run(drift={"change_k": 0.0}, helicopter=rotating)
     assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
+    # The gyros measure the rotation of the Earth, but the attitude fit ignores it.
     to_inertial = EarthRotation.to_inertial
     monkeypatch.setattr(EarthRotation, "to_inertial", lambda self, times: to_inertial(self, 0.0 * times))
     monkeypatch.setattr(
@@ -120,34 +121,34 @@ def test_attitudes_would_be_wrong_without_the_rotation_of_the_earth(monkeypatch:
 
 
 def test_camera_looks_up_to_45_deg_off_nadir() -> None:
-    maxima = []
+    max_angles_deg = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
         flight = draw_helicopter_flight(HelicopterParameters(), np.zeros(3), 0.3, 9.8, rng)
         times = np.concatenate([np.arange(leg.start_s, leg.end_s, 0.5) for leg in flight.passes])
         axes = flight.motion(times).attitudes.apply(np.array([0.0, 0.0, -1.0]))
-        maxima.append(float(np.degrees(np.arccos(-axes[:, 2])).max()))
-    # residual motion of the platform: 0.2 deg
-    assert max(maxima) == pytest.approx(45.0, abs=1.5)
-    assert min(maxima) > 30.0
+        max_angles_deg.append(float(np.degrees(np.arccos(-axes[:, 2])).max()))
+    # The residual motion of the platform is 0.2 deg.
+    assert max(max_angles_deg) == pytest.approx(45.0, abs=1.5)
+    assert min(max_angles_deg) > 30.0
 
 
-def test_lost_runs_have_bursts_of_noise() -> None:
+def test_noise_campaign_has_bursts_in_each_run() -> None:
     parameters = tomllib.loads(CATALOGUE.with_name("dimes-fieldtest-noise.toml").read_text(encoding="utf-8"))
-    lost = FieldTestParameters.model_validate(parameters["parameters"])
-    assert [run.name for run in lost.runs] == ["Pisgah Run 1", "Kelso Run 1", "Ivanpah Run 1", "Ivanpah Run 2"]
-    assert all(lost.run_detector(number).bursts.bursts == 10.0 for number in range(4))
-    flown = make_parameters()
-    assert flown.run_detector(0) == flown.detector
+    noisy = FieldTestParameters.model_validate(parameters["parameters"])
+    assert [run.name for run in noisy.runs] == ["Pisgah Run 1", "Kelso Run 1", "Ivanpah Run 1", "Ivanpah Run 2"]
+    assert all(noisy.run_detector(number).bursts.bursts == 10.0 for number in range(4))
+    without_bursts = make_parameters()
+    assert without_bursts.run_detector(0) == without_bursts.detector
 
 
-def test_fit_removes_a_constant_bias() -> None:
+def test_attitude_fit_removes_a_constant_bias() -> None:
     run = make_ivanpah_run(drift={"change_k": 0.0}, imu={**IMU, "gyro_bias_deg_h": 5.0})
     assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
 
 
-def test_fit_does_not_remove_a_drift_about_the_flight_line() -> None:
-    """The drifting gyro bias is about the flight line: the tilt about this axis changes by tenths of a degree."""
+def test_attitude_fit_does_not_remove_a_drift_about_the_flight_line() -> None:
+    """The gyro bias about the flight line drifts: the tilt about this axis changes by tenths of a degree."""
     run = make_ivanpah_run()
     azimuth = run.flight.azimuth_rad
     flight_direction = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -165,28 +166,28 @@ def test_alternating_headings_cancel_the_drift() -> None:
     )
 
 
-@pytest.mark.parametrize("number", [0, 2, 4])
-def test_targets_are_detected_in_the_images_of_a_pass(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On lava, dunes and the lake bed: nearly all targets; errors of a fraction of a pixel of 0.4 m x 1.6 m.
+@pytest.mark.parametrize("run_index", [0, 2, 4])
+def test_targets_are_detected_in_the_images_of_a_pass(run_index: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nearly all targets are detected on lava, dunes and the lake bed.
 
-    The bounds of the errors are 15 cm and 40 cm on the ground.
+    A binned pixel covers 0.4 m x 1.6 m: the RMS bounds are 15 cm along columns and 40 cm along rows on the ground.
     """
     detections = []
 
-    def record(*arguments: Any) -> np.ndarray:
+    def record_detection(*arguments: Any) -> np.ndarray:
         detections.append(centroids := detect_targets(*arguments))
         return centroids
 
     states = []
 
     def record_state(*arguments: Any) -> Any:
-        states.append(arguments[3])
+        states.append(arguments[3])  # camera state at the exposure
         return take_image(*arguments)
 
-    monkeypatch.setattr(run_module, "detect_targets", record)
+    monkeypatch.setattr(run_module, "detect_targets", record_detection)
     monkeypatch.setattr(run_module, "take_image", record_state)
     p = make_parameters(drift={"change_k": 0.0}, targets={"pictures": 3})
-    key = RunKey(p, number, 6, "test")
+    key = RunKey(p, run_index, 6, "test")
     run = simulate_run(key)
     assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
     camera = field_camera().bin(columns=1, rows=4)
@@ -209,13 +210,14 @@ def test_no_targets_are_detected_on_bare_ground() -> None:
     position = np.array([0.0, 0.0, 500.0])
     centroids = detect_targets(image, targets, camera, position, Rotation.identity(), np.radians(1.0))
     assert np.isnan(centroids).all()
-    # the same image with the targets, seen from another attitude than the prior's
+    # Add the targets to the image, seen with an attitude that differs from the prior. Bilinear weights spread each
+    # target over four pixels.
     attitude = Rotation.from_rotvec(np.radians([1.0, -1.5, 1.0]))
     pixels = camera.project(attitude.inv().apply(targets.true_m - position))[0]
     corner = np.floor(pixels).astype(int)
-    part = pixels - corner
+    fraction = pixels - corner
     for row, column in np.ndindex(2, 2):
-        weights = np.abs(1 - row - part[:, 1]) * np.abs(1 - column - part[:, 0])
+        weights = np.abs(1 - row - fraction[:, 1]) * np.abs(1 - column - fraction[:, 0])
         image[corner[:, 1] + row, corner[:, 0] + column] += (2000.0 * weights).astype(np.uint16)
     centroids = detect_targets(image, targets, camera, position, Rotation.identity(), np.radians(1.0))
     assert np.abs(centroids - pixels).max() < 0.3
@@ -228,10 +230,10 @@ def test_run_without_detected_targets_is_an_error(monkeypatch: pytest.MonkeyPatc
 
 
 def test_elevation_model_has_the_error_of_its_class() -> None:
-    """Over flat ground the error is that of the posts, 6 m; interpolation reduces it slightly."""
+    """Over flat ground the heights have the RMS error of the posts, 6 m. Interpolation reduces it slightly."""
     flat_ground = Surface.from_samples(np.zeros((64, 64, 2), dtype=np.float32), 500.0)
     positions = np.random.default_rng(1).uniform(0.0, 30000.0, (4000, 2))
-    elevation_model = survey_ground(ElevationParameters(), flat_ground, positions, np.random.default_rng(2))
+    elevation_model = simulate_elevation_model(ElevationParameters(), flat_ground, positions, np.random.default_rng(2))
     assert elevation_model(positions).std() == pytest.approx(6.0, rel=0.06)
 
 
@@ -264,19 +266,19 @@ def test_case_order_contains_the_paper_triples_evenly() -> None:
 
 def test_run_is_deterministic() -> None:
     key = RunKey(make_parameters(), 4, 5, "test")
-    stored, repeated = simulate_run(key), simulate_run(key)
-    assert repeated is not stored
-    assert np.array_equal(repeated.attitudes.as_quat(), stored.attitudes.as_quat())
-    assert repeated.triples == stored.triples
+    first, second = simulate_run(key), simulate_run(key)
+    assert second is not first
+    assert np.array_equal(second.attitudes.as_quat(), first.attitudes.as_quat())
+    assert second.triples == first.triples
 
 
 def test_sun_moves_while_rocks_are_fixed() -> None:
-    """A run builds its rocks once for all image times, as this is slow; the sun direction differs per image."""
+    """Rocks are built once per run, because this is slow. The sun direction is computed for each image."""
     key = RunKey(make_parameters(), 0, 5, "test")
     run, time_s = simulate_run(key), 1800.0
     ground = run_ground(key)
-    first = build_start_scene(run, ground)
-    early_scene, late_scene = (scene_at(run, first, ground, time) for time in (0.0, time_s))
+    start_scene = build_start_scene(run, ground)
+    early_scene, late_scene = (scene_at(run, start_scene, ground, time) for time in (0.0, time_s))
     assert len(early_scene.objects) > 0
     assert late_scene.objects is early_scene.objects
     east, north, _ = run.flight.origin_m.tolist()
@@ -296,7 +298,7 @@ def test_too_many_triples_are_rejected() -> None:
 
 
 def score_inputs(case: ScoredFlight) -> dict[str, float]:
-    """Custom score that returns quantities for comparison with the row."""
+    """Custom score that returns errors, which are compared with the columns of the row."""
     assert case.answer.velocity_m_s is not None
     assert case.true_velocity_m_s is not None
     error = case.answer.velocity_m_s - case.true_velocity_m_s
@@ -332,7 +334,7 @@ def test_case_is_answered_and_deterministic() -> None:
 
 
 def test_cloud_shadows_move_steadily_between_images() -> None:
-    """The sun direction is continuous: with steps, the shadows of high clouds would move faster than the wind."""
+    """The sun direction is continuous. Steps of it would move the shadows of high clouds faster than the wind."""
     key = RunKey(make_parameters(), 3, 5, "test")
     run = simulate_run(key)
     assert run.clouds is not None

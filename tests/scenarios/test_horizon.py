@@ -1,4 +1,4 @@
-"""Tests of hills on the horizon, of rocks too small to be drawn, and of the rover in hazard-camera images."""
+"""Tests of hills on the horizon, of unresolved rocks, and of the rover in hazard-camera images."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from marsyard.sim.terrain.sites import Hill
 
 HILL = Hill(azimuth_deg=60.0, distance_m=3000.0, width_m=800.0, depth_m=600.0, height_m=90.0)
 MARS_RADIUS_M = 3.39e6
+#: Values of `Frame.body` for pixels without an object. As negative indices they select the last two object names.
+SKY, GROUND = -2, -1
 
 
 def test_hill_stands_at_its_azimuth_and_distance() -> None:
@@ -27,17 +29,17 @@ def test_hill_stands_at_its_azimuth_and_distance() -> None:
     top = points[np.argmax(points[:, 2])]
     assert np.degrees(np.arctan2(top[0], top[1])) == pytest.approx(60.0, abs=4.0)
     assert np.hypot(top[0], top[1]) == pytest.approx(3000.0, abs=200.0)
-    # the ridges have an RMS of a quarter of the height; the top differs from the dome by up to a few times that
+    # The ridges have an RMS of a quarter of the height. The top differs from the dome by up to a few times that.
     assert 0.5 * 90.0 < top[2] - 5.0 < 2.0 * 90.0
     assert set(hills.names) == {HILL_NAME}
 
 
 def test_hill_is_lower_by_the_curvature_of_the_planet() -> None:
     far = HILL.model_copy(update={"distance_m": 9000.0, "width_m": 2400.0, "depth_m": 1800.0})
-    near_m, far_m = (hill_objects([hill], 0.0, 0.2).triangles[..., 2].max() for hill in (HILL, far))
-    # the meshes of both hills are similar figures, so their ridges are the same
+    near_top_m, far_top_m = (hill_objects([hill], 0.0, 0.2).triangles[..., 2].max() for hill in (HILL, far))
+    # The meshes of both hills are geometrically similar, so their relative ridge heights are equal.
     drop_m = (9000.0**2 - 3000.0**2) / (2.0 * MARS_RADIUS_M)
-    assert near_m - far_m == pytest.approx(drop_m, rel=0.2)
+    assert near_top_m - far_top_m == pytest.approx(drop_m, rel=0.2)
 
 
 def test_faces_and_normals_of_hills_point_up() -> None:
@@ -56,21 +58,22 @@ def gusev_image() -> RenderedImage:
 
 def test_navigation_camera_sees_the_hills_of_gusev_above_the_horizon(gusev_image: RenderedImage) -> None:
     image = gusev_image
-    # ids of the objects at the pixels; -2 is the sky, -1 the ground
-    object_ids = np.append(image.scene.objects.names, [-2, -1])[image.frame.body]
+    object_ids = np.append(image.scene.objects.names, [SKY, GROUND])[image.frame.body]
     is_hill = object_ids == HILL_NAME
-    up = image.frame.rays.directions.reshape(*is_hill.shape, 3) @ image.frame.world_from_body.rotation.as_matrix()[2]
-    assert np.degrees(np.arcsin(up[is_hill].max())) == pytest.approx(np.degrees(85.0 / 2900.0), abs=1.0)
+    up_components = (
+        image.frame.rays.directions.reshape(*is_hill.shape, 3) @ image.frame.world_from_body.rotation.as_matrix()[2]
+    )
+    assert np.degrees(np.arcsin(up_components[is_hill].max())) == pytest.approx(np.degrees(85.0 / 2900.0), abs=1.0)
     assert image.frame.range_m[is_hill].min() > 1500.0
-    # no pixel below a pixel of a hill shows the sky
+    # No pixel below a hill shows the sky.
     column = object_ids[:, np.argmax(is_hill.sum(axis=0))]
-    assert not np.any(column[np.argmax(column == HILL_NAME) :] == -2)
+    assert not np.any(column[np.argmax(column == HILL_NAME) :] == SKY)
 
 
 def test_rover_is_visible_at_the_sides_of_its_hazard_camera() -> None:
     request = ImageRequest.from_defaults("meridiani", "mer-hazcam")
     image = render_images(request, detector=False, both=False)[0]
-    is_rover = np.append(image.scene.objects.names, [-2, -1])[image.frame.body] == ROVER_NAME
+    is_rover = np.append(image.scene.objects.names, [SKY, GROUND])[image.frame.body] == ROVER_NAME
     columns = is_rover.shape[1]
     assert is_rover[:, : columns // 4].any()
     assert is_rover[:, -columns // 4 :].any()
@@ -83,25 +86,26 @@ def test_unresolved_rocks_occlude_distant_ground_by_their_frontal_area(gusev_ima
     frame, ground = image.frame, SiteGround.of(site("gusev"), "ground")
     rocks, limit_rad, rms_slope = ground.rocks, 1.2e-3, 0.02
     assert rocks is not None
-    # black ground and white rocks: the radiance is the occluded fraction
-    is_ground = frame.body == -1
+    # With black ground and white rocks the radiance is the occluded fraction.
+    is_ground = frame.body == GROUND
     black_ground = replace(frame, radiance=np.where(is_ground, 0.0, 1.0).astype(np.float32))
     blended = add_unresolved_rocks(black_ground, image.scene, rocks, limit_rad, rms_slope)
     row, column = np.argwhere(is_ground & (frame.range_m > 100.0))[0]
     is_unresolved = rocks.diameter_m < limit_rad * frame.range_m[row, column]
-    area = 0.85 * np.sum((rocks.diameter_m * rocks.height_m)[is_unresolved]) / rocks.period_m**2
+    # A silhouette has 0.85 of the area of its bounding rectangle.
+    area_fraction = 0.85 * np.sum((rocks.diameter_m * rocks.height_m)[is_unresolved]) / rocks.period_m**2
     ray = frame.rays.directions.reshape(*is_ground.shape, 3)[row, column]
     elevation = np.arcsin(frame.world_from_body.rotation.apply(ray)[2])
-    expected = 1.0 - np.exp(-area / np.hypot(np.tan(elevation), rms_slope))
+    expected = 1.0 - np.exp(-area_fraction / np.hypot(np.tan(elevation), rms_slope))
     assert blended.radiance[row, column] == pytest.approx(expected, rel=1e-3)
     assert expected > 0.3
-    near = is_ground & (frame.range_m < 3.0)
-    assert blended.radiance[near].max() < 0.01
+    is_near = is_ground & (frame.range_m < 3.0)
+    assert blended.radiance[is_near].max() < 0.01
     np.testing.assert_array_equal(blended.radiance[~is_ground], black_ground.radiance[~is_ground])
 
 
 def test_ground_without_rocks_is_unchanged() -> None:
-    frame = SimpleNamespace(body=np.full((2, 2), -1), radiance=np.ones((2, 2)))
+    frame = SimpleNamespace(body=np.full((2, 2), GROUND), radiance=np.ones((2, 2)))
     scene = SimpleNamespace(objects=SimpleNamespace(names=np.empty(0, dtype=np.int64)))
     unchanged = add_unresolved_rocks(cast(Frame, frame), cast(Scene, scene), None, 1e-3, 0.0)
     np.testing.assert_array_equal(unchanged.radiance, frame.radiance)

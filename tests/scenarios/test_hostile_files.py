@@ -33,7 +33,7 @@ from marsyard.sim.sensor import read_datasheet
 
 
 def test_calibration_with_aliases_is_rejected(tmp_path: Path) -> None:
-    """Nested aliases: each list contains nine aliases of the list before, so 500 bytes expand to 9**8 numbers."""
+    """Each list contains nine aliases of the previous list, so 500 bytes would expand to 9**8 numbers."""
     lines = ["a0: &a0 [0,0,0,0,0,0,0,0,0]"]
     lines += [f"a{n}: &a{n} [{','.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 8)]
     path = tmp_path / "camera.yaml"
@@ -53,7 +53,7 @@ def test_archives_are_rejected_as_meshes(tmp_path: Path, suffix: str) -> None:
 
 
 def test_zipped_mesh_size_is_checked_before_expansion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An archive of 300 kB contains 300 MB of blanks; trimesh reads 3MF if lxml and networkx are installed."""
+    """An archive of 300 kB contains 300 MB of blanks. Trimesh reads 3MF files only with lxml and networkx."""
     monkeypatch.setattr(trimesh, "available_formats", lambda: {"3mf", "stl"})
     monkeypatch.setattr(trimesh, "load", lambda *_, **__: pytest.fail("the archive was expanded"))
     path = tmp_path / "rock.3mf"

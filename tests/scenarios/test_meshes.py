@@ -15,6 +15,7 @@ from marsyard.scenarios.meshes import MeshFileError, MeshParameters, read_mesh
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.terrain import Surface, TerrainParameters, site, synthesise
 
+#: Edge lengths, m.
 BOX = (2.0, 1.0, 0.5)
 
 
@@ -48,7 +49,7 @@ def test_mesh_formats_give_the_same_box(tmp_path: Path, surface: Surface, suffix
 
 
 def test_size_heading_and_up_axis_are_applied(tmp_path: Path, surface: Surface) -> None:
-    file = write_box(tmp_path, extents=(2.0, 0.5, 1.0))  # y axis up
+    file = write_box(tmp_path, extents=(2.0, 0.5, 1.0))  # The y axis is up in this file.
     body = MeshParameters(file=file, up="y", size_m=4.0, heading_deg=90.0, east_m=20.0, north_m=30.0)
     extent = np.ptp(body.place_on_ground(surface, (20.0, 30.0)).triangles.reshape(-1, 3), axis=0)
     assert np.allclose(extent, [2.0, 4.0, 1.0], atol=1e-6)
@@ -56,7 +57,7 @@ def test_size_heading_and_up_axis_are_applied(tmp_path: Path, surface: Surface) 
 
 def test_rocks_have_smooth_normals(tmp_path: Path, surface: Surface) -> None:
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
-    sphere.export(tmp_path / "ball.stl")  # separate triangles: each corner is stored three times
+    sphere.export(tmp_path / "ball.stl")  # STL has no shared vertices.
     body = MeshParameters(file=str(tmp_path / "ball.stl")).place_on_ground(surface, (0.0, 0.0))
     corners = body.triangles.reshape(-1, 3)
     radial = corners - (corners.min(axis=0) + corners.max(axis=0)) / 2.0

@@ -108,7 +108,7 @@ def test_landing_site_answers_are_read(tmp_path: Path) -> None:
     ]
     assert np.array_equal(sites[0], [1.0, 2.0, 3.0])  # type: ignore[arg-type]
     assert sites[1] is None
-    # Without convergence the a-priori site is used.
+    # An algorithm that does not converge reports the a-priori site.
     assert np.array_equal(sites[2], measurements.apriori_site_world)  # type: ignore[arg-type]
 
 

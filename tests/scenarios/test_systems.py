@@ -83,7 +83,7 @@ def test_built_in_systems_are_complete() -> None:
         for name, path in system.campaigns.items():
             assert catalogue()[name] == path
         assert set(system.compiled_by) <= set(system.campaigns)
-    # Each file in the folder belongs to a system.
+    # Each campaign file in the folder belongs to a system.
     folder = next(iter(catalogue().values())).parent
     assert set(catalogue()) == {path.stem for path in folder.glob("*.toml")}
     assert list(template_paths()) == ["velocity", "tracking", "landing"]
@@ -143,16 +143,16 @@ def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_pa
 )
 def test_invalid_system_does_not_affect_others(install: Install, source: str, reason: str) -> None:
     install("mine", source, **{"hda-map": ""})
-    install("sound", _format_system("sound"))
+    install("valid", _format_system("valid"))
     (message,) = problems()
     assert message.startswith("system 'mine' (mine:SYSTEM) is omitted: ")
     assert reason in message
-    assert [entry.name for entry in systems()[len(BUILT_IN) :]] == ["sound"]
+    assert [entry.name for entry in systems()[len(BUILT_IN) :]] == ["valid"]
     result = CliRunner().invoke(app, ["list"])
     assert (result.exit_code, result.stderr) == (0, f"warning: {message}\n")
     assert "dimes-smoke" in result.stdout
     checks = list(check_systems())
-    assert checks[0].finding.endswith("from other packages: sound")
+    assert checks[0].finding.endswith("from other packages: valid")
     assert [entry.finding for entry in checks if entry.verdict is Verdict.WARN] == [message]
     with pytest.raises(UnknownScenarioError, match="is omitted"):
         scenario("unknown-scenario")

@@ -47,7 +47,7 @@ def write_tif(folder: Path, name: str = "dtm.tif", **changes: Any) -> Path:
         "nodata": -32767.0,
     } | changes
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # files without a geotransform are intended
+        warnings.simplefilter("ignore")  # Some tests need files without a geotransform.
         with rasterio.open(path, "w", **profile) as file:
             file.write(values, 1)
             for key, value in tags.items():
@@ -101,12 +101,12 @@ def test_terrain_file_faults_are_reported(tmp_path: Path, changes: dict[str, Any
 
 
 MOON_SPHERE, MARS_ELLIPSOID = "+R=1737400", "+a=3396190 +b=3376200"
-#: Projection, longitude, latitude and grid convergence of a file in degrees (Snyder 1987). Equations 8-9 for transverse
-#: Mercator; (lon - lon_0) times the cone constant n for polar and conic projections.
-CONFORMAL: list[tuple[str, float, float, float]] = [
+#: Projection; longitude, latitude and grid convergence of its file, deg. The convergence of polar and conic projections
+#: is (lon - lon_0) times the cone constant n. Transverse Mercator: Eq. 8-9 of Snyder (1987).
+CONFORMAL_PROJECTIONS: list[tuple[str, float, float, float]] = [
     *[("+proj=stere +lat_0=90 +lon_0=0 +k=1", lon, 85.0, lon) for lon in (0.0, 45.0, 90.0, 177.0, -120.0)],
     *[("+proj=stere +lat_0=-90 +lon_0=0 +k=1", lon, -85.0, -lon) for lon in (0.0, 45.0, 90.0, 177.0, -120.0)],
-    # one standard parallel: n = sin 45 deg
+    # One standard parallel: n = sin 45 deg.
     *[("+proj=lcc +lat_1=45 +lat_0=45 +lon_0=10", lon, 45.0, (lon - 10.0) * 0.5**0.5) for lon in (-50.0, 10.0, 80.0)],
     *[
         (
@@ -121,7 +121,7 @@ CONFORMAL: list[tuple[str, float, float, float]] = [
 
 
 @pytest.mark.parametrize("body", [MOON_SPHERE, MARS_ELLIPSOID], ids=["moon", "mars"])
-@pytest.mark.parametrize(("projection", "lon", "lat", "convergence"), CONFORMAL)
+@pytest.mark.parametrize(("projection", "lon", "lat", "convergence"), CONFORMAL_PROJECTIONS)
 def test_conformal_maps_are_valid_with_their_grid_convergence(
     tmp_path: Path, projection: str, lon: float, lat: float, convergence: float, body: str
 ) -> None:
@@ -129,7 +129,7 @@ def test_conformal_maps_are_valid_with_their_grid_convergence(
     (x,), (y,) = transform(CRS.from_string(f"+proj=longlat {body} +no_defs"), crs, [lon], [lat])
     path = write_tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))
     check_source(RealTerrain(dtm=path))
-    # Tolerance: the formulas are spherical; the flattening of Mars changes the convergence by thousandths of a degree.
+    # The formulas are spherical. The flattening of Mars changes the convergence by thousandths of a degree.
     assert grid_north_deg(path) == pytest.approx(convergence, abs=0.01)
 
 
@@ -205,7 +205,7 @@ def test_missing_nodata_is_detected_from_implausible_heights(tmp_path: Path) -> 
     values[10, 10] = -32767.0
     with pytest.raises(TerrainFileError, match=r"contains heights of -32767 m; .*it has no nodata value"):
         check_source(RealTerrain(dtm=write_tif(tmp_path, values=values, nodata=None)))
-    check_source(RealTerrain(dtm=write_tif(tmp_path, "stated.tif", values=values)))
+    check_source(RealTerrain(dtm=write_tif(tmp_path, "with_nodata.tif", values=values)))
 
 
 def test_image_with_another_projection_is_rejected(tmp_path: Path) -> None:

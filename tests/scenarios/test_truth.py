@@ -1,6 +1,8 @@
-"""Tests that no algorithm receives the truth: spy algorithms record their inputs, and each input field has to differ
-from the truth in several cases. Not compared: images, exposure times, the sun direction (known from the ephemeris)
-and the mast geometry (its errors are in angles and cameras).
+"""Tests that no algorithm receives the truth.
+
+Spy algorithms record their inputs. Each input field must differ from the truth in several cases. Not compared: images,
+exposure times, the sun direction (known from the ephemeris) and the mast geometry (its errors are in angles and
+cameras).
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ def _clear_spies() -> Iterator[None]:
 
 
 def assert_differs(name: str, inputs: Any, true: Any) -> None:
-    """Assert that the field of each case differs from its truth by more than rounding."""
+    """Assert that an input differs from its true value by more than rounding."""
     inputs, true = np.asarray(inputs, dtype=np.float64), np.asarray(true, dtype=np.float64)
     assert np.abs(inputs - true).max() > 1e-9 * max(np.abs(true).max(), 1.0), f"{name} is the truth: {inputs}"
 
@@ -65,28 +67,28 @@ def assert_poses_differ(name: str, inputs: RigidTransform, true: RigidTransform)
 
 
 def assert_rotations_differ(name: str, inputs: Rotation, true: Rotation) -> None:
-    """Assert that the rotations differ by more than rounding, 1e-8 rad of an angle."""
+    """Assert that the rotations differ by more than 1e-7 rad; rounding causes 1e-8 rad."""
     assert (inputs * true.inv()).magnitude() > 1e-7, f"{name} is the true attitude"
 
 
 def assert_flat_field_differs(inputs: Numbers, detector: Detector) -> None:
-    """Assert that the calibrated pixel response is not a multiple of the true response."""
+    """Assert that the calibrated pixel response, shape (rows, columns), is not a multiple of the true response."""
     rows, columns = inputs.shape
     true = detector.response.reshape(rows, -1, columns).mean(axis=1)
     assert float(np.std(inputs / true)) > 1e-6
 
 
 def assert_all_fields_are_compared(measurement_class: type[Any], names: set[str]) -> None:
-    """Assert that each field of the measurements is compared, or exempted with a reason."""
+    """Assert that the measurements have exactly the named fields, which this module compares or exempts."""
     assert {entry.name for entry in fields(measurement_class)} == names
 
 
 @pytest.mark.parametrize("case", range(3))
 def test_descent_inputs_differ_from_truth(case: int) -> None:
-    from tests.scenarios.descent.settings import DESCENT, WORLD
+    from tests.scenarios.descent.settings import DESCENT, SMALL_WORLD
 
     p = DescentScenarioParameters.model_validate(
-        {**WORLD, "descent": DESCENT, "algorithm": "tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE}
+        {**SMALL_WORLD, "descent": DESCENT, "algorithm": "tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE}
     )
     streams = Streams(1, "truth", case)
     row = DescentScenario().run(p, streams).row
@@ -122,7 +124,7 @@ def assert_flight_inputs_differ(
 
 @pytest.mark.parametrize("case", range(3))
 def test_field_test_inputs_differ_from_truth(case: int) -> None:
-    """As in the paper (III.D), the intervals between time tags equal the virtual interval."""
+    """Time tags are not compared: as in the paper (III.D), their intervals equal the virtual interval."""
     from tests.scenarios.test_fieldtest import make_parameters
 
     runs = [make_parameters().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}]
@@ -139,7 +141,7 @@ def test_field_test_inputs_differ_from_truth(case: int) -> None:
 @pytest.mark.parametrize("helicopter", [None, {}])
 @pytest.mark.parametrize("case", range(3))
 def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] | None) -> None:
-    """Time tags are not compared: they are exact, and the pose errors include the clock error."""
+    """Time tags are not compared: they are exact, because the pose errors include the clock error."""
     p = LandingScenarioParameters.model_validate(
         {
             "site": "heli-benign",

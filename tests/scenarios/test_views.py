@@ -57,7 +57,7 @@ def test_camera_has_the_specified_direction(ground: SiteGround, name: str, azimu
     design = preset(name).design
     pose = camera_pose(ground.surface, design, 3.0, 4.0, 5.0, azimuth, elevation)
     axes = [camera.transform(pose).a for camera in preset(name).cameras()]
-    # The mean is the direction of a stereo pair, whose axes have a toe-in.
+    # The direction of a stereo pair is the mean of its two axes, which have a toe-in.
     mean_axis = np.mean(axes, axis=0)
     expected = direction(np.radians(azimuth), np.radians(elevation))
     np.testing.assert_allclose(mean_axis / np.linalg.norm(mean_axis), expected, atol=1e-12)
@@ -87,7 +87,7 @@ def test_horizontal_view_covers_sector_and_nadir_view_disc(ground: SiteGround) -
         return Eye.of(PixelRays.of(camera_preset.cameras()[0]), pose, ground.surface)
 
     pancam_eye = make_eye("research-pancam", 1.5, 90.0, -10.0)
-    assert pancam_eye.azimuth_rad == pytest.approx(np.radians(91.0), abs=0.01)  # the left camera, with 1 deg of toe-in
+    assert pancam_eye.azimuth_rad == pytest.approx(np.radians(91.0), abs=0.01)  # left camera: 1 deg of toe-in
     assert pancam_eye.half_width_rad < np.radians(20.0)
     assert np.isinf(pancam_eye.reach_m)
     assert pancam_eye.height_m == pytest.approx(1.5, abs=0.05)
@@ -104,7 +104,7 @@ def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
     eye = Eye(2.0, 3.0, 1.5, pixel_rad=5e-3, reach_m=12.0)
     selected = select_rocks(ground, eye)
     assert len(selected) > 100
-    # Each body has the horizontal position of its rock, except for multiples of the period.
+    # Each body is at the horizontal position of its rock plus a multiple of the period.
     offsets_m = selected.spheres[:, :2] - field.position_m[selected.names, :2]
     offsets_m -= field.period_m * np.rint(offsets_m / field.period_m)
     diameter = field.diameter_m[selected.names]
@@ -152,7 +152,7 @@ def test_scene_from_mast_and_nadir_has_the_terrain_heights(ground: SiteGround) -
         # Distant ground is smoothed.
         points = frame.points_world()[(frame.body == -1) & (frame.range_m < 12.0)]
         assert len(points) > 5000
-        # Exceptions are a few pixels at grazing angles, with a smoothed terrain level.
+        # A few pixels at grazing angles use a smoothed terrain level and have larger errors.
         height_errors = np.abs(points[:, 2] - ground.surface.height(*points[:, :2].T))
         assert np.mean(height_errors > 0.02) < 0.005
         assert np.isfinite(frame.radiance).all()

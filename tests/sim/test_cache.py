@@ -12,7 +12,7 @@ from marsyard.sim.cache import GIGA, evict_files, limit_bytes, touch
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Five files of 100 bytes in a cache of 500 bytes; file 0 is the least recently used."""
+    """Create five files of 100 bytes in a cache of 500 bytes; file 0 is the least recently used."""
     monkeypatch.setenv("MARSYARD_CACHE_GB", f"{500 / GIGA:.12f}")
     for number in range(5):
         path = tmp_path / str(number)

@@ -52,7 +52,7 @@ def test_completed_runs_are_recorded_until_kernels_change(tmp_path: Path, monkey
     assert not kernels_are_ready("descent")
 
 
-def test_unwritable_cache_records_no_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_not_recorded_without_a_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     mark_ready("descent")
     assert not kernels_are_ready("descent")

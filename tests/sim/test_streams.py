@@ -8,17 +8,17 @@ from benchmarks.validation.sampling_checks import all_seeds, collisions, seeds, 
 from marsyard.sim.streams import Streams, stream_key
 
 
-def _draw_first(streams: Streams, name: str) -> tuple[int, ...]:
+def _draw_first_numbers(streams: Streams, name: str) -> tuple[int, ...]:
     return tuple(streams.generator(name).integers(0, 2**63, 2))
 
 
 def test_stream_depends_only_on_its_key() -> None:
     streams = Streams(7, "campaign", 3)
-    expected = _draw_first(streams, "wind")
-    _draw_first(streams, "sun")
+    expected = _draw_first_numbers(streams, "wind")
+    _draw_first_numbers(streams, "sun")
     streams.generator("wind").standard_normal(100)
-    assert _draw_first(streams, "wind") == expected
-    assert _draw_first(Streams(7, "campaign", 3), "wind") == expected
+    assert _draw_first_numbers(streams, "wind") == expected
+    assert _draw_first_numbers(Streams(7, "campaign", 3), "wind") == expected
 
 
 @given(
@@ -30,20 +30,20 @@ def test_stream_depends_only_on_its_key() -> None:
 def test_each_key_part_selects_another_stream(
     seeds: set[int], campaigns: set[str], cases: set[int], names: set[str]
 ) -> None:
-    firsts = {
-        _draw_first(Streams(seed, campaign, case), name)
+    first_numbers = {
+        _draw_first_numbers(Streams(seed, campaign, case), name)
         for seed in seeds
         for campaign in campaigns
         for case in cases
         for name in names
     }
-    assert len(firsts) == 16
+    assert len(first_numbers) == 16
 
 
 def test_key_parts_are_hashed_separately() -> None:
-    """The parts of a key are hashed separately: moving a letter from one part to another changes the stream."""
-    assert _draw_first(Streams(0, "ab", 0), "c") != _draw_first(Streams(0, "a", 0), "bc")
-    assert _draw_first(Streams(1, "a", 0), "b") != _draw_first(Streams(0, "a", 1), "b")
+    """Moving a letter from one part to another changes the stream."""
+    assert _draw_first_numbers(Streams(0, "ab", 0), "c") != _draw_first_numbers(Streams(0, "a", 0), "bc")
+    assert _draw_first_numbers(Streams(1, "a", 0), "b") != _draw_first_numbers(Streams(0, "a", 1), "b")
 
 
 def test_streams_of_neighbouring_cases_are_uncorrelated() -> None:
@@ -68,5 +68,5 @@ def test_400_000_streams_have_different_seeds() -> None:
     result = all_seeds(campaigns=10, cases=2000, names=names)
     assert len(result) == 400_000
     assert collisions(result) == 0
-    # A duplicate would be detected.
+    # `collisions` detects duplicates.
     assert collisions(np.concatenate([result, result[7:9]])) == 2

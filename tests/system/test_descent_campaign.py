@@ -16,6 +16,8 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
 ]
 
+#: Exit code of a campaign with too few cases for a verdict, and of invalid input.
+EXIT_INSUFFICIENT, EXIT_INVALID_INPUT = 3, 2
 #: The smoke campaign on small terrain with fewer dispersions.
 CAMPAIGN = """
 name = "small-descents"
@@ -48,11 +50,11 @@ population = "valid"
 """
 
 
-def _run_marsyard(*words: str, cwd: Path) -> Result:
+def _run_marsyard(*arguments: str, cwd: Path) -> Result:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(cwd)
-        patch.setattr(sys, "path", [*sys.path])  # restores the path: commands add the folder
-        return CliRunner().invoke(app, words)
+        patch.setattr(sys, "path", [*sys.path])  # Commands add the folder to the path; the context restores it.
+        return CliRunner().invoke(app, arguments)
 
 
 @pytest.fixture(scope="module")
@@ -60,16 +62,16 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run the campaign with one worker (folder A) and with two workers (folder B)."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "small.toml").write_text(CAMPAIGN)
-    # modules of the user with the names of Marsyard's packages must not be imported
+    # Marsyard must not import user modules that have the names of its packages.
     (folder / "sim.py").write_text("raise ImportError('the wrong module')\n")
     for name in ("reports", "tests"):
         (folder / name).mkdir()
         (folder / name / "__init__.py").write_text("raise ImportError('the wrong module')\n")
-    words = [sys.executable, "-m", "marsyard", "run", "small.toml", "--jobs", "1", "--out", "A"]
-    subprocess_run = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=300)
-    assert subprocess_run.returncode == 3, subprocess_run.stdout + subprocess_run.stderr
+    arguments = [sys.executable, "-m", "marsyard", "run", "small.toml", "--jobs", "1", "--out", "A"]
+    subprocess_run = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, timeout=300)
+    assert subprocess_run.returncode == EXIT_INSUFFICIENT, subprocess_run.stdout + subprocess_run.stderr
     in_process_run = _run_marsyard("run", "small.toml", "--jobs", "2", "--out", "B", cwd=folder)
-    assert in_process_run.exit_code == 3, in_process_run.output
+    assert in_process_run.exit_code == EXIT_INSUFFICIENT, in_process_run.output
     for output in (subprocess_run.stdout, in_process_run.stdout):
         assert "INSUFFICIENT" in output
         assert "report.html" in output
@@ -92,7 +94,7 @@ def test_velocities_are_scored_against_truth(runs: Path) -> None:
     rows = _read_rows(runs / "A")
     valid = rows[rows["outcome"] == "VALID"]
     assert len(valid) >= 4
-    # 10 times the expected error; a wrong frame or sign gives tens of metres per second
+    # The bound is 10 times the expected error. A wrong frame or sign causes errors of tens of metres per second.
     assert (valid["velocity_error_m_s"] < 3.0).all()
     assert valid["velocity_true_x_m_s"].abs().max() > 5.0
 
@@ -138,13 +140,13 @@ def test_record_describes_the_run(runs: Path) -> None:
 def test_existing_campaign_is_not_overwritten(runs: Path) -> None:
     before = (runs / "A" / "cases.parquet").read_bytes()
     result = _run_marsyard("run", "small.toml", "--out", "A", cwd=runs)
-    assert result.exit_code == 2
+    assert result.exit_code == EXIT_INVALID_INPUT
     assert "A" in result.stderr
     assert (runs / "A" / "cases.parquet").read_bytes() == before
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("arguments", "message"),
     [
         (("run", "small.toml", "--set", "descent.altitud_first_m=1500"), "altitud_first_m"),
         (("run", "small.toml", "--set", "descent.altitude_first_m=-5"), "altitude_first_m"),
@@ -156,8 +158,8 @@ def test_existing_campaign_is_not_overwritten(runs: Path) -> None:
         (("report", "nowhere"), "nowhere"),
     ],
 )
-def test_invalid_input_is_reported_with_exit_code_2(runs: Path, words: tuple[str, ...], message: str) -> None:
-    result = _run_marsyard(*words, cwd=runs)
-    assert result.exit_code == 2, result.output
+def test_invalid_input_is_reported_with_exit_code_2(runs: Path, arguments: tuple[str, ...], message: str) -> None:
+    result = _run_marsyard(*arguments, cwd=runs)
+    assert result.exit_code == EXIT_INVALID_INPUT, result.output
     assert message in result.stderr
     assert "Traceback" not in result.output

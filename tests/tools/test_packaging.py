@@ -19,7 +19,7 @@ SOURCES = ("marsyard", *FOLDERS, "pyproject.toml", "README.md", "LICENSE")
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build a wheel from a copy of the repository; symbolic links are copied as links."""
-    tree, out = tmp_path_factory.mktemp("tree"), tmp_path_factory.mktemp("wheel")
+    tree, output_folder = tmp_path_factory.mktemp("tree"), tmp_path_factory.mktemp("wheel")
     for name in SOURCES:
         if (ROOT / name).is_dir():
             shutil.copytree(ROOT / name, tree / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
@@ -27,14 +27,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copy(ROOT / name, tree / name)
     command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
     result = subprocess.run(
-        [*command, "--disable-pip-version-check", "-w", str(out), str(tree)],
+        [*command, "--disable-pip-version-check", "-w", str(output_folder), str(tree)],
         capture_output=True,
         text=True,
         timeout=300,
         check=False,
     )
     assert result.returncode == 0, result.stderr
-    (path,) = out.glob("*.whl")
+    (path,) = output_folder.glob("*.whl")
     return path
 
 

@@ -25,14 +25,14 @@ def test_correct_shape_is_accepted() -> None:
 
 def test_kernels_are_not_wrapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = "def f(x: int) -> int:\n    return x\n"
-    for package, module in (("marsyard.algorithms", "kernels"), ("marsyard.algorithms", "ordinary")):
+    for package, module in (("marsyard.algorithms", "kernels"), ("marsyard.algorithms", "functions")):
         (tmp_path / f"{module}.py").write_text(source)
         monkeypatch.delitem(sys.modules, f"{package}.{module}", raising=False)
     monkeypatch.setattr(importlib.import_module("marsyard.algorithms"), "__path__", [str(tmp_path)])
     kernel = importlib.import_module("marsyard.algorithms.kernels").f
-    checked = importlib.import_module("marsyard.algorithms.ordinary").f
+    checked = importlib.import_module("marsyard.algorithms.functions").f
     monkeypatch.delitem(sys.modules, "marsyard.algorithms.kernels")
-    monkeypatch.delitem(sys.modules, "marsyard.algorithms.ordinary")
+    monkeypatch.delitem(sys.modules, "marsyard.algorithms.functions")
 
     assert kernel("a text") == "a text"
     with pytest.raises(jaxtyping.TypeCheckError):

@@ -1,4 +1,4 @@
-"""Tests of the set-up script, the demo script and the constraints; no package is installed."""
+"""Tests of the set-up script, the demo script and the constraints. The tests install no package."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def checkout(tmp_path: Path) -> Path:
     write_executable(root / "marsyard" / "gl_probe.py", "print('{}')\n")
     write_executable(tmp_path / "bin" / "apt-get", "#!/bin/sh\necho apt-get $* >>$APT_LOG\nexit 100\n")
     write_executable(tmp_path / "bin" / "sudo", "#!/bin/sh\nexit 1\n")
-    # a Python that creates environments without pip, because the module venv needs seconds
+    # This Python creates an environment without the module venv, which needs seconds.
     fake_python = f"""#!/bin/sh
 case "$*" in
     "-m venv "*)
@@ -90,18 +90,18 @@ def test_changed_requirements_are_installed_again(checkout: Path, changed: str) 
 
 def test_interrupted_setup_starts_again(checkout: Path) -> None:
     assert run_setup(checkout, PIP_STATUS="1").returncode != 0
-    leftover = checkout / ".venv" / "leftover"
-    leftover.touch()
+    old_file = checkout / ".venv" / "old_file"
+    old_file.touch()
     assert run_setup(checkout).returncode == 0
-    assert not leftover.exists()
+    assert not old_file.exists()
 
 
 def test_moved_checkout_is_set_up_again(checkout: Path) -> None:
     run_setup(checkout)
-    (checkout / ".venv" / "leftover").touch()
+    (checkout / ".venv" / "old_file").touch()
     moved = checkout.rename(checkout.with_name("moved"))
     assert run_setup(moved).returncode == 0
-    assert not (moved / ".venv" / "leftover").exists()
+    assert not (moved / ".venv" / "old_file").exists()
 
 
 def test_missing_backend_gives_one_line_and_status_0(checkout: Path) -> None:
@@ -125,7 +125,7 @@ def test_setup_fails_if_the_backend_does_not_render(checkout: Path) -> None:
 
 @pytest.mark.parametrize(
     ("status", "expected", "verdict"),
-    # the verdict is read from the report, because several verdicts have exit code 3
+    # The demo reads the verdict from the report, because several verdicts have exit code 3.
     [(0, 0, "PASS"), (3, 0, "INSUFFICIENT"), (3, 0, "MET BY RATE"), (1, 1, "FAIL"), (2, 2, "FAIL")],
 )
 def test_demo_succeeds_if_the_campaign_was_run(checkout: Path, status: int, expected: int, verdict: str) -> None:

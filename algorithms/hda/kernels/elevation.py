@@ -45,6 +45,7 @@ def _fit_exact_plane(x: Array, y: Array, z: Array, i: int, j: int, k: int) -> tu
     ux, uy, uz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
     vx, vy, vz = x[k] - x[i], y[k] - y[i], z[k] - z[i]
     determinant = ux * vy - uy * vx
+    # x and y are whole cells, therefore a nonzero determinant is at least 1.
     if abs(determinant) < 0.5:
         return math.nan, math.nan, math.nan
     slope_x = (uz * vy - uy * vz) / determinant
@@ -89,10 +90,11 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
     """Value at (0, 0) and slopes of the least-median-of-squares plane (section III): the best plane of random triples.
 
     `triples` are uniform random numbers in [0, 1), one row per trial. x and y are integers (cells). The median of n
-    values is their (n / 2 + 2)-th smallest, for three unknowns (Rousseeuw & Leroy 1987). `refine`: fit to the inliers.
+    values is their (n / 2 + 2)-th smallest, for three unknowns (Rousseeuw & Leroy 1987). With `refine` the plane is
+    fitted to the inliers by least squares.
     """
     n = x.size
-    order = min(n // 2 + 2, n) - 1
+    median_index = min(n // 2 + 2, n) - 1
     best = math.inf
     plane = (math.nan, math.nan, math.nan)
     distances = np.empty(n)
@@ -113,8 +115,8 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
             distances[m] = distance
             closer_count += distance < best
         # The median can only improve if enough distances are below the best median.
-        if closer_count > order:
-            best = np.partition(distances, order)[order]
+        if closer_count > median_index:
+            best = np.partition(distances, median_index)[median_index]
             plane = (value, slope_x, slope_y)
     if not refine or math.isinf(best):
         return plane

@@ -172,7 +172,7 @@ def match_along_epipolar_segments(
     for k in range(pixels.shape[0]):
         du, dv = ends[k, 0] - starts[k, 0], ends[k, 1] - starts[k, 1]
         steps = max(math.ceil(max(abs(du), abs(dv))), 1)
-        best = 2**62
+        best = 2**62  # larger than any sum
         for n in range(steps + 1):
             u = round(starts[k, 0] + du * n / steps)
             v = round(starts[k, 1] + dv * n / steps)

@@ -122,7 +122,9 @@ def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, 
 def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, with_depths: bool) -> tuple[Array, Array]:
     """Damped Gauss-Newton step of rotation and translation (6,) and of inverse depths, by the Schur complement.
 
-    NaN if the normal equations are not finite.
+    S and g are the Hessian and the gradient of rotation and translation after elimination of the inverse depths.
+    `curvature` and `slope` are those of each inverse depth; `mixed` are its second derivatives with rotation and
+    translation. NaN if the normal equations are not finite.
     """
     first, focal, scale = matches.first, matches.focal, matches.scale
     n = first.shape[0]

@@ -1,8 +1,7 @@
 """Compiled kernels of `marsyard.algorithms.image.correlation`, which contains the definitions and checks the inputs.
 
 Normalised correlation uses float32 images, so that a vector register contains eight values. Sums that are subtracted
-from each other are float64. Eq. 11 is that of Kim et al., "Targeted
-Driving Using Visual Tracking".
+from each other are float64. Eq. 11 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations

@@ -193,6 +193,7 @@ def register(
                         change[i, 2 + k] = solution[8 + 3 * i + k] / gain
             if not compose_with_inverse(warp, change):
                 return failed
+            # `warp_size` expects the complete warp, including the identity
             change[0, 0] += 1.0
             change[1, 1] += 1.0
             warp_change = warp_size(change, half)
@@ -201,6 +202,7 @@ def register(
         v, u = v - dv, u - du
         if math.hypot(v - row, u - column) > limits[0] or warp_size(warp, half) > limits[1]:
             return failed
+        # at the template's border the last change of the warp is less than ten tolerances
         if math.hypot(dv, du) < tolerance and warp_change * side < 20.0 * tolerance:
             return True, v, u, score
     return failed

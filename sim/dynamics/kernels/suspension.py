@@ -63,6 +63,7 @@ def compute_tread_points(
         for wheel in range(2 * WHEELS_PER_SIDE):
             tread = treads[wheel % treads.shape[0]]
             for k in range(points_per_tread):
+                # point (a, b, c) of the tread in the rover frame
                 a = centres[wheel, 0] + tread[k, 0]
                 b = centres[wheel, 1] + tread[k, 1]
                 c = centres[wheel, 2] + tread[k, 2]

@@ -82,11 +82,11 @@ def compute_wind(height: float, field: WindField) -> tuple[float, float, float]:
     up = 0.0
     for k in range(field.waves.shape[0]):
         wave = field.waves[k]
-        c = math.cos(wave[0] * height)
-        s = math.sin(wave[0] * height)
-        east += wave[1] * c + wave[4] * s
-        north += wave[2] * c + wave[5] * s
-        up += wave[3] * c + wave[6] * s
+        cosine = math.cos(wave[0] * height)
+        sine = math.sin(wave[0] * height)
+        east += wave[1] * cosine + wave[4] * sine
+        north += wave[2] * cosine + wave[5] * sine
+        up += wave[3] * cosine + wave[6] * sine
     return east, north, up
 
 
@@ -145,16 +145,17 @@ def pack_constants(chain: Chain, field: WindField) -> tuple[Array, Array]:
 def interpolate_states(
     times: Array, knots: Array, starts: Array, lengths: Array, states: Array, polynomials: Array
 ) -> Array:
-    """Evaluate the polynomials of `marsyard.sim.dynamics.swing.Path` at many times, a row with a state each."""
+    """Evaluate the polynomials of `marsyard.sim.dynamics.swing.DescentPath` at many times, a row with a state each."""
     rows = np.empty((times.size, SIZE))
     for n in range(times.size):
-        i = max(np.searchsorted(knots, times[n], side="right") - 1, 0)
-        x = (times[n] - starts[i]) / lengths[i]
-        for c in range(SIZE):
+        step = max(np.searchsorted(knots, times[n], side="right") - 1, 0)
+        # elapsed fraction of the step
+        x = (times[n] - starts[step]) / lengths[step]
+        for component in range(SIZE):
             value = 0.0
             for k in range(TERMS):
-                value = (value + polynomials[i, TERMS - 1 - k, c]) * (x if k % 2 == 0 else 1.0 - x)
-            rows[n, c] = states[i, c] + value
+                value = (value + polynomials[step, TERMS - 1 - k, component]) * (x if k % 2 == 0 else 1.0 - x)
+            rows[n, component] = states[step, component] + value
     return rows
 
 

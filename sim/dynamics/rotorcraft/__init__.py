@@ -188,24 +188,24 @@ class FlownPath(Trajectory):
         """Compute the true states at many times. Raises ValueError for times outside the span."""
         check_times(times_s, self.span_s, 1e-6 * self.step_s)  # sums of steps have rounding errors
         interval = np.clip(((times_s - self.start_s) / self.step_s).astype(int), 0, len(self.rows) - 2)
-        elapsed = (times_s - self.start_s - self.step_s * interval)[:, None]
-        angles, angle_rates, _ = self._interpolate(interval, elapsed, kernels.ANGLE)
+        elapsed_s = (times_s - self.start_s - self.step_s * interval)[:, None]
+        angles, angle_rates, _ = self._interpolate(interval, elapsed_s, kernels.ANGLE)
         vibration = [self.vibration.derivative(times_s, order) for order in range(3)]
         attitudes, rates = attitudes_and_body_rates(angles + vibration[0][:, 3:], angle_rates + vibration[1][:, 3:])
-        path = self._interpolate(interval, elapsed, kernels.POSITION)
+        path = self._interpolate(interval, elapsed_s, kernels.POSITION)
         derivatives = [smooth + sine[:, :3] for smooth, sine in zip(path, vibration, strict=True)]
         return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
     def _interpolate(
-        self, interval: np.ndarray, t: Float64[np.ndarray, "n 1"], column: int
+        self, interval: np.ndarray, elapsed_s: Float64[np.ndarray, "n 1"], column: int
     ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
         """Interpolate a vector and its first two derivatives (consecutive columns); the second derivative is linear."""
         value, first, second = np.split(self.rows[interval, column : column + 9], 3, axis=1)
         third = (self.rows[interval + 1, column + 6 : column + 9] - second) / self.step_s
         return (
-            value + t * (first + t * (second / 2.0 + t * third / 6.0)),
-            first + t * (second + t * third / 2.0),
-            second + t * third,
+            value + elapsed_s * (first + elapsed_s * (second / 2.0 + elapsed_s * third / 6.0)),
+            first + elapsed_s * (second + elapsed_s * third / 2.0),
+            second + elapsed_s * third,
         )
 
 

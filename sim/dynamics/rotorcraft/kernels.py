@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 POSITION, VELOCITY, ACCELERATION, ANGLE, RATE, ANGULAR_ACCELERATION, SIZE = 0, 3, 6, 9, 12, 15, 18
 #: State of the autopilot: thrust per mass, then the trim against steady wind (east, north, up).
 THRUST, TRIM, AUTOPILOT_SIZE = 0, 1, 4
+#: Maximum commanded vertical acceleration, in units of gravity.
+MAX_VERTICAL_G = 0.4
 #: Phases of a flight.
 FOLLOW, WAIT, APPROACH, DESCEND, FLARE, REST = range(6)
 
@@ -119,15 +121,15 @@ def _limit_length(east: float, north: float, limit: float) -> tuple[float, float
 
 @njit(cache=True)
 def _command_acceleration(
-    state: Array, autopilot: Array, goal: Array, speed: Array, acceleration: Array, step: float, c: Craft
+    state: Array, autopilot: Array, goal: Array, speed: Array, acceleration: Array, step: float, craft: Craft
 ) -> tuple[float, float, float]:
     """Compute the acceleration that the autopilot commands (east, north, up), and update the autopilot's trim."""
-    error = speed + c.position_gain * (goal - state[:VELOCITY]) - state[VELOCITY:ACCELERATION]
-    autopilot[TRIM:] += c.trim_gain * error * step
-    command = acceleration + c.speed_gain * error + autopilot[TRIM:]
-    limit = c.gravity_m_s2 * math.tan(c.max_tilt_rad)
+    error = speed + craft.position_gain * (goal - state[:VELOCITY]) - state[VELOCITY:ACCELERATION]
+    autopilot[TRIM:] += craft.trim_gain * error * step
+    command = acceleration + craft.speed_gain * error + autopilot[TRIM:]
+    limit = craft.gravity_m_s2 * math.tan(craft.max_tilt_rad)
     east, north = _limit_length(command[0], command[1], limit)
-    return east, north, min(max(command[2], -0.4 * c.gravity_m_s2), 0.4 * c.gravity_m_s2)
+    return east, north, min(max(command[2], -MAX_VERTICAL_G * craft.gravity_m_s2), MAX_VERTICAL_G * craft.gravity_m_s2)
 
 
 @njit(cache=True)
@@ -141,35 +143,35 @@ def _integrate(row: Array, after: Array, step: float) -> None:
 
 
 @njit(cache=True)
-def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float, float, float], c: Craft) -> None:
+def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float, float, float], craft: Craft) -> None:
     """Compute the row after row k: angles from the commands; accelerations from thrust (body z), drag and gravity."""
     row, after, gust = flight.rows[k], flight.rows[k + 1], flight.gusts[k + 1]
-    autopilot, step, g = flight.autopilot, flight.step, c.gravity_m_s2
+    autopilot, step, g = flight.autopilot, flight.step, craft.gravity_m_s2
     yaw_estimate = row[ANGLE] + tilt_error[0]
     cy, sy = math.cos(yaw_estimate), math.sin(yaw_estimate)
     pitch_command = math.atan2(cy * command[0] + sy * command[1], g)
     roll_command = -math.atan2((cy * command[1] - sy * command[0]) * math.cos(pitch_command), g)
     thrust_command = (g + command[2]) / (math.cos(row[ANGLE + 1]) * math.cos(row[ANGLE + 2]))
-    autopilot[THRUST] += (thrust_command - autopilot[THRUST]) * min(step / c.thrust_lag_s, 1.0)
+    autopilot[THRUST] += (thrust_command - autopilot[THRUST]) * min(step / craft.thrust_lag_s, 1.0)
 
     cy, sy = math.cos(row[ANGLE]), math.sin(row[ANGLE])
     gust_forward = cy * gust[0] + sy * gust[1]
     gust_left = cy * gust[1] - sy * gust[0]
     # the autopilot controls the estimated angles; a gust tilts the rotor along its direction and turns the nose into it
     targets = (
-        flight.heading - tilt_error[0] - c.gust_yaw_s_m * gust_left,
-        pitch_command - tilt_error[1] + c.gust_tilt_s_m * gust_forward,
-        roll_command - tilt_error[2] - c.gust_tilt_s_m * gust_left,
+        flight.heading - tilt_error[0] - craft.gust_yaw_s_m * gust_left,
+        pitch_command - tilt_error[1] + craft.gust_tilt_s_m * gust_forward,
+        roll_command - tilt_error[2] - craft.gust_tilt_s_m * gust_left,
     )
     for i in range(3):
-        natural_frequency = c.heading_rad_s if i == 0 else c.attitude_rad_s
+        natural_frequency = craft.heading_rad_s if i == 0 else craft.attitude_rad_s
         angle = row[ANGLE + i] + step * row[RATE + i] + 0.5 * step * step * row[ANGULAR_ACCELERATION + i]
         rate = row[RATE + i] + step * row[ANGULAR_ACCELERATION + i]
         error = targets[i] - angle
         if i == 0:
             error = math.atan2(math.sin(error), math.cos(error))
         after[ANGULAR_ACCELERATION + i] = (
-            natural_frequency * natural_frequency * error - 2.0 * c.attitude_damping * natural_frequency * rate
+            natural_frequency * natural_frequency * error - 2.0 * craft.attitude_damping * natural_frequency * rate
         )
         after[ANGLE + i] = angle
     yaw, pitch, roll = after[ANGLE], after[ANGLE + 1], after[ANGLE + 2]
@@ -180,16 +182,16 @@ def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float
     after[ACCELERATION + 1] = thrust * (math.sin(yaw) * forward + math.cos(yaw) * left)
     after[ACCELERATION + 2] = thrust * math.cos(roll) * math.cos(pitch) - g
     velocity = row[VELOCITY:ACCELERATION] + step * row[ACCELERATION:ANGLE]
-    after[ACCELERATION:ANGLE] += (flight.wind + gust - velocity) / c.drag_s
+    after[ACCELERATION:ANGLE] += (flight.wind + gust - velocity) / craft.drag_s
     _integrate(row, after, step)
 
 
 @njit(cache=True)
-def _step_on_ground(row: Array, after: Array, step: float, c: Craft) -> None:
+def _step_on_ground(row: Array, after: Array, step: float, craft: Craft) -> None:
     """Compute the next row on the ground: velocity and tilt decay to zero with the time constant `contact_s`."""
     for i in range(3):
-        after[ACCELERATION + i] = -(row[VELOCITY + i] + step * row[ACCELERATION + i]) / c.contact_s
-        natural_frequency = 0.5 / c.contact_s
+        after[ACCELERATION + i] = -(row[VELOCITY + i] + step * row[ACCELERATION + i]) / craft.contact_s
+        natural_frequency = 0.5 / craft.contact_s
         angle = 0.0 if i == 0 else row[ANGLE + i] + step * row[RATE + i]
         rate = row[RATE + i] + step * row[ANGULAR_ACCELERATION + i]
         after[ANGULAR_ACCELERATION + i] = (
@@ -199,15 +201,15 @@ def _step_on_ground(row: Array, after: Array, step: float, c: Craft) -> None:
 
 
 @njit(cache=True)
-def follow_path(flight: Flight, path: Array, c: Craft) -> None:
+def follow_path(flight: Flight, path: Array, craft: Craft) -> None:
     """Simulate a flight along a path (position, velocity, acceleration of each knot), controlled by true states."""
     no_error = np.zeros(3)
     for k in range(flight.rows.shape[0] - 1):
-        delayed = flight.rows[max(k - c.delay_steps, 0)]
+        delayed = flight.rows[max(k - craft.delay_steps, 0)]
         command = _command_acceleration(
-            delayed, flight.autopilot, path[k, 0:3], path[k, 3:6], path[k, 6:9], flight.step, c
+            delayed, flight.autopilot, path[k, 0:3], path[k, 3:6], path[k, 6:9], flight.step, craft
         )
-        _step_flight(flight, k, no_error, command, c)
+        _step_flight(flight, k, no_error, command, craft)
 
 
 @njit(cache=True)
@@ -219,7 +221,7 @@ def land(
     laser_noise: Array,
     ground: Ground,
     landing: Landing,
-    c: Craft,
+    craft: Craft,
 ) -> None:
     """Simulate a landing from row `start` on, controlled by estimated states; updates rows and phases.
 
@@ -232,11 +234,11 @@ def land(
     zero = np.zeros(3)
     phase = WAIT
     for k in range(start, rows.shape[0] - 1):
-        delayed = max(k - c.delay_steps, 0)
+        delayed = max(k - craft.delay_steps, 0)
         estimate = rows[delayed, :ACCELERATION] + errors[delayed, :ACCELERATION]
         if phase == REST:
             phases[k + 1] = REST
-            _step_on_ground(rows[k], rows[k + 1], flight.step, c)
+            _step_on_ground(rows[k], rows[k + 1], flight.step, craft)
             continue
         if phase == WAIT and k >= landing.wait_until:
             phase = APPROACH
@@ -255,14 +257,14 @@ def land(
         if phase in (WAIT, FLARE):
             goal[0], goal[1] = estimate[0], estimate[1]
         else:
-            east, north = _limit_length(to_site_east, to_site_north, landing.approach_m_s / c.position_gain)
+            east, north = _limit_length(to_site_east, to_site_north, landing.approach_m_s / craft.position_gain)
             goal[0], goal[1] = estimate[0] + east, estimate[1] + north
         if phase >= DESCEND:
             speed[2] = -landing.descent_m_s if phase == DESCEND else -landing.flare_m_s
             goal[2] = estimate[2]
-        command = _command_acceleration(estimate, flight.autopilot, goal, speed, zero, flight.step, c)
-        _step_flight(flight, k, errors[k, ACCELERATION:], command, c)
+        command = _command_acceleration(estimate, flight.autopilot, goal, speed, zero, flight.step, craft)
+        _step_flight(flight, k, errors[k, ACCELERATION:], command, craft)
         after = rows[k + 1]
-        if phase != WAIT and after[2] - c.gear_m <= compute_ground_height(ground, after[0], after[1]):
+        if phase != WAIT and after[2] - craft.gear_m <= compute_ground_height(ground, after[0], after[1]):
             phase = REST
         phases[k + 1] = phase

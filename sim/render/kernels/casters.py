@@ -39,7 +39,7 @@ MIN_DOUBLE_AREA_M2 = 1e-18
 
 @njit(cache=True)
 def _project_along_sun(triangles: Array, axes: Array) -> tuple[Array, Array]:
-    """Bounds of each triangle (minimum u and v, maximum u, v and s), and its linear coefficients (`Casters`)."""
+    """Compute bounds of each triangle (minimum u and v, maximum u, v and s), and its linear functions (`Casters`)."""
     bounds = np.empty((triangles.shape[0], 5))
     linear = np.empty((triangles.shape[0], 9))
     projected = np.empty((3, 3))
@@ -94,13 +94,14 @@ def _cell(value: float, low: float, per_metre: float, count: int) -> int:
 
 
 @njit(cache=True)
-def _add_to_cells(bounds: Array, n: int, outline: Array, side: int, first: int, ends: Longs, items: Longs) -> None:
+def _add_to_cells(bounds: Array, n: int, grid: Array, side: int, first: int, ends: Longs, items: Longs) -> None:
     """Add the n-th row of bounds to the list of each cell of a grid that it overlaps.
 
-    `first` is the grid's first cell; `ends`, the ends of the cells' lists, are updated. An empty `items` only counts.
+    `grid` is a row of `grid_rows` of `_list_in_cells`, `first` the grid's first cell. `ends`, the ends of the cells'
+    lists, are updated. With an empty `items` the function only counts.
     """
-    low, high = _cell(bounds[n, 1], outline[1], outline[3], side), _cell(bounds[n, 3], outline[1], outline[3], side)
-    left, right = _cell(bounds[n, 0], outline[0], outline[2], side), _cell(bounds[n, 2], outline[0], outline[2], side)
+    low, high = _cell(bounds[n, 1], grid[1], grid[3], side), _cell(bounds[n, 3], grid[1], grid[3], side)
+    left, right = _cell(bounds[n, 0], grid[0], grid[2], side), _cell(bounds[n, 2], grid[0], grid[2], side)
     for i in range(low, high + 1):
         for j in range(left, right + 1):
             cell = first + i * side + j
@@ -111,23 +112,26 @@ def _add_to_cells(bounds: Array, n: int, outline: Array, side: int, first: int, 
 
 @njit(cache=True)
 def _list_in_cells(
-    bounds: Array, first_row: Longs, outlines: Array, sides: Longs, first_cells: Longs
+    bounds: Array, first_row: Longs, grid_rows: Array, sides: Longs, first_cells: Longs
 ) -> tuple[Longs, Longs]:
     """List the rows of bounds in the cells of grids; rows `first_row[g]` to `first_row[g + 1] - 1` belong to grid g.
 
+    - grid_rows: minimum u and v, cells per metre along u and v of each grid
+    - sides, first_cells: cells along a side, and index of the first cell of each grid
+
     Returns the start of each cell's list and the end of the last, and the listed rows.
     """
-    grids = sides.size
-    cells = first_cells[-1] + sides[-1] ** 2 if grids > 0 else 0
+    grid_count = sides.size
+    cells = first_cells[-1] + sides[-1] ** 2 if grid_count > 0 else 0
     starts = np.zeros(cells + 1, dtype=np.int64)
     items = np.empty(0, dtype=np.int64)
-    for filling in range(2):
+    for is_second_pass in range(2):
         # the first pass counts the entries of each cell, the second lists them
-        ends = starts[:-1].copy() if filling else starts[1:]
-        for grid in range(grids):
+        ends = starts[:-1].copy() if is_second_pass else starts[1:]
+        for grid in range(grid_count):
             for n in range(first_row[grid], first_row[grid + 1]):
-                _add_to_cells(bounds, n, outlines[grid], sides[grid], first_cells[grid], ends, items)
-        if not filling:
+                _add_to_cells(bounds, n, grid_rows[grid], sides[grid], first_cells[grid], ends, items)
+        if not is_second_pass:
             for k in range(cells):
                 starts[k + 1] += starts[k]
             items = np.empty(starts[-1], dtype=np.int64)
@@ -135,9 +139,9 @@ def _list_in_cells(
 
 
 @njit(cache=True)
-def _grid_rect(rect: BoundsUVS, side: int) -> BoundsUVS:
+def _grid_row(bounds: BoundsUVS, side: int) -> BoundsUVS:
     """Minimum u and v, cells per metre along u and v, and maximum s of a grid over these bounds."""
-    return rect[0], rect[1], side / (rect[2] - rect[0]), side / (rect[3] - rect[1]), rect[4]
+    return bounds[0], bounds[1], side / (bounds[2] - bounds[0]), side / (bounds[3] - bounds[1]), bounds[4]
 
 
 @njit(cache=True)
@@ -146,17 +150,17 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     bodies = first_triangle.size - 1
     bounds, linear = _project_along_sun(triangles, axes)
     body_bounds = np.empty((bodies, 5))
-    outlines = np.empty((bodies, 5))
-    shapes = np.empty((bodies, 2), dtype=np.int64)
+    body_grids = np.empty((bodies, 5))
+    layouts = np.empty((bodies, 2), dtype=np.int64)
     cells = 0
     for body in range(bodies):
         first, end = first_triangle[body], first_triangle[body + 1]
         side = _cells_per_side((end - first) / TRIANGLES_PER_CELL)
-        rect = _joint_bounds(bounds, first, end)
-        body_bounds[body], outlines[body] = rect, _grid_rect(rect, side)
-        shapes[body, 0], shapes[body, 1] = side, cells
+        joint = _joint_bounds(bounds, first, end)
+        body_bounds[body], body_grids[body] = joint, _grid_row(joint, side)
+        layouts[body, 0], layouts[body, 1] = side, cells
         cells += side * side
-    starts, items = _list_in_cells(bounds, first_triangle, outlines, shapes[:, 0].copy(), shapes[:, 1].copy())
+    starts, items = _list_in_cells(bounds, first_triangle, body_grids, layouts[:, 0].copy(), layouts[:, 1].copy())
     max_s = np.empty(items.size)
     for k in range(items.size):
         max_s[k] = bounds[items[k], 4]
@@ -164,12 +168,12 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     sides = np.array([_cells_per_side(float(bodies))])
     joint_grid = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
     if bodies > 0:
-        joint_grid[0] = _grid_rect(_joint_bounds(body_bounds, 0, bodies), sides[0])
+        joint_grid[0] = _grid_row(_joint_bounds(body_bounds, 0, bodies), sides[0])
     first_items, bodies_listed = _list_in_cells(
         body_bounds, np.array([0, bodies]), joint_grid, sides, np.zeros(1, dtype=np.int64)
     )
     grid: Grid = (joint_grid[0, :4].copy(), sides, first_items, bodies_listed)
-    return linear, axes, grid, (outlines, shapes, starts, items, max_s)
+    return linear, axes, grid, (body_grids, layouts, starts, items, max_s)
 
 
 @njit(cache=True)
@@ -178,15 +182,15 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
 
     All positions are tested in one call, because passing the arrays takes longer than testing most positions.
     """
-    linear, axes, (grid, sides, starts, items), (outlines, shapes, first_items, listed, max_s) = casters
+    linear, axes, (grid, sides, starts, items), (body_grids, layouts, first_items, listed, max_s) = casters
     to_axes = unpack_matrix(axes)
     side = sides[0]
-    west, south, per_u, per_v = grid[0], grid[1], grid[2], grid[3]
+    min_u, min_v, per_u, per_v = grid[0], grid[1], grid[2], grid[3]
     for position in range(x.size):
         u, v, s = rotate(to_axes, x[position], y[position], z[position])
         hidden[position] = False
-        column = (u - west) * per_u
-        row = (v - south) * per_v
+        column = (u - min_u) * per_u
+        row = (v - min_v) * per_v
         # bounds have a margin: a ray on the border hits no triangle
         if not (0.0 <= column < side and 0.0 <= row < side):
             continue
@@ -195,21 +199,21 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
         while k < starts[cell + 1] and not hidden[position]:
             body = items[k]
             k += 1
-            if outlines[body, 4] < s:
+            if body_grids[body, 4] < s:
                 continue
-            body_side = shapes[body, 0]
-            column = (u - outlines[body, 0]) * outlines[body, 2]
-            row = (v - outlines[body, 1]) * outlines[body, 3]
+            body_side = layouts[body, 0]
+            column = (u - body_grids[body, 0]) * body_grids[body, 2]
+            row = (v - body_grids[body, 1]) * body_grids[body, 3]
             if not (0.0 <= column < body_side and 0.0 <= row < body_side):
                 continue
-            body_cell = shapes[body, 1] + int(row) * body_side + int(column)
+            body_cell = layouts[body, 1] + int(row) * body_side + int(column)
             for m in range(first_items[body_cell], first_items[body_cell + 1]):
                 if max_s[m] < s:
                     continue
                 n = listed[m]
-                second = linear[n, 0] + linear[n, 1] * u + linear[n, 2] * v
-                third = linear[n, 3] + linear[n, 4] * u + linear[n, 5] * v
+                weight2 = linear[n, 0] + linear[n, 1] * u + linear[n, 2] * v
+                weight3 = linear[n, 3] + linear[n, 4] * u + linear[n, 5] * v
                 above = linear[n, 6] + linear[n, 7] * u + linear[n, 8] * v > s
-                if above and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
+                if above and weight2 >= 0.0 and weight3 >= 0.0 and weight2 + weight3 <= 1.0:
                     hidden[position] = True
                     break

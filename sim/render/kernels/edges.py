@@ -77,23 +77,24 @@ def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: Flags) ->
     rows, columns = radiance.shape
     is_candidate = np.empty(columns, dtype=np.bool_)
     for i in range(rows):
-        for side in range(2):
-            i2 = i + side
+        # the neighbour to the right (0) and the neighbour below (1)
+        for below in range(2):
+            i2 = i + below
             if i2 >= rows:
                 continue
-            last = columns - 1 + side
-            shift = 1 - side
+            column_count = columns - 1 + below
+            shift = 1 - below
             t, next_t = distance[i], distance[i2, shift:]
             _find_candidates(radiance[i], radiance[i2, shift:], t, next_t, body[i], body[i2, shift:], is_candidate)
-            for j in range(last):
+            for j in range(column_count):
                 if not is_candidate[j]:
                     continue
                 j2 = j + shift
                 first, second = radiance[i, j], radiance[i2, j2]
                 is_edge = body[i, j] != body[i2, j2] or abs(second - first) > MIN_SHADOW_CONTRAST * max(first, second)
                 if not is_edge:
-                    i0, j0 = max(i - side, 0), max(j - 1 + side, 0)
-                    i3, j3 = min(i2 + side, rows - 1), min(j2 + 1 - side, columns - 1)
+                    i0, j0 = max(i - below, 0), max(j - 1 + below, 0)
+                    i3, j3 = min(i2 + below, rows - 1), min(j2 + 1 - below, columns - 1)
                     is_edge = _is_range_jump(distance[i0, j0], distance[i, j], distance[i2, j2], distance[i3, j3])
                 if is_edge:
                     marked[i, j], marked[i2, j2] = True, True
@@ -150,17 +151,17 @@ def _gather_neighbours(
     """
     row = pixel // columns
     column = pixel - row * columns
-    count, sky, objects, farthest = 0, False, False, 0.0
+    count, has_sky, has_objects, farthest = 0, False, False, 0.0
     for i in range(max(row - 1, 0), min(row + 2, hits.distance.size // columns)):
         for j in range(max(column - 1, 0), min(column + 2, columns)):
             n = i * columns + j
             distance = hits.distance[n]
             if distance == math.inf:
-                sky = True
+                has_sky = True
                 continue
             farthest = max(farthest, distance)
             if hits.triangle[n] >= 0:
-                objects = True
+                has_objects = True
                 continue
             position = count
             while position > 0 and ranges[position - 1] > distance:
@@ -170,7 +171,7 @@ def _gather_neighbours(
             ranges[position] = distance
             levels[position] = hits.level[n]
             count += 1
-    return count, sky, objects, farthest
+    return count, has_sky, has_objects, farthest
 
 
 @njit(cache=True, fastmath={"contract"})
@@ -191,17 +192,17 @@ def trace_subpixel_rays(
     origin, direction = np.empty((1, 3), dtype=np.float32), np.empty((1, 3), dtype=np.float32)
     for k in range(pixels.size):
         pixel = pixels[k]
-        count, sky, objects, farthest = _gather_neighbours(primary, pixel, columns, ranges, levels)
+        count, has_sky, has_objects, farthest = _gather_neighbours(primary, pixel, columns, ranges, levels)
         listed_count = -1
         first, last = k * rays_per_pixel, (k + 1) * rays_per_pixel
-        if objects:
+        if has_objects:
             # the ray through the pixel's centre is the mean of the first and the last subpixel ray
             for axis in range(3):
                 origin[0, axis] = 0.5 * (rays.origins[first, axis] + rays.origins[last - 1, axis])
                 direction[0, axis] = 0.5 * (rays.directions[first, axis] + rays.directions[last - 1, axis])
             centre_ray = world_ray(pose, Rays(origin, direction, rays.pixel_angles), 0)
             half_angle = BEAM_RADIUS_PX * rays.pixel_angles[first]
-            max_range = math.inf if sky else SEARCH_END * farthest
+            max_range = math.inf if has_sky else SEARCH_END * farthest
             listed_count = list_in_beam(tree, centre_ray, half_angle, max_range, listed)
         for n in range(first, last):
             ray = world_ray(pose, rays, n)
@@ -211,27 +212,27 @@ def trace_subpixel_rays(
             t = math.inf
             level = 0
             end = math.inf
-            c = 0
-            while c < count and t == math.inf:
+            index = 0
+            while index < count and t == math.inf:
                 # consecutive ranges on one level form one interval, which starts at the end of the previous interval
-                level = levels[c]
-                start = max(min(SEARCH_START * ranges[c], end), entry_distance(extent, ray))
+                level = levels[index]
+                start = max(min(SEARCH_START * ranges[index], end), entry_distance(extent, ray))
                 # ground behind an object is hidden
                 if start >= hit.distance:
                     break
-                while c + 1 < count and levels[c + 1] == level:
-                    c += 1
-                end = (HORIZON_SEARCH_END if sky and c + 1 == count else SEARCH_END) * ranges[c]
+                while index + 1 < count and levels[index + 1] == level:
+                    index += 1
+                end = (HORIZON_SEARCH_END if has_sky and index + 1 == count else SEARCH_END) * ranges[index]
                 end = min(end, exit_distance(extent, ray))
                 m = max(level, 0)
                 ground_level = GroundLevel(fields[m], ceilings[m], 1.0 / spacing / (1 << m))
                 t = intersect_ground(ground_level, ray, start, min(end, hit.distance))
-                c += 1
-            if listed_count < 0 and objects:
+                index += 1
+            if listed_count < 0 and has_objects:
                 hit = nearest_hit(tree, ray, t)
             if not hit.distance < t:
                 hit = TriangleHit(t, -1, 0.0, 0.0)
-            if hit.distance == math.inf and not sky:
+            if hit.distance == math.inf and not has_sky:
                 if count > 0:
                     # the ray grazes the ground without an intersection
                     hit = TriangleHit(ranges[count - 1], -1, 0.0, 0.0)

@@ -31,6 +31,7 @@ def hit_triangle(triangles: Array, n: int, ray: Ray) -> tuple[float, float, floa
 
     Moeller & Trumbore (1997). The distance is infinite if the ray is parallel to the plane.
     """
+    # a: first corner; u, v: edges from it; s: from it to the ray's origin; p = d x v and q = s x u for the direction d
     ax, ay, az = triangles[n, 0, 0], triangles[n, 0, 1], triangles[n, 0, 2]
     ux, uy, uz = triangles[n, 1, 0] - ax, triangles[n, 1, 1] - ay, triangles[n, 1, 2] - az
     vx, vy, vz = triangles[n, 2, 0] - ax, triangles[n, 2, 1] - ay, triangles[n, 2, 2] - az
@@ -50,8 +51,8 @@ def hit_triangle(triangles: Array, n: int, ray: Ray) -> tuple[float, float, floa
 def nearer_hit(best: TriangleHit, triangles: Array, n: int, ray: Ray, slack: float) -> TriangleHit:
     """Return the hit of the n-th triangle if it is nearer than `best`, else `best`; `slack` enlarges the triangle."""
     t, second, third = hit_triangle(triangles, n, ray)
-    inside = second >= -slack and third >= -slack and second + third <= 1.0 + slack
-    return TriangleHit(t, n, second, third) if 0.0 < t < best.distance and inside else best
+    is_inside = second >= -slack and third >= -slack and second + third <= 1.0 + slack
+    return TriangleHit(t, n, second, third) if 0.0 < t < best.distance and is_inside else best
 
 
 @njit(cache=True)
@@ -188,7 +189,8 @@ def _entry_distance(boxes: Array32, node: int, ray: Ray, inverse: tuple[float, f
 
 
 @njit(cache=True, inline="always")
-def _inverse(component: float) -> float:
+def _invert_component(component: float) -> float:
+    """Invert a component of a direction; finite for zero."""
     return 1.0 / (component if abs(component) > 1e-12 else 1e-12)
 
 
@@ -199,7 +201,7 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
     best = TriangleHit(farthest, -1, 0.0, 0.0)
     if order.size == 0:
         return best
-    inverse = (_inverse(ray.dx), _inverse(ray.dy), _inverse(ray.dz))
+    inverse = (_invert_component(ray.dx), _invert_component(ray.dy), _invert_component(ray.dz))
     first_leaf = boxes.shape[0] // 2
     node = 0
     while True:
@@ -216,14 +218,14 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
 
 
 @njit(cache=True, inline="always")
-def _outside_beam(triangles: Array, n: int, sides: tuple[Plane, ...]) -> bool:
+def _is_outside_beam(triangles: Array, n: int, sides: tuple[Plane, ...]) -> bool:
     """Whether a triangle is entirely outside one of a frustum's four lateral sides (the fifth is the far side)."""
     for nx, ny, nz, offset, _ix, _iy, _iz in sides[:4]:
-        outside = True
+        is_outside = True
         for corner in range(3):
             x, y, z = triangles[n, corner, 0], triangles[n, corner, 1], triangles[n, corner, 2]
-            outside &= nx * x + ny * y + nz * z > offset
-        if outside:
+            is_outside &= nx * x + ny * y + nz * z > offset
+        if is_outside:
             return True
     return False
 
@@ -260,16 +262,16 @@ def list_in_beam(tree: Hierarchy, ray: Ray, half_angle: float, farthest: float, 
     count = 0
     node = 0
     while True:
-        outside = False
+        is_outside = False
         for nx, ny, nz, offset, ix, iy, iz in sides:
-            outside |= nx * boxes[node, ix] + ny * boxes[node, iy] + nz * boxes[node, iz] > offset
-        if not outside:
+            is_outside |= nx * boxes[node, ix] + ny * boxes[node, iy] + nz * boxes[node, iz] > offset
+        if not is_outside:
             if node < first_leaf:
                 node = 2 * node + 1
                 continue
             start = (node - first_leaf) * LEAF
             for k in range(start, min(start + LEAF, order.size)):
-                if _outside_beam(triangles, order[k], sides):
+                if _is_outside_beam(triangles, order[k], sides):
                     continue
                 if count == listed.size:
                     return -1

@@ -17,7 +17,7 @@ FADING = 0.306
 MIN_CELLS = math.sqrt(FADING)
 #: Mean squares of `relief_noise` and of its derivative along one axis.
 HEIGHT_VARIANCE, SLOPE_VARIANCE = 0.0464, 0.3886
-#: Gradients of the noise: eight unit vectors, evenly spaced.
+#: Components of the noise's gradients: eight unit vectors, evenly spaced in angle.
 _LONG, _SHORT = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
 
 
@@ -80,12 +80,12 @@ def add_relief_slopes(
     for k in range(footprint.size):
         finest = min(finest, footprint[k])
         slope_x[k] = slope_y[k] = resolved[k] = unresolved[k] = 0.0
-    cell, invisible = relief.coarsest, 0.0
+    cell, unresolved_octaves = relief.coarsest, 0.0
     for octave in range(relief.heights.size):
         gain = relief.heights[octave] / cell
         variance = gain * gain * SLOPE_VARIANCE
         if cell <= MIN_CELLS * finest:
-            invisible += variance
+            unresolved_octaves += variance
         else:
             for k in range(footprint.size):
                 ratio = footprint[k] / cell
@@ -98,7 +98,7 @@ def add_relief_slopes(
                 unresolved[k] += variance * (1.0 - fade * fade)
         cell *= 0.5
     for k in range(footprint.size):
-        unresolved[k] += invisible
+        unresolved[k] += unresolved_octaves
 
 
 @njit(cache=True, inline="always", error_model="numpy")
@@ -110,6 +110,6 @@ def smith_shadowing(cosine: float, variance: float) -> float:
     """
     # without branches, for vector instructions; a is infinite without roughness or at normal incidence
     a = min(cosine / math.sqrt(max(2.0 * variance * (1.0 - cosine * cosine), 1e-300)), 1.6)
-    masked = 1.0 - 1.259 * a + 0.396 * a * a
-    facing = 3.535 * a + 2.181 * a * a
-    return facing / (facing + masked) if a < 1.6 else 1.0
+    remainder = 1.0 - 1.259 * a + 0.396 * a * a
+    numerator = 3.535 * a + 2.181 * a * a
+    return numerator / (numerator + remainder) if a < 1.6 else 1.0

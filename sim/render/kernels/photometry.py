@@ -10,7 +10,7 @@ from numba import njit
 from marsyard.sim.terrain.kernels import Array
 
 #: Sine of the elevation below which the sky's brightness is constant.
-HORIZON = 1e-3
+MIN_ELEVATION_SINE = 1e-3
 
 
 @njit(cache=True)
@@ -20,8 +20,8 @@ def single_scattering(cos_zenith: float, cos_sun_zenith: float, cos_g: float, de
     ``P(g) mu0 / (mu0 - mu) (1 - exp(tau / mu0 - tau / mu))`` with the Henyey-Greenstein phase function P and
     the optical depth tau. mu and mu0 are the sines of the elevations of the direction and of the sun.
     """
-    mu = max(cos_zenith, HORIZON)
-    mu0 = max(cos_sun_zenith, HORIZON)
+    mu = max(cos_zenith, MIN_ELEVATION_SINE)
+    mu0 = max(cos_sun_zenith, MIN_ELEVATION_SINE)
     # the limit for equal elevations avoids 0 / 0
     difference = depth / mu - depth / mu0
     path = 1.0 - 0.5 * difference if abs(difference) < 1e-6 else -math.expm1(-difference) / difference
@@ -31,22 +31,22 @@ def single_scattering(cos_zenith: float, cos_sun_zenith: float, cos_g: float, de
 
 
 @njit(cache=True)
-def sky_brightness(sky: Array, sun_z: float, sun_radius: float, dz: float, cos_g: float, pixel: float) -> float:
+def sky_brightness(sky: Array, sun_z: float, sun_radius: float, dz: float, cos_g: float, pixel_rad: float) -> float:
     """Radiance factor of the sky in a direction; a dusty sky includes the disc of the sun.
 
     - sky: uniform radiance factor, factor of single scattering (0 for a uniform sky), its optical depth, asymmetry
     - sun_z, sun_radius: sine of the sun's elevation, and its angular radius
     - dz, cos_g: sine of the direction's elevation, and cosine of its angle from the sun
-    - pixel: angle that the pixel subtends: the width of the disc's edge
+    - pixel_rad: angle that the pixel subtends, radians: the width of the disc's edge
     """
     brightness: float = sky[0]
     if sky[1] <= 0.0:
         return brightness
     brightness += sky[1] * single_scattering(dz, sun_z, cos_g, sky[2], sky[3])
     if cos_g > 0.9:
-        inside = (sun_radius - math.acos(min(cos_g, 1.0))) / pixel + 0.5
+        disc_fraction = (sun_radius - math.acos(min(cos_g, 1.0))) / pixel_rad + 0.5
         # the ramp across the edge adds pixel**2 / 12 to the squared radius, on average
-        brightness += min(max(inside, 0.0), 1.0) / (sun_radius * sun_radius + pixel * pixel / 12.0)
+        brightness += min(max(disc_fraction, 0.0), 1.0) / (sun_radius * sun_radius + pixel_rad * pixel_rad / 12.0)
     return brightness
 
 

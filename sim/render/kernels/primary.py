@@ -15,8 +15,8 @@ from marsyard.sim.render.kernels.strips import (
     STRIP,
     FetchedCells,
     Matrix,
+    allocate_cells,
     fetch_levels,
-    no_cells,
     rotate,
     spline,
     unpack_matrix,
@@ -24,12 +24,12 @@ from marsyard.sim.render.kernels.strips import (
 from marsyard.sim.render.kernels.structs import Array32, Ground, GroundLevel, Hits, Ints, Longs, Pose, Ray, Rays, Views
 from marsyard.sim.terrain.kernels import Array, Level
 
-#: Minimum sine of the angle between ray and horizontal, for the length of a pixel's footprint.
-FLATTEST = 0.01
+#: Minimum sine of the angle between ray and horizontal with which the length of a pixel's footprint is computed.
+MIN_INCIDENCE_SINE = 0.01
 #: Maximum footprint, in samples, of a ray that is traced on the finest level of the terrain.
 MAX_FINE_FOOTPRINT = 8.0
 #: Sine of the angle between ray and horizontal below which the ray may hit crests that the mesh does not resolve.
-GRAZING = 0.4
+MAX_GRAZING_SINE = 0.4
 #: Maximum number of Newton steps, and the maximum relative change of the first guess.
 MAX_STEPS, MAX_CHANGE = 8, 0.05
 #: Relative tolerance at a triangle's edges, so that no ray passes between two triangles.
@@ -141,16 +141,17 @@ def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None
     Inverse depth is interpolated, because the inverse depth of a plane is linear in the image.
     """
     for k in range(min(width, STRIP)):
-        a, b, c, d = work[UPPER_LEFT + k], work[UPPER_RIGHT + k], work[LOWER_LEFT + k], work[LOWER_RIGHT + k]
+        upper_left, upper_right = work[UPPER_LEFT + k], work[UPPER_RIGHT + k]
+        lower_left, lower_right = work[LOWER_LEFT + k], work[LOWER_RIGHT + k]
         fu, fv = work[U + k], work[V + k]
-        smallest = min(min(a, b), min(c, d))
-        largest = max(max(a, b), max(c, d))
-        above = (1.0 - fu) / a + fu / b
-        below = (1.0 - fu) / c + fu / d
+        smallest = min(min(upper_left, upper_right), min(lower_left, lower_right))
+        largest = max(max(upper_left, upper_right), max(lower_left, lower_right))
+        above = (1.0 - fu) / upper_left + fu / upper_right
+        below = (1.0 - fu) / lower_left + fu / lower_right
         depth = 1.0 / ((1.0 - fv) * above + fv * below)
         t = depth / work[FORWARD + k] if smallest > 0.0 and largest < 1.1 * smallest else 0.0
         work[GUESS + k] = t
-        work[FOOTPRINT + k] = t * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
+        work[FOOTPRINT + k] = t * pixel_angles[k] / max(-work[DZ + k], MIN_INCIDENCE_SINE)
 
 
 @njit(cache=True, error_model="numpy")
@@ -257,7 +258,7 @@ def _select_levels(
             view = view_of_pixel[first + k]
             nearest = _nearest_depth(depth, ids, any_id[k], view, row[k], column[k], work[U + k], work[V + k])
             work[GUESS + k] = nearest / work[FORWARD + k]
-            work[FOOTPRINT + k] = work[GUESS + k] * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
+            work[FOOTPRINT + k] = work[GUESS + k] * pixel_angles[k] / max(-work[DZ + k], MIN_INCIDENCE_SINE)
         level_of[k] = 0
         if work[GUESS + k] == 0.0:
             work[GUESS + k] = -1.0
@@ -296,7 +297,7 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
     centre = (pose.position[0], pose.position[1], pose.position[2])
     origins, directions = rays.origins.reshape(-1), rays.directions.reshape(-1)
     levels, ceilings, top_level, spacing, extent = ground
-    fetched = no_cells()
+    fetched = allocate_cells()
     work, pixels = np.empty(ROWS * ROW), rays.directions.shape[0]
     index_buffers = np.empty((4, STRIP), dtype=np.int64)
     level_of, refined = index_buffers[2], index_buffers[3]
@@ -311,7 +312,7 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
         _select_levels(spacing, top_level, views, angles, first, width, strip)
         count = 0
         for k in range(width):
-            if work[DZ + k] > -GRAZING and work[DISTANCE + k] < math.inf:
+            if work[DZ + k] > -MAX_GRAZING_SINE and work[DISTANCE + k] < math.inf:
                 # first intersection of a grazing ray with the ground
                 n = level_of[k]
                 level = GroundLevel(levels[n], ceilings[n], 1.0 / spacing / (1 << n))

@@ -11,19 +11,26 @@ from numba import njit
 from marsyard.sim.render.kernels.casters import Casters, sun_hidden
 from marsyard.sim.render.kernels.microrelief import add_relief_slopes, smith_shadowing
 from marsyard.sim.render.kernels.photometry import add_texture, sky_brightness
-from marsyard.sim.render.kernels.primary import FLATTEST
+from marsyard.sim.render.kernels.primary import MIN_INCIDENCE_SINE
 from marsyard.sim.render.kernels.strips import (
     ROW,
     STRIP,
     FetchedCells,
     Matrix,
+    allocate_cells,
     fetch_levels,
-    no_cells,
     rotate,
     spline,
     unpack_matrix,
 )
 from marsyard.sim.render.kernels.structs import (
+    CASTER_DIAMETER,
+    CLOUD_CELLS_PER_METRE,
+    CLOUD_HEIGHT,
+    CLOUD_OPACITY,
+    DRIFT_EAST,
+    DRIFT_NORTH,
+    SUN_RADIUS,
     Array32,
     Flags,
     Footprint,
@@ -52,21 +59,20 @@ from marsyard.sim.render.kernels.sun import (
 from marsyard.sim.terrain.kernels import Array, Level, sample
 
 #: Maximum footprint, in samples, for which the finest level is used; the B-spline contains no finer detail.
-SHARP_UNTIL = 1.2
+MAX_SHARP_FOOTPRINT = 1.2
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
 #: Rows of a strip's buffer: position, direction of the line of sight, footprint (infinite without ground), height,
 #: slopes and albedo of the terrain, normal, logarithm of the texture's relative albedo, cosines of incidence, emission
 #: and phase angles, visible fraction of the sun.
-X, Y, Z, DX, DY, DZ, FOOTPRINT, HEIGHT, SLOPE_X, SLOPE_Y, ALBEDO, NX, NY, NZ, CHANGE, COS_I, COS_E, COS_G, LIT = (
-    ROW * n for n in range(19)
-)
+X, Y, Z, DX, DY, DZ, FOOTPRINT, HEIGHT, SLOPE_X, SLOPE_Y, ALBEDO, NX, NY, NZ = (ROW * n for n in range(14))
+LOG_ALBEDO, COS_I, COS_E, COS_G, SUN_FRACTION = (ROW * n for n in range(14, 19))
 #: Rows of the ground's level: samples per metre, weight of the next coarser level, and terrain of the coarser level.
 SCALE, BLEND, COARSE_HEIGHT, COARSE_SLOPE_X, COARSE_SLOPE_Y, COARSE_ALBEDO = (ROW * n for n in range(19, 25))
 #: Rows of the pixels with objects: position, footprint and logarithm of the relative albedo.
-OBJECT_X, OBJECT_Y, OBJECT_Z, OBJECT_FOOTPRINT, OBJECT_CHANGE = (ROW * n for n in range(25, 30))
+OBJECT_X, OBJECT_Y, OBJECT_Z, OBJECT_FOOTPRINT, OBJECT_LOG_ALBEDO = (ROW * n for n in range(25, 30))
 #: Rows of the micro-relief: slopes, resolved and unresolved variance of slope, strength of texture, and roughness.
-FINE_X, FINE_Y, RESOLVED, UNRESOLVED, STRENGTH, ROUGHNESS = (ROW * n for n in range(30, 36))
+RELIEF_SLOPE_X, RELIEF_SLOPE_Y, RESOLVED, UNRESOLVED, STRENGTH, ROUGHNESS = (ROW * n for n in range(30, 36))
 ROWS = 36
 
 
@@ -129,9 +135,9 @@ def _locate_pixels(
         work[Y + k] = centre[1] + y + t * dy
         work[Z + k] = centre[2] + z + t * dz
         work[DX + k], work[DY + k], work[DZ + k] = dx, dy, dz
-        work[FOOTPRINT + k] = t * pixel_angles[k] / math.sqrt(max(-dz, FLATTEST))
-        work[CHANGE + k] = 0.0
-        work[LIT + k] = 1.0
+        work[FOOTPRINT + k] = t * pixel_angles[k] / math.sqrt(max(-dz, MIN_INCIDENCE_SINE))
+        work[LOG_ALBEDO + k] = 0.0
+        work[SUN_FRACTION + k] = 1.0
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -183,8 +189,8 @@ def _select_levels(spacing: float, top_level: int, hits: Hits, strip: _Strip) ->
             n_other += 1
             continue
         lower = 0
-        if level[k] > 0 or work[FOOTPRINT + k] > SHARP_UNTIL * spacing:
-            footprint_level = math.log2(max(work[FOOTPRINT + k] / (SHARP_UNTIL * spacing), 1.0))
+        if level[k] > 0 or work[FOOTPRINT + k] > MAX_SHARP_FOOTPRINT * spacing:
+            footprint_level = math.log2(max(work[FOOTPRINT + k] / (MAX_SHARP_FOOTPRINT * spacing), 1.0))
             fractional = max(footprint_level, float(level[k]))
             lower = min(int(fractional), top_level)
             if lower < top_level and fractional > lower:
@@ -252,7 +258,7 @@ def _sample_objects(
         work[OBJECT_X + count], work[OBJECT_Y + count], work[OBJECT_Z + count] = (work[X + k], work[Y + k], work[Z + k])
         facing = -(work[DX + k] * work[NX + k] + work[DY + k] * work[NY + k] + work[DZ + k] * work[NZ + k])
         work[OBJECT_FOOTPRINT + count] = distance[k] * pixel_angles[k] / math.sqrt(max(facing, 0.05))
-        work[OBJECT_CHANGE + count] = 0.0
+        work[OBJECT_LOG_ALBEDO + count] = 0.0
         other[count] = k
         count += 1
     return count
@@ -271,9 +277,9 @@ def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
     if relief.heights.size == 0:
         return
     x, y, footprint = work[X : X + width], work[Y : Y + width], work[FOOTPRINT : FOOTPRINT + width]
-    fine_x, fine_y = work[FINE_X : FINE_X + width], work[FINE_Y : FINE_Y + width]
+    relief_x, relief_y = work[RELIEF_SLOPE_X : RELIEF_SLOPE_X + width], work[RELIEF_SLOPE_Y : RELIEF_SLOPE_Y + width]
     resolved, unresolved = work[RESOLVED : RESOLVED + width], work[UNRESOLVED : UNRESOLVED + width]
-    add_relief_slopes(x, y, footprint, relief, fine_x, fine_y, resolved, unresolved)
+    add_relief_slopes(x, y, footprint, relief, relief_x, relief_y, resolved, unresolved)
     for k in range(width):
         factor = 0.0
         if footprint[k] < math.inf:
@@ -284,8 +290,8 @@ def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
         factor, is_ground = work[ROUGHNESS + k], work[FOOTPRINT + k] < math.inf
         work[RESOLVED + k] *= factor * factor
         work[UNRESOLVED + k] *= factor * factor
-        slope_x = work[SLOPE_X + k] + factor * work[FINE_X + k]
-        slope_y = work[SLOPE_Y + k] + factor * work[FINE_Y + k]
+        slope_x = work[SLOPE_X + k] + factor * work[RELIEF_SLOPE_X + k]
+        slope_y = work[SLOPE_Y + k] + factor * work[RELIEF_SLOPE_Y + k]
         nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
         work[NX + k] = -slope_x * nz if is_ground else work[NX + k]
         work[NY + k] = -slope_y * nz if is_ground else work[NY + k]
@@ -297,7 +303,7 @@ def _shade_roughness(width: int, work: Array) -> None:
     """Restore the mean radiance after the normals were tilted, and darken by shadows of unresolved relief."""
     for k in range(min(width, STRIP)):
         cosine = min(max(work[COS_I + k], 1e-6), 1.0)
-        work[LIT + k] *= (1.0 + work[RESOLVED + k]) * smith_shadowing(cosine, work[UNRESOLVED + k])
+        work[SUN_FRACTION + k] *= (1.0 + work[RESOLVED + k]) * smith_shadowing(cosine, work[UNRESOLVED + k])
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -307,9 +313,8 @@ def _apply_texture(materials: Materials, width: int, n_objects: int, strip: _Str
     coarsest, amplitudes = materials.ground_texture
     x, y, z = work[X : X + width], work[Y : Y + width], work[Z : Z + width]
     strength = work[STRENGTH : STRENGTH + width]
-    add_texture(
-        x, y, z, work[FOOTPRINT : FOOTPRINT + width], coarsest, amplitudes, strength, work[CHANGE : CHANGE + width]
-    )
+    footprint, change = work[FOOTPRINT : FOOTPRINT + width], work[LOG_ALBEDO : LOG_ALBEDO + width]
+    add_texture(x, y, z, footprint, coarsest, amplitudes, strength, change)
     if n_objects > 0:
         coarsest, amplitudes = materials.object_texture
         x, y, z = (
@@ -319,15 +324,16 @@ def _apply_texture(materials: Materials, width: int, n_objects: int, strip: _Str
         )
         footprint, change = (
             work[OBJECT_FOOTPRINT : OBJECT_FOOTPRINT + n_objects],
-            work[OBJECT_CHANGE : OBJECT_CHANGE + n_objects],
+            work[OBJECT_LOG_ALBEDO : OBJECT_LOG_ALBEDO + n_objects],
         )
-        work[FINE_X : FINE_X + n_objects] = 1.0
-        add_texture(x, y, z, footprint, coarsest, amplitudes, work[FINE_X : FINE_X + n_objects], change)
+        # full strength; the row of relief slopes is free at this point
+        work[RELIEF_SLOPE_X : RELIEF_SLOPE_X + n_objects] = 1.0
+        add_texture(x, y, z, footprint, coarsest, amplitudes, work[RELIEF_SLOPE_X : RELIEF_SLOPE_X + n_objects], change)
         for m in range(n_objects):
-            work[CHANGE + strip.other[m]] = work[OBJECT_CHANGE + m]
+            work[LOG_ALBEDO + strip.other[m]] = work[OBJECT_LOG_ALBEDO + m]
     for k in range(width):
-        if work[CHANGE + k] != 0.0:
-            work[ALBEDO + k] *= math.exp(work[CHANGE + k])
+        if work[LOG_ALBEDO + k] != 0.0:
+            work[ALBEDO + k] *= math.exp(work[LOG_ALBEDO + k])
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -345,7 +351,7 @@ def _cast_shadows(
 
     `terrain` is the level on whose grid the ground's shadow was computed.
     """
-    sun, radius = light.sun, light.law[7]
+    sun, radius = light.sun, light.law[SUN_RADIUS]
     distance, triangle, level = hits.distance, hits.triangle, hits.level
     work, other, hidden = strip.work, strip.other, strip.hidden
     shadow, casters, footprint = occluders
@@ -359,7 +365,7 @@ def _cast_shadows(
         x, y, z = work[X + k], work[Y + k], work[Z + k]
         on_object = triangle[k] >= 0
         on_finest_level = level[k] == 0
-        lit = 1.0
+        sun_fraction = 1.0
         if has_shadow:
             if not on_object and not on_finest_level:
                 # a pixel on a smoothed level must not be shaded by bumps of the finest level
@@ -369,14 +375,14 @@ def _cast_shadows(
             clearance, rows = shadow_clearance(shadow, x, y, z)
             half_penumbra = penumbra(shadow, radius, 0.0, rows)
             if on_object or not on_finest_level:
-                lit = disc_above(clearance / half_penumbra)
+                sun_fraction = disc_above(clearance / half_penumbra)
             elif clearance <= -margin - half_penumbra:
-                lit = 0.0
+                sun_fraction = 0.0
             elif clearance < margin + half_penumbra:
                 # at the edge of the shadow the grid is too coarse: march towards the sun
-                lit = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
-        work[LIT + k] = lit
-        if lit > 0.0 and has_objects and (on_object or _in_footprint(footprint, x, y)):
+                sun_fraction = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
+        work[SUN_FRACTION + k] = sun_fraction
+        if sun_fraction > 0.0 and has_objects and (on_object or _in_footprint(footprint, x, y)):
             # an offset along the normal prevents shading by the facet itself because of rounding
             offset = 1e-4 + (0.05 * distance[k] * pixel_angles[k] if on_object else 0.0)
             work[OBJECT_X + n_tested] = x + offset * work[NX + k]
@@ -389,12 +395,12 @@ def _cast_shadows(
         zs = work[OBJECT_Z : OBJECT_Z + n_tested]
         sun_hidden(casters, xs, ys, zs, hidden)
         for m in range(n_tested):
-            work[LIT + other[m]] *= 0.0 if hidden[m] else 1.0
+            work[SUN_FRACTION + other[m]] *= 0.0 if hidden[m] else 1.0
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def photometric_angles(sun: tuple[float, float, float], width: int, work: Array) -> None:
-    """Cosines of incidence, emission and phase."""
+    """Compute the cosines of the incidence, emission and phase angles."""
     for k in range(min(width, STRIP)):
         dx, dy, dz = work[DX + k], work[DY + k], work[DZ + k]
         nx, ny, nz = work[NX + k], work[NY + k], work[NZ + k]
@@ -413,7 +419,7 @@ def reflect(law: tuple[float, float, float, float, float, float], width: int, wo
         surge = 1.0 + amplitude / (1.0 + tan_half / surge_width)
         brightness = normalisation * surge * (2.0 * lunar * cos_i / (cos_i + work[COS_E + k]) + (1.0 - lunar) * cos_i)
         value = sky_fraction * 0.5 * (1.0 + nz) + ground_light * 0.5 * (1.0 - nz)
-        value += work[LIT + k] * brightness if cos_i > 0.0 else 0.0
+        value += work[SUN_FRACTION + k] * brightness if cos_i > 0.0 else 0.0
         radiance[k] = work[ALBEDO + k] * value
 
 
@@ -421,22 +427,23 @@ def reflect(law: tuple[float, float, float, float, float, float], width: int, wo
 def dim_sun(light: Light, distance: Array, work: Array) -> None:
     """Reduce the visible fraction of the sun by a round body at the camera, and by clouds."""
     sun, law, drift, cover = light.sun, light.law, light.drift, light.cover
+    diameter, sun_radius, opacity = law[CASTER_DIAMETER], law[SUN_RADIUS], drift[CLOUD_OPACITY]
     for k in range(distance.size):
         if work[COS_I + k] <= 0.0:
             continue
         cos_g = work[COS_G + k]
-        if law[6] > 0.0 and cos_g > 0.9:
-            work[LIT + k] *= 1.0 - disc_overlap(0.5 * law[6] / distance[k], law[7], math.acos(cos_g))
-        if drift[4] > 0.0:
-            path = max(drift[1] - work[Z + k], 0.0) / sun[2]
-            x, y = work[X + k] + path * sun[0] - drift[2], work[Y + k] + path * sun[1] - drift[3]
-            work[LIT + k] *= 1.0 - drift[4] * interpolate_bilinear(cover, drift[0], x, y)[0]
+        if diameter > 0.0 and cos_g > 0.9:
+            work[SUN_FRACTION + k] *= 1.0 - disc_overlap(0.5 * diameter / distance[k], sun_radius, math.acos(cos_g))
+        if opacity > 0.0:
+            path = max(drift[CLOUD_HEIGHT] - work[Z + k], 0.0) / sun[2]
+            x, y = work[X + k] + path * sun[0] - drift[DRIFT_EAST], work[Y + k] + path * sun[1] - drift[DRIFT_NORTH]
+            work[SUN_FRACTION + k] *= 1.0 - opacity * interpolate_bilinear(cover, drift[CLOUD_CELLS_PER_METRE], x, y)[0]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def shade_sky(light: Light, pixel_angles: Array32, body: Ints, work: Array, radiance: Array32) -> None:
     """Compute the radiance factor of the sky pixels."""
-    sun, sky, radius = light.sun, light.sky, light.law[7]
+    sun, sky, radius = light.sun, light.sky, light.law[SUN_RADIUS]
     for k in range(body.size):
         if body[k] == SKY:
             cos_g = work[DX + k] * sun[0] + work[DY + k] * sun[1] + work[DZ + k] * sun[2]
@@ -464,7 +471,7 @@ def shade(
     levels, spacing = ground.levels, ground.spacing
     finest = GroundLevel(levels[0], ground.ceilings[0], 1.0 / spacing)
     terrain = levels[occluders.shadow.level]
-    fetched = no_cells()
+    fetched = allocate_cells()
     work = np.empty(ROWS * ROW)
     index_buffers = np.empty((4, STRIP), dtype=np.int64)
     strip = _Strip(
@@ -493,7 +500,7 @@ def shade(
         photometric_angles(sun, width, work)
         _apply_texture(materials, width, n_objects, strip)
         _cast_shadows(finest, terrain, strip_hits, angles, light, occluders, body, strip)
-        if law[6] > 0.0 or light.drift[4] > 0.0:
+        if law[CASTER_DIAMETER] > 0.0 or light.drift[CLOUD_OPACITY] > 0.0:
             dim_sun(light, strip_hits.distance, work)
         if materials.relief.heights.size > 0:
             _shade_roughness(width, work)

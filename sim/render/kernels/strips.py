@@ -29,7 +29,7 @@ CELLS = 2 * 16 * ROW
 
 
 @njit(cache=True)
-def no_cells() -> FetchedCells:
+def allocate_cells() -> FetchedCells:
     """Allocate buffers for the control values around the positions of a strip."""
     return np.empty(CELLS, dtype=np.float32), np.empty(2 * ROW), np.empty(STRIP, dtype=np.int64)
 
@@ -58,6 +58,7 @@ def fetch_cells(
     """
     side = field.shape[0]
     mask = side - 1
+    # a height and an albedo, 32 bits each, are copied as one integer of 64 bits
     pairs = field.reshape(-1).view(np.int64)
     copies = cells.view(np.int64)
     for m in range(count):

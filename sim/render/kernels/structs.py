@@ -135,6 +135,12 @@ class Footprint(NamedTuple):
     per_metre: float
 
 
+#: Elements of `Light.law` that describe shadows: diameter of the body at the camera, and angular radius of the sun.
+CASTER_DIAMETER, SUN_RADIUS = 6, 7
+#: Elements of `Light.drift`.
+CLOUD_CELLS_PER_METRE, CLOUD_HEIGHT, DRIFT_EAST, DRIFT_NORTH, CLOUD_OPACITY = range(5)
+
+
 class Light(NamedTuple):
     """Illumination at one time.
 

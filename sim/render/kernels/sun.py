@@ -11,7 +11,7 @@ from marsyard.sim.render.kernels.structs import Array32, Bytes, GroundShadow, Lo
 from marsyard.sim.terrain.kernels import Array, Level, sample
 
 #: Unit of the stored distances of shadow casters, in rows of the grid.
-REACH_ROWS = 4
+CASTER_UNIT_ROWS = 4
 #: Margin above the shadow boundary, in grid spacings, within which the swept grid is not accurate enough.
 COARSE_GRID_MARGIN = 0.3
 #: Side of the blocks in which a grid is transposed: source and destination fit in the processor's first-level cache.
@@ -50,7 +50,7 @@ def sweep_shadow(height: Array32, row_sign: float, drop: float, shift: float, ma
     sun, minus `drop` metres and shifted by `-shift` columns. `row_sign` is 1.0 if the row number increases towards the
     sun, else -1.0. `max_rows` is the length of the longest shadow in rows; the sweep starts at this distance.
 
-    Returns the shadow height, and the distance of the caster in units of `REACH_ROWS` rows, rounded up.
+    Returns the shadow height, and the distance of the caster in units of `CASTER_UNIT_ROWS` rows, rounded up.
     """
     rows, columns = height.shape
     row_mask, column_mask = rows - 1, columns - 1
@@ -79,7 +79,7 @@ def sweep_shadow(height: Array32, row_sign: float, drop: float, shift: float, ma
         if step < rows:
             for j in range(columns):
                 shadow[i, j] = shadow_row[j]
-                caster_distance[i, j] = min((shadow_rows[j] + REACH_ROWS - 1) // REACH_ROWS, 255)
+                caster_distance[i, j] = min((shadow_rows[j] + CASTER_UNIT_ROWS - 1) // CASTER_UNIT_ROWS, 255)
     return shadow, caster_distance
 
 
@@ -102,10 +102,10 @@ def interpolate_bilinear(
 def shadow_clearance(shadow: GroundShadow, x: float, y: float, z: float) -> tuple[float, float]:
     """Height of a position above the ground's shadow, metres, and distance of the shadow's caster in rows."""
     column, row = (y, x) if shadow.along_x else (x, y)
-    edge, (i0, i1), (j0, j1) = interpolate_bilinear(shadow.height, 1.0 / shadow.spacing, column, row)
+    shadow_height, (i0, i1), (j0, j1) = interpolate_bilinear(shadow.height, 1.0 / shadow.spacing, column, row)
     distance = shadow.caster_distance
     farthest = max(max(distance[i0, j0], distance[i0, j1]), max(distance[i1, j0], distance[i1, j1]))
-    return z - edge, float(farthest * REACH_ROWS)
+    return z - shadow_height, float(farthest * CASTER_UNIT_ROWS)
 
 
 @njit(cache=True, inline="always")

@@ -152,7 +152,9 @@ class NavigationFilter:
                 np.full(2, np.radians(c.tilt_bias_deg)),
             ]
         )
-        return FilterState(state, np.diag(deviations**2), np.array([-1.0, 0.0, 0.0, 0.0, 0.0]))
+        # no solution yet, acceleration zero, no rejected solutions
+        memory = np.array([-1.0, 0.0, 0.0, 0.0, 0.0])
+        return FilterState(state, np.diag(deviations**2), memory)
 
     def run(
         self,
@@ -208,13 +210,14 @@ class NavigationFilter:
         return rows
 
     def _convert_readings(self, r: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
-        """Convert readings to rows for the kernels."""
+        """Convert readings to rows for the kernels; headings become yaw, counterclockwise from east."""
         rows = np.column_stack([r.times_s, r.up_body, 0.5 * np.pi - r.headings_rad])
         for column, values in ((kernels.UP, r.up_body), (kernels.YAW, r.headings_rad[:, None])):
             rows[_is_stuck(values, self.parameters.max_repeated_fixes), column] = np.nan
         return rows
 
     def _create_tuning(self, step_s: float) -> kernels.Tuning:
+        """Convert the parameters of filter and instruments to SI units and to factors per step."""
         i, r, c, p = self.imu, self.rtk, self.compass, self.parameters
         force_wander = i.accelerometer_wander_mg * MILLI_G
         return kernels.Tuning(

@@ -134,35 +134,37 @@ def propagate_state(state: Array, after: Array, angle: Array, velocity: Array, g
 
 
 @njit(cache=True)
-def apply_transition(m: Array, matrix: Array, force: Array, decay: float, velocity_decay: float, step: float) -> None:
-    """Multiply error vectors (the columns of `m`) by the transition matrix of a step, in place.
+def apply_transition(
+    errors: Array, matrix: Array, cross: Array, decay: float, velocity_decay: float, step: float
+) -> None:
+    """Multiply error vectors (the columns of `errors`) by the transition matrix of a step, in place.
 
-    `matrix` rotates from body to world; `force` is minus the cross-product matrix of the velocity change.
+    `matrix` rotates from body to world; `cross` is minus the cross-product matrix of the velocity change.
     """
     velocity, rotation = np.empty(3), np.empty(3)
     for j in range(ERRORS):
         for i in range(3):
             velocity[i] = rotation[i] = 0.0
             for k in range(3):
-                bias = step * matrix[i, k] * m[ACCELEROMETER_BIAS + k, j]
-                velocity[i] += force[i, k] * m[ATTITUDE_ERROR + k, j] - bias
-                rotation[i] += matrix[i, k] * m[GYRO_BIAS + k, j]
+                bias = step * matrix[i, k] * errors[ACCELEROMETER_BIAS + k, j]
+                velocity[i] += cross[i, k] * errors[ATTITUDE_ERROR + k, j] - bias
+                rotation[i] += matrix[i, k] * errors[GYRO_BIAS + k, j]
         for i in range(3):
-            m[POSITION + i, j] += step * (m[VELOCITY + i, j] + 0.5 * velocity[i])
-            m[VELOCITY + i, j] += velocity[i]
-            m[ATTITUDE_ERROR + i, j] -= step * rotation[i]
-            m[POSITION_WANDER + i, j] *= decay
-            m[VELOCITY_WANDER + i, j] *= velocity_decay
+            errors[POSITION + i, j] += step * (errors[VELOCITY + i, j] + 0.5 * velocity[i])
+            errors[VELOCITY + i, j] += velocity[i]
+            errors[ATTITUDE_ERROR + i, j] -= step * rotation[i]
+            errors[POSITION_WANDER + i, j] *= decay
+            errors[VELOCITY_WANDER + i, j] *= velocity_decay
 
 
 @njit(cache=True)
 def propagate_covariance(p: Array, matrix: Array, delta_v: Array, decay: float, t: Tuning, step: float) -> None:
     """Propagate the covariance by a step, in place: P = F P F' + Q."""
-    force = np.zeros((3, 3))
-    force[0, 1], force[0, 2], force[1, 2] = delta_v[2], -delta_v[1], delta_v[0]
-    force[1, 0], force[2, 0], force[2, 1] = -delta_v[2], delta_v[1], -delta_v[0]
-    apply_transition(p, matrix, force, decay, t.velocity_decay, step)
-    apply_transition(p.T, matrix, force, decay, t.velocity_decay, step)
+    cross = np.zeros((3, 3))
+    cross[0, 1], cross[0, 2], cross[1, 2] = delta_v[2], -delta_v[1], delta_v[0]
+    cross[1, 0], cross[2, 0], cross[2, 1] = -delta_v[2], delta_v[1], -delta_v[0]
+    apply_transition(p, matrix, cross, decay, t.velocity_decay, step)
+    apply_transition(p.T, matrix, cross, decay, t.velocity_decay, step)
     for i in range(3):
         p[VELOCITY + i, VELOCITY + i] += t.velocity_density**2 * step
         p[ATTITUDE_ERROR + i, ATTITUDE_ERROR + i] += t.attitude_density**2 * step
@@ -176,7 +178,10 @@ def propagate_covariance(p: Array, matrix: Array, delta_v: Array, decay: float, 
 def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, gate: float, log: Array) -> None:
     """Update with one scalar measurement; gains of considered errors are zero (Schmidt 1966).
 
-    Write the normalised innovation and whether it passed the gate to the last columns of `log`.
+    - h: derivatives of the measurement with respect to all errors
+    - residual, noise: measured minus expected value, and standard deviation of the measurement noise
+    - gate: maximum absolute normalised innovation of an accepted measurement
+    - log: output, normalised innovation and whether it was accepted in the last two columns
     """
     state, p = estimate
     ph = np.zeros(ERRORS)

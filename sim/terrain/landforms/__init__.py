@@ -1,4 +1,4 @@
-"""Landforms, each with its own parameters and random substream; their sum is one grid of heights and albedos."""
+"""Landforms, each with its own parameters and random substream; all add to one grid of heights and albedos."""
 
 from marsyard.sim.terrain.landforms.ground import Ground
 from marsyard.sim.terrain.landforms.relief import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell

@@ -21,11 +21,11 @@ class Ground:
     """Height and albedo of a terrain during synthesis; landforms change them in place.
 
     - height: control values of the spline, metres
-    - tone: natural logarithm of albedo divided by its mean
+    - log_albedo: natural logarithm of albedo divided by the mean albedo
     """
 
     height: Grid
-    tone: Grid
+    log_albedo: Grid
     spacing_m: float
 
     @property
@@ -41,17 +41,17 @@ class Ground:
     def coarser(self, feature_m: float) -> Ground:
         """Return an empty grid of the same extent with a spacing of at most `feature_m`, but not finer than this grid.
 
-        A landform without finer detail is computed faster on such a grid, and then added by `add`.
+        A landform without detail finer than `feature_m` is computed faster on this grid. `add` then adds it.
         """
         side = self.side
         while side > SMALLEST_SIDE and self.period_m / (side // 2) <= feature_m:
             side //= 2
-        height, tone = np.zeros((2, side, side), dtype=np.float32)
-        return Ground(height, tone, self.period_m / side)
+        height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
+        return Ground(height, log_albedo, self.period_m / side)
 
-    def add(self, part: Ground, *, tone: bool = True) -> None:
-        """Add a part computed on a coarser grid. The refinement of a B-spline is exact, and so is the sum."""
-        for total, grid in ((self.height, part.height), (self.tone, part.tone))[: 1 + tone]:
+    def add(self, part: Ground, *, include_albedo: bool = True) -> None:
+        """Add a part computed on a coarser grid. The refinement of a B-spline and therefore the sum are exact."""
+        for total, grid in ((self.height, part.height), (self.log_albedo, part.log_albedo))[: 1 + include_albedo]:
             if grid.shape == total.shape:
                 total += grid
             else:
@@ -67,7 +67,7 @@ def refine(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[n
     return coarse
 
 
-def resample(field: Float32[np.ndarray, "own own"], side: int) -> Float32[np.ndarray, "side side"]:
+def resample(field: Float32[np.ndarray, "rows rows"], side: int) -> Float32[np.ndarray, "side side"]:
     """Refine or decimate a smooth field to a grid with `side` samples along each side."""
     step = max(field.shape[0] // side, 1)
     return refine(np.ascontiguousarray(field[::step, ::step]), side)
@@ -78,8 +78,8 @@ def draw_smooth_fields(
 ) -> Float32[np.ndarray, "side side 2"]:
     """Draw two independent smooth random fields; the mean of the sum of their squares is 1.
 
-    The spectrum is Gaussian with correlation lengths (1/e of the amplitude spectrum at wavenumber sqrt(2)/length)
-    across and along a direction (azimuth of "along", counter-clockwise from x).
+    The amplitude spectrum is Gaussian: it falls to 1/e at the wavenumber sqrt(2)/length. The correlation length differs
+    along and across the direction `azimuth_rad`, counter-clockwise from x.
     """
     shortest = min(length_across_m, length_along_m)
     side = SMALLEST_SIDE
@@ -131,7 +131,7 @@ class Spectrum:
         elongation: float = 1.0,
         azimuth_rad: float = 0.0,
     ) -> Spectrum:
-        """Power spectral density ``(k**2 + k0**2)**-(hurst + 1)`` with k0 the wavenumber of the outer scale.
+        """Create a power spectral density ``(k**2 + k0**2)**-(hurst + 1)`` with k0 the wavenumber of the outer scale.
 
         Above k0 the field is self-affine with the Hurst exponent; below it is white. Features are `elongation` times as
         long along a direction (counter-clockwise from x) as across it.
@@ -144,12 +144,12 @@ class Spectrum:
         squared += np.float32((2.0 * np.pi / outer_scale_m) ** 2)
         amplitude = np.exp(np.float32(-(hurst + 1.0) / 2.0) * np.log(squared))
         amplitude[0, 0] = 0.0
-        return cls(amplitude, spacing_m, _column_power(amplitude))
+        return cls(amplitude, spacing_m, _compute_column_power(amplitude))
 
     def apply_low_pass(self, wavelength_m: float) -> Spectrum:
         """Return the spectrum after a Gaussian low-pass filter that attenuates waves shorter than `wavelength_m`."""
-        amplitude = self.amplitude * _low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m)
-        return Spectrum(amplitude, self.spacing_m, _column_power(amplitude))
+        amplitude = self.amplitude * _compute_low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m)
+        return Spectrum(amplitude, self.spacing_m, _compute_column_power(amplitude))
 
     def draw_field(self, rng: Generator, scale: float) -> Float32[np.ndarray, "samples samples"]:
         """Draw a Gaussian random field with the expected variance ``scale**2``, by filtered white noise.
@@ -157,19 +157,22 @@ class Spectrum:
         The variance of a single field differs from its expectation. The transform uses one thread, so that the result
         does not depend on the number of threads.
         """
-        return self._transform(self._modes(rng), scale)
+        return self._transform(self._draw_modes(rng), scale)
 
     def draw_split_field(
         self, rng: Generator, scale: float, wavelength_m: float
     ) -> tuple[Float32[np.ndarray, "samples samples"], Float32[np.ndarray, "samples samples"]]:
         """Draw the field of `draw_field` as the sum of a coarse and a fine part, separated at a wavelength."""
-        modes = self._modes(rng)
-        coarse = self._transform(modes * _low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m), scale)
+        modes = self._draw_modes(rng)
+        coarse = self._transform(
+            modes * _compute_low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m), scale
+        )
         fine = self._transform(modes, scale)
         fine -= coarse
         return coarse, fine
 
-    def _modes(self, rng: Generator) -> Complex64[np.ndarray, "samples half"]:
+    def _draw_modes(self, rng: Generator) -> Complex64[np.ndarray, "samples half"]:
+        """Draw the Fourier modes of a field: white noise times the amplitude."""
         samples, half = self.amplitude.shape
         noise = rng.standard_normal((samples, half, 2), dtype=np.float32).view(np.complex64)[..., 0]
         noise *= self.amplitude
@@ -181,6 +184,7 @@ class Spectrum:
     def _transform(
         self, modes: Complex64[np.ndarray, "samples half"], scale: float
     ) -> Float32[np.ndarray, "samples samples"]:
+        """Transform modes to a field with the expected variance ``scale**2``."""
         samples = modes.shape[0]
         field = scipy.fft.irfft2(modes, s=(samples, samples), workers=1, overwrite_x=True)
         # complex noise has variance 2; irfft2 divides by samples**2
@@ -198,14 +202,14 @@ class Spectrum:
         return float(np.sqrt(square) / baseline_m)
 
 
-def _column_power(amplitude: Float32[np.ndarray, "samples half"]) -> Float64[np.ndarray, "half"]:
+def _compute_column_power(amplitude: Float32[np.ndarray, "samples half"]) -> Float64[np.ndarray, "half"]:
     power = np.einsum("ij,ij->j", amplitude, amplitude, dtype=np.float64)
     # each mode of the half spectrum represents two conjugate modes, except in the first and last column
     power[1:-1] *= 2.0
     return np.asarray(power)
 
 
-def _low_pass(samples: int, spacing_m: float, wavelength_m: float) -> Float32[np.ndarray, "samples half"]:
+def _compute_low_pass(samples: int, spacing_m: float, wavelength_m: float) -> Float32[np.ndarray, "samples half"]:
     """Compute a Gaussian filter with the gain exp(-1/2) at a wavelength."""
     along_y = scipy.fft.fftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)
     along_x = scipy.fft.rfftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)

@@ -59,22 +59,23 @@ def add_refined(fine: Grid, coarse: Grid) -> None:
 
 
 @njit(cache=True)
-def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reach: float) -> None:
+def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array, max_r: float) -> None:
     """Add bowls, rims and ejecta of craters to height and to the logarithm of albedo, in order.
 
     Each crater is a row of `craters`:
 
     - x, y, radius; depth below the surroundings, rim height, width of the rounded rim crest, all in metres
-    - fraction of the depth that is filled; tones (changes of the logarithm of albedo) of the ejecta and of the floor
+    - fraction of the depth that is filled; changes of the logarithm of albedo on the ejecta and on the floor
     - three pairs of cosine and sine terms of the outline with two, three and five lobes; phase of the rays
 
-    Where the outline is displaced inwards, the rim is lower.
+    `max_r` is the maximum distance of ejecta from the centre, in radii. The rim is lower where the outline is displaced
+    inwards.
     """
     mask = height.shape[0] - 1
     for n in range(craters.shape[0]):
-        x, y, radius, depth, rim, rounding, fill, ejecta_tone, floor_tone = craters[n, :9]
+        x, y, radius, depth, rim, rounding, fill, ejecta_log_albedo, floor_log_albedo = craters[n, :9]
         c2, s2, c3, s3, c5, s5, phase = craters[n, 9:]
-        extent = reach * radius * 1.1
+        extent = max_r * radius * 1.1
         cos_phase_7, sin_phase_7 = math.cos(phase), math.sin(phase)
         cos_phase_12, sin_phase_12 = math.cos(2.3 * phase), math.sin(2.3 * phase)
         # depth of the bowl before its fill
@@ -93,11 +94,12 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                 cos_3, sin_3 = cos_2 * c - sin_2 * s, sin_2 * c + cos_2 * s
                 cos_5, sin_5 = cos_3 * cos_2 - sin_3 * sin_2, sin_3 * cos_2 + cos_3 * sin_2
                 lobes = c2 * cos_2 + s2 * sin_2 + c3 * cos_3 + s3 * sin_3 + c5 * cos_5 + s5 * sin_5
+                # distance from the centre in local radii: 1 on the rim
                 r = d / (radius * (1.0 + lobes))
-                if r >= reach:
+                if r >= max_r:
                     continue
                 outside = max(r, 0.6)
-                fade = min((reach - r) / (reach - 1.0), 1.0)
+                fade = min((max_r - r) / (max_r - 1.0), 1.0)
                 notched_rim = rim * max(1.0 + RIM_HEIGHT_SENSITIVITY * lobes, 0.0)
                 blanket = notched_rim / (outside * outside * outside) * fade
                 rays = 0.0
@@ -110,7 +112,7 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                     ) * sin_phase_12
                     blanket *= 1.0 + 0.25 * rays * min(2.0 * (r - 1.0), 1.0)
                 change = blanket
-                # outside, the extended wall of the bowl soon rises above the ejecta blanket: the lower one is used
+                # the profile is the lower one of the bowl, extended outwards, and the ejecta blanket
                 if r <= 1.0 or (rim + bottom) * r * r - bottom < blanket + rounding:
                     bowl = (rim + bottom) * r**2.2 - bottom
                     if fill > 0.0:
@@ -121,25 +123,25 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                     change = min(bowl, blanket) - overlap * overlap / (4.0 * max(rounding, 1e-9))
                 row, column = i & mask, j & mask
                 height[row, column] += change
-                if ejecta_tone != 0.0:
-                    light = fade * fade * (1.0 + 0.5 * rays) if r > 1.0 else 1.0
-                    tone[row, column] += ejecta_tone * max(light, 0.0)
-                if floor_tone != 0.0 and r < 1.1:
+                if ejecta_log_albedo != 0.0:
+                    strength = fade * fade * (1.0 + 0.5 * rays) if r > 1.0 else 1.0
+                    log_albedo[row, column] += ejecta_log_albedo * max(strength, 0.0)
+                if floor_log_albedo != 0.0 and r < 1.1:
                     # constant over the floor, zero at the rim
-                    tone[row, column] += floor_tone * min(max((1.1 - r) / 0.5, 0.0), 1.0)
+                    log_albedo[row, column] += floor_log_albedo * min(max((1.1 - r) / 0.5, 0.0), 1.0)
 
 
 @njit(cache=True)
-def stamp_cover(factors: Grid, spacing: float, craters: Array, reach: float) -> None:
+def scale_roughness(factors: Grid, spacing: float, craters: Array, max_r: float) -> None:
     """Scale the amplitude of fine relief: lower on filled crater floors, higher on fresh ejecta.
 
     `factors` is the relative amplitude on a grid. `craters` has rows (x, y, radius, factor on the floor, factor on the
-    ejecta).
+    ejecta). `max_r` is the maximum distance of ejecta from the centre, in radii.
     """
     mask = factors.shape[0] - 1
     for n in range(craters.shape[0]):
         x, y, radius, floor, ejecta = craters[n]
-        extent = reach * radius
+        extent = max_r * radius
         for i in range(math.ceil((y - extent) / spacing), math.floor((y + extent) / spacing) + 1):
             dy = i * spacing - y
             for j in range(math.ceil((x - extent) / spacing), math.floor((x + extent) / spacing) + 1):
@@ -147,19 +149,19 @@ def stamp_cover(factors: Grid, spacing: float, craters: Array, reach: float) -> 
                 r = math.sqrt(dx * dx + dy * dy) / radius
                 if r < 1.0:
                     factors[i & mask, j & mask] *= floor + (ejecta - floor) * r * r * r * r
-                elif r < reach:
-                    factors[i & mask, j & mask] *= 1.0 + (ejecta - 1.0) * (reach - r) / (reach - 1.0)
+                elif r < max_r:
+                    factors[i & mask, j & mask] *= 1.0 + (ejecta - 1.0) * (max_r - r) / (max_r - 1.0)
 
 
 @njit(cache=True)
-def stamp_streaks(tone: Grid, spacing: float, streaks: Array) -> None:
-    """Add wind tails to the logarithm of albedo: rows (x, y, half width, length, cosine and sine downwind, tone).
+def stamp_streaks(log_albedo: Grid, spacing: float, streaks: Array) -> None:
+    """Add wind tails to the logarithm of albedo: rows (x, y, half width, length, cosine and sine downwind, log_albedo).
 
     A tail begins at (x, y), widens downwind and fades to its end and its sides.
     """
-    mask = tone.shape[0] - 1
+    mask = log_albedo.shape[0] - 1
     for n in range(streaks.shape[0]):
-        x, y, half_width, length, c, s, streak_tone = streaks[n]
+        x, y, half_width, length, c, s, streak_log_albedo = streaks[n]
         max_half_width = 1.6 * half_width
         reach_x = max(c * length, 0.0) + max_half_width, max(-c * length, 0.0) + max_half_width
         reach_y = max(s * length, 0.0) + max_half_width, max(-s * length, 0.0) + max_half_width
@@ -173,8 +175,8 @@ def stamp_streaks(tone: Grid, spacing: float, streaks: Array) -> None:
                 across = (c * dy - s * dx) / (half_width * (0.8 + 0.8 * along))
                 if abs(across) < 1.0:
                     side = 1.0 - across * across
-                    tone[i & mask, j & mask] += (
-                        streak_tone * side * side * (1.0 - along) * min(along * length / half_width, 1.0)
+                    log_albedo[i & mask, j & mask] += (
+                        streak_log_albedo * side * side * (1.0 - along) * min(along * length / half_width, 1.0)
                     )
 
 
@@ -197,35 +199,43 @@ def _arctan2(x: float, y: float) -> float:
 # Without Python's check for a division by zero, and without calls, the loop is compiled to vector instructions.
 @njit(cache=True, error_model="numpy")
 def _add_row_of_dunes(
-    height: GridRow, tone: GridRow, real: Array, imaginary: Array, first_phase: float, spacing: float, dunes: Bedforms
+    height: GridRow,
+    log_albedo: GridRow,
+    real: Array,
+    imaginary: Array,
+    first_phase: float,
+    spacing: float,
+    dunes: Bedforms,
 ) -> None:
     """Add dunes along a row from the complex modulation at its samples and the plane wave's phase at the first one."""
     phase_step, crest, contrast = dunes.wave_x * spacing, dunes.crest_m, dunes.contrast
     wave = math.sqrt(dunes.wave_x * dunes.wave_x + dunes.wave_y * dunes.wave_y)
-    # the upper half of the slip face is plane, the lower half concave: it is 4/3 as long as a plane face
-    slip_of_height = 4.0 / 3.0 * wave / (2.0 * math.pi * dunes.slip_face_slope)
+    # the upper half of the slip face is plane, the lower half concave: it is 4/3 as long as a plane face;
+    # the length of the slip face is expressed as a fraction of the wavelength
+    slip_per_height = 4.0 / 3.0 * wave / (2.0 * math.pi * dunes.slip_face_slope)
     for j in range(height.shape[0]):
         strength = math.sqrt(real[j] * real[j] + imaginary[j] * imaginary[j])
         crest_height = crest * min(strength, 1.6)
         cycles = (first_phase + j * phase_step + _arctan2(real[j], imaginary[j])) / (2.0 * math.pi)
+        # position in the wavelength, 0 and 1 at the troughs; v and w: position on the stoss slope and on the slip face
         u = cycles - np.floor(cycles)
-        slip = min(max(slip_of_height * crest_height, 0.01), 0.5)
+        slip = min(max(slip_per_height * crest_height, 0.01), 0.5)
         v = u / (1.0 - slip)
         stoss = 0.25 * v + 0.75 * v * v * (3.0 - 2.0 * v)
         w = (1.0 - u) / slip
-        face = 4.0 / 3.0 * w - 1.0 / 3.0 if w > 0.5 else 4.0 / 3.0 * w * w
-        shape = stoss if u < 1.0 - slip else face
+        slip_face = 4.0 / 3.0 * w - 1.0 / 3.0 if w > 0.5 else 4.0 / 3.0 * w * w
+        shape = stoss if u < 1.0 - slip else slip_face
         height[j] += crest_height * shape
-        tone[j] += contrast * (shape - 0.5) * min(strength, 1.0)
+        log_albedo[j] += contrast * (shape - 0.5) * min(strength, 1.0)
 
 
 @njit(cache=True)
-def add_dunes(height: Grid, tone: Grid, spacing: float, modulation: Level, dunes: Bedforms) -> None:
+def add_dunes(height: Grid, log_albedo: Grid, spacing: float, modulation: Level, dunes: Bedforms) -> None:
     """Add transverse dunes: a gentle stoss slope up to the crest, a slip face, a concave apron.
 
     The dunes are a plane wave multiplied by a smooth complex amplitude of unit mean square: its argument shifts the
-    phase, its modulus scales the height. `modulation` contains the B-spline coefficients of this amplitude on a grid of
-    the same extent that is not finer. Where the amplitude is zero the dunes have no height, and crests end and fork.
+    phase, its modulus scales the height. `modulation` contains the B-spline coefficients of this amplitude, real and
+    imaginary, on a grid of the same extent that is not finer. Crests end and fork where the amplitude is zero.
     """
     side, cells = height.shape[0], modulation.shape[0]
     step = side // cells
@@ -247,20 +257,20 @@ def add_dunes(height: Grid, tone: Grid, spacing: float, modulation: Level, dunes
                 a, b, c, d = weights[k]
                 real[j * step + k] = a * value0[0] + b * value1[0] + c * value2[0] + d * value3[0]
                 imaginary[j * step + k] = a * value0[1] + b * value1[1] + c * value2[1] + d * value3[1]
-        _add_row_of_dunes(height[i], tone[i], real, imaginary, dunes.wave_y * i * spacing, spacing, dunes)
+        _add_row_of_dunes(height[i], log_albedo[i], real, imaginary, dunes.wave_y * i * spacing, spacing, dunes)
 
 
 @njit(cache=True)
-def stamp_lobes(height: Grid, tone: Grid, spacing: float, lobes: Array, warp_x: Grid, warp_y: Grid) -> None:
+def stamp_lobes(height: Grid, log_albedo: Grid, spacing: float, lobes: Array, warp_x: Grid, warp_y: Grid) -> None:
     """Stack lava lobes: plateaus with a steep, crenulated margin and a slightly lower middle.
 
-    `lobes` has rows (x, y, half length, half width, thickness, cosine and sine of the direction, tone). `warp_x` and
-    `warp_y` are displacements of the outlines in units of the half width; they make the outlines irregular. The tone of
-    a lobe replaces that of the lobes below.
+    `lobes` has rows (x, y, half length, half width, thickness, cosine and sine of the direction, logarithm of albedo).
+    `warp_x` and `warp_y` are displacements of the outlines in half widths; they make the outlines irregular. The albedo
+    of a lobe replaces that of the lobes below.
     """
     mask = height.shape[0] - 1
     for n in range(lobes.shape[0]):
-        x, y, half_length, half_width, thickness, c, s, lobe_tone = lobes[n]
+        x, y, half_length, half_width, thickness, c, s, lobe_log_albedo = lobes[n]
         reach_x = 1.3 * (half_length * abs(c) + half_width * abs(s)) + 0.5 * half_width
         reach_y = 1.3 * (half_length * abs(s) + half_width * abs(c)) + 0.5 * half_width
         for i in range(math.ceil((y - reach_y) / spacing), math.floor((y + reach_y) / spacing) + 1):
@@ -276,12 +286,19 @@ def stamp_lobes(height: Grid, tone: Grid, spacing: float, lobes: Array, warp_x: 
                     continue
                 edge = 1.0 - (radius2 * radius2) * (radius2 * radius2)
                 height[row, column] += thickness * edge * (0.65 + 0.35 * radius2)
-                tone[row, column] += (lobe_tone - tone[row, column]) * edge
+                log_albedo[row, column] += (lobe_log_albedo - log_albedo[row, column]) * edge
 
 
 @njit(cache=True)
 def add_cracks(
-    height: Grid, tone: Grid, spacing: float, points: Array, cell: float, width: float, depth: float, contrast: float
+    height: Grid,
+    log_albedo: Grid,
+    spacing: float,
+    points: Array,
+    cell: float,
+    width: float,
+    depth: float,
+    contrast: float,
 ) -> None:
     """Add polygonal cracks along the borders of Voronoi cells, with one point in each square of a periodic grid.
 
@@ -317,13 +334,16 @@ def add_cracks(
             if border < width:
                 strength = 1.0 - border / width
                 height[i, j] -= depth * strength
-                tone[i, j] += contrast * strength
+                log_albedo[i, j] += contrast * strength
 
 
 @njit(cache=True)
-def cut_channels(cut: Grid, spacing: float, discs: Array, sharpness: float) -> None:
-    """Cut channels: discs with rows (x, y, half width w, depth) and the profile ``depth (1 - (r / w)**sharpness)``."""
-    mask = cut.shape[0] - 1
+def cut_channels(depths: Grid, spacing: float, discs: Array, sharpness: float) -> None:
+    """Cut channels: discs with rows (x, y, half width w, depth) and the profile ``depth (1 - (r / w)**sharpness)``.
+
+    `depths` is the depth below the ground, changed in place; where channels overlap it is the larger depth.
+    """
+    mask = depths.shape[0] - 1
     for n in range(discs.shape[0]):
         x, y, half_width, depth = discs[n]
         for i in range(math.ceil((y - half_width) / spacing), math.floor((y + half_width) / spacing) + 1):
@@ -333,15 +353,15 @@ def cut_channels(cut: Grid, spacing: float, discs: Array, sharpness: float) -> N
                 ratio = math.sqrt(dx * dx + dy * dy) / half_width
                 if ratio < 1.0:
                     local_depth = depth * (1.0 - ratio**sharpness)
-                    if local_depth > cut[i & mask, j & mask]:
-                        cut[i & mask, j & mask] = local_depth
+                    if local_depth > depths[i & mask, j & mask]:
+                        depths[i & mask, j & mask] = local_depth
 
 
 @njit(cache=True)
 def raise_cones(
-    height: Grid, cover: Grid, spacing: float, apexes: Array, slope: float, concavity: float, rounding: float
+    height: Grid, coverage: Grid, spacing: float, apexes: Array, slope: float, concavity: float, rounding: float
 ) -> None:
-    """Add the union of concave cones with rows (x, y, radius R) in `apexes`; `cover` is 1 on the cones.
+    """Add the union of concave cones with rows (x, y, radius R) in `apexes`; `coverage` is 1 on the cones.
 
     The height at the distance r from the apex is ``slope R / concavity (1 - r / R)**concavity``. The apex is rounded,
     with the slope `slope` next to it.
@@ -363,11 +383,11 @@ def raise_cones(
             if total > 0.0:
                 z = total**0.125
                 height[i, j] += z
-                cover[i, j] = min(z / (0.02 * slope * apexes[0, 2]), 1.0)
+                coverage[i, j] = min(z / (0.02 * slope * apexes[0, 2]), 1.0)
 
 
 @njit(cache=True)
-def pack(height: Grid, albedo: Grid, scale: float, samples: Level) -> None:
+def interleave_samples(height: Grid, albedo: Grid, scale: float, samples: Level) -> None:
     """Interleave height and albedo; the albedo is scaled and limited to 1."""
     for i in range(height.shape[0]):
         for j in range(height.shape[0]):

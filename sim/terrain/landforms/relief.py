@@ -29,7 +29,7 @@ SAMPLES_ON_SLIP_FACE = 2.1  #: Minimum number of samples along the slope of a sl
 CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.
 #: RMS of a cubic B-spline divided by that of its control values, if these are independent: 151/315.
 SPLINE_OF_NOISE_RMS = 151.0 / 315.0
-EJECTA_REACH_RADII = 3.0
+EJECTA_EXTENT_RADII = 3.0  #: Maximum distance of ejecta from the centre of a crater, in radii.
 #: Depth from the rim crest to the floor, divided by the diameter: 0.2 for fresh simple craters (Pike 1977; Robbins &
 #: Hynek 2012 for Mars); 0.04 is barely visible. Small Martian craters are mostly degraded (Golombek et al. 2014).
 FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
@@ -55,7 +55,7 @@ class Dunes(Parameters):
 
     wavelength_m: Annotated[Positive, Field(description="distance from crest to crest, m")] = 110.0
     height_m: Annotated[Positive, Field(description="RMS height of crest over trough, m")] = 5.0
-    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth the wind comes from")] = 270.0
+    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth from which the wind blows")] = 270.0
     repose_deg: Annotated[float, Field(ge=10.0, le=36.0, description="slope of the faces away from the wind")] = 32.0
     crest_length: Annotated[float, Field(ge=0.5, le=50.0, description="length of crests, wavelengths")] = 4.0
     regularity: Annotated[float, Field(ge=0.3, le=20.0, description="wavelengths over which spacing persists")] = 1.5
@@ -81,7 +81,7 @@ class Dunes(Parameters):
         slip_face_m = self.height_m / steepest
         part = ground.coarser(min(slip_face_m / SAMPLES_ON_SLIP_FACE, ground.period_m / modulation.shape[0]))
         bedforms = Bedforms(float(wave[0]), float(wave[1]), self.height_m, steepest, self.albedo_contrast)
-        add_dunes(part.height, part.tone, part.spacing_m, modulation, bedforms)
+        add_dunes(part.height, part.log_albedo, part.spacing_m, modulation, bedforms)
         ground.add(part)
 
 
@@ -91,10 +91,10 @@ class Lava(Parameters):
     Lobes of 1-3 m thickness overlap. Patches of a'a lava have blocks and pinnacles of a few metres.
     """
 
-    layers: Annotated[float, Field(gt=0.0, le=10.0, description="lobes lying over one another, on average")] = 3.0
+    layers: Annotated[float, Field(gt=0.0, le=10.0, description="mean number of overlapping lobes")] = 3.0
     lobe_length_m: Annotated[Positive, Field(description="median length of a lobe, m")] = 210.0
     lobe_thickness_m: Annotated[NonNegative, Field(description="median thickness of a lobe, m")] = 1.5
-    flow_to_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth the flows run to")] = 280.0
+    flow_to_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth to which the flows run")] = 280.0
     lobe_contrast: Annotated[Fraction, Field(description="RMS of the lobes' log albedo")] = 0.05
     aa_fraction: Annotated[Fraction, Field(description="fraction of the ground under a'a")] = 0.25
     aa_block_m: Annotated[Positive, Field(description="size of its blocks, m")] = 6.0
@@ -105,9 +105,9 @@ class Lava(Parameters):
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the flows, then the blocks."""
         part = ground.coarser(max(self.lobe_length_m / 36.0, self.lobe_thickness_m))
-        crenulation = self.lobe_length_m / 12.0
-        warp = np.float32(CRENULATION) * draw_smooth_fields(ground.period_m, crenulation, crenulation, 0.0, rng)
-        # log-normal lengths; widths are a half to a quarter of the lengths; random order
+        scale_m = self.lobe_length_m / 12.0
+        warp = np.float32(CRENULATION) * draw_smooth_fields(ground.period_m, scale_m, scale_m, 0.0, rng)
+        # log-normal lengths; widths are 1/4 to 1/2 of the lengths; the number of lobes assumes a mean ratio of 0.38
         spread = 0.5
         mean_area = np.pi / 4.0 * self.lobe_length_m**2 * np.exp(2.0 * spread**2) * 0.38
         count = int(rng.poisson(self.layers * ground.period_m**2 / mean_area))
@@ -116,11 +116,11 @@ class Lava(Parameters):
         thickness = self.lobe_thickness_m * np.exp(0.35 * rng.standard_normal(count))
         heading = np.radians(90.0 - self.flow_to_deg) + 0.45 * rng.standard_normal(count)
         position = rng.uniform(0.0, ground.period_m, (count, 2))
-        tone = self.lobe_contrast * rng.standard_normal(count)
-        outline = (half_length, half_width, thickness, np.cos(heading), np.sin(heading), tone)
+        log_albedo = self.lobe_contrast * rng.standard_normal(count)
+        outline = (half_length, half_width, thickness, np.cos(heading), np.sin(heading), log_albedo)
         lobes = np.column_stack([position, *outline])
         warp_x, warp_y = (resample(warp[..., axis], part.side) for axis in (0, 1))
-        stamp_lobes(part.height, part.tone, part.spacing_m, lobes, warp_x, warp_y)
+        stamp_lobes(part.height, part.log_albedo, part.spacing_m, lobes, warp_x, warp_y)
         ground.add(part)
         self._add_blocks(ground, rng)
 
@@ -133,12 +133,12 @@ class Lava(Parameters):
             field = draw_smooth_fields(ground.period_m, size, size, 0.0, rng)[..., 0]
             patches += np.float32(strength) * resample(field, blocks.side)
         threshold = float(np.quantile(patches[::4, ::4], 1.0 - self.aa_fraction))
-        cover = np.clip((patches - np.float32(threshold)) * np.float32(6.0) + np.float32(0.5), 0.0, 1.0)
-        relief = np.float32(self.pahoehoe_relief_m) + np.float32(self.aa_relief_m - self.pahoehoe_relief_m) * cover
+        coverage = np.clip((patches - np.float32(threshold)) * np.float32(6.0) + np.float32(0.5), 0.0, 1.0)
+        relief = np.float32(self.pahoehoe_relief_m) + np.float32(self.aa_relief_m - self.pahoehoe_relief_m) * coverage
         relief *= rng.standard_normal(relief.shape, dtype=np.float32)
         relief *= np.float32(1.0 / SPLINE_OF_NOISE_RMS)
         blocks.height[...] = relief
-        np.multiply(cover, np.float32(self.aa_contrast), out=blocks.tone)
+        np.multiply(coverage, np.float32(self.aa_contrast), out=blocks.log_albedo)
         ground.add(blocks)
 
 
@@ -146,7 +146,7 @@ class Swell(Parameters):
     """Broad relief of a specified height, such as a dune field: a few waves about as long as the terrain's side."""
 
     relief_m: Annotated[Positive, Field(description="lowest to highest, m")] = 200.0
-    waves: Annotated[int, Field(ge=1, le=8, description="most waves along a side")] = 1
+    waves: Annotated[int, Field(ge=1, le=8, description="maximum number of waves along a side")] = 1
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the swell."""
@@ -160,7 +160,7 @@ class Swell(Parameters):
                 field += strength * np.cos(m * phase[None, :] + n * phase[:, None] + shift)
         field *= self.relief_m / np.ptp(field)
         part.height[...] = field
-        ground.add(part, tone=False)
+        ground.add(part, include_albedo=False)
 
 
 class Ramp(Parameters):
@@ -221,13 +221,13 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     depth = diameter * (DEGRADED_DEPTH + (FRESH_DEPTH - DEGRADED_DEPTH) * freshness) - rim
     rounding = depth * (ROUNDEST_RIM + (SHARPEST_RIM - ROUNDEST_RIM) * freshness)
     fill = DEEPEST_FILL * (1.0 - freshness)
-    ejecta_tone = p.crater_ejecta_contrast * np.maximum(freshness - BRIGHT_ABOVE, 0.0) / (1.0 - BRIGHT_ABOVE)
-    ejecta_tone *= rng.choice([-1.0, 1.0], count)
-    floor_tone = p.crater_floor_contrast * rng.standard_normal(count)
+    ejecta_log_albedo = p.crater_ejecta_contrast * np.maximum(freshness - BRIGHT_ABOVE, 0.0) / (1.0 - BRIGHT_ABOVE)
+    ejecta_log_albedo *= rng.choice([-1.0, 1.0], count)
+    floor_log_albedo = p.crater_floor_contrast * rng.standard_normal(count)
     outline = rng.standard_normal((count, 6)) * np.repeat([0.025, 0.02, 0.012], 2)
     phase = rng.uniform(0.0, 2.0 * np.pi, count)
     return np.column_stack(
-        [position, diameter / 2.0, depth, rim, rounding, fill, ejecta_tone, floor_tone, outline, phase]
+        [position, diameter / 2.0, depth, rim, rounding, fill, ejecta_log_albedo, floor_log_albedo, outline, phase]
     )
 
 
@@ -263,11 +263,12 @@ class Gullies(Parameters):
     wall_slope_deg: Annotated[float, Field(gt=0.0, le=60.0, description="steepest slope of the walls")] = 35.0
     length_m: Annotated[Positive, Field(description="mean length of a trunk, m")] = 90.0
     tributaries: Annotated[int, Field(ge=0, le=50, description="tributaries of a trunk")] = 4
-    downhill_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth they run to")] = 90.0
+    downhill_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth to which they run")] = 90.0
     contrast: Annotated[float, bounded_field(-1.0, 1.0, "log albedo of their floors over the ground's")] = -0.1
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Cut the gullies."""
+        # until the channels are complete, the albedo grid of `part` contains their depth
         part = ground.coarser(self.width_m / 12.0)
         count = int(rng.poisson(self.per_km2 * (ground.period_m / 1000.0) ** 2))
         heading = np.radians(90.0 - self.downhill_deg) + 0.3 * rng.standard_normal(count)
@@ -276,20 +277,21 @@ class Gullies(Parameters):
         start = rng.uniform(0.0, ground.period_m, (count, 2))
         trunks = draw_channels(start, heading, length, width, width * self._depth(1.0), 0.15, rng)
         # the profile depth (1 - (r / w)**1.5) has its maximum slope at the rim: 1.5 depth / w
-        cut_channels(part.tone, part.spacing_m, trunks, 1.5)
+        cut_channels(part.log_albedo, part.spacing_m, trunks, 1.5)
         if self.tributaries and trunks.size:
             mouths = rng.integers(0, trunks.shape[0], count * self.tributaries)
             heading = np.radians(90.0 - self.downhill_deg) + np.pi + rng.choice([-0.7, 0.7], mouths.size)
             width = trunks[mouths, 2] * 2.0 * rng.uniform(0.35, 0.6, mouths.size)
             length = 6.0 * width + 0.1 * self.length_m
             branches = draw_channels(trunks[mouths, :2], heading, length, width, width * self._depth(1.0), 0.15, rng)
-            cut_channels(part.tone, part.spacing_m, branches, 1.5)
-        part.height[...] = -part.tone
-        part.tone[...] *= np.float32(self.contrast / (0.5 * self._depth(self.width_m)))
-        np.clip(part.tone, -abs(self.contrast), abs(self.contrast), out=part.tone)
+            cut_channels(part.log_albedo, part.spacing_m, branches, 1.5)
+        part.height[...] = -part.log_albedo
+        part.log_albedo[...] *= np.float32(self.contrast / (0.5 * self._depth(self.width_m)))
+        np.clip(part.log_albedo, -abs(self.contrast), abs(self.contrast), out=part.log_albedo)
         ground.add(part)
 
     def _depth(self, width: float) -> float:
+        """Compute the depth of a gully from its width and the slope of its walls, m."""
         return float(0.5 * width * np.tan(np.radians(self.wall_slope_deg)) / 1.5)
 
 
@@ -318,7 +320,7 @@ class Playa(Parameters):
             width = max(scale * self.fissure_m, part.spacing_m)
             depth, contrast = scale * self.fissure_depth_m, scale * self.contrast
             cell_m = ground.period_m / cells
-            add_cracks(part.height, part.tone, part.spacing_m, points, cell_m, width, depth, contrast)
+            add_cracks(part.height, part.log_albedo, part.spacing_m, points, cell_m, width, depth, contrast)
         return part
 
 
@@ -336,7 +338,7 @@ class Fans(Parameters):
     radius_m: Annotated[Positive, Field(description="mean distance from apex to toe, m")] = 1300.0
     apex_spacing_m: Annotated[Positive, Field(description="distance between apexes, m")] = 600.0
     concavity: Annotated[float, Field(ge=1.0, le=3.0, description="1: straight profile; larger: flatter toe")] = 1.15
-    playa_relief: Annotated[float, Field(ge=0.0, le=1.0, description="relief left on the playa")] = 0.05
+    playa_relief: Annotated[float, Field(ge=0.0, le=1.0, description="factor of existing relief on the playa")] = 0.05
     washes_per_fan: Annotated[int, Field(ge=0, le=500, description="channels on a fan")] = 50
     wash_width_m: Annotated[Positive, Field(description="median width of a wash, m")] = 9.0
     wash_depth_m: Annotated[NonNegative, Field(description="median depth of a wash, m")] = 0.7
@@ -357,17 +359,17 @@ class Fans(Parameters):
         broad = ground.coarser(CONE_DETAIL * self.radius_m)
         slope = float(np.tan(np.radians(self.slope_deg)))
         rounding = APEX_ROUNDING * self.radius_m
-        raise_cones(broad.height, broad.tone, broad.spacing_m, apexes, slope, self.concavity, rounding)
+        raise_cones(broad.height, broad.log_albedo, broad.spacing_m, apexes, slope, self.concavity, rounding)
         if self.polygons is not None:
             fissures = self.polygons.fissures(ground, rng)
-            playa_fraction = np.float32(1.0) - resample(broad.tone, fissures.side)
+            playa_fraction = np.float32(1.0) - resample(broad.log_albedo, fissures.side)
             np.multiply(fissures.height, playa_fraction, out=fissures.height)
-            np.multiply(fissures.tone, playa_fraction, out=fissures.tone)
-        relief = np.float32(self.playa_relief) + np.float32(1.0 - self.playa_relief) * broad.tone
+            np.multiply(fissures.log_albedo, playa_fraction, out=fissures.log_albedo)
+        relief = np.float32(self.playa_relief) + np.float32(1.0 - self.playa_relief) * broad.log_albedo
         relief = refine(relief, ground.side)
         np.multiply(ground.height, relief, out=ground.height)
-        np.multiply(ground.tone, relief, out=ground.tone)
-        broad.tone[...] *= np.float32(self.fan_contrast)
+        np.multiply(ground.log_albedo, relief, out=ground.log_albedo)
+        broad.log_albedo[...] *= np.float32(self.fan_contrast)
         ground.add(broad)
         if self.polygons is not None:
             ground.add(fissures)
@@ -375,6 +377,7 @@ class Fans(Parameters):
             self._add_washes(ground, apexes, rng)
 
     def _add_washes(self, ground: Ground, apexes: Float64[np.ndarray, "fans 3"], rng: Generator) -> None:
+        # until the channels are complete, the albedo grid of `part` contains their depth
         part = ground.coarser(self.wash_width_m / 3.0)
         count = self.washes_per_fan
         for apex in apexes:
@@ -386,8 +389,8 @@ class Fans(Parameters):
             start = apex[:2] + start_radius[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
             length = apex[2] * rng.uniform(0.9, 1.05, count) - start_radius
             discs = draw_channels(start, heading, np.maximum(length, width), width, depth, 0.06, rng)
-            cut_channels(part.tone, part.spacing_m, discs, 2.0)
-        part.height[...] = -part.tone
-        part.tone[...] *= np.float32(self.wash_contrast / max(self.wash_depth_m, 1e-6))
-        np.clip(part.tone, -0.5, 0.5, out=part.tone)
+            cut_channels(part.log_albedo, part.spacing_m, discs, 2.0)
+        part.height[...] = -part.log_albedo
+        part.log_albedo[...] *= np.float32(self.wash_contrast / max(self.wash_depth_m, 1e-6))
+        np.clip(part.log_albedo, -0.5, 0.5, out=part.log_albedo)
         ground.add(part)

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import Grid, Ground, Spectrum
-from marsyard.sim.terrain.landforms.kernels import cut_channels, stamp_cover, stamp_streaks
+from marsyard.sim.terrain.landforms.kernels import cut_channels, scale_roughness, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import draw_channels
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS
 
@@ -53,9 +53,9 @@ class SurfaceUnits(Parameters):
         float, Field(ge=1.0, le=10.0, description="length of patches along the wind divided by width")
     ] = 2.0
     wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="mean azimuth from which the wind blows")] = 0.0
-    wind_spread_deg: Annotated[NonNegative, Field(description="its standard deviation between terrains")] = 20.0
+    wind_spread_deg: Annotated[NonNegative, Field(description="SD of this azimuth between terrains, deg")] = 20.0
     concentration: Annotated[
-        Positive, Field(description="of the Dirichlet distribution: areas vary less if larger")
+        Positive, Field(description="concentration of the Dirichlet distribution; areas vary less if larger")
     ] = 8.0
 
     tracks_per_km2: Annotated[NonNegative, Field(description="tracks of dust devils per km2")] = 0.0
@@ -71,7 +71,7 @@ class SurfaceUnits(Parameters):
     def apply(
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], rng: Generator
     ) -> Float32[np.ndarray, "cover cover 3"]:
-        """Add the tones of the units, dust devil tracks and wind tails of craters; return the cover (see `Surface`)."""
+        """Add the albedo of units, dust devil tracks and wind tails of craters; return the cover (see `Surface`)."""
         units = self.kinds
         expected = np.array([unit.fraction for unit in units])
         areas = rng.dirichlet(self.concentration * expected / expected.sum())
@@ -81,36 +81,38 @@ class SurfaceUnits(Parameters):
         spectrum = Spectrum.power_law(side, spacing, OUTLINE_HURST, self.largest_m, self.elongation, downwind)
         spectrum = spectrum.apply_low_pass(self.smallest_m)
         fields = np.stack([spectrum.draw_field(rng, 1.0) for _ in units], axis=-1)
-        membership = self._membership(fields, areas)
+        membership = self._compute_membership(fields, areas)
         values = np.array([(unit.roughness, unit.texture, unit.rocks) for unit in units])
         factors = np.exp(membership @ np.log(np.maximum(values, 1e-3)).astype(np.float32))
-        tone = np.ascontiguousarray(membership @ np.array([unit.tone for unit in units], dtype=np.float32))
-        self._add_tracks(tone, spacing, downwind, rng)
-        ground.add(Ground(np.zeros_like(tone), tone, spacing))
+        log_albedo = np.ascontiguousarray(membership @ np.array([unit.tone for unit in units], dtype=np.float32))
+        self._add_tracks(log_albedo, spacing, downwind, rng)
+        ground.add(Ground(np.zeros_like(log_albedo), log_albedo, spacing))
         self._add_streaks(ground, craters, downwind, rng)
         if len(craters):
+            # rows of `stamp_craters`; a fresh crater has a depth of 0.4 radii below its rim
             fill, depth, radius = craters[:, 6], craters[:, 3] + craters[:, 4], craters[:, 2]
             freshness = np.clip(depth / radius / 0.4, 0.0, 1.0)
             rows = np.column_stack([craters[:, :3], 1.0 - 1.6 * fill, 1.0 + freshness])
-            rough = np.ascontiguousarray(factors[..., ROUGHNESS])
-            stamp_cover(rough, spacing, rows, 2.0)
-            factors[..., ROUGHNESS] = rough
-        # the parameter `abundance` refers to the whole terrain
+            roughness = np.ascontiguousarray(factors[..., ROUGHNESS])
+            scale_roughness(roughness, spacing, rows, 2.0)
+            factors[..., ROUGHNESS] = roughness
+        # mean 1: the parameter `abundance` refers to the whole terrain
         factors[..., ROCKS] /= factors[..., ROCKS].mean(dtype=np.float64)
         return np.asarray(factors)
 
-    def _add_tracks(self, tone: Grid, spacing: float, downwind: float, rng: Generator) -> None:
-        period = tone.shape[0] * spacing
+    def _add_tracks(self, log_albedo: Grid, spacing: float, downwind: float, rng: Generator) -> None:
+        """Darken the tracks of dust devils; the profile of a track is that of a channel."""
+        period = log_albedo.shape[0] * spacing
         count = int(rng.poisson(self.tracks_per_km2 * (period / 1000.0) ** 2))
         heading = downwind + 0.5 * rng.standard_normal(count)
         width = np.maximum(self.track_width_m * np.exp(0.5 * rng.standard_normal(count)), 2.0 * spacing)
         length = self.track_length_m * rng.exponential(1.0, count)
         start = rng.uniform(0.0, period, (count, 2))
-        depth = -self.track_tone * rng.uniform(0.3, 1.0, count)
-        discs = draw_channels(start, heading, length, width, depth, 0.12, rng)
-        track_depth = np.zeros_like(tone)
-        cut_channels(track_depth, spacing, discs, 2.0)
-        tone -= track_depth
+        max_darkening = -self.track_tone * rng.uniform(0.3, 1.0, count)
+        discs = draw_channels(start, heading, length, width, max_darkening, 0.12, rng)
+        darkening = np.zeros_like(log_albedo)
+        cut_channels(darkening, spacing, discs, 2.0)
+        log_albedo -= darkening
 
     def _add_streaks(
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator
@@ -120,11 +122,11 @@ class SurfaceUnits(Parameters):
         radius, count = sources[:, 2], len(sources)
         heading = downwind + 0.12 * rng.standard_normal(count)
         length = 2.0 * radius * rng.uniform(2.0, 7.0, count)
-        tone = self.streak_tone * rng.standard_normal(count)
-        rows = np.column_stack([sources[:, :2], radius, length, np.cos(heading), np.sin(heading), tone])
-        stamp_streaks(ground.tone, ground.spacing_m, rows)
+        log_albedo = self.streak_tone * rng.standard_normal(count)
+        rows = np.column_stack([sources[:, :2], radius, length, np.cos(heading), np.sin(heading), log_albedo])
+        stamp_streaks(ground.log_albedo, ground.spacing_m, rows)
 
-    def _membership(
+    def _compute_membership(
         self, fields: Float32[np.ndarray, "side side kinds"], areas: Float[np.ndarray, "kinds"]
     ) -> Float32[np.ndarray, "side side kinds"]:
         """Compute the soft membership of each unit: a softmax of the fields, shifted until the areas match."""
@@ -138,7 +140,7 @@ class SurfaceUnits(Parameters):
     def _softmax(
         self, fields: Float32[np.ndarray, "rows columns kinds"], shift: Float[np.ndarray, "kinds"]
     ) -> Float32[np.ndarray, "rows columns kinds"]:
-        level = (fields + shift.astype(np.float32)) / np.float32(self.boundary)
-        level -= level.max(axis=-1, keepdims=True)
-        weights = np.exp(level, out=level)
+        logits = (fields + shift.astype(np.float32)) / np.float32(self.boundary)
+        logits -= logits.max(axis=-1, keepdims=True)
+        weights = np.exp(logits, out=logits)
         return np.asarray(weights / weights.sum(axis=-1, keepdims=True), dtype=np.float32)

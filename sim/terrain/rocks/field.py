@@ -187,22 +187,22 @@ class RockField:
         """
         placed = parameters.placed
         drawn = draw_diameters(parameters, surface.period_m**2, substream(rng, "rock sizes"))
-        appearance = substream(rng, "rock looks")
-        ratio = parameters.height_ratio * (1.0 + parameters.height_spread * appearance.uniform(-1.0, 1.0, drawn.size))
-        first = list(shapes.FORMS).index(parameters.form) * SHAPES_OF_FORM
-        placed_shape, placed_yaw, draws = [], [], substream(rng, "placed rocks")
+        appearance_rng = substream(rng, "rock looks")
+        ratio = parameters.height_ratio * (
+            1.0 + parameters.height_spread * appearance_rng.uniform(-1.0, 1.0, drawn.size)
+        )
+        first_shape = list(shapes.FORMS).index(parameters.form) * SHAPES_OF_FORM
+        placed_shape, placed_yaw, placed_rng = [], [], substream(rng, "placed rocks")
         for rock in placed:
             if rock.shape is not None and rock.shape >= shapes.SHAPES:
                 allowed = f"0 to {shapes.SHAPES - 1}"
                 raise ValueError(f"rock '{rock.name}' has shape {rock.shape}; allowed: {allowed}")
-            random_shape, random_yaw_rad = (
-                first + int(draws.integers(0, SHAPES_OF_FORM)),
-                float(draws.uniform(-np.pi, np.pi)),
-            )
+            random_shape = first_shape + int(placed_rng.integers(0, SHAPES_OF_FORM))
+            random_yaw_rad = float(placed_rng.uniform(-np.pi, np.pi))
             placed_shape.append(random_shape if rock.shape is None else rock.shape)
             placed_yaw.append(random_yaw_rad if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
         diameter = np.concatenate([[rock.diameter_m for rock in placed], drawn])
-        drawn_shape = first + appearance.integers(0, SHAPES_OF_FORM, drawn.size)
+        drawn_shape = first_shape + appearance_rng.integers(0, SHAPES_OF_FORM, drawn.size)
         if parameters.forms is not None:
             weights = np.array(parameters.forms.weights())
             form = substream(rng, "rock forms").choice(weights.size, drawn.size, p=weights / weights.sum())
@@ -212,16 +212,16 @@ class RockField:
         log_albedo = parameters.albedo_spread * substream(rng, "rock albedo").standard_normal(drawn.size)
         albedo = np.concatenate([np.ones(len(placed)), np.exp(log_albedo - 0.5 * parameters.albedo_spread**2)])
         shape = np.concatenate([placed_shape, drawn_shape]).astype(np.int32)
-        yaw = np.concatenate([placed_yaw, appearance.uniform(-np.pi, np.pi, drawn.size)])
+        yaw = np.concatenate([placed_yaw, appearance_rng.uniform(-np.pi, np.pi, drawn.size)])
         radius = rock_shapes(shapes.COARSEST).reach[shape] * diameter
         xy = _draw_positions(parameters, radius, diameter, surface, substream(rng, "rock places"))
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
-        # slope of the ground over about the size of the rock
+        # normal of the ground, averaged over about the size of the rock
         level = np.clip(np.log2(np.maximum(diameter / surface.spacing_m, 1.0)).astype(int), 0, len(surface.levels) - 1)
         up = np.ones((diameter.size, 3))
         for number in np.unique(level):
-            rows = level == number
-            up[rows, :2] = -surface.gradient(xy[rows, 0], xy[rows, 1], int(number))
+            has_level = level == number
+            up[has_level, :2] = -surface.gradient(xy[has_level, 0], xy[has_level, 1], int(number))
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         for array in (shape, position, diameter, height, yaw, up, albedo):
             array.setflags(write=False)
@@ -283,6 +283,7 @@ class RockField:
         return self._assemble(numbers, self.position_m[numbers], np.array([detail]))
 
     def _assemble(self, number: Numbers, position: Positions, detail: Numbers) -> RockMesh:
+        """Create the mesh of rocks, ordered by level of detail."""
         order = np.argsort(detail, kind="stable")
         number, position, detail = number[order], position[order], detail[order]
         diameter = self.diameter_m[number]
@@ -297,10 +298,10 @@ class RockField:
             )
             level_vertices, level_normals = assemble(placements, unit.vertices, unit.normals)
             stop = start + len(level_vertices)
-            first = np.arange(start, stop, unit.vertices.shape[1], dtype=np.int32)
+            first_vertex = np.arange(start, stop, unit.vertices.shape[1], dtype=np.int32)
             vertices.append(level_vertices)
             normals.append(level_normals)
-            faces.append((unit.faces[None] + first[:, None, None]).reshape(-1, 3))
+            faces.append((unit.faces[None] + first_vertex[:, None, None]).reshape(-1, 3))
             counts.append(np.full(rocks.size, len(unit.faces)))
             start = stop
         body_of_face = np.repeat(np.arange(number.size, dtype=np.int32), np.concatenate(counts))

@@ -108,13 +108,13 @@ def place_discs(
 
 @njit(cache=True)
 def stamp_tails(
-    samples: NDArray[np.float32], spacing: float, tails: Array, downwind_x: float, downwind_y: float, tone: float
+    samples: NDArray[np.float32], spacing: float, tails: Array, downwind_x: float, downwind_y: float, log_albedo: float
 ) -> None:
     """Raise ridges in the lee of rocks; `samples` are heights and albedos on a periodic square, changed in place.
 
-    `tails` has rows (x, y, half width, distance of the tip, height). `tone` is the natural logarithm of the albedo of a
-    ridge divided by that of the ground. The ridge rises from the centre of the rock to its edge, where its width and
-    height are largest, and decreases linearly to its tip. Its cross section at the offset t is
+    `tails` has rows (x, y, half width, distance of the tip, height). `log_albedo` is the natural logarithm of the
+    albedo of a ridge divided by that of the ground. The ridge rises from the centre of the rock to its edge. Its width
+    and height are largest there, and decrease linearly to its tip. Its cross section at the offset t is
     ``(1 - (t / half width)**2)**2``; the maximum slope is 1.54 times the height divided by the half width.
     """
     mask = samples.shape[0] - 1
@@ -143,7 +143,7 @@ def stamp_tails(
                     continue
                 shape = amplitude * (1.0 - t * t) ** 2
                 samples[i & mask, j & mask, 0] += height * shape
-                samples[i & mask, j & mask, 1] *= math.exp(tone * shape)
+                samples[i & mask, j & mask, 1] *= math.exp(log_albedo * shape)
 
 
 @njit(cache=True)

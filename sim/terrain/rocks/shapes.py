@@ -17,6 +17,7 @@ from scipy.sparse.linalg import splu
 from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.kernel_cache import processor_features
 
+_SEED = 0x70C6  #: Root seed of all shapes.
 SHAPES_OF_FORM = 16  #: Number of shapes of each form, from angular to rounded.
 
 
@@ -27,8 +28,8 @@ class RockForm:
     - cuts, cut_distances: ranges of the number of planes that cut an ellipsoid, and of their distances from its centre
     - sharpness: exponents of the first and the last shape in the norm that combines the cuts and rounds their edges
     - bumps: RMS height of bumps divided by the radius, in each wavenumber band
-    - depths: range of the ratio of the shortest to the longest axis; the ratio of the middle axis is 0.65 to 0.95
-    - buried: range of the fraction of the height that is below the ground
+    - short_axis_ratios: range of shortest / longest axis; middle / longest axis is 0.65 to 0.95
+    - buried_fractions: range of the fraction of the height that is below the ground
     - flatness: factor of the ratio of height to diameter of a terrain's rocks
     - folded: whether bumps meet in ridges
     - bedding: whether two of the cuts are almost horizontal, and the others steep
@@ -39,8 +40,8 @@ class RockForm:
     cut_distances: tuple[float, float] = (0.45, 0.85)
     sharpness: tuple[float, float] = (200.0, 10.0)
     bumps: tuple[float, float, float, float] = (0.03, 0.015, 0.008, 0.004)
-    depths: tuple[float, float] = (0.6, 0.85)
-    buried: tuple[float, float] = (0.15, 0.4)
+    short_axis_ratios: tuple[float, float] = (0.6, 0.85)
+    buried_fractions: tuple[float, float] = (0.15, 0.4)
     flatness: float = 1.0
     folded: bool = False
     bedding: bool = False
@@ -51,16 +52,16 @@ class RockForm:
 #: wind-faceted ventifacts (all in images of Spirit and Opportunity: Grotzinger et al. 2005, Greeley et al. 2006).
 FORMS = {
     "block": RockForm(),
-    "clinker": RockForm(bumps=(0.1, 0.045, 0.022, 0.0), buried=(0.3, 0.5), folded=True),
+    "clinker": RockForm(bumps=(0.1, 0.045, 0.022, 0.0), buried_fractions=(0.3, 0.5), folded=True),
     "vesicular": RockForm(
-        cuts=(10, 18), sharpness=(80.0, 12.0), bumps=(0.03, 0.02, 0.012, 0.006), buried=(0.1, 0.6), pits=90
+        cuts=(10, 18), sharpness=(80.0, 12.0), bumps=(0.03, 0.02, 0.012, 0.006), buried_fractions=(0.1, 0.6), pits=90
     ),
     "slab": RockForm(
         cuts=(8, 12),
         cut_distances=(0.55, 0.95),
         sharpness=(250.0, 40.0),
-        depths=(0.9, 1.0),
-        buried=(0.3, 0.7),
+        short_axis_ratios=(0.9, 1.0),
+        buried_fractions=(0.3, 0.7),
         flatness=0.35,
         bedding=True,
     ),
@@ -69,14 +70,14 @@ FORMS = {
         cut_distances=(0.4, 0.75),
         sharpness=(400.0, 120.0),
         bumps=(0.012, 0.008, 0.004, 0.002),
-        buried=(0.1, 0.5),
+        buried_fractions=(0.1, 0.5),
     ),
 }
 SHAPES = SHAPES_OF_FORM * len(FORMS)
 #: Range of the angular radii of vesicles, radians, and ratio of their depth to their radius.
 _PIT_RADII, _PIT_DEPTH = (0.07, 0.2), 0.5
 #: Range of the half thickness of slabs in their own axes, and maximum tilt of their bedding planes, radians.
-_BED_HALF, _BED_TILT = (0.35, 0.55), 0.1
+_SLAB_HALF_THICKNESS, _BED_TILT = (0.35, 0.55), 0.1
 #: Subdivisions of the icosahedron at each level of detail: 20, 80, 320, 1280 and 5120 triangles.
 SUBDIVISIONS = (0, 1, 2, 3, 4)
 COARSEST, COARSE, MEDIUM, FINE, FINEST = range(5)
@@ -109,7 +110,9 @@ class ShapeSet:
 def rock_shapes(detail: int) -> ShapeSet:
     """Return the shapes at a level of detail, 0 (`COARSEST`) to 4 (`FINEST`); other levels are fitted to the finest."""
     directions, faces = _icosphere(detail)
-    normals = _load_or_build(f"normals-{detail}", lambda: np.stack([block.normals(directions) for block in _blocks()]))
+    normals = _load_or_build(
+        f"normals-{detail}", lambda: np.stack([shape.normals(directions) for shape in _all_shapes()])
+    )
     return ShapeSet(_vertices(detail), normals, faces, _reach())
 
 
@@ -126,12 +129,12 @@ def max_pixels(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes le
 def _max_pixels_per_deviation() -> Float64[np.ndarray, "shapes levels"]:
     shapes = rock_shapes(FINEST)
     limits = np.empty((SHAPES, FINEST))
-    for number, block in enumerate(_blocks()):
+    for number, shape in enumerate(_all_shapes()):
         finest, normals = shapes.vertices[number], shapes.normals[number]
         for detail in range(FINEST):
             inverse = _corner_weights(detail) @ _fitted_inverse_radii(number, detail)
-            flat = block.to_unit_shape(_icosphere(FINEST)[0] / inverse[:, None])
-            deviation = np.sum((flat - finest) * normals, axis=1)[finest[:, 2] > 0.0]
+            facets = shape.to_unit_shape(_icosphere(FINEST)[0] / inverse[:, None])
+            deviation = np.sum((facets - finest) * normals, axis=1)[finest[:, 2] > 0.0]
             limits[number, detail] = 1.0 / np.sqrt(np.mean(deviation**2))
     return limits
 
@@ -171,18 +174,18 @@ def _vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
 def _build_vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
     directions, _ = _icosphere(detail)
     vertices: Float64[np.ndarray, "shapes vertices 3"] = np.empty((SHAPES, *directions.shape))
-    for number, block in enumerate(_blocks()):
+    for number, shape in enumerate(_all_shapes()):
         if detail == FINEST:
-            points = directions * block.radius(directions)[:, None]
+            points = directions * shape.radius(directions)[:, None]
         else:
             points = directions / _fitted_inverse_radii(number, detail)[:, None]
-        vertices[number] = block.to_unit_shape(points)
+        vertices[number] = shape.to_unit_shape(points)
     return vertices
 
 
 @cache
 def _reach() -> Float64[np.ndarray, "shapes"]:
-    """Maximum horizontal distance from the origin over all levels: fitted corners may lie outside the finest shape."""
+    """Compute the maximum horizontal distance from the origin over all levels; fitted corners can exceed the finest."""
     levels = [np.hypot(_vertices(k)[..., 0], _vertices(k)[..., 1]).max(axis=1) for k in range(len(SUBDIVISIONS))]
     reach: Float64[np.ndarray, "shapes"] = np.max(levels, axis=0)
     reach.setflags(write=False)
@@ -190,10 +193,10 @@ def _reach() -> Float64[np.ndarray, "shapes"]:
 
 
 @dataclass(frozen=True)
-class _Block:
+class _RockShape:
     """A star-shaped body: an ellipsoid cut by planes, with rounded edges and a bumpy surface.
 
-    In the block's axes, before stretching, the distance of the surface from the centre along the unit vector d is
+    In the shape's axes, before stretching, the distance of the surface from the centre along the unit vector d is
     ``(1 + sum((n_i . d / c_i)**p))**(-1/p) (1 + bumps(d))``, with the normals n_i and distances c_i of the cuts and the
     sharpness p. For large p this is the minimum over the sphere and all cuts. Bumps are waves; those of clinker are
     folded, so that they meet in sharp ridges. Vesicles are paraboloids below the surface.
@@ -212,8 +215,8 @@ class _Block:
     pit_radii: Float64[np.ndarray, "pits"]
 
     @classmethod
-    def draw(cls, number: int) -> _Block:
-        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(0x70C6, spawn_key=(number,))))
+    def draw(cls, number: int) -> _RockShape:
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(_SEED, spawn_key=(number,))))
         form = list(FORMS.values())[number // SHAPES_OF_FORM]
         roundness = number % SHAPES_OF_FORM / (SHAPES_OF_FORM - 1)
         cuts = int(rng.integers(*form.cuts))
@@ -227,11 +230,11 @@ class _Block:
         bumps = np.repeat(np.array(form.bumps) * np.sqrt(2.0 / np.array(_BUMP_WAVES)), _BUMP_WAVES)
         distances = rng.uniform(*form.cut_distances, cuts)
         if form.bedding:
-            distances[:2] = rng.uniform(*_BED_HALF, 2)
+            distances[:2] = rng.uniform(*_SLAB_HALF_THICKNESS, 2)
         sharpest, roundest = form.sharpness
         phases = rng.uniform(0.0, 2.0 * np.pi, sum(_BUMP_WAVES))
-        axes = np.array([1.0, rng.uniform(0.65, 0.95), rng.uniform(*form.depths)])
-        buried = float(rng.uniform(*form.buried))
+        axes = np.array([1.0, rng.uniform(0.65, 0.95), rng.uniform(*form.short_axis_ratios)])
+        buried = float(rng.uniform(*form.buried_fractions))
         pits = rng.standard_normal((form.pits, 3))
         return cls(
             cut_normals=normals,
@@ -248,17 +251,18 @@ class _Block:
         )
 
     def to_unit_shape(self, points: Points) -> Points:
-        """Convert points in the block's own axes, before stretching, to points of the unit shape."""
+        """Convert points in the shape's own axes, before stretching, to points of the unit shape."""
         shift, stretch = self.frame
         return np.asarray((points * self.axes - shift) * stretch)
 
     def normals(self, directions: Points) -> Points:
-        """Outward unit normals along directions, by finite differences of the implicit surface ``|x| - r(x / |x|)``."""
+        """Compute outward unit normals by finite differences of the implicit surface ``|x| - r(x / |x|)``."""
 
         def implicit(points: Points) -> Float64[np.ndarray, "n"]:
             length = np.linalg.norm(points, axis=1)
             return np.asarray(length - self.radius(points / length[:, None]))
 
+        # multiplication and division by the axes cancel, except for rounding
         surface_points = directions * self.radius(directions)[:, None] * self.axes / self.axes
         step = 1e-4
         differences = [
@@ -268,7 +272,7 @@ class _Block:
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def radius(self, d: Points) -> Float64[np.ndarray, "n"]:
-        """Distance of the surface along directions, in the block's own axes."""
+        """Compute the distance of the surface along directions, in the shape's own axes."""
         inverse_distance = np.maximum(_dot_products(d, self.cut_normals), 0.0) / self.cut_distances
         radius = (1.0 + np.sum(inverse_distance**self.sharpness, axis=1)) ** (-1.0 / self.sharpness)
         phase = _dot_products(d, self.waves) + self.wave_phases
@@ -290,7 +294,7 @@ class _Block:
 
     @cached_property
     def frame(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-        """Origin on the ground plane and scale that make the block a unit shape."""
+        """Origin on the ground plane, and scale, that convert this shape to a unit shape."""
         points = _icosphere(FINEST)[0] * self.finest_radius[:, None] * self.axes
         lowest, highest = points[:, 2].min(), points[:, 2].max()
         ground = lowest + self.buried_fraction * (highest - lowest)
@@ -312,8 +316,8 @@ def _dot_products(d: Points, vectors: Float64[np.ndarray, "m 3"]) -> Float64[np.
 
 
 @cache
-def _blocks() -> tuple[_Block, ...]:
-    return tuple(_Block.draw(number) for number in range(SHAPES))
+def _all_shapes() -> tuple[_RockShape, ...]:
+    return tuple(_RockShape.draw(number) for number in range(SHAPES))
 
 
 @cache
@@ -323,7 +327,7 @@ def _fitted_inverse_radii(number: int, detail: int) -> Float64[np.ndarray, "corn
     Along the direction sum(c d) of three corners with directions d and radii r, the distance of the triangle is
     1 / sum(c / r). The inverse distance is therefore linear in the inverse radii of the corners.
     """
-    corners, radius = _corner_weights(detail), _blocks()[number].finest_radius
+    corners, radius = _corner_weights(detail), _all_shapes()[number].finest_radius
     weighted = corners.multiply(radius[:, None] ** 4).tocsc()
     return np.asarray(splu((corners.T @ weighted).tocsc()).solve(weighted.T @ (1.0 / radius)))
 

@@ -40,6 +40,6 @@ class WindTails(Parameters):
         tails = np.column_stack([rocks.position_m[:, :2], 0.5 * width, 0.5 * width + length, height])
         downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
         samples = np.array(surface.levels[0])
-        visible = tails[width >= SAMPLES_ACROSS * surface.spacing_m]
-        stamp_tails(samples, surface.spacing_m, visible, float(np.cos(downwind)), float(np.sin(downwind)), self.tone)
+        wide_tails = tails[width >= SAMPLES_ACROSS * surface.spacing_m]
+        stamp_tails(samples, surface.spacing_m, wide_tails, float(np.cos(downwind)), float(np.sin(downwind)), self.tone)
         return Surface.from_samples(samples, surface.spacing_m, surface.cover)

@@ -1,5 +1,7 @@
-"""Synthetic landing images for hazard-detection tests: textured relief seen by a CAHVOR camera at two poses. The ray
-of each pixel is intersected with an analytic height function; no epipolar geometry is used."""
+"""Synthetic landing images for hazard-detection tests: textured relief seen by a CAHVOR camera at two poses.
+
+The ray of each pixel is intersected with an analytic height function. No epipolar geometry is used.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,16 @@ from marsyard.sim.measurements import DetectorCalibration, DetectorImage, Landin
 
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
-TEXEL_M = 0.01
-TEXELS = 2048
+TEXEL_M = 0.01  #: Size of a texture cell, metres.
+TEXELS = 2048  #: Cells along each side of the texture.
 
 
 @cache
 def make_camera(columns: int = 320) -> Cahvor:
-    """Camera 0.3 m in front of the body origin that looks straight down; image right is body right (-y). Field of view
-    of the XC-55 (6 mm, 640 x 480 pixels of 7.4 um), with barrel distortion of several pixels in the corners.
+    """Create a camera 0.3 m in front of the body origin that looks straight down; image right is body right (-y).
+
+    It has the field of view of the XC-55 (6 mm, 640 x 480 pixels of 7.4 um), and a barrel distortion of several pixels
+    in the corners.
     """
     size = (columns, columns * 3 // 4)
     linear = Cahv.from_focal_length(
@@ -35,16 +39,20 @@ def make_camera(columns: int = 320) -> Cahvor:
 
 @cache
 def make_texture() -> np.ndarray:
-    """Spline coefficients of a periodic texture of mean 1: details of 3 cm to metres; a pixel is 2.5 cm."""
+    """Create the spline coefficients of a periodic texture of mean 1, with details of 3 cm to metres.
+
+    A pixel of the images is 2.5 cm on the ground.
+    """
     rng = np.random.default_rng(7)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(TEXELS), fft.rfftfreq(TEXELS), indexing="ij"))
     frequency[0, 0] = np.inf
-    shape = frequency**-1.0 * np.exp(-((frequency / 0.12) ** 2))
-    values = fft.irfft2(shape * fft.rfft2(rng.standard_normal((TEXELS, TEXELS))), (TEXELS, TEXELS))
+    amplitude = frequency**-1.0 * np.exp(-((frequency / 0.12) ** 2))
+    values = fft.irfft2(amplitude * fft.rfft2(rng.standard_normal((TEXELS, TEXELS))), (TEXELS, TEXELS))
     return ndimage.spline_filter(1.0 + 0.2 * values / values.std(), order=3, mode="grid-wrap")
 
 
 def brightness(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Evaluate the texture at world positions, metres."""
     positions = np.stack([y.ravel(), x.ravel()]) / TEXEL_M
     return ndimage.map_coordinates(make_texture(), positions, order=3, mode="grid-wrap", prefilter=False).reshape(
         x.shape
@@ -56,7 +64,7 @@ def make_plane(slope_x: float = 0.0, slope_y: float = 0.0) -> Height:
 
 
 def make_bumps(*bumps: tuple[float, float, float, float], base: Height | None = None) -> Height:
-    """Height function of Gaussian bumps (x, y, height, standard deviation) on a base, metres."""
+    """Create the height function of Gaussian bumps (x, y, height, standard deviation) on a base, metres."""
     base_height = make_plane() if base is None else base
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -69,7 +77,10 @@ def make_bumps(*bumps: tuple[float, float, float, float], base: Height | None = 
 
 
 def intersect_relief(height: Height, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Intersect rays with the relief: march to the first step below ground, then refine; shape of the rays."""
+    """Intersect rays with the relief: march to the first step below ground, then refine.
+
+    Return points with the shape of `rays`. The distances first, last, low, high and s are along the rays, in metres.
+    """
     # The relief is between the heights -2 m and 3 m.
     last = (origin[2] + 2.0) / -rays[..., 2]
     first = np.maximum((origin[2] - 3.0) / -rays[..., 2], 0.0)
@@ -110,11 +121,11 @@ class Pass:
     columns: int = 320
 
     def camera(self, index: int) -> Cahvor:
-        """The camera in the world."""
+        """Return the camera in world axes."""
         return make_camera(self.columns).transform(self.poses[index])
 
     def ground(self, index: int, pixels: np.ndarray) -> np.ndarray:
-        """Points of the relief, in the world, at these pixels of an image."""
+        """Compute the points of the relief at pixels of an image, world axes."""
         model = self.camera(index)
         _, rays = model.rays(pixels)
         return intersect_relief(self.height, np.array(model.c), rays)
@@ -138,14 +149,14 @@ def _camera_rotation(model: Cahvor) -> Rotation:
 
 
 def make_pose(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> RigidTransform:
-    """Pose of a body, angles in degrees."""
+    """Create the pose of a body from its position, metres, and angles, degrees."""
     return rigid(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True), np.array([x, y, z]))
 
 
 def render_image(
     scene: Pass, index: int, noise: np.random.Generator | None = None, albedo: Callable[..., np.ndarray] = brightness
 ) -> DetectorImage:
-    """A 12-bit image, 1500 counts for brightness 1, with optional noise of 8 counts (1 sigma)."""
+    """Render a 12-bit image: 1500 counts for brightness 1, with optional noise of 8 counts (1 sigma)."""
     points = scene.ground(index, make_camera(scene.columns).pixel_grid())
     counts = 1500.0 * albedo(points[..., 0], points[..., 1])
     if noise is not None:
@@ -156,7 +167,7 @@ def render_image(
 
 
 def measure_pass(scene: Pass, noise: np.random.Generator | None = None) -> LandingMeasurements:
-    """Exact measurements of a pass; the a-priori site is the ground below the first pose."""
+    """Create exact measurements of a pass; the a-priori site is the ground below the first pose."""
     site = np.array(scene.poses[0].translation)
     site[2] = float(scene.height(site[0], site[1]))
     return LandingMeasurements(

@@ -66,31 +66,31 @@ def estimate(measurements: LandingMeasurements) -> SiteEstimate:
     return HdaEstimator(OPTIONS).estimate(measurements)
 
 
-def details_of(estimate: SiteEstimate) -> HdaDetails:
+def get_details(estimate: SiteEstimate) -> HdaDetails:
     assert isinstance(estimate.details, HdaDetails)
     return estimate.details
 
 
-def ground_of(estimate: SiteEstimate) -> Ground:
-    ground = details_of(estimate).ground
+def get_ground(estimate: SiteEstimate) -> Ground:
+    ground = get_details(estimate).ground
     assert ground is not None
     return ground
 
 
-def motion_of(estimate: SiteEstimate) -> Motion:
-    motion = details_of(estimate).motion
+def get_motion(estimate: SiteEstimate) -> Motion:
+    motion = get_details(estimate).motion
     assert motion is not None
     return motion
 
 
-def site_of(estimate: SiteEstimate) -> np.ndarray:
+def get_site(estimate: SiteEstimate) -> np.ndarray:
     assert estimate.site_world is not None
     return estimate.site_world
 
 
-def map_errors(scene: Pass, estimate: SiteEstimate) -> np.ndarray:
-    """Elevation errors at known cells, metres, from the exact pose of the first camera."""
-    result = ground_of(estimate)
+def compute_map_errors(scene: Pass, estimate: SiteEstimate) -> np.ndarray:
+    """Compute elevation errors at known cells, metres, with the exact pose of the first camera."""
+    result = get_ground(estimate)
     cells = np.argwhere(~np.isnan(result.elevation.elevation_m))
     z = result.elevation.elevation_m[tuple(cells.T)]
     points = np.column_stack([result.elevation.positions(cells.astype(np.float64)), z])
@@ -99,7 +99,7 @@ def map_errors(scene: Pass, estimate: SiteEstimate) -> np.ndarray:
 
 
 def is_clear_of_boulders(scene: Pass, x: float, y: float) -> bool:
-    """Whether a position is at least one lander radius and two boulder radii away from each boulder."""
+    """Return whether a position is at least one lander radius and two boulder radii away from each boulder."""
     return all(np.hypot(x - cx, y - cy) > 0.5 + 2.0 * radius for cx, cy, _, radius in BOULDERS)
 
 
@@ -112,23 +112,23 @@ def test_site_is_on_the_ground_and_clear_of_boulders(name: str, scene: Pass, mea
     assert is_clear_of_boulders(scene, x, y)
     # The smoothed elevation is accurate to half a percent of the height.
     assert z == pytest.approx(float(scene.height(np.array(x), np.array(y))), abs=0.05)
-    assert ground_of(result).hazards.safety[ground_of(result).site_cell] == Safety.SAFE
+    assert get_ground(result).hazards.safety[get_ground(result).site_cell] == Safety.SAFE
 
 
 def test_motion_and_map_match_exact_scene(scene: Pass, estimate: SiteEstimate) -> None:
     # Required accuracy: 0.05 deg, 1 % of the baseline, half a percent of the height.
-    motion = motion_of(estimate)
+    motion = get_motion(estimate)
     true_motion = scene.second_from_first
     assert np.rad2deg((motion.second_from_first.rotation * true_motion.rotation.inv()).magnitude()) < 0.05
     position_error = np.linalg.norm(motion.second_from_first.translation - true_motion.translation)
     assert position_error < 0.01 * np.linalg.norm(true_motion.translation)
-    errors = map_errors(scene, estimate)
+    errors = compute_map_errors(scene, estimate)
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
     assert abs(np.median(errors)) < 0.02
 
 
 def test_each_boulder_is_a_hazard(scene: Pass, estimate: SiteEstimate) -> None:
-    result = ground_of(estimate)
+    result = get_ground(estimate)
     for x, y, _, _ in BOULDERS:
         offset = np.array([x, y, float(scene.height(np.array(x), np.array(y)))]) - scene.camera(0).c
         row, column = np.rint(result.elevation.cells(result.world_from_surface.inv().apply(offset)[:2])).astype(int)
@@ -144,7 +144,7 @@ def test_too_steep_ground_has_no_safe_site() -> None:
     assert result.outcome is SiteOutcome.NO_SAFE_SITE
     assert result.outcome.converged
     assert result.site_world is None
-    assert np.rad2deg(np.nanmedian(ground_of(result).hazards.slope_rad)) == pytest.approx(16.7, abs=0.5)
+    assert np.rad2deg(np.nanmedian(get_ground(result).hazards.slope_rad)) == pytest.approx(16.7, abs=0.5)
 
 
 def test_gravity_from_fitted_plane_removes_mean_slope() -> None:
@@ -152,8 +152,8 @@ def test_gravity_from_fitted_plane_removes_mean_slope() -> None:
     frame = replace(OPTIONS, surface_frame=SurfaceFrame.PLANE)
     result = HdaEstimator(frame).estimate(steep)
     assert result.outcome is SiteOutcome.SAFE_SITE
-    ground = ground_of(result)
-    first = details_of(result).views[0]
+    ground = get_ground(result)
+    first = get_details(result).views[0]
     normal = (first.world_from_camera.rotation * ground.surface_from_camera.inv()).apply(np.array([0.0, 0.0, 1.0]))
     # For independent matches the error is 0.01 deg (3,000 points, 2 cm of noise, 7 m); neighbours are correlated.
     assert np.rad2deg(np.arccos(normal @ np.array([-0.3, 0.0, 1.0]) / np.hypot(0.3, 1.0))) < 0.2
@@ -164,7 +164,7 @@ def test_gravity_from_inclinometers_or_state(measurements: LandingMeasurements) 
     slopes = {}
     for frame in (SurfaceFrame.INCLINOMETER, SurfaceFrame.STATE):
         result = HdaEstimator(replace(OPTIONS, surface_frame=frame)).estimate(tilted)
-        slopes[frame] = float(np.nanmedian(ground_of(result).hazards.slope_rad))
+        slopes[frame] = float(np.nanmedian(get_ground(result).hazards.slope_rad))
     assert slopes[SurfaceFrame.STATE] == pytest.approx(np.arctan(np.hypot(0.03, 0.02)), abs=0.005)
     assert abs(slopes[SurfaceFrame.INCLINOMETER] - slopes[SurfaceFrame.STATE]) > 0.05
 
@@ -180,7 +180,7 @@ def test_sites_are_reported_in_map_coordinates(measurements: LandingMeasurements
             apriori_site_world=map_from_world.apply(measurements.apriori_site_world),
         )
     )
-    np.testing.assert_allclose(site_of(result), map_from_world.apply(site_of(estimate)), atol=1e-6)
+    np.testing.assert_allclose(get_site(result), map_from_world.apply(get_site(estimate)), atol=1e-6)
 
 
 def test_position_error_shifts_the_site_equally(measurements: LandingMeasurements, estimate: SiteEstimate) -> None:
@@ -191,19 +191,19 @@ def test_position_error_shifts_the_site_equally(measurements: LandingMeasurement
     )
     # The a-priori site comes from map data and only breaks ties.
     result = HdaEstimator(OPTIONS).estimate(replace(measurements, poses=(poses[0], poses[1])))
-    np.testing.assert_allclose(site_of(result), site_of(estimate) + shift, atol=1e-6)
+    np.testing.assert_allclose(get_site(result), get_site(estimate) + shift, atol=1e-6)
 
 
 @all_estimators
 def test_estimate_is_deterministic(name: str, measurements: LandingMeasurements) -> None:
     first, second = (ESTIMATORS[name](OPTIONS).estimate(measurements) for _ in range(2))
     np.testing.assert_array_equal(first.site_world, second.site_world)
-    for key, value in hda_products(details_of(first)).items():
-        np.testing.assert_array_equal(hda_products(details_of(second))[key], value)
+    for key, value in hda_products(get_details(first)).items():
+        np.testing.assert_array_equal(hda_products(get_details(second))[key], value)
 
 
 def is_apriori_site(result: SiteEstimate, inputs: LandingMeasurements) -> bool:
-    """Whether an estimate did not converge and its site is the a-priori site."""
+    """Return whether an estimate did not converge and its site is the a-priori site."""
     assert not result.outcome.converged
     return result.site_world is not None and np.array_equal(result.site_world, inputs.apriori_site_world)
 
@@ -301,8 +301,8 @@ def test_poses_can_predict_feature_positions(scene: Pass) -> None:
     inputs = measure_pass(wide)
     seeded = HdaEstimator(replace(OPTIONS, track_seed=TrackSeed.POSE)).estimate(inputs)
     assert seeded.outcome.converged
-    assert motion_of(seeded).parallax_px > 50.0
-    errors = map_errors(wide, seeded)
+    assert get_motion(seeded).parallax_px > 50.0
+    errors = compute_map_errors(wide, seeded)
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
     assert not HdaEstimator(OPTIONS).estimate(inputs).outcome.converged
 
@@ -313,7 +313,7 @@ def test_image_size_must_match_camera(measurements: LandingMeasurements) -> None
 
 
 def test_products_contain_figure_data(scene: Pass, measurements: LandingMeasurements, estimate: SiteEstimate) -> None:
-    products = hda_products(details_of(estimate))
+    products = hda_products(get_details(estimate))
     accepted = products["tracks_accepted"]
     assert products["sparse_points"].shape == (accepted.sum(), 3)
     # The points of Fig. 2 (landing paper) are on the ground at the pixels of the tracks.
@@ -327,17 +327,17 @@ def test_products_contain_figure_data(scene: Pass, measurements: LandingMeasurem
     # Fig. 7 (landing paper): each cell projects to the pixel that shows it.
     row, column = products["site"].astype(int)
     observed = scene.ground(0, products["map_pixels"][row, column][None])[0]
-    np.testing.assert_allclose(observed[:2], site_of(estimate)[:2], atol=0.05)
+    np.testing.assert_allclose(observed[:2], get_site(estimate)[:2], atol=0.05)
     # Products of stages that did not run are absent.
     without_range = HdaEstimator(OPTIONS).estimate(replace(measurements, slant_range_m=np.nan))
-    assert hda_products(details_of(without_range)) == {}
+    assert hda_products(get_details(without_range)) == {}
 
 
 def test_map_does_not_depend_on_image_brightness(scene: Pass, measurements: LandingMeasurements) -> None:
     darker = measurements
     for index in (0, 1):
         darker = replace_image(darker, index, (measurements.images[index].counts // 4).astype(np.uint16))
-    errors = map_errors(scene, HdaEstimator(OPTIONS).estimate(darker))
+    errors = compute_map_errors(scene, HdaEstimator(OPTIONS).estimate(darker))
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
 
 
@@ -354,5 +354,5 @@ def test_map_tolerates_detector_noise(scene: Pass) -> None:
     inputs = measure_pass(scene)
     result = HdaEstimator(OPTIONS).estimate(replace(inputs, images=(noisy[0], noisy[1])))
     clean = HdaEstimator(OPTIONS).estimate(inputs)
-    deviations_m = [float(np.std(map_errors(scene, estimate))) for estimate in (clean, result)]
+    deviations_m = [float(np.std(compute_map_errors(scene, estimate))) for estimate in (clean, result)]
     assert deviations_m[1] < 1.3 * deviations_m[0]

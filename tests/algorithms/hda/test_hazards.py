@@ -89,8 +89,8 @@ def test_robust_fit_has_least_median_of_tested_triples() -> None:
     expected = None
     for u in triples:
         # Sampling without replacement: the second of 24 indices, then the third of 23.
-        left = list(range(25))
-        i, j, k = left.pop(int(u[0] * 25)), left.pop(int(u[1] * 24)), left.pop(int(u[2] * 23))
+        remaining = list(range(25))
+        i, j, k = (remaining.pop(int(u[n] * (25 - n))) for n in range(3))
         design = np.array([[1.0, x[n], y[n]] for n in (i, j, k)])
         if abs(np.linalg.det(design)) < 0.5:
             continue

@@ -19,7 +19,7 @@ NO_MOTION_START = rigid(Rotation.identity(), np.zeros(3))
 
 
 def make_tracks(rng: np.random.Generator, relief: float, tracks: int = 59) -> tuple[np.ndarray, np.ndarray]:
-    """Normalised image coordinates over the XC-55's field of view, and depths near 10 m on ground with 6 deg slope."""
+    """Draw normalised image coordinates in the XC-55's field of view, and depths of about 10 m on a 6 deg slope."""
     points = rng.uniform([-0.39, -0.29], [0.39, 0.29], (tracks, 2))
     return points, 10.0 * (1.0 + 0.1 * points[:, 0]) * (1.0 + relief * rng.standard_normal(tracks))
 
@@ -40,7 +40,7 @@ def solve_motion(points: np.ndarray, second: np.ndarray, start: RigidTransform =
 
 
 def motion_errors(result: Motion, true_motion: RigidTransform, scale: float) -> tuple[float, float]:
-    """Rotation error in radians, and translation error as a fraction of the baseline."""
+    """Compute the rotation error, radians, and the translation error as a fraction of the baseline."""
     rotation_error = (result.second_from_first.rotation * true_motion.rotation.inv()).magnitude()
     translation_error = scale * result.second_from_first.translation - true_motion.translation
     return float(rotation_error), float(np.linalg.norm(translation_error) / np.linalg.norm(true_motion.translation))
@@ -166,8 +166,8 @@ def test_residuals_are_reprojection_errors_in_pixels() -> None:
     true_motion = draw_motion(rng)
     second = project_points(points, depths, true_motion) + 0.01
     motion = kernels.Motion(true_motion.rotation.as_quat(scalar_first=True), true_motion.translation, 1.0 / depths)
-    r = kernels.residuals(kernels.Matches(points, second, FOCAL_PX, 1.0), motion)
-    np.testing.assert_allclose(r, -0.01 * FOCAL_PX, rtol=1e-9)
+    residuals = kernels.residuals(kernels.Matches(points, second, FOCAL_PX, 1.0), motion)
+    np.testing.assert_allclose(residuals, -0.01 * FOCAL_PX, rtol=1e-9)
 
 
 def test_level_ground_depths_match_a_plane() -> None:

@@ -13,7 +13,7 @@ from tests.algorithms.hda.relief_scene import make_camera
 
 
 def render_detector_image(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, DetectorImage]:
-    """A scene with a brightness gradient and its image, exposed for 4 ms with negligible noise."""
+    """Render a scene with a brightness gradient, and its image, exposed for 4 ms with negligible noise."""
     optics = make_camera(320)
     rows, columns = optics.size[1], optics.size[0]
     rng = np.random.default_rng(3)

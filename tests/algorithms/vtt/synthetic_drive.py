@@ -29,7 +29,7 @@ MAST = MastGeometry(
 def make_stereo_pair(
     focal_px: float, size: tuple[int, int], baseline_m: float, toe_in_rad: float = 0.0
 ) -> tuple[CameraModel, CameraModel]:
-    """Head cameras with the lens distortion of Opportunity's navcam and an off-centre axis."""
+    """Create head cameras with the lens distortion of Opportunity's navcam and an off-centre axis."""
     cameras = []
     for side in (1.0, -1.0):
         toe_in_rotation = Rotation.from_rotvec([0.0, 0.0, -side * toe_in_rad])
@@ -87,7 +87,7 @@ class Plane:
     normal: np.ndarray
 
     def ranges(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distance along each ray; NaN where the ray misses the front side."""
+        """Compute the distance along each ray, metres; NaN where the ray misses the front side."""
         slope = directions @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):
             t = ((self.point - origins) @ self.normal) / slope
@@ -102,12 +102,12 @@ class Sphere:
     radius: float
 
     def ranges(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distance along each ray; NaN where the ray misses."""
+        """Compute the distance along each ray, metres; NaN where the ray misses."""
         offset = origins - self.centre
         b = np.sum(offset * directions, axis=-1)
-        gap = b * b - np.sum(offset * offset, axis=-1) + self.radius**2
+        discriminant = b * b - np.sum(offset * offset, axis=-1) + self.radius**2
         with np.errstate(invalid="ignore"):
-            return np.asarray(-b - np.sqrt(gap))
+            return np.asarray(-b - np.sqrt(discriminant))
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Scene:
     level_dn: float = 1500.0
 
     def intersect(self, camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
-        """World points at the pixels of a camera that is given in the world frame; NaN for the sky."""
+        """Compute the world points at the pixels of a camera in the world frame; NaN for the sky."""
         origins, directions = camera.rays(pixels)
         ranges = np.stack([body.ranges(origins, directions) for body in self.bodies])
         nearest = np.where(np.isnan(ranges), np.inf, ranges).min(axis=0)
@@ -130,7 +130,7 @@ class Scene:
     def render_image(
         self, camera: CameraModel, box: PixelBox, noise: np.random.Generator | None = None, noise_dn: float = 8.0
     ) -> MastImage:
-        """Counts of a part of the frame. Texture is averaged over the extent of the pixel at the centre of the part."""
+        """Render a part of the frame; each texture wave is averaged over the extent of the central pixel."""
         u = box.corner[0] + np.arange(box.size[0], dtype=np.float64)
         v = box.corner[1] + np.arange(box.size[1], dtype=np.float64)
         points = self.intersect(camera, np.stack(np.meshgrid(u, v), axis=-1))
@@ -140,9 +140,10 @@ class Scene:
         attenuated = self.texture.amplitudes.copy()
         for extent in (by_u, by_v):
             attenuated *= np.sinc(self.texture.vectors @ extent / (2.0 * np.pi))
-        used = np.abs(attenuated) > 1e-4
+        is_relevant = np.abs(attenuated) > 1e-4
         vectors, phases, amplitudes = (
-            x.astype(np.float32) for x in (self.texture.vectors[used].T, self.texture.phases[used], attenuated[used])
+            x.astype(np.float32)
+            for x in (self.texture.vectors[is_relevant].T, self.texture.phases[is_relevant], attenuated[is_relevant])
         )
         value = np.empty(points.shape[:2])
         for row, offsets in zip(value, (points - self.origin).astype(np.float32), strict=True):
@@ -155,7 +156,7 @@ class Scene:
 
 
 def pose(x: float, y: float, heading_rad: float = 0.0, tilt: Rotation | None = None) -> RigidTransform:
-    """Pose of the rover on level ground, heading counter-clockwise from +x, tilted in its own axes."""
+    """Create the pose of the rover on level ground, heading counter-clockwise from +x, tilted in its own axes."""
     heading = Rotation.from_rotvec([0.0, 0.0, heading_rad])
     return rigid(heading if tilt is None else heading * tilt, np.array([x, y, 0.0]))
 
@@ -177,15 +178,15 @@ class Drive:
     measurements: list[RoverMeasurements] = field(default_factory=list)
 
     def camera(self, world_from_rover: RigidTransform, angles: tuple[float, float], right: bool = False) -> CameraModel:
-        """Camera in the world frame for given mast angles."""
-        chosen = self.mast.right if right else self.mast.left
-        return chosen.transform(world_from_rover * self.mast.geometry.rover_from_head(*angles))
+        """Return the camera in the world frame for mast angles (azimuth, elevation), radians."""
+        camera = self.mast.right if right else self.mast.left
+        return camera.transform(world_from_rover * self.mast.geometry.rover_from_head(*angles))
 
     def stop(self, true_pose: RigidTransform, estimated_pose: RigidTransform | None = None) -> TargetUpdate | None:
         """Aim, capture images at the true pose and update; return None if the tracker has no aim."""
         rover_estimate = true_pose if estimated_pose is None else estimated_pose
-        known_mast = self.mast if self.calibrated is None else self.calibrated
-        aim = self.tracker.aim(rover_estimate, known_mast)
+        tracker_mast = self.mast if self.calibrated is None else self.calibrated
+        aim = self.tracker.aim(rover_estimate, tracker_mast)
         if aim is None:
             return None
         angles = (aim.azimuth_rad, aim.elevation_rad)
@@ -194,7 +195,7 @@ class Drive:
             RoverMeasurements(
                 left=self.scene.render_image(self.camera(true_pose, actual), aim.left, self.noise),
                 right=self.scene.render_image(self.camera(true_pose, actual, right=True), aim.right, self.noise),
-                mast=known_mast,
+                mast=tracker_mast,
                 azimuth_rad=angles[0],
                 elevation_rad=angles[1],
                 world_from_rover=rover_estimate,
@@ -203,28 +204,28 @@ class Drive:
         return self.tracker.update(self.measurements[-1])
 
     def true_pixel(self, true_pose: RigidTransform, point_world: np.ndarray) -> np.ndarray:
-        """True pixel of a world point in the left image of the last stop."""
+        """Project a world point into the left image of the last stop, with the true pose and mast angles."""
         last, error = self.measurements[-1], self.pointing_error_rad
         return self.camera(true_pose, (last.azimuth_rad + error[0], last.elevation_rad + error[1])).project(
             point_world
         )[0]
 
 
-#: A smaller window than the paper's reduces the computed image parts.
-SMALL = VttOptions(search_px=101, warp="bend")
+#: Options with a smaller search window than the paper's, for smaller computed image parts.
+SMALL_WINDOW = VttOptions(search_px=101, warp="bend")
 
-Body = Callable[[int, np.ndarray], Plane | Sphere]
+MakeBody = Callable[[int, np.ndarray], Plane | Sphere]
 
 
 def make_face(seed: int, target: np.ndarray) -> Plane:
-    """A face through the target with a random tilt, visible to a rover at the origin."""
+    """Create a face through the target with a random tilt, visible to a rover at the origin."""
     rng = np.random.default_rng(seed)
     normal = np.array([-1.0, rng.uniform(-0.5, 0.5), rng.uniform(0.0, 1.0)])
     return Plane(target, normal / np.linalg.norm(normal))
 
 
 def make_boulder(seed: int, target: np.ndarray) -> Sphere:
-    """A sphere of 0.3 to 0.6 m with the target on its front."""
+    """Create a sphere of 0.3 to 0.6 m radius with the target on its front."""
     rng = np.random.default_rng(seed)
     normal = np.array([-1.0, rng.uniform(-0.4, 0.4), rng.uniform(0.2, 0.8)])
     radius = rng.uniform(0.3, 0.6)
@@ -235,19 +236,19 @@ def make_scene(body: Plane | Sphere, target: np.ndarray, seed: int) -> Scene:
     return Scene((body,), draw_waves(seed, count=100), target)
 
 
-def details_of(update: TargetUpdate | None) -> VttDetails:
+def get_details(update: TargetUpdate | None) -> VttDetails:
     assert update is not None
     assert isinstance(update.details, VttDetails)
     return update.details
 
 
-def pixel_of(update: TargetUpdate) -> np.ndarray:
-    match = details_of(update).match
+def get_pixel(update: TargetUpdate) -> np.ndarray:
+    match = get_details(update).match
     assert match is not None
     return match.pixel
 
 
-def approach(
+def drive_to_target(
     drive: Drive, target: np.ndarray, fraction: float, goal_m: float = 2.0, slip: float = 0.0
 ) -> list[tuple[RigidTransform, TargetUpdate]]:
     """Drive towards the target until it is near or lost; each step is a fraction of the distance.
@@ -260,7 +261,7 @@ def approach(
         update = drive.stop(pose(x, 0.0), pose(estimated_x, 0.0))
         assert update is not None
         stops.append((pose(x, 0.0), update))
-        distance = details_of(update).distance_m
+        distance = get_details(update).distance_m
         if not update.found or distance < goal_m + 0.02:
             return stops
         step = min(fraction * distance, 1.3 * (distance - goal_m))

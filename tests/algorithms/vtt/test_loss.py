@@ -10,13 +10,13 @@ import pytest
 from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.accuracy import GoalCriterion, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.tracker import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
+from marsyard.algorithms.vtt.tracker import Distances, Evidence, Tolerances, find_losses, next_state, tolerances
 from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
 
 OPTIONS = VttOptions()
 GOOD = {"match_score": 0.9, "stereo_score": 0.9, "distance_correction_m": 0.0, "position_correction_m": 0.0}
-ALLOWED = Tolerances(distance_m=0.2, position_m=0.4)
+TOLERANCES = Tolerances(distance_m=0.2, position_m=0.4)
 
 
 @pytest.mark.parametrize(
@@ -34,12 +34,12 @@ ALLOWED = Tolerances(distance_m=0.2, position_m=0.4)
     ],
 )
 def test_each_loss_criterion_is_independent(criterion: str, value: float, expected: TargetLoss | None) -> None:
-    result = find_losses(Evidence(**(GOOD | {criterion: value})), ALLOWED, OPTIONS)
+    result = find_losses(Evidence(**(GOOD | {criterion: value})), TOLERANCES, OPTIONS)
     assert result == (() if expected is None else (expected,))
 
 
 def test_all_violated_criteria_are_reported() -> None:
-    assert find_losses(Evidence(0.1, 0.1, 9.0, 9.0), ALLOWED, OPTIONS) == (
+    assert find_losses(Evidence(0.1, 0.1, 9.0, 9.0), TOLERANCES, OPTIONS) == (
         TargetLoss.LOW_MATCH_SCORE,
         TargetLoss.LOW_STEREO_SCORE,
         TargetLoss.DISTANCE_JUMP,
@@ -50,7 +50,7 @@ def test_all_violated_criteria_are_reported() -> None:
 def test_tolerances_match_the_formula() -> None:
     # Range error of the MER navcam for 1 px of disparity: R^2 / 244.5, which is 0.409 m at 10 m and 0.331 m at 9 m. The
     # step of 1 m adds 0.2 m, and the direction error 0.27 m.
-    result = tolerances(Journey(10.0, 10.0, 9.0, 1.0, 1.0), navcam().left, navcam().right, OPTIONS)
+    result = tolerances(Distances(10.0, 10.0, 9.0, 1.0, 1.0), navcam().left, navcam().right, OPTIONS)
     assert result.distance_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2), abs=1e-3)
     assert result.position_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2 + 0.27**2), abs=1e-3)
 
@@ -58,7 +58,7 @@ def test_tolerances_match_the_formula() -> None:
 def test_tolerances_decrease_with_target_distance() -> None:
     distances = [10.0 * 0.9**i for i in range(16)]
     allowed = [
-        tolerances(Journey(10.0, old, new, old - new, 10.0 - new), navcam().left, navcam().right, OPTIONS)
+        tolerances(Distances(10.0, old, new, old - new, 10.0 - new), navcam().left, navcam().right, OPTIONS)
         for old, new in pairwise(distances)
     ]
     assert np.all(np.diff([a.distance_m for a in allowed]) < 0.0)
@@ -75,7 +75,7 @@ def test_stereo_noise_rarely_loses_a_target(mast: MastCalibration) -> None:
     scale = mast.left.focal_lengths[0] * np.linalg.norm(mast.left.c - mast.right.c)
     old, new = (scale / (scale / r + rng.normal(0.0, 1.0 / 3.0, 100_000)) for r in (10.0, 9.0))
     correction = new - (old - 1.0 + rng.normal(0.0, 0.2 / 3.0, 100_000))
-    allowed = tolerances(Journey(10.0, 10.0, 9.0, 1.0, 1.0), mast.left, mast.right, OPTIONS)
+    allowed = tolerances(Distances(10.0, 10.0, 9.0, 1.0, 1.0), mast.left, mast.right, OPTIONS)
     assert np.mean(np.abs(correction) > allowed.distance_m) < 0.003
     assert np.quantile(np.abs(correction), 0.99) > allowed.distance_m * 0.45  # the tolerance is not much too large
 
@@ -94,10 +94,10 @@ NORMAL, LOST, FAILURE = TrackingState.NORMAL, TrackingState.LOST, TrackingState.
     ],
 )
 def test_state_transitions_match_figure_6(limit: int, results: list[bool], expected: list[TrackingState]) -> None:
-    """`results`: whether the target was found in each image."""
-    state, tries, states = NORMAL, 0, []
+    """`results`: whether the tracker located the target in each image."""
+    state, lost_count, states = NORMAL, 0, []
     for is_found in results:
-        state, tries = next_state(state, tries, is_found, limit)
+        state, lost_count = next_state(state, lost_count, is_found, limit)
         states.append(state)
     assert states == expected
 

@@ -16,20 +16,20 @@ from marsyard.algorithms.vtt.tracker import VisualTargetTracker
 from marsyard.sim.camera import Cahvor
 from marsyard.sim.measurements import MastImage, PixelTarget, RoverTarget, SiteTarget, TargetDesignation
 from tests.algorithms.vtt.synthetic_drive import (
-    SMALL,
-    Body,
+    SMALL_WINDOW,
     Drive,
+    MakeBody,
     Plane,
     Scene,
-    approach,
-    details_of,
     draw_waves,
+    drive_to_target,
+    get_details,
+    get_pixel,
     make_boulder,
     make_face,
     make_scene,
     navcam,
     pancam,
-    pixel_of,
     pose,
 )
 
@@ -37,29 +37,29 @@ from tests.algorithms.vtt.synthetic_drive import (
 
 
 @pytest.mark.parametrize(
-    ("fraction", "body", "seeds"),
+    ("fraction", "make_body", "seeds"),
     [(0.1, make_face, range(3)), (0.1, make_boulder, range(3)), (0.05, make_face, range(10, 11))],
 )
-def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, body: Body, seeds: range) -> None:
+def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_body: MakeBody, seeds: range) -> None:
     # Requirement without noise: 1 px rms, 2.5 px maximum. An error of one pixel at 10 m grows to 5 px at 2 m.
     drifts = []
     for seed in seeds:
         target = np.array([10.0, 0.2 - 0.1 * seed, 0.2])
-        drive = Drive(make_scene(body(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL))
-        stops = approach(drive, target, fraction)
+        drive = Drive(make_scene(make_body(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL_WINDOW))
+        stops = drive_to_target(drive, target, fraction)
         true_pose, last = stops[-1]
         assert last.found
-        assert details_of(last).distance_m < 2.05
-        drifts.append(pixel_of(last) - drive.true_pixel(true_pose, target))
+        assert get_details(last).distance_m < 2.05
+        drifts.append(get_pixel(last) - drive.true_pixel(true_pose, target))
         assert last.position_rover is not None
         # One tenth of the required 3 cm, with exact poses and cameras.
         assert np.linalg.norm(last.position_rover - true_pose.inv().apply(target)) < 0.003
         for (_, previous), (_, current) in pairwise(stops):
-            change = details_of(current).change
+            change = get_details(current).change
             assert change is not None
             # The pose predicts the magnification, stereo measures it. 0.1 px of disparity changes the range by 0.4 %
             # at 10 m.
-            measured = details_of(previous).distance_m / details_of(current).distance_m
+            measured = get_details(previous).distance_m / get_details(current).distance_m
             assert change.magnification == pytest.approx(measured, abs=0.012)
     assert np.sqrt(np.mean(np.sum(np.square(drifts), axis=1))) < 1.0
     assert np.max(np.linalg.norm(drifts, axis=1)) < 2.5
@@ -70,11 +70,11 @@ def test_published_tracker_drifts_by_a_few_pixels() -> None:
     drifts = []
     for seed in range(3):
         target = np.array([10.0, 0.2 - 0.1 * seed, 0.2])
-        tracker = VisualTargetTracker(replace(SMALL, warp="none"))
+        tracker = VisualTargetTracker(replace(SMALL_WINDOW, warp="none"))
         drive = Drive(make_scene(make_boulder(seed, target), target, seed), navcam(), tracker)
-        true_pose, last = approach(drive, target, 0.1)[-1]
+        true_pose, last = drive_to_target(drive, target, 0.1)[-1]
         assert last.found
-        drifts.append(np.linalg.norm(pixel_of(last) - drive.true_pixel(true_pose, target)))
+        drifts.append(np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)))
     assert 0.3 < np.sqrt(np.mean(np.square(drifts))) < 10.0
 
 
@@ -86,10 +86,10 @@ def test_track_drifts_without_subpixel_matching() -> None:
         drive = Drive(
             make_scene(make_face(seed, target), target, seed),
             navcam(),
-            VisualTargetTracker(replace(SMALL, subpixel=False, min_match_score=0.0)),
+            VisualTargetTracker(replace(SMALL_WINDOW, subpixel=False, min_match_score=0.0)),
         )
-        true_pose, last = approach(drive, target, 0.05)[-1]
-        drifts.append(np.linalg.norm(pixel_of(last) - drive.true_pixel(true_pose, target)))
+        true_pose, last = drive_to_target(drive, target, 0.05)[-1]
+        drifts.append(np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)))
     assert max(drifts) > 2.5
 
 
@@ -99,10 +99,10 @@ def test_track_drifts_without_subpixel_matching() -> None:
 def test_scaling_allows_larger_steps_than_pure_ncc() -> None:
     target = np.array([10.0, 0.1, 0.2])
     scene = make_scene(make_face(2, target), target, 2)
-    scaled = approach(Drive(scene, navcam(), VisualTargetTracker(SMALL)), target, 0.23)
+    scaled = drive_to_target(Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW)), target, 0.23)
     assert scaled[-1][1].found
-    assert details_of(scaled[-1][1]).distance_m < 2.05
-    pure = approach(Drive(scene, navcam(), VisualTargetTracker(replace(PURE_NCC, search_px=101))), target, 0.23)
+    assert get_details(scaled[-1][1]).distance_m < 2.05
+    pure = drive_to_target(Drive(scene, navcam(), VisualTargetTracker(replace(PURE_NCC, search_px=101))), target, 0.23)
     assert pure[-1][1].state is TrackingState.LOST
     assert TargetLoss.LOW_MATCH_SCORE in pure[-1][1].losses
 
@@ -110,28 +110,30 @@ def test_scaling_allows_larger_steps_than_pure_ncc() -> None:
 @pytest.mark.parametrize("roll", [True, False])
 def test_tilted_rover_requires_roll_correction(roll: bool) -> None:
     target = np.array([5.0, 0.1, 0.3])
-    drive = Drive(make_scene(make_face(1, target), target, 1), navcam(), VisualTargetTracker(replace(SMALL, roll=roll)))
+    drive = Drive(
+        make_scene(make_face(1, target), target, 1), navcam(), VisualTargetTracker(replace(SMALL_WINDOW, roll=roll))
+    )
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     # The body tilts by 25 deg to its right: its image rolls counter-clockwise by about the same angle.
     tilted_pose = pose(0.3, 0.0, tilt=Rotation.from_rotvec([np.deg2rad(25.0), 0.0, 0.0]))
     update = drive.stop(tilted_pose)
-    change = details_of(update).change
+    change = get_details(update).change
     assert change is not None
     assert np.degrees(change.roll_rad) == pytest.approx(-25.0, abs=4.0)
     assert update is not None
     assert update.found == roll
     if roll:
-        np.testing.assert_allclose(pixel_of(update), drive.true_pixel(tilted_pose, target), atol=0.3)
+        np.testing.assert_allclose(get_pixel(update), drive.true_pixel(tilted_pose, target), atol=0.3)
 
 
 def test_turn_in_place_changes_only_mast_angles() -> None:
     target = np.array([6.0, 0.5, 0.2])
-    drive = Drive(make_scene(make_face(4, target), target, 4), navcam(), VisualTargetTracker(SMALL))
+    drive = Drive(make_scene(make_face(4, target), target, 4), navcam(), VisualTargetTracker(SMALL_WINDOW))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0, np.deg2rad(45.0)))
-    result = details_of(update)
+    result = get_details(update)
     assert update is not None
     assert update.found
     assert result.match is not None
@@ -150,7 +152,7 @@ def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
     scene = make_scene(Plane(target, np.array([-0.96, 0.0, 0.28])), target, 5)
     scores = {}
     for step in (2.0, 8.0, 15.0):
-        drive = Drive(scene, navcam(), VisualTargetTracker(SMALL))
+        drive = Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW))
         first, second = (
             pose(4.0 - 4.0 * np.cos(a), -4.0 * np.sin(a), a) for a in (np.deg2rad(-0.5 * step), np.deg2rad(0.5 * step))
         )
@@ -160,9 +162,9 @@ def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
         assert update is not None
         assert update.found
         # The mast is ahead and to the left of the rover origin; the angle is that of the line of sight.
-        assert abs(np.degrees(details_of(update).azimuth_change_rad)) == pytest.approx(step, rel=0.02)
-        np.testing.assert_allclose(pixel_of(update), drive.true_pixel(second, target), atol=0.2)
-        match = details_of(update).match
+        assert abs(np.degrees(get_details(update).azimuth_change_rad)) == pytest.approx(step, rel=0.02)
+        np.testing.assert_allclose(get_pixel(update), drive.true_pixel(second, target), atol=0.2)
+        match = get_details(update).match
         assert match is not None
         scores[step] = match.score
     assert 0.79 < scores[15.0] < scores[8.0] < scores[2.0]
@@ -170,17 +172,17 @@ def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
 
 def test_driving_backwards_shrinks_the_template() -> None:
     target = np.array([4.0, 0.1, 0.2])
-    drive = Drive(make_scene(make_face(2, target), target, 2), navcam(), VisualTargetTracker(SMALL))
+    drive = Drive(make_scene(make_face(2, target), target, 2), navcam(), VisualTargetTracker(SMALL_WINDOW))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     for x in (-0.4, -0.8, -1.2):
         update = drive.stop(pose(x, 0.0))
-        change = details_of(update).change
+        change = get_details(update).change
         assert update is not None
         assert update.found
         assert change is not None
         assert 0.88 < change.magnification < 0.93
-        np.testing.assert_allclose(pixel_of(update), drive.true_pixel(pose(x, 0.0), target), atol=0.15)
+        np.testing.assert_allclose(get_pixel(update), drive.true_pixel(pose(x, 0.0), target), atol=0.15)
 
 
 # ----- designation, stereo, poses -----
@@ -198,7 +200,7 @@ def test_all_three_designations_define_the_same_target() -> None:
         PixelTarget(camera.project(target)[0], 0.02, -0.12),
     ]
     for designation in designations:
-        drive = Drive(scene, navcam(), VisualTargetTracker(replace(SMALL, seed_range_m=(3.0, 15.0))))
+        drive = Drive(scene, navcam(), VisualTargetTracker(replace(SMALL_WINDOW, seed_range_m=(3.0, 15.0))))
         drive.tracker.designate(designation, start)
         update = drive.stop(start)
         assert update is not None
@@ -209,12 +211,12 @@ def test_all_three_designations_define_the_same_target() -> None:
         second_update = drive.stop(pose(0.7, 0.0))
         assert second_update is not None
         assert second_update.found
-        np.testing.assert_allclose(pixel_of(second_update), drive.true_pixel(pose(0.7, 0.0), target), atol=0.1)
+        np.testing.assert_allclose(get_pixel(second_update), drive.true_pixel(pose(0.7, 0.0), target), atol=0.1)
 
 
 def test_near_target_range_uses_pair_centred_pointing() -> None:
     target = np.array([2.2, -0.1, 0.3])
-    options = replace(SMALL, aim_pair=True)
+    options = replace(SMALL_WINDOW, aim_pair=True)
     drive = Drive(make_scene(make_face(6, target), target, 6), pancam(), VisualTargetTracker(options))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0))
@@ -229,9 +231,9 @@ def test_slanted_face_score_includes_second_camera_view() -> None:
     face = Plane(target, np.array([-np.cos(slant), np.sin(slant), 0.0]))
     scores = {}
     for warp in ("shift", "bend"):
-        drive = Drive(make_scene(face, target, 3), navcam(), VisualTargetTracker(replace(SMALL, warp=warp)))
+        drive = Drive(make_scene(face, target, 3), navcam(), VisualTargetTracker(replace(SMALL_WINDOW, warp=warp)))
         drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-        stereo = details_of(drive.stop(pose(0.0, 0.0))).stereo
+        stereo = get_details(drive.stop(pose(0.0, 0.0))).stereo
         scores[warp] = 0.0 if stereo is None else stereo.score
     assert scores["bend"] > 0.95
     assert scores["shift"] < scores["bend"] - 0.1
@@ -240,13 +242,13 @@ def test_slanted_face_score_includes_second_camera_view() -> None:
 def test_slip_appears_as_a_position_correction() -> None:
     # The rover drives 4 % less than estimated: 4 cm in the first metre, a displacement of at most 5 px in the image.
     target = np.array([8.0, 0.1, 0.2])
-    drive = Drive(make_scene(make_face(7, target), target, 7), navcam(), VisualTargetTracker(SMALL))
-    stops = approach(drive, target, 0.1, slip=0.04)
+    drive = Drive(make_scene(make_face(7, target), target, 7), navcam(), VisualTargetTracker(SMALL_WINDOW))
+    stops = drive_to_target(drive, target, 0.1, slip=0.04)
     true_pose, last = stops[-1]
     assert last.found
     assert last.position_rover is not None
     np.testing.assert_allclose(last.position_rover, true_pose.inv().apply(target), atol=0.01)
-    evidence = details_of(last).evidence
+    evidence = get_details(last).evidence
     assert evidence is not None
     # After 6 m the target has moved by 4 % of that in the estimated world frame.
     assert evidence.position_correction_m == pytest.approx(0.24, abs=0.05)
@@ -254,28 +256,30 @@ def test_slip_appears_as_a_position_correction() -> None:
 
 def test_pointing_error_does_not_change_the_match() -> None:
     target = np.array([6.0, 0.1, 0.2])
-    drive = Drive(make_scene(make_face(5, target), target, 5), navcam(), VisualTargetTracker(SMALL))
+    drive = Drive(make_scene(make_face(5, target), target, 5), navcam(), VisualTargetTracker(SMALL_WINDOW))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     drive.pointing_error_rad = (np.deg2rad(0.5), np.deg2rad(-0.3))
     update = drive.stop(pose(0.5, 0.0))
     assert update is not None
     assert update.found
-    result = details_of(update)
+    result = get_details(update)
     assert result.predicted_pixel is not None
     # 0.82 mrad per pixel: pointing too far right and down moves the target left and up.
-    correction = pixel_of(update) - result.predicted_pixel
+    correction = get_pixel(update) - result.predicted_pixel
     np.testing.assert_allclose(correction, [-1222.5 * np.deg2rad(0.5), -1222.5 * np.deg2rad(0.3)], atol=0.5)
-    np.testing.assert_allclose(pixel_of(update), drive.true_pixel(pose(0.5, 0.0), target), atol=0.1)
+    np.testing.assert_allclose(get_pixel(update), drive.true_pixel(pose(0.5, 0.0), target), atol=0.1)
 
 
-@pytest.mark.parametrize(("rows_px", "is_found"), [(1.4, True), (5.0, False)])
-def test_point_stereo_tolerates_two_pixel_misalignment(rows_px: float, is_found: bool) -> None:
+@pytest.mark.parametrize(("row_offset_px", "is_found"), [(1.4, True), (5.0, False)])
+def test_point_stereo_tolerates_two_pixel_misalignment(row_offset_px: float, is_found: bool) -> None:
     target = np.array([6.0, 0.1, 0.2])
     mast = navcam()
     assert isinstance(mast.right, Cahvor)
-    misaligned = replace(mast, right=replace(mast.right, v=mast.right.v + rows_px * mast.right.a))
-    drive = Drive(make_scene(make_face(5, target), target, 5), mast, VisualTargetTracker(SMALL), calibrated=misaligned)
+    misaligned = replace(mast, right=replace(mast.right, v=mast.right.v + row_offset_px * mast.right.a))
+    drive = Drive(
+        make_scene(make_face(5, target), target, 5), mast, VisualTargetTracker(SMALL_WINDOW), calibrated=misaligned
+    )
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0))
     assert update is not None
@@ -290,7 +294,7 @@ def test_point_stereo_tolerates_two_pixel_misalignment(rows_px: float, is_found:
 def test_spinning_wheels_are_detected() -> None:
     # The estimated drive is 1.5 m of 8 m. The target is still 8 m away, and its image is not magnified.
     target = np.array([8.0, 0.1, 0.2])
-    tracker = VisualTargetTracker(replace(SMALL, search_px=161))
+    tracker = VisualTargetTracker(replace(SMALL_WINDOW, search_px=161))
     drive = Drive(make_scene(make_face(8, target), target, 8), navcam(), tracker)
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
@@ -302,10 +306,10 @@ def test_spinning_wheels_are_detected() -> None:
 def test_detector_noise_has_little_effect() -> None:
     target = np.array([6.0, 0.1, 0.2])
     scene = replace(make_scene(make_face(9, target), target, 9), contrast=0.08)
-    drive = Drive(scene, navcam(), VisualTargetTracker(SMALL), noise=np.random.default_rng(1))
-    true_pose, last = approach(drive, target, 0.1)[-1]
+    drive = Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW), noise=np.random.default_rng(1))
+    true_pose, last = drive_to_target(drive, target, 0.1)[-1]
     assert last.found
-    assert np.linalg.norm(pixel_of(last) - drive.true_pixel(true_pose, target)) < 1.0
+    assert np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)) < 1.0
 
 
 # ----- another tracker with the same protocol -----
@@ -313,13 +317,13 @@ def test_detector_noise_has_little_effect() -> None:
 
 def test_lucas_kanade_tracks_in_the_same_loop() -> None:
     target = np.array([6.0, 0.1, 0.2])
-    tracker: TargetTracker = lucas_kanade_tracker(SMALL)
+    tracker: TargetTracker = lucas_kanade_tracker(SMALL_WINDOW)
     drive = Drive(make_scene(make_face(1, target), target, 1), navcam(), tracker)
     assert [tracker.state] == [TrackingState.NO_TARGET]
-    true_pose, last = approach(drive, target, 0.1)[-1]
+    true_pose, last = drive_to_target(drive, target, 0.1)[-1]
     assert last.found
     assert tracker.state is TrackingState.NORMAL
-    assert np.linalg.norm(pixel_of(last) - drive.true_pixel(true_pose, target)) < 2.5
+    assert np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)) < 2.5
 
 
 @pytest.mark.parametrize(
@@ -358,7 +362,7 @@ def hide_behind_board(scene: Scene) -> Scene:
 def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], expected: list[TrackingState]) -> None:
     target = np.array([6.0, 0.1, 0.2])
     clear_scene = make_scene(make_face(3, target), target, 3)
-    tracker = VisualTargetTracker(SMALL)
+    tracker = VisualTargetTracker(SMALL_WINDOW)
     drive = Drive(clear_scene, navcam(), tracker)
     tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
@@ -370,7 +374,7 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
         assert update is not None
         states.append(update.state)
         if update.found:
-            np.testing.assert_allclose(pixel_of(update), drive.true_pixel(true_pose, target), atol=0.2)
+            np.testing.assert_allclose(get_pixel(update), drive.true_pixel(true_pose, target), atol=0.2)
         else:
             # The predicted position is exact because the poses are exact.
             assert update.losses
@@ -391,7 +395,7 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
 def test_image_without_the_target_is_reported_as_lost() -> None:
     target = np.array([6.0, 0.1, 0.2])
     scene = make_scene(make_face(3, target), target, 3)
-    drive = Drive(scene, navcam(), VisualTargetTracker(SMALL))
+    drive = Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     measurements = drive.measurements[-1]
@@ -417,8 +421,8 @@ def test_image_without_the_target_is_reported_as_lost() -> None:
         assert loss in update.losses
 
 
-def test_target_never_seen_is_abandoned() -> None:
-    tracker = VisualTargetTracker(SMALL)
+def test_target_outside_all_images_is_abandoned() -> None:
+    tracker = VisualTargetTracker(SMALL_WINDOW)
     target = np.array([6.0, 0.1, 0.2])
     drive = Drive(make_scene(make_face(3, target), target, 3), navcam(), tracker)
     tracker.designate(RoverTarget(target), pose(0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Tests of loading campaign files: every problem is reported with its file or option, key and allowed values."""
+"""Tests of loading campaign files: each problem is reported with its file or option, key and allowed values."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def has_ended(process: int) -> bool:
 
 
 def start_endless_tasks(kind: str, folder: str, item: int) -> int:
-    """Start endless threads or processes in the first item and record the process ids."""
+    """In item 0, start endless threads or processes and write their process ids to a file; return the own id."""
     processes = []
     if item == 0 and kind == "thread":
         threading.Thread(target=time.sleep, args=(3600,)).start()
@@ -109,8 +109,8 @@ def test_processes_started_by_a_case_end_with_the_case(kind: str, tmp_path: Path
     assert all(map(has_ended, processes))
     # the next items run in another process
     assert results[1].result == results[2].result != results[0].result
-    task_text = "threads" if kind == "thread" else "child processes"
-    assert f"{task_text} that are still running" in results[0].changed[-1]
+    leftovers = "threads" if kind == "thread" else "child processes"
+    assert f"{leftovers} that are still running" in results[0].changed[-1]
     assert results[1].changed == results[2].changed == ()
 
 
@@ -207,7 +207,7 @@ def read_state() -> tuple[object, ...]:
     """Return the parts of the process state that a case can change, and two random numbers."""
     import cv2
 
-    # the rounding mode decides whether this sum is 1
+    # the rounding mode decides whether this sum is 1; float("1") prevents evaluation at compile time
     rounded_sum = float("1") + 2.0**-60
     return (
         Path.cwd(),
@@ -224,22 +224,22 @@ def read_state() -> tuple[object, ...]:
     )
 
 
-def read_and_change_state(seconds: float, item: int) -> object:
+def read_and_change_state(sleep_s: float, item: int) -> object:
     """Return the process state; odd items then change one part of it."""
     process_state = read_state()
     if item % 2:
         changes: list[Any] = list(STATE_CHANGES.values())
         changes[item // 2]()
-    time.sleep(seconds)
+    time.sleep(sleep_s)
     # values of environment variables depend on the worker's folder; compare their names
     return item, [part for part in process_state if not isinstance(part, dict)], sorted(set(process_state[1]))  # type: ignore[call-overload]
 
 
-@pytest.mark.parametrize("seconds", [0.01, 0.0])
-def test_changed_process_state_is_restored_for_the_next_case(seconds: float) -> None:
+@pytest.mark.parametrize("sleep_s", [0.01, 0.0])
+def test_changed_process_state_is_restored_for_the_next_case(sleep_s: float) -> None:
     """The state is also restored between short cases (0 s), which run in one batch."""
     n_items = 2 * len(STATE_CHANGES)
-    run_results = run_items(partial(read_and_change_state, seconds), range(n_items))
+    run_results = run_items(partial(read_and_change_state, sleep_s), range(n_items))
     results: list[Any] = [run_results[item].result for item in range(n_items)]
     # the last two entries are random numbers: they depend on the case, not on the worker
     assert len({str((result[1][:-2], result[2])) for result in results}) == 1

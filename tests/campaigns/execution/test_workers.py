@@ -49,7 +49,7 @@ def raise_or_exit(item: int) -> object:
         raise LookupError("no such key")
     if item == 1:
         os._exit(3)
-    return lambda: None if item == 2 else item
+    return lambda: item
 
 
 def sleep_and_return(seconds: float, item: int) -> int:

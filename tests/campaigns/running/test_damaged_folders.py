@@ -103,7 +103,7 @@ def test_stored_parameters_with_wrong_types_are_rejected(
         ("DROP TABLE layouts", "no such table"),
     ],
 )
-def test_unknown_store_layout_is_reported(tmp_path: Path, change: str, message: str) -> None:
+def test_damaged_store_is_reported(tmp_path: Path, change: str, message: str) -> None:
     path = tmp_path / ROWS_FILE
     create_store(path, {})
     with RowStore(path) as store:

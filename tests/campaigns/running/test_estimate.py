@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.running.preparation import estimate
+from marsyard.campaigns.running.preparation import estimate_campaign
 
 CampaignFile = Callable[..., Path]
 
 
 def test_estimate_follows_from_trial_cases(campaign_file: CampaignFile) -> None:
     campaign = load_campaign(str(campaign_file("sleep_s = 0.05")), ["cases=1000", "retain.products=all"])
-    cost = estimate(campaign, jobs=2)
+    cost = estimate_campaign(campaign, jobs=2)
     # an estimate runs at most 9 trial cases
     assert (cost.trials, cost.unfinished) == (9, 0)
     assert 0.05 <= cost.case_s < 0.5

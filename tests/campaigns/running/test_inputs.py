@@ -12,7 +12,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases
-from marsyard.campaigns.running.preparation import estimate, find_used_inputs, plan_inputs
+from marsyard.campaigns.running.preparation import estimate_campaign, find_used_inputs, plan_inputs
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import scenario, scenario_names
 from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, RecordingWatch, read_case_rows, run
@@ -54,13 +54,13 @@ def test_cache_warnings_are_recorded_as_notes(selecting_campaign: Path, tmp_path
 def test_estimate_includes_inputs_to_build(selecting_campaign: Path, tmp_path: Path) -> None:
     campaign = load_campaign(str(selecting_campaign))
     n_inputs = len(find_used_inputs(campaign, range(3)))
-    first_estimate = estimate(campaign, jobs=1)
+    first_estimate = estimate_campaign(campaign, jobs=1)
     assert (first_estimate.inputs, first_estimate.inputs_bytes) == (n_inputs, n_inputs * 1e6)
     assert first_estimate.input_s > 0.0
     assert first_estimate.time_s == pytest.approx(3 * first_estimate.case_s + n_inputs * first_estimate.input_s)
     # the trial cases have built the inputs
     assert len(_list_built_inputs(tmp_path / "inputs")) == n_inputs
-    second_estimate = estimate(campaign, jobs=1)
+    second_estimate = estimate_campaign(campaign, jobs=1)
     assert (second_estimate.inputs, second_estimate.inputs_bytes, second_estimate.input_s) == (0, 0, 0.0)
 
 

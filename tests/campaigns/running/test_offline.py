@@ -25,11 +25,11 @@ from marsyard.campaigns.running.replay import differing_columns
 from marsyard.sim.measurements import DescentMeasurements
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 
-CASES = 3
+N_CASES = 3
 CAMPAIGN = f"""
 name = "fake-velocity"
 scenario = "tests.campaigns.fake_velocity:FakeVelocityScenario"
-cases = {CASES}
+cases = {N_CASES}
 seed = 3
 [[requirements]]
 id = "v"
@@ -40,7 +40,7 @@ confidence = 0.5
 """
 
 
-class Exported(NamedTuple):
+class ExportFolders(NamedTuple):
     """Folders of an exported campaign: the cases, and their truth."""
 
     directory: Path
@@ -48,23 +48,24 @@ class Exported(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+def export(tmp_path_factory: pytest.TempPathFactory) -> ExportFolders:
+    """Export a campaign of three cases."""
     folder = tmp_path_factory.mktemp("offline")
     (folder / "fake.toml").write_text(CAMPAIGN)
-    export = Exported(folder / "out", truth_folder(folder / "out"))
-    export_campaign(load_export_campaign(export), *export, ExecutorConfig(1), RecordingWatch())
-    return export
+    folders = ExportFolders(folder / "out", truth_folder(folder / "out"))
+    export_campaign(load_campaign_to_export(folders), *folders, ExecutorConfig(1), RecordingWatch())
+    return folders
 
 
-def load_export_campaign(exported: Exported, *settings: str) -> Campaign:
-    path = str(exported.directory.parent / "fake.toml")
-    return load_campaign(path, ["retain.showcase=none", *settings], None, None, [f"export:{exported.directory}"])
+def load_campaign_to_export(export: ExportFolders, *settings: str) -> Campaign:
+    path = str(export.directory.parent / "fake.toml")
+    return load_campaign(path, ["retain.showcase=none", *settings], None, None, [f"export:{export.directory}"])
 
 
-def estimate_exported(exported: Exported) -> dict[int, VelocityEstimate]:
+def estimate_exported_cases(export: ExportFolders) -> dict[int, VelocityEstimate]:
     """Run an estimator on the exported files only."""
     estimates = {}
-    for folder in sorted((exported.directory / "cases").iterdir()):
+    for folder in sorted((export.directory / "cases").iterdir()):
         measurements = read_case(folder)
         assert isinstance(measurements, DescentMeasurements)
         estimates[int(folder.name)] = HomographyEstimator().estimate(measurements)
@@ -81,60 +82,60 @@ def write_answers(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
     return path
 
 
-def test_external_answers_are_scored_as_in_a_normal_run(exported: Exported, tmp_path: Path) -> None:
+def test_external_answers_are_scored_as_in_a_normal_run(export: ExportFolders, tmp_path: Path) -> None:
     watch = RecordingWatch()
-    scored = create_scoring_campaign(*exported, write_answers(tmp_path / "external.csv", estimate_exported(exported)))
+    scored = create_scoring_campaign(*export, write_answers(tmp_path / "external.csv", estimate_exported_cases(export)))
     run_campaign(scored, tmp_path / "scored", ExecutorConfig(1), watch)
-    normal_campaign = load_campaign(str(exported.directory.parent / "fake.toml"))
+    normal_campaign = load_campaign(str(export.directory.parent / "fake.toml"))
     run_campaign(normal_campaign, tmp_path / "normal", ExecutorConfig(1), watch)
     for row, normal_row in zip(read_case_rows(tmp_path / "scored"), read_case_rows(tmp_path / "normal"), strict=True):
         assert differing_columns(row, normal_row) == ("algorithm",)
         assert row["algorithm"] == "external"
         assert row["velocity_error_m_s"] < 1.0
-    assert find_cases_with_changed_images(exported.truth, tmp_path / "scored") == []
+    assert find_cases_with_changed_images(export.truth, tmp_path / "scored") == []
     assert watch.notes == []
 
 
-def test_truth_is_stored_in_a_separate_folder(exported: Exported) -> None:
-    rows = read_case_rows(exported.truth)
+def test_truth_is_stored_in_a_separate_folder(export: ExportFolders) -> None:
+    rows = read_case_rows(export.truth)
     # the true east velocity of the fake descent is 12 m/s
-    assert [row["velocity_true_x_m_s"] for row in rows] == [12.0] * CASES
-    files = sorted(path.relative_to(exported.directory).as_posix() for path in exported.directory.rglob("*"))
+    assert [row["velocity_true_x_m_s"] for row in rows] == [12.0] * N_CASES
+    files = sorted(path.relative_to(export.directory).as_posix() for path in export.directory.rglob("*"))
     assert {name for name in files if "/" not in name} == {"README.md", "cases", "export.json"}
-    assert not any("12.0" in path.read_text() for path in exported.directory.glob("*.*"))
+    assert not any("12.0" in path.read_text() for path in export.directory.glob("*.*"))
     with pytest.raises(CampaignError, match="is inside"):
         export_campaign(
-            load_export_campaign(exported),
-            exported.directory,
-            exported.directory / "truth",
+            load_campaign_to_export(export),
+            export.directory,
+            export.directory / "truth",
             ExecutorConfig(1),
             RecordingWatch(),
         )
 
 
-def test_export_resumes_and_rejects_other_exports(exported: Exported) -> None:
-    times = {path: path.stat().st_mtime_ns for path in (exported.directory / "cases").rglob("*")}
-    export_campaign(load_export_campaign(exported), *exported, ExecutorConfig(1), RecordingWatch())
+def test_export_resumes_and_rejects_other_exports(export: ExportFolders) -> None:
+    times = {path: path.stat().st_mtime_ns for path in (export.directory / "cases").rglob("*")}
+    export_campaign(load_campaign_to_export(export), *export, ExecutorConfig(1), RecordingWatch())
     assert {path: path.stat().st_mtime_ns for path in times} == times
     with pytest.raises(StoreError, match="contains the truth of another export"):
-        export_campaign(load_export_campaign(exported, "seed=4"), *exported, ExecutorConfig(1), RecordingWatch())
-    new_truth = Exported(exported.directory, exported.truth.with_name("new-truth"))
+        export_campaign(load_campaign_to_export(export, "seed=4"), *export, ExecutorConfig(1), RecordingWatch())
+    new_truth = ExportFolders(export.directory, export.truth.with_name("new-truth"))
     with pytest.raises(StoreError, match="already exists and is not empty"):
-        export_campaign(load_export_campaign(exported), *new_truth, ExecutorConfig(1), RecordingWatch())
+        export_campaign(load_campaign_to_export(export), *new_truth, ExecutorConfig(1), RecordingWatch())
 
 
-def test_tables_with_missing_or_unknown_cases_are_rejected(exported: Exported, tmp_path: Path) -> None:
-    answers = estimate_exported(exported)
-    incomplete = write_answers(tmp_path / "few.csv", {case: answers[case] for case in (0, 2)})
+def test_tables_with_missing_or_unknown_cases_are_rejected(export: ExportFolders, tmp_path: Path) -> None:
+    answers = estimate_exported_cases(export)
+    incomplete = write_answers(tmp_path / "incomplete.csv", {case: answers[case] for case in (0, 2)})
     with pytest.raises(CampaignError, match=r"no answer to 1 of 3 cases: 1; .*such as NO_TEMPLATE_AREA"):
-        create_scoring_campaign(*exported, incomplete)
-    unknown_case = write_answers(tmp_path / "many.csv", {**answers, 7: answers[0]})
+        create_scoring_campaign(*export, incomplete)
+    unknown_case = write_answers(tmp_path / "unknown-case.csv", {**answers, 7: answers[0]})
     with pytest.raises(CampaignError, match="unknown case 7; allowed: 0 to 2"):
-        create_scoring_campaign(*exported, unknown_case)
+        create_scoring_campaign(*export, unknown_case)
     with pytest.raises(CampaignError, match="No such file"):
-        create_scoring_campaign(*exported, tmp_path / "none.csv")
+        create_scoring_campaign(*export, tmp_path / "none.csv")
     with pytest.raises(StoreError, match="contains no finished export"):
-        create_scoring_campaign(tmp_path, exported.truth, incomplete)
+        create_scoring_campaign(tmp_path, export.truth, incomplete)
 
 
 def test_target_trackers_cannot_be_exported(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from marsyard.campaigns.errors import ConfigurationError
 from marsyard.campaigns.sampling.design import Correlation
 
 CampaignFile = Callable[..., Path]
-CASES = 4000
+N_CASES = 4000
 TOP_LEVEL_KEYS = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
 #: Tolerance in standard errors: a correct sampler exceeds it for one of 16,000 seeds (normal, two-sided).
 MAX_STANDARD_ERRORS = 4.0
@@ -43,13 +43,15 @@ parameters = ["wind.east_m_s", "wind.north_m_s"]
 """
 
 
-def load_correlated(write_file: CampaignFile, dispersions: str, design: str = "random", cases: int = CASES) -> Campaign:
+def load_correlated(
+    write_file: CampaignFile, dispersions: str, design: str = "random", cases: int = N_CASES
+) -> Campaign:
     """Load a campaign of the fake scenario with correlated dispersions."""
     text = f'[design]\nkind = "{design}"\n{dispersions}'
     return load_campaign(str(write_file(top_level_keys=TOP_LEVEL_KEYS.format(cases=cases), dispersions=text)))
 
 
-def draw_table(campaign: Campaign, cases: int = CASES) -> np.ndarray:
+def draw_table(campaign: Campaign, cases: int = N_CASES) -> np.ndarray:
     return np.array([list(campaign.draws(case).values()) for case in range(cases)], dtype=np.float64)
 
 
@@ -62,7 +64,7 @@ def rank_standard_error(rank: float, cases: int) -> float:
     return float(np.sqrt((1.0 + 0.5 * rank**2) / (cases - 3)) * (1.0 - rank**2))
 
 
-@pytest.mark.parametrize(("design", "cases"), [("random", CASES), ("latin-hypercube", CASES), ("sobol", 4096)])
+@pytest.mark.parametrize(("design", "cases"), [("random", N_CASES), ("latin-hypercube", N_CASES), ("sobol", 4096)])
 def test_rank_correlation_holds_for_any_distribution(campaign_file: CampaignFile, design: str, cases: int) -> None:
     campaign = load_correlated(campaign_file, SKEWED, design, cases)
     draws = draw_table(campaign, cases)
@@ -113,7 +115,7 @@ def test_normal_groups_have_the_specified_covariance(
     assert stats.kstest((whitened**2).sum(axis=0), stats.chi2(2).cdf).pvalue > 1e-3
     # Wishart distribution: the variance of an entry s_ij is (c_ij^2 + c_ii c_jj) / (n - 1)
     variances = np.diag(covariance)
-    standard_error = np.sqrt((covariance**2 + np.outer(variances, variances)) / (CASES - 1))
+    standard_error = np.sqrt((covariance**2 + np.outer(variances, variances)) / (N_CASES - 1))
     assert np.all(np.abs(np.cov(draws.T) - covariance) < MAX_STANDARD_ERRORS * standard_error)
 
 

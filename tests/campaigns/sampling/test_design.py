@@ -90,9 +90,9 @@ def test_latin_hypercube_columns_are_uncorrelated(campaign_file: CampaignFile) -
 def test_sobol_design_is_a_digital_net(campaign_file: CampaignFile) -> None:
     """The first two dimensions of 2^m points have one point per elementary interval of volume 2^-m (t = 0)."""
     points = read_probabilities(load_design(campaign_file, "sobol", 256), range(256))[:, :2]
-    for rows in range(9):
-        boxes = np.floor(points * [2**rows, 2 ** (8 - rows)]).astype(int)
-        assert len({tuple(box) for box in boxes.tolist()}) == 256
+    for exponent in range(9):
+        intervals = np.floor(points * [2**exponent, 2 ** (8 - exponent)]).astype(int)
+        assert len({tuple(interval) for interval in intervals.tolist()}) == 256
     assert points.min() > 0.0
     assert points.max() < 1.0
 
@@ -127,12 +127,12 @@ def test_added_dispersion_does_not_change_other_draws(
     other_dispersions = DISPERSIONS.replace('"wind.east_m_s" = {distribution = "uniform", low = 0, high = 1}', "")
     entry = f'"{name}" = {{distribution = "uniform", low = 0, high = 1}}\n'
     draws_without = load_design(campaign_file, kind, 64, dispersions=other_dispersions).draws(case)
-    texts = (
+    dispersion_texts = (
         [other_dispersions + entry]
         if kind == "sobol"
         else [other_dispersions + entry, other_dispersions.replace("[dispersions]", f"[dispersions]\n{entry}")]
     )
-    for text in texts:
+    for text in dispersion_texts:
         draw = load_design(campaign_file, kind, 64, dispersions=text).draws(case)
         assert 0.0 < draw.pop(name) < 1.0
         assert draw == draws_without

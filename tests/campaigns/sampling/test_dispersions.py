@@ -20,9 +20,9 @@ from marsyard.campaigns.sampling.dispersions import AnyDispersion
 from marsyard.sim.streams import Streams
 
 CampaignFile = Callable[..., Path]
-CASES = 2000
-#: Smallest accepted p-value of a test: a correct sampler fails for one of 1000 seeds. The seeds are fixed.
-MIN_P = 1e-3
+N_CASES = 2000
+#: Minimum p-value of a test: a correct sampler fails for one of 1000 seeds. The seeds are fixed.
+MIN_P_VALUE = 1e-3
 
 _ADAPTER: TypeAdapter[Dispersion] = TypeAdapter(AnyDispersion)
 
@@ -32,13 +32,13 @@ def make_dispersion(**keys: object) -> Dispersion:
 
 
 @cache
-def draw_uniform() -> list[float]:
+def draw_uniform_numbers() -> list[float]:
     """Draw one uniform number per case."""
-    return [float(Streams(1, "ks", case).generator("dispersion:x").random()) for case in range(CASES)]
+    return [float(Streams(1, "ks", case).generator("dispersion:x").random()) for case in range(N_CASES)]
 
 
 def draw_values(dispersion: Dispersion) -> np.ndarray:
-    return np.array([dispersion.quantile(value) for value in draw_uniform()])
+    return np.array([dispersion.quantile(value) for value in draw_uniform_numbers()])
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def draw_values(dispersion: Dispersion) -> np.ndarray:
     ids=lambda value: value.describe() if isinstance(value, Dispersion) else "",
 )
 def test_continuous_draws_follow_their_distribution(dispersion: Dispersion, reference: object) -> None:
-    assert stats.kstest(draw_values(dispersion), reference.cdf).pvalue > MIN_P  # type: ignore[attr-defined]
+    assert stats.kstest(draw_values(dispersion), reference.cdf).pvalue > MIN_P_VALUE  # type: ignore[attr-defined]
 
 
 _SHAPE_PARAMETERS: dict[str, dict[str, st.SearchStrategy[float]]] = {
@@ -81,9 +81,9 @@ def test_truncated_scipy_draws_follow_their_distribution(data: st.DataObject, na
     keys = {key: data.draw(values) for key, values in _SHAPE_PARAMETERS[name].items()}
     keys |= {"loc": data.draw(st.floats(-100.0, 100.0)), "scale": data.draw(st.floats(0.1, 100.0))}
     reference = getattr(stats, name)(**keys)
-    first = data.draw(st.floats(0.0, 0.9))
-    last = data.draw(st.floats(first + 0.05, 1.0 - 1e-9))
-    limits = [float(reference.ppf(max(first, 1e-9))), float(reference.ppf(last))]
+    low_probability = data.draw(st.floats(0.0, 0.9))
+    high_probability = data.draw(st.floats(low_probability + 0.05, 1.0 - 1e-9))
+    limits = [float(reference.ppf(max(low_probability, 1e-9))), float(reference.ppf(high_probability))]
     draws = draw_values(make_dispersion(distribution=name, truncate=limits, **keys))
     assert limits[0] <= draws.min()
     assert draws.max() <= limits[1]
@@ -102,18 +102,20 @@ def test_truncated_scipy_draws_follow_their_distribution(data: st.DataObject, na
 )
 def test_discrete_scipy_draws_follow_their_weights(keys: dict[str, Any], reference: Any) -> None:
     dispersion = make_dispersion(**keys)
-    draws = [dispersion.quantile(value) for value in np.random.default_rng(3).random(CASES)]
+    draws = [dispersion.quantile(value) for value in np.random.default_rng(3).random(N_CASES)]
     assert {type(value) for value in draws} == {int}
     first, last = keys.get("truncate", (0, 60))
     allowed = np.arange(np.ceil(first), last + 1)
     probabilities = reference.pmf(allowed) / reference.pmf(allowed).sum()
     assert set(draws) <= set(allowed.astype(int).tolist())
     # the chi-square test needs more than five expected draws; other values are counted together
-    is_frequent = probabilities * CASES > 5
+    is_frequent = probabilities * N_CASES > 5
     observed = np.array([draws.count(int(value)) for value in allowed])
-    table = [np.append(counts[is_frequent], counts[~is_frequent].sum()) for counts in (observed, probabilities * CASES)]
-    is_used = table[1] > 0
-    assert stats.chisquare(table[0][is_used], table[1][is_used]).pvalue > MIN_P
+    observed_counts, expected_counts = (
+        np.append(counts[is_frequent], counts[~is_frequent].sum()) for counts in (observed, probabilities * N_CASES)
+    )
+    is_used = expected_counts > 0
+    assert stats.chisquare(observed_counts[is_used], expected_counts[is_used]).pvalue > MIN_P_VALUE
 
 
 @pytest.mark.parametrize("name", sorted(scipy_distributions()))
@@ -147,15 +149,15 @@ def test_formulas_use_draws_and_parameters(campaign_file: CampaignFile) -> None:
     """
     campaign = load_campaign(str(campaign_file("shared = 4\nheights_m = [6.0, 1.0]", dispersions=text)))
     assert campaign.order == ("terrain", "heights_m.1", "altitude_m", "lowest_altitude_m")
-    draws = [campaign.draws(case) for case in range(CASES)]
+    draws = [campaign.draws(case) for case in range(N_CASES)]
     assert list(draws[0]) == ["lowest_altitude_m", "altitude_m", "terrain", "heights_m.1"]
     values = {name: np.array([draw[name] for draw in draws]) for name in draws[0]}
     assert set(values["terrain"].tolist()) == {0, 1, 2, 3, 4}
-    standard = (values["altitude_m"] - 1500.0 - 100.0 * values["terrain"]) / (5.0 + values["terrain"])
-    assert stats.kstest(standard, stats.norm.cdf).pvalue > MIN_P
+    standardised = (values["altitude_m"] - 1500.0 - 100.0 * values["terrain"]) / (5.0 + values["terrain"])
+    assert stats.kstest(standardised, stats.norm.cdf).pvalue > MIN_P_VALUE
     fraction = (values["lowest_altitude_m"] - values["altitude_m"] + 300.0) / 200.0
-    assert stats.kstest(fraction, stats.uniform.cdf).pvalue > MIN_P
-    assert stats.kstest(values["heights_m.1"], stats.gamma(3, scale=3).cdf).pvalue > MIN_P
+    assert stats.kstest(fraction, stats.uniform.cdf).pvalue > MIN_P_VALUE
+    assert stats.kstest(values["heights_m.1"], stats.gamma(3, scale=3).cdf).pvalue > MIN_P_VALUE
     # formulas use the values of overrides
     fixed = load_campaign(str(campaign_file("shared = 4", dispersions=text)), ["terrain=2"])
     assert (
@@ -170,17 +172,17 @@ def test_truncation_in_the_far_tail_is_accurate() -> None:
     # beyond 9 standard deviations, 1 - cdf is 0 in double precision
     draws = draw_values(make_dispersion(distribution="normal", mean=0, sd=1, truncate=[9, 20]))
     assert draws.min() >= 9.0
-    assert np.unique(draws).size == CASES
+    assert np.unique(draws).size == N_CASES
     assert draws.mean() - 9.0 == pytest.approx(stats.truncnorm(9, 20).mean() - 9.0, rel=0.1)
 
 
 def test_integers_and_choices_follow_their_probabilities() -> None:
     counts = np.unique_counts(draw_values(make_dispersion(distribution="integer", low=-1, high=2)))
     assert counts.values.tolist() == [-1, 0, 1, 2]
-    assert stats.chisquare(counts.counts).pvalue > MIN_P
+    assert stats.chisquare(counts.counts).pvalue > MIN_P_VALUE
     choices = draw_values(make_dispersion(distribution="choice", values=["a", "b", "c"], weights=[1, 2, 5]))
     counts = np.unique_counts(choices)
-    assert stats.chisquare(counts.counts, CASES * np.array([1, 2, 5]) / 8).pvalue > MIN_P
+    assert stats.chisquare(counts.counts, N_CASES * np.array([1, 2, 5]) / 8).pvalue > MIN_P_VALUE
 
 
 @pytest.mark.parametrize("probability", [2.0**-54, TAIL, 0.5, 1.0 - TAIL, 1.0 - 2.0**-53])

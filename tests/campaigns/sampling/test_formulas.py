@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marsyard.campaigns.sampling.dispersion import MAX_LENGTH, formula
+from marsyard.campaigns.sampling.dispersion import MAX_FORMULA_LENGTH, parse_formula
 
 #: Values of parameters by path, as formulas use them.
 VALUES = {"altitude_m": 2000.0, "wind.east_m_s": -3.0, "heights_m.1": 4, "on": True, "site": "gusev"}
@@ -29,11 +29,11 @@ VALUES = {"altitude_m": 2000.0, "wind.east_m_s": -3.0, "heights_m.1": 4, "on": T
     ],
 )
 def test_formulas_have_the_expected_value(text: str, value: float) -> None:
-    assert formula(text).value(VALUES) == pytest.approx(value, rel=1e-15)
+    assert parse_formula(text).evaluate(VALUES) == pytest.approx(value, rel=1e-15)
 
 
 def test_formula_names_are_parameter_paths() -> None:
-    assert formula("a.b_m * heights_m[1] + a.b_m + pi").names == ("a.b_m", "heights_m.1")
+    assert parse_formula("a.b_m * heights_m[1] + a.b_m + pi").names == ("a.b_m", "heights_m.1")
 
 
 @pytest.mark.parametrize(
@@ -70,13 +70,13 @@ def test_formula_names_are_parameter_paths() -> None:
         "1; 2",
         "a\x00",
         "(" * 100,
-        "9" * (MAX_LENGTH + 1),
+        "9" * (MAX_FORMULA_LENGTH + 1),
         "[" * 200 + "1" + "]" * 200,
     ],
 )
 def test_non_arithmetic_syntax_is_rejected(text: str) -> None:
     with pytest.raises(ValueError, match=r"is neither a number nor a formula|has at most"):
-        formula(text)
+        parse_formula(text)
 
 
 @pytest.mark.parametrize(
@@ -93,14 +93,14 @@ def test_non_arithmetic_syntax_is_rejected(text: str) -> None:
 )
 def test_formulas_without_a_value_are_reported(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
-        formula(text).value(VALUES)
+        parse_formula(text).evaluate(VALUES)
 
 
 @given(text=st.text(max_size=40) | st.text("ab.[]()+-*/0123456789e ,", max_size=40))
 def test_random_text_has_a_finite_value_or_is_rejected(text: str) -> None:
     try:
-        parsed = formula(text)
-        value = parsed.value(dict.fromkeys(parsed.names, 1.5))
+        parsed = parse_formula(text)
+        value = parsed.evaluate(dict.fromkeys(parsed.names, 1.5))
     except ValueError:
         return
     assert math.isfinite(value)
@@ -112,9 +112,9 @@ def test_random_text_has_a_finite_value_or_is_rejected(text: str) -> None:
     max_leaves=8,
 ))  # fmt: skip
 def test_formulas_evaluate_like_python(text: str) -> None:
-    if len(text) > MAX_LENGTH:
+    if len(text) > MAX_FORMULA_LENGTH:
         return
     # in Python, the parameter path t.b is an attribute
     table = type("Table", (), {"b": -0.75})
     expected = eval(text, {"a": 2.5, "t": table})  # noqa: S307
-    assert formula(text).value({"a": 2.5, "t.b": -0.75}) == expected
+    assert parse_formula(text).evaluate({"a": 2.5, "t.b": -0.75}) == expected

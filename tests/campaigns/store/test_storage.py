@@ -48,7 +48,7 @@ def test_rows_are_read_in_case_order(tmp_path: Path) -> None:
     with open_store(tmp_path, rows) as store:
         stored = [store.row(case) or {} for case in range(3)]
         assert store.about == {"identity": "abc"}
-        assert (store.count(), store.with_outcomes(["VALID"]), store.count_unfinished()) == (3, [0, 1, 2], 0)
+        assert (store.count(), store.list_cases_with_outcomes(["VALID"]), store.count_unfinished()) == (3, [0, 1, 2], 0)
         assert store.row(1) == complete_row(rows[2])
         assert store.row(7) is None
     assert [row["case"] for row in stored] == [0, 1, 2]
@@ -59,13 +59,13 @@ def test_rows_are_read_in_case_order(tmp_path: Path) -> None:
 
 def test_missing_rows_are_listed_and_rows_replaced(tmp_path: Path) -> None:
     with open_store(tmp_path, [{"case": 1, "outcome": "CRASHED"}, {"case": 2}, {"case": 5}]) as store:
-        assert store.missing(9) == [range(1), range(3, 5), range(6, 9)]
-        assert store.missing(6) == [range(1), range(3, 5)]
-        assert store.with_outcomes(["CRASHED", "TIMED_OUT"]) == [1]
-        assert (store.with_outcomes([]), store.count_unfinished()) == ([], 1)
+        assert store.list_missing_cases(9) == [range(1), range(3, 5), range(6, 9)]
+        assert store.list_missing_cases(6) == [range(1), range(3, 5)]
+        assert store.list_cases_with_outcomes(["CRASHED", "TIMED_OUT"]) == [1]
+        assert (store.list_cases_with_outcomes([]), store.count_unfinished()) == ([], 1)
         store.add([complete_row({"case": 1, "x": 3.0})])
         assert store.row(1) == complete_row({"case": 1, "x": 3.0})
-        assert store.with_outcomes(["VALID"]) == [1, 2, 5]
+        assert store.list_cases_with_outcomes(["VALID"]) == [1, 2, 5]
 
 
 def test_failed_transaction_stores_no_row(tmp_path: Path) -> None:
@@ -92,16 +92,21 @@ def test_full_disk_is_reported_without_loss_of_rows(tmp_path: Path) -> None:
         assert store.count() == 1
 
 
+#: Page size of the SQLite database, in bytes.
+_PAGE_BYTES = 4096
+
+
 def _truncate(path: Path, pages: float) -> None:
-    """Shorten the database file to a number of pages of 4096 bytes."""
+    """Shorten the database file to a number of pages."""
     with path.open("r+b") as file:
-        file.truncate(int(pages * 4096))
+        file.truncate(int(pages * _PAGE_BYTES))
 
 
 def _overwrite_pages(path: Path) -> None:
+    """Overwrite two pages of the database file."""
     with path.open("r+b") as file:
-        file.seek(5 * 4096)
-        file.write(b"\xa5" * 8192)
+        file.seek(5 * _PAGE_BYTES)
+        file.write(b"\xa5" * 2 * _PAGE_BYTES)
 
 
 @pytest.mark.parametrize(
@@ -167,6 +172,7 @@ def test_tables_are_written_in_row_groups(tmp_path: Path, monkeypatch: pytest.Mo
     path = write_rows_table(tmp_path, rows)
     assert pq.ParquetFile(path).num_row_groups == 8
     for row, stored in zip(rows, read_rows(path), strict=True):
+        # NaN differs from itself and marks a missing value
         numbers = {name: value for name, value in stored.items() if value == value and name in ("case", "x", "y", "z")}
         assert numbers == row
 

@@ -74,6 +74,7 @@ def test_rectified_image_is_resampled_with_the_lattice(dimes_products: dict[str,
     figure = draw_dimes_pair({**dimes_products, "image_1": counts}, 0)
     image = np.asarray(figure.axes[0].get_images()[0].get_array())[..., 0]
     bright = np.argwhere(image > 128)
+    # the rectified image is shifted by 64 px
     assert bright.min(axis=0).tolist() == [164, 104]
     assert bright.max(axis=0).tolist() == [173, 123]
 

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.reports.dimes.presentation import draw_stream_case, is_stream_case
-from marsyard.reports.dimes.presentation import view_stream as view
+from marsyard.reports.dimes.presentation import draw_stream_case, is_stream_case, view_stream
 from marsyard.reports.presentation import write_case_figures
 
 N_IMAGES = 4
@@ -15,17 +14,17 @@ N_IMAGES = 4
 
 @pytest.fixture
 def products() -> dict[str, Any]:
-    """Four images; each one after the first has an estimate for the preceding interval, 0.5 m/s too large in x."""
-    numbers = np.arange(1.0, N_IMAGES)
-    no_value = np.full((1, 2), np.nan)
-    true = np.concatenate([no_value, np.stack([10.0 + numbers, -numbers], axis=1)])
+    """Return four images. Each later image has an estimate for the interval before it, 0.5 m/s too large in x."""
+    interval_ends_s = np.arange(1.0, N_IMAGES)
+    no_interval = np.full((1, 2), np.nan)
+    true_velocities = np.concatenate([no_interval, np.stack([10.0 + interval_ends_s, -interval_ends_s], axis=1)])
     images = {f"image_{k}": np.random.default_rng(k).integers(0, 4095, (16, 64)) for k in range(1, N_IMAGES + 1)}
     return {
         **images,
-        "after_spans_s": np.concatenate([no_value, np.stack([numbers - 1.0, numbers], axis=1)]),
-        "after_velocities_m_s": true + np.array([0.5, 0.0]),
-        "after_true_m_s": true,
-        "velocity_true_m_s": true[-1],
+        "after_spans_s": np.concatenate([no_interval, np.stack([interval_ends_s - 1.0, interval_ends_s], axis=1)]),
+        "after_velocities_m_s": true_velocities + np.array([0.5, 0.0]),
+        "after_true_m_s": true_velocities,
+        "velocity_true_m_s": true_velocities[-1],
     }
 
 
@@ -41,7 +40,7 @@ def test_all_images_and_estimates_are_drawn(products: dict[str, Any]) -> None:
 
 
 def test_case_view_has_one_row_per_image(products: dict[str, Any], tmp_path: Path) -> None:
-    case_view = view(products, "case3")
+    case_view = view_stream(products, "case3")
     assert [row.succeeded for row in case_view.rows] == [False, True, True, True]
     assert case_view.rows[0].values[0] == "1"
     assert set(case_view.rows[0].values[1:]) == {""}

@@ -11,5 +11,5 @@ from tests.reports.hda.synthetic_landing import synthetic_products
 
 @pytest.fixture
 def hda_products() -> dict[str, Any]:
-    """Products of a synthetic landing; see `synthetic_products`."""
+    """Return products of a synthetic landing; see `synthetic_products`."""
     return synthetic_products()

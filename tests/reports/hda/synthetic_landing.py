@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-#: Rows and columns of the elevation map, and image width / 2 = 160 px at 10 m height and 240 px focal length.
+#: Rows and columns of the elevation map.
 SHAPE = (24, 32)
+#: Cell of the elevation map, height of the camera, and focal length for images of 320 x 240 pixels.
 CELL_M, HEIGHT_M, FOCAL_PX = 0.25, 10.0, 240.0
 
 

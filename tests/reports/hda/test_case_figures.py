@@ -41,9 +41,9 @@ def test_all_figures_of_a_complete_case_are_written(hda_products: dict[str, Any]
 def test_tracks_are_drawn_in_both_images(hda_products: dict[str, Any]) -> None:
     left, right = draw_tracks(hda_products).axes
     accepted = hda_products["tracks_accepted"]
-    tracked, lost = (np.array(line.get_data()).T for line in left.lines[:2])
-    np.testing.assert_array_equal(tracked, hda_products["features"][accepted])
-    np.testing.assert_array_equal(lost, hda_products["features"][~accepted])
+    accepted_features, rejected_features = (np.array(line.get_data()).T for line in left.lines[:2])
+    np.testing.assert_array_equal(accepted_features, hda_products["features"][accepted])
+    np.testing.assert_array_equal(rejected_features, hda_products["features"][~accepted])
     np.testing.assert_array_equal(np.array(right.lines[-1].get_data()).T, hda_products["tracked"][accepted])
 
 

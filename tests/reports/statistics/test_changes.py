@@ -22,9 +22,9 @@ def _make_single_terrain_sample(values: np.ndarray) -> Sample:
 
 def test_rates_on_one_terrain_agree_with_fisher() -> None:
     new, old = np.repeat([1, 0], [7, 33]), np.repeat([1, 0], [2, 58])
-    greater = stats.fisher_exact(np.array([[7, 33], [2, 58]]), "greater").pvalue
+    one_sided_p_value = stats.fisher_exact(np.array([[7, 33], [2, 58]]), "greater").pvalue
     assert difference_p_value(_make_single_terrain_sample(new), _make_single_terrain_sample(old)) == pytest.approx(
-        2 * greater
+        2 * one_sided_p_value
     )
 
 

@@ -40,12 +40,12 @@ def test_bounds_for_clustered_cases_cover_the_true_rate(rate: float, terrains: i
 
 
 @pytest.mark.parametrize(
-    ("terrains", "size", "answer_rate", "bad_fraction", "rates"),
+    ("terrains", "cases_per_terrain", "answer_rate", "bad_fraction", "rates"),
     [(40, 8, 0.1, 0.3, (0.2, 0.99)), (49, 20, 0.05, 0.3, (0.0, 0.99)), (60, 8, 0.3, 0.1, (0.0, 1.0)),
      (60, 20, 0.2, 0.1, (0.0, 1.0)), (60, 8, 0.2, 0.3, (0.6, 0.97))],
 )  # fmt: skip
 def test_bounds_cover_the_rate_if_bad_terrains_have_fewer_answers(
-    terrains: int, size: int, answer_rate: float, bad_fraction: float, rates: tuple[float, float]
+    terrains: int, cases_per_terrain: int, answer_rate: float, bad_fraction: float, rates: tuple[float, float]
 ) -> None:
     """A bound that counts only terrains would miss the true rate in up to 99 % of these campaigns."""
     rng = np.random.default_rng(15)
@@ -53,7 +53,7 @@ def test_bounds_cover_the_rate_if_bad_terrains_have_fewer_answers(
     rate, n_missed = float(weights @ np.array(rates) / weights.sum()), np.zeros(2)
     for _ in range(400):
         is_bad = rng.random(terrains) < bad_fraction
-        answers = rng.binomial(size, np.where(is_bad, answer_rate, 1.0))
+        answers = rng.binomial(cases_per_terrain, np.where(is_bad, answer_rate, 1.0))
         terrain = np.repeat(np.arange(terrains), answers)
         success = rng.random(terrain.size) < np.where(is_bad, *rates)[terrain]
         evidence = clustered_evidence(success, terrain, 0.9)
@@ -62,7 +62,6 @@ def test_bounds_cover_the_rate_if_bad_terrains_have_fewer_answers(
 
 
 def test_bounds_for_independent_cases_miss_the_rate_of_clustered_cases() -> None:
-    # the bound for independent cases is too high for correlated cases
     rng = np.random.default_rng(12)
     n_exceeded = 0
     for _ in range(300):
@@ -122,10 +121,14 @@ def test_terrains_are_numbered_without_gaps() -> None:
         np.testing.assert_array_equal(number_terrains(terrain_ids), np.unique(terrain_ids, return_inverse=True)[1])
 
 
-@pytest.mark.parametrize(("terrains", "failing", "is_estimated"), [(50, 10, True), (49, 10, False), (50, 9, False)])
-def test_correlation_is_estimated_from_enough_terrains(terrains: int, failing: int, is_estimated: bool) -> None:
+@pytest.mark.parametrize(
+    ("terrains", "n_failed_terrains", "is_estimated"), [(50, 10, True), (49, 10, False), (50, 9, False)]
+)
+def test_correlation_is_estimated_from_enough_terrains(
+    terrains: int, n_failed_terrains: int, is_estimated: bool
+) -> None:
     terrain = np.repeat(np.arange(terrains), 4)
-    success = ~((terrain < failing) & (np.arange(terrain.size) % 4 == 0))
+    success = ~((terrain < n_failed_terrains) & (np.arange(terrain.size) % 4 == 0))
     method = ClusterMethod.KORN_GRAUBARD if is_estimated else ClusterMethod.TERRAIN_COUNT
     assert clustered_evidence(success, terrain, 0.9).method is method
 

@@ -12,7 +12,7 @@ from marsyard.reports.statistics.samples import ErrorEllipse, circular_error, er
 
 
 def _draw_errors(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Normal errors with standard deviations 3 and 1 about (2, -1), rotated by 30 degrees."""
+    """Draw normal errors with standard deviations 3 and 1 about (2, -1), rotated by 30 degrees."""
     rotation = np.array([[math.cos(0.5236), -math.sin(0.5236)], [math.sin(0.5236), math.cos(0.5236)]])
     return np.asarray(np.array([2.0, -1.0]) + (rng.normal(size=(n, 2)) * [3.0, 1.0]) @ rotation.T)
 

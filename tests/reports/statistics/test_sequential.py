@@ -1,4 +1,4 @@
-"""Tests of sequential evaluation: planned evaluations, fraction of the risk per evaluation, additional cases.
+"""Tests of sequential evaluation: planned looks, risk of a wrong verdict per look, and additional cases.
 
 A look is one evaluation of the verdict during a campaign (interim analysis).
 """
@@ -82,10 +82,10 @@ def test_repeated_looks_at_full_risk_pass_too_often() -> None:
 
 
 def _append_advised_cases(
-    rng: np.random.Generator, first: int, max_cases: int, passes: LaterLook, fails: LaterLook
+    rng: np.random.Generator, first_cases: int, max_cases: int, pass_look: LaterLook, fail_look: LaterLook
 ) -> set[str]:
     """Return the verdicts of a campaign with true and required rate 0.99 that appends the advised numbers of cases."""
-    cases, failures, verdicts = first, int(rng.binomial(first, 0.01)), set()
+    cases, failures, verdicts = first_cases, int(rng.binomial(first_cases, 0.01)), set()
     pass_risk = fail_risk = 0.1
     while True:
         if stats.binom.cdf(cases - failures, cases, 0.99) < fail_risk:
@@ -94,51 +94,52 @@ def _append_advised_cases(
             return verdicts | {"PASS"}
         if cases >= max_cases:
             return verdicts
-        needed = min(max_cases, passes.cases_needed(cases, failures))
+        needed = min(max_cases, pass_look.cases_needed(cases, failures))
         failures += int(rng.binomial(needed - cases, 0.01))
         cases = needed
-        pass_risk, fail_risk = passes.risk_of_bound(cases), fails.risk_of_bound(cases)
+        pass_risk, fail_risk = pass_look.risk_of_bound(cases), fail_look.risk_of_bound(cases)
 
 
-@pytest.mark.parametrize("first", [24, 230])
-def test_appending_advised_cases_keeps_the_confidence(first: int) -> None:
+@pytest.mark.parametrize("first_cases", [24, 230])
+def test_appending_advised_cases_keeps_the_confidence(first_cases: int) -> None:
     """Campaigns have at most 5000 cases. With uncorrected bounds at each evaluation, 38.6 % of them would pass."""
     rng = np.random.default_rng(21)
-    passes, fails = LaterLook(0.01, 0.1, first), LaterLook(0.99, 0.1, first)
-    for later_look in (passes, fails):
+    pass_look, fail_look = LaterLook(0.01, 0.1, first_cases), LaterLook(0.99, 0.1, first_cases)
+    # cached methods keep the simulation fast
+    for later_look in (pass_look, fail_look):
         object.__setattr__(later_look, "risk_of_bound", cache(later_look.risk_of_bound))
         object.__setattr__(later_look, "cases_needed", cache(later_look.cases_needed))
-    verdicts = [_append_advised_cases(rng, first, 5000, passes, fails) for _ in range(1500)]
+    verdicts = [_append_advised_cases(rng, first_cases, 5000, pass_look, fail_look) for _ in range(1500)]
     # standard deviation of a fraction of 10 % of 1500: 0.8 %
     for verdict in ("PASS", "FAIL"):
         assert np.mean([verdict in reached for reached in verdicts]) <= 0.1 + 2 * 0.008
 
 
-@pytest.mark.parametrize("first", [1, 24, 230, 388])
+@pytest.mark.parametrize("first_cases", [1, 24, 230, 388])
 @pytest.mark.parametrize(("rate", "confidence"), [(0.01, 0.9), (0.1, 0.95), (0.95, 0.9)])
-def test_frequent_looks_keep_the_risk(first: int, rate: float, confidence: float) -> None:
+def test_frequent_looks_keep_the_risk(first_cases: int, rate: float, confidence: float) -> None:
     """The exact probability of a verdict is at most the risk if the campaign is evaluated after every 10 cases."""
-    risk, look = 1.0 - confidence, LaterLook(rate, 1.0 - confidence, first)
-    counts = np.arange(first + 1)
-    undecided = stats.binom.pmf(counts, first, rate)
-    undecided[stats.binom.cdf(counts, first, rate) <= risk] = 0.0
+    risk, look = 1.0 - confidence, LaterLook(rate, 1.0 - confidence, first_cases)
+    counts = np.arange(first_cases + 1)
+    undecided = stats.binom.pmf(counts, first_cases, rate)
+    undecided[stats.binom.cdf(counts, first_cases, rate) <= risk] = 0.0
     p_decided = 1.0 - undecided.sum()
-    for cases in range(first + 1, first + 1501):
+    for cases in range(first_cases + 1, first_cases + 1501):
         undecided = np.convolve(undecided, [1.0 - rate, rate])
         if cases % 10 == 0:
-            verdict = stats.binom.cdf(np.arange(cases + 1), cases, rate) <= look.risk_of_bound(cases)
-            p_decided += undecided[verdict].sum()
-            undecided[verdict] = 0.0
+            is_decided = stats.binom.cdf(np.arange(cases + 1), cases, rate) <= look.risk_of_bound(cases)
+            p_decided += undecided[is_decided].sum()
+            undecided[is_decided] = 0.0
     assert p_decided <= risk
 
 
 @given(st.integers(0, 400), st.integers(0, 5), st.sampled_from([0.5, 0.9, 0.99]))
-def test_advised_number_of_cases_is_the_minimum(first: int, failures: int, required_rate: float) -> None:
-    look = LaterLook(1.0 - required_rate, 0.1, first)
-    needed = look.cases_needed(max(first, failures), failures)
+def test_advised_number_of_cases_is_the_minimum(first_cases: int, failures: int, required_rate: float) -> None:
+    look = LaterLook(1.0 - required_rate, 0.1, first_cases)
+    needed = look.cases_needed(max(first_cases, failures), failures)
 
     def passes(cases: int) -> bool:
         return proportion_lower(cases - failures, cases, 1.0 - look.risk_of_bound(cases)) >= required_rate
 
     assert passes(needed)
-    assert needed == max(first, failures) or not passes(needed - 1)
+    assert needed == max(first_cases, failures) or not passes(needed - 1)

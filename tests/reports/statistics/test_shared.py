@@ -28,17 +28,17 @@ def _draw_values(rng: np.random.Generator, terrains: int, correlation: float) ->
 def test_intervals_of_mean_and_standard_deviation_have_nominal_coverage(terrains: int, correlation: float) -> None:
     # 200 samples at 95 %: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(1)
-    n_mean, n_sd, n_independent = 0, 0, 0
+    n_mean_covered, n_sd_covered, n_independent_covered = 0, 0, 0
     for _ in range(200):
         values, groups = _draw_values(rng, terrains, correlation)
         lower, upper = mean_interval(values, 0.95, groups)
-        n_mean += lower <= 0.0 <= upper
+        n_mean_covered += lower <= 0.0 <= upper
         lower, upper = standard_deviation_interval(values, 0.95, groups)
-        n_sd += lower <= 1.0 <= upper
+        n_sd_covered += lower <= 1.0 <= upper
         lower, upper = stats.t.interval(0.95, values.size - 1, values.mean(), stats.sem(values))
-        n_independent += lower <= 0.0 <= upper
-    assert min(n_mean, n_sd) / 200 >= 0.95 - 3 * 0.015
-    assert n_independent / 200 < 0.85
+        n_independent_covered += lower <= 0.0 <= upper
+    assert min(n_mean_covered, n_sd_covered) / 200 >= 0.95 - 3 * 0.015
+    assert n_independent_covered / 200 < 0.85
 
 
 @pytest.mark.parametrize(("terrains", "correlation"), [(20, 0.3), (60, 0.3), (60, 0.9)])

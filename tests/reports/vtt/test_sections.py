@@ -118,12 +118,13 @@ def test_oblique_targets_are_reported_separately() -> None:
 
 
 def _make_update_rows(n_updates: int, cases: int = 3) -> pd.DataFrame:
+    """Return rows with `n_updates` updates of the target per case."""
     frame = make_rows(cases)
-    for n in range(1, n_updates + 1):
-        for name, value in (("range_m", 4.0), ("magnification", 1.0 + 0.01 * n), ("roll_change_deg", -2.0)):
-            frame[f"update_{n}_{name}"] = value
+    for number in range(1, n_updates + 1):
+        for name, value in (("range_m", 4.0), ("magnification", 1.0 + 0.01 * number), ("roll_change_deg", -2.0)):
+            frame[f"update_{number}_{name}"] = value
         for name in ("azimuth_change_deg", "match_score", "stereo_score", "correction_px", "error_px"):
-            frame[f"update_{n}_{name}"] = 0.9
+            frame[f"update_{number}_{name}"] = 0.9
     return frame
 
 
@@ -131,10 +132,10 @@ def test_updates_are_compared_with_table_3() -> None:
     frame = _make_update_rows(8)
     frame.loc[0, "update_8_match_score"] = 0.5
     table = read_table(updates_section(make_subject(frame, CHECKOUT_1)))
-    score_row = next(k for k, row in enumerate(table) if row["Parameter"] == "NCC score")
+    score_row = next(index for index, row in enumerate(table) if row["Parameter"] == "NCC score")
     assert (table[score_row]["8"], table[score_row]["1"]) == ("0.79", "–")
     assert table[score_row + 1]["8"] == "0.90 (0.50 to 0.90)"
-    roll_row = next(k for k, row in enumerate(table) if row["Parameter"] == "Roll change (deg)")
+    roll_row = next(index for index, row in enumerate(table) if row["Parameter"] == "Roll change (deg)")
     assert table[roll_row + 1]["2"] == "2.00"  # absolute value, as printed in the paper
     other_campaign = read_table(updates_section(make_subject(frame, "another")))
     assert other_campaign[7]["NCC score"] == "0.90 (0.50 to 0.90)"

@@ -6,7 +6,7 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 
 
-class Inertial:
+class InertialEstimator:
     """Return the inertial velocity over the second pair."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
@@ -14,7 +14,7 @@ class Inertial:
         return VelocityEstimate(VelocityOutcome.VALID, measurements.interval_velocities_m_s[1, :2].copy())
 
 
-class SlowInertial(Inertial):
+class SlowInertialEstimator(InertialEstimator):
     """Return the same velocity after 0.1 s; on the slower flight computer the answer comes after the firing."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:

@@ -1,4 +1,4 @@
-"""Settings shared by the descent tests: a small terrain, one descent, ideal instruments and a noiseless detector."""
+"""Settings of the descent tests: a small terrain, one descent, ideal instruments and a noiseless detector."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,9 +9,10 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
 #: A small terrain (3 km) that is generated quickly.
-WORLD: dict[str, Any] = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "location": {"bank": 1}}
+SMALL_WORLD: dict[str, Any] = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "location": {"bank": 1}}
 #: The same terrain without relief.
-FLAT = {"samples": 1024, "spacing_m": 3.0, "rms_slope_deg": 0.0, "craters_per_km2": 0.0}
+FLAT_TERRAIN = {"samples": 1024, "spacing_m": 3.0, "rms_slope_deg": 0.0, "craters_per_km2": 0.0}
+#: A descent that drifts with the wind, swings and rotates.
 DESCENT = {
     "wind_east_m_s": 14.0,
     "wind_north_m_s": -9.0,
@@ -22,7 +23,7 @@ DESCENT = {
 }
 _IDEAL_CLOCK = {"offset_sd_s": 0.0, "jitter_sd_s": 0.0}
 #: Instruments without errors.
-PERFECT: Mapping[str, Mapping[str, Any]] = {
+IDEAL_INSTRUMENTS: Mapping[str, Mapping[str, Any]] = {
     "camera": {"alignment_error_deg": 0.0, "focal_error": 0.0, "centre_error_px": 0.0, "distortion_error_px": 0.0},
     "altimeter": {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": _IDEAL_CLOCK},
     "clock": _IDEAL_CLOCK,
@@ -44,7 +45,7 @@ PERFECT: Mapping[str, Mapping[str, Any]] = {
     },
 }
 #: A detector with negligible shot noise: response and full well are a million times those of the flight camera.
-NOISELESS = {
+NOISELESS_DETECTOR = {
     "responsivity_e_s": 1.019e13,
     "full_well_e": 1.7e11,
     "gain_e_dn": 4.15e7,
@@ -53,11 +54,11 @@ NOISELESS = {
 }
 
 
-def parameters(**parts: Any) -> DescentScenarioParameters:
+def make_parameters(**parts: Any) -> DescentScenarioParameters:
     """Return parameters of a descent over the small terrain; `parts` replaces tables."""
-    return DescentScenarioParameters.model_validate(WORLD | {"descent": DESCENT} | parts)
+    return DescentScenarioParameters.model_validate(SMALL_WORLD | {"descent": DESCENT} | parts)
 
 
-def run(case: int = 0, /, **parts: Any) -> CaseResult:
+def run_descent(case: int = 0, /, **parts: Any) -> CaseResult:
     """Run one descent over the small terrain; `parts` replaces tables of its parameters."""
-    return DescentScenario().run(parameters(**parts), Streams(1, "test", case))
+    return DescentScenario().run(make_parameters(**parts), Streams(1, "test", case))

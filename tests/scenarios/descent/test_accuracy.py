@@ -14,11 +14,11 @@ from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
-from tests.scenarios.descent.settings import FLAT, NOISELESS, PERFECT, parameters
+from tests.scenarios.descent.settings import FLAT_TERRAIN, IDEAL_INSTRUMENTS, NOISELESS_DETECTOR, make_parameters
 
 #: Rough ground on a long wave ("swell") with 200 m between trough and crest.
 RELIEF = {"samples": 1024, "spacing_m": 4.0, "rms_slope_deg": 1.0, "swell": {"relief_m": 200.0}}
-CASES = 5
+N_CASES = 5
 
 
 def _run_descent(case: int, **parts: Any) -> tuple[list[Track], list[State], DescentMeasurements, Surface]:
@@ -33,7 +33,7 @@ def _run_descent(case: int, **parts: Any) -> tuple[list[Track], list[State], Des
         "nod_phase_deg": rng.uniform(0.0, 360.0),
         "heading_deg": rng.uniform(0.0, 360.0),
     }
-    p = parameters(**PERFECT, descent=motion, detector=NOISELESS, **parts)
+    p = make_parameters(**IDEAL_INSTRUMENTS, descent=motion, detector=NOISELESS_DETECTOR, **parts)
     world, streams = World.from_parameters(p), Streams(5, "accuracy", case)
     flight = create_flight(p, world.surface, streams)
     states = states_at_images(p, flight)
@@ -55,27 +55,29 @@ def _compute_velocity_errors(tracks: list[Track], states: list[State]) -> np.nda
 
 def test_flat_ground_velocity_error_is_within_15_cm_s() -> None:
     """Requirement: 0.15 m/s rms over all valid tracks, also of cases without a reported velocity."""
-    runs = [_run_descent(case, terrain=FLAT) for case in range(CASES)]
+    runs = [_run_descent(case, terrain=FLAT_TERRAIN) for case in range(N_CASES)]
     errors = np.concatenate([_compute_velocity_errors(tracks, states) for tracks, states, _, _ in runs])
-    assert len(errors) >= 3 * CASES
+    assert len(errors) >= 3 * N_CASES
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.15
 
 
 def test_relief_errors_match_geometric_prediction() -> None:
-    """Requirement: errors agree with the formula to 0.2 m/s rms over 200 m of relief. The estimator assumes a plane at
-    the measured altitude H. A point at height h above the plane, with the assumed offset rho, has the true horizontal
-    offset ``rho (1 - h / H)``: the error of a displacement is ``h1 rho1 / H1 - h2 rho2 / H2``. Correlation yields the
-    mean over the heights in a template, weighted by the squared image gradients.
+    """Requirement: errors agree with the formula to 0.2 m/s rms over 200 m of relief.
+
+    The estimator assumes a plane at the measured altitude H. A point at height h above the plane, with the assumed
+    horizontal offset rho, has the true offset ``rho (1 - h / H)``. The error of a displacement is
+    ``h1 rho1 / H1 - h2 rho2 / H2``. Correlation yields the mean over the heights in a template, weighted by the
+    squared image gradients.
     """
     track_errors, track_predictions = [], []
-    for case in range(CASES):
+    for case in range(N_CASES):
         tracks, states, measurements, surface = _run_descent(
             case, terrain=RELIEF, location={"bank": 1, "east_m": 511.0 * case}
         )
         track_errors.append(_compute_velocity_errors(tracks, states))
         track_predictions += [_predict_error(track, states, measurements, surface) for track in tracks]
     simulated_errors, predicted_errors = np.concatenate(track_errors), np.array(track_predictions)
-    assert len(simulated_errors) >= 3 * CASES
+    assert len(simulated_errors) >= 3 * N_CASES
     assert np.sqrt(np.mean(np.sum((simulated_errors - predicted_errors) ** 2, axis=1))) < 0.2
     # The relief causes significant errors.
     assert np.sqrt(np.mean(np.sum(simulated_errors**2, axis=1))) > 0.4
@@ -88,13 +90,14 @@ def _predict_error(
     first, second = states[track.pair], states[track.pair + 1]
     altitude_1, altitude_2 = altitudes_at_images(measurements)[track.pair : track.pair + 2]
     template_size_px = len(track.template)
-    gsd = altitude_2 * 4.0 * 12e-6 / 14.67e-3
-    offsets_m = gsd * (np.arange(template_size_px) - 0.5 * (template_size_px - 1))
-    # Binned pixels of 4 x 12 um, focal length 14.67 mm; rows increase southwards.
+    # Binned pixels of 4 x 12 um, focal length 14.67 mm.
+    pixel_size_m = altitude_2 * 4.0 * 12e-6 / 14.67e-3
+    offsets_m = pixel_size_m * (np.arange(template_size_px) - 0.5 * (template_size_px - 1))
+    # Rows increase southwards.
     offsets = np.stack([np.tile(offsets_m, template_size_px), np.repeat(-offsets_m, template_size_px)], axis=1)
     rho_1 = track.ground_m + offsets
+    # Fixed-point iteration for the intersection of each viewing ray with the terrain: true offset / assumed offset.
     true_fraction = np.ones(len(rho_1))
-    # Fixed-point iteration for the intersection of each viewing ray with the terrain.
     for _ in range(60):
         positions = first.position_m[:2] + true_fraction[:, None] * rho_1
         true_fraction = (first.position_m[2] - surface.height(positions[:, 0], positions[:, 1])) / altitude_1
@@ -104,8 +107,8 @@ def _predict_error(
     true_offset = first.position_m[:2] + true_fraction[:, None] * rho_1 - second.position_m[:2]
     rho_2 = true_offset / (1.0 - height_2 / altitude_2)[:, None]
     shifts = height_1[:, None] * rho_1 / altitude_1 - height_2[:, None] * rho_2 / altitude_2
-    south, east = np.gradient(track.template)
-    slopes = np.stack([east.ravel(), -south.ravel()], axis=1)
-    weights = slopes[:, :, None] * slopes[:, None, :]
+    gradient_south, gradient_east = np.gradient(track.template)
+    gradients = np.stack([gradient_east.ravel(), -gradient_south.ravel()], axis=1)
+    weights = gradients[:, :, None] * gradients[:, None, :]
     mean_shift = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, shifts))
     return np.asarray(mean_shift / (second.time_s - first.time_s))

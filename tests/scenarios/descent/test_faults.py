@@ -35,7 +35,7 @@ from marsyard.sim.render import Frame, PixelRays, Sun
 from marsyard.sim.sensor import Detector, DetectorParameters
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment, TerrainParameters
-from tests.scenarios.descent.settings import NOISELESS, parameters, run
+from tests.scenarios.descent.settings import NOISELESS_DETECTOR, make_parameters, run_descent
 
 SMALL_CAMERA = CameraParameters(columns=256, rows=256, pixel_pitch_um=48.0)
 SUN = Sun(direction(4.0, 0.7))
@@ -133,7 +133,8 @@ def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
 
 
 def _render_descent(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]:
-    p = parameters(faults=faults, detector=NOISELESS, **parts)
+    """Return the three images of a descent, in counts."""
+    p = make_parameters(faults=faults, detector=NOISELESS_DETECTOR, **parts)
     world, streams = World.from_parameters(p), Streams(1, "faults", 0)
     states = states_at_images(p, create_flight(p, world.surface, streams))
     optics = camera_optics(p.camera)
@@ -149,32 +150,32 @@ def test_image_faults_change_the_expected_pixels() -> None:
         pairs = zip(_render_descent(faults), clear_images, strict=True)
         return [float(np.mean(np.abs(faulty / clear - 1.0) > 0.02)) for faulty, clear in pairs]
 
-    dust = compute_changed_fractions({"dust_discs": 10})
-    assert all(0.002 < fraction < 0.3 for fraction in dust)
-    assert np.ptp(dust) < 0.02
+    dust_fractions = compute_changed_fractions({"dust_discs": 10})
+    assert all(0.002 < fraction < 0.3 for fraction in dust_fractions)
+    assert np.ptp(dust_fractions) < 0.02
     # A binned pixel sums four rows: one defective pixel among them changes its value.
     assert compute_changed_fractions({"bad_pixels": 0.01})[0] > 0.02
-    late = compute_changed_fractions({"late_s": 0.5})
-    assert late[0] == late[2] == 0.0 < late[1]
-    shield = compute_changed_fractions({"heat_shield_deg": 5.0})
+    late_fractions = compute_changed_fractions({"late_s": 0.5})
+    assert late_fractions[0] == late_fractions[2] == 0.0 < late_fractions[1]
+    shield_fractions = compute_changed_fractions({"heat_shield_deg": 5.0})
     # Shadows of clouds darken pixels; scattered light brightens others.
     assert min(compute_changed_fractions({"cloud_cover": 0.4})) > 0.2
     # The shield tumbles: it may be invisible in one image if its edge points to the camera.
-    assert max(shield) > 0.001
+    assert max(shield_fractions) > 0.001
 
 
 def test_calibration_errors_have_the_specified_standard_deviation() -> None:
-    """Standard deviations of image centre and corner position over many draws of the calibration."""
+    """Compare standard deviations of image centre and corner position over 300 draws of the calibration."""
     p = CameraParameters()
-    true = camera_optics(p).camera
+    true_camera = camera_optics(p).camera
     cameras = [calibrated_camera(p, np.random.default_rng(seed)) for seed in range(300)]
     nadir = np.array([[0.0, 0.0, -1.0]])
-    centre_shifts = np.stack([camera.project(nadir)[0][0] for camera in cameras]) - true.project(nadir)[0][0]
+    centre_shifts = np.stack([camera.project(nadir)[0][0] for camera in cameras]) - true_camera.project(nadir)[0][0]
     # 300 draws determine a standard deviation to 4 %.
     assert centre_shifts.std(axis=0) == pytest.approx([p.centre_error_px] * 2, rel=0.15)
-    _, corner = true.rays(np.array([[0.0, 0.0]]))
+    _, corner = true_camera.rays(np.array([[0.0, 0.0]]))
     corners = np.stack([camera.project(corner)[0][0] for camera in cameras])
-    corner_shifts = corners - centre_shifts - true.project(corner)[0][0]
+    corner_shifts = corners - centre_shifts - true_camera.project(corner)[0][0]
     radial_shifts = corner_shifts @ np.array([-1.0, -1.0]) / np.sqrt(2.0)
     expected = np.hypot(p.distortion_error_px, p.focal_error * np.hypot(511.5, 511.5))
     assert radial_shifts.std() == pytest.approx(expected, rel=0.15)
@@ -183,7 +184,9 @@ def test_calibration_errors_have_the_specified_standard_deviation() -> None:
 
 def test_regular_dunes_trigger_the_second_peak_check() -> None:
     """The paper's ratio of the second to the first correlation peak detects repetitive terrain."""
-    result = run(faults={"dunes_m": 4.0}, descent={"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 10.0})
+    result = run_descent(
+        faults={"dunes_m": 4.0}, descent={"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 10.0}
+    )
     columns = list(result.products["tracks_columns"])
     ratios = result.products["tracks"][:, columns.index("second_peak_ratio")]
     assert ratios.max() > 0.6

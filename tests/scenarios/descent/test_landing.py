@@ -8,7 +8,7 @@ from marsyard.scenarios.descent.score import compute_touchdown
 
 IDEAL = LandingParameters(steering_error=0.0, burn_error_m_s=0.0)
 #: True horizontal velocity before the firing, m/s, with a magnitude of 15.
-DRIFT = np.array([12.0, -9.0])
+TRUE_VELOCITY = np.array([12.0, -9.0])
 
 
 def make_rng() -> np.random.Generator:
@@ -16,37 +16,41 @@ def make_rng() -> np.random.Generator:
 
 
 def test_correct_answer_cancels_the_velocity() -> None:
-    result = compute_touchdown(IDEAL, DRIFT, DRIFT.copy(), 17.0, make_rng())
+    result = compute_touchdown(IDEAL, TRUE_VELOCITY, TRUE_VELOCITY.copy(), 17.0, make_rng())
     np.testing.assert_allclose(result.with_answer, 0.0, atol=1e-12)
-    np.testing.assert_allclose(result.without_answer, DRIFT)
+    np.testing.assert_allclose(result.without_answer, TRUE_VELOCITY)
 
 
 def test_steering_is_limited_by_its_capability() -> None:
-    fast = 2.0 * DRIFT
-    result = compute_touchdown(IDEAL, fast, fast.copy(), 17.0, make_rng())
+    fast_velocity = 2.0 * TRUE_VELOCITY
+    result = compute_touchdown(IDEAL, fast_velocity, fast_velocity.copy(), 17.0, make_rng())
     np.testing.assert_allclose(np.hypot(*result.with_answer), 30.0 - IDEAL.max_steering_m_s)
 
 
 def test_wrong_answer_increases_the_velocity() -> None:
     """Steering with the negated velocity doubles the velocity."""
-    result = compute_touchdown(IDEAL, DRIFT, -DRIFT, 17.0, make_rng())
-    np.testing.assert_allclose(result.with_answer, 2.0 * DRIFT)
+    result = compute_touchdown(IDEAL, TRUE_VELOCITY, -TRUE_VELOCITY, 17.0, make_rng())
+    np.testing.assert_allclose(result.with_answer, 2.0 * TRUE_VELOCITY)
 
 
 @pytest.mark.parametrize(
-    ("estimate", "available_s"), [(None, 17.0), (DRIFT, IDEAL.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)]
+    ("estimate", "available_s"),
+    [(None, 17.0), (TRUE_VELOCITY, IDEAL.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)],
 )
 def test_late_or_missing_answer_disables_steering(estimate: np.ndarray | None, available_s: float) -> None:
-    result = compute_touchdown(IDEAL, DRIFT, estimate, available_s, make_rng())
+    result = compute_touchdown(IDEAL, TRUE_VELOCITY, estimate, available_s, make_rng())
     np.testing.assert_array_equal(result.with_answer, result.without_answer)
     assert result.is_in_time == (available_s >= IDEAL.computation_s)
 
 
 def test_burn_and_steering_errors_have_the_specified_standard_deviation() -> None:
     p = LandingParameters(steering_error=0.1, burn_error_m_s=1.0)
-    touchdowns = [compute_touchdown(p, DRIFT, DRIFT.copy(), 17.0, np.random.default_rng(seed)) for seed in range(2000)]
-    without_answer = np.stack([touchdown.without_answer for touchdown in touchdowns]) - DRIFT
-    steering = np.stack([touchdown.with_answer - touchdown.without_answer for touchdown in touchdowns]) + DRIFT
+    touchdowns = [
+        compute_touchdown(p, TRUE_VELOCITY, TRUE_VELOCITY.copy(), 17.0, np.random.default_rng(seed))
+        for seed in range(2000)
+    ]
+    without_answer = np.stack([touchdown.without_answer for touchdown in touchdowns]) - TRUE_VELOCITY
+    steering = np.stack([touchdown.with_answer - touchdown.without_answer for touchdown in touchdowns]) + TRUE_VELOCITY
     # 4000 draws determine a standard deviation to 1.1 %.
     assert without_answer.std() == pytest.approx(1.0, rel=0.05)
     assert steering.std() == pytest.approx(1.5, rel=0.05)

@@ -1,4 +1,4 @@
-"""Tests of descents with any number of images: images for each algorithm, and true velocity for each answer."""
+"""Tests of descents with two or more images: images for each algorithm, and true velocity for each answer."""
 
 from pathlib import Path
 from typing import Any
@@ -11,15 +11,15 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
-from tests.scenarios.descent.settings import DESCENT, PERFECT, parameters, run
+from tests.scenarios.descent.settings import DESCENT, IDEAL_INSTRUMENTS, make_parameters, run_descent
 
-STREAM_ESTIMATOR = "tests.scenarios.descent.test_many_images:Inertial"
+STREAM_ESTIMATOR = "tests.scenarios.descent.test_many_images:InertialEstimator"
 #: Nine images of a descent that contain the three images of a standard descent.
 NINE_IMAGES: dict[str, Any] = {"pictures": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
 
 
-class Inertial:
-    """Return the inertial velocity: its mean over the last interval after each image, its last value at the end."""
+class InertialEstimator:
+    """Return the mean inertial velocity over the last interval after each image, and its last value at the end."""
 
     def start(self) -> None:
         self.frames: list[DescentFrame] = []
@@ -41,7 +41,7 @@ class Inertial:
         )
 
 
-class LastThreeQuarters(Inertial):
+class LastThreeQuartersEstimator(InertialEstimator):
     """Return a mean velocity with a span from a quarter of the descent to the last image."""
 
     def finish(self) -> VelocityEstimate:
@@ -51,8 +51,8 @@ class LastThreeQuarters(Inertial):
 
 @pytest.fixture(scope="module")
 def nine_images() -> CaseResult:
-    """Nine images with ideal instruments: the inertial velocity is exact."""
-    return run(algorithm=STREAM_ESTIMATOR, compared=["dimes"], **NINE_IMAGES, **PERFECT)
+    """Run a case with nine images and ideal instruments: the inertial velocity is exact."""
+    return run_descent(algorithm=STREAM_ESTIMATOR, compared=["dimes"], **NINE_IMAGES, **IDEAL_INSTRUMENTS)
 
 
 def test_true_velocity_is_averaged_over_the_span_of_the_answer(nine_images: CaseResult) -> None:
@@ -71,7 +71,7 @@ def test_true_velocity_is_averaged_over_the_span_of_the_answer(nine_images: Case
 
 
 def test_three_image_estimator_receives_first_middle_and_last_image(nine_images: CaseResult) -> None:
-    three_images = run(**PERFECT).row
+    three_images = run_descent(**IDEAL_INSTRUMENTS).row
     assert [nine_images.row[f"altitude_{number}_m"] for number in (1, 5, 9)] == [
         three_images[f"altitude_{number}_m"] for number in (1, 2, 3)
     ]
@@ -86,16 +86,21 @@ def test_three_image_estimator_receives_first_middle_and_last_image(nine_images:
 
 
 def test_dimes_input_images_are_stored_for_figures() -> None:
-    result = run(compared=[STREAM_ESTIMATOR], triple=[1, 2, 3], **NINE_IMAGES)
+    result = run_descent(compared=[STREAM_ESTIMATOR], triple=[1, 2, 3], **NINE_IMAGES)
     assert [name for name in result.products if name.startswith("image_")] == ["image_1", "image_2", "image_3"]
-    assert {"Inertial.stream_pictures", "Inertial.velocity_nees"} <= set(result.row)
+    assert {"InertialEstimator.stream_pictures", "InertialEstimator.velocity_nees"} <= set(result.row)
 
 
 def test_span_between_images_is_interpolated() -> None:
     """The span starts a quarter of the descent after the first image: the truth is interpolated between the images."""
-    spec = "tests.scenarios.descent.test_many_images:LastThreeQuarters"
+    spec = "tests.scenarios.descent.test_many_images:LastThreeQuartersEstimator"
     first, second = (
-        run(algorithm=spec, pictures=pictures, descent=DESCENT | {"interval_s": 4.0 / (pictures - 1)}, **PERFECT)
+        run_descent(
+            algorithm=spec,
+            pictures=pictures,
+            descent=DESCENT | {"interval_s": 4.0 / (pictures - 1)},
+            **IDEAL_INSTRUMENTS,
+        )
         for pictures in (2, 9)
     )
     # Both cases have the same flight and span, but different images.
@@ -108,12 +113,12 @@ def test_span_between_images_is_interpolated() -> None:
 
 def test_many_image_case_is_deterministic() -> None:
     parts: dict[str, Any] = {"pictures": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
-    first, repeated = run(**parts), run(**parts)
+    first, repeated = run_descent(**parts), run_descent(**parts)
     assert differing_columns(dict(first.row), dict(repeated.row)) == ()
 
 
 def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
-    run(algorithm=f"export:{tmp_path}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
+    run_descent(algorithm=f"export:{tmp_path}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
     exported = read_case(tmp_path / "cases" / "000000")
     assert isinstance(exported, DescentMeasurements)
     assert len(exported.images) == len(exported.attitudes) == len(exported.altitudes) == 4
@@ -123,8 +128,8 @@ def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
     start, end = exported.tags_s[0], exported.tags_s[2]
     answer_table = tmp_path / "answers.csv"
     answer_table.write_text(f"case,velocity_east_m_s,velocity_north_m_s,start_s,end_s\n0,1,2,{start!r},{end!r}\n")
-    scored_case = run(algorithm=f"answers:{answer_table}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
-    same_span = run(algorithm=STREAM_ESTIMATOR, pictures=2, descent=DESCENT | {"interval_s": 2.0})
+    scored_case = run_descent(algorithm=f"answers:{answer_table}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
+    same_span = run_descent(algorithm=STREAM_ESTIMATOR, pictures=2, descent=DESCENT | {"interval_s": 2.0})
     assert [scored_case.row[f"velocity_true_{axis}_m_s"] for axis in "xy"] == pytest.approx(
         same_span.products["after_true_m_s"][1], abs=1e-9
     )
@@ -145,14 +150,14 @@ def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
 )
 def test_invalid_image_counts_are_rejected(parts: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        parameters(**parts)
+        make_parameters(**parts)
 
 
 @pytest.mark.parametrize(("pictures", "positions"), [(3, (0, 1, 2)), (4, (1, 2, 3)), (5, (0, 2, 4)), (10, (1, 5, 9))])
 def test_default_image_triple_is_evenly_spaced(pictures: int, positions: tuple[int, int, int]) -> None:
-    assert parameters(pictures=pictures).triple_indices == positions
+    assert make_parameters(pictures=pictures).triple_indices == positions
 
 
 def test_image_times_after_thruster_ignition_are_rejected() -> None:
     with pytest.raises(ValueError, match=r"image \d of 9 would be taken at .* s, after the thrusters' firing"):
-        run(pictures=9)
+        run_descent(pictures=9)

@@ -71,8 +71,8 @@ def test_illumination_follows_the_site() -> None:
     assert earth.brightness / mars.brightness > 1.0 / 0.44
     # A detector specified for the sun at 1 au receives 1 / 1.5^2 = 0.44 of its light on Mars.
     earth_detector = {"site": SITES[0], "detector": {"sun_au": 1.0}} | small_terrain
-    dimmer = World.from_parameters(DescentScenarioParameters.model_validate(earth_detector))
-    assert dimmer.brightness == pytest.approx(mars.brightness / 1.5**2)
+    world_with_earth_detector = World.from_parameters(DescentScenarioParameters.model_validate(earth_detector))
+    assert world_with_earth_detector.brightness == pytest.approx(mars.brightness / 1.5**2)
     scene = mars.scene(0.0, 0.0, 1400.0, 8.2e-4)
     assert scene.photometry == mars.ground.photometry(mars.sun)
     assert len(scene.objects) > 0
@@ -98,12 +98,13 @@ def test_custom_cameras_are_stored_in_the_campaign(tmp_path: Path) -> None:
     sheet.unlink()
     assert DescentScenarioParameters.model_validate(repeated.model_dump(mode="json", round_trip=True)) == p
     # The calibrated camera differs by the specified errors (4 standard deviations): at the corner by their sum.
-    true, calibrated = camera_optics(p.camera).camera, calibrated_camera(p.camera, np.random.default_rng(1))
-    directions = true.rays(np.array([[0.0, 0.0], [320.0, 240.0], [639.0, 479.0]]))[1]
-    shifts_px = np.linalg.norm(calibrated.project(directions)[0] - true.project(directions)[0], axis=1)
+    true_camera, calibrated = camera_optics(p.camera).camera, calibrated_camera(p.camera, np.random.default_rng(1))
+    directions = true_camera.rays(np.array([[0.0, 0.0], [320.0, 240.0], [639.0, 479.0]]))[1]
+    shifts_px = np.linalg.norm(calibrated.project(directions)[0] - true_camera.project(directions)[0], axis=1)
     assert 0.0 < shifts_px[1] < 4.0 * p.camera.centre_error_px
-    sum_px = p.camera.centre_error_px + p.camera.distortion_error_px + 400 * p.camera.focal_error
-    assert shifts_px.max() < 4.0 * sum_px
+    # half of the image diagonal is 400 px
+    error_sum_px = p.camera.centre_error_px + p.camera.distortion_error_px + 400 * p.camera.focal_error
+    assert shifts_px.max() < 4.0 * error_sum_px
 
 
 def test_custom_camera_distortion_error_applies_at_corner() -> None:
@@ -112,10 +113,10 @@ def test_custom_camera_distortion_error_applies_at_corner() -> None:
     for camera_parameters in (p, custom):
         rng = np.random.default_rng(3)
         normal_draw = np.random.default_rng(3).standard_normal(4)[3]
-        true, calibrated = camera_optics(camera_parameters).camera, calibrated_camera(camera_parameters, rng)
-        corner = true.rays(np.array([0.0, 0.0]))[1]
+        true_camera, calibrated = camera_optics(camera_parameters).camera, calibrated_camera(camera_parameters, rng)
+        corner = true_camera.rays(np.array([0.0, 0.0]))[1]
         radial_shift_px = np.linalg.norm(calibrated.project(corner)[0] - 511.5) - np.linalg.norm(
-            true.project(corner)[0] - 511.5
+            true_camera.project(corner)[0] - 511.5
         )
         assert radial_shift_px == pytest.approx(2.0 * normal_draw, rel=0.02)
 

@@ -17,7 +17,7 @@ from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.sim.dynamics.recorded import COLUMNS
 from marsyard.sim.streams import Streams
-from tests.scenarios.descent.settings import parameters, run
+from tests.scenarios.descent.settings import make_parameters, run_descent
 
 #: OpenCV's camera axes in the body axes, as rows.
 CAMERA_IN_BODY = Rotation.from_matrix([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -31,18 +31,18 @@ def _write_poses(folder: Path, times: np.ndarray, positions: np.ndarray, attitud
     return str(path)
 
 
-def _write_vertical_fall(folder: Path, **changes: Any) -> str:
-    """Write 25 s of descent at 70 m/s from 2200 m, 10 m/s east; attitudes of a camera that looks down."""
+def _write_vertical_fall(folder: Path, *, height_m: float = 2200.0, tilt_deg: float = 0.0) -> str:
+    """Write 25 s of descent at 70 m/s, 10 m/s east; attitudes of a camera that looks down, tilted about x."""
     times = np.arange(0.0, 25.0, 0.1)
-    positions = np.column_stack([10.0 * times, 0.0 * times, changes.get("height", 2200.0) - 70.0 * times])
+    positions = np.column_stack([10.0 * times, 0.0 * times, height_m - 70.0 * times])
     down = Rotation.from_matrix([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
-    tilt = Rotation.from_euler("x", changes.get("tilt_deg", 0.0), degrees=True)
+    tilt = Rotation.from_euler("x", tilt_deg, degrees=True)
     return _write_poses(folder, times, positions, Rotation.concatenate([tilt * down] * times.size))
 
 
 def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
     """The file has 50 Hz, north-east-down axes, attitudes of the camera and another time origin."""
-    simulated, p = run(), parameters()
+    simulated, p = run_descent(), make_parameters()
     world = World.from_parameters(p)
     flight = create_flight(p, world.surface, Streams(1, "test", 0))
     times = np.arange(-5.0, flight.firing_s + 1.0, 0.02)
@@ -56,7 +56,7 @@ def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
         NED_FROM_ENU.apply(truth.positions_m - origin),
         NED_FROM_ENU * truth.attitudes * CAMERA_IN_BODY.inv(),
     )
-    recorded = run(flight={"file": file, "axes": "ned", "first_picture_s": 1234.0})
+    recorded = run_descent(flight={"file": file, "axes": "ned", "first_picture_s": 1234.0})
     assert recorded.outcome == simulated.outcome == "VALID"
     for name in ("velocity_true_x_m_s", "velocity_true_y_m_s", "altitude_1_m", "off_nadir_3_deg", "firing_after_s"):
         assert recorded.row[name] == pytest.approx(simulated.row[name], abs=1e-2), name
@@ -108,7 +108,7 @@ def test_invalid_flights_are_rejected_on_load(tmp_path: Path) -> None:
         "at image 1 the camera looks up, 60.0 deg above the horizon", _write_vertical_fall(tmp_path, tilt_deg=150.0)
     )
     expect_error("at image 1 the camera looks up", _write_vertical_fall(tmp_path), attitude_of="body")
-    expect_error(r"at image 3 the camera is 5.0 m below the ground", _write_vertical_fall(tmp_path, height=870.0))
+    expect_error(r"at image 3 the camera is 5.0 m below the ground", _write_vertical_fall(tmp_path, height_m=870.0))
     expect_error(
         r"covers 0.000 to 24.900 s; images from 23.000 to", _write_vertical_fall(tmp_path), first_picture_s=23.0
     )
@@ -122,6 +122,6 @@ def test_changed_flight_file_is_rejected(tmp_path: Path) -> None:
     p = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"}})
     stored = p.model_dump(mode="json", round_trip=True)
     assert DescentScenarioParameters.model_validate(stored) == p
-    _write_vertical_fall(tmp_path, height=2300.0)
+    _write_vertical_fall(tmp_path, height_m=2300.0)
     with pytest.raises(ValidationError, match=r"file has changed since the campaign was created"):
         DescentScenarioParameters.model_validate(stored)

@@ -10,38 +10,39 @@ import pytest
 from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
-from tests.scenarios.descent.settings import DESCENT, FLAT, PERFECT, WORLD, run
+from tests.scenarios.descent.settings import DESCENT, FLAT_TERRAIN, IDEAL_INSTRUMENTS, SMALL_WORLD, run_descent
 
 
 @pytest.fixture(scope="module")
-def nominal() -> CaseResult:
-    return run()
+def nominal_case() -> CaseResult:
+    """Run case 0 with the default parameters and the small terrain."""
+    return run_descent()
 
 
 def _drop_times(row: Any) -> dict[str, Any]:
     return {name: value for name, value in row.items() if "time" not in name}
 
 
-def test_case_is_deterministic(nominal: CaseResult) -> None:
-    second_case = run(1)
-    repeated = run()
-    assert _drop_times(repeated.row) == _drop_times(nominal.row)
-    assert second_case.row["image_hash"] != nominal.row["image_hash"]
+def test_case_is_deterministic(nominal_case: CaseResult) -> None:
+    second_case = run_descent(1)
+    repeated = run_descent()
+    assert _drop_times(repeated.row) == _drop_times(nominal_case.row)
+    assert second_case.row["image_hash"] != nominal_case.row["image_hash"]
 
 
 def test_each_catalogue_dispersion_is_reported() -> None:
     """The row has the value of each dispersion in a column that is named by the path or by the end of the path."""
     dispersed = load_campaign("dimes-gusev").draws(3)
     samples = {path: value for path, value in dispersed.items() if path != "location.terrain"}
-    settings: dict[str, Any] = {"location": dict(WORLD["location"]), "faults": {"late_s": 0.25}, "site": "gusev"}
-    settings["terrain"] = dict(WORLD["terrain"])
+    settings: dict[str, Any] = {"location": dict(SMALL_WORLD["location"]), "faults": {"late_s": 0.25}, "site": "gusev"}
+    settings["terrain"] = dict(SMALL_WORLD["terrain"])
     for path, value in samples.items():
         *names, last = path.split(".")
         table = settings
         for name in names:
             table = table.setdefault(name, {})
         table[last] = value
-    row = run(**settings).row
+    row = run_descent(**settings).row
     for path, value in samples.items():
         parts = path.split(".")
         column = next(name for name in ("_".join(parts[start:]) for start in range(len(parts))) if name in row)
@@ -53,9 +54,9 @@ def test_each_catalogue_dispersion_is_reported() -> None:
 
 
 @pytest.mark.parametrize("name", ["velocity", "firing_velocity"])
-def test_velocity_error_is_estimate_minus_truth(nominal: CaseResult, name: str) -> None:
-    row: Any = nominal.row
-    assert nominal.answered
+def test_velocity_error_is_estimate_minus_truth(nominal_case: CaseResult, name: str) -> None:
+    row: Any = nominal_case.row
+    assert nominal_case.answered
     for axis in "xy":
         assert row[f"{name}_error_{axis}_m_s"] == pytest.approx(
             row[f"{name}_estimated_{axis}_m_s"] - row[f"{name}_true_{axis}_m_s"], abs=1e-12
@@ -63,18 +64,18 @@ def test_velocity_error_is_estimate_minus_truth(nominal: CaseResult, name: str) 
     assert row[f"{name}_error_m_s"] == pytest.approx(math.hypot(row[f"{name}_error_x_m_s"], row[f"{name}_error_y_m_s"]))
 
 
-def test_figures_use_the_scored_data(nominal: CaseResult) -> None:
-    row = nominal.row
+def test_figures_use_the_scored_data(nominal_case: CaseResult) -> None:
+    row = nominal_case.row
     for kind in ("true", "estimated"):
         stored = [float(row[f"velocity_{kind}_{axis}_m_s"]) for axis in "xy"]
-        np.testing.assert_allclose(nominal.products[f"velocity_{kind}_m_s"], stored)
-    assert all(nominal.products[f"image_{k}"].shape == (256, 1024) for k in (1, 2, 3))
+        np.testing.assert_allclose(nominal_case.products[f"velocity_{kind}_m_s"], stored)
+    assert all(nominal_case.products[f"image_{k}"].shape == (256, 1024) for k in (1, 2, 3))
 
 
 def test_true_velocity_is_the_mean_camera_velocity() -> None:
     """Without swing and gusts the lander drifts with the wind, which is uniform above the boundary layer of 500 m."""
     no_swing = {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "gust_intensity_m_s": 0.0}
-    row = run(descent=DESCENT | no_swing).row
+    row = run_descent(descent=DESCENT | no_swing).row
     assert row["velocity_true_x_m_s"] == pytest.approx(14.0, abs=1e-6)
     assert row["velocity_true_y_m_s"] == pytest.approx(-9.0, abs=1e-6)
     # In the boundary layer the wind decreases, and the parachute follows.
@@ -89,7 +90,7 @@ def test_ideal_instruments_over_flat_ground_give_exact_velocity(wind: tuple[floa
     """
     east, north = wind
     descent = DESCENT | {"wind_east_m_s": east, "wind_north_m_s": north}
-    result = run(**PERFECT, terrain=FLAT, descent=descent)
+    result = run_descent(**IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN, descent=descent)
     row = result.row
     assert result.outcome == "VALID"
     assert float(row["velocity_error_m_s"]) < 0.15
@@ -97,19 +98,19 @@ def test_ideal_instruments_over_flat_ground_give_exact_velocity(wind: tuple[floa
         assert row[f"firing_velocity_error_{axis}_m_s"] == pytest.approx(row[f"velocity_error_{axis}_m_s"], abs=0.01)
 
 
-def test_ideal_instruments_are_reported_without_errors(nominal: CaseResult) -> None:
+def test_ideal_instruments_are_reported_without_errors(nominal_case: CaseResult) -> None:
     """Over flat ground the only error is the altitude change between the last altimeter reading and the image."""
-    row = run(**PERFECT, terrain=FLAT).row
+    row = run_descent(**IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN).row
     for name in ("attitude_error_common_deg", "attitude_error_independent_deg"):
-        assert float(row[name]) < 1e-4 < float(nominal.row[name])
+        assert float(row[name]) < 1e-4 < float(nominal_case.row[name])
     # A tenth of a second at 0.3 m/s^2 and a swing velocity of 2 m/s changes the altitude of 1400 m by 0.1 m.
-    assert abs(float(row["altitude_error_common"])) < 1e-4 < abs(float(nominal.row["altitude_error_common"]))
-    assert float(row["velocity_change_error_m_s"]) < 1e-3 < float(nominal.row["velocity_change_error_m_s"])
+    assert abs(float(row["altitude_error_common"])) < 1e-4 < abs(float(nominal_case.row["altitude_error_common"]))
+    assert float(row["velocity_change_error_m_s"]) < 1e-3 < float(nominal_case.row["velocity_change_error_m_s"])
 
 
 def test_instrument_errors_have_the_specified_size() -> None:
     """Altimeter: 3 sigma of all errors is 1 %. Attitude: 1.4 deg (38 revolutions, gyro scale error of 100 ppm)."""
-    rows = [run(case).row for case in range(4)]
+    rows = [run_descent(case).row for case in range(4)]
     altitude = np.array([float(row["altitude_error_common"]) for row in rows])
     attitude = np.array([float(row["attitude_error_common_deg"]) for row in rows])
     independent = np.array([float(row["attitude_error_independent_deg"]) for row in rows])
@@ -128,7 +129,9 @@ def test_attitude_error_causes_predicted_velocity_error() -> None:
     steady_descent = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
     errors, expected = [], []
     for case in range(4):
-        row = run(case, **PERFECT, terrain=FLAT, descent=steady_descent, faults={"attitude_error_deg": 0.8}).row
+        row = run_descent(
+            case, **IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN, descent=steady_descent, faults={"attitude_error_deg": 0.8}
+        ).row
         descent_m = float(row["altitude_2_m"]) - float(row["altitude_3_m"])
         velocity = [float(row["velocity_true_x_m_s"]), float(row["velocity_true_y_m_s"]), -descent_m / 3.75]
         errors.append([float(row[f"velocity_error_{axis}_m_s"]) for axis in "xy"])
@@ -144,13 +147,15 @@ def test_attitude_error_causes_predicted_velocity_error() -> None:
 def test_common_altitude_error_scales_the_velocity() -> None:
     """An altitude error of +2 % makes displacements and velocity 2 % too large."""
     steady_descent = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 25.0}
-    row = run(**PERFECT, terrain=FLAT, descent=steady_descent, faults={"altitude_error": 0.02}).row
+    row = run_descent(
+        **IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN, descent=steady_descent, faults={"altitude_error": 0.02}
+    ).row
     assert row["velocity_error_x_m_s"] == pytest.approx(0.02 * float(row["velocity_true_x_m_s"]), abs=0.12)
     assert row["altitude_error_common"] == pytest.approx(0.02, abs=1e-4)
 
 
-def test_condition_columns_have_the_simulated_values(nominal: CaseResult) -> None:
-    row: Any = nominal.row
+def test_condition_columns_have_the_simulated_values(nominal_case: CaseResult) -> None:
+    row: Any = nominal_case.row
     assert row["altitude_1_m"] == pytest.approx(2000.0, abs=20.0)
     assert row["altitude_1_m"] - row["altitude_3_m"] == pytest.approx(7.5 * row["descent_rate_m_s"], abs=40.0)
     assert row["off_nadir_max_deg"] == max(row[f"off_nadir_{k}_deg"] for k in (1, 2, 3))
@@ -168,7 +173,7 @@ def test_condition_columns_have_the_simulated_values(nominal: CaseResult) -> Non
 def test_insufficient_overlap_gives_no_velocity() -> None:
     """The camera swings by 42 deg to opposite sides: the overlap of the images is too small."""
     wide_swing = {"cone_angle_deg": 42.0, "cone_phase_deg": 0.0, "cone_minor_fraction": 0.0}
-    result = run(descent=DESCENT | wide_swing)
+    result = run_descent(descent=DESCENT | wide_swing)
     assert result.outcome == "NO_TEMPLATE_AREA"
     assert result.row["feasible_overlap"] is False
     assert not result.answered
@@ -177,22 +182,22 @@ def test_insufficient_overlap_gives_no_velocity() -> None:
         assert math.isfinite(float(result.row[f"{name}_true_x_m_s"]))
 
 
-def test_feasible_overlap_is_computed_from_truth(nominal: CaseResult) -> None:
+def test_feasible_overlap_is_computed_from_truth(nominal_case: CaseResult) -> None:
     """An altitude error of 40 % makes DIMES search in wrong areas; the true overlap is unchanged."""
-    wrong_altitude = run(faults={"altitude_error": 0.4})
+    wrong_altitude = run_descent(faults={"altitude_error": 0.4})
     for name in ("feasible_overlap", "feasible_overlap_first_pair", "feasible_overlap_second_pair"):
-        assert wrong_altitude.row[name] == nominal.row[name]
-    assert nominal.row["feasible_overlap"] is True
+        assert wrong_altitude.row[name] == nominal_case.row[name]
+    assert nominal_case.row["feasible_overlap"] is True
 
 
 def test_dark_images_give_no_velocity() -> None:
-    result = run(detector={"responsivity_e_s": 1.0})
+    result = run_descent(detector={"responsivity_e_s": 1.0})
     assert result.outcome == "NO_VALID_TRACK"
     assert not result.answered
 
 
 def test_velocity_over_a_site_is_accurate() -> None:
-    result = run(site="gusev", **PERFECT)
+    result = run_descent(site="gusev", **IDEAL_INSTRUMENTS)
     assert result.outcome == "VALID"
     assert result.row["site"] == "gusev"
     # Slopes of 2 deg shift a template against the plane below the lander, by at most 1 m/s here.
@@ -206,8 +211,8 @@ def test_imported_terrain_is_rendered(tmp_path: Path) -> None:
     np.savez(tmp_path / "dtm.npz", dem=heights, dem_gsd=8.0)
     location = {"location": {"bank": 1, "east_m": 1536.0, "north_m": 1536.0}}
     source = {"source": {"dtm": str(tmp_path / "dtm.npz")}}
-    result = run(site="gusev", terrain=WORLD["terrain"] | source, **location)
-    without_source = run(site="gusev", **location)
+    result = run_descent(site="gusev", terrain=SMALL_WORLD["terrain"] | source, **location)
+    without_source = run_descent(site="gusev", **location)
     assert result.outcome == "VALID"
     assert result.row["image_hash"] != without_source.row["image_hash"]
     # The imported relief has an amplitude of 30 m within 500 m.
@@ -215,7 +220,7 @@ def test_imported_terrain_is_rendered(tmp_path: Path) -> None:
 
 
 def test_custom_algorithm_receives_the_measurements() -> None:
-    result = run(algorithm="tests.scenarios.descent.inertial_estimators:Inertial")
+    result = run_descent(algorithm="tests.scenarios.descent.inertial_estimators:InertialEstimator")
     assert result.outcome == "VALID"
     assert result.row["velocity_estimated_x_m_s"] == pytest.approx(14.0, abs=8.0)
     assert "tracks" not in result.products
@@ -223,12 +228,12 @@ def test_custom_algorithm_receives_the_measurements() -> None:
 
 def test_slow_algorithm_is_not_in_time_for_the_firing() -> None:
     """The measured time is scaled by the flight computer's factor: 0.1 s become 60 s, but 14 to 24 s are available."""
-    slow = run(algorithm="tests.scenarios.descent.inertial_estimators:SlowInertial").row
-    fast = run(algorithm="tests.scenarios.descent.inertial_estimators:Inertial").row
+    slow = run_descent(algorithm="tests.scenarios.descent.inertial_estimators:SlowInertialEstimator").row
+    fast = run_descent(algorithm="tests.scenarios.descent.inertial_estimators:InertialEstimator").row
     assert float(slow["estimation_time_s"]) >= 0.1
     assert (slow["in_time_measured"], fast["in_time_measured"]) == (False, True)
-    spec = "tests.scenarios.descent.inertial_estimators:SlowInertial"
-    fast_processor = run(algorithm=spec, landing={"processor_factor": 1.0}).row
+    spec = "tests.scenarios.descent.inertial_estimators:SlowInertialEstimator"
+    fast_processor = run_descent(algorithm=spec, landing={"processor_factor": 1.0}).row
     assert fast_processor["in_time_measured"] is True
 
 
@@ -238,7 +243,7 @@ def test_dimes_run_time_requirement_uses_measured_time() -> None:
 
 
 def test_exact_instruments_have_no_instrument_errors() -> None:
-    row = run(exact_instruments=True).row
+    row = run_descent(exact_instruments=True).row
     for name in ("attitude_error_common_deg", "attitude_error_independent_deg", "velocity_change_error_m_s"):
         assert float(row[name]) < 1e-6
     assert abs(float(row["altitude_error_common"])) < 1e-9

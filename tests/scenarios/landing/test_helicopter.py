@@ -13,7 +13,7 @@ from marsyard.sim.sensor import LaserParameters
 from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.streams import Streams
 
-GRAVITY, HEIGHT = 9.8, 10.0
+GRAVITY_M_S2, HEIGHT_M = 9.8, 10.0
 SITE = np.array([4.0, 3.0, 0.0])
 GROUND = GroundPatch(SITE[:2] - 15.0, 0.5, np.zeros((61, 61)))
 #: RTK receiver with floating solutions: errors of half a metre that change slowly.
@@ -23,7 +23,7 @@ FLOATING_RTK: dict[str, object] = {"rtk": {"float_fraction": 1.0}, "transit": {"
 def _fly_transit(case: int, **changes: object) -> tuple[Transit, Streams]:
     streams = Streams(7, "helicopter", case)
     parameters = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}} | changes)
-    return Transit.fly(parameters, np.array([0.0, 0.0, HEIGHT]), 0.5, 0.5, GRAVITY, streams), streams
+    return Transit.fly(parameters, np.array([0.0, 0.0, HEIGHT_M]), 0.5, 0.5, GRAVITY_M_S2, streams), streams
 
 
 @cache
@@ -45,7 +45,7 @@ def test_transit_has_forty_images_at_constant_height() -> None:
     assert transit.times_s[0] == 0.0
     assert transit.times_s[-1] == 5.0
     heights = [transit.state(number).position_m[2] for number in range(40)]
-    np.testing.assert_allclose(heights, HEIGHT, atol=0.4)
+    np.testing.assert_allclose(heights, HEIGHT_M, atol=0.4)
     # The clock has an offset of 1 ms, and each time tag an error of 0.5 ms.
     assert 0.0 < np.abs(transit.tags_s - transit.times_s).max() < 6e-3
 
@@ -90,7 +90,7 @@ def test_landing_iteration_converges_to_a_consistent_flight() -> None:
     for case in range(3):
         transit, touchdown = _fly_landing(case)
         assert touchdown.iterations < 8
-        assert touchdown.change_m < 1e-3
+        assert touchdown.path_change_m < 1e-3
         path, navigated = touchdown.flight.path, touchdown.navigated
         errors = np.zeros((len(path.rows), 9))
         transit_navigation = transit.navigated

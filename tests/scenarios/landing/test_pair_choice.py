@@ -13,8 +13,8 @@ from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset
 
 CAMERA = preset("xc-55").cameras()[0]
-HEIGHT = 10.0
-RANGES = np.full(40, HEIGHT)
+HEIGHT_M = 10.0
+RANGES_M = np.full(40, HEIGHT_M)
 
 
 def _make_poses(step_m: float, count: int = 40, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> list[PoseMeasurement]:
@@ -23,12 +23,12 @@ def _make_poses(step_m: float, count: int = 40, yaw_deg: float = 0.0, pitch_deg:
     for number in range(count):
         angles = [yaw_deg * (number > 0), pitch_deg * (number > 0)]
         rotation = Rotation.from_euler("zy", angles, degrees=True)
-        poses.append(PoseMeasurement(rigid(rotation, np.array([number * step_m, 0.0, HEIGHT])), 0.1 * number))
+        poses.append(PoseMeasurement(rigid(rotation, np.array([number * step_m, 0.0, HEIGHT_M])), 0.1 * number))
     return poses
 
 
 def test_shortest_sufficient_baseline_has_max_overlap() -> None:
-    choice = choose_pair(_make_poses(0.125), RANGES, CAMERA, PairParameters(max_baseline_fraction=0.2), HEIGHT)
+    choice = choose_pair(_make_poses(0.125), RANGES_M, CAMERA, PairParameters(max_baseline_fraction=0.2), HEIGHT_M)
     assert (choice.first, choice.second) == (0, 16)
     assert choice.baseline_m == pytest.approx(2.0)
     # Field width at 10 m: 640 px of 7.4 um and a focal length of 6 mm give 7.89 m, with lens distortion 8.04 m.
@@ -38,12 +38,12 @@ def test_shortest_sufficient_baseline_has_max_overlap() -> None:
 def test_insufficient_overlap_maximises_baseline_times_overlap() -> None:
     """With the field width w, b (1 - b / w) is maximal at b = w / 2 = 4.0 m, if the required overlap allows it."""
     choice = choose_pair(
-        _make_poses(0.125), RANGES, CAMERA, PairParameters(max_baseline_fraction=1.0, min_overlap=0.1), HEIGHT
+        _make_poses(0.125), RANGES_M, CAMERA, PairParameters(max_baseline_fraction=1.0, min_overlap=0.1), HEIGHT_M
     )
     assert choice.baseline_m == pytest.approx(4.0, abs=0.13)
     # A larger required overlap limits the baseline.
     choice = choose_pair(
-        _make_poses(0.125), RANGES, CAMERA, PairParameters(max_baseline_fraction=1.0, min_overlap=0.7), HEIGHT
+        _make_poses(0.125), RANGES_M, CAMERA, PairParameters(max_baseline_fraction=1.0, min_overlap=0.7), HEIGHT_M
     )
     assert choice.baseline_m == pytest.approx(0.3 * 8.0, abs=0.13)
 
@@ -51,7 +51,7 @@ def test_insufficient_overlap_maximises_baseline_times_overlap() -> None:
 def test_rotation_reduces_overlap() -> None:
     """A pitch of 10 deg shifts the footprint of the second image by 10 m tan 10 deg = 1.76 m."""
     no_pitch, pitch_with_motion, pitch_against_motion = (
-        choose_pair(_make_poses(0.5, 2, pitch_deg=deg), RANGES[:2], CAMERA, PairParameters(), HEIGHT).overlap
+        choose_pair(_make_poses(0.5, 2, pitch_deg=deg), RANGES_M[:2], CAMERA, PairParameters(), HEIGHT_M).overlap
         for deg in (0.0, -10.0, 10.0)
     )
     assert no_pitch == pytest.approx(1.0 - 0.5 / 8.0, abs=0.005)
@@ -61,20 +61,22 @@ def test_rotation_reduces_overlap() -> None:
 
 def test_motion_of_the_ground_in_the_image_is_limited() -> None:
     """At 10 m a pixel is 12.5 mm wide: 38 px are 0.475 m, which three steps of 0.125 m do not exceed, but four do."""
-    choice = choose_pair(_make_poses(0.125), RANGES, CAMERA, PairParameters(max_shift_px=38.0), HEIGHT)
+    choice = choose_pair(_make_poses(0.125), RANGES_M, CAMERA, PairParameters(max_shift_px=38.0), HEIGHT_M)
     assert choice.baseline_m == pytest.approx(0.375)
-    rotated = choose_pair(_make_poses(0.125, yaw_deg=10.0), RANGES, CAMERA, PairParameters(max_shift_px=38.0), HEIGHT)
+    rotated = choose_pair(
+        _make_poses(0.125, yaw_deg=10.0), RANGES_M, CAMERA, PairParameters(max_shift_px=38.0), HEIGHT_M
+    )
     assert rotated.first > 0  # a rotation of 10 deg after the first image moves the corners by 70 px
     assert rotated.baseline_m == pytest.approx(0.375)
 
 
 def test_missing_range_uses_commanded_height() -> None:
-    choice = choose_pair(_make_poses(0.125), np.full(40, np.nan), CAMERA, PairParameters(), HEIGHT)
+    choice = choose_pair(_make_poses(0.125), np.full(40, np.nan), CAMERA, PairParameters(), HEIGHT_M)
     assert (choice.first, choice.second) == (0, 16)
 
 
 def test_pair_with_too_small_overlap_is_accepted_without_alternative() -> None:
-    choice = choose_pair(_make_poses(5.0, 3), RANGES[:3], CAMERA, PairParameters(min_overlap=0.9), HEIGHT)
+    choice = choose_pair(_make_poses(5.0, 3), RANGES_M[:3], CAMERA, PairParameters(min_overlap=0.9), HEIGHT_M)
     assert (choice.first, choice.second) == (0, 1)
     with pytest.raises(ValueError, match="at least 2"):
-        choose_pair(_make_poses(1.0, 1), RANGES[:1], CAMERA, PairParameters(), HEIGHT)
+        choose_pair(_make_poses(1.0, 1), RANGES_M[:1], CAMERA, PairParameters(), HEIGHT_M)

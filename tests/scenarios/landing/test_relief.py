@@ -9,14 +9,14 @@ from marsyard.scenarios.landing import kernels
 from marsyard.scenarios.landing.relief import Limits, Relief
 
 LIMITS = Limits(diameter_m=2.0, max_slope_rad=float(np.radians(15.0)), max_roughness_m=0.2)
-SPACING = 0.025
+SPACING_M = 0.025
 
 
-def _make_relief(slope: float = 0.0, block: float = 0.0, half_width_m: float = 0.1) -> Relief:
-    """Return a 6 m x 6 m relief that rises to the east, with a block of height `block` (m) at its centre."""
-    x, y = np.meshgrid(np.arange(-3.0, 3.0, SPACING), np.arange(-3.0, 3.0, SPACING))
-    heights = slope * x + block * ((abs(x) < half_width_m) & (abs(y) < half_width_m))
-    return Relief(heights, -3.0, -3.0, SPACING)
+def _make_relief(slope: float = 0.0, block_height_m: float = 0.0, half_width_m: float = 0.1) -> Relief:
+    """Return a 6 m x 6 m relief that rises to the east, with a block at its centre."""
+    x, y = np.meshgrid(np.arange(-3.0, 3.0, SPACING_M), np.arange(-3.0, 3.0, SPACING_M))
+    heights = slope * x + block_height_m * ((abs(x) < half_width_m) & (abs(y) < half_width_m))
+    return Relief(heights, -3.0, -3.0, SPACING_M)
 
 
 def test_plane_has_exact_slope_and_no_roughness() -> None:
@@ -28,7 +28,7 @@ def test_plane_has_exact_slope_and_no_roughness() -> None:
 
 
 def test_block_is_a_hazard_only_inside_the_footprint() -> None:
-    relief = _make_relief(slope=0.1, block=0.3)
+    relief = _make_relief(slope=0.1, block_height_m=0.3)
     footprints = relief.footprints(np.array([[0.0, 0.0], [1.0, 0.0], [1.2, 0.0]]), LIMITS)
     # The fitted plane is nearly the ground, because the block is small. The cost of deviations below
     # 0.1 mm is quadratic, so the block tilts the plane slightly.
@@ -42,7 +42,7 @@ def _make_uneven_relief(height_m: float = 0.3) -> Relief:
     """Return a 6 m x 6 m relief with mounds and hollows of half a metre width."""
     noise = np.random.default_rng(3).standard_normal((240, 240))
     smooth_noise = gaussian_filter(noise, 20.0)
-    return Relief(height_m * smooth_noise / abs(smooth_noise).max(), -3.0, -3.0, SPACING)
+    return Relief(height_m * smooth_noise / abs(smooth_noise).max(), -3.0, -3.0, SPACING_M)
 
 
 def test_plane_minimises_absolute_deviations() -> None:
@@ -50,13 +50,15 @@ def test_plane_minimises_absolute_deviations() -> None:
     position = np.array([0.4, -0.3])
     footprints = relief.footprints(position[None], LIMITS)
     row, column = np.rint(relief.cells(position)).astype(int)
+    # The lander radius of 1 m is 40 grid points.
     i, j = (index.ravel() for index in np.mgrid[-40:41, -40:41])
     in_footprint = np.hypot(i, j) <= 40
     i, j = i[in_footprint], j[in_footprint]
     heights = relief.heights_m[row + i, column + j]
     # Independent method: linear program for the same points, minimise sum t with -t <= z - plane <= t.
+    # The fit uses every fourth row and column.
     in_fit = (i % 4 == 0) & (j % 4 == 0)
-    design = np.stack([np.ones(len(i)), j * SPACING, i * SPACING], axis=-1)
+    design = np.stack([np.ones(len(i)), j * SPACING_M, i * SPACING_M], axis=-1)
     fit_design, n = design[in_fit], int(in_fit.sum())
     bounds = np.block([[fit_design, -np.eye(n)], [-fit_design, -np.eye(n)]])
     solution = linprog(
@@ -72,7 +74,7 @@ def test_plane_minimises_absolute_deviations() -> None:
 
 
 def test_footprint_plane_is_continuous_in_position() -> None:
-    steps = np.arange(-1.5, 1.5, SPACING)
+    steps = np.arange(-1.5, 1.5, SPACING_M)
     for x, y in ((steps, np.full_like(steps, 0.2)), (np.full_like(steps, -0.4), steps)):
         footprints = _make_uneven_relief().footprints(np.stack([x, y], axis=-1), LIMITS)
         # The slope is at most 0.5: one step changes a height, and therefore the plane, by at most 1.3 cm.
@@ -82,7 +84,7 @@ def test_footprint_plane_is_continuous_in_position() -> None:
 
 def test_rock_on_a_fifth_of_the_footprint_does_not_tilt_the_plane() -> None:
     # A square of 0.8 m at the centre: 0.64 of 3.14 m2.
-    footprints = _make_relief(slope=0.1, block=0.3, half_width_m=0.4).footprints(np.zeros((1, 2)), LIMITS)
+    footprints = _make_relief(slope=0.1, block_height_m=0.3, half_width_m=0.4).footprints(np.zeros((1, 2)), LIMITS)
     assert np.tan(footprints.slope_rad[0]) == pytest.approx(0.1, abs=1e-3)
     assert footprints.roughness_m[0] == pytest.approx(0.3, abs=1e-3)
 

@@ -52,7 +52,12 @@ def make_truth(n_safe: int) -> GroundTruth:
     zeros = np.zeros(safe.shape)
     footprints = Footprints(zeros, zeros, zeros, safe)
     return GroundTruth(
-        Relief(np.maximum(x, 0.0), -6.0, -6.0, 0.1), Limits(2.0, 0.26, 0.2), positions_m, footprints, safe | True, 1.0
+        Relief(np.maximum(x, 0.0), -6.0, -6.0, 0.1),
+        Limits(2.0, 0.26, 0.2),
+        positions_m,
+        footprints,
+        np.ones_like(safe),
+        1.0,
     )
 
 

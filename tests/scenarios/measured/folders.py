@@ -113,13 +113,13 @@ flat_field = "flat.npy"
 
 
 def write_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write `pictures.csv`."""
+    """Write `pictures.csv` with numbers in full precision."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with (folder / "pictures.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(
-            {name: repr(float(v)) if not isinstance(v, str) else v for name, v in row.items()} for row in rows
+            {name: cell if isinstance(cell, str) else repr(float(cell)) for name, cell in row.items()} for row in rows
         )
 
 
@@ -129,8 +129,8 @@ def read_rows(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def write_texts(folder: Path, rows: Sequence[Mapping[str, str]]) -> None:
-    """Write rows of text without changes."""
+def write_text_rows(folder: Path, rows: Sequence[Mapping[str, str]]) -> None:
+    """Write `pictures.csv` from rows of text without changes."""
     with (folder / "pictures.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()

@@ -17,7 +17,7 @@ from marsyard.scenarios.measured.layout import IngestError
 from marsyard.scenarios.measured.scenarios import MatchingScenario
 from marsyard.scenarios.measured.store import CasesFile, load_images
 from marsyard.sim.streams import Streams
-from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_texts, write_velocity_folder
+from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder
 
 Rows = list[dict[str, str]]
 
@@ -30,8 +30,8 @@ def ingest_and_expect_error(folder: Path, tmp_path: Path) -> str:
     return str(error_info.value)
 
 
-def change_cells(rows: Rows, position: int, **cells: str) -> Rows:
-    return [row | cells if number == position else row for number, row in enumerate(rows)]
+def change_cells(rows: Rows, row_number: int, **cells: str) -> Rows:
+    return [row | cells if number == row_number else row for number, row in enumerate(rows)]
 
 
 def drop_columns(rows: Rows, *names: str) -> Rows:
@@ -60,7 +60,7 @@ def drop_columns(rows: Rows, *names: str) -> Rows:
 )
 def test_invalid_tables_are_rejected(tmp_path: Path, change: Callable[[Rows], Rows], message: str) -> None:
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
-    write_texts(folder, change(read_rows(folder)))
+    write_text_rows(folder, change(read_rows(folder)))
     assert message in ingest_and_expect_error(folder, tmp_path)
 
 
@@ -118,7 +118,7 @@ def test_image_formats_preserve_the_counts(tmp_path: Path, suffix: str) -> None:
     for row, image in zip(rows, measurements.images, strict=True):
         row["file"] = Path(row["file"]).stem + suffix
         cv2.imwrite(str(folder / row["file"]), image.counts)
-    write_texts(folder, rows)
+    write_text_rows(folder, rows)
     (tmp_path / "out").mkdir()
     path, stored = ingest(folder, tmp_path / "out")
     images = load_images(CasesFile(file=str(path)), stored.cases[0])

@@ -16,7 +16,7 @@ from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.scenarios import MatchingScenario, MeasuredLandingScenario, MeasuredVelocityScenario
 from marsyard.scenarios.parts import ScoredSite, ScoredVelocity
 from marsyard.sim.streams import Streams
-from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_texts, write_velocity_folder
+from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder
 
 STREAMS = Streams(seed=1, campaign="measured", case=0)
 TRUE_VELOCITY_M_S = inputs.DESCENT_VELOCITY_M_S[:2]
@@ -94,7 +94,7 @@ def test_positions_replace_inertial_velocities_and_truth(tmp_path: Path) -> None
         position = 3.75 * number * inputs.DESCENT_VELOCITY_M_S
         table_row |= {f"{axis}_m": str(value) for axis, value in zip("xyz", position, strict=True)}
         table_row |= {f"true_{axis}_m": str(value) for axis, value in zip("xyz", position, strict=True)}
-    write_texts(folder, rows)
+    write_text_rows(folder, rows)
     row: dict[str, Any] = dict(run_ingested(folder, tmp_path / "out").row)
     assert np.isclose(row["velocity_true_x_m_s"], TRUE_VELOCITY_M_S[0])
     assert np.isclose(row["inertial_difference_m_s"], row["velocity_error_m_s"])
@@ -124,7 +124,7 @@ def test_attitude_errors_are_detected(
     error_rotation = Rotation.from_euler("x", error_deg, degrees=True)
     wrong_attitude = (error_rotation * Rotation.from_quat([float(rows[1][f"q{axis}"]) for axis in "xyzw"])).as_quat()
     rows[1] |= {f"q{axis}": repr(float(value)) for axis, value in zip("xyzw", wrong_attitude, strict=True)}
-    write_texts(folder, rows)
+    write_text_rows(folder, rows)
     result = run_ingested(folder, tmp_path / "out")
     assert result.outcome == "MATCHED"
     assert min_residual_px <= float(result.row["residual_median_px"]) <= max_residual_px

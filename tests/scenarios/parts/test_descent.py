@@ -15,7 +15,7 @@ from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
 from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.sim.streams import Streams
-from tests.scenarios.descent.settings import FLAT, PERFECT, parameters, run
+from tests.scenarios.descent.settings import FLAT_TERRAIN, IDEAL_INSTRUMENTS, make_parameters, run_descent
 
 MODULE = f"{__name__}:"
 
@@ -108,8 +108,8 @@ CUSTOM_PARTS: dict[str, Any] = {
 
 
 def test_case_uses_custom_motion_instruments_and_score() -> None:
-    ideal_instruments = {name: part for name, part in PERFECT.items() if name != "altimeter"}
-    result = run(terrain=FLAT, **ideal_instruments, **CUSTOM_PARTS)
+    ideal_instruments = {name: part for name, part in IDEAL_INSTRUMENTS.items() if name != "altimeter"}
+    result = run_descent(terrain=FLAT_TERRAIN, **ideal_instruments, **CUSTOM_PARTS)
     row = result.row
     assert result.outcome == "VALID"
     # Motion: the row has the velocity of the custom flight; the firing is at 100 m above level ground.
@@ -135,7 +135,7 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
 
 
 def test_motion_is_deterministic_per_case() -> None:
-    p = parameters(terrain=FLAT, **CUSTOM_PARTS)
+    p = make_parameters(terrain=FLAT_TERRAIN, **CUSTOM_PARTS)
     surface = World.from_parameters(p).surface
     first, repeated, second_case = (create_flight(p, surface, Streams(1, "test", case)).row for case in (0, 0, 1))
     assert first == repeated
@@ -156,7 +156,7 @@ def test_motion_is_deterministic_per_case() -> None:
 )
 def test_invalid_motion_is_reported(defect: str, message: str) -> None:
     flight = {**CUSTOM_PARTS["flight"], "options": {"defect": defect}}
-    p = parameters(terrain=FLAT, flight=flight)
+    p = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
     with pytest.raises(ValueError, match=message):
         create_flight(p, World.from_parameters(p).surface, Streams(1, "test", 0))
 
@@ -165,7 +165,7 @@ def test_invalid_motion_is_reported(defect: str, message: str) -> None:
 def test_firing_is_at_the_end_of_a_short_motion(duration_s: float) -> None:
     """If the motion ends above the firing altitude, the firing is 0.1 s before its end, for any rounding of times."""
     flight = {**CUSTOM_PARTS["flight"], "options": {"east_m_s": 0.0, "duration_s": duration_s, "height_m": 5000.0}}
-    p = parameters(terrain=FLAT, flight=flight)
+    p = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
     world, streams = World.from_parameters(p), Streams(1, "test", 0)
     created_flight = create_flight(p, world.surface, streams)
     assert created_flight.firing_s == pytest.approx(created_flight.motion.span_s[1] - 0.1)
@@ -175,7 +175,7 @@ def test_firing_is_at_the_end_of_a_short_motion(duration_s: float) -> None:
 
 def test_motion_below_the_ground_is_reported() -> None:
     flight = {**CUSTOM_PARTS["flight"], "options": {"height_m": 500.0}}
-    p = parameters(terrain=FLAT, flight=flight)
+    p = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
     with pytest.raises(ValueError, match=r"at image 3 the camera is 62\.5 m below the ground"):
         create_flight(p, World.from_parameters(p).surface, Streams(1, "test", 0))
 

@@ -27,12 +27,12 @@ EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
 
 
 @pytest.fixture(autouse=True)
-def _examples(monkeypatch: pytest.MonkeyPatch) -> None:
+def _add_examples_to_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
 
 
 def find_problem(**parts: Any) -> tuple[str, str]:
-    """Return the invalid key of descent parameters and the message."""
+    """Validate descent parameters with one error; return its key and message."""
     with pytest.raises(ValidationError) as error_info:
         DescentScenarioParameters.model_validate(parts)
     ((key, message),) = validation_problems(error_info.value, DescentScenarioParameters)
@@ -79,9 +79,9 @@ def find_problem(**parts: Any) -> tuple[str, str]:
     ],
 )
 def test_errors_are_reported_with_the_invalid_key(parts: dict[str, Any], key: str, message: str) -> None:
-    reported_key, output = find_problem(**parts)
+    reported_key, reported_message = find_problem(**parts)
     assert reported_key == key
-    assert message in output
+    assert message in reported_message
 
 
 def test_module_that_raises_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,7 +90,7 @@ def test_module_that_raises_is_reported(tmp_path: Path, monkeypatch: pytest.Monk
     assert "RuntimeError: no licence" in find_problem(flight={"motion": "raises_at_import:Any"})[1]
 
 
-def test_options_have_defaults_and_can_be_dispersed() -> None:
+def test_options_of_parts_have_defaults_and_round_trip() -> None:
     p = DescentScenarioParameters.model_validate(
         {"flight": {"motion": "custom_parts:Glider", "options": {"glide_ratio": 0.25}}}
     )
@@ -152,7 +152,7 @@ def test_invalid_columns_are_rejected(columns: object, message: str) -> None:
 
 
 def test_campaign_identity_includes_the_modules_of_parts() -> None:
-    """The identity includes modules of parts in the parameters and in dispersions, there as value or in a table."""
+    """Parts occur in parameters and in dispersions, there as a value or in a table."""
     configuration = CampaignConfiguration.model_validate(
         {
             "name": "parts",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, run_check
-from marsyard.scenarios.conformance import parts as suite
+from marsyard.scenarios.conformance import parts as part_checks
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
 MODULE_HEADER = """
@@ -90,8 +90,8 @@ def write_defective_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: st
 def test_motion_defects_are_reported(
     check: str, random: bool, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    head = f"class Defective:\n    random = {random}\n    def fly(self, place, rng):\n"
-    body = head + textwrap.indent(lines, " " * 8)
+    header = f"class Defective:\n    random = {random}\n    def fly(self, place, rng):\n"
+    body = header + textwrap.indent(lines, " " * 8)
     name = write_defective_part(tmp_path, monkeypatch, body)
     (result,) = run_suite(f"{name}:Defective", check).values()
     assert problem in result.problem
@@ -126,8 +126,8 @@ def test_motion_defects_are_reported(
 def test_instrument_defects_are_reported(
     check: str, quantity: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    head = f"class Defective:\n    random = False\n    quantity = '{quantity}'\n    def read(self, truth, rng):\n"
-    name = write_defective_part(tmp_path, monkeypatch, head + textwrap.indent(lines, " " * 8))
+    header = f"class Defective:\n    random = False\n    quantity = '{quantity}'\n    def read(self, truth, rng):\n"
+    name = write_defective_part(tmp_path, monkeypatch, header + textwrap.indent(lines, " " * 8))
     (result,) = run_suite(f"{name}:Defective", check).values()
     assert problem in result.problem
 
@@ -161,14 +161,14 @@ def test_nearest_ground_distance_in_a_cone_matches_the_plane() -> None:
     apex = np.array([30.0, -20.0, 500.0])
     tilt = 0.4
     axis = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
-    lateral, tilted = np.array([0.0, 1.0, 0.0]), np.array([np.cos(tilt), 0.0, np.sin(tilt)])
+    lateral_axis, upper_axis = np.array([0.0, 1.0, 0.0]), np.array([np.cos(tilt), 0.0, np.sin(tilt)])
     half_angle_rad = np.radians(20.0)
     off_axis, azimuth = np.meshgrid(np.linspace(0.0, half_angle_rad, 200), np.linspace(0.0, 2.0 * np.pi, 361))
-    rays = (
+    directions = (
         np.cos(off_axis)[..., None] * axis
-        + (np.sin(off_axis) * np.cos(azimuth))[..., None] * tilted
-        + (np.sin(off_axis) * np.sin(azimuth))[..., None] * lateral
+        + (np.sin(off_axis) * np.cos(azimuth))[..., None] * upper_axis
+        + (np.sin(off_axis) * np.sin(azimuth))[..., None] * lateral_axis
     )
-    ranges = (apex[2] - 0.05 * apex[0]) / (0.05 * rays[..., 0] - rays[..., 2])
-    nearest = suite.instrument_cases()[0].nearest_ground(apex, axis, half_angle_rad, 1e4)
+    ranges = (apex[2] - 0.05 * apex[0]) / (0.05 * directions[..., 0] - directions[..., 2])
+    nearest = part_checks.instrument_cases()[0].nearest_ground(apex, axis, half_angle_rad, 1e4)
     assert nearest == pytest.approx(float(ranges.min()), rel=1e-4)

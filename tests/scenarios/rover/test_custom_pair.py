@@ -36,7 +36,7 @@ SENSOR_DATASHEET = (
 def test_pair_from_preset_files_equals_the_preset(
     name: str, baseline_m: float, toe_in_deg: float, tmp_path: Path
 ) -> None:
-    """The mast is the same for any common pose of the two cameras in the files."""
+    """The pose of the pair in the files does not matter: only the relative pose of the two cameras is used."""
     file_pose = rigid(Rotation.from_euler("xyz", [20.0, -50.0, 130.0], degrees=True), np.array([3.0, -8.0, 1.5]))
     for side, camera in zip(("left", "right"), preset(name).cameras(), strict=True):
         write_cahvor(camera.transform(file_pose), tmp_path / f"{side}.cahvor")
@@ -53,22 +53,26 @@ def test_pair_from_preset_files_equals_the_preset(
 
 
 def test_target_is_tracked_with_a_custom_pair(tmp_path: Path) -> None:
-    camera, sheet = tmp_path / "cam0.yaml", tmp_path / "sensor.toml"
+    camera, datasheet = tmp_path / "cam0.yaml", tmp_path / "sensor.toml"
     camera.write_text(OPENCV_CALIBRATION)
-    sheet.write_text(SENSOR_DATASHEET)
-    custom = {"preset": "research-navcam", "custom": {"left": str(camera), "baseline_m": 0.24}, "detector": str(sheet)}
+    datasheet.write_text(SENSOR_DATASHEET)
+    custom = {
+        "preset": "research-navcam",
+        "custom": {"left": str(camera), "baseline_m": 0.24},
+        "detector": str(datasheet),
+    }
     p = RoverScenarioParameters.model_validate({**SHORT_RUN, "camera": custom})
     # The campaign stores all calibration values, so the files are not necessary.
     camera.unlink()
-    sheet.unlink()
+    datasheet.unlink()
     p = RoverScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True))
     result = RoverScenario().run(p, Streams(1, "own pair", 0))
     row = dict(result.row)
     assert (result.outcome, row["camera"], row["navcam"]) == ("COMPLETED", str(camera), False)
-    # One pixel of disparity is 8 cm of range at 3.5 m (Eq. 1 of the tracking paper); the calibration error
-    # is at most half a pixel.
+    # One pixel of disparity is 8 cm of range at 3.5 m (Eq. 1 of the tracking paper). The calibration error is at most
+    # half a pixel.
     assert 0.0 < float(row["position_error_m"]) < 0.06
-    # The exposure uses the range of 10 bits.
+    # The brightest counts use the 10-bit range of the detector.
     counts = result.products["stop_1_left"]
     assert 200 < np.percentile(counts, 99) <= 1023
 

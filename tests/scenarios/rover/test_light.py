@@ -16,8 +16,8 @@ def make_run(**changes: Any) -> Run:
 
 
 def test_sun_moves_westwards_with_its_hour_angle() -> None:
-    # A sun in the zenith of the equator moves west by the hour angle: 16 deg in the 66 minutes of Table IV
-    # of the tracking paper.
+    # At the equator a sun in the zenith moves west by its hour angle: 16 deg in 66 minutes (Table IV of the tracking
+    # paper).
     sun = SunParameters(azimuth_deg=0.0, elevation_deg=90.0, latitude_deg=0.0)
     for minutes in (0.0, 66.0, 132.0):
         angle = np.radians(16.0 * minutes / 66.0)
@@ -25,7 +25,7 @@ def test_sun_moves_westwards_with_its_hour_angle() -> None:
 
 
 def test_images_use_the_sun_direction_of_their_time() -> None:
-    # One hour between two images: the sun direction changes, but not in the run with a fixed sun.
+    # One hour passes between two images. The sun direction changes in it, except with an hour angle rate of 0.
     slow_tracking = {"timing": {"track_s": 3600.0}, "camera": {"detector_noise": False}}
     fixed_sun = {"sun": {**SHORT_RUN["sun"], "hour_angle_deg_min": 0.0}, "rover_shadow": False}
     moving_sun = {"sun": {**SHORT_RUN["sun"], "held_s": 1.0}, "rover_shadow": False}
@@ -34,7 +34,7 @@ def test_images_use_the_sun_direction_of_their_time() -> None:
     moving_directions = [moving_sun_run.world.scene(stop.time_s).sun.direction for stop in moving_sun_run.stops[:2]]
     sun_rotation_deg = np.degrees(np.arccos(moving_directions[0] @ moving_directions[1]))
     minutes = (moving_sun_run.stops[1].time_s - moving_sun_run.stops[0].time_s) / 60.0
-    # At most the hour angle: the sun is not on the celestial equator.
+    # The rotation is less than the hour angle, because the sun is not on the celestial equator.
     assert 10.0 < sun_rotation_deg < 16.0 / 66.0 * minutes + 0.01
     fixed_directions = [fixed_sun_run.world.scene(stop.time_s).sun.direction for stop in fixed_sun_run.stops[:2]]
     np.testing.assert_allclose(fixed_directions[0], fixed_directions[1], atol=1e-12)

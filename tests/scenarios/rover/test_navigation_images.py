@@ -1,4 +1,4 @@
-"""Tests of visual odometry and terrain maps from rendered stereo pairs, and of their variants that use the truth."""
+"""Tests of visual odometry and terrain maps from rendered stereo pairs, and of oracles that use the truth instead."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
 
 #: A rover with 30 % wheel slip on ground with rocks.
-SLIPPING: dict[str, Any] = {
+SLIPPING_ROVER: dict[str, Any] = {
     **SHORT_RUN,
     "world": {"samples": 1024, "bank": 1},
     "start": {"distance_m": 5.0},
@@ -22,8 +22,8 @@ SLIPPING: dict[str, Any] = {
 OBSTACLE = {"towards_start_m": 3.0, "right_m": 0.4, "diameter_m": 0.5, "height_m": 0.3}
 
 
-def _run(**changes: Any) -> Run:
-    return run_case(RoverScenarioParameters.model_validate({**SLIPPING, **changes}), Streams(4, "rover tests", 0))
+def run_slipping_rover(**changes: Any) -> Run:
+    return run_case(RoverScenarioParameters.model_validate({**SLIPPING_ROVER, **changes}), Streams(4, "rover tests", 0))
 
 
 def _position_error_m(run: Run) -> float:
@@ -33,16 +33,19 @@ def _position_error_m(run: Run) -> float:
 
 def test_visual_odometry_measures_slip_and_wheel_odometry_does_not() -> None:
     leg = {"motion": "approach", "goal_m": 3.6, "step_fraction": 0.1}
-    errors = {visual: _position_error_m(_run(legs=[leg | {"visual_odometry": visual}])) for visual in (False, True)}
-    # the rover drives 1.4 m, and the wheel odometry measures about 2 m
+    errors = {
+        visual: _position_error_m(run_slipping_rover(legs=[leg | {"visual_odometry": visual}]))
+        for visual in (False, True)
+    }
+    # The rover drives 1.4 m, and the wheel odometry measures about 2 m.
     assert errors[False] > 0.4
-    # 2 % of the distance, as in the tracking paper (section 4.2), plus a constant error per step
+    # The bound is 2 % of the distance (tracking paper, section 4.2), plus a constant error per step.
     assert errors[True] < 0.02 * 1.4 + 0.03
 
 
 def test_visual_odometry_without_overlap_falls_back_to_the_wheels() -> None:
     leg = {"motion": "straight", "step_m": 3.0, "steps": 1, "visual_odometry": True, "visual_odometry_step_m": 3.0}
-    run = _run(legs=[leg], slip={"flat": 0.01})
+    run = run_slipping_rover(legs=[leg], slip={"flat": 0.01})
     assert run.visual_odometry_updates == run.visual_odometry_failures == 1
     assert _position_error_m(run) < 0.15
 
@@ -53,36 +56,36 @@ def test_stereo_map_agrees_with_true_heights(map_by: str) -> None:
     maps = {}
     for terrain in ("stereo", "oracle-heights"):
         changes = {"legs": [leg], "navigation": {"terrain": terrain}, "obstacles": [OBSTACLE]}
-        p = RoverScenarioParameters.model_validate({**SLIPPING, **changes})
+        p = RoverScenarioParameters.model_validate({**SLIPPING_ROVER, **changes})
         run = prepare_run(p, Streams(4, "rover tests", 0))
         target = run.vehicle.stance.world_from_rover.inv().apply(run.target.point_world.copy())
-        map_terrain(p, run, p.legs[0], run.estimate_at(target))
+        map_terrain(p, run, p.legs[0], run.create_target_estimate(target))
         assert run.navigator.terrain is not None
         maps[terrain] = run.navigator.terrain
     stereo, oracle = maps["stereo"].median_m, maps["oracle-heights"].median_m
-    both = np.isfinite(stereo) & np.isfinite(oracle)
-    assert np.count_nonzero(both) > 100
-    error_m = stereo[both] - oracle[both]
+    is_in_both = np.isfinite(stereo) & np.isfinite(oracle)
+    assert np.count_nonzero(is_in_both) > 100
+    error_m = stereo[is_in_both] - oracle[is_in_both]
     assert abs(np.median(error_m)) < 0.02
     assert np.percentile(np.abs(error_m), 80.0) < 0.06
-    # the oracle maps all ground within its range; parts of it are not visible in the images
+    # The oracle maps all ground within its range; the images show only a part of it.
     assert np.count_nonzero(np.isfinite(oracle) & ~np.isfinite(stereo)) > 0
 
 
 def test_rover_drives_around_an_obstacle_in_its_images() -> None:
     leg = {"motion": "approach", "goal_m": 2.0, "autonav": True}
-    run = _run(legs=[leg], obstacles=[OBSTACLE], slip={"flat": 0.01}, start={"distance_m": 6.0})
+    run = run_slipping_rover(legs=[leg], obstacles=[OBSTACLE], slip={"flat": 0.01}, start={"distance_m": 6.0})
     rocks = run.world.rocks
     rock_m = rocks.position_m[rocks.names["obstacle-1"], :2]
     path = [stance for stop in run.stops for drive in stop.drives for stance in drive.stances]
     closest_m = min(float(np.hypot(*(stance.world_from_rover.translation[:2] - rock_m))) for stance in path)
     assert run.outcome.name == "COMPLETED"
-    # the circle around all wheels has a radius of 0.6 m
+    # The circle around all wheels has a radius of 0.6 m.
     assert closest_m > 0.6 + 0.5 * OBSTACLE["diameter_m"] - 0.05
 
 
 def test_oracles_need_no_navigation_cameras() -> None:
     leg = {"motion": "approach", "goal_m": 4.5, "autonav": True, "visual_odometry": True}
-    run = _run(legs=[leg], navigation={"odometry": "oracle-motion", "terrain": "oracle-heights"})
+    run = run_slipping_rover(legs=[leg], navigation={"odometry": "oracle-motion", "terrain": "oracle-heights"})
     assert run.navigation_cameras.mast is run.navigation_cameras.body is None
     assert _position_error_m(run) < 0.05

@@ -1,4 +1,4 @@
-"""Tests of the activities in a step: mapping, drive with visual odometry, tracking (Fig. 12 of the tracking paper)."""
+"""Tests of the order of activities in a step: mapping, drive, tracking (Fig. 12 of the tracking paper)."""
 
 import re
 
@@ -29,7 +29,7 @@ def test_each_step_maps_then_drives_then_tracks(monkeypatch: pytest.MonkeyPatch)
     record_calls(run_module, "visit_stop", "track")
     leg = {"motion": "approach", "goal_m": 3.0, "step_fraction": 0.08, "autonav": True, "visual_odometry": True}
     run = run_case(RoverScenarioParameters.model_validate({**SHORT_RUN, "legs": [leg]}), Streams(1, "rover tests", 0))
-    # One letter per activity; consecutive drives are one drive.
+    # Each activity is represented by its first letter. Consecutive drives count as one drive.
     steps = re.sub("d( d)+", "d", " ".join(activity[0] for activity in activities))
     # The run starts with tracking. Then each step maps, drives with visual odometry, and tracks.
     assert steps.split(" m d t")[0] == "t"

@@ -31,7 +31,7 @@ def integrate_commands(commands: list[DriveCommand]) -> tuple[np.ndarray, float]
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 5.0, -14.0, 40.0, -120.0])
-def test_steps_end_at_the_position(angle_deg: float) -> None:
+def test_drive_commands_end_at_the_position(angle_deg: float) -> None:
     angle = np.radians(angle_deg)
     position = 3.0 * np.array([np.cos(angle), np.sin(angle)])
     final_position, _ = integrate_commands(list(plan_drive(position, 10.0)))
@@ -60,7 +60,7 @@ def test_circle_keeps_target_distance_and_bearing() -> None:
     leg = LegParameters(motion="circle", step_deg=10.0, steps=7)
     target = make_target(7.0, 0.5)
     position, heading = integrate_commands(list(plan_step(leg, 0, target)))
-    # From above, the rover drives clockwise around the target; the target is fixed in the rover frame.
+    # Seen from above, the rover drives clockwise around the target. The target is fixed in the rover frame.
     target_from_rover = target.position_rover[:2] - position
     sine, cosine = np.sin(-heading), np.cos(-heading)
     np.testing.assert_allclose(

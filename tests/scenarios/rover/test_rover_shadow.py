@@ -14,7 +14,7 @@ EAST = 0.5 * np.pi
 
 @pytest.mark.parametrize("elevation_deg", [25.0, 40.0])
 def test_head_shadow_is_at_the_sun_ray_intersection(elevation_deg: float) -> None:
-    """The rover faces east and the sun is in the west: the shadow of the camera head is h / tan(elevation) ahead."""
+    """The rover faces east and the sun is in the west: the head's shadow is height / tan(elevation) ahead."""
     stance = settle(ROCKY_8, Plane(), 0.0, 0.0, EAST)
     sun = direction(-EAST, float(np.radians(elevation_deg)))
     head = stance.world_from_rover.apply(RESEARCH_MAST.base_m + RESEARCH_MAST.elbow_m + RESEARCH_MAST.head_m)
@@ -26,11 +26,11 @@ def test_head_shadow_is_at_the_sun_ray_intersection(elevation_deg: float) -> Non
         return rover_shades_patch(ROCKY_8, stance, RESEARCH_MAST, (0.0, 0.0), patch, sun)
 
     assert is_shaded(0.0, 0.0)
-    # The head is at most half a metre wide: at 0.6 m ahead or to the side the ground is sunlit.
+    # The head is at most half a metre wide. The ground 0.6 m ahead or to the side is sunlit.
     assert not is_shaded(0.6, 0.0)
     assert not is_shaded(0.0, 0.6)
     assert not is_shaded(0.0, -0.6)
-    # Closer to the rover the shadow is that of the mast.
+    # Closer to the rover, the mast shades the ground.
     assert is_shaded(-0.4, 0.0)
 
 

@@ -38,8 +38,8 @@ def test_run_is_tracked_scored_and_deterministic() -> None:
     assert row["tracked"]
     assert row["true_track"]
     assert not row["not_tracked"]
-    # One pixel of disparity is 5 cm of range at 3.5 m (Eq. 1 of the tracking paper); the calibration error
-    # is at most half a pixel.
+    # One pixel of disparity is 5 cm of range at 3.5 m (Eq. 1 of the tracking paper). The calibration error is at most
+    # half a pixel.
     assert 0.0 < row["position_error_m"] < 0.04
     assert row["position_error_m"] ** 2 == pytest.approx(row["range_error_m"] ** 2 + row["cross_error_m"] ** 2)
     assert row["drift_px"] < 1.0
@@ -67,7 +67,8 @@ def test_designated_point_agrees_with_rendered_pixels() -> None:
     camera = run.rig.left.crop(column - 4, row - 4, (9, 9))
     frame = process_renderer(p.backend).render(run.world.base, PixelRays.of(camera), stop.world_from_head)
     surface_points = frame.points_world()[3:6, 3:6].reshape(-1, 3)
-    assert (frame.body[4, 4]) >= 0
+    # The central pixel shows an object, not ground or sky.
+    assert frame.body[4, 4] >= 0
     # A pixel covers 3 mm, and more on the oblique face.
     assert np.linalg.norm(surface_points - run.target.point_world, axis=1).min() < 0.008
 
@@ -86,10 +87,10 @@ def test_start_and_goal_have_the_specified_distance(diameter_m: float) -> None:
     )
 
 
-def test_targets_on_occluding_edges_are_rejected() -> None:
-    """Only a template at the top of a large rock contains distant background.
+def test_template_is_on_an_occluding_edge_only_at_the_top_of_a_large_rock() -> None:
+    """Only at the top of a large rock a template contains distant background.
 
-    A template on a rock of 7 cm, or at the foot of a large rock, contains ground next to the rock.
+    A template on a rock of 7 cm, or at the foot of a large rock, contains the adjacent ground.
     """
     is_on_edge = {
         (diameter, up): run_case(
@@ -121,8 +122,8 @@ def test_ideal_instruments_have_only_match_errors() -> None:
 def test_targets_can_be_designated_by_position(designation: str) -> None:
     run = run_case(make_parameters(target={**SHORT_RUN["target"], "designation": designation}), make_streams(3))
     assert run.outcome.name == "COMPLETED"
-    # The mast points at the position. The backlash of 0.1 deg causes 2.1 px per axis; half the epipolar error is 0.2
-    # px.
+    # The mast points at the position. The backlash of 0.1 deg causes an error of 2.1 px per axis. Half the epipolar
+    # error is 0.2 px.
     assert np.linalg.norm(run.stops[0].reported_px(run.rig.calibrated) - run.stops[0].point_px) < 3.5
 
 
@@ -181,8 +182,8 @@ def test_trackers_share_the_images_of_a_drive() -> None:
     assert [result.failure for result in results] == [None, None]
     # A new scenario object without a cached drive gives the same row.
     uncached_row = SharedDriveScenario().run(small_steps, make_streams(0)).row
-    assert _drop_times(uncached_row) == _drop_times(results[0].row)
-    # Small and large steps cover the same arc; a target is valid if no stop exceeds the allowed viewing angle.
+    assert drop_time_columns(uncached_row) == drop_time_columns(results[0].row)
+    # Small and large steps cover the same arc. A target is on the face if no stop exceeds the allowed viewing angle.
     row = results[0].row
     assert [result.row["obliquity_max_deg"] for result in results] == [row["obliquity_max_deg"]] * 2
     assert isinstance(row["obliquity_max_deg"], float)
@@ -190,7 +191,7 @@ def test_trackers_share_the_images_of_a_drive() -> None:
         scenario.run(SharedDriveParameters.model_validate({**settings, "face_deg": limit}), make_streams(0)).row
         for limit in (row["obliquity_max_deg"] + 0.1, row["obliquity_max_deg"] - 0.1)
     )
-    assert [(entry["in_view"], entry["on_face"]) for entry in (row, allowed, exceeded)] == [
+    assert [(columns["in_view"], columns["on_face"]) for columns in (row, allowed, exceeded)] == [
         (True, True),
         (True, True),
         (True, False),
@@ -204,7 +205,7 @@ def test_trackers_share_the_images_of_a_drive() -> None:
     assert np.ptp(ranges) < 0.15
 
 
-def _drop_times(row: Mapping[str, Scalar]) -> dict[str, str]:
+def drop_time_columns(row: Mapping[str, Scalar]) -> dict[str, str]:
     return {name: repr(value) for name, value in row.items() if "time" not in name}
 
 

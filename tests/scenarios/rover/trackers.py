@@ -14,7 +14,7 @@ from marsyard.sim.measurements import MastCalibration, RoverMeasurements, Target
 
 
 class OffsetTracker:
-    """The paper's tracker with a position error of 0.3 m to the left; the target is reported as tracked."""
+    """Adds 0.3 m to the left to the positions of the paper's tracker, and reports the target as tracked."""
 
     def __init__(self) -> None:
         self.inner = VisualTargetTracker()

@@ -47,8 +47,8 @@ distortion_coefficients: !!opencv-matrix
 avg_reprojection_error: 4.4034956116049290e-001
 """
 
-#: A telephone camera as published by ROS (README of a repository that streams Tango to ROS): rational model without k4
-#: to k6.
+#: A smartphone camera as published by ROS (README of a repository that streams Tango to ROS). Its rational model has no
+#: coefficients k4 to k6.
 ROS = """image_width: 1920
 image_height: 1080
 camera_name: camera_color
@@ -72,7 +72,7 @@ projection_matrix:
     0.0, 0.0, 1.0, 0.0]
 """
 
-#: A wide-angle camera with a lens model that does not reach its corners (README of a driver for Kodak's PIXPRO).
+#: A wide-angle camera whose lens model is not valid at the image corners (README of a driver for Kodak's PIXPRO).
 KODAK = """image_width: 1440
 image_height: 1440
 camera_name: kodak
@@ -158,14 +158,16 @@ def write_file(folder: Path, text: str, name: str = "calibration.yaml") -> Path:
 def max_opencv_distance_px(
     camera: CameraModel, matrix: np.ndarray, distortion: list[float], pose: RigidTransform | None = None
 ) -> float:
-    """Maximum distance over the frame between Marsyard's pixels and OpenCV's projection of the same far points."""
+    """Compute the maximum distance over the frame between Marsyard's and OpenCV's pixels of the same far points."""
     columns, rows = (np.linspace(-0.5, extent - 0.5, 25) for extent in camera.size)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = camera.c + 1e5 * camera.rays(pixels)[1]
     pose = RigidTransform.identity() if pose is None else pose
     rotation, translation = pose.rotation.as_rotvec(), np.asarray(pose.translation)
-    reference, _ = cv2.projectPoints(points.reshape(-1, 1, 3), rotation, translation, matrix, np.array(distortion))
-    return float(np.max(np.linalg.norm(reference.reshape(-1, 2) - pixels, axis=1)))
+    expected_pixels, _ = cv2.projectPoints(
+        points.reshape(-1, 1, 3), rotation, translation, matrix, np.array(distortion)
+    )
+    return float(np.max(np.linalg.norm(expected_pixels.reshape(-1, 2) - pixels, axis=1)))
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
@@ -182,9 +184,9 @@ def test_opencv_file_projects_like_opencv(tmp_path: Path) -> None:
     matrix = storage.getNode("camera_matrix").mat()
     distortion = storage.getNode("distortion_coefficients").mat().ravel()
     distance_px = max_opencv_distance_px(calibration.camera, matrix, distortion)
-    # The reported residual, with a margin for positions between its samples.
+    # The reported residual is computed at samples. The margin covers the pixels between them.
     assert distance_px < 1.1 * calibration.residual.max_px
-    # Less than the reprojection error of the calibration: 0.44 px.
+    # The residual is less than the reprojection error of the calibration, 0.44 px.
     assert 0.0 < calibration.residual.rms_px < 0.2
     assert read_camera(path) == calibration.camera
 
@@ -226,7 +228,7 @@ def test_ros_camera_info_is_read(tmp_path: Path) -> None:
 
 
 def test_ros_rational_lens_is_fitted(tmp_path: Path) -> None:
-    """The eight coefficients of an Azure Kinect colour camera, scaled to the field of view of this telephone."""
+    """The eight coefficients of an Azure Kinect colour camera, scaled to the field of view of the smartphone."""
     coefficients = [0.52, -2.6, 4e-4, -2e-4, 1.5, 0.40, -2.4, 1.45]
     text = ROS.replace("[0.09370951394834764, -0.1640721737187069, 0.0, 0.0, 0.1224192868301668]", str(coefficients))
     (calibration,) = read_calibrations(write_file(tmp_path, text.replace("cols: 5", "cols: 8")))
@@ -266,19 +268,19 @@ def test_equidistant_lens_projects_like_opencv_fisheye(tmp_path: Path) -> None:
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = 1e5 * calibration.camera.rays(pixels)[1]
     data = yaml.safe_load(EQUIDISTANT)["cam0"]
-    reference, _ = cv2.fisheye.projectPoints(
+    expected_pixels, _ = cv2.fisheye.projectPoints(
         points.reshape(-1, 1, 3),
         np.zeros(3),
         np.zeros(3),
         camera_matrix(*data["intrinsics"]),
         np.array(data["distortion_coeffs"]),
     )
-    distances_px = np.linalg.norm(reference.reshape(-1, 2) - pixels, axis=1)
+    distances_px = np.linalg.norm(expected_pixels.reshape(-1, 2) - pixels, axis=1)
     assert distances_px.max() < 1.1 * calibration.residual.max_px
 
 
-def test_fisheye_with_two_coefficients_is_exact_beyond_90_degrees() -> None:
-    """Directions from the formula of Kannala and Brandt, inverted by hand for k1 = k2 = 0: theta = r / f."""
+def test_fisheye_with_up_to_two_coefficients_is_exact_beyond_90_degrees() -> None:
+    """Without coefficients the model of Kannala and Brandt is theta = r / f."""
     matrix, size = camera_matrix(300.0, 300.0, 499.5, 499.5), (1000, 1000)
     camera, residual = from_opencv_fisheye(matrix, np.zeros(4), size)
     assert residual.max_px < 1e-9
@@ -293,14 +295,14 @@ def test_fisheye_pose_is_applied() -> None:
     matrix, size = camera_matrix(300.0, 310.0, 320.0, 240.0), (640, 480)
     camera, _ = from_opencv_fisheye(matrix, np.array([0.01, -0.002, 0.0, 0.0]), size, pose)
     point = pose.inv().apply([0.3, -0.2, 1.0])
-    reference, _ = cv2.fisheye.projectPoints(
+    expected_pixels, _ = cv2.fisheye.projectPoints(
         point.reshape(1, 1, 3),
         pose.rotation.as_rotvec(),
         np.asarray(pose.translation),
         matrix,
         np.array([0.01, -0.002, 0.0, 0.0]),
     )
-    assert np.allclose(camera.project(point)[0], reference.ravel(), rtol=0, atol=1e-6)
+    assert np.allclose(camera.project(point)[0], expected_pixels.ravel(), rtol=0, atol=1e-6)
 
 
 FAULTS = [
@@ -327,10 +329,10 @@ FAULTS = [
 def test_errors_name_field_and_allowed_values(tmp_path: Path, text: str, old: str, new: str, fault: str) -> None:
     assert old in text
     path = write_file(tmp_path, text.replace(old, new, 1), "faulty.yaml")
-    with pytest.raises(CameraFileError, match=fault) as raised:
+    with pytest.raises(CameraFileError, match=fault) as error_info:
         read_cameras(path)
-    assert "faulty.yaml" in str(raised.value)
-    assert "allowed" in str(raised.value)
+    assert "faulty.yaml" in str(error_info.value)
+    assert "allowed" in str(error_info.value)
 
 
 def test_lens_not_representable_by_cahvor_is_rejected(tmp_path: Path) -> None:

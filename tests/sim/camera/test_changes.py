@@ -20,7 +20,7 @@ from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 
 
 @st.composite
-def transforms(draw: st.DrawFn) -> RigidTransform:
+def draw_transforms(draw: st.DrawFn) -> RigidTransform:
     rotation = Rotation.from_rotvec(draw(arrays(float, 3, elements=st.floats(-3, 3))))
     return RigidTransform.from_components(draw(arrays(float, 3, elements=st.floats(-2000, 2000))), rotation)
 
@@ -46,10 +46,10 @@ def test_moved_camera_projects_moved_points_equally(camera: CameraModel) -> None
     assert np.allclose(camera.transform(motion).project(moved_points)[0], camera.project(points)[0], rtol=0, atol=1e-10)
 
 
-@given(transforms(), transforms())
+@given(draw_transforms(), draw_transforms())
 def test_motions_compose(first: RigidTransform, second: RigidTransform) -> None:
     camera = Cahv.from_field_of_view(0.8, (64, 48), axis=(0, 0, -1), right=(1, 0, 0), centre=(1, 2, 3))
-    # Coordinates reach 4000 m: 1e-11 is a few roundings.
+    # Coordinates reach 4000 m: 1e-11 m is a few rounding errors.
     assert np.allclose(
         stack_cahv(camera.transform(first).transform(second)),
         stack_cahv(camera.transform(second * first)),
@@ -262,10 +262,10 @@ def copy_by_pickle(camera: CameraModel) -> CameraModel:
     return copied
 
 
-@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, copy_by_pickle])
-def test_copies_are_equal_and_immutable(camera: CameraModel, duplicate: Callable[[CameraModel], CameraModel]) -> None:
-    camera.rays(np.zeros(2))  # fills the cache
-    copied = duplicate(camera)
+@pytest.mark.parametrize("copy_camera", [copy.copy, copy.deepcopy, copy_by_pickle])
+def test_copies_are_equal_and_immutable(camera: CameraModel, copy_camera: Callable[[CameraModel], CameraModel]) -> None:
+    camera.rays(np.zeros(2))  # Fills the cache of the camera.
+    copied = copy_camera(camera)
     assert copied == camera
     assert hash(copied) == hash(camera)
     assert not copied.c.flags.writeable
@@ -281,7 +281,10 @@ def test_different_cameras_differ(navcam: Cahvor, pinhole: Cahv) -> None:
 
 
 def test_derived_quantities_match_the_formulas_of_cmod(navcam: Cahvor) -> None:
-    """Compare with cmod_cahv_internal of JPL's cmod library, which assumes a unit vector A (labelled to six digits)."""
+    """Compare with cmod_cahv_internal of JPL's cmod library, which assumes that A is a unit vector.
+
+    The label rounds A to six digits.
+    """
     hs, vs = navcam.focal_lengths
     hc, vc = navcam.image_centre
     assert hs == pytest.approx(np.linalg.norm(np.cross(navcam.a, navcam.h)), rel=2e-6)
@@ -294,7 +297,7 @@ def test_derived_quantities_match_the_formulas_of_cmod(navcam: Cahvor) -> None:
     )
     assert np.allclose(hs * navcam.right + hc * navcam.a, navcam.h, atol=1e-2)
     half_angles = np.arccos(navcam.corner_rays()[1] @ navcam.boresight())
-    assert np.degrees(2 * half_angles.max()) == pytest.approx(61.4, abs=0.1)  # 45 x 45 degrees, along the diagonal
+    assert np.degrees(2 * half_angles.max()) == pytest.approx(61.4, abs=0.1)  # diagonal of 45 x 45 degrees
 
 
 def test_corner_rays_are_in_clockwise_order(camera: CameraModel) -> None:

@@ -61,8 +61,8 @@ END_GROUP                         = INSTRUMENT_STATE_PARMS
 END
 """
 
-# The text format of JPL's camera library cmod, with comment, covariances and derived lines.
-TEXT = """# navcam, left
+#: The text format of JPL's camera library cmod, with comment, covariances and derived lines.
+CMOD_TEXT = """# navcam, left
 #
 
 Model = CAHVOR = perspective, distortion
@@ -118,9 +118,9 @@ def test_cahvore_label_is_read(tmp_path: Path, hazcam: Cahvore) -> None:
     assert read_camera(write_file(tmp_path, LABEL + "\0\xff END of nothing" * 1000)) == expected
 
 
-@pytest.mark.parametrize(("kind", "linearity"), [("1.0", 1.0), ("2", 0.0), ("3.0", 0.37)])
-def test_cahvore_types_set_linearity(tmp_path: Path, kind: str, linearity: float) -> None:
-    text = LABEL.replace("MODEL_COMPONENT_8               = 3.0", f"MODEL_COMPONENT_8 = {kind}")
+@pytest.mark.parametrize(("cahvore_type", "linearity"), [("1.0", 1.0), ("2", 0.0), ("3.0", 0.37)])
+def test_cahvore_types_set_linearity(tmp_path: Path, cahvore_type: str, linearity: float) -> None:
+    text = LABEL.replace("MODEL_COMPONENT_8               = 3.0", f"MODEL_COMPONENT_8 = {cahvore_type}")
     camera = read_camera(write_file(tmp_path, text))
     assert isinstance(camera, Cahvore)
     assert camera.linearity == linearity
@@ -190,28 +190,28 @@ LABEL_FAULTS = [
 def test_label_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert old in LABEL
     path = write_file(tmp_path, LABEL.replace(old, new), "faulty.IMG")
-    with pytest.raises(CameraFileError, match=fault) as raised:
+    with pytest.raises(CameraFileError, match=fault) as error_info:
         read_camera(path)
-    assert "faulty.IMG" in str(raised.value)
-    assert "allowed" in str(raised.value)
+    assert "faulty.IMG" in str(error_info.value)
+    assert "allowed" in str(error_info.value)
 
 
 # ----- JPL text files -----
 
 
 def test_cmod_text_file_is_read(tmp_path: Path, navcam: Cahvor) -> None:
-    camera = read_cahvor(write_file(tmp_path, TEXT))
+    camera = read_cahvor(write_file(tmp_path, CMOD_TEXT))
     assert isinstance(camera, Cahvor)
     assert camera.size == (1024, 1024)
-    for name in "cahvor":  # %13f: six decimals
+    for name in "cahvor":  # The format %13f has six decimals.
         assert np.allclose(getattr(camera, name), getattr(navcam, name), rtol=0, atol=5.1e-7)
 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
 def test_spacing_and_line_endings_may_differ(tmp_path: Path, ending: str) -> None:
-    text = TEXT.replace("C =", "  C  =").replace("Dimensions = 1024 1024", "Dimensions=1024\t1024 # columns, rows")
+    text = CMOD_TEXT.replace("C =", "  C  =").replace("Dimensions = 1024 1024", "Dimensions=1024\t1024 # columns, rows")
     assert read_camera(write_file(tmp_path, text.replace("\n", ending))) == read_cahvor(
-        write_file(tmp_path, TEXT, "plain")
+        write_file(tmp_path, CMOD_TEXT, "plain")
     )
 
 
@@ -225,7 +225,7 @@ def test_spacing_and_line_endings_may_differ(tmp_path: Path, ending: str) -> Non
     ],
 )
 def test_cahvore_text_is_read(tmp_path: Path, model: str, linearity: float) -> None:
-    text = TEXT.replace("CAHVOR = perspective, distortion", model).replace("\nS =", "E = 0.001 0.002 0.003\n\nS =")
+    text = CMOD_TEXT.replace("CAHVOR = perspective, distortion", model).replace("\nS =", "E = 0.001 0.002 0.003\n\nS =")
     camera = read_camera(write_file(tmp_path, text))
     assert isinstance(camera, Cahvore)
     assert camera.linearity == linearity
@@ -233,7 +233,7 @@ def test_cahvore_text_is_read(tmp_path: Path, model: str, linearity: float) -> N
 
 
 def test_cahv_text_is_read(tmp_path: Path) -> None:
-    text = TEXT.replace("CAHVOR = perspective, distortion", "CAHV = perspective, linear")
+    text = CMOD_TEXT.replace("CAHVOR = perspective, distortion", "CAHV = perspective, linear")
     assert isinstance(read_camera(write_file(tmp_path, text)), Cahv)
 
 
@@ -260,7 +260,7 @@ def test_round_trip_is_exact(
     assert read_camera(tmp_path / "camera.cahvore") == camera
 
 
-TEXT_FAULTS = [
+CMOD_TEXT_FAULTS = [
     ("Model = CAHVOR = perspective, distortion\n", "", "Model: missing"),
     ("Model = CAHVOR =", "Model = CAHVOX =", "Model: 'CAHVOX.*allowed: CAHV, CAHVOR, CAHVORE1"),
     ("Model = CAHVOR =", "Model = CAHVORE =", "type is missing; allowed: type 1, 2 or 3"),
@@ -283,14 +283,14 @@ TEXT_FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "fault"), TEXT_FAULTS, ids=[f"{new!r}" for _, new, _ in TEXT_FAULTS])
+@pytest.mark.parametrize(("old", "new", "fault"), CMOD_TEXT_FAULTS, ids=[f"{new!r}" for _, new, _ in CMOD_TEXT_FAULTS])
 def test_text_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
-    assert old in TEXT
-    path = write_file(tmp_path, TEXT.replace(old, new, 1), "faulty.cahvor")
-    with pytest.raises(CameraFileError, match=fault) as raised:
+    assert old in CMOD_TEXT
+    path = write_file(tmp_path, CMOD_TEXT.replace(old, new, 1), "faulty.cahvor")
+    with pytest.raises(CameraFileError, match=fault) as error_info:
         read_camera(path)
-    assert "faulty.cahvor" in str(raised.value)
-    assert "allowed" in str(raised.value)
+    assert "faulty.cahvor" in str(error_info.value)
+    assert "allowed" in str(error_info.value)
 
 
 def test_missing_files_and_unknown_formats_are_rejected(tmp_path: Path) -> None:
@@ -301,20 +301,24 @@ def test_missing_files_and_unknown_formats_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(CameraFileError, match=r"is empty \(0 bytes\)"):
         read_camera(write_file(tmp_path, ""))
     with pytest.raises(CameraFileError, match="PDS_VERSION_ID: missing"):
-        read_pds3(write_file(tmp_path, TEXT))
+        read_pds3(write_file(tmp_path, CMOD_TEXT))
 
 
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.sampled_from([TEXT, LABEL]), st.integers(0, 1700), st.binary(min_size=0, max_size=12), st.integers(0, 30))
-def test_damaged_files_raise_camera_file_errors(tmp_path: Path, text: str, at: int, junk: bytes, removed: int) -> None:
-    full = text.encode("latin-1")
+@given(
+    st.sampled_from([CMOD_TEXT, LABEL]), st.integers(0, 1700), st.binary(min_size=0, max_size=12), st.integers(0, 30)
+)
+def test_damaged_files_raise_camera_file_errors(
+    tmp_path: Path, text: str, position: int, inserted: bytes, n_removed: int
+) -> None:
+    original = text.encode("latin-1")
     path = tmp_path / "damaged"
-    path.write_bytes(full[:at] + junk + full[at + removed :])
+    path.write_bytes(original[:position] + inserted + original[position + n_removed :])
     with contextlib.suppress(CameraFileError):
         assert len(read_cameras(path)) == 1
 
 
-#: Curiosity: the start of a navigation camera's label (MSL_MMM EDR), its model group and a part of the frame.
+#: The label with the keywords and group names of a navigation camera of Curiosity (MSL_MMM EDR).
 CURIOSITY = (
     LABEL.replace("PDS_VERSION_ID                    = PDS3", "ODL_VERSION_ID                    = ODL3")
     .replace("^IMAGE                            = 3", '^IMAGE                            = ("NLB_0001.IMG", 9)')
@@ -325,10 +329,10 @@ CURIOSITY = (
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
 def test_curiosity_labels_are_read(tmp_path: Path, ending: str) -> None:
-    actual, reference = tmp_path / "spirit.lbl", tmp_path / "curiosity.lbl"
-    actual.write_text(LABEL)
-    reference.write_bytes(CURIOSITY.replace("\n", ending).encode())
-    (expected,), (result,) = read_cameras(actual), read_cameras(reference)
+    mer_path, curiosity_path = tmp_path / "opportunity.lbl", tmp_path / "curiosity.lbl"
+    mer_path.write_text(LABEL)
+    curiosity_path.write_bytes(CURIOSITY.replace("\n", ending).encode())
+    (expected,), (result,) = read_cameras(mer_path), read_cameras(curiosity_path)
     assert result == expected
 
 
@@ -349,15 +353,15 @@ def test_curiosity_subframes_require_subframe_folded_in(tmp_path: Path, old: str
 
 
 def test_text_files_without_dimensions_use_the_given_size(tmp_path: Path) -> None:
-    with_size, without_size = tmp_path / "stated.cahvor", tmp_path / "unstated.cahvor"
-    with_size.write_text(TEXT)
-    without_size.write_text(TEXT.replace("Dimensions = 1024 1024\n", ""))
+    with_size, without_size = tmp_path / "with_size.cahvor", tmp_path / "without_size.cahvor"
+    with_size.write_text(CMOD_TEXT)
+    without_size.write_text(CMOD_TEXT.replace("Dimensions = 1024 1024\n", ""))
     with pytest.raises(CameraFileError, match=r"Dimensions: missing; allowed: a line .* or size = \[columns, rows\]"):
         read_cameras(without_size)
     assert read_cameras(without_size, size=(1024, 1024)) == read_cameras(with_size)
     with pytest.raises(CameraFileError, match="Dimensions: 1024 1024; allowed: the given size, 512 512"):
         read_cameras(with_size, size=(512, 512))
-    campaign: TypeAdapter[CustomCamera] = TypeAdapter(CustomCameraChoice)
-    assert campaign.validate_python({"file": str(without_size), "size": [1024, 1024]}).size == (1024, 1024)
+    choice: TypeAdapter[CustomCamera] = TypeAdapter(CustomCameraChoice)
+    assert choice.validate_python({"file": str(without_size), "size": [1024, 1024]}).size == (1024, 1024)
     with pytest.raises(ValueError, match=r"size is \[1024\]; allowed: \[columns, rows\]"):
-        campaign.validate_python({"file": str(without_size), "size": [1024]})
+        choice.validate_python({"file": str(without_size), "size": [1024]})

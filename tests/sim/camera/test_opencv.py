@@ -26,7 +26,7 @@ MATRIX = np.array([[900.0, 0.0, 630.0], [0.0, 905.0, 350.0], [0.0, 0.0, 1.0]])
 POSE = RigidTransform.from_components([0.5, -1.0, 2.0], Rotation.from_rotvec([0.4, -0.2, 1.0]))
 
 
-def opencv_distances_px(camera: Cahvor, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+def compute_opencv_distances_px(camera: Cahvor, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     pixels = sample_frame(camera)
     reference, _ = cv2.projectPoints(
         make_far_points(camera, pixels).reshape(-1, 1, 3),
@@ -44,15 +44,15 @@ def test_radial_distortion_from_opencv_is_exact(distortion: list[float]) -> None
     camera, residual = from_opencv(MATRIX, coefficients, (1280, 720), POSE)
     assert residual.max_px < 1e-9
     padded = np.concatenate([coefficients, np.zeros(5 - len(coefficients))])
-    # Points 1e4 m away are not at infinity; both cameras have the same centre.
-    assert np.max(opencv_distances_px(camera, MATRIX, padded)) < 1e-8
+    # The test points are 1e4 m away, not at infinity. This has no effect, because both cameras have the same centre.
+    assert np.max(compute_opencv_distances_px(camera, MATRIX, padded)) < 1e-8
 
 
 def test_full_distortion_from_opencv_is_fitted() -> None:
     distortion = np.array([-0.25, 0.08, 0.001, -0.0008, -0.005])
     camera, residual = from_opencv(MATRIX, distortion, (1280, 720), POSE)
-    reference = opencv_distances_px(camera, MATRIX, distortion)
-    # Both are sampled at the same pixels: along CAHVOR's rays and along OpenCV's rays.
+    reference = compute_opencv_distances_px(camera, MATRIX, distortion)
+    # Both are computed at the same pixels: here with CAHVOR's rays, in the residual with OpenCV's rays.
     assert np.sqrt(np.mean(reference**2)) == pytest.approx(residual.rms_px, rel=0.05)
     assert residual.rms_px < 0.2
     assert residual.max_px < 1.0

@@ -107,14 +107,14 @@ def test_mars_2020_navcam_is_read(tmp_path: Path) -> None:
     assert np.array_equal(camera.h, [-3229.43, 141.993, 229.563])
     assert np.array_equal(camera.r, [1.736e-06, 0.0501396, -0.0171254])
     assert np.array_equal(camera.e, [-8.0e-09, 1.0e-08, -2.9e-08])
-    # The label lists the field of view of the subframe. Its definition of the width differs by up to 2 %.
+    # The label contains the field of view of the subframe. Its definition differs from this one by up to 2 %.
     middle = np.array([647.5, 487.5])
     for edges, fov_deg in (([[-0.5, 487.5], [1295.5, 487.5]], 24.7326), ([[647.5, -0.5], [647.5, 975.5]], 18.6047)):
         first, last = camera.rays(np.array(edges))[1]
         assert np.degrees(np.arccos(first @ last)) == pytest.approx(fov_deg, rel=0.02)
     assert np.all(np.isfinite(camera.rays(middle)[1]))
-    # The model refers to the subframe: with the subframe's first sample and line added, the image centre is near the
-    # centre of the 5120 x 3840 detector.
+    # The model refers to the subframe. With the subframe's offset (first sample and line minus 1), the image centre is
+    # near the centre of the 5120 x 3840 detector.
     hc, vc = camera.image_centre
     assert hc + 1272 == pytest.approx(2560, rel=0.02)
     assert vc + 952 == pytest.approx(1920, rel=0.02)
@@ -164,7 +164,7 @@ FAULTS = [
 @pytest.mark.parametrize(("old", "new", "fault"), FAULTS, ids=[f"{old!r} {new!r}" for old, new, _ in FAULTS])
 def test_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert old in FULL_FRAME
-    with pytest.raises(CameraFileError, match=fault) as raised:
+    with pytest.raises(CameraFileError, match=fault) as error_info:
         read_pds4(write_label(tmp_path, FULL_FRAME.replace(old, new)))
-    assert "label.xml" in str(raised.value)
-    assert "allowed" in str(raised.value)
+    assert "label.xml" in str(error_info.value)
+    assert "allowed" in str(error_info.value)

@@ -1,4 +1,4 @@
-"""Tests that images and poses of PDS3 products are read: Opportunity's products and synthetic products."""
+"""Tests of reading images and poses of PDS3 products, from Opportunity and synthetic."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ END
 
 def write_product(
     folder: Path,
-    sample: str = ">i2",
+    sample_dtype: str = ">i2",
     pointer: str = "3",
     kind: str = "MSB_INTEGER",
     bits: int = 16,
@@ -42,12 +42,12 @@ def write_product(
     """Write a product whose image begins at its third record."""
     path = folder / "made.img"
     label = LABEL.format(pointer=pointer, kind=kind, bits=bits, quaternion=quaternion).encode()
-    path.write_bytes(label.ljust(1024, b" ") + counts.astype(sample).tobytes())
+    path.write_bytes(label.ljust(1024, b" ") + counts.astype(sample_dtype).tobytes())
     return path
 
 
 @pytest.mark.parametrize(
-    ("sample", "pointer", "kind", "bits"),
+    ("sample_dtype", "pointer", "kind", "bits"),
     [
         (">i2", "3", "MSB_INTEGER", 16),
         (">u2", "1025 <BYTES>", "MSB_UNSIGNED_INTEGER", 16),
@@ -55,13 +55,13 @@ def write_product(
         ("u1", "3", "UNSIGNED_INTEGER", 8),
     ],
 )
-def test_all_sample_types_are_read(tmp_path: Path, sample: str, pointer: str, kind: str, bits: int) -> None:
+def test_all_sample_types_are_read(tmp_path: Path, sample_dtype: str, pointer: str, kind: str, bits: int) -> None:
     counts = COUNTS // 16 if bits == 8 else COUNTS
-    result = read_pds3_product(write_product(tmp_path, sample, pointer, kind, bits, counts=counts))
+    result = read_pds3_product(write_product(tmp_path, sample_dtype, pointer, kind, bits, counts=counts))
     assert np.array_equal(result.counts, counts)
     assert result.time_s == 100.5
     assert result.site_from_rover is not None
-    # Scalar first: a right turn about the down axis by 2 acos 0.8.
+    # The quaternion has the scalar first. It is a right turn about the down axis by 2 acos 0.8.
     forward = result.site_from_rover.rotation.apply(np.array([1.0, 0.0, 0.0]))
     assert np.allclose(forward, [0.8**2 - 0.6**2, 2 * 0.8 * 0.6, 0.0])
     assert np.allclose(result.site_from_rover.translation, [1.0, 2.0, 3.0])
@@ -80,9 +80,9 @@ def test_all_sample_types_are_read(tmp_path: Path, sample: str, pointer: str, ki
     ],
 )
 def test_invalid_products_are_rejected(tmp_path: Path, changes: dict[str, object], message: str) -> None:
-    with pytest.raises(CameraFileError, match=message) as caught:
+    with pytest.raises(CameraFileError, match=message) as error_info:
         read_pds3_product(write_product(tmp_path, **changes))  # type: ignore[arg-type]
-    assert "made.img" in str(caught.value)
+    assert "made.img" in str(error_info.value)
 
 
 def test_truncated_image_is_rejected(tmp_path: Path) -> None:

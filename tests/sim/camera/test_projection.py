@@ -35,14 +35,14 @@ def tilt_axis(axis: np.ndarray, tilt: np.ndarray) -> np.ndarray:
     return np.asarray(tilted / np.linalg.norm(tilted))
 
 
-tilts = arrays(float, 3, elements=st.floats(-0.03, 0.03))
-radials = st.tuples(st.floats(-0.05, 0.05), st.floats(-0.08, 0.2), st.floats(-0.02, 0.05)).map(np.array)
+axis_tilts = arrays(float, 3, elements=st.floats(-0.03, 0.03))
+radial_coefficients = st.tuples(st.floats(-0.05, 0.05), st.floats(-0.08, 0.2), st.floats(-0.02, 0.05)).map(np.array)
 
 
 @st.composite
 def cahvor_cameras(draw: st.DrawFn) -> Cahvor:
     cahv = draw(cahv_cameras())
-    return Cahvor.from_cahv(cahv, r=draw(radials), o=tilt_axis(cahv.a, draw(tilts)))
+    return Cahvor.from_cahv(cahv, r=draw(radial_coefficients), o=tilt_axis(cahv.a, draw(axis_tilts)))
 
 
 @st.composite
@@ -50,10 +50,10 @@ def cahvore_cameras(draw: st.DrawFn) -> Cahvore:
     cahv = draw(cahv_cameras())
     return Cahvore.from_cahv(
         cahv,
-        r=draw(radials),
+        r=draw(radial_coefficients),
         e=draw(arrays(float, 3, elements=st.floats(-0.003, 0.003))),
         linearity=draw(st.sampled_from([-1.0, -0.5, 0.0, 0.37, 1.0]) | st.floats(-1, 1)),
-        o=tilt_axis(cahv.a, draw(tilts)),
+        o=tilt_axis(cahv.a, draw(axis_tilts)),
     )
 
 
@@ -62,34 +62,34 @@ fractions = arrays(float, (4, 2), elements=st.floats(0, 1))
 
 
 def pixels_from_fractions(camera: CameraModel, uv: np.ndarray) -> np.ndarray:
-    """Pixels at fractions `uv` (0 to 1) of the frame width and height."""
+    """Return the pixels at fractions `uv` (0 to 1) of the frame width and height, shape (n, 2)."""
     return np.asarray(uv * np.array(camera.size) - 0.5)
 
 
 # ----- projection and rays are inverse -----
 
 
-@pytest.mark.parametrize("distance", [0.5, 10.0, 1e4])
-def test_projection_inverts_rays_of_real_cameras(camera: CameraModel, distance: float) -> None:
+@pytest.mark.parametrize("distance_m", [0.5, 10.0, 1e4])
+def test_projection_inverts_rays_of_real_cameras(camera: CameraModel, distance_m: float) -> None:
     pixels = camera.pixel_grid()
     origins, directions = camera.rays(pixels)
-    repeated, visible = camera.project(origins + distance * directions)
+    reprojected, visible = camera.project(origins + distance_m * directions)
     assert visible.all()
-    # Requirement: 1e-8 px for CAHVOR and 1e-3 px for CAHVORE. Newton converges to rounding errors. Pixels near 1000 and
-    # points near 1e4 m leave about 1e3 * 2e-16 * 1e4 / 10 ~ 2e-12 px.
-    assert np.max(np.abs(repeated - pixels)) < 1e-10
+    # The requirement is 1e-8 px for CAHVOR and 1e-3 px for CAHVORE. Newton's method converges to rounding errors: about
+    # 1e3 * 2e-16 * 1e4 / 10 ~ 2e-12 px for pixels near 1000 and points near 1e4 m.
+    assert np.max(np.abs(reprojected - pixels)) < 1e-10
 
 
 @given(cameras, fractions, st.floats(0.5, 1e5))
-def test_projection_inverts_rays_of_random_cameras(camera: CameraModel, uv: np.ndarray, distance: float) -> None:
+def test_projection_inverts_rays_of_random_cameras(camera: CameraModel, uv: np.ndarray, distance_m: float) -> None:
     pixels = pixels_from_fractions(camera, uv)
     origins, directions = camera.rays(pixels)
     has_ray = np.isfinite(directions).all(axis=-1)
-    repeated, visible = camera.project(origins + distance * directions)
+    reprojected, visible = camera.project(origins + distance_m * directions)
     assert np.array_equal(visible, has_ray)
     # C is up to 5000 m away: a point at 0.5 m is rounded by 1e-12 m, or 1e-7 px for 4e4 px/rad (2048 px in 0.05 rad).
     # Near the end of the polynomial's range the inverse direction loses digits, but the pixel does not.
-    assert np.max(np.abs(repeated - pixels)[has_ray], initial=0) < 1e-6
+    assert np.max(np.abs(reprojected - pixels)[has_ray], initial=0) < 1e-6
 
 
 @given(cameras, fractions)
@@ -112,7 +112,7 @@ def test_rays_of_cahvore_start_on_the_optical_axis(hazcam: Cahvore) -> None:
 
 
 def project_with_cmod_cahvor(camera: Cahvor, point: np.ndarray) -> tuple[float, float]:
-    """cmod_cahvor_3d_to_2d with Gennery's omega, lambda, tau and mu."""
+    """Project a point as cmod_cahvor_3d_to_2d does, with Gennery's symbols omega, lambda, tau and mu."""
     difference = point - camera.c
     omega = difference @ camera.o
     lambda_ = difference - omega * camera.o
@@ -124,7 +124,10 @@ def project_with_cmod_cahvor(camera: Cahvor, point: np.ndarray) -> tuple[float, 
 
 
 def project_with_cmod_cahvore(camera: Cahvore, point: np.ndarray) -> tuple[float, float]:
-    """cmod_cahvore_3d_to_2d_general with its Newton iteration on theta, but a limit of 1e-16 instead of 1e-8."""
+    """Project a point as cmod_cahvore_3d_to_2d_general does, with Gennery's symbols and Newton's method for theta.
+
+    The iteration ends after a step below 1e-8.
+    """
     difference = point - camera.c
     zeta = float(difference @ camera.o)
     lambda3 = difference - zeta * camera.o
@@ -170,11 +173,11 @@ def project_with_cmod(camera: Cahvor | Cahvore, point: np.ndarray) -> tuple[floa
 
 
 @given(st.one_of(cahvor_cameras(), cahvore_cameras()), fractions, st.floats(1, 1e4))
-def test_projection_matches_cmod(camera: Cahvor | Cahvore, uv: np.ndarray, distance: float) -> None:
+def test_projection_matches_cmod(camera: Cahvor | Cahvore, uv: np.ndarray, distance_m: float) -> None:
     origins, directions = camera.rays(pixels_from_fractions(camera, uv))
-    points = (origins + distance * directions)[np.isfinite(directions).all(axis=-1)]
+    points = (origins + distance_m * directions)[np.isfinite(directions).all(axis=-1)]
     expected = np.array([project_with_cmod(camera, point) for point in points]).reshape(-1, 2)
-    # Rounding of points 5000 m away, as above.
+    # The bound is the rounding of points 5000 m away.
     assert np.max(np.abs(camera.project(points)[0] - expected), initial=0) < 1e-6
 
 
@@ -216,7 +219,10 @@ def test_projection_centre_and_nan_are_not_visible(camera: CameraModel) -> None:
 
 
 def make_folding_camera() -> Cahvor:
-    """The polynomial chi - 0.2 chi^3 increases up to chi^2 = 1 / 0.6, with the value (2 / 3) sqrt(1 / 0.6)."""
+    """Return a camera with the distortion chi - 0.2 chi^3.
+
+    It increases up to chi^2 = 1 / 0.6, with the value (2 / 3) sqrt(1 / 0.6).
+    """
     cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
     return Cahvor.from_cahv(cahv, r=(0.0, -0.2, 0.0))
 
@@ -244,17 +250,17 @@ def test_pixels_beyond_distortion_range_have_no_ray() -> None:
     "r", [(0.0, -0.2, 0.0), (0.0, 0.3, -0.05), (0.0, -0.3, 0.06), (-0.5, 0.0, 0.0), (0.1, 2.0, 3.0)]
 )
 def test_rays_exist_up_to_the_distortion_limit(r: tuple[float, float, float]) -> None:
-    """Includes polynomials with an inflection, where an unbounded Newton iteration leaves the valid range."""
+    """Polynomials with an inflection are included: there an unbounded Newton iteration would leave the valid range."""
     cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
     camera = Cahvor.from_cahv(cahv, r=r)
     chi = np.concatenate([np.geomspace(1e-9, 1e-3, 30), np.linspace(0.002, 8, 2000)])
     points = np.stack([0.6 * chi, -0.8 * chi, np.ones_like(chi)], axis=-1)
     pixels, visible = camera.project(points)
     directions = camera.rays(pixels[visible])[1]
-    repeated = camera.project(directions)[0]
+    reprojected = camera.project(directions)[0]
     assert visible[:60].all()
-    scale = np.maximum(np.abs(pixels[visible]), 1e4)  # the strongest polynomial reaches 1e7 px
-    assert np.max(np.abs(repeated - pixels[visible]) / scale) < 1e-14
+    scale = np.maximum(np.abs(pixels[visible]), 1e4)  # The strongest polynomial reaches 1e7 px.
+    assert np.max(np.abs(reprojected - pixels[visible]) / scale) < 1e-14
     slope = 1 + r[0] + 3 * r[1] * chi**2 + 5 * r[2] * chi**4
     first_invalid = np.argmax(slope <= 0) if (slope <= 0).any() else len(chi)
     assert visible[:first_invalid].all()
@@ -316,13 +322,13 @@ def test_jacobian_on_the_optical_axis_matches_finite_differences(navcam: Cahvor,
 
 @given(cameras, arrays(float, (4, 2), elements=st.floats(0.1, 0.9)), st.floats(5, 50))
 def test_jacobian_of_random_cameras_matches_finite_differences(
-    camera: CameraModel, uv: np.ndarray, distance: float
+    camera: CameraModel, uv: np.ndarray, distance_m: float
 ) -> None:
     origins, directions = camera.rays(pixels_from_fractions(camera, uv))
-    points = origins + distance * directions
+    points = origins + distance_m * directions
     analytic = camera.projection_jacobian(points)
-    numerical = numerical_jacobian(camera, points, 1e-4 * distance)
-    is_valid = np.isfinite(numerical)  # differences may leave the valid range
+    numerical = numerical_jacobian(camera, points, 1e-4 * distance_m)
+    is_valid = np.isfinite(numerical)  # Difference points may be outside the valid range.
     size = np.linalg.norm(np.where(np.isfinite(analytic), analytic, 0), axis=(-2, -1), keepdims=True)
     # Rounding of points 5000 m away: 1e-12 m / (1e-4 * 5 m) = 2e-9 of the slope; truncation adds to it near a limit.
     assert np.all((np.abs(analytic - numerical) <= 2e-5 * size + 1e-7)[is_valid])
@@ -345,10 +351,10 @@ def test_leading_dimensions_are_preserved(camera: CameraModel, shape: tuple[int,
 
 
 def test_single_point_equals_the_point_among_many(camera: CameraModel) -> None:
-    """Bitwise equality: results do not depend on the division of work."""
+    """The results are bitwise equal, so they do not depend on the division into blocks."""
     points = camera.c + 3 * camera.rays(camera.pixel_grid()[::4, ::4].reshape(-1, 2))[1]
     all_pixels = camera.project(points)[0]
-    assert len(points) > 3 * 16384  # several blocks
+    assert len(points) > 3 * 16384  # The points fill several blocks.
     for index in (0, 1, 7, 16383, 16384, 40000, len(points) - 1):
         assert np.array_equal(camera.project(points[index])[0], all_pixels[index])
 

@@ -1,4 +1,4 @@
-"""Analytic grounds for rover tests: on planes and single mounds, the stance of a rover has a closed form."""
+"""Analytic grounds for rover tests, on which the stance of a rover has a closed form: planes and mounds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NO_SLIP = SlipParameters(
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane through a height at the origin, with slopes dz/dx and dz/dy."""
+    """A plane with a height at the origin and the slopes dz/dx (east) and dz/dy (north)."""
 
     slope_east: float = 0.0
     slope_north: float = 0.0
@@ -30,7 +30,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Mounds:
-    """Level ground with mounds (x, y, height) under single wheels; the tops are flat up to a radius of 0.2 m."""
+    """Level ground with mounds (x, y, height), m; a top is flat up to a radius of 0.2 m, the slope ends at 0.3 m."""
 
     mounds: tuple[tuple[float, float, float], ...]
 

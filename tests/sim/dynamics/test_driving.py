@@ -10,9 +10,9 @@ from marsyard.sim.measurements import DriveCommand
 from tests.sim.dynamics.grounds import NO_SLIP, Plane, uphill_east
 
 EAST, NORTH = 0.5 * np.pi, 0.0
-#: The defaults without random parts.
-STEADY = SlipParameters(soil_spread=0.0, step_spread=0.0, wander_deg_m=0.0)
-PERFECT = Soil(NO_SLIP, 1.0)
+#: The default slip without its random parts.
+NO_RANDOM_SLIP = SlipParameters(soil_spread=0.0, step_spread=0.0, wander_deg_m=0.0)
+NO_SLIP_SOIL = Soil(NO_SLIP, 1.0)
 COMMANDS = [
     DriveCommand(forward_m=1.0),
     DriveCommand(forward_m=-0.7),
@@ -30,10 +30,10 @@ def _rng() -> np.random.Generator:
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("slope_deg", [0.0, 15.0])
 def test_motion_without_slip_follows_the_command(command: DriveCommand, slope_deg: float) -> None:
-    # On a plane the motion in body axes is planar for any slope.
+    # On a plane the motion in rover axes has no vertical component, for any slope.
     ground = uphill_east(slope_deg)
     start = settle(MER, ground, 1.0, 2.0, 0.4)
-    result = drive(MER, ground, PERFECT, start, command, _rng())
+    result = drive(MER, ground, NO_SLIP_SOIL, start, command, _rng())
     motion = start.world_from_rover.inv() * result.end.world_from_rover
     assert motion.translation == pytest.approx([*command.displacement_m, 0.0], abs=1e-8)
     assert motion.rotation.as_rotvec() == pytest.approx([0.0, 0.0, command.turn_left_rad], abs=1e-7)
@@ -57,7 +57,7 @@ def test_target_stays_ahead_when_the_rover_circles_it() -> None:
     distance_m, turn_rad = 7.0, np.radians(10.0)
     command = DriveCommand(left_m=-distance_m * turn_rad, turn_left_rad=turn_rad)
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
-    end = drive(MER, Plane(), PERFECT, start, command, _rng()).end
+    end = drive(MER, Plane(), NO_SLIP_SOIL, start, command, _rng()).end
     target = end.world_from_rover.inv().apply(np.array([distance_m, 0.0, 0.0]))
     assert target == pytest.approx([distance_m, 0.0, 0.0], abs=1e-7)
     # A left turn around the target moves the rover right of its initial heading.
@@ -70,7 +70,7 @@ def test_slip_of_one_half_halves_the_distance() -> None:
     assert slip == pytest.approx(0.5, abs=0.01)
     ground = uphill_east(15.0)
     start = settle(MER, ground, 0.0, 0.0, EAST)
-    result = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=2.0), _rng())
+    result = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=2.0), _rng())
     distance_m = np.linalg.norm(result.end.world_from_rover.translation - start.world_from_rover.translation)
     assert distance_m == pytest.approx(2.0 * (1.0 - slip), rel=1e-9)
     assert result.slip == pytest.approx(slip, rel=1e-9)
@@ -80,13 +80,13 @@ def test_slip_of_one_half_halves_the_distance() -> None:
 def test_uphill_slip_increases_to_one(slope_deg: float, slip: float) -> None:
     ground = uphill_east(slope_deg)
     start = settle(MER, ground, 0.0, 0.0, EAST)
-    uphill = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.5), _rng())
+    uphill = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=0.5), _rng())
     assert uphill.slip == pytest.approx(slip, abs=0.005)
-    # Reverse driving uphill has the same slip; downhill the rover moves farther.
+    # Reverse driving uphill has the same slip. Downhill the rover moves farther than commanded.
     facing_downhill = settle(MER, ground, 0.0, 0.0, -EAST)
-    reverse = drive(MER, ground, Soil(STEADY, 1.0), facing_downhill, DriveCommand(forward_m=-0.5), _rng())
+    reverse = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), facing_downhill, DriveCommand(forward_m=-0.5), _rng())
     assert reverse.slip == pytest.approx(uphill.slip, abs=1e-9)
-    downhill = drive(MER, ground, Soil(STEADY, 1.0), facing_downhill, DriveCommand(forward_m=0.5), _rng())
+    downhill = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), facing_downhill, DriveCommand(forward_m=0.5), _rng())
     assert downhill.slip == pytest.approx(0.01 - 0.3 * (uphill.slip - 0.01), abs=1e-9)
 
 
@@ -94,38 +94,38 @@ def test_uphill_slip_increases_to_one(slope_deg: float, slip: float) -> None:
 def test_rover_slides_downhill_across_a_slope(azimuth_rad: float) -> None:
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, azimuth_rad)
-    result = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=1.0), _rng())
+    result = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=1.0), _rng())
     motion_m = result.end.world_from_rover.translation - start.world_from_rover.translation
-    sideways = 0.5 * (STEADY.slip_fraction(np.radians(10.0)) - STEADY.flat)
+    lateral_slip_m = 0.5 * (NO_RANDOM_SLIP.slip_fraction(np.radians(10.0)) - NO_RANDOM_SLIP.flat)
     # The ground falls to the west.
-    assert motion_m[0] == pytest.approx(-sideways * np.cos(np.radians(10.0)), abs=1e-9)
-    assert result.slip == pytest.approx(STEADY.flat, abs=1e-9)
+    assert motion_m[0] == pytest.approx(-lateral_slip_m * np.cos(np.radians(10.0)), abs=1e-9)
+    assert result.slip == pytest.approx(NO_RANDOM_SLIP.flat, abs=1e-9)
 
 
 def test_slip_reduces_the_turn_angle() -> None:
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
-    result = drive(MER, Plane(), Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _rng())
+    result = drive(MER, Plane(), Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _rng())
     assert np.degrees(start.azimuth_rad - result.end.azimuth_rad) == pytest.approx(40.0 * 0.97)
     assert np.isnan(result.slip)
     steep = uphill_east(15.0)
     start = settle(MER, steep, 0.0, 0.0, EAST)
-    result = drive(MER, steep, Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _rng())
+    result = drive(MER, steep, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _rng())
     assert 1.0 - result.turn_left_rad / np.radians(10.0) == pytest.approx(
-        0.03 + 0.5 * (STEADY.slip_fraction(np.radians(15.0)) - 0.01), rel=1e-6
+        0.03 + 0.5 * (NO_RANDOM_SLIP.slip_fraction(np.radians(15.0)) - 0.01), rel=1e-6
     )
 
 
 def test_soil_step_and_heading_errors_have_the_specified_deviation() -> None:
     parameters = SlipParameters(soil_spread=0.3, step_spread=0.0, wander_deg_m=0.0)
     factors = np.log([Soil.draw(parameters, np.random.default_rng(n)).factor for n in range(400)])
-    # 400 draws determine the deviation of 0.3 to 0.3 / sqrt(800); the tolerance is four times that.
+    # The standard error of the deviation 0.3 from 400 draws is 0.3 / sqrt(800); the tolerance is four times that.
     assert np.std(factors) == pytest.approx(0.3, abs=0.042)
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, EAST)
-    slippery = drive(MER, ground, Soil(STEADY, 1.5), start, DriveCommand(forward_m=0.3), _rng())
-    nominal = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.3), _rng())
+    slippery = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.5), start, DriveCommand(forward_m=0.3), _rng())
+    nominal = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=0.3), _rng())
     assert slippery.slip == pytest.approx(1.5 * nominal.slip, rel=1e-9)
-    # 120 draws determine each deviation to a fraction of 1 / sqrt(240); the tolerance is four times that.
+    # The relative standard error of a deviation from 120 draws is 1 / sqrt(240); the tolerance is four times that.
     rng = np.random.default_rng(1)
     random_steps = Soil(SlipParameters(soil_spread=0.0, step_spread=0.2, wander_deg_m=0.0), 1.0)
     slips = [drive(MER, ground, random_steps, start, DriveCommand(forward_m=0.1), rng).slip for _ in range(120)]

@@ -17,7 +17,7 @@ def make_flight(**changes: object) -> HelicopterFlight:
 
 @pytest.mark.parametrize("turns", [False, True])
 def test_velocity_rate_and_force_are_derivatives(turns: bool) -> None:
-    """Central differences over 0.4 ms: the truncation for the vibration of 13 Hz is below 1e-6 m/s."""
+    """The truncation error of central differences over 0.4 ms is below 1e-6 m/s for the vibration of 13 Hz."""
     flight, step = make_flight(turns_with_flight=turns), 2e-4
     times = np.linspace(-40.0, 2440.0, 400)
     before, motion, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
@@ -33,12 +33,12 @@ def test_velocity_rate_and_force_are_derivatives(turns: bool) -> None:
 
 def test_heights_speed_and_tilt_match_the_paper() -> None:
     flight = make_flight()
-    times = np.concatenate([np.arange(p.start_s, p.end_s, 0.1) for p in flight.passes])
+    times = np.concatenate([np.arange(leg.start_s, leg.end_s, 0.1) for leg in flight.passes])
     motion = flight.motion(times)
     heights = motion.positions_m[:, 2] - ORIGIN[2]
     assert abs(heights.min() - 1000.0) < 1.0
     assert abs(heights.max() - 2000.0) < 1.0
-    assert np.all(np.abs(motion.velocities_m_s[:, 2] - 1.0) < 0.03)  # "1 to 2 m/s", and vibration
+    assert np.all(np.abs(motion.velocities_m_s[:, 2] - 1.0) < 0.03)  # climb rate (paper: "1 to 2 m/s") plus vibration
     speed = np.hypot(*motion.velocities_m_s[:, :2].T)
     assert abs(speed.mean() - 30.0) < 0.5
     tilt = np.degrees(np.arccos(motion.attitudes.as_matrix()[:, 2, 2]))
@@ -48,11 +48,11 @@ def test_heights_speed_and_tilt_match_the_paper() -> None:
 
 def test_passes_alternate_along_one_line() -> None:
     flight = make_flight()
-    course = np.array([np.sin(np.radians(70.0)), np.cos(np.radians(70.0))])
+    course_axis = np.array([np.sin(np.radians(70.0)), np.cos(np.radians(70.0))])
     for flight_pass in flight.passes:
         middle = flight.state(0.5 * (flight_pass.start_s + flight_pass.end_s))
-        assert np.sign(middle.velocity_m_s[:2] @ course) == flight_pass.direction == (-1) ** flight_pass.number
-        cross_track_m = (middle.position_m - ORIGIN)[:2] @ np.array([-course[1], course[0]])
+        assert np.sign(middle.velocity_m_s[:2] @ course_axis) == flight_pass.direction == (-1) ** flight_pass.number
+        cross_track_m = (middle.position_m - ORIGIN)[:2] @ np.array([-course_axis[1], course_axis[0]])
         assert abs(cross_track_m) < 40.0  # 5 times the RMS of the wander
 
 

@@ -13,8 +13,7 @@ from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.dynamics.recorded import COLUMNS, RecordedMotion, TrajectoryFileError, read_poses
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
-#: The start of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012): its first two poses, repeated after one
-#: second.
+#: The first two poses of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012), repeated after one second.
 TUM = """# ground truth trajectory
 # file: 'rgbd_dataset_freiburg1_xyz.bag'
 # timestamp tx ty tz qx qy qz qw
@@ -48,21 +47,21 @@ def test_tum_file_is_read(tmp_path: Path) -> None:
     poses = read_poses(write_poses(tmp_path, TUM))
     assert poses.times_s[0] == 1305031098.6659
     assert np.allclose(poses.positions_m[1], [1.3543, 0.6306, 1.6360])
-    # Stored with four digits, then normalised.
+    # The file has four digits; the reader normalises the quaternions.
     assert np.allclose(poses.quaternions[0], [0.6132, 0.5962, -0.3311, -0.3986], atol=1e-4)
     assert np.allclose(np.linalg.norm(poses.quaternions, axis=1), 1.0)
 
 
 def test_euroc_ground_truth_is_read(tmp_path: Path) -> None:
     poses = read_poses(write_poses(tmp_path, EUROC, "data.csv"))
-    # Scalar first in the file, last in Marsyard. Nanoseconds become seconds without loss of the 5 ms steps.
+    # The scalar is first in the file and last in Marsyard. The conversion of nanoseconds preserves the steps of 5 ms.
     assert np.allclose(poses.quaternions[0], [-0.153029, -0.827383, -0.082152, 0.534108], atol=1e-5)
     assert np.allclose(np.diff(poses.times_s), 0.005, atol=1e-6)
     motion = RecordedMotion(
         poses.times_s - poses.times_s[0], poses.positions_m, Rotation.from_quat(poses.quaternions), 9.81
     )
     middle = motion.motion(motion.times_s[1:3])
-    # The velocities of the file are estimated together with the positions.
+    # The tolerance is wide, because the file contains estimated velocities, not derivatives of its positions.
     assert np.allclose(middle.velocities_m_s, [[-0.0293, 0.0340, 0.8048], [-0.0300, 0.0350, 0.8082]], atol=2e-3)
 
 
@@ -108,20 +107,20 @@ def test_splines_converge_to_closed_form_motion() -> None:
         assert fine[name] < coarse[name] / 2 ** (order - 0.5), name
     assert fine["position"] < 1e-5
     assert fine["rate"] < 1e-4
-    # Fourth derivative of the sway, 5 m x 1.5^4 rad^4/s^4, times h^2 / 12.
+    # The error of the curvature is the fourth derivative of the sway, 5 m x 1.5^4 rad^4/s^4, times h^2 / 12.
     assert fine["force"] < 2.0 * 5.0 * 1.5**4 * 0.05**2 / 12.0 + 1e-3
 
 
 def test_rates_and_forces_are_spline_derivatives() -> None:
-    """Inertial readings agree with the poses, including recorded noise."""
+    """Rates and forces are consistent with the poses, also if the poses are noisy."""
     rng = np.random.default_rng(3)
     knots_s = np.arange(0.0, 3.0, 0.1)
-    noisy = (
+    noisy_attitudes = (
         Rotation.from_rotvec(0.02 * rng.standard_normal((knots_s.size, 3)))
         * _make_swaying_motion().motion(knots_s).attitudes
     )
     positions = _make_swaying_motion().motion(knots_s).positions_m + 0.1 * rng.standard_normal((knots_s.size, 3))
-    motion, times_s, h = RecordedMotion(knots_s, positions, noisy, GRAVITY), np.linspace(0.5, 2.5, 57), 1e-5
+    motion, times_s, h = RecordedMotion(knots_s, positions, noisy_attitudes, GRAVITY), np.linspace(0.5, 2.5, 57), 1e-5
     before, centre, after = motion.motion(times_s - h), motion.motion(times_s), motion.motion(times_s + h)
     assert np.allclose((after.positions_m - before.positions_m) / (2 * h), centre.velocities_m_s, atol=1e-4)
     acceleration = (after.velocities_m_s - before.velocities_m_s) / (2 * h)
@@ -131,8 +130,8 @@ def test_rates_and_forces_are_spline_derivatives() -> None:
         rtol=1e-4,
         atol=1e-2,
     )
-    rotated = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2 * h)
-    assert np.allclose(rotated, centre.body_rates_rad_s, atol=1e-4)
+    body_rates = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2 * h)
+    assert np.allclose(body_rates, centre.body_rates_rad_s, atol=1e-4)
 
 
 def test_pandas_tables_are_read(tmp_path: Path) -> None:
@@ -144,9 +143,9 @@ def test_pandas_tables_are_read(tmp_path: Path) -> None:
     for name in ("poses.csv", "poses.parquet"):
         poses = read_poses(tmp_path / name)
         assert np.allclose(poses.positions_m, truth.positions_m, rtol=0, atol=1e-9)
-        rotated = Rotation.from_quat(poses.quaternions).inv() * truth.attitudes
-        assert rotated.magnitude().max() < 1e-9
-    # Equal files have equal hashes; a changed file has another hash.
+        difference = Rotation.from_quat(poses.quaternions).inv() * truth.attitudes
+        assert difference.magnitude().max() < 1e-9
+    # A file is read once; another file has another hash.
     assert read_poses(tmp_path / "poses.csv") is read_poses(tmp_path / "poses.csv")
     assert read_poses(tmp_path / "poses.csv").sha256 != read_poses(tmp_path / "poses.parquet").sha256
 
@@ -171,9 +170,9 @@ def _write_faulty_poses(tmp_path: Path, **changes: float) -> Path:
     ],
 )
 def test_invalid_poses_are_reported(tmp_path: Path, changes: dict[str, float], fault: str) -> None:
-    with pytest.raises(TrajectoryFileError, match=fault) as raised:
+    with pytest.raises(TrajectoryFileError, match=fault) as error_info:
         read_poses(_write_faulty_poses(tmp_path, **changes))
-    assert "faulty.csv" in str(raised.value)
+    assert "faulty.csv" in str(error_info.value)
 
 
 @pytest.mark.parametrize(

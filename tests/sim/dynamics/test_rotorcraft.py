@@ -24,10 +24,13 @@ from marsyard.sim.dynamics.rotorcraft import (
     simulate_transit,
 )
 
+#: Gravity, m/s2; course and heading of the transit, rad.
 GRAVITY, COURSE, HEADING = 9.8, 0.3, 1.0
-ABOVE_SITE, SITE = np.array([100.0, 50.0, 12.0]), np.array([103.0, 52.0])
+#: Point that the transit passes over, and the horizontal position of the landing site; world axes, m.
+TRANSIT_POINT, SITE_XY = np.array([100.0, 50.0, 12.0]), np.array([103.0, 52.0])
 CRAFT, TRANSIT, GUIDANCE = RotorcraftParameters(), TransitParameters(), LandingGuidance()
 CALM: dict[str, Any] = {"east_m_s": 0.0, "north_m_s": 0.0, "gust_m_s": 0.0, "vertical_gust_m_s": 0.0}
+#: A craft without vibration.
 SMOOTH = RotorcraftParameters(vibration=VibrationParameters(acceleration_m_s2=0.0, angle_deg=0.0))
 
 
@@ -37,7 +40,7 @@ def _make_air(seed: int, **changes: float) -> Air:
 
 
 def _fly_transit(air: Air, craft: RotorcraftParameters = CRAFT) -> RotorcraftFlight:
-    return simulate_transit(craft, TRANSIT, ABOVE_SITE, COURSE, HEADING, GRAVITY, air, np.random.default_rng(5))
+    return simulate_transit(craft, TRANSIT, TRANSIT_POINT, COURSE, HEADING, GRAVITY, air, np.random.default_rng(5))
 
 
 def _fly_landing(
@@ -50,12 +53,13 @@ def _fly_landing(
 ) -> RotorcraftFlight:
     air = _make_air(seed, **wind)
     flight = _fly_transit(air, craft)
+    # Navigation errors in nine columns; the first one is the east position.
     errors = np.zeros((len(flight.path.rows), 9))
     errors[:, 0] = east_error_m
     heights = 2.0 + slope * np.tile(0.5 * np.arange(101.0) - 25.0, (101, 1))
-    ground = GroundPatch(SITE - 25.0, 0.5, heights)
+    ground = GroundPatch(SITE_XY - 25.0, 0.5, heights)
     laser = AltimeterErrors(1.0, np.zeros(len(air.gusts_m_s)), stuck_m)
-    return simulate_landing(flight, GUIDANCE, SITE, errors, air, ground, laser)
+    return simulate_landing(flight, GUIDANCE, SITE_XY, errors, air, ground, laser)
 
 
 def test_air_shorter_than_the_flight_is_rejected() -> None:
@@ -93,8 +97,8 @@ def test_specific_force_is_rotor_thrust_plus_drag() -> None:
     flight = _fly_transit(_make_air(0, **CALM), SMOOTH).path
     motion = flight.motion(flight.knots_s[1:])
     drag = motion.attitudes.inv().apply(-motion.velocities_m_s / SMOOTH.drag_s)
-    # Thrust angles are predicted one step h ahead. A command jump of 1 m/s2 changes them by (omega h)^2 / (6 g) = 2e-4
-    # rad.
+    # Thrust angles are predicted one step h ahead. A command jump of 1 m/s2 causes a prediction error of
+    # (omega h)^2 / (6 g) = 2e-4 rad.
     np.testing.assert_allclose(motion.specific_forces_m_s2[:, :2], drag[:, :2], atol=3e-3)
 
 
@@ -103,7 +107,7 @@ def test_pitch_balances_drag_and_wind() -> None:
     for wind in (0.0, -3.0):
         air = CALM | {"east_m_s": wind * np.cos(COURSE), "north_m_s": wind * np.sin(COURSE)}
         flight = simulate_transit(
-            SMOOTH, TRANSIT, ABOVE_SITE, COURSE, COURSE, GRAVITY, _make_air(0, **air), np.random.default_rng(0)
+            SMOOTH, TRANSIT, TRANSIT_POINT, COURSE, COURSE, GRAVITY, _make_air(0, **air), np.random.default_rng(0)
         ).path
         attitude = flight.state(TRANSIT.pictures_s).attitude.as_euler("ZYX")
         speed = float(flight.state(TRANSIT.pictures_s).velocity_m_s[:2] @ [np.cos(COURSE), np.sin(COURSE)])
@@ -113,19 +117,19 @@ def test_pitch_balances_drag_and_wind() -> None:
 
 
 def test_transit_has_constant_height_and_course() -> None:
-    """Forty images in five seconds at 1 m/s: 5 m along the course at constant height except for gusts."""
-    ends, heights, tilts = [], [], []
+    """Forty images in five seconds at 1 m/s cover 5 m along the course. Only gusts change the height."""
+    displacements, height_ranges, attitude_deviations_deg = [], [], []
     for seed in range(20):
         motion = _fly_transit(_make_air(seed)).path.motion(np.linspace(0.0, TRANSIT.pictures_s, TRANSIT.pictures))
-        ends.append(motion.positions_m[-1] - motion.positions_m[0])
-        heights.append(np.ptp(motion.positions_m[:, 2]))
-        tilts.append(motion.attitudes.as_euler("ZYX", degrees=True).std(axis=0))
-    mean_path = np.mean(ends, axis=0)
-    assert np.hypot(*mean_path[:2]) == pytest.approx(5.0, abs=0.3)
-    assert np.arctan2(mean_path[1], mean_path[0]) == pytest.approx(COURSE, abs=0.1)
-    assert max(heights) < 0.3
+        displacements.append(motion.positions_m[-1] - motion.positions_m[0])
+        height_ranges.append(np.ptp(motion.positions_m[:, 2]))
+        attitude_deviations_deg.append(motion.attitudes.as_euler("ZYX", degrees=True).std(axis=0))
+    mean_displacement = np.mean(displacements, axis=0)
+    assert np.hypot(*mean_displacement[:2]) == pytest.approx(5.0, abs=0.3)
+    assert np.arctan2(mean_displacement[1], mean_displacement[0]) == pytest.approx(COURSE, abs=0.1)
+    assert max(height_ranges) < 0.3
     # Gusts change the attitude by about a degree; the paper's limit for tracking is 10 deg.
-    assert 0.2 < np.mean(tilts) < 2.0
+    assert 0.2 < np.mean(attitude_deviations_deg) < 2.0
 
 
 def test_vibration_has_the_specified_frequency() -> None:
@@ -134,7 +138,7 @@ def test_vibration_has_the_specified_frequency() -> None:
     motions = [flight.motion(times) for flight in (vibrating, without_vibration)]
     specific_force = [motion.attitudes.apply(motion.specific_forces_m_s2) for motion in motions]
     spectrum = np.abs(np.fft.rfft(specific_force[0] - specific_force[1], axis=0)) * 2.0 / times.size
-    assert np.all(np.argmax(spectrum, axis=0) == 110)  # 5 s resolve 0.2 Hz
+    assert np.all(np.argmax(spectrum, axis=0) == 110)  # 22 Hz: 5 s resolve 0.2 Hz
     np.testing.assert_allclose(spectrum[110], 1.5, rtol=1e-3)
     angles_deg = motions[0].attitudes.as_euler("ZYX", degrees=True) - motions[1].attitudes.as_euler("ZYX", degrees=True)
     np.testing.assert_allclose(angles_deg.std(axis=0), 0.03 / np.sqrt(2.0), rtol=1e-3)
@@ -142,17 +146,17 @@ def test_vibration_has_the_specified_frequency() -> None:
 
 def test_calm_air_landing_error_equals_navigation_error() -> None:
     exact = _touchdown_position(_fly_landing(**CALM))
-    np.testing.assert_allclose(exact[:2], SITE, atol=0.02)
+    np.testing.assert_allclose(exact[:2], SITE_XY, atol=0.02)
     with_error = _touchdown_position(_fly_landing(east_error_m=0.7, **CALM))
-    np.testing.assert_allclose(with_error[:2], SITE - [0.7, 0.0], atol=0.02)
+    np.testing.assert_allclose(with_error[:2], SITE_XY - [0.7, 0.0], atol=0.02)
 
 
 def test_touchdown_error_is_proportional_to_gusts() -> None:
     def rms_error(gust_m_s: float) -> float:
-        errors = [_touchdown_position(_fly_landing(seed, gust_m_s=gust_m_s))[:2] - SITE for seed in range(25)]
+        errors = [_touchdown_position(_fly_landing(seed, gust_m_s=gust_m_s))[:2] - SITE_XY for seed in range(25)]
         return float(np.sqrt(np.mean(np.square(errors))))
 
-    # Without saturation, doubled gusts double the errors; 50 values determine an rms to 10 %.
+    # Without saturation, doubled gusts double the errors. The standard error of an RMS of 50 values is 10 %.
     assert rms_error(0.8) / rms_error(0.4) == pytest.approx(2.0, rel=0.2)
 
 
@@ -161,12 +165,14 @@ def test_phases_start_at_the_heights_of_the_paper() -> None:
     state = {phase: flight.path.state(time) for phase in Phase if (time := flight.phase_start_s(phase)) is not None}
     assert list(state) == list(Phase)
     assert state[Phase.APPROACH].time_s - TRANSIT.pictures_s == pytest.approx(GUIDANCE.wait_s, abs=0.05)
-    # Commands use the state 0.1 s earlier: 0.2 m at 2 m/s, 0.07 m at the descent's 0.7 m/s.
-    assert np.hypot(*(state[Phase.DESCENT].position_m[:2] - SITE)) == pytest.approx(2.0, abs=0.25)
+    # Commands use the state 0.1 s earlier. This is 0.2 m at 2 m/s, and 0.07 m at the descent rate of 0.7 m/s.
+    assert np.hypot(*(state[Phase.DESCENT].position_m[:2] - SITE_XY)) == pytest.approx(2.0, abs=0.25)
     flare_start = state[Phase.FLARE].position_m
-    assert flare_start[2] - 2.0 - 0.1 * (flare_start[0] - SITE[0]) == pytest.approx(1.5, abs=0.1)
+    assert flare_start[2] - 2.0 - 0.1 * (flare_start[0] - SITE_XY[0]) == pytest.approx(1.5, abs=0.1)
     landed = state[Phase.ON_GROUND]
-    assert landed.position_m[2] - 2.0 - 0.1 * (landed.position_m[0] - SITE[0]) == pytest.approx(CRAFT.gear_m, abs=0.01)
+    assert landed.position_m[2] - 2.0 - 0.1 * (landed.position_m[0] - SITE_XY[0]) == pytest.approx(
+        CRAFT.gear_m, abs=0.01
+    )
     assert landed.velocity_m_s[2] == pytest.approx(-GUIDANCE.flare_m_s, abs=0.05)
     at_rest = flight.path.state(flight.path.span_s[1])
     np.testing.assert_allclose(at_rest.velocity_m_s, 0.0, atol=1e-9)

@@ -48,7 +48,7 @@ def test_slope_causes_pitch_if_heading_uphill_and_roll_if_heading_across() -> No
 
 
 def test_chassis_pitch_is_the_mean_of_the_rocker_angles() -> None:
-    # The left front wheel is on a block of 10 cm: its rocker and bogie rotate, those of the other side rotate in the
+    # The left front wheel is on a block of 10 cm. Its rocker rotates, and the rocker of the other side rotates in the
     # opposite direction. For a heading to the east, the left front wheel is at (0.705, 0.53).
     block_m = 0.10
     one_block = settle(MER, Mounds(((0.705, 0.53, block_m),)), 0.0, 0.0, EAST)
@@ -64,14 +64,14 @@ def test_chassis_pitch_is_the_mean_of_the_rocker_angles() -> None:
 
 
 def test_block_under_the_middle_wheel_rotates_the_bogie() -> None:
-    # The middle wheel rises by h: the bogie pivot rises by h times its distance from the rear wheel / wheelbase.
+    # The bogie pivot rises by the height of the block times its distance from the rear wheel / bogie wheelbase.
     block_m = 0.06
     stance = settle(MER, Mounds(((0.0, 0.61, block_m), (0.0, -0.61, block_m))), 0.0, 0.0, EAST)
     pivot_rise_m = block_m * (MER.rear_m + MER.bogie_pivot_x_m) / MER.rear_m
-    nose_down = pivot_rise_m / (MER.front_m - MER.bogie_pivot_x_m)
-    assert stance.pitch_rad == pytest.approx(-nose_down, rel=0.05)
+    nose_down_rad = pivot_rise_m / (MER.front_m - MER.bogie_pivot_x_m)
+    assert stance.pitch_rad == pytest.approx(-nose_down_rad, rel=0.05)
     assert stance.bogies_rad[0] == pytest.approx(stance.bogies_rad[1])
-    assert stance.bogies_rad[0] == pytest.approx(-block_m / MER.rear_m - nose_down, rel=0.05)
+    assert stance.bogies_rad[0] == pytest.approx(-block_m / MER.rear_m - nose_down_rad, rel=0.05)
 
 
 def test_all_wheels_touch_rough_ground() -> None:
@@ -84,7 +84,7 @@ def test_all_wheels_touch_rough_ground() -> None:
         east, north = rng.uniform(0.0, 25.0, 2).tolist()
         stance = settle(MER, surface, east, north, float(rng.uniform(-3.0, 3.0)))
         assert np.abs(stance.gaps_m).max() < 1e-6
-        # No point below the wheel centre is deeper than the rim.
+        # The ground below each wheel centre is not above the rim.
         centres = stance.world_from_rover.apply(compute_wheel_centres(MER, stance.differential_rad, stance.bogies_rad))
         clearance = centres[:, 2] - surface.height(centres[:, 0], centres[:, 1])
         assert np.all(clearance > 0.9 * MER.wheel_radius_m)
@@ -110,7 +110,7 @@ def test_rocks_raise_the_ground() -> None:
 
 
 def test_block_gives_the_same_stance_as_a_mound_of_equal_height() -> None:
-    # Equal to a mound of the same height with a top wide enough for a wheel.
+    # The tops of block and mound are wider than the wheel's contact.
     height_m = 0.10
     ground = RockyGround.of(Plane(), _make_block(0.705, 0.53, height_m), (0.0, 0.0), 1.5)
     stance = settle(MER, ground, 0.0, 0.0, EAST)

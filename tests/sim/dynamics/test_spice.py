@@ -1,4 +1,4 @@
-"""Tests of flights read from SPICE kernels. The kernels of a closed-form motion are written by NAIF's library."""
+"""Tests of flights read from SPICE kernels, which NAIF's library writes for a closed-form motion."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics.recorded import TrajectoryFileError, read_poses
 
+#: NAIF identifiers of bodies and of frames.
 LANDER, SITE, MARS = -999, 399999, 499
 CAMERA_FRAME, SITE_FRAME = -999001, 1499901
-BEGIN, STEP_S, COUNT = "2030-01-01T00:00:00", 0.5, 81
+BEGIN, STEP_S, N_POSES = "2030-01-01T00:00:00", 0.5, 81
 
 LEAPSECONDS = """KPL/LSK
 \\begindata
@@ -70,8 +71,8 @@ step_s = {STEP_S}
 """
 
 
-def closed_form_flight(times_s: np.ndarray) -> tuple[np.ndarray, Rotation]:
-    """Return a descent in site axes, m, and the camera attitude in them."""
+def compute_flight(times_s: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    """Compute positions in site axes, m, shape (n, 3), and the rotations from camera to site axes of a descent."""
     east, north = 20.0 * times_s, -5.0 * times_s + 0.1 * times_s**2
     positions = np.stack([east, north, 2000.0 - 75.0 * times_s + 0.2 * times_s**2], axis=-1)
     rotation = Rotation.from_rotvec(np.array([0.3, 0.0, 0.0])) * Rotation.from_rotvec(
@@ -89,10 +90,11 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "flight.spice.toml").write_text(FLIGHT_FILE)
     with spiceypy.KernelPool([str(folder / name) for name in ("leap.tls", "lander.tsc", "site.tf")]):
         begin = spiceypy.str2et(BEGIN)
-        times = STEP_S * np.arange(-4, COUNT + 4)
-        positions, attitudes = closed_form_flight(times)
+        times = STEP_S * np.arange(-4, N_POSES + 4)
+        positions, attitudes = compute_flight(times)
         rotation = spiceypy.pxform("SITE_ENU", "J2000", begin)
         velocities = np.gradient(positions, times, axis=0)
+        # SPICE uses km and km/s.
         states = 1e-3 * np.concatenate([positions @ rotation.T, velocities @ rotation.T], axis=1)
         spk = spiceypy.spkopn(str(folder / "lander.bsp"), "descent", 0)
         span = (begin + times[0], begin + times[-1])
@@ -113,9 +115,9 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_kernels_reproduce_the_flight(kernels: Path) -> None:
     poses = read_poses(kernels / "flight.spice.toml")
-    assert poses.times_s.size == COUNT
-    np.testing.assert_allclose(poses.times_s, STEP_S * np.arange(COUNT))
-    positions, attitudes = closed_form_flight(poses.times_s)
+    assert poses.times_s.size == N_POSES
+    np.testing.assert_allclose(poses.times_s, STEP_S * np.arange(N_POSES))
+    positions, attitudes = compute_flight(poses.times_s)
     np.testing.assert_allclose(poses.positions_m, positions, atol=1e-6)
     assert (attitudes.inv() * Rotation.from_quat(poses.quaternions)).magnitude().max() < 1e-8
 
@@ -157,6 +159,6 @@ def test_kernel_errors_are_reported(kernels: Path, tmp_path: Path, old: str, new
     shutil.copytree(kernels, copy)
     path = copy / "flight.spice.toml"
     path.write_text(FLIGHT_FILE.replace(old, new))
-    with pytest.raises(TrajectoryFileError, match=f"flight.spice.toml: .*{message}") as caught:
+    with pytest.raises(TrajectoryFileError, match=f"flight.spice.toml: .*{message}") as error_info:
         read_poses(path)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error_info.value)

@@ -17,11 +17,12 @@ START = np.array([100.0, -50.0, 2100.0])
 GROUND_M = 100.0
 GRAVITY = 3.72
 UP = np.array([0.0, 0.0, 1.0])
-FIVE_POINTS = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
+#: Weights of the first derivative from five equidistant values.
+FIVE_POINT_DERIVATIVE = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0
 #: No gusts and no damping.
 UNDISTURBED = {"gust_intensity_m_s": 0.0, "cone_damping_ratio": 0.0, "nod_damping_ratio": 0.0}
-HANGING = UNDISTURBED | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
-WILD = {
+VERTICAL_FALL = UNDISTURBED | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
+LARGE_MOTION = {
     "wind_east_m_s": 20.0,
     "wind_north_m_s": -8.0,
     "gust_intensity_m_s": 3.0,
@@ -53,30 +54,35 @@ def _make_calm_wind() -> WindField:
 
 
 def _body_states(y: np.ndarray, chain: Chain, p: SwingParameters) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """Mass, position and velocity of the centres of mass of canopy, backshell and lander."""
+    """Return (mass, position, velocity) of the centres of mass of canopy, backshell and lander.
+
+    State `y` (22 components, see `kernels.swing`): r, v of the canopy; n, dn of the line; e, de of the lander's axis.
+    """
     r, v, n, dn, e, de = y[:18].reshape(6, 3)
-    at = p.line_length_m - p.bridle_length_m
+    backshell_m = p.line_length_m - p.bridle_length_m
     return [
         (p.canopy_mass_kg, r, v),
-        (p.backshell_mass_kg, r + at * n, v + at * dn),
+        (p.backshell_mass_kg, r + backshell_m * n, v + backshell_m * dn),
         (p.lander_mass_kg, r + chain.line_m * n + p.mass_centre_m * e, v + chain.line_m * dn + p.mass_centre_m * de),
     ]
 
 
 def _energy(y: np.ndarray, chain: Chain, p: SwingParameters) -> float:
+    """Compute kinetic plus potential energy, J. `y[21]` is the spin of the lander."""
     translational = sum(0.5 * m * v @ v + m * GRAVITY * r[2] for m, r, v in _body_states(y, chain, p))
     rotational = chain.transverse_inertia * y[15:18] @ y[15:18] + chain.axial_inertia * y[21] ** 2
     return float(translational + 0.5 * rotational)
 
 
 def _angular_momentum(y: np.ndarray, chain: Chain, p: SwingParameters) -> np.ndarray:
-    """Angular momentum about the world origin."""
+    """Compute the angular momentum about the world origin."""
     orbital = sum(m * np.cross(r, v) for m, r, v in _body_states(y, chain, p))
     e, de = y[12:15], y[15:18]
     return np.asarray(orbital + chain.transverse_inertia * np.cross(e, de) + chain.axial_inertia * y[21] * e)
 
 
 def _draw_state(rng: np.random.Generator) -> np.ndarray:
+    """Draw a state vector with random directions and rates of line and lander."""
     y = np.zeros(22)
     y[:6] = [10.0, 20.0, 1500.0, 15.0, -8.0, -70.0]
     for start, rate in ((6, 0.3), (12, 1.5)):
@@ -93,20 +99,20 @@ def _draw_state(rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(5))
 def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
     """The rates of energy, momentum and angular momentum equal the power, forces and torques of drag and friction."""
-    p = SwingParameters(**(WILD | {"nod_damping_ratio": 0.1}))
+    p = SwingParameters(**(LARGE_MOTION | {"nod_damping_ratio": 0.1}))
     chain = build_chain(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
     y, wind = _draw_state(np.random.default_rng(seed)), _make_calm_wind()
     rates, force = compute_derivatives(y, chain, wind), compute_aerodynamic_force(y, chain, wind)
     n, dn, e, de = y[6:18].reshape(4, 3)
-    spinning = np.cross(e, de) + y[21] * e
-    slip = spinning - (spinning @ n) * n - np.cross(n, dn)
+    lander_rate = np.cross(e, de) + y[21] * e
+    hinge_rate = lander_rate - (lander_rate @ n) * n - np.cross(n, dn)
     h = 1e-5
     power = (_energy(y + h * rates, chain, p) - _energy(y - h * rates, chain, p)) / (2.0 * h)
     # Tolerance: the energy of 1e7 J is rounded to 1e-9 J, and the difference is divided by 2e-5 s.
-    assert power == pytest.approx(force @ y[3:6] - chain.hinge_damping * slip @ slip, abs=1e-3)
+    assert power == pytest.approx(force @ y[3:6] - chain.hinge_damping * hinge_rate @ hinge_rate, abs=1e-3)
     torque = (_angular_momentum(y + h * rates, chain, p) - _angular_momentum(y - h * rates, chain, p)) / (2.0 * h)
-    weights = sum(np.cross(r, -m * GRAVITY * UP) for m, r, _ in _body_states(y, chain, p))
-    np.testing.assert_allclose(torque, np.cross(y[:3], force) + weights, atol=1e-2)
+    gravity_torque = sum(np.cross(r, -m * GRAVITY * UP) for m, r, _ in _body_states(y, chain, p))
+    np.testing.assert_allclose(torque, np.cross(y[:3], force) + gravity_torque, atol=1e-2)
     momentum_rate = sum(
         m * dv
         for (m, _, _), dv in zip(
@@ -117,13 +123,13 @@ def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
         )
     ) / (2.0 * h)
     np.testing.assert_allclose(momentum_rate, force - chain.mass_kg * GRAVITY * UP, atol=1e-4)
-    # The direction n of each link is a unit vector: n . n'' = -|n'|^2.
+    # The direction n of each link is a unit vector, so that n . n'' = -|n'|^2.
     assert rates[9:12] @ n == pytest.approx(-dn @ dn, abs=1e-12)
     assert rates[15:18] @ e == pytest.approx(-de @ de, abs=1e-12)
 
 
 def test_drag_and_friction_only_dissipate_energy() -> None:
-    p = SwingParameters(**WILD)
+    p = SwingParameters(**LARGE_MOTION)
     chain = build_chain(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -133,14 +139,15 @@ def test_drag_and_friction_only_dissipate_energy() -> None:
 
 
 def _build_linear_chain(p: SwingParameters) -> tuple[Chain, Modes]:
-    """A chain that falls at a constant rate, because the air density is constant."""
+    """Build a chain that falls at a constant rate, because the air density is constant."""
     constant_density = p.model_copy(update={"density_scale_height_m": 1e15})
     modes = Modes.of(constant_density, GRAVITY)
     return build_chain(constant_density, modes, GRAVITY, 2000.0), modes
 
 
 def _eigenvalues_by_matrices(p: SwingParameters, chain: Chain, modes: Modes) -> np.ndarray:
-    """Eigenvalues of the planar double pendulum below a canopy: canopy position x, tilts of line and lander."""
+    """Compute eigenvalues of the planar double pendulum: canopy position x, tilts of line and lander; their rates."""
+    # Symbols of `sim.dynamics.swing`: S, J, c, k the normal force per radian, `lander` the first moment of the lander.
     s, j, length = chain.first_moment, chain.second_moment, chain.line_m
     lander, k, speed, c = (
         p.lander_mass_kg * p.mass_centre_m,
@@ -164,7 +171,7 @@ def _eigenvalues_by_matrices(p: SwingParameters, chain: Chain, modes: Modes) -> 
 
 
 def _eigenvalues_by_differences(p: SwingParameters, chain: Chain) -> np.ndarray:
-    """Eigenvalues of the equations of motion in the east-up plane, linearised at the steady fall."""
+    """Compute eigenvalues of the equations of motion in the east-up plane, linearised at the steady fall."""
 
     def rates(q: np.ndarray) -> np.ndarray:
         x, line, lander, dx, dline, dlander = q
@@ -195,9 +202,9 @@ def test_small_swings_match_the_double_pendulum(ratio: float) -> None:
 def test_mode_frequencies_and_damping_match_linear_theory() -> None:
     p = SwingParameters(cone_angle_deg=0.0, cone_damping_ratio=0.02, nod_damping_ratio=0.05)
     chain, modes = _build_linear_chain(p)
-    swings = _eigenvalues_by_matrices(p, chain, modes)
-    cone, nod = sorted(swings[swings.imag > 0.0], key=abs)
-    # The coning formula assumes a lander fixed to the line; canopy drag damps nods by another 0.003.
+    eigenvalues = _eigenvalues_by_matrices(p, chain, modes)
+    cone, nod = sorted(eigenvalues[eigenvalues.imag > 0.0], key=abs)
+    # The coning formula assumes a lander fixed to the line. Canopy drag adds 0.003 to the damping ratio of nods.
     assert abs(cone) == pytest.approx(modes.cone_rad_s, rel=0.02)
     assert -cone.real / abs(cone) == pytest.approx(0.02, abs=0.003)
     assert abs(nod) == pytest.approx(modes.nod_rad_s, rel=0.01)
@@ -209,14 +216,14 @@ def test_mode_frequencies_and_damping_match_linear_theory() -> None:
 
 @pytest.mark.parametrize("changes", [{}, {"cone_minor_fraction": 0.0, "cone_phase_deg": 90.0}, {"cone_angle_deg": 0.0}])
 def test_velocity_rate_and_force_match_finite_differences(changes: dict[str, float]) -> None:
-    descent = _fly(**(WILD | changes))
+    descent = _fly(**(LARGE_MOTION | changes))
     h, times = 1e-3, np.linspace(-9.9, descent.span_s[1] - 0.1, 400)
     stencil = [descent.motion(times + k * h) for k in range(-2, 3)]
     middle = stencil[2]
-    velocity = np.tensordot(FIVE_POINTS, [m.positions_m for m in stencil], 1) / h
-    acceleration = np.tensordot(FIVE_POINTS, [m.velocities_m_s for m in stencil], 1) / h
+    velocity = np.tensordot(FIVE_POINT_DERIVATIVE, [m.positions_m for m in stencil], 1) / h
+    acceleration = np.tensordot(FIVE_POINT_DERIVATIVE, [m.velocities_m_s for m in stencil], 1) / h
     inverse = middle.attitudes.inv()
-    rate = np.tensordot(FIVE_POINTS, [(inverse * m.attitudes).as_rotvec() for m in stencil], 1) / h
+    rate = np.tensordot(FIVE_POINT_DERIVATIVE, [(inverse * m.attitudes).as_rotvec() for m in stencil], 1) / h
     # The dense output satisfies the equations to about 1e-6.
     np.testing.assert_allclose(velocity, middle.velocities_m_s, atol=1e-5)
     np.testing.assert_allclose(inverse.apply(acceleration + GRAVITY * UP), middle.specific_forces_m_s2, atol=1e-5)
@@ -224,15 +231,15 @@ def test_velocity_rate_and_force_match_finite_differences(changes: dict[str, flo
 
 
 def test_motion_is_continuous_at_the_first_image() -> None:
-    descent = _fly(**WILD)
+    descent = _fly(**LARGE_MOTION)
     np.testing.assert_allclose(descent.state(0.0).position_m, START, atol=1e-9)
-    around = descent.motion(np.array([-1e-9, 0.0]))
-    np.testing.assert_allclose(around.velocities_m_s[0], around.velocities_m_s[1], atol=1e-6)
-    np.testing.assert_allclose(around.specific_forces_m_s2[0], around.specific_forces_m_s2[1], atol=1e-6)
+    motion = descent.motion(np.array([-1e-9, 0.0]))
+    np.testing.assert_allclose(motion.velocities_m_s[0], motion.velocities_m_s[1], atol=1e-6)
+    np.testing.assert_allclose(motion.specific_forces_m_s2[0], motion.specific_forces_m_s2[1], atol=1e-6)
 
 
 def test_state_equals_a_row_of_motion() -> None:
-    descent = _fly(**WILD)
+    descent = _fly(**LARGE_MOTION)
     times = np.array([9.0, -3.0, 4.0])
     motion = descent.motion(times)
     for k, time in enumerate(times):
@@ -243,7 +250,7 @@ def test_state_equals_a_row_of_motion() -> None:
 
 
 def test_fall_follows_terminal_velocity() -> None:
-    descent = _fly(**HANGING, descent_rate_m_s=75.0, density_scale_height_m=10000.0)
+    descent = _fly(**VERTICAL_FALL, descent_rate_m_s=75.0, density_scale_height_m=10000.0)
     # Vertical fall: z'' = rho / rho_0 (g + V^2 / (2 H)) (z' / V)^2 - g.
     braking = GRAVITY + 75.0**2 / 20000.0
 
@@ -266,7 +273,7 @@ def test_fall_follows_terminal_velocity() -> None:
 
 
 def test_descent_drifts_with_the_mean_wind() -> None:
-    motion = _fly(**HANGING, wind_east_m_s=12.0, wind_north_m_s=-7.0).motion(np.linspace(-5.0, 15.0, 21))
+    motion = _fly(**VERTICAL_FALL, wind_east_m_s=12.0, wind_north_m_s=-7.0).motion(np.linspace(-5.0, 15.0, 21))
     np.testing.assert_allclose(motion.velocities_m_s[:, :2], np.tile([12.0, -7.0], (21, 1)), atol=1e-6)
 
 
@@ -274,7 +281,7 @@ def test_descent_drifts_with_the_mean_wind() -> None:
 def test_circular_cone_has_a_constant_angle(angle: float) -> None:
     descent = _fly(**(UNDISTURBED | {"cone_angle_deg": angle, "cone_minor_fraction": 1.0, "nod_rate_deg_s": 0.0}))
     assert _off_nadir_deg(descent, np.zeros(1))[0] == pytest.approx(angle, abs=1e-6)
-    # Wide cones deviate from the lander tilt of linear theory, which causes nods of one degree.
+    # For wide cones the lander tilt of linear theory is inaccurate. This causes nods of one degree.
     np.testing.assert_allclose(_off_nadir_deg(descent, np.linspace(-5.0, 7.5, 200)), angle, atol=0.04 * angle)
     rates = descent.motion(np.zeros(1)).body_rates_rad_s[0]
     modes = Modes.of(descent.parameters, GRAVITY)
@@ -309,7 +316,7 @@ def test_cone_starts_at_its_azimuth_with_its_sense_of_rotation(fraction: float) 
 
 @pytest.mark.parametrize("phase", [0.0, 45.0, 250.0])
 def test_max_rate_equals_the_specified_rate(phase: float) -> None:
-    parameters = HANGING | {"nod_rate_deg_s": 60.0, "nod_phase_deg": phase}
+    parameters = VERTICAL_FALL | {"nod_rate_deg_s": 60.0, "nod_phase_deg": phase}
     descent = _fly(**parameters)
     period = 2.0 * np.pi / Modes.of(descent.parameters, GRAVITY).nod_rad_s
     motion = descent.motion(np.linspace(-0.5, 0.5, 400) * period)
@@ -320,7 +327,7 @@ def test_max_rate_equals_the_specified_rate(phase: float) -> None:
 
 
 def test_heading_and_spin_are_clockwise() -> None:
-    descent = _fly(**HANGING, heading_deg=90.0, spin_rate_deg_s=5.0)
+    descent = _fly(**VERTICAL_FALL, heading_deg=90.0, spin_rate_deg_s=5.0)
     matrices = descent.motion(np.array([0.0, 3.0])).attitudes.as_matrix()
     np.testing.assert_allclose(matrices[0, :, 1], [1.0, 0.0, 0.0], atol=1e-12)
     azimuth = np.degrees(np.arctan2(matrices[1, 0, 1], matrices[1, 1, 1]))
@@ -328,7 +335,7 @@ def test_heading_and_spin_are_clockwise() -> None:
 
 
 def test_gusts_depend_on_generator_and_swing_the_line() -> None:
-    gusty = HANGING | {"gust_intensity_m_s": 3.0}
+    gusty = VERTICAL_FALL | {"gust_intensity_m_s": 3.0}
     first, repeated, other_seed = _fly(4, **gusty), _fly(4, **gusty), _fly(5, **gusty)
     times = np.linspace(-5.0, 20.0, 50)
     np.testing.assert_array_equal(first.motion(times).positions_m, repeated.motion(times).positions_m)
@@ -337,14 +344,14 @@ def test_gusts_depend_on_generator_and_swing_the_line() -> None:
 
 
 def test_thrusters_fire_at_their_height_before_the_end() -> None:
-    descent = _fly(**WILD)
+    descent = _fly(**LARGE_MOTION)
     assert descent.state(descent.thruster_firing_s).position_m[2] == pytest.approx(GROUND_M + 100.0, abs=1e-6)
     assert descent.span_s[1] > descent.thruster_firing_s + 1.0
     assert descent.state(descent.time_of_altitude(1400.0)).position_m[2] == pytest.approx(1500.0, abs=1e-6)
 
 
 def test_horizontal_velocities_match_the_paper() -> None:
-    """Up to 30 m/s at the images, including the swing (field test paper, III.C)."""
+    """Velocities including the swing are up to 30 m/s at the images (field test paper, III.C)."""
     speeds = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -361,7 +368,7 @@ def test_horizontal_velocities_match_the_paper() -> None:
 
 
 def test_error_messages_contain_the_allowed_values() -> None:
-    descent = _fly(**HANGING)
+    descent = _fly(**VERTICAL_FALL)
     with pytest.raises(ValueError, match=r"time -11 s is outside of the motion; allowed: -10 to 27\.\d+ s"):
         descent.state(-11.0)
     with pytest.raises(ValueError, match=r"altitude 5000 m is not passed; allowed: .* to 27\d\d"):
@@ -383,8 +390,8 @@ def test_error_messages_contain_the_allowed_values() -> None:
 
 
 def test_compiled_integrator_matches_scipy() -> None:
-    """Compare with SciPy's DOP853, within the rounding of sums."""
-    descent = _fly(**WILD)
+    """The result equals SciPy's DOP853 except for rounding."""
+    descent = _fly(**LARGE_MOTION)
     state = descent.path.at(np.zeros(1))[0]
     for end_s in (-9.0, 12.0):
         expected = solve_ivp(

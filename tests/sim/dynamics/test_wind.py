@@ -33,9 +33,10 @@ def test_wind_without_gusts_is_the_mean_wind() -> None:
 
 
 def _structure_function(spectrum: str, lag_m: float, length_m: float) -> float:
-    """Mean squared difference over a lag for unit variance, by quadrature of the band spectrum."""
+    """Compute the mean squared difference over a lag for unit variance, from the band-limited Dryden spectrum."""
 
     def density(k: float) -> float:
+        """Compute the spectral density at wavenumber k, rad/m, not normalised."""
         x2 = (length_m * k) ** 2
         return 2.0 / (1.0 + x2) if spectrum == "longitudinal" else (1.0 + 3.0 * x2) / (1.0 + x2) ** 2
 
@@ -47,18 +48,20 @@ def _structure_function(spectrum: str, lag_m: float, length_m: float) -> float:
 
 @pytest.mark.parametrize("lag_m", [50.0, 300.0])
 def test_gusts_have_dryden_spectra(lag_m: float) -> None:
-    draws = 3000
+    n_draws = 3000
     heights = GROUND_M + np.array([1000.0, 1000.0 + lag_m])
-    rows = np.stack([_make_wind(seed, gust_intensity_m_s=2.0).velocities(heights) for seed in range(draws)])
+    velocities_m_s = np.stack([_make_wind(seed, gust_intensity_m_s=2.0).velocities(heights) for seed in range(n_draws)])
     # The variance of n normal draws has a relative deviation of sqrt(2 / n) = 2.6 %; the tolerance is four times that.
-    band = 4.0 * np.sqrt(2.0 / draws)
-    np.testing.assert_allclose(rows[:, 0].var(axis=0), 4.0, rtol=band)
-    structure = np.mean((rows[:, 1] - rows[:, 0]) ** 2, axis=0) / 4.0
-    np.testing.assert_allclose(structure[:2], _structure_function("transverse", lag_m, 533.0), rtol=band)
-    np.testing.assert_allclose(structure[2], _structure_function("longitudinal", lag_m, 533.0), rtol=band)
+    tolerance = 4.0 * np.sqrt(2.0 / n_draws)
+    np.testing.assert_allclose(velocities_m_s[:, 0].var(axis=0), 4.0, rtol=tolerance)
+    structure = np.mean((velocities_m_s[:, 1] - velocities_m_s[:, 0]) ** 2, axis=0) / 4.0
+    np.testing.assert_allclose(structure[:2], _structure_function("transverse", lag_m, 533.0), rtol=tolerance)
+    np.testing.assert_allclose(structure[2], _structure_function("longitudinal", lag_m, 533.0), rtol=tolerance)
 
 
 def test_components_are_independent() -> None:
-    rows = np.stack([_make_wind(seed, gust_intensity_m_s=1.0).velocities(np.zeros(1))[0] for seed in range(2000)])
-    correlation = np.corrcoef(rows.T) - np.eye(3)
+    velocities_m_s = np.stack(
+        [_make_wind(seed, gust_intensity_m_s=1.0).velocities(np.zeros(1))[0] for seed in range(2000)]
+    )
+    correlation = np.corrcoef(velocities_m_s.T) - np.eye(3)
     assert np.abs(correlation).max() < 4.0 / np.sqrt(2000)

@@ -17,8 +17,8 @@ def renderer() -> Renderer:
 
 
 @pytest.fixture(scope="session")
-def rough() -> Surface:
-    """Return a small world of 768 m with craters and slopes of 6 deg."""
+def terrain() -> Surface:
+    """Return a terrain of 768 m with craters and slopes of 6 deg."""
     parameters = TerrainParameters(
         samples=512,
         rms_slope_deg=6.0,
@@ -32,9 +32,9 @@ def rough() -> Surface:
 
 @pytest.fixture(scope="session")
 def descent_camera() -> Callable[..., Cahvor]:
-    """Return a function that makes descent cameras of given size and distortion, in the body frame."""
+    """Return a function that makes descent cameras of given size (pixels) and distortion, in the body frame."""
 
-    def make(size: int = 1024, r: tuple[float, float, float] = (0.00096, -0.002183, 0.018547)) -> Cahvor:
+    def make_camera(size: int = 1024, r: tuple[float, float, float] = (0.00096, -0.002183, 0.018547)) -> Cahvor:
         pinhole = Cahv.from_focal_length(
             focal_m=14.67e-3,
             pixel_pitch_m=12e-6 * 1024 / size,
@@ -45,4 +45,4 @@ def descent_camera() -> Callable[..., Cahvor]:
         )
         return Cahvor.from_cahv(pinhole, r=np.array(r))
 
-    return make
+    return make_camera

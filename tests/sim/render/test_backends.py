@@ -55,11 +55,11 @@ def _render_in_process(backend: str, folder: Path) -> dict[str, np.ndarray]:
 
 def test_osmesa_and_egl_render_equal_images(tmp_path: Path) -> None:
     osmesa, egl = _render_in_process("osmesa", tmp_path), _render_in_process("egl", tmp_path)
-    # Where a ray grazes a crest, a rounding difference in depth can select either side.
+    # At crests a rounding difference in depth can select the near or the far side.
     assert np.mean(np.abs(egl["distance"] / osmesa["distance"] - 1.0) < 1e-6) > 0.999
     assert np.mean(np.abs(egl["radiance"] / osmesa["radiance"] - 1.0) < 1e-4) > 0.999
-    # A depth sample off the pixel centre (EGL multisampling) would differ by the slope times a quarter of a pixel:
-    # several tenths of a metre.
+    # With depth samples off the pixel centre (EGL multisampling), depths would differ by the slope times a quarter of a
+    # pixel: several tenths of a metre.
     assert np.abs(egl["depth"] - osmesa["depth"]).mean() < 1e-3
 
 
@@ -69,36 +69,41 @@ def test_unknown_backend_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         default_backend()
 
 
-@pytest.mark.parametrize(("installed", "chosen"), [(("OSMesa", "EGL"), "osmesa"), (("EGL",), "egl"), ((), "osmesa")])
-def test_default_backend_is_installed(monkeypatch: pytest.MonkeyPatch, installed: tuple[str, ...], chosen: str) -> None:
+@pytest.mark.parametrize(("installed", "expected"), [(("OSMesa", "EGL"), "osmesa"), (("EGL",), "egl"), ((), "osmesa")])
+def test_default_backend_is_installed(
+    monkeypatch: pytest.MonkeyPatch, installed: tuple[str, ...], expected: str
+) -> None:
     from marsyard.sim.render import backend
 
     monkeypatch.delenv("MARSYARD_GL", raising=False)
     monkeypatch.setattr(backend, "find_library", lambda name: f"lib{name}.so" if name in installed else None)
-    assert backend.default_backend() == chosen
+    assert backend.default_backend() == expected
 
 
-def _depth_view(height_m: float) -> tuple[np.ndarray, float, float, float]:
-    """Pose of a camera that looks straight down, its focal length in pixels, and the near and far distance."""
+def _make_depth_view(height_m: float) -> tuple[np.ndarray, float, float, float]:
+    """Return the pose of a camera that looks down, focal length (pixels), near and far distance (m)."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = height_m
     return pose, 40.0, 1.0, 100.0
 
 
 def test_load_replaces_the_previous_geometry() -> None:
-    """Depths of level ground and of a triangle above its centre in closed form, for any load order."""
+    """Depths of level ground and of a triangle above its centre are exact, for any load order.
+
+    The drawn number of a triangle is its object number plus 1; the number of ground is 0.
+    """
     corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0], [-30.0, 30.0, 0.0]])
     ground = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
     above = np.array([[[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]]])
     renderer = DepthRenderer(64, default_backend())
     with pytest.raises(RenderingError, match="no mesh"):
-        renderer.draw(*_depth_view(20.0))
+        renderer.draw(*_make_depth_view(20.0))
     no_triangles = (np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
     for loaded, number in (((above, np.array([70000])), 70001), (no_triangles, 0), ((above, np.array([5])), 6)):
         renderer.load(ground, *loaded)
         for height in (20.0, 10.0):
-            depth, numbers = renderer.draw(*_depth_view(height))
-            # 24 bits of a depth between 1 and 100 m.
+            depth, numbers = renderer.draw(*_make_depth_view(height))
+            # The tolerance is the resolution of a 24-bit depth between 1 and 100 m.
             assert depth[32, 32] == pytest.approx(height - (4.0 if number else 0.0), abs=1e-3)
             assert depth[2, 2] == pytest.approx(height, abs=1e-3)
             assert numbers.size == 0 if number == 0 else (numbers[32, 32], numbers[2, 2]) == (number, 0)

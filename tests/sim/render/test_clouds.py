@@ -14,7 +14,7 @@ from marsyard.sim.terrain import Surface
 
 ALBEDO = 0.3
 SUN = Sun(direction(np.radians(130.0), np.radians(50.0)))
-#: Brightness is then albedo times the cosine of incidence times the transmittance of the clouds.
+#: With this law the radiance is albedo times the cosine of incidence times the transmittance of the clouds.
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 
 
@@ -33,9 +33,13 @@ def _make_scene(clouds: CloudLayer | None, photometry: Photometry = LAMBERT) -> 
 
 
 def _render_from_above(
-    renderer: Renderer, scene: Scene, camera: CameraModel, time_s: float = 0.0, at: tuple[float, float] = (100.0, 300.0)
+    renderer: Renderer,
+    scene: Scene,
+    camera: CameraModel,
+    time_s: float = 0.0,
+    position_m: tuple[float, float] = (100.0, 300.0),
 ) -> Frame:
-    pose = rigid(Rotation.from_euler("z", 25.0, degrees=True), np.array([*at, 2000.0]))
+    pose = rigid(Rotation.from_euler("z", 25.0, degrees=True), np.array([*position_m, 2000.0]))
     return renderer.render(scene, PixelRays.of(camera), pose, time_s)
 
 
@@ -43,10 +47,10 @@ def _render_from_above(
 def test_cover_and_size_equal_the_parameters(cover: float) -> None:
     layers = [_make_layer(seed, cover=cover, size_m=900.0, edge_m=20.0) for seed in range(4)]
     assert np.mean([layer.cover.mean() for layer in layers]) == pytest.approx(cover, rel=0.01)
-    inside = np.stack([layer.cover > 0.5 for layer in layers])
-    entries = np.count_nonzero(inside & ~np.roll(inside, 1, axis=2))
-    # 1024 lines cross about 400 clouds per layer.
-    assert inside.sum() / entries * layers[0].cell_m == pytest.approx(900.0, rel=0.05)
+    is_cloud = np.stack([layer.cover > 0.5 for layer in layers])
+    n_crossings = np.count_nonzero(is_cloud & ~np.roll(is_cloud, 1, axis=2))
+    # The size is the mean length of clouds along the rows. The 1024 rows cross about 400 clouds per layer.
+    assert is_cloud.sum() / n_crossings * layers[0].cell_m == pytest.approx(900.0, rel=0.05)
 
 
 def test_direct_sunlight_is_attenuated_by_the_optical_depth(
@@ -76,20 +80,22 @@ def test_shadows_move_with_the_wind(renderer: Renderer, descent_camera: Callable
     """From a camera that drifts with the wind, the shadows on uniform ground are static."""
     scene, camera = _make_scene(_make_layer(wind_east_m_s=9.0, wind_north_m_s=-4.0)), descent_camera(128)
     first = _render_from_above(renderer, scene, camera, 5.0)
-    moving_camera = _render_from_above(renderer, scene, camera, 8.75, at=(100.0 + 3.75 * 9.0, 300.0 - 3.75 * 4.0))
+    moving_camera = _render_from_above(
+        renderer, scene, camera, 8.75, position_m=(100.0 + 3.75 * 9.0, 300.0 - 3.75 * 4.0)
+    )
     fixed_camera = _render_from_above(renderer, scene, camera, 8.75)
     assert np.ptp(first.radiance) > 0.1
-    # A hundredth of a pixel of 13 m times the steepest gradient of a 40 m edge is 7e-4.
+    # An error of 0.13 m (a hundredth of a pixel) would change the radiance at the 40 m wide edges by up to 7e-4.
     assert np.abs(moving_camera.radiance - first.radiance).max() < 1e-4
     assert np.abs(fixed_camera.radiance - first.radiance).max() > 0.05
 
 
 def test_zero_cover_is_bitwise_equal_to_no_clouds(
-    renderer: Renderer, descent_camera: Callable[..., Cahvor], rough: Surface
+    renderer: Renderer, descent_camera: Callable[..., Cahvor], terrain: Surface
 ) -> None:
     camera = PixelRays.of(descent_camera(128))
     pose = rigid(Rotation.identity(), np.array([380.0, 200.0, 900.0]))
-    clear = Scene(rough, (380.0, 200.0), SUN, Photometry())
+    clear = Scene(terrain, (380.0, 200.0), SUN, Photometry())
     zero_cover = replace(clear, clouds=_make_layer(cover=0.0))
     assert (
         renderer.render(clear, camera, pose).radiance.tobytes()

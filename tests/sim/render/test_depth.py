@@ -6,7 +6,7 @@ from marsyard.sim.render.kernels.views import depth_in_metres
 
 
 def test_perspective_depths_convert_to_metres() -> None:
-    """OpenGL stores ``f (z - n) / (z (f - n))`` for a depth z between n and f, lowest row first."""
+    """OpenGL stores `f (z - n) / (z (f - n))` for a depth z between n and f, lowest row first; 1 is empty."""
     near, far = 3.0, 900.0
     depths_m = np.geomspace(4.0, 60.0, 15).reshape(5, 3)
     stored = far * (depths_m - near) / (depths_m * (far - near))
@@ -14,5 +14,5 @@ def test_perspective_depths_convert_to_metres() -> None:
     result = depth_in_metres(stored[::-1].astype(np.float32), near, far)
     assert result[1, 2] == 0.0
     depths_m[1, 2] = 0.0
-    # Rounding of 1 - n / z in single precision causes a relative error of 6e-8 z / n in z.
+    # In single precision the rounding of 1 - n / z causes a relative error of 6e-8 z / n in z.
     np.testing.assert_allclose(result, depths_m, rtol=3e-6)

@@ -18,7 +18,8 @@ from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
-SAMPLES = 16
+#: Rays along each side of a pixel in the reference image.
+RAYS_PER_SIDE = 16
 
 
 def _make_camera(size: tuple[int, int], focal_m: float = 16e-3) -> Cahv:
@@ -33,8 +34,8 @@ def _make_camera(size: tuple[int, int], focal_m: float = 16e-3) -> Cahv:
 
 
 @pytest.fixture(scope="module")
-def rocky() -> View:
-    """A rock of 1 m among other rocks at 5 m, with rolling ground and sky."""
+def rocky_view() -> View:
+    """Return a view of a rock of 1 m among others at 5 m, with rolling ground and sky."""
     parameters = TerrainParameters(
         samples=512, spacing_m=0.05, rms_slope_deg=3.0, slope_baseline_m=1.0, outer_scale_m=10.0, craters_per_km2=0.0
     )
@@ -59,10 +60,10 @@ def rocky() -> View:
 
 
 @pytest.fixture(scope="module")
-def reference(renderer: Renderer, rocky: View) -> np.ndarray:
-    """Radiance rendered with 256 rays per pixel; ground and texture are smoothed over a pixel."""
-    single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
-    return supersample(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
+def reference(renderer: Renderer, rocky_view: View) -> np.ndarray:
+    """Render the radiance with 256 rays per pixel; ground and texture are smoothed over a pixel."""
+    one_ray_view = replace(rocky_view, scene=replace(rocky_view.scene, edge_rays=1))
+    return supersample(renderer, replace(one_ray_view, footprint=float(RAYS_PER_SIDE)), RAYS_PER_SIDE)
 
 
 def test_subpixel_rays_are_evenly_distributed() -> None:
@@ -80,9 +81,9 @@ def test_subpixel_rays_are_evenly_distributed() -> None:
         np.testing.assert_allclose(steps, 1.0 / 9.0, atol=2e-3)
 
 
-def test_nearest_triangle_equals_exhaustive_search(rocky: View) -> None:
-    objects, pose = rocky.scene.objects, rocky.world_from_body
-    rays = pose.rotation.apply(rocky.rays(rocky.camera).directions[::37].astype(np.float64))
+def test_nearest_triangle_equals_exhaustive_search(rocky_view: View) -> None:
+    objects, pose = rocky_view.scene.objects, rocky_view.world_from_body
+    rays = pose.rotation.apply(rocky_view.rays(rocky_view.camera).directions[::37].astype(np.float64))
     starts = np.broadcast_to(pose.translation, rays.shape)
     expected = cast_triangles(objects, starts, rays)
     result = np.array([nearest_hit(objects.hierarchy, Ray(*pose.translation, *ray), np.inf).distance for ray in rays])
@@ -92,12 +93,12 @@ def test_nearest_triangle_equals_exhaustive_search(rocky: View) -> None:
 
 @pytest.mark.parametrize(("side", "fraction"), [(2, 0.5), (3, 0.4)])
 def test_outlines_match_256_rays_per_pixel(
-    renderer: Renderer, rocky: View, reference: np.ndarray, side: int, fraction: float
+    renderer: Renderer, rocky_view: View, reference: np.ndarray, side: int, fraction: float
 ) -> None:
-    one_ray_view = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
-    rays = rocky.rays(rocky.camera)
-    single_ray = renderer.render(one_ray_view.scene, rays, rocky.world_from_body)
-    antialiased = renderer.render(replace(rocky.scene, edge_rays=side), rays, rocky.world_from_body)
+    one_ray_view = replace(rocky_view, scene=replace(rocky_view.scene, edge_rays=1))
+    rays = rocky_view.rays(rocky_view.camera)
+    single_ray = renderer.render(one_ray_view.scene, rays, rocky_view.world_from_body)
+    antialiased = renderer.render(replace(rocky_view.scene, edge_rays=side), rays, rocky_view.world_from_body)
     edges = edge_pixels(single_ray.radiance, single_ray.range_m, single_ray.body)
     assert 500 < edges.size < 0.2 * single_ray.radiance.size
 
@@ -106,14 +107,14 @@ def test_outlines_match_256_rays_per_pixel(
 
     assert error(antialiased.radiance) < fraction * error(single_ray.radiance)
     # The mean brightness at outlines is unbiased.
-    at_edges = (antialiased.radiance - reference).ravel()[edges].mean() / reference.mean()
-    assert abs(at_edges) < 0.1 * error(single_ray.radiance)
+    mean_error = (antialiased.radiance - reference).ravel()[edges].mean() / reference.mean()
+    assert abs(mean_error) < 0.1 * error(single_ray.radiance)
 
 
-def test_truth_is_at_pixel_centres(renderer: Renderer, rocky: View) -> None:
-    rays = rocky.rays(rocky.camera)
-    single_ray = renderer.render(replace(rocky.scene, edge_rays=1), rays, rocky.world_from_body)
-    antialiased = renderer.render(rocky.scene, rays, rocky.world_from_body)
+def test_truth_is_at_pixel_centres(renderer: Renderer, rocky_view: View) -> None:
+    rays = rocky_view.rays(rocky_view.camera)
+    single_ray = renderer.render(replace(rocky_view.scene, edge_rays=1), rays, rocky_view.world_from_body)
+    antialiased = renderer.render(rocky_view.scene, rays, rocky_view.world_from_body)
     for layer in ("range_m", "body", "normal"):
         assert getattr(single_ray, layer).tobytes() == getattr(antialiased, layer).tobytes()
     changed = np.flatnonzero(single_ray.radiance.ravel() != antialiased.radiance.ravel())
@@ -121,19 +122,19 @@ def test_truth_is_at_pixel_centres(renderer: Renderer, rocky: View) -> None:
 
 
 def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
-    """Ground fraction per column for a rolled camera over a plane: the part of the column below the mesh border.
+    """For a rolled camera over a plane, the ground fraction per column is the part below the mesh border.
 
     The mesh ends 200 m away, 5 mrad or 3.3 pixels below the horizon.
     """
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = 0.2
     surface = Surface.from_samples(samples, 0.5)
-    law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0)
-    scene = Scene(surface, (0.0, 0.0), SUN, law, mesh_finest_m=0.04, mesh_reach_m=200.0, mesh_lines=801)
+    photometry = Photometry(lunar_fraction=0.0, surge_amplitude=0.0)
+    scene = Scene(surface, (0.0, 0.0), SUN, photometry, mesh_finest_m=0.04, mesh_reach_m=200.0, mesh_lines=801)
     camera = _make_camera((128, 64), 8e-3)
     pose = rigid(Rotation.from_euler("x", 7.0, degrees=True), np.array([0.0, 0.0, 1.0]))
     border, _ = camera.transform(pose).project(np.array([[200.0, -30.0, 0.0], [200.0, 30.0, 0.0]]))
-    # Pixel 63 ends at 63.5.
+    # The last row, 63, ends at 63.5.
     expected = 63.5 - np.interp(np.arange(128), *border[np.argsort(border[:, 0])].T)
     errors = []
     for count in (1, 3):
@@ -141,6 +142,6 @@ def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
         ground, sky = frame.radiance[-1].mean(), frame.radiance[0].mean()
         fraction = ((frame.radiance - sky) / (ground - sky)).sum(axis=0)
         errors.append(float(np.sqrt(np.mean((fraction - expected) ** 2))))
-    # A straight edge with one ray per pixel has a uniform error of up to half a pixel: 0.29 px rms.
+    # With one ray per pixel the error of a straight edge is uniform up to half a pixel: 0.29 px RMS.
     assert errors[0] > 0.2
     assert errors[1] < 0.1

@@ -1,4 +1,4 @@
-"""Tests of shadow footprints: they contain all ground that objects may shade, and little more."""
+"""Tests of shadow footprints: they contain all ground that objects may shade, and little other ground."""
 
 from dataclasses import replace
 
@@ -18,6 +18,7 @@ ROCKY = TerrainParameters(samples=512, spacing_m=3.0, rocks=RockParameters(abund
 
 
 def _is_inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Whether the footprint marks the cells of the positions (m)."""
     cells, west, south, per_metre = footprint
     column = np.floor((x - west) * per_metre).astype(int)
     row = np.floor((y - south) * per_metre).astype(int)
@@ -36,7 +37,7 @@ def test_footprint_contains_every_shaded_position(elevation: float) -> None:
     )
     sun = direction(rng.uniform(0.0, 6.0), elevation)
     footprint = shadow_footprint(spheres, sun, -40.0)
-    # Points in the spheres, traced back along the sun rays to any height.
+    # Random points in the spheres, projected along the sun direction to random lower heights, down to -40 m.
     sphere_of_point = np.repeat(spheres, 500, axis=0)
     offset = rng.standard_normal((len(sphere_of_point), 3))
     offset *= (rng.random(len(sphere_of_point)) ** (1.0 / 3.0) / np.linalg.norm(offset, axis=1))[:, None]
@@ -44,9 +45,9 @@ def test_footprint_contains_every_shaded_position(elevation: float) -> None:
     height_drop = rng.random(len(points)) * (points[:, 2] + 40.0)
     ground = points - (height_drop / sun[2])[:, None] * sun
     assert _is_inside(footprint, ground[:, 0], ground[:, 1]).all()
-    anywhere = rng.uniform(-1000.0, 1000.0, (20000, 2))
-    # 40 shadows, each up to 70 m / tan(elevation) long and a few cells wide, on 4 km2
-    assert _is_inside(footprint, *anywhere.T).mean() < 0.15 + 0.1 / np.tan(elevation)
+    random_positions = rng.uniform(-1000.0, 1000.0, (20000, 2))
+    # The bound allows 40 shadows on 4 km2, each up to 70 m / tan(elevation) long and a few cells wide.
+    assert _is_inside(footprint, *random_positions.T).mean() < 0.15 + 0.1 / np.tan(elevation)
 
 
 def test_footprint_without_objects_or_sun_is_everywhere() -> None:
@@ -56,7 +57,7 @@ def test_footprint_without_objects_or_sun_is_everywhere() -> None:
 
 
 def test_footprint_does_not_change_images() -> None:
-    """Bitwise equal over ground with many rocks under a low sun."""
+    """The images of ground with many rocks under a low sun are bitwise equal."""
     ground = SiteGround.of(site("gusev").model_copy(update={"descent": ROCKY}))
     rays = PixelRays.of(preset("mer-descent-flown").cameras()[0].bin(4, 4))
     pose = nadir_pose(ground.surface, 300.0, 200.0, 400.0)
@@ -80,7 +81,7 @@ def test_culling_does_not_change_images(elevation: float) -> None:
     rays = PixelRays.of(preset("research-navcam").cameras()[0].crop(400, 380, (161, 161)))
     pose = mast_pose(ground.surface, 12.0, 11.0, 1.5, 30.0, -14.0)
     for azimuth in (0.5, 3.0):
-        eye = Eye(12.0, 11.0, 1.5, rays.pixel_rad, 0.5, 1.2, 25.0)
+        eye = Eye(12.0, 11.0, 1.5, rays.pixel_rad, azimuth_rad=0.5, half_width_rad=1.2, reach_m=25.0)
         scene = site_scene(ground, eye, Sun(direction(azimuth, elevation)))
         visible_scene = scene.restrict_to_cones([rays.cone(pose)])
         assert 0 < len(visible_scene.objects) < 0.5 * len(scene.objects)
@@ -88,6 +89,6 @@ def test_culling_does_not_change_images(elevation: float) -> None:
         full, subset = renderer.render(scene, rays, pose), renderer.render(visible_scene, rays, pose)
         np.testing.assert_array_equal(subset.radiance, full.radiance)
         np.testing.assert_array_equal(subset.range_m, full.range_m)
-        # culling keeps the spheres of the remaining objects
-        repeated = Objects(**{name: getattr(visible_scene.objects, name) for name in Objects.__dataclass_fields__})
-        np.testing.assert_array_equal(visible_scene.objects.spheres, repeated.spheres)
+        # Culling keeps the spheres of the remaining objects.
+        recomputed = Objects(**{name: getattr(visible_scene.objects, name) for name in Objects.__dataclass_fields__})
+        np.testing.assert_array_equal(visible_scene.objects.spheres, recomputed.spheres)

@@ -28,8 +28,9 @@ STRONG_DISTORTION = (0.01, -0.25, 0.08)
 
 
 def _make_spotted_plane(height_m: float) -> tuple[Surface, np.ndarray]:
-    """A plane with bright spots; returns the surface and the spot positions in the world, shape (n, 3). A spot is a
-    Gaussian of 2.5 samples in the control values: the symmetric B-spline keeps its centre.
+    """Make a plane with bright spots; return the surface and the spot positions in world axes, m, shape (n, 3).
+
+    A spot is a Gaussian of 2.5 samples in the control values. The symmetric B-spline preserves its centre.
     """
     side, spacing = 512, 1.5
     rng = np.random.default_rng(4)
@@ -46,7 +47,7 @@ def _make_spotted_plane(height_m: float) -> tuple[Surface, np.ndarray]:
 
 
 def _centroid(radiance: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Centroid of brightness above the background within 8 pixels of a position."""
+    """Compute the centroid (column, row) of brightness above the background within 8 pixels of a position."""
     u0, v0 = np.rint(position).astype(int)
     patch = radiance[v0 - 8 : v0 + 9, u0 - 8 : u0 + 9].astype(np.float64)
     border = np.concatenate([patch[0], patch[-1], patch[:, 0], patch[:, -1]])
@@ -56,14 +57,15 @@ def _centroid(radiance: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def _expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
-    """Expected centroid of a spot's image: the mean pixel of its points, weighted by brightness and image area.
+    """Compute the centroid of a spot's image: the mean pixel of its points, weighted by brightness and image area.
+
     Perspective shifts it by about 0.01 px from the pixel of the centre.
     """
     offset = np.linspace(-15.0, 15.0, 31)
     dx, dy = np.meshgrid(offset, offset)
     points = spot + np.stack([dx, dy, np.zeros_like(dx)], axis=-1)
     area = np.abs(np.linalg.det(camera.projection_jacobian(points)[..., :2]))
-    # The spot of 2.5 samples, blurred by the B-spline (variance 1/3 sample^2).
+    # The B-spline adds a variance of 1/3 sample^2 to the spot of 2.5 samples; a sample is 1.5 m.
     variance = (2.5**2 + 1.0 / 3.0) * 1.5**2
     weight = area * np.exp(-(dx**2 + dy**2) / (2.0 * variance))
     pixels, _ = camera.project(points)
@@ -78,18 +80,18 @@ def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_ca
     scene = Scene(surface, (300.0, 400.0), OVERHEAD, ALBEDO_ONLY)
     frame = renderer.render(scene, PixelRays.of(camera), pose)
     copies = np.arange(-2, 3) * surface.period_m
-    everywhere = np.concatenate([spots + np.array([dx, dy, 0.0]) for dx in copies for dy in copies])
-    pixels, visible = camera.transform(pose).project(everywhere)
+    all_spots = np.concatenate([spots + np.array([dx, dy, 0.0]) for dx in copies for dy in copies])
+    pixels, visible = camera.transform(pose).project(all_spots)
     inside = visible & (np.abs(pixels - 511.5) < 495.0).all(axis=-1)
     result = np.stack([_centroid(frame.radiance, position) for position in pixels[inside]])
-    expected = np.stack([_expected_centroid(camera.transform(pose), spot) for spot in everywhere[inside]])
+    expected = np.stack([_expected_centroid(camera.transform(pose), spot) for spot in all_spots[inside]])
     error = result - expected
     assert inside.sum() > 400
     assert np.sqrt(np.mean(np.sum(error**2, axis=-1))) < 0.05
     assert np.sqrt(np.mean(np.sum((result - pixels[inside]) ** 2, axis=-1))) < 0.05
     assert np.abs(error.mean(axis=0)).max() < 0.003
     # The distortion is significant: a pinhole camera would shift the spots by pixels.
-    pinhole, _ = descent_camera(r=(0.0, 0.0, 0.0)).transform(pose).project(everywhere[inside])
+    pinhole, _ = descent_camera(r=(0.0, 0.0, 0.0)).transform(pose).project(all_spots[inside])
     assert np.linalg.norm(pinhole - pixels[inside], axis=-1).max() > 20.0
 
 
@@ -112,7 +114,7 @@ def test_world_points_are_on_the_plane_and_on_rays(
 
 
 def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, expected_m: float) -> float:
-    """Distance to the ground near the expected distance: march in steps of a fifth of a sample, then find the root."""
+    """Find the distance to the ground, m: march in steps of a fifth of a sample, then refine the root."""
     control = surface.levels[0][..., 0].astype(np.float64)
 
     def clearance(t: np.ndarray) -> np.ndarray:
@@ -129,54 +131,56 @@ def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, expected_m:
 
 
 def test_rough_ground_ranges_match_independent_ray_cast(
-    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     rays = PixelRays.of(descent_camera())
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
-    frame = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
+    frame = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
     rng = np.random.default_rng(8)
     pixels = rng.integers(0, frame.range_m.size, 300)
     directions = pose.rotation.apply(rays.directions[pixels].astype(np.float64))
     actual = frame.range_m.ravel()[pixels]
-    expected = np.array([_cast_ray(rough, pose.translation, ray, t) for ray, t in zip(directions, actual, strict=True)])
+    expected = np.array(
+        [_cast_ray(terrain, pose.translation, ray, t) for ray, t in zip(directions, actual, strict=True)]
+    )
     assert np.mean(np.abs(actual / expected - 1.0) < 1e-6) >= 0.99
     assert np.abs(actual / expected - 1.0).max() < 1e-4
 
 
-@pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
-def test_grazing_rays_intersect_the_first_occluding_crest(rough: Surface, bounded: bool) -> None:
-    """Rays graze rough ground hundreds of samples away. The reference marches in steps of a thirtieth of a sample."""
+@pytest.mark.parametrize("use_ceilings", [True, False], ids=["by ceilings", "by steps"])
+def test_grazing_rays_intersect_the_first_occluding_crest(terrain: Surface, use_ceilings: bool) -> None:
+    """Rays graze rough ground at distances of hundreds of samples. The reference marches in steps of 1/30 sample."""
     rng = np.random.default_rng(3)
-    count, ground = 400, Ground(rough)
-    origins = np.column_stack([rng.uniform(0.0, rough.period_m, (count, 2)), np.full(count, ground.highest + 60.0)])
+    count, ground = 400, Ground(terrain)
+    origins = np.column_stack([rng.uniform(0.0, terrain.period_m, (count, 2)), np.full(count, ground.highest + 60.0)])
     rays = np.array([direction(a, -np.radians(e)) for a, e in rng.uniform([-np.pi, 2.5], [np.pi, 5.0], (count, 2))])
     expected = ground.cast(origins, rays, 4000.0, 0.05)
-    level = GroundLevel(rough.levels[0], rough.ceilings[0] if bounded else NO_CEILING, 1.0 / rough.spacing_m)
-    # With ceilings the search of the complete ray is fast; without them it starts near the intersection.
-    begin = 0.0 if bounded else 0.8
+    level = GroundLevel(terrain.levels[0], terrain.ceilings[0] if use_ceilings else NO_CEILING, 1.0 / terrain.spacing_m)
+    # With ceilings the search of the complete ray is fast. Without them it starts near the intersection.
+    begin = 0.0 if use_ceilings else 0.8
     result = np.array(
         [
             intersect_ground(level, Ray(*origin, *ray), begin * t, 1.25 * t)
             for origin, ray, t in zip(origins, rays, expected, strict=True)
         ]
     )
-    assert np.median(expected) > 500.0 * rough.spacing_m
+    assert np.median(expected) > 500.0 * terrain.spacing_m
     assert np.mean(np.abs(result / expected - 1.0) < 1e-4) > 0.99
-    # Rays end on the ground: the search ends within a thousandth of a sample, and one Newton step squares the error.
-    assert np.abs(ground.clearance(origins, rays, result)).max() < 1e-5 * rough.spacing_m
+    # The search ends within a thousandth of a sample of the ground. One Newton step then squares the error.
+    assert np.abs(ground.clearance(origins, rays, result)).max() < 1e-5 * terrain.spacing_m
 
 
-@pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
-def test_search_returns_infinity_beyond_its_end(rough: Surface, bounded: bool) -> None:
-    """Without ceilings a step is longer than the remaining distance; the search must still stop at its end."""
+@pytest.mark.parametrize("use_ceilings", [True, False], ids=["by ceilings", "by steps"])
+def test_search_returns_infinity_beyond_its_end(terrain: Surface, use_ceilings: bool) -> None:
+    """Without ceilings a step can be longer than the remaining distance; the search must still stop at its end."""
     rng = np.random.default_rng(4)
-    ground = Ground(rough)
-    level = GroundLevel(rough.levels[0], rough.ceilings[0] if bounded else NO_CEILING, 1.0 / rough.spacing_m)
+    ground = Ground(terrain)
+    level = GroundLevel(terrain.levels[0], terrain.ceilings[0] if use_ceilings else NO_CEILING, 1.0 / terrain.spacing_m)
     for azimuth, elevation in rng.uniform([-np.pi, np.radians(20.0)], [np.pi, np.radians(50.0)], (50, 2)):
-        origin = np.array([*rng.uniform(0.0, rough.period_m, 2), ground.highest + 80.0])
+        origin = np.array([*rng.uniform(0.0, terrain.period_m, 2), ground.highest + 80.0])
         ray = direction(azimuth, -elevation)
         t = float(ground.cast(origin[None], ray[None], 2000.0, 0.05)[0])
-        begin = t - 4.0 * rough.spacing_m
+        begin = t - 4.0 * terrain.spacing_m
         assert intersect_ground(level, Ray(*origin, *ray), begin, t + 1e-3) == pytest.approx(t, rel=1e-6)
         assert intersect_ground(level, Ray(*origin, *ray), begin, t - 1e-3) == np.inf
 
@@ -191,41 +195,44 @@ def test_entry_distance_is_at_the_height_of_the_highest_ground() -> None:
     assert exit_distance(extent, Ray(2.0, -1.0, 0.0, 0.5, -0.1, 0.0)) == pytest.approx(16.0)
 
 
-def test_blocks_below_a_ray_are_skipped(rough: Surface) -> None:
+def test_blocks_below_a_ray_are_skipped(terrain: Surface) -> None:
     """Rays skip to the first block whose ceiling is above the ray, in all directions and across the period."""
-    ceiling = rough.ceilings[0]
-    level, block = GroundLevel(rough.levels[0], ceiling, 1.0 / rough.spacing_m), CEILING_BLOCK * rough.spacing_m
+    ceiling = terrain.ceilings[0]
+    level = GroundLevel(terrain.levels[0], ceiling, 1.0 / terrain.spacing_m)
+    block = CEILING_BLOCK * terrain.spacing_m
     rng = np.random.default_rng(5)
     for azimuth in [*rng.uniform(-np.pi, np.pi, 60), 0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi]:
-        origin = np.array([*rng.uniform(0.0, rough.period_m, 2), float(ceiling.max()) + 5.0])
+        origin = np.array([*rng.uniform(0.0, terrain.period_m, 2), float(ceiling.max()) + 5.0])
         ray = direction(azimuth, -np.radians(rng.uniform(1.0, 20.0)))
         start = rng.uniform(0.0, 50.0)
-        clear = skip_empty_blocks(level, Ray(*origin, *ray), start, 5000.0)
-        t = np.arange(start, clear + 3.0 * block, 0.01 * block)
+        skipped_to = skip_empty_blocks(level, Ray(*origin, *ray), start, 5000.0)
+        t = np.arange(start, skipped_to + 3.0 * block, 0.01 * block)
         positions = origin + t[:, None] * ray
-        a, b = (np.floor(positions[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))
-        below = positions[:, 2] <= ceiling[a, b]
-        assert not below[t < clear - 1e-6].any()
-        assert below[(t > clear) & (t < clear + 2.0 * block)].any()
+        block_row, block_column = (np.floor(positions[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))
+        below = positions[:, 2] <= ceiling[block_row, block_column]
+        assert not below[t < skipped_to - 1e-6].any()
+        assert below[(t > skipped_to) & (t < skipped_to + 2.0 * block)].any()
 
 
 def test_mesh_resolution_does_not_change_the_image(
-    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    """The mesh is only the start of the search on the terrain: a mesh three times as coarse has the same image."""
+    """The mesh only defines the start of the search: a mesh three times as coarse gives the same image."""
     rays = PixelRays.of(descent_camera(256))
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
-    fine = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
-    coarse = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY, mesh_finest_m=36.0), rays, pose)
+    fine = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
+    coarse = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY, mesh_finest_m=36.0), rays, pose)
     is_equal = np.abs(fine.range_m / coarse.range_m - 1.0) < 1e-6
     assert is_equal.mean() > 0.995
 
 
 def test_pixels_above_the_horizon_show_the_sky(
-    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    level = rigid(Rotation.from_euler("x", 90.0, degrees=True), np.array([0.0, 0.0, 500.0]))
-    frame = renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(128)), level)
+    level_pose = rigid(Rotation.from_euler("x", 90.0, degrees=True), np.array([0.0, 0.0, 500.0]))
+    frame = renderer.render(
+        Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(128)), level_pose
+    )
     upper, lower = frame.range_m[:60], frame.range_m[-40:]
     assert np.isinf(upper).all()
     assert np.isfinite(lower).all()
@@ -234,42 +241,42 @@ def test_pixels_above_the_horizon_show_the_sky(
 
 
 def test_objects_out_of_view_do_not_change_the_image(
-    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    """Without visible objects no triangle is drawn: the search must not read missing data."""
+    """Without visible objects OpenGL draws no triangle, and the search must not read triangle numbers."""
     position = np.array([100.0, 200.0, 300.0])
     corners = position + np.array([[0.0, 0.0, 100.0], [1.0, 0.0, 100.0], [0.0, 1.0, 100.0]])
     faces = np.array([[0, 1, 2]], dtype=np.int32)
-    above = Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (3, 1)), faces, np.zeros(1, np.int32), albedo=0.1)
+    object_above = Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (3, 1)), faces, np.zeros(1, np.int32), albedo=0.1)
     sun = Sun(direction(0.3, np.radians(5.0)))
     rays = PixelRays.of(descent_camera(256))
-    with_objects, without = (
+    with_object, without_objects = (
         renderer.render(
-            Scene(rough, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True), rays, rigid(TILTED, position)
+            Scene(terrain, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True), rays, rigid(TILTED, position)
         )
-        for objects in (above, Objects.none())
+        for objects in (object_above, Objects.none())
     )
-    assert (with_objects.body == -1).all()
-    np.testing.assert_array_equal(with_objects.range_m, without.range_m)
-    np.testing.assert_array_equal(with_objects.radiance, without.radiance)
+    assert (with_object.body == -1).all()
+    np.testing.assert_array_equal(with_object.range_m, without_objects.range_m)
+    np.testing.assert_array_equal(with_object.radiance, without_objects.radiance)
 
 
 def test_camera_below_the_ground_is_rejected(
-    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     buried = rigid(Rotation.identity(), np.array([0.0, 0.0, -1000.0]))
     with pytest.raises(RenderingError, match="below the ground"):
-        renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(64)), buried)
+        renderer.render(Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(64)), buried)
 
 
 def test_image_does_not_depend_on_earlier_images(
-    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     rays = PixelRays.of(descent_camera(256))
     sun = Sun(direction(np.radians(100.0), np.radians(40.0)))
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
-    first = renderer.render(Scene(rough, (380.0, 200.0), sun, Photometry()), rays, pose)
-    renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), rays, rigid(TILTED, np.array([0.0, 0.0, 900.0])))
-    repeated = renderer.render(Scene(rough, (380.0, 200.0), sun, Photometry()), rays, pose)
+    first = renderer.render(Scene(terrain, (380.0, 200.0), sun, Photometry()), rays, pose)
+    renderer.render(Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), rays, rigid(TILTED, np.array([0.0, 0.0, 900.0])))
+    repeated = renderer.render(Scene(terrain, (380.0, 200.0), sun, Photometry()), rays, pose)
     assert first.radiance.tobytes() == repeated.radiance.tobytes()
     assert first.range_m.tobytes() == repeated.range_m.tobytes()

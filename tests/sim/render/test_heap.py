@@ -3,24 +3,25 @@
 import subprocess
 import sys
 
+#: Size of the block, bytes.
 SIZE = 20_000_000
-#: Frees a large block, then prints the bytes still in use before and after the memory is returned to the system.
+#: Allocates and frees a large block. Prints the bytes still in use before and after the memory is returned.
 SCRIPT = f"""
 import os, sys
 from marsyard.sim.render.renderer import keep_freed_memory, return_freed_memory
 
-def used():
+def resident_bytes():
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 if sys.argv[1] == "keep":
     keep_freed_memory()
-before = used()
+before = resident_bytes()
 block = b"1" * {SIZE}
 del block
-freed = used()
+freed = resident_bytes()
 return_freed_memory()
-print(freed - before, used() - before)
+print(freed - before, resident_bytes() - before)
 """
 
 
@@ -34,5 +35,5 @@ def test_freed_memory_stays_allocated_until_it_is_returned() -> None:
     freed, returned = _measure_memory("keep")
     assert freed > 0.9 * SIZE
     assert returned < 0.1 * SIZE
-    # The default behaviour of the C library.
-    assert _measure_memory("as it is")[0] < 0.1 * SIZE
+    # By default the C library returns freed memory at once.
+    assert _measure_memory("default")[0] < 0.1 * SIZE

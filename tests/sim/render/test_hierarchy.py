@@ -14,10 +14,10 @@ EYE = np.array([0.3, -0.2, 1.1])
 
 @pytest.fixture(scope="module")
 def objects() -> Objects:
-    """Triangles of 0.1 m to 1 m in all directions."""
+    """Return triangles with sizes of about 0.03 m to 0.6 m in all directions."""
     rng = np.random.default_rng(6)
-    middles = rng.uniform(-12.0, 12.0, (1500, 1, 3))
-    corners = (middles + 10.0 ** rng.uniform(-1.5, -0.2, (1500, 1, 1)) * rng.normal(size=(1500, 3, 3))).reshape(-1, 3)
+    centres = rng.uniform(-12.0, 12.0, (1500, 1, 3))
+    corners = (centres + 10.0 ** rng.uniform(-1.5, -0.2, (1500, 1, 1)) * rng.normal(size=(1500, 3, 3))).reshape(-1, 3)
     faces = np.arange(4500, dtype=np.int32).reshape(-1, 3)
     return Objects.of_mesh(corners, np.zeros_like(corners), faces, np.zeros(1500, dtype=np.int32), albedo=0.1)
 
@@ -48,12 +48,12 @@ def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.nda
     perpendicular = np.cross(axis, _draw_rays(rng, 400))
     perpendicular /= np.linalg.norm(perpendicular, axis=1, keepdims=True)
     angles = half_angle * rng.uniform(0.0, 1.0, (400, 1))
-    hit: set[int] = set()
+    hit_triangles: set[int] = set()
     for ray in np.cos(angles) * axis + np.sin(angles) * perpendicular:
-        hit |= _list_hits(objects, ray, max_distance_m)
-    assert hit <= listed
-    # A wide beam must have hits; otherwise the test checks nothing.
-    assert hit or half_angle < 0.5
+        hit_triangles |= _list_hits(objects, ray, max_distance_m)
+    assert hit_triangles <= listed
+    # Only narrow beams may have no hits; otherwise the test would check nothing.
+    assert hit_triangles or half_angle < 0.5
     # The beam lists triangles in a square frustum, which is larger than the cone at its corners.
     centres = objects.triangles.mean(axis=1) - EYE
     size = np.linalg.norm(objects.triangles - objects.triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
@@ -74,7 +74,7 @@ def test_beam_reports_an_overflow_of_its_list(objects: Objects) -> None:
 
 
 def _list_hits(objects: Objects, ray: np.ndarray, max_distance_m: float) -> set[int]:
-    """Numbers of all triangles that a ray from the eye hits up to a distance, from barycentric coordinates."""
+    """List the indices of all triangles that a ray from the eye hits up to a distance, by barycentric coordinates."""
     first, second, third = objects.triangles.transpose(1, 0, 2)
     columns = np.stack([second - first, third - first, np.broadcast_to(-ray, first.shape)], axis=2)
     u, v, t = np.linalg.solve(columns, (EYE - first)[:, :, None])[:, :, 0].T

@@ -45,14 +45,15 @@ def test_lunar_lambert_matches_the_formula(renderer: Renderer, descent_camera: C
         lunar_fraction=0.6, surge_amplitude=0.8, surge_width=0.05, sky_fraction=0.2, surrounding_albedo=0.0
     )
     _, to_ground = camera.rays(camera.pixel_grid())
+    # Cosines of the angles of incidence and emission.
     cos_i, cos_e = sun.direction[2], -to_ground[..., 2]
     phase = np.arccos(-to_ground @ sun.direction)
 
-    def surge(g: np.ndarray) -> np.ndarray:
+    def compute_surge(g: np.ndarray) -> np.ndarray:
         return 1 + 0.8 / (1 + np.tan(g / 2) / 0.05)
 
     disc = 0.6 * 2 * cos_i / (cos_i + cos_e) + 0.4 * cos_i
-    expected = 0.2 * (law.normalisation() * surge(phase) * disc + 0.2)
+    expected = 0.2 * (law.normalisation() * compute_surge(phase) * disc + 0.2)
     np.testing.assert_allclose(_render(renderer, camera, FLAT, sun, law), expected, rtol=1e-4)
 
 
@@ -84,17 +85,21 @@ def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: 
 def test_ground_facing_away_receives_only_sky_light(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     x = np.arange(256) * 8.0
     heights = np.broadcast_to(40.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
-    low = Sun(direction(np.radians(90.0), np.radians(5.0)))
+    low_sun = Sun(direction(np.radians(90.0), np.radians(5.0)))
     without_sky = _render(
-        renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_fraction=0.0, surrounding_albedo=0.0)
+        renderer,
+        descent_camera(128),
+        _make_surface(heights),
+        low_sun,
+        Photometry(sky_fraction=0.0, surrounding_albedo=0.0),
     )
     assert without_sky.min() == 0.0
-    with_sky = _render(renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_fraction=0.15))
+    with_sky = _render(renderer, descent_camera(128), _make_surface(heights), low_sun, Photometry(sky_fraction=0.15))
     assert with_sky.min() > 0.15 * 0.2 * 0.9
 
 
-def test_distant_ground_is_averaged(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
-    """Stripes four times finer than a pixel converge to their mean without aliasing."""
+def test_albedo_finer_than_a_pixel_is_averaged(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+    """Stripes four times finer than a pixel appear as their mean, without aliasing."""
     samples = np.zeros((512, 512, 2), dtype=np.float32)
     samples[..., 1] = 0.2
     samples[:, ::2, 1] = 0.4

@@ -28,6 +28,7 @@ from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.microrelief import octave_heights
 
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
+#: Cover of one cell with the amplitude factor 1.
 UNIFORM = np.ones((1, 1), dtype=np.float32)
 POSE = rigid(Rotation.identity(), np.array([30.0, 40.0, 20.0]))
 
@@ -37,7 +38,7 @@ def _make_relief(coarsest_m: float, *heights_m: float) -> MicroRelief:
 
 
 def _sample_noise(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Value and derivatives of the noise, shape (n, 3)."""
+    """Compute value and x and y derivatives of the noise, shape (n, 3)."""
     return np.array([relief_noise(a, b, seed) for a, b in zip(x.ravel(), y.ravel(), strict=True)])
 
 
@@ -89,14 +90,15 @@ def test_octaves_continue_the_spectrum_of_the_terrain(hurst: float) -> None:
 
 @pytest.mark.parametrize("cell_px", [4.0, 2.0])
 def test_slopes_are_attenuated_as_by_averaging_over_a_pixel(cell_px: float) -> None:
-    """Slopes averaged over pixels of 15 x 15 samples, against the attenuation of the footprint."""
-    pixels, inside = 40, 15
+    """The RMS of attenuated slopes equals that of slopes averaged over pixels of 15 x 15 samples."""
+    pixels, samples_per_pixel = 40, 15
     centre = np.arange(pixels) / cell_px
-    offset = (np.arange(inside) - 7.0) / inside / cell_px
+    offset = (np.arange(samples_per_pixel) - 7.0) / samples_per_pixel / cell_px
     x, y = np.meshgrid((centre[:, None] + offset).ravel(), (centre[:, None] + offset).ravel())
-    slope = _sample_noise(x, y)[:, 1].reshape(pixels, inside, pixels, inside)
+    slope = _sample_noise(x, y)[:, 1].reshape(pixels, samples_per_pixel, pixels, samples_per_pixel)
     expected = slope.mean(axis=(1, 3))
     u, v = (grid.ravel() for grid in np.meshgrid(centre, centre))
+    # Slopes in x and y; resolved and unresolved slope variance.
     outputs = [np.zeros(u.size) for _ in range(4)]
     add_relief_slopes(u, v, np.full(u.size, 1.0 / cell_px), _make_relief(1.0, 1.0), *outputs)
     assert np.std(outputs[0]) == pytest.approx(np.std(expected), rel=0.06)
@@ -122,43 +124,45 @@ def test_shadowing_equals_smiths_formula(elevation_deg: float, slope_deg: float)
 
 
 def _shade_heights(heights: np.ndarray, step_m: float, sun: np.ndarray) -> np.ndarray:
-    """Lambert shading of a fine height field with cast shadows, found by marching along the sun's azimuth."""
+    """Compute Lambert shading of a fine height field; find cast shadows by marching along the sun's azimuth."""
     slope_y, slope_x = np.gradient(heights, step_m)
     cosine = (sun[2] - slope_x * sun[0] - slope_y * sun[1]) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
     horizontal = np.hypot(*sun[:2])
-    rise, shadow = sun[2] / horizontal * step_m, np.zeros(heights.shape, dtype=bool)
+    rise, is_shaded = sun[2] / horizontal * step_m, np.zeros(heights.shape, dtype=bool)
     rows, columns = np.mgrid[: heights.shape[0], : heights.shape[1]].astype(float)
     for k in range(1, int(np.ptp(heights) / rise) + 2):
-        at = [rows + k * sun[1] / horizontal, columns + k * sun[0] / horizontal]
-        shadow |= map_coordinates(heights, at, order=1, mode="nearest") > heights + k * rise
-    return np.where(shadow, 0.0, np.maximum(cosine, 0.0))
+        positions = [rows + k * sun[1] / horizontal, columns + k * sun[0] / horizontal]
+        is_shaded |= map_coordinates(heights, positions, order=1, mode="nearest") > heights + k * rise
+    return np.where(is_shaded, 0.0, np.maximum(cosine, 0.0))
 
 
 @pytest.mark.parametrize("rms_slope_deg", [8.0, 15.0])
 def test_shading_changes_with_the_sun_as_for_a_height_field(
     renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], rms_slope_deg: float
 ) -> None:
-    """Images under two suns 90 deg apart correlate as those of a ray-cast height field, within 0.05."""
-    cell, pixels, inside = 0.8, 96, 6
+    """Images under two sun azimuths 90 deg apart have the correlation of a ray-cast height field, within 0.05."""
+    cell, pixels, samples_per_pixel = 0.8, 96, 6
     relief = _make_relief(cell, np.tan(np.radians(rms_slope_deg)) * cell / np.sqrt(SLOPE_VARIANCE))
     rays = PixelRays.of(descent_camera(pixels, (0.0, 0.0, 0.0)))
     suns = [direction(np.radians(azimuth), np.radians(35.0)) for azimuth in (60.0, 150.0)]
     scene = Scene(flat, (30.0, 40.0), Sun(suns[0]), LAMBERT, relief=relief)
     frames = [renderer.render(replace(scene, sun=Sun(sun)), rays, POSE) for sun in suns]
-    rendered = np.corrcoef(frames[0].radiance.ravel(), frames[1].radiance.ravel())[0, 1]
+    rendered_correlation = np.corrcoef(frames[0].radiance.ravel(), frames[1].radiance.ravel())[0, 1]
     points = frames[0].points_world()
     x0, x1 = np.sort(points[0, [0, -1], 0])
     y0, y1 = np.sort(points[[0, -1], 0, 1])
-    step = (x1 - x0) / (pixels - 1) / inside
+    step = (x1 - x0) / (pixels - 1) / samples_per_pixel
     x, y = np.meshgrid(np.arange(x0, x1, step), np.arange(y0, y1, step))
     heights = relief.heights[0] * _sample_noise(x / cell, y / cell)[:, 0].reshape(x.shape)
-    shaded = []
+    reference_images = []
     for sun in suns:
         image = _shade_heights(heights, step, sun)
-        side = [n // inside * inside for n in image.shape]
-        image = image[: side[0], : side[1]].reshape(side[0] // inside, inside, side[1] // inside, inside)
-        shaded.append(image.mean(axis=(1, 3)).ravel())
-    assert rendered == pytest.approx(np.corrcoef(*shaded)[0, 1], abs=0.05)
+        side = [n // samples_per_pixel * samples_per_pixel for n in image.shape]
+        image = image[: side[0], : side[1]].reshape(
+            side[0] // samples_per_pixel, samples_per_pixel, side[1] // samples_per_pixel, samples_per_pixel
+        )
+        reference_images.append(image.mean(axis=(1, 3)).ravel())
+    assert rendered_correlation == pytest.approx(np.corrcoef(*reference_images)[0, 1], abs=0.05)
     for frame in frames:
         assert frame.radiance.std() > 0.03 * frame.radiance.mean()
 

@@ -1,4 +1,4 @@
-"""Tests of image motion between renderings, against the camera model: short forms of checks in `make validate`."""
+"""Tests of image motion between renderings against the camera model; `make validate` has longer versions."""
 
 from collections.abc import Callable
 
@@ -15,12 +15,12 @@ from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
-#: Limit of the means over all patches in the full measurement of at least 200 patches.
+#: Limit of the mean error over all patches; the full validation has at least 200 patches.
 MAX_MEAN_ERROR_PX = 0.02
 
 
 def test_known_shift_is_estimated() -> None:
-    """Bumps of several pixels at exact positions; the second image is darker by a gain."""
+    """The images show Gaussian bumps at exact positions. The second image has another gain and offset."""
     rng = np.random.default_rng(2)
     positions, sizes, heights = rng.uniform(0, 160, (900, 2)), rng.uniform(2.0, 5.0, 900), rng.uniform(-1, 1, 900)
     v, u = np.mgrid[:160, :160].astype(np.float64)
@@ -35,21 +35,23 @@ def test_known_shift_is_estimated() -> None:
     first, second = SmoothImage(render_bumps(np.zeros(2))), SmoothImage(0.8 * render_bumps(shift) + 0.1)
     shifts = symmetric_shifts(first, second, patch_grid((160, 160)))
     np.testing.assert_allclose(shifts.motion_px, np.broadcast_to(shift, shifts.motion_px.shape), atol=2e-3)
-    # With equal motion of all pixels in a patch, the estimator expects that motion.
-    everywhere = np.broadcast_to(shift, (len(shifts.motion_px), PATCH, PATCH, 2))
-    np.testing.assert_allclose(shifts.expected(everywhere), np.broadcast_to(shift, shifts.motion_px.shape), atol=1e-9)
+    # If all pixels of a patch have the same motion, the expected shift is that motion.
+    uniform_motion = np.broadcast_to(shift, (len(shifts.motion_px), PATCH, PATCH, 2))
+    np.testing.assert_allclose(
+        shifts.expected(uniform_motion), np.broadcast_to(shift, shifts.motion_px.shape), atol=1e-9
+    )
 
 
 def test_descent_image_motion_matches_the_camera(
-    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
+    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     texture = Texture(3.0, (0.03,) * 6)
-    scene = Scene(rough, (380.0, 200.0), SUN, Photometry(), ground_texture=texture)
+    scene = Scene(terrain, (380.0, 200.0), SUN, Photometry(), ground_texture=texture)
     camera = descent_camera().crop(256, 256, (512, 512))
     pose = rigid(Rotation.from_euler("zyx", [20.0, 5.0, -4.0], degrees=True), np.array([380.0, 200.0, 2000.0]))
     for motion in measure(renderer, View(scene, camera, pose), np.array([0.3, 0.75])):
         assert len(motion.error) >= 200
-        # Ten times better than the limit: without rocks the image has no edges.
+        # Without rocks the image has no edges, so the limit is ten times stricter.
         assert np.abs(motion.error.mean(axis=0)).max() < 0.1 * MAX_MEAN_ERROR_PX
 
 
@@ -84,8 +86,8 @@ def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer, distance_
         axis=np.array([1.0, 0.0, 0.0]),
         right=np.array([0.0, -1.0, 0.0]),
     )
-    down = np.arctan2(0.9, distance_m)
-    view = View(scene, camera, rigid(Rotation.from_euler("y", down), eye))
+    depression_rad = np.arctan2(0.9, distance_m)
+    view = View(scene, camera, rigid(Rotation.from_euler("y", depression_rad), eye))
     for motion in measure(renderer, view, np.array([0.3, 0.75])):
         on_rock = motion.error[motion.body >= 0]
         assert len(on_rock) > 60

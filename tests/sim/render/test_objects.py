@@ -40,7 +40,7 @@ def test_subset_contains_the_selected_bodies() -> None:
 
 
 def test_cone_selects_facing_triangles_of_bodies_within_it() -> None:
-    """A triangle faces the eye if its corners appear counter-clockwise from there."""
+    """A triangle faces the eye if its corners appear counter-clockwise from the eye."""
     objects = _make_bodies()
     eye = objects.spheres[2, :3] + np.array([0.0, 0.0, 200.0])
     result = objects.in_cone(eye, np.array([0.0, 0.0, -1.0]), 1e-3)

@@ -49,14 +49,14 @@ def test_reflectance_law_is_reciprocal(renderer: Renderer, flat: Surface, law: P
     for _ in range(3):
         azimuths, heights = rng.uniform(0.0, 2.0 * np.pi, 2), np.arcsin(rng.uniform(0.15, 1.0, 2))
         sun, eye = (direction(float(a), float(h)) for a, h in zip(azimuths, heights, strict=True))
-        forward, backward = _brightness(renderer, flat, law, sun, eye), _brightness(renderer, flat, law, eye, sun)
+        forward, backward = (_brightness(renderer, flat, law, sun, eye), _brightness(renderer, flat, law, eye, sun))
         # I/F divided by the cosine of incidence is pi times the bidirectional reflectance.
         assert forward / sun[2] == pytest.approx(backward / eye[2], rel=1e-5)
 
 
 @with_each_law
 def test_albedo_is_the_reflected_fraction_of_light(law: Photometry) -> None:
-    """For sun and eye directions drawn with a cosine density, the mean of (I/F) / cos i is the spherical albedo."""
+    """For sun and eye directions with a cosine density, the mean of (I/F) / cos i is the spherical albedo."""
     sin2_i, sin2_e, azimuth_turns = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(17).T
     cos_i, cos_e = np.sqrt(1.0 - sin2_i), np.sqrt(1.0 - sin2_e)
     g = np.arccos(np.clip(cos_i * cos_e + np.sqrt(sin2_i * sin2_e) * np.cos(2.0 * np.pi * azimuth_turns), -1.0, 1.0))
@@ -79,9 +79,9 @@ def _hazcam() -> Cahvore:
 
 @pytest.mark.parametrize("is_fisheye", [False, True])
 def test_opposition_peak_is_at_the_antisolar_point(
-    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], is_fisheye: float
+    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], is_fisheye: bool
 ) -> None:
-    """The centre of the peak in the image is within half a pixel."""
+    """The centroid of the peak is within half a pixel of the antisolar point."""
     camera = _hazcam() if is_fisheye else descent_camera(512)
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
     pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))

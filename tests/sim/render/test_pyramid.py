@@ -16,7 +16,9 @@ def test_kernels_receive_a_constant_number_of_levels(side: int) -> None:
     assert levels[coarsest].shape[0] == 16
     assert all(level is expected for level, expected in zip(levels, surface.levels, strict=False))
     # Kernels are compiled for levels of the same array type.
-    assert {(a.dtype.str, a.flags.writeable, a.flags.c_contiguous) for a in levels} == {("<f4", False, True)}
+    assert {(level.dtype.str, level.flags.writeable, level.flags.c_contiguous) for level in levels} == {
+        ("<f4", False, True)
+    }
     assert all(ceiling is expected for ceiling, expected in zip(ground.ceilings, surface.ceilings, strict=False))
-    without = ground_struct(surface, ground.extent, ceilings=False)
-    assert all(ceiling is NO_CEILING for ceiling in without.ceilings)
+    ground_without_ceilings = ground_struct(surface, ground.extent, ceilings=False)
+    assert all(ceiling is NO_CEILING for ceiling in ground_without_ceilings.ceilings)

@@ -35,7 +35,7 @@ def test_rover_stands_on_the_ground_with_specified_size(rover: RoverParameters, 
     stance = settle(rover, Plane(height_m=2.0), 10.0, 20.0, EAST)
     objects = rover_objects(rover, stance, mast, 0.0, 0.0)
     low, high = objects.triangles.min(axis=(0, 1)), objects.triangles.max(axis=(0, 1))
-    # Wheels are cylinders with 24 sides: a side may be a hundredth of a radius short.
+    # Wheels are prisms with 24 sides: the middle of a side is 1 % of the radius closer to the axis than a corner.
     assert low[2] == pytest.approx(2.0, abs=0.01 * rover.wheel_radius_m)
     assert high[2] == pytest.approx(2.0 + (mast.base_m + mast.elbow_m + mast.head_m)[2] + 0.06, abs=1e-9)
     assert (low[1], high[1]) == pytest.approx(
@@ -48,15 +48,15 @@ def test_rover_stands_on_the_ground_with_specified_size(rover: RoverParameters, 
 def test_normals_point_outwards() -> None:
     stance = settle(MER, Plane(), 0.0, 0.0, EAST)
     objects = rover_objects(MER, stance, MER_MAST, 0.3, -0.2)
-    # For closed bodies the flux of the position through the faces is three times the positive volume.
-    crossed = np.cross(*(objects.triangles[:, k] - objects.triangles[:, 0] for k in (1, 2)))
-    assert np.einsum("ti,ti->", objects.triangles[:, 0], crossed) > 0.0
-    areas = np.linalg.norm(crossed, axis=1, keepdims=True)
-    assert objects.normals[:, 0] == pytest.approx(crossed / areas)
+    # For closed bodies the flux of the position vector through the faces is three times the volume, so it is positive.
+    face_normals = np.cross(*(objects.triangles[:, k] - objects.triangles[:, 0] for k in (1, 2)))
+    assert np.einsum("ti,ti->", objects.triangles[:, 0], face_normals) > 0.0
+    lengths = np.linalg.norm(face_normals, axis=1, keepdims=True)
+    assert objects.normals[:, 0] == pytest.approx(face_normals / lengths)
 
 
 def test_wheels_follow_the_suspension() -> None:
-    # With a block under the left front wheel, the lowest rover points there are on the block.
+    # The left front wheel stands on a block: its lowest points are at the height of the block.
     stance = settle(MER, Mounds(((0.705, 0.53, 0.1),)), 0.0, 0.0, EAST)
     corners = rover_objects(MER, stance, MER_MAST, 0.0, 0.0).triangles.reshape(-1, 3)
     for x, y, height in ((0.705, 0.53, 0.1), (0.705, -0.53, 0.0), (-0.705, 0.53, 0.0)):
@@ -73,7 +73,7 @@ def test_head_does_not_occlude_its_cameras(azimuth_deg: float, elevation_deg: fl
     objects = rover_objects(MER, stance, pair.geometry, *angles, baseline_m=0.2)
     world_from_head = stance.world_from_rover * pair.geometry.rover_from_head(*angles)
     for camera in (pair.left.transform(world_from_head), pair.right.transform(world_from_head)):
-        # The central part of the image, which shows the targets.
+        # Only the central part of the image is tested, because targets appear there.
         u, v = np.meshgrid(np.linspace(430.0, 590.0, 9), np.linspace(430.0, 590.0, 9))
         origins, directions = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))
         hit_distances = cast_triangles(objects, origins, directions, nearest=1e-3)
@@ -84,9 +84,9 @@ def test_head_does_not_occlude_its_cameras(azimuth_deg: float, elevation_deg: fl
 def test_rover_tilts_with_the_ground() -> None:
     stance = settle(MER, uphill_east(10.0), 0.0, 0.0, EAST)
     objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
-    level = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
+    on_level_ground = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
     assert objects.triangles.reshape(-1, 3) == pytest.approx(
-        stance.world_from_rover.apply(level.triangles.reshape(-1, 3)), abs=1e-9
+        stance.world_from_rover.apply(on_level_ground.triangles.reshape(-1, 3)), abs=1e-9
     )
 
 
@@ -99,7 +99,7 @@ def test_mast_shadow_is_opposite_the_sun(renderer: Renderer) -> None:
     sun = Sun(direction(EAST, elevation))
     objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
     scene = Scene(surface, (32.0, 32.0), sun, LAMBERT, objects, mesh_finest_m=0.2, mesh_reach_m=60.0, edge_rays=1)
-    # High on the mast, outside the deck's shadow: the shadow is in the west at height / tan(elevation).
+    # A point high on the mast, whose shadow is outside that of the deck: in the west at height / tan(elevation).
     mast = stance.world_from_rover.apply(np.array([*MER_MAST.base_m[:2], 0.0]))
     height_m = 1.28
     expected = mast + np.array([-height_m / np.tan(elevation), 0.0, 0.0])

@@ -24,7 +24,7 @@ from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
 
 ALBEDO = 0.2
-#: Brightness is then albedo times the cosine of incidence in sunlight, and 0 in shadow.
+#: With this law the radiance is albedo times the cosine of incidence in sunlight, and 0 in shadow.
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 #: Required fraction of equal pixels, from docs/validation.md.
 MIN_AGREEMENT = 0.995
@@ -38,30 +38,30 @@ def _with_uniform_albedo(surface: Surface) -> Surface:
 
 
 def _compare_with_ray_cast(frame: Frame, scene: Scene, count: int, step: float) -> tuple[float, float]:
-    """Fraction of random pixels where image and ray cast agree, and the fraction in cast shadow."""
+    """Compute the fraction of random pixels where image and ray cast agree, and the fraction in cast shadow."""
     pixels = np.random.default_rng(6).integers(0, frame.radiance.size, count)
     points = frame.points_world().reshape(-1, 3)[pixels]
     to_sun = scene.sun.direction
-    facing = frame.normal.reshape(-1, 3)[pixels].astype(np.float64) @ to_sun
-    fraction = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(facing, 1e-6))
+    cos_incidence = frame.normal.reshape(-1, 3)[pixels].astype(np.float64) @ to_sun
+    fraction = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(cos_incidence, 1e-6))
     is_shaded = Ground(scene.surface).is_occluded(points, to_sun, step)
     rays = np.broadcast_to(to_sun, points.shape)
     is_shaded |= np.isfinite(cast_triangles(scene.objects, points, rays, nearest=2e-3))
-    actual, expected = (facing > 0.0) & (fraction > 0.5), (facing > 0.0) & ~is_shaded
-    return float(np.mean(actual == expected)), float(np.mean((facing > 0.0) & is_shaded))
+    actual, expected = (cos_incidence > 0.0) & (fraction > 0.5), (cos_incidence > 0.0) & ~is_shaded
+    return float(np.mean(actual == expected)), float(np.mean((cos_incidence > 0.0) & is_shaded))
 
 
 @pytest.mark.parametrize("azimuth_deg", [110.0, 200.0])
 def test_low_sun_shadows_of_rough_ground_match_ray_cast(
-    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor], azimuth_deg: float
+    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor], azimuth_deg: float
 ) -> None:
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(12.0)))
-    scene = Scene(_with_uniform_albedo(rough), (380.0, 200.0), sun, LAMBERT, edge_rays=1)
+    scene = Scene(_with_uniform_albedo(terrain), (380.0, 200.0), sun, LAMBERT, edge_rays=1)
     pose = rigid(Rotation.from_euler("zxy", [30.0, 12.0, 5.0], degrees=True), np.array([380.0, 200.0, 1500.0]))
     frame = renderer.render(scene, PixelRays.of(descent_camera(512)), pose)
-    agree, in_shadow = _compare_with_ray_cast(frame, scene, 4000, 0.3)
-    assert in_shadow > 0.02
-    assert agree >= MIN_AGREEMENT
+    agreement, shaded_fraction = _compare_with_ray_cast(frame, scene, 4000, 0.3)
+    assert shaded_fraction > 0.02
+    assert agreement >= MIN_AGREEMENT
 
 
 def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
@@ -83,9 +83,9 @@ def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
     scene = Scene(surface, (10.0, 10.0), sun, LAMBERT, rocks, mesh_finest_m=0.1, mesh_reach_m=100.0, edge_rays=1)
     eye = np.array([10.0, 10.0, float(surface.height(10.0, 10.0)) + 8.0])
     frame = renderer.render(scene, PixelRays.of(camera), rigid(Rotation.from_euler("x", 15.0, degrees=True), eye))
-    agree, in_shadow = _compare_with_ray_cast(frame, scene, 3000, 0.02)
-    assert in_shadow > 0.02
-    assert agree >= MIN_AGREEMENT
+    agreement, shaded_fraction = _compare_with_ray_cast(frame, scene, 3000, 0.02)
+    assert shaded_fraction > 0.02
+    assert agreement >= MIN_AGREEMENT
 
 
 def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
@@ -95,7 +95,7 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
     samples = np.stack([heights, np.full_like(heights, ALBEDO)], axis=-1).astype(np.float32)
     surface = Surface.from_samples(samples, spacing)
     sun = Sun(direction(np.radians(270.0), elevation))
-    # Elevation of the skyline, which the ridge at x = 30 m forms, seen from ground positions in the east.
+    # Elevation of the ridge at x = 30 m, seen from ground positions in the east.
     profile = np.arange(28.0, 32.0, 0.01)
     crest = surface.height(profile, 0.0)
     ground = np.linspace(75.0, 95.0, 2001)
@@ -107,7 +107,7 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
     offset = np.clip((elevation - np.interp(x_m, ground, skyline)) / sun.angular_radius_rad, -1.0, 1.0)
     expected = 0.5 + (offset * np.sqrt(1.0 - offset**2) + np.arcsin(offset)) / np.pi
     sun_fraction = frame.radiance.ravel() / (ALBEDO * np.sin(elevation))
-    # the penumbra is 1 m wide; a pixel covers 3 cm
+    # The penumbra is 1 m wide; a pixel covers 3 cm.
     assert 0.1 < np.mean((expected > 0.0) & (expected < 1.0)) < 0.3
     np.testing.assert_allclose(sun_fraction, expected, atol=0.01)
 
@@ -135,12 +135,12 @@ def test_shaded_positions_equal_an_exhaustive_search(elevation: float) -> None:
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 200.0, 290.0, 45.0])
-def test_shadow_sweep_of_an_area_equals_the_full_sweep(rough: Surface, azimuth_deg: float) -> None:
-    """Includes the border of the terrain period."""
+def test_shadow_sweep_of_an_area_equals_the_full_sweep(terrain: Surface, azimuth_deg: float) -> None:
+    """The area includes the border of the terrain period."""
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(35.0)))
-    heights = height_range(rough.levels[0])
+    heights = height_range(terrain.levels[0])
     area_m = (-40.0, 60.0, 700.0, 760.0)
-    full_shadow, area_shadow = ground_shadow(rough, sun, heights), ground_shadow(rough, sun, heights, area_m)
+    full_shadow, area_shadow = (ground_shadow(terrain, sun, heights), ground_shadow(terrain, sun, heights, area_m))
     full, area, spacing = full_shadow.height, area_shadow.height, full_shadow.spacing
     assert full_shadow[2:] == area_shadow[2:]
     assert len(area) < len(full)
@@ -153,15 +153,15 @@ def test_shadow_sweep_of_an_area_equals_the_full_sweep(rough: Surface, azimuth_d
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 225.0])
-def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_deg: float) -> None:
+def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_deg: float) -> None:
     def sun_at(elevation_rad: float) -> Sun:
         return Sun(direction(np.radians(azimuth_deg), elevation_rad))
 
     high_sun = sun_at(np.radians(80.0))
-    max_slopes = slope_bounds(rough, high_sun)
+    max_slopes = slope_bounds(terrain, high_sun)
     rng = np.random.default_rng(4)
-    x, y = rng.uniform(0.0, rough.period_m, (2, 20000))
-    slopes = np.abs(rough.gradient(x, y))
+    x, y = rng.uniform(0.0, terrain.period_m, (2, 20000))
+    slopes = np.abs(terrain.gradient(x, y))
     assert np.all(slopes <= max_slopes)
     assert np.all(slopes.max(axis=0) > 0.6 * np.array(max_slopes))
     east, north = np.abs(high_sun.direction[:2]) / np.hypot(*high_sun.direction[:2])
@@ -170,29 +170,29 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_de
         sun_at(max_slope_angle + high_sun.angular_radius_rad + offset) for offset in (1e-4, -1e-4)
     )
     assert is_sun_above_slopes(just_above, max_slopes)
-    assert slope_bounds(rough, just_above) == max_slopes
+    assert slope_bounds(terrain, just_above) == max_slopes
     assert not is_sun_above_slopes(just_below, max_slopes)
-    assert slope_bounds(rough, just_below) == (np.inf, np.inf)
-    # The sweep finds no shadow except for rounding.
-    shadow = ground_shadow(rough, just_above, height_range(rough.levels[0]))
-    heights = rough.levels[shadow.level][..., 0].T if shadow.along_x else rough.levels[shadow.level][..., 0]
+    assert slope_bounds(terrain, just_below) == (np.inf, np.inf)
+    # The sweep finds no shadow; the tolerance covers rounding.
+    shadow = ground_shadow(terrain, just_above, height_range(terrain.levels[0]))
+    heights = terrain.levels[shadow.level][..., 0].T if shadow.along_x else terrain.levels[shadow.level][..., 0]
     assert np.all(shadow.height < heights + 1e-3)
-    scene = Scene(rough, (0.0, 0.0), just_above, Photometry())
+    scene = Scene(terrain, (0.0, 0.0), just_above, Photometry())
     assert scene.shadow is NO_SHADOW
     assert scene.with_light(just_below, Photometry()).shadow is not NO_SHADOW
 
 
 def test_bounds_contain_all_ground_in_a_cone() -> None:
     rng = np.random.default_rng(2)
-    tip, half = np.array([3.0, -2.0, 1.5]), 0.12
+    apex, half_angle_rad = np.array([3.0, -2.0, 1.5]), 0.12
     axis = direction(2.0, -0.3)
-    bounds = ground_in_cones([(tip, axis, half)], -0.4)
+    bounds = ground_in_cones([(apex, axis, half_angle_rad)], -0.4)
     assert bounds is not None
-    rays = axis + np.tan(half) * rng.uniform(-1.0, 1.0, (20000, 3))
+    rays = axis + np.tan(half_angle_rad) * rng.uniform(-1.0, 1.0, (20000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    rays = rays[rays @ axis >= np.cos(half)]
-    positions = tip + (rng.uniform(0.0, 1.0, len(rays)) ** 0.1 * (-0.4 - tip[2]) / rays[:, 2])[:, None] * rays
+    rays = rays[rays @ axis >= np.cos(half_angle_rad)]
+    positions = apex + (rng.uniform(0.0, 1.0, len(rays)) ** 0.1 * (-0.4 - apex[2]) / rays[:, 2])[:, None] * rays
     low, high = np.array(bounds).reshape(2, 2).T
     assert np.all((positions[:, :2] > low) & (positions[:, :2] < high))
-    assert np.all(high - low < 1.1 * np.ptp(np.vstack([positions, tip])[:, :2], axis=0))
-    assert ground_in_cones([(tip, direction(2.0, -0.1), half)], -0.4) is None
+    assert np.all(high - low < 1.1 * np.ptp(np.vstack([positions, apex])[:, :2], axis=0))
+    assert ground_in_cones([(apex, direction(2.0, -0.1), half_angle_rad)], -0.4) is None

@@ -13,6 +13,7 @@ from marsyard.sim.render import DustySky, Frame, Photometry, PixelRays, Renderer
 from marsyard.sim.render.kernels.photometry import sky_brightness
 from marsyard.sim.terrain import Surface
 
+#: Sky with an optical depth of 0.5, a single-scattering albedo of 0.95 and an asymmetry of 0.65.
 DUSTY = Photometry(sky_fraction=0.25, sky=DustySky(0.5, 0.95, 0.65))
 
 
@@ -23,7 +24,7 @@ def _make_flat_ground() -> Surface:
 
 
 def _make_sky_camera(size: int = 200) -> Cahv:
-    """Return a camera of 40 deg that looks north and up by 10 deg."""
+    """Return a camera with a field of view of 40 deg that looks north, 10 deg above the horizon."""
     up = np.radians(10.0)
     return Cahv.from_field_of_view(
         horizontal_rad=np.radians(40.0),
@@ -42,9 +43,9 @@ def _render_from_mast(renderer: Renderer, camera: Cahv, sun: Sun, photometry: Ph
 @pytest.mark.parametrize("elevation_deg", [15.0, 40.0, 90.0])
 @pytest.mark.parametrize("depth", [0.1, 0.9, 3.0])
 def test_sky_irradiance_on_level_ground_matches_its_fraction(elevation_deg: float, depth: float) -> None:
-    law = replace(DUSTY, sky=DustySky(depth, 0.95, 0.65))
+    photometry = replace(DUSTY, sky=DustySky(depth, 0.95, 0.65))
     sun = Sun(direction(0.3, np.radians(elevation_deg)))
-    coefficients = law.sky_coefficients(sun)
+    coefficients = photometry.sky_coefficients(sun)
     squared, azimuth_turns = qmc.Sobol(2, rng=np.random.default_rng(2)).random_base2(14).T
     up, horizontal, azimuth = np.sqrt(squared), np.sqrt(1.0 - squared), 2.0 * np.pi * azimuth_turns
     directions = np.stack([horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), up], axis=1)
@@ -54,7 +55,7 @@ def test_sky_irradiance_on_level_ground_matches_its_fraction(elevation_deg: floa
         sky_brightness(coefficients, sun.direction[2], 1e-9, ray[2], min(cos_angle, np.cos(1e-3)), 1e-3)
         for ray, cos_angle in zip(directions, cos_sun_angles, strict=True)
     ]
-    # The forward peak, 0.65**2 of singly scattered light, counts as direct sunlight.
+    # The forward peak (0.65**2 of the singly scattered light) counts as direct sunlight.
     single_scattering = np.mean(brightness) - coefficients[0]
     assert coefficients[0] + (1.0 - 0.65**2) * single_scattering == pytest.approx(0.25, rel=0.01)
 
@@ -77,10 +78,10 @@ def test_sky_radiance_matches_the_formula(renderer: Renderer) -> None:
 
 def test_sky_is_brighter_towards_the_sun_and_the_horizon(renderer: Renderer) -> None:
     camera = _make_sky_camera()
-    isotropic_law = replace(DUSTY, sky=DustySky(0.1, 0.95, 0.0))
+    isotropic_photometry = replace(DUSTY, sky=DustySky(0.1, 0.95, 0.0))
     towards_sun, away_from_sun, isotropic = (
-        _render_from_mast(renderer, camera, Sun(direction(azimuth, np.radians(40.0))), law).radiance[:, 100]
-        for azimuth, law in ((0.0, DUSTY), (np.pi, DUSTY), (np.pi, isotropic_law))
+        _render_from_mast(renderer, camera, Sun(direction(azimuth, np.radians(40.0))), photometry).radiance[:, 100]
+        for azimuth, photometry in ((0.0, DUSTY), (np.pi, DUSTY), (np.pi, isotropic_photometry))
     )
     _, directions = camera.rays(camera.pixel_grid())
     top, middle, low = (int(np.abs(directions[:, 100, 2] - np.sin(np.radians(e))).argmin()) for e in (28.0, 15.0, 1.5))

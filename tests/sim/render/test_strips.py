@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from marsyard.sim.render.kernels.strips import ROW, STRIP, fetch_levels, no_cells, spline
+from marsyard.sim.render.kernels.strips import ROW, STRIP, allocate_cells, fetch_levels, spline
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import sample
 
@@ -13,12 +13,12 @@ SURFACE = Surface.from_samples(SAMPLES, SPACING_M)
 
 def test_vectorised_spline_equals_single_evaluation() -> None:
     rng = np.random.default_rng(4)
-    # Inside the terrain, on its border and beyond (periodic).
+    # Positions inside the terrain, on its border and in other periods.
     x, y = rng.uniform(-40.0, 40.0, (2, ROW))
     x[:4], y[:4] = [0.0, -0.25, 31.75, 32.0], [31.9, 0.0, -0.1, 16.0]
     level_of = rng.integers(0, len(SURFACE.levels), STRIP)
     indices = np.sort(rng.permutation(STRIP)[:100])
-    cells = no_cells()
+    cells = allocate_cells()
     fetch_levels(SURFACE.levels, 1.0 / SPACING_M, level_of, indices, indices.size, x, y, cells)
     for k in indices:
         scale = 1.0 / SPACING_M / 2.0 ** level_of[k]

@@ -38,17 +38,17 @@ def test_exception_in_a_thread_is_raised() -> None:
 
 
 def test_images_do_not_depend_on_threads(
-    renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor], monkeypatch: pytest.MonkeyPatch
+    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rock = PlacedRock(name="rock", east_m=380.0, north_m=205.0, diameter_m=30.0, shape=3, yaw_deg=20.0)
-    field = RockField.on(rough, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
+    field = RockField.on(terrain, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
     mesh = field.near(380.0, 205.0, 60.0, above_m=200.0)
     rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.15)
-    light = Sun(direction(2.0, 0.6))
+    sun = Sun(direction(2.0, 0.6))
     scene = Scene(
-        rough,
+        terrain,
         (380.0, 200.0),
-        light,
+        sun,
         Photometry(),
         rocks,
         ground_texture=Texture(3.0, (0.03,) * 6),

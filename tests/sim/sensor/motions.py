@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.dynamics import Motion, State
 from marsyard.sim.sensor import ImageMotion
 
+#: Gravity of Mars, m/s2.
 GRAVITY = 3.71
 
 
 def uniform_motion(rows_s: float, columns_s: float) -> ImageMotion:
-    """Image motion with equal velocities of all pixels, pixels per second."""
+    """Return an image motion with equal velocities of all pixels, pixels per second (row, column)."""
     return ImageMotion(np.tile(np.array([rows_s, columns_s]), (2, 2, 1)))
 
 
@@ -55,6 +56,7 @@ class Swaying:
         attitudes = self.tilt * Rotation.from_rotvec(self.spin_rad_s * t * up) * nod
         rates = nod.inv().apply(np.broadcast_to(self.spin_rad_s * up, (times_s.size, 3)).copy())
         rates = rates + self.nod_rad * self.nod_rad_s * np.cos(self.nod_rad_s * t) * x_axis
+        # Velocity, acceleration and angular frequency of the sway.
         v, a, k = np.array(self.velocity_m_s), np.array(self.acceleration_m_s2), self.sway_rad_s
         accelerations = a - self.sway_m * k**2 * np.sin(k * t) * east
         return Motion(

@@ -13,7 +13,7 @@ from marsyard.sim.sensor import Approach, ApproachParameters, Imu, ImuIncrements
 from marsyard.sim.sensor.imu import true_increments
 from tests.sim.sensor.test_imu import perfect_unit
 
-#: A short profile that can be measured at the full rate.
+#: A profile short enough for a propagation at the full rate, without initial errors.
 SHORT = ApproachParameters(
     attitude_sd_deg=0.0, velocity_sd_m_s=0.0, cruise_s=60.0, entry_s=40.0, parachute_s=25.0, upright_s=15.0
 )
@@ -21,7 +21,7 @@ SHORT = ApproachParameters(
 
 @dataclass(frozen=True)
 class ProfileMotion:
-    """The nominal profile as a motion: attitude, rate and force without position and gravity."""
+    """Adapter of the nominal profile to a motion: attitude, rate and force; position and velocity are zero."""
 
     approach: Approach
     span_s: tuple[float, float] = (-np.inf, np.inf)
@@ -36,7 +36,7 @@ class ProfileMotion:
 
 
 def _propagate_at_full_rate(imu: Imu, approach: Approach, seeds: range) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Final errors of attitude and velocity from measurements of the profile at the full rate."""
+    """Compute the final errors of attitude (rotation vector, rad) and velocity (m/s); one pair per seed."""
     start = approach.attitudes(np.array([approach.start_s]))[0]
     boundaries = imu.boundaries(approach.start_s, approach.end_s)
     angles, velocities = true_increments(ProfileMotion(approach), boundaries)
@@ -62,10 +62,10 @@ def test_rates_are_the_derivative_of_attitude() -> None:
     h = 1e-4
     before, after = approach.attitudes(times - h), approach.attitudes(times + h)
     differences = (before.inv() * after).as_rotvec() / (2.0 * h)
-    # Except at the corners of the profile.
+    # The rate jumps at the corners of the profile, which are excluded.
     knots = np.array([-2.0 - 25.0 - 40.0, -2.0 - 25.0, -2.0 - 10.0])
-    smooth = np.abs(times[:, None] - knots).min(axis=1) > 2.0 * h
-    np.testing.assert_allclose(approach.body_rates(times)[smooth], differences[smooth], atol=1e-6)
+    is_smooth = np.abs(times[:, None] - knots).min(axis=1) > 2.0 * h
+    np.testing.assert_allclose(approach.body_rates(times)[is_smooth], differences[is_smooth], atol=1e-6)
 
 
 def test_profile_has_specified_deceleration_and_ends_upright() -> None:
@@ -116,7 +116,7 @@ def test_noise_matches_a_full_rate_propagation() -> None:
         np.std([e.velocity_m_s for e in fast], axis=0),
     )
     attitude_slow, velocity_slow = (np.std([s[k] for s in slow], axis=0) for k in (0, 1))
-    # 400 and 120 values determine the ratio to 7.4 %; the tolerance is three times that.
+    # The standard error of the ratio from 400 and 120 values is 7.4 %; the tolerance is three times that.
     np.testing.assert_allclose(attitude_fast / attitude_slow, 1.0, atol=0.22)
     np.testing.assert_allclose(velocity_fast / velocity_slow, 1.0, atol=0.22)
     np.testing.assert_allclose(np.degrees(attitude_fast), np.sqrt(125.0 / 3600.0), rtol=0.12)
@@ -143,7 +143,7 @@ def test_spin_scale_error_dominates_the_descent_attitude_error() -> None:
         imu = approach.calibrate(Imu.draw(ImuParameters(), (approach.start_s, 0.0), rng), rng)
         errors.append(approach.errors(imu, rng).attitude_rad)
     deviations_deg = np.degrees(np.std(errors, axis=0))
-    # About the spin axis (the entry direction): 1 deg/h for 1140 s is 0.32 deg, and 100 ppm of 38 turns are 1.37 deg.
-    # About the other axes the bias averages out until the parachute opens.
+    # Errors about the spin axis (the entry direction): 1 deg/h for 1140 s is 0.32 deg; 100 ppm of 38 turns is 1.37 deg.
+    # About the other axes the effect of the bias averages out until the parachute opens.
     assert 1.2 < deviations_deg[0] < 1.6
     assert deviations_deg[1:].max() < 0.45

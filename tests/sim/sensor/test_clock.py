@@ -16,7 +16,8 @@ def test_clock_offset_is_common_and_jitter_is_independent() -> None:
         offsets.append(clock.offset_s)
         jitters.append((errors[0] - errors[1]) / np.sqrt(2.0))
         assert errors.mean() == pytest.approx(clock.offset_s, abs=0.015)
-    # 400 values determine the standard deviation to 3.5 % and the mean to 0.001 s; tolerances are three times that.
+    # The standard errors from 400 values are 3.5 % of the deviation and 0.001 s of the mean; tolerances are three times
+    # that.
     assert np.mean(offsets) == pytest.approx(0.1, abs=0.003)
     assert np.std(offsets) == pytest.approx(0.02, rel=0.11)
     assert np.std(jitters) == pytest.approx(0.003, rel=0.11)

@@ -15,7 +15,7 @@ def test_companding_round_trip_is_within_half_a_step(full_scale: int) -> None:
     step = np.gradient(expansion_table(full_scale).astype(float))[compression_table(full_scale)]
     # The last codes are excluded because the last step has half the width.
     assert (error <= 0.5 * step + 1.0)[counts < expansion_table(full_scale)[253]].all()
-    # Twelve bits in eight: the widest step is 32 counts, the first steps are single counts.
+    # For twelve bits in eight the widest step is 32 counts. The first steps are single counts.
     assert error.max() <= full_scale / 255 * 1.1
     assert error[0, :2].max() == 0
 
@@ -24,7 +24,7 @@ def test_step_width_grows_with_square_root_of_signal() -> None:
     steps = np.diff(expansion_table(4095).astype(float))
     middle = expansion_table(4095)[1:-1].astype(float)
     widths = 0.5 * (steps[1:] + steps[:-1])
-    # The step is proportional to the root of the signal, with 31.9 counts at full scale.
+    # The step is proportional to the square root of the signal. It is 31.9 counts at full scale.
     np.testing.assert_allclose(widths[100:-2], 31.9 * np.sqrt((middle[100:-2] + 4.3) / 4099.0), atol=1.5)
 
 

@@ -1,4 +1,4 @@
-"""Tests of lossy image compression: error for a given size in bits per pixel, mean, position and range of counts."""
+"""Tests of lossy image compression: error for a given number of bits per pixel; mean, position and range of counts."""
 
 from itertools import pairwise
 
@@ -32,6 +32,6 @@ def test_counts_stay_within_full_scale() -> None:
 
 
 @pytest.mark.parametrize("bits", [0.0, 17.0, float("nan")])
-def test_impossible_sizes_are_rejected(bits: float) -> None:
+def test_invalid_bits_per_pixel_are_rejected(bits: float) -> None:
     with pytest.raises(ValueError, match=r"allowed: 0\.1 to 16"):
         compress(COUNTS, bits, 4095)

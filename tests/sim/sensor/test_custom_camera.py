@@ -1,4 +1,4 @@
-"""Tests of custom cameras in campaigns: mounting keeps all angles, and a stored camera replaces its file."""
+"""Tests of custom cameras in campaigns: mounting preserves all angles, and a stored camera replaces its file."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ def test_mounting_preserves_all_angles(euroc: Path) -> None:
     pixels = np.array([[0.0, 0.0], [751.0, 10.0], [400.0, 479.0], [100.0, 200.0]])
     actual, expected = (camera.rays(pixels)[1] for camera in (mounted, unmounted))
     assert np.allclose(actual @ actual.T, expected @ expected.T, rtol=0, atol=1e-12)
-    # Columns along +x, upper image edge along +y, viewing direction -z: OpenCV's y and z inverted.
+    # Mounted axes: columns along +x, upper image edge along +y, viewing direction -z. OpenCV's y and z are inverted.
     point = np.array([0.1, -0.2, 1.0])
-    reference, _ = cv2.projectPoints(
+    expected_pixels, _ = cv2.projectPoints(
         point.reshape(1, 1, 3),
         np.zeros(3),
         np.zeros(3),
         np.array([[458.654, 0, 367.215], [0, 457.296, 248.375], [0, 0, 1.0]]),
         np.array([-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]),
     )
-    # Within the fit and the 0.01 deg tilt of A caused by decentring.
-    assert np.allclose(mounted.project(point * [1.0, -1.0, -1.0])[0], reference.ravel(), rtol=0, atol=0.2)
+    # The tolerance covers the fit, and the 0.01 deg tilt of A that the tangential distortion causes.
+    assert np.allclose(mounted.project(point * [1.0, -1.0, -1.0])[0], expected_pixels.ravel(), rtol=0, atol=0.2)
 
 
 def test_opportunity_labels_can_be_mounted(shared_data: Path) -> None:

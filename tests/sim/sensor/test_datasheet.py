@@ -12,7 +12,7 @@ from marsyard.sim.sensor import DetectorChoice, DetectorParameters, preset, read
 
 CHOICE: TypeAdapter[DetectorParameters] = TypeAdapter(DetectorChoice)
 #: Sony IMX265: rounded EMVA 1288 values from a camera manufacturer, with a 16 mm f/4 lens.
-SHEET = """name = "Sony IMX265, f/4"
+DATASHEET = """name = "Sony IMX265, f/4"
 pixel_pitch_um = 3.45
 full_well_e = 10500
 read_noise_e = 2.4
@@ -31,46 +31,46 @@ transmission = 0.9
 """
 
 
-def write_sheet(folder: Path, text: str = SHEET) -> Path:
+def write_datasheet(folder: Path, text: str = DATASHEET) -> Path:
     path = folder / "sensor.toml"
     path.write_text(text)
     return path
 
 
 def test_parameters_follow_from_the_datasheet(tmp_path: Path) -> None:
-    p = read_datasheet(write_sheet(tmp_path)).parameters()
+    p = read_datasheet(write_datasheet(tmp_path)).parameters()
     assert p.gain_e_dn == pytest.approx(10500 / 4096)
     assert p.rows_summed == 1
     assert p.transfer_row_s == p.clear_row_s == 0.0
     assert p.readout_row_s == pytest.approx(0.0512 / 1536)
-    # The dark current at its specified temperature.
+    # At its specified temperature the dark current is that of the datasheet.
     assert p.temperature_c == 20.0
     assert p.dark_e_s * p.dark_growth == pytest.approx(1.0)
-    # Diffraction: about 550 nm x 4 / 3.45 um.
+    # The diffraction is wavelength times f-number / pixel pitch.
     assert p.optics.diffraction_px == pytest.approx(0.55 * 4 / 3.45, rel=0.02)
     # A radiance factor of 0.3 fills 60 % of the full well.
     assert 0.3 * p.responsivity_e_s * p.exposure_s == pytest.approx(0.6 * 10500)
 
 
 def test_responsivity_counts_solar_photons(tmp_path: Path) -> None:
-    """ASTM E490 gives 475 W/m2 between 420 and 680 nm; the mean photon energy is that of 550 nm."""
-    p = read_datasheet(write_sheet(tmp_path, "sun_au = 1.0\n" + SHEET)).parameters()
-    photons = 475.0 / (6.62607015e-34 * 2.99792458e8 / 550e-9)
-    expected = 0.65 * 0.9 * (3.45e-6) ** 2 * photons / (4.0 * 4.0**2)
+    """The solar irradiance is 475 W/m2 between 420 and 680 nm (ASTM E490). The mean photon energy is that of 550 nm."""
+    p = read_datasheet(write_datasheet(tmp_path, "sun_au = 1.0\n" + DATASHEET)).parameters()
+    photons_m2_s = 475.0 / (6.62607015e-34 * 2.99792458e8 / 550e-9)
+    expected = 0.65 * 0.9 * (3.45e-6) ** 2 * photons_m2_s / (4.0 * 4.0**2)
     # The sun is modelled as a black body, whose irradiance is up to 9 % below ASTM E490 in green light.
     assert p.responsivity_e_s == pytest.approx(expected, rel=0.1)
     # `sunlight` is the solar irradiance at `sun_au`, relative to 1 au.
     assert p.sunlight == 1.0
-    far_from_sun = read_datasheet(write_sheet(tmp_path, "sun_au = 3.0\n" + SHEET)).parameters()
+    far_from_sun = read_datasheet(write_datasheet(tmp_path, "sun_au = 3.0\n" + DATASHEET)).parameters()
     assert far_from_sun.responsivity_e_s / far_from_sun.sunlight == pytest.approx(p.responsivity_e_s)
 
 
 def test_constant_efficiency_curve_equals_scalar_efficiency(tmp_path: Path) -> None:
-    curve = SHEET.replace("quantum_efficiency = 0.65\n", "").replace(
+    curve = DATASHEET.replace("quantum_efficiency = 0.65\n", "").replace(
         "[lens]", "[quantum_efficiency]\nwavelength_nm = [300.0, 900.0]\nefficiency = [0.65, 0.65]\n\n[lens]"
     )
-    mean = read_datasheet(write_sheet(tmp_path)).parameters()
-    assert read_datasheet(write_sheet(tmp_path, curve)).parameters() == mean
+    scalar = read_datasheet(write_datasheet(tmp_path)).parameters()
+    assert read_datasheet(write_datasheet(tmp_path, curve)).parameters() == scalar
 
 
 def test_mer_ccd_from_datasheet_matches_the_preset(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ efficiency = {[percent / 100 for percent in efficiency_percent]}
 f_number = 12.0
 band_nm = [600.0, 800.0]
 """
-    actual = read_datasheet(write_sheet(tmp_path, text)).parameters()
+    actual = read_datasheet(write_datasheet(tmp_path, text)).parameters()
     expected = preset("mer-navcam").detector
     for name in ("responsivity_e_s", "exposure_s", "full_well_e", "gain_e_dn", "read_noise_e", "readout_row_s"):
         assert getattr(actual, name) == pytest.approx(getattr(expected, name), rel=1e-3), name
@@ -104,13 +104,13 @@ band_nm = [600.0, 800.0]
 
 
 def test_stored_parameters_do_not_need_the_datasheet_file(tmp_path: Path) -> None:
-    path = write_sheet(tmp_path)
+    path = write_datasheet(tmp_path)
     parameters = CHOICE.validate_python(str(path))
     assert parameters == read_datasheet(path).parameters().model_copy(update={"file": str(path)})
     # Stored parameters are validated without reading the datasheet file again.
     path.write_text("")
     assert CHOICE.validate_python(parameters.model_dump(mode="json")) == parameters
-    path.write_text(SHEET)
+    path.write_text(DATASHEET)
     changed = CHOICE.validate_python({"file": str(path), "temperature_c": -10.0, "optics": {"dust_discs": 3}})
     assert (changed.temperature_c, changed.optics.dust_discs) == (-10.0, 3)
     assert changed.full_well_e == parameters.full_well_e
@@ -136,15 +136,15 @@ FAULTS = [
 
 @pytest.mark.parametrize(("old", "new", "fault"), FAULTS, ids=[new or "nothing" for _, new, _ in FAULTS])
 def test_datasheet_errors_are_reported(tmp_path: Path, old: str, new: str, fault: str) -> None:
-    assert old in SHEET
-    path = write_sheet(tmp_path, SHEET.replace(old, new))
-    with pytest.raises(ValidationError, match=fault) as raised:
+    assert old in DATASHEET
+    path = write_datasheet(tmp_path, DATASHEET.replace(old, new))
+    with pytest.raises(ValidationError, match=fault) as error_info:
         CHOICE.validate_python(str(path))
-    assert "sensor.toml" in str(raised.value)
+    assert "sensor.toml" in str(error_info.value)
 
 
 def test_preset_and_file_together_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(ValidationError, match="not both"):
-        CHOICE.validate_python({"file": str(write_sheet(tmp_path)), "preset": "xc-55"})
+        CHOICE.validate_python({"file": str(write_datasheet(tmp_path)), "preset": "xc-55"})
     with pytest.raises(ValidationError, match="cannot be read"):
         CHOICE.validate_python("absent.toml")

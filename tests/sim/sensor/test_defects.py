@@ -13,12 +13,12 @@ def test_bad_pixels_are_replaced_by_the_mean_of_good_neighbours() -> None:
     is_bad[2, 3] = is_bad[2, 4] = is_bad[0, 0] = True
     corrupted = counts.copy()
     corrupted[is_bad] = 4000
-    repaired = fill_bad_pixels(corrupted, is_bad)
-    np.testing.assert_array_equal(repaired[~is_bad], counts[~is_bad])
+    corrected = fill_bad_pixels(corrupted, is_bad)
+    np.testing.assert_array_equal(corrected[~is_bad], counts[~is_bad])
     # Pixel (2, 3) has seven good neighbours: (2, 4) is bad.
     neighbours = [counts[i, j] for i in (1, 2, 3) for j in (2, 3, 4) if (i, j) not in ((2, 3), (2, 4))]
-    assert repaired[2, 3] == np.rint(np.mean(neighbours))
-    assert repaired[0, 0] == np.rint(np.mean([counts[0, 1], counts[1, 0], counts[1, 1]]))
+    assert corrected[2, 3] == np.rint(np.mean(neighbours))
+    assert corrected[0, 0] == np.rint(np.mean([counts[0, 1], counts[1, 0], counts[1, 1]]))
 
 
 def test_pixel_without_good_neighbours_is_unchanged() -> None:

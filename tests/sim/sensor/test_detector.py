@@ -10,19 +10,24 @@ from marsyard.sim.sensor.detector import BurstParameters, DefectParameters, dark
 from marsyard.sim.sensor.optics import OpticsParameters
 from tests.sim.sensor.motions import uniform_motion
 
+#: A uniform and a dark scene: radiance factors, shape (rows, columns).
 UNIFORM = np.ones((64, 48), dtype=np.float32)
+#: Optics without spread.
 SHARP = OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)
-PERFECT = {"response_spread": 0.0, "calibration_error": 0.0, "read_noise_e": 0.0, "optics": SHARP}
+NO_ERRORS = {"response_spread": 0.0, "calibration_error": 0.0, "read_noise_e": 0.0, "optics": SHARP}
 DARK = np.zeros_like(UNIFORM)
 
 
 def _make_detector(shape: tuple[int, int] = UNIFORM.shape, **changes: object) -> Detector:
-    parameters = DetectorParameters.model_validate(PERFECT | changes)
+    parameters = DetectorParameters.model_validate(NO_ERRORS | changes)
     return Detector.draw(np.ones(shape, dtype=np.float32), parameters, np.random.default_rng(0))
 
 
 def test_signal_divided_by_variance_equals_the_gain() -> None:
-    """Signal / variance of uniform images, both in counts, is the gain; 2 % is four standard errors of 100 images."""
+    """Signal divided by variance of uniform images, both in counts, is the gain in electrons per count.
+
+    The tolerance of 2 % is four standard errors of 100 images.
+    """
     detector = _make_detector(transfer_row_s=0.0, clear_row_s=0.0, responsivity_e_s=5e7)
     images = np.stack(
         [detector.expose(0.2 * UNIFORM, np.random.default_rng(seed)).astype(np.float64) for seed in range(100)]
@@ -34,7 +39,7 @@ def test_signal_divided_by_variance_equals_the_gain() -> None:
 
 
 def test_smear_of_a_bright_row_matches_transfer_times() -> None:
-    """A packet of row r passes the previous rows during readout and the following rows during clearing."""
+    """The charge of a row passes the previous rows during readout and the following rows during clearing."""
     detector = _make_detector(rows_summed=1, transfer_row_s=1e-5, clear_row_s=2e-6)
     scene = np.zeros_like(UNIFORM)
     scene[20] = 1.0
@@ -70,7 +75,7 @@ def test_calibration_response_has_the_specified_error() -> None:
         UNIFORM, DetectorParameters(response_spread=0.02, calibration_error=0.005), np.random.default_rng(3)
     )
     true_response = detector.response.reshape(16, 4, 48).mean(axis=1)
-    # 768 pixels determine the standard deviation to 2.6 %.
+    # The standard error of the deviation from 768 pixels is 2.6 %.
     assert (detector.calibration.flat_field / true_response).std() == pytest.approx(0.005, rel=0.1)
     assert true_response.std() == pytest.approx(0.02 / 2, rel=0.1)
 
@@ -81,11 +86,15 @@ def test_indivisible_rows_are_rejected() -> None:
 
 
 def test_dimes_correction_removes_the_smear() -> None:
-    """A static image of the complete detector with light down to one third and texture between pixels."""
+    """The static scene has the height of the detector, large-scale contrast, and texture of a few pixels."""
     rng = np.random.default_rng(5)
-    large = gaussian_filter(rng.standard_normal((1024, 32)), 60.0, mode="wrap")
-    fine = gaussian_filter(rng.standard_normal((1024, 32)), 1.5, mode="wrap")
-    scene = (0.15 * (1.0 + 0.3 * large / large.std() + 0.08 * fine / fine.std())).clip(0.05).astype(np.float32)
+    large_scale = gaussian_filter(rng.standard_normal((1024, 32)), 60.0, mode="wrap")
+    fine_scale = gaussian_filter(rng.standard_normal((1024, 32)), 1.5, mode="wrap")
+    scene = (
+        (0.15 * (1.0 + 0.3 * large_scale / large_scale.std() + 0.08 * fine_scale / fine_scale.std()))
+        .clip(0.05)
+        .astype(np.float32)
+    )
     detector = _make_detector(scene.shape)
     p = detector.parameters
 
@@ -97,7 +106,7 @@ def test_dimes_correction_removes_the_smear() -> None:
     assert np.abs(smeared - exposed).max() > 0.2 * p.full_scale_dn
     assert smeared.max() < p.full_scale_dn
     error = remove_frame_transfer(smeared, detector.calibration, 4) - exposed
-    # Requirement: 0.2 % of full scale; the residual comes from different rows within a delivered row.
+    # The requirement is 0.2 % of full scale. The residual is caused by differences between the rows that are summed.
     assert np.abs(error).max() < 0.002 * p.full_scale_dn
 
 
@@ -122,16 +131,16 @@ def test_dark_current_adds_signal_and_shot_noise() -> None:
     assert ((image - expected) / np.sqrt(expected)).std() == pytest.approx(1.0, abs=0.1)
 
 
-def test_hot_and_dead_pixels_have_specified_rates() -> None:
+def test_hot_and_dead_pixels_have_specified_fractions() -> None:
     defects = DefectParameters(hot_fraction=0.01, dead_fraction=0.02, hot_e_s=5000.0)
     detector = _make_detector((512, 512), defects=defects)
     assert detector.hot_e_s is not None
-    hot = detector.hot_e_s > 0.0
-    # 262,144 pixels: standard errors are 2 % and 1.4 % of the rates and 2 % of the mean current.
-    assert hot.mean() == pytest.approx(0.01, rel=0.06)
+    is_hot = detector.hot_e_s > 0.0
+    # For 262,144 pixels the standard errors are 2 % and 1.4 % of the fractions, and 2 % of the mean current.
+    assert is_hot.mean() == pytest.approx(0.01, rel=0.06)
     assert (detector.response == 0.0).mean() == pytest.approx(0.02, rel=0.05)
-    assert detector.hot_e_s[hot].mean() == pytest.approx(5000.0, rel=0.08)
-    # The calibration contains neither.
+    assert detector.hot_e_s[is_hot].mean() == pytest.approx(5000.0, rel=0.08)
+    # The calibration contains neither hot nor dead pixels.
     assert (detector.calibration.flat_field == 1.0).all()
     warmer = _make_detector((512, 512), defects=defects, temperature_c=detector.parameters.temperature_c + 6.0)
     np.testing.assert_allclose(warmer.dark_charge(), 2.0 * detector.dark_charge(), rtol=1e-5)
@@ -148,11 +157,11 @@ def test_bursts_disturb_runs_along_the_rows() -> None:
         for n in range(60)
     ]
     changed = np.stack([(a != b).reshape(-1) for a, b in pairs])
-    # 180 bursts of 200 pixels determine the rate to 10 %, minus those clipped by the image border (1 %).
+    # The standard error from 180 bursts of 200 pixels is 10 %. The image border clips 1 % of the pixels.
     assert changed.sum() / 60 == pytest.approx(600.0, rel=0.25)
-    # Each burst is one run: few disturbed pixels follow a quiet pixel (some noise rounds to zero).
-    starts = (changed[:, 1:] & ~changed[:, :-1]).sum() / 60
-    assert starts < 10.0
+    # A burst is one run of pixels, so few disturbed pixels follow an undisturbed one (some noise rounds to zero).
+    run_starts = (changed[:, 1:] & ~changed[:, :-1]).sum() / 60
+    assert run_starts < 10.0
 
 
 def test_companding_noise_is_below_shot_noise() -> None:
@@ -162,8 +171,9 @@ def test_companding_noise_is_below_shot_noise() -> None:
         for value in (False, True)
     )
     assert len(np.unique(companded)) < len(np.unique(uncompanded))
-    signal = uncompanded - 20.0
-    assert (np.abs(companded - uncompanded) <= np.sqrt(signal * 41.5) / 41.5 * 2.0 + 1.0).all()
+    # The default offset is 20 counts, the gain 41.5 electrons per count. The limit is two sigma of shot noise.
+    signal_dn = uncompanded - 20.0
+    assert (np.abs(companded - uncompanded) <= np.sqrt(signal_dn * 41.5) / 41.5 * 2.0 + 1.0).all()
 
 
 def test_motion_blur_is_reproducible() -> None:

@@ -6,6 +6,7 @@ from pydantic import ValidationError
 
 from marsyard.sim.sensor import AutoExposureParameters, Detector, DetectorParameters, auto_expose
 
+#: Radiance factors, mean 0.11.
 GROUND = (0.1 + 0.02 * np.random.default_rng(0).random((128, 96))).astype(np.float32)
 OPTIONS = AutoExposureParameters()
 
@@ -26,7 +27,7 @@ def test_auto_exposure_converges_from_dark_and_bright(start_s: float) -> None:
 
 
 def test_exposure_can_use_a_part_of_the_image() -> None:
-    """Under a bright sky the ground is dark unless exposure uses the ground only."""
+    """Under a bright sky the ground is underexposed, unless the exposure uses only the ground."""
     scene = GROUND.copy()
     scene[:40] = 0.6
     full_image = auto_expose(_make_detector(0.01), scene, OPTIONS, np.random.default_rng(2))

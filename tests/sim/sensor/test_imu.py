@@ -10,8 +10,8 @@ from marsyard.sim.sensor import Imu, ImuParameters, WarmUp
 from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, STANDARD_GRAVITY_M_S2
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
-#: An ideal unit; tests add single errors.
-PERFECT = {name: 0.0 for name in ImuParameters.model_fields if name.startswith(("gyro_", "accelerometer_"))} | {
+#: Parameters of an error-free unit; tests add single errors.
+NO_ERRORS = {name: 0.0 for name in ImuParameters.model_fields if name.startswith(("gyro_", "accelerometer_"))} | {
     "gyro_wander_s": 100.0,
     "accelerometer_wander_s": 60.0,
     "angular_random_walk_deg_sqrt_h": 0.0,
@@ -22,38 +22,41 @@ AT_REST = Swaying()
 
 
 def perfect_unit(**errors: object) -> ImuParameters:
-    return ImuParameters.model_validate(PERFECT | errors)
+    """Return the parameters of a unit that has only the given errors."""
+    return ImuParameters.model_validate(NO_ERRORS | errors)
 
 
 def _allan_deviation(rates: Float64[np.ndarray, "n channels"], samples: int) -> float:
-    """Allan deviation for averages over this number of samples, over all channels (IEEE Std 952, annex C)."""
+    """Compute the Allan deviation of all channels for averages over `samples` samples (IEEE Std 952, annex C)."""
     count = len(rates) // samples
     means = rates[: count * samples].reshape(count, samples, -1).mean(axis=1)
     return float(np.sqrt(0.5 * np.mean(np.diff(means, axis=0) ** 2)))
 
 
 def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
-    walk, wander, correlation, rate = 0.07, 1.0, 100.0, 4.0
+    # Angular random walk, deg/sqrt(h); bias wander, deg/h; its correlation time, s; sample rate, Hz.
+    walk, wander, correlation_s, rate = 0.07, 1.0, 100.0, 4.0
     parameters = perfect_unit(
-        rate_hz=rate, angular_random_walk_deg_sqrt_h=walk, gyro_wander_deg_h=wander, gyro_wander_s=correlation
+        rate_hz=rate, angular_random_walk_deg_sqrt_h=walk, gyro_wander_deg_h=wander, gyro_wander_s=correlation_s
     )
     rng = np.random.default_rng(0)
-    hours = 12.0 * 3600.0
-    imu = Imu.draw(parameters, (0.0, hours), rng)
-    rates = imu.increments(AT_REST, 0.0, hours, rng).delta_angles_rad * rate
+    duration_s = 12.0 * 3600.0
+    imu = Imu.draw(parameters, (0.0, duration_s), rng)
+    rates = imu.increments(AT_REST, 0.0, duration_s, rng).delta_angles_rad * rate
 
-    def expected(tau: float) -> float:
-        x = tau / correlation
+    def compute_expected_deviation(tau: float) -> float:
+        x = tau / correlation_s
         # White noise N^2 / tau and an exponentially correlated bias (IEEE Std 952, eq. C.14, with q T = 2 sd^2).
         markov = (wander * DEG_H) ** 2 / x**2 * (2.0 * x - 3.0 + 4.0 * np.exp(-x) - np.exp(-2.0 * x))
         return float(np.sqrt((walk * DEG_SQRT_H) ** 2 / tau + markov))
 
-    # 5 s: random walk only (slope -1/2); 190 s: maximum of the bias instability. The means determine the deviations to
-    # sqrt(tau / (3 x 43200)): 0.6 % and 3.8 %. Tolerances are three times that, plus 1 % for the knots.
-    assert expected(5.0) == pytest.approx(walk * DEG_SQRT_H / np.sqrt(5.0), rel=0.01)
-    assert _allan_deviation(rates, int(5.0 * rate)) == pytest.approx(expected(5.0), rel=0.03)
-    assert _allan_deviation(rates, int(190.0 * rate)) == pytest.approx(expected(190.0), rel=0.12)
-    assert expected(190.0) > 0.618 * wander * DEG_H
+    # At 5 s the random walk dominates (slope -1/2). At 190 s the bias instability has its maximum. The relative
+    # standard errors are sqrt(tau / (3 x 43200)): 0.6 % and 3.8 %. Tolerances are three times that, plus 1 % for
+    # interpolation of the bias.
+    assert compute_expected_deviation(5.0) == pytest.approx(walk * DEG_SQRT_H / np.sqrt(5.0), rel=0.01)
+    assert _allan_deviation(rates, int(5.0 * rate)) == pytest.approx(compute_expected_deviation(5.0), rel=0.03)
+    assert _allan_deviation(rates, int(190.0 * rate)) == pytest.approx(compute_expected_deviation(190.0), rel=0.12)
+    assert compute_expected_deviation(190.0) > 0.618 * wander * DEG_H
 
 
 def test_static_ideal_unit_measures_gravity() -> None:
@@ -100,7 +103,7 @@ def test_drawn_errors_have_the_specified_deviations() -> None:
     parameters = ImuParameters()
     units = [Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(seed)) for seed in range(400)]
     milli_g = 1e-3 * STANDARD_GRAVITY_M_S2
-    # 1,200 values each determine the standard deviation to 2 %; the tolerance is four times that.
+    # The standard error of a deviation from 1,200 values is 2 %; the tolerance is more than four times that.
     for samples, sd in (
         ([unit.gyro.bias for unit in units], 1.0 * DEG_H),
         ([unit.gyro.scale for unit in units], 100e-6),

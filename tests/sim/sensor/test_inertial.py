@@ -12,7 +12,7 @@ from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from tests.sim.sensor.motions import GRAVITY, Swaying
 from tests.sim.sensor.test_imu import perfect_unit
 
-#: Nods with 60 deg/s, rotates, oscillates and falls like a descent.
+#: A motion like a descent: it nods with 60 deg/s, rotates, sways and falls.
 DESCENT = Swaying(
     spin_rad_s=0.3,
     nod_rad=0.2,
@@ -39,7 +39,7 @@ def _navigate(
 
 def test_error_free_navigation_reproduces_the_motion() -> None:
     _, solution = _navigate(DESCENT, perfect_unit())
-    # Includes times between samples.
+    # Times between samples are included.
     times = np.linspace(-2.0, 18.0, 137)
     truth = DESCENT.motion(times)
     assert (solution.attitude(times) * truth.attitudes.inv()).magnitude().max() < 1e-5
@@ -63,7 +63,7 @@ def test_only_bias_along_the_spin_axis_accumulates() -> None:
     imu, solution = _navigate(Swaying(spin_rad_s=spin), perfect_unit(gyro_bias_deg_h=100.0))
     truth = Swaying(spin_rad_s=spin).state(18.0).attitude
     error = (solution.attitude(np.array([18.0]))[0] * truth.inv()).as_rotvec()
-    # Five complete turns; second-order errors are 1e-5 of the first order.
+    # The body makes five complete turns. Second-order errors are 1e-5 of those of first order.
     assert error[2] == pytest.approx(imu.gyro.bias[2] * 20.0, rel=1e-4)
     assert np.abs(error[:2]).max() < 1e-3 * np.abs(imu.gyro.bias[:2] * 20.0).max()
 
@@ -84,8 +84,8 @@ def test_random_walks_have_the_specified_deviation() -> None:
         _, solution = _navigate(Swaying(), noisy, seed=seed)
         attitude.append(np.degrees(solution.attitude(np.array([18.0]))[0].as_rotvec()))
         velocity.append(solution.velocity(np.array([18.0]))[0, 2])
-    # 450 and 150 values determine the standard deviation to 3.3 % and 5.8 %; the tolerance is three times that. Tilt
-    # does not affect the z velocity.
+    # The standard errors from 450 and 150 values are 3.3 % and 5.8 %; the tolerance is three times that. Tilt does not
+    # affect the z velocity.
     assert np.std(attitude) == pytest.approx(0.07 * np.sqrt(20.0 / 3600.0), rel=0.1)
     assert np.std(velocity) == pytest.approx(50e-6 * 9.80665 * np.sqrt(20.0), rel=0.18)
 
@@ -113,7 +113,7 @@ def test_time_tags_increase_despite_large_jitter() -> None:
     solution = InertialSolution.propagate(increments, start.attitude, start.velocity_m_s, GRAVITY)
     times = np.concatenate([increments.times_s[:1], np.linspace(-1.9, 17.9, 1000), increments.times_s[-1:]])
     error = (solution.attitude(times) * DESCENT.motion(times).attitudes.inv()).magnitude()
-    # The body rate is at most 1.35 rad/s; 0.05 s exceeds the jitter of four standard deviations.
+    # The body rate is at most 1.35 rad/s. A time of 0.05 s is more than four standard deviations of the jitter.
     assert error.max() < 1.35 * 0.05
 
 
@@ -125,7 +125,7 @@ def test_navigation_is_defined_only_within_its_samples() -> None:
 
 
 def test_gyro_bias_rotates_attitude_by_less_than_0_1_deg() -> None:
-    # 1 deg/h over 20 s is 0.006 deg: the attitude error accumulates before the images.
+    # 1 deg/h over 20 s is only 0.006 deg: most of the attitude error accumulates before the descent.
     imu, solution = _navigate(DESCENT, ImuParameters())
     error = (solution.attitude(np.array([17.9]))[0] * DESCENT.state(17.9).attitude.inv()).magnitude()
     assert np.degrees(error) < 0.1

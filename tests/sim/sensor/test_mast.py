@@ -17,8 +17,8 @@ from marsyard.sim.sensor.mast import (
     stereo_mast,
 )
 
-EXACT = PointingParameters(zero_deg=0.0, backlash_deg=0.0, settling_deg=0.0, count_deg=0.0)
-PERFECT = StereoCalibrationParameters(
+EXACT_POINTING = PointingParameters(zero_deg=0.0, backlash_deg=0.0, settling_deg=0.0, count_deg=0.0)
+EXACT_CALIBRATION = StereoCalibrationParameters(
     disparity_error_px=0.0, epipolar_error_px=0.0, alignment_deg=0.0, roll_deg=0.0, focal_error=0.0
 )
 
@@ -35,7 +35,7 @@ def _move_mast(mast: Mast, azimuths_deg: list[float]) -> list[MastState]:
 
 
 def test_error_free_mast_points_as_commanded() -> None:
-    mast = Mast.draw(EXACT, MER_MAST, _make_rng())
+    mast = Mast.draw(EXACT_POINTING, MER_MAST, _make_rng())
     state = mast.point(mast.rest, 0.4, -0.3, _make_rng())
     assert state.true_rad == state.readings_rad == (0.4, -0.3)
     expected = MER_MAST.rover_from_head(0.4, -0.3)
@@ -43,20 +43,21 @@ def test_error_free_mast_points_as_commanded() -> None:
 
 
 def test_backlash_lags_by_half_and_absorbs_short_reversals() -> None:
-    mast = Mast.draw(EXACT.model_copy(update={"backlash_deg": 0.2}), MER_MAST, _make_rng())
+    mast = Mast.draw(EXACT_POINTING.model_copy(update={"backlash_deg": 0.2}), MER_MAST, _make_rng())
     forward, repeated, short_reverse, reverse, long_reverse = (
         np.degrees(state.true_rad[0]) for state in _move_mast(mast, [10.0, 10.0, 9.9, 9.5, -20.0])
     )
-    # The axis stops 0.1 short from below and 0.1 beyond from above; a reversal by 0.1 is within the backlash of 0.2.
+    # From below the axis stops 0.1 deg below the command, from above 0.1 deg above it. A reversal by 0.1 deg is within
+    # the backlash of 0.2 deg.
     assert [forward, repeated, short_reverse, reverse, long_reverse] == pytest.approx([9.9, 9.9, 9.9, 9.6, -19.9])
-    # The encoder is before the gears and does not measure it.
+    # The encoder is on the motor side of the gears and does not measure the backlash.
     assert np.degrees([state.readings_rad[0] for state in _move_mast(mast, [10.0, 9.9])]) == pytest.approx([10.0, 9.9])
 
 
 def test_zero_error_is_constant_in_a_run() -> None:
-    parameters = EXACT.model_copy(update={"zero_deg": 0.3})
+    parameters = EXACT_POINTING.model_copy(update={"zero_deg": 0.3})
     zeros_deg = np.degrees([Mast.draw(parameters, MER_MAST, _make_rng(n)).zeros_rad for n in range(400)])
-    # 800 draws: 0.3 within four standard errors.
+    # The tolerance is four standard errors of 800 draws.
     assert np.std(zeros_deg) == pytest.approx(0.3, abs=4.0 * 0.3 / np.sqrt(1600.0))
     mast = Mast.draw(parameters, MER_MAST, _make_rng())
     for state in _move_mast(mast, [10.0, -40.0, 5.0]):
@@ -64,7 +65,7 @@ def test_zero_error_is_constant_in_a_run() -> None:
 
 
 def test_encoder_rounding_and_settling_error_have_the_specified_size() -> None:
-    mast = Mast.draw(EXACT.model_copy(update={"count_deg": 0.05, "settling_deg": 0.2}), MER_MAST, _make_rng())
+    mast = Mast.draw(EXACT_POINTING.model_copy(update={"count_deg": 0.05, "settling_deg": 0.2}), MER_MAST, _make_rng())
     states = _move_mast(mast, list(np.linspace(-30.0, 30.0, 400)))
     counts = np.degrees([state.readings_rad[0] for state in states]) / 0.05
     assert counts == pytest.approx(np.rint(counts), abs=1e-9)
@@ -76,13 +77,14 @@ def test_encoder_rounding_and_settling_error_have_the_specified_size() -> None:
 
 
 def test_mast_stops_at_its_elevation_limit() -> None:
-    mast = Mast.draw(EXACT, MER_MAST, _make_rng())
+    mast = Mast.draw(EXACT_POINTING, MER_MAST, _make_rng())
     state = mast.point(mast.rest, 0.0, -2.0, _make_rng())
     assert np.degrees(state.readings_rad[1]) == pytest.approx(-87.0)
 
 
 def test_mer_navcam_position_matches_opportunity_labels() -> None:
-    # 1N491020376 and 1N491020519: C and the measured angles. The label frame has y right and z down, 0.29 m higher.
+    # Measured angles (rad) and C of 1N491020376 and 1N491020519. In the label frame y is right and z is down. Its
+    # origin is 0.29 m higher.
     mast = stereo_mast("mer-navcam")
     for azimuth, elevation, centre in (
         (-0.340449, -0.10962, (0.442604, -0.0611635, -1.25106)),
@@ -96,7 +98,7 @@ def test_mer_navcam_position_matches_opportunity_labels() -> None:
 @pytest.mark.parametrize("name", MASTS)
 def test_ideal_calibration_equals_the_design(name: str) -> None:
     design = stereo_mast(name)
-    head = StereoHead.draw(design, PERFECT, _make_rng())
+    head = StereoHead.draw(design, EXACT_CALIBRATION, _make_rng())
     for calibrated, ideal in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
         for vector in ("c", "a", "h", "v"):
             assert getattr(calibrated, vector) == pytest.approx(getattr(ideal, vector), abs=1e-9)
@@ -104,10 +106,10 @@ def test_ideal_calibration_equals_the_design(name: str) -> None:
 
 
 def _triangulate_range_m(left_camera: CameraModel, right_camera: CameraModel, pixels: list[np.ndarray]) -> float:
-    """Range at the closest approach of the lines of sight of two pixels."""
-    sights = [camera.rays(pixel) for camera, pixel in zip((left_camera, right_camera), pixels, strict=True)]
-    directions = np.stack([sights[0][1], -sights[1][1]], axis=1)
-    distances = np.linalg.lstsq(directions, sights[1][0] - sights[0][0], rcond=None)[0]
+    """Compute the range (m) along the left line of sight at its closest approach to the right one."""
+    lines_of_sight = [camera.rays(pixel) for camera, pixel in zip((left_camera, right_camera), pixels, strict=True)]
+    directions = np.stack([lines_of_sight[0][1], -lines_of_sight[1][1]], axis=1)
+    distances = np.linalg.lstsq(directions, lines_of_sight[1][0] - lines_of_sight[0][0], rcond=None)[0]
     return float(distances[0])
 
 
@@ -115,7 +117,7 @@ def _triangulate_range_m(left_camera: CameraModel, right_camera: CameraModel, pi
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_disparity_error_causes_range_error_of_eq_1(name: str, seed: int) -> None:
     design = stereo_mast(name)
-    head = StereoHead.draw(design, PERFECT.model_copy(update={"disparity_error_px": 0.5}), _make_rng(seed))
+    head = StereoHead.draw(design, EXACT_CALIBRATION.model_copy(update={"disparity_error_px": 0.5}), _make_rng(seed))
     error, range_m = head.disparity_error_px(10.0), 10.0
     assert 0.0 < abs(error) <= 0.5
     assert head.disparity_error_px(2.0) == pytest.approx(error, rel=0.02)
@@ -124,13 +126,13 @@ def test_disparity_error_causes_range_error_of_eq_1(name: str, seed: int) -> Non
     measured = _triangulate_range_m(head.calibrated.left, head.calibrated.right, pixels)
     baseline = float(np.linalg.norm(design.left.c - design.right.c))
     expected = range_m**2 / (design.left.focal_lengths[0] * baseline) * error
-    # Eq. 1 of the tracking paper is first order in the ratio of error and disparity (25 px at 10 m for the navcam).
+    # Eq. 1 of the tracking paper is of first order in error / disparity. The disparity is 25 px at 10 m for the navcam.
     assert measured - np.hypot(range_m, 0.5 * baseline) == pytest.approx(expected, rel=0.03)
 
 
 def test_disparity_errors_are_uniform_within_their_bound() -> None:
     design = stereo_mast("research-navcam")
-    parameters = PERFECT.model_copy(update={"disparity_error_px": 0.5})
+    parameters = EXACT_CALIBRATION.model_copy(update={"disparity_error_px": 0.5})
     errors = np.array([StereoHead.draw(design, parameters, _make_rng(n)).disparity_error_px(1e4) for n in range(150)])
     assert np.abs(errors).max() <= 0.5 + 1e-6
     assert np.std(errors) == pytest.approx(0.5 / np.sqrt(3.0), rel=0.15)
@@ -138,15 +140,18 @@ def test_disparity_errors_are_uniform_within_their_bound() -> None:
 
 def test_row_errors_and_common_rotations_shift_images() -> None:
     design, point = stereo_mast("research-navcam"), np.array([50.0, 0.0, 0.0])
-    misaligned = StereoHead.draw(design, PERFECT.model_copy(update={"epipolar_error_px": 1.0}), _make_rng(5)).calibrated
+    misaligned = StereoHead.draw(
+        design, EXACT_CALIBRATION.model_copy(update={"epipolar_error_px": 1.0}), _make_rng(5)
+    ).calibrated
     rows = [camera.project(point)[0][1] for camera in (misaligned.left, misaligned.right)]
     columns = [camera.project(point)[0][0] for camera in (misaligned.left, misaligned.right)]
     expected = [camera.project(point)[0][0] for camera in (design.left, design.right)]
     assert columns == pytest.approx(expected, abs=1e-3)
+    # The second draw of the generator is the epipolar error.
     rng = _make_rng(5)
     rng.uniform()
     assert abs(rows[0] - rows[1]) == pytest.approx(abs(rng.standard_normal()), rel=1e-3)
-    rotated = StereoHead.draw(design, PERFECT.model_copy(update={"alignment_deg": 1.0}), _make_rng(5))
+    rotated = StereoHead.draw(design, EXACT_CALIBRATION.model_copy(update={"alignment_deg": 1.0}), _make_rng(5))
     shifts = [
         calibrated.project(point)[0] - ideal.project(point)[0]
         for calibrated, ideal in ((rotated.calibrated.left, design.left), (rotated.calibrated.right, design.right))
@@ -158,7 +163,7 @@ def test_row_errors_and_common_rotations_shift_images() -> None:
 
 def test_focal_length_errors_scale_the_image() -> None:
     design = stereo_mast("research-navcam")
-    head = StereoHead.draw(design, PERFECT.model_copy(update={"focal_error": 0.01}), _make_rng(3))
+    head = StereoHead.draw(design, EXACT_CALIBRATION.model_copy(update={"focal_error": 0.01}), _make_rng(3))
     point = np.array([10.0, 2.0, 1.0])
     for calibrated, ideal in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
         centre = np.array(ideal.image_centre)

@@ -26,7 +26,10 @@ EXPOSURE_S = 4e-3
 def _sum_sharp_images(
     image_at: Callable[[float], Image], shape: tuple[int, int], transfer_row_s: float, clear_row_s: float, rows: int
 ) -> Image:
-    """Radiance x seconds collected by packets from images at any time; `rows` transfer steps at once."""
+    """Compute the radiance x seconds that the charge of each pixel collects; `image_at` renders at a time, s.
+
+    `rows` transfer steps use one image.
+    """
     total = sum((image_at(((n + 0.5) / 24 - 0.5) * EXPOSURE_S) for n in range(24)), np.zeros(shape)) * EXPOSURE_S / 24
     for first in range(1, shape[0], rows):
         lags = range(first, min(first + rows, shape[0]))
@@ -40,7 +43,10 @@ def _sum_sharp_images(
 
 
 def test_rotating_camera_matches_many_renderings() -> None:
-    """60 deg/s and 80 m/s over rough ground; a coarse descent camera with the same transfer time."""
+    """The camera rotates by 60 deg/s and moves by 80 m/s over rough ground.
+
+    It is a coarse descent camera with the transfer time of the full one.
+    """
     size = 80
     transfer_row_s, clear_row_s = 5e-6 * 1024 / size, 1e-6 * 1024 / size
     parameters = TerrainParameters(samples=512, rms_slope_deg=6.0, outer_scale_m=400.0, albedo_contrast=0.2)
@@ -68,7 +74,7 @@ def test_rotating_camera_matches_many_renderings() -> None:
     assert motion.max_px_s == pytest.approx(np.radians(60.0) * 14.67e-3 / 12e-6, rel=0.1)
     result = moving_exposure(frame.radiance, response, motion, EXPOSURE_S, transfer_row_s, clear_row_s)
     expected = _sum_sharp_images(render_at, (size, size), transfer_row_s, clear_row_s, rows=6)
-    # Pixels outside the frame have no radiance: a border as wide as the image motion is excluded.
+    # Pixels outside the frame have no radiance, so a border as wide as the image motion is excluded.
     inside = np.s_[13:-13, 13:-13]
     error = (result - expected)[inside] / expected.mean()
     assert np.sqrt((error**2).mean()) < 0.004
@@ -85,8 +91,8 @@ def test_smear_and_blur_of_drifting_image_match_sum_of_sharp_images(velocity: tu
     rows, columns = np.indices(scene.shape).astype(np.float64)
 
     def render_at(time_s: float) -> Image:
-        where = [rows - velocity[0] * time_s, columns - velocity[1] * time_s]
-        return map_coordinates(scene.astype(np.float64), where, order=3, mode="nearest") * response
+        positions = [rows - velocity[0] * time_s, columns - velocity[1] * time_s]
+        return map_coordinates(scene.astype(np.float64), positions, order=3, mode="nearest") * response
 
     result = moving_exposure(scene, response, uniform_motion(*velocity), EXPOSURE_S, 4e-5, 8e-6)
     expected = _sum_sharp_images(render_at, scene.shape, 4e-5, 8e-6, rows=1)
@@ -109,14 +115,14 @@ def test_moving_dot_is_at_its_mid_exposure_position(velocity: tuple[float, float
 
 
 def test_smear_trail_of_a_moving_dot_is_inclined() -> None:
-    """During readout a packet d rows below the dot passes it d row times after the exposure."""
+    """The charge d rows below the dot passes it d transfer times after the exposure."""
     rows, columns = np.indices((96, 96))
     dot = np.exp(-0.5 * ((rows - 20.0) ** 2 + (columns - 40.0) ** 2) / 1.5**2).astype(np.float32)
     image = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 5e-5, 0.0)
     for row in (40, 60, 90):
         centre = (image[row] * columns[row]).sum() / image[row].sum()
         assert centre == pytest.approx(40.0 + 1000.0 * (0.5 * EXPOSURE_S + (row - 20 - 0.5) * 5e-5), abs=0.05)
-    # Before the exposure the packets above passed it; higher packets passed earlier.
+    # During clearing the charge of higher rows passes the dot before the exposure; the higher the row, the earlier.
     cleared = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 0.0, 5e-5)
     centre = (cleared[5] * columns[5]).sum() / cleared[5].sum()
     assert centre == pytest.approx(40.0 - 1000.0 * (0.5 * EXPOSURE_S + 14.5 * 5e-5), abs=0.05)
@@ -127,9 +133,9 @@ def test_slow_motion_equals_static_exposure() -> None:
     scene, response = (1.0 + 0.1 * rng.standard_normal((2, 96, 64))).astype(np.float32)
     result = moving_exposure(scene, response, uniform_motion(1e-6, 1e-6), EXPOSURE_S, 5e-6, 1e-6)
     rate = scene * response
-    passed = np.cumsum(rate, axis=0)
-    static = EXPOSURE_S * rate + 5e-6 * (passed - rate) + 1e-6 * (passed[-1:] - passed)
-    # Responses are averaged over 32 rows where they weight the passing scene.
+    cumulative_rate = np.cumsum(rate, axis=0)
+    static = EXPOSURE_S * rate + 5e-6 * (cumulative_rate - rate) + 1e-6 * (cumulative_rate[-1:] - cumulative_rate)
+    # The tolerance covers the smear, which uses responses averaged over 32 rows.
     np.testing.assert_allclose(result, static, rtol=1e-3)
 
 
@@ -179,9 +185,9 @@ def test_path_kernel_has_unit_sum_and_zero_mean() -> None:
 
 @pytest.mark.parametrize("velocity", [(1222.0, 0.0), (0.0, -1222.0), (864.0, 864.0)])
 def test_border_of_moving_image_approximates_wider_image(velocity: tuple[float, float]) -> None:
-    """The scene extrapolated at the border, against a wider image with zero response outside the frame.
+    """The scene is extrapolated at the border; the reference is a wider image with zero response outside the frame.
 
-    Motion of 60 deg/s through the descent camera (1222 px/s); ground with 10 % contrast in waves of about 8 pixels.
+    The motion is 60 deg/s of the descent camera (1222 px/s). The ground has 10 % contrast in waves of about 8 pixels.
     """
     margin = 12
     rng = np.random.default_rng(2)
@@ -196,8 +202,8 @@ def test_border_of_moving_image_approximates_wider_image(velocity: tuple[float, 
     from_wider_image = moving_exposure(wide, response, motion, EXPOSURE_S, 5e-6, 1e-6)[inside]
     error = (from_frame - from_wider_image) / from_wider_image.mean()
     rows, columns = (np.asarray(indices) for indices in np.indices(frame.shape))
-    depth: np.ndarray = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])
-    rms = [float(np.sqrt(np.mean(error[depth == ring] ** 2))) for ring in range(20)]
-    # The noise is 1 %.
+    border_distance: np.ndarray = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])
+    rms = [float(np.sqrt(np.mean(error[border_distance == ring] ** 2))) for ring in range(20)]
+    # The noise of an image is 1 %.
     assert 1e-4 < rms[0] < 0.03
     assert max(rms[3:]) < 0.0015

@@ -24,7 +24,8 @@ from marsyard.sim.sensor.navigation.kernels import POSITION_FIX, VELOCITY_FIX
 from marsyard.sim.sensor.satellite_navigation import Outage, RtkParameters, RtkReceiver
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
 
-GRAVITY, FLIGHTS = 9.8, 50
+#: Gravity, m/s2; number of simulated flights.
+GRAVITY, N_FLIGHTS = 9.8, 50
 CRAFT, TRANSIT = RotorcraftParameters(), TransitParameters(hover_s=8.0)
 RTK, COMPASS = RtkParameters(), TiltCompassParameters()
 
@@ -33,8 +34,8 @@ RTK, COMPASS = RtkParameters(), TiltCompassParameters()
 def _make_path(seed: int) -> FlownPath:
     rng = np.random.default_rng(seed)
     air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S, rng)
-    over, heading = np.array([100.0, 50.0, 10.0]), rng.uniform(0.0, 2.0 * np.pi)
-    return simulate_transit(CRAFT, TRANSIT, over, 0.3, heading, GRAVITY, air, rng).path
+    waypoint_m, heading_rad = np.array([100.0, 50.0, 10.0]), rng.uniform(0.0, 2.0 * np.pi)
+    return simulate_transit(CRAFT, TRANSIT, waypoint_m, 0.3, heading_rad, GRAVITY, air, rng).path
 
 
 def _run_filter(
@@ -58,9 +59,9 @@ def _run_filter(
 
 
 def _state_errors(path: FlownPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray) -> np.ndarray:
-    """True minus estimated state, fifteen columns.
+    """Compute the true minus the estimated state, fifteen columns (position, velocity, attitude, two biases).
 
-    The effect of gravity by scale and misalignment errors counts as accelerometer bias.
+    Scale and misalignment errors of the accelerometer count as a bias: their product with gravity.
     """
     times = imu.boundaries(*path.span_s)[indices]
     truth = path.motion(times)
@@ -82,14 +83,16 @@ def test_errors_are_consistent_with_the_covariance() -> None:
 
     The state of each flight has fifteen degrees of freedom.
     """
-    floating = RtkParameters(float_fraction=0.3, float_s=10.0)
+    receiver_with_float_solutions = RtkParameters(float_fraction=0.3, float_s=10.0)
     squares = []
-    for seed in range(FLIGHTS):
-        path, imu, solution = _run_filter(seed, rtk_parameters=floating, covariance_times_s=(-3.0, 0.0, 2.5, 5.0))
+    for seed in range(N_FLIGHTS):
+        path, imu, solution = _run_filter(
+            seed, rtk_parameters=receiver_with_float_solutions, covariance_times_s=(-3.0, 0.0, 2.5, 5.0)
+        )
         errors = _state_errors(path, imu, solution, solution.covariance_indices)
         covariances = solution.covariances
         squares.append([float(e @ np.linalg.solve(p, e)) for e, p in zip(errors, covariances, strict=True)])
-    low, high = (float(chi2.ppf(p, 15 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
+    low, high = (float(chi2.ppf(p, 15 * N_FLIGHTS)) / N_FLIGHTS for p in (0.001, 0.999))
     means = np.mean(squares, axis=0)
     assert np.all((means > low) & (means < high)), means
 
@@ -107,13 +110,14 @@ def test_innovations_are_white() -> None:
                 normalised[kind].extend(values)
                 products[kind].extend(values[1:] * values[:-1])
     for kind in normalised:
-        # 7,600 values determine a variance to 1.6 % and a correlation to 0.011; unmodelled bias increases both.
+        # The standard errors from 7,600 values are 1.6 % of the variance and 0.011 of the correlation. Unmodelled bias
+        # increases both.
         assert np.var(normalised[kind]) == pytest.approx(1.0, abs=0.1)
         assert abs(np.mean(products[kind])) < 0.12
 
 
 def test_better_instruments_reduce_the_errors() -> None:
-    """Ideal inertial unit; the receiver has white noise of 2 mm and 5 mm/s, averaged over about 1 s by the filter."""
+    """The inertial unit is ideal. The receiver has white noise of 2 mm and 5 mm/s, which the filter averages."""
     no_errors = {name: 0.0 for name, value in SMALL_UNIT.model_dump().items() if isinstance(value, float)}
     times = {"rate_hz": 100.0, "gyro_wander_s": 100.0, "accelerometer_wander_s": 60.0}
     ideal = ImuParameters.model_validate(no_errors | times | {"clock": {}})
@@ -129,15 +133,15 @@ def test_better_instruments_reduce_the_errors() -> None:
 def test_outage_errors_are_consistent_with_the_covariance() -> None:
     """Without fixes for eight seconds the position drifts by decimetres, as for a tilt error of 0.2 deg."""
     with_outage = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_fraction=0.0)
-    squares, sizes = [], []
-    for seed in range(FLIGHTS):
+    squares, horizontal_errors_m = [], []
+    for seed in range(N_FLIGHTS):
         path, imu, solution = _run_filter(seed, rtk_parameters=with_outage, covariance_times_s=(5.0,))
         error = _state_errors(path, imu, solution, solution.covariance_indices)[0]
         squares.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
-        sizes.append(np.hypot(*error[:2]))
-    assert 0.2 < np.sqrt(np.mean(np.square(sizes))) < 3.0
-    # the errors agree with the covariance in an outage
-    low, high = (float(chi2.ppf(p, 9 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
+        horizontal_errors_m.append(np.hypot(*error[:2]))
+    assert 0.2 < np.sqrt(np.mean(np.square(horizontal_errors_m))) < 3.0
+    # The errors agree with the covariance during the outage.
+    low, high = (float(chi2.ppf(p, 9 * N_FLIGHTS)) / N_FLIGHTS for p in (0.001, 0.999))
     assert low < np.mean(squares) < high
 
 
@@ -159,7 +163,7 @@ def test_stuck_instruments_are_ignored() -> None:
 
 
 def test_filter_resets_after_persistent_rejection() -> None:
-    """A filter with an initial error of 20 m rejects all solutions, but resets after one second."""
+    """A filter with an initial error of 20 m rejects all fixes and resets after one second."""
     path, rng = _make_path(3), np.random.default_rng(4)
     span = path.span_s
     imu, receiver = Imu.draw(SMALL_UNIT, span, rng), RtkReceiver.draw(RtkParameters(float_fraction=0.0), span, rng)

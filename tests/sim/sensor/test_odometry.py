@@ -13,7 +13,7 @@ from tests.sim.dynamics.grounds import NO_SLIP, Plane, uphill_east
 
 EAST = 0.5 * np.pi
 STRAIGHT = DriveCommand(forward_m=0.8)
-MIXED = (
+MIXED_COMMANDS = (
     DriveCommand(forward_m=0.5, turn_left_rad=0.6),
     DriveCommand(left_m=0.4),
     DriveCommand(turn_left_rad=-1.0),
@@ -41,20 +41,20 @@ def _estimate_poses(
     rng = np.random.default_rng(seed)
     odometer = Odometer.draw(parameters, drives[0].start.world_from_rover, rng)
     estimate = odometer.initial_estimate
-    for driven in drives:
-        estimate = odometer.step(estimate, driven, rng, visual)
+    for motion in drives:
+        estimate = odometer.step(estimate, motion, rng, visual)
     return odometer, estimate
 
 
 @pytest.mark.parametrize("visual", [False, True])
 def test_estimate_is_exact_without_slip_and_errors(visual: bool) -> None:
-    drives = _drive(Plane(0.2, -0.1), MIXED)
+    drives = _drive(Plane(0.2, -0.1), MIXED_COMMANDS)
     _, estimate = _estimate_poses(drives, EXACT, 0, visual)
     assert estimate.world_from_rover.as_matrix() == pytest.approx(drives[-1].end.world_from_rover.as_matrix(), abs=1e-7)
 
 
 def test_visual_odometry_detects_slip_and_wheels_do_not() -> None:
-    # 15 deg uphill: about half of the distance is lost, but the wheels count it.
+    # On a slope of 15 deg, slip removes about half of the distance, but the wheels count it.
     slip = SlipParameters(step_spread=0.0, wander_deg_m=0.0)
     drives = _drive(uphill_east(15.0), (STRAIGHT,) * 3, slip)
     true_pose = drives[-1].end.world_from_rover
@@ -94,7 +94,7 @@ def test_visual_odometry_error_is_two_percent_of_the_distance() -> None:
         np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n, visual=True)[1].error_m(end))
         for n in range(100)
     ]
-    # The rms of 100 vectors with one to three degrees of freedom has a standard deviation of up to 7 %.
+    # The RMS of 100 vectors with one to three degrees of freedom has a standard error of up to 7 %.
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.02 * 8.0, rel=0.2)
     wheel_errors = [
         np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n)[1].error_m(end)) for n in range(100)
@@ -127,7 +127,8 @@ def test_heading_errors_grow_and_shift_the_position() -> None:
     odometer, estimate = _estimate_poses(drives, drift, 2)
     assert estimate.heading_error_rad == pytest.approx(4.0 * odometer.heading_drift_rad_m)
     assert _attitude_error_rad(estimate, true_pose) == pytest.approx([0.0, 0.0, estimate.heading_error_rad], abs=1e-9)
-    # The initial heading error of each of five drives shifts it sideways: (0 + 1 + 2 + 3 + 4) steps of 0.8 m each.
+    # The heading error at the start of a drive shifts its end sideways. The five errors are 0, 1, 2, 3 and 4 times that
+    # of one drive of 0.8 m.
     assert estimate.error_m(true_pose)[1] == pytest.approx(odometer.heading_drift_rad_m * 0.8 * 0.8 * 10.0, rel=1e-3)
     walk = EXACT.model_copy(update={"heading_walk_deg": 0.2})
     errors = [np.degrees(_estimate_poses(drives, walk, n)[1].heading_error_rad) for n in range(100)]

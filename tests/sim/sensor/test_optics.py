@@ -9,11 +9,13 @@ from marsyard.sim.camera import Cahv, Cahvore
 from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
 from marsyard.sim.sensor.optics import OpticsParameters, apply_point_spread, dust_transmission, line_spread
 
-MER = OpticsParameters()
-FORWARD: dict[str, Any] = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 0.0])}
+OPTICS = OpticsParameters()
+CAMERA_AXES: dict[str, Any] = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 0.0])}
 
 
-@pytest.mark.parametrize("parameters", [MER, OpticsParameters(pixel_aperture=True), OpticsParameters(diffusion_px=1.0)])
+@pytest.mark.parametrize(
+    "parameters", [OPTICS, OpticsParameters(pixel_aperture=True), OpticsParameters(diffusion_px=1.0)]
+)
 def test_point_spread_preserves_total_light_and_position(parameters: OpticsParameters) -> None:
     scene = np.zeros((41, 41), dtype=np.float32)
     scene[20, 17] = 1.0
@@ -27,16 +29,19 @@ def test_point_spread_preserves_total_light_and_position(parameters: OpticsParam
 
 def test_total_light_is_conserved_at_the_border() -> None:
     scene = np.random.default_rng(0).random((30, 25), dtype=np.float32)
-    assert apply_point_spread(scene, MER).sum(dtype=np.float64) == pytest.approx(scene.sum(dtype=np.float64), rel=1e-6)
+    assert apply_point_spread(scene, OPTICS).sum(dtype=np.float64) == pytest.approx(
+        scene.sum(dtype=np.float64), rel=1e-6
+    )
 
 
 def test_point_spread_has_the_specified_modulation_transfer() -> None:
-    """At half the Nyquist frequency by the closed form; the kernel contains the 1.5 % of light beyond its ends."""
+    """The modulation at half the Nyquist frequency has a closed form; the kernel includes light beyond its ends."""
     frequency = 0.25
-    s = frequency * MER.diffraction_px
+    # Spatial frequency relative to the cut-off of diffraction.
+    s = frequency * OPTICS.diffraction_px
     diffraction = 2.0 / np.pi * (np.arccos(s) - s * np.sqrt(1.0 - s * s))
-    diffusion = np.exp(-2.0 * (np.pi * MER.diffusion_px * frequency) ** 2)
-    taps = line_spread(MER)
+    diffusion = np.exp(-2.0 * (np.pi * OPTICS.diffusion_px * frequency) ** 2)
+    taps = line_spread(OPTICS)
     result = (taps * np.cos(2.0 * np.pi * frequency * np.arange(-6, 7))).sum()
     assert result == pytest.approx(diffraction * diffusion, rel=0.02)
 
@@ -47,17 +52,19 @@ def test_zero_spread_returns_the_scene() -> None:
 
 
 def test_perspective_fall_off_is_cosine_to_the_fourth() -> None:
-    camera = Cahv.from_field_of_view(horizontal_rad=np.radians(60.0), size=(101, 101), centre=np.zeros(3), **FORWARD)
+    camera = Cahv.from_field_of_view(
+        horizontal_rad=np.radians(60.0), size=(101, 101), centre=np.zeros(3), **CAMERA_AXES
+    )
     fall_off = natural_fall_off(camera)
     assert fall_off[50, 50] == pytest.approx(1.0)
     cosine = camera.rays(camera.pixel_grid())[1] @ camera.a
-    # Finite differences over pixels of 0.6 deg.
+    # The tolerance covers finite differences over pixels of 0.6 deg.
     np.testing.assert_allclose(fall_off, cosine**4, rtol=2e-3)
 
 
 def test_equidistant_fisheye_fall_off_matches_formula() -> None:
     """The solid angle of a pixel decreases with sin(theta) / theta, and the pupil tilts by a twentieth of theta."""
-    pinhole = Cahv.from_focal_length(5.58e-3, 96e-6, (128, 128), centre=np.zeros(3), **FORWARD)
+    pinhole = Cahv.from_focal_length(5.58e-3, 96e-6, (128, 128), centre=np.zeros(3), **CAMERA_AXES)
     camera = Cahvore.from_cahv(pinhole, r=np.zeros(3), linearity=0.0)
     theta = np.arccos(np.clip(camera.rays(camera.pixel_grid())[1] @ camera.a, -1.0, 1.0))
     expected = np.cos(0.95 * theta) * np.sinc(theta / np.pi)
@@ -74,7 +81,7 @@ def test_dust_attenuates_light_and_is_absent_from_the_flat_field() -> None:
     assert np.abs(np.diff(transmission, axis=1)).max() < 0.4 * 1.5 / 8.0
     flat = np.ones((128, 128), dtype=np.float32)
     clean, with_dust = (
-        Detector.draw(flat, DetectorParameters(optics=o), np.random.default_rng(1)) for o in (MER, dusty)
+        Detector.draw(flat, DetectorParameters(optics=optics), np.random.default_rng(1)) for optics in (OPTICS, dusty)
     )
     assert with_dust.response.sum() < clean.response.sum()
     np.testing.assert_array_equal(with_dust.calibration.flat_field, clean.calibration.flat_field)
@@ -82,13 +89,13 @@ def test_dust_attenuates_light_and_is_absent_from_the_flat_field() -> None:
 
 @pytest.mark.parametrize("diameter", [1.0, 2.5])
 def test_defocus_has_the_transfer_of_a_uniform_disc(diameter: float) -> None:
-    sharp, soft = (OpticsParameters(diffraction_px=0.0, diffusion_px=0.0, defocus_px=d) for d in (1e-6, diameter))
+    sharp, defocused = (OpticsParameters(diffraction_px=0.0, diffusion_px=0.0, defocus_px=d) for d in (1e-6, diameter))
     frequency = np.array([0.1, 0.2, 0.3])
     offsets = np.arange(-6, 7)
     waves = np.cos(2.0 * np.pi * frequency[:, None] * offsets)
-    measured = waves @ line_spread(soft) / (waves @ line_spread(sharp))
+    measured = waves @ line_spread(defocused) / (waves @ line_spread(sharp))
     x = np.pi * diameter * frequency
-    # Bessel function J1 by its integral, 1/pi times that of cos(t - x sin t) from 0 to pi
+    # Bessel function J1(x): the integral of cos(t - x sin t) from 0 to pi, divided by pi.
     t = np.linspace(0.0, np.pi, 2001)
     bessel = np.trapezoid(np.cos(t - x[:, None] * np.sin(t)), t, axis=1) / np.pi
     np.testing.assert_allclose(measured, 2.0 * bessel / x, atol=0.02)

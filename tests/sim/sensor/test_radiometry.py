@@ -9,11 +9,11 @@ from marsyard.sim.sensor import DetectorParameters, preset
 from marsyard.sim.sensor.detector import dark_seconds
 from marsyard.sim.sensor.optics import DARK_E_S, DARKEST_RADIANCE_FACTOR, LightPath, solar_photons
 
-FLOWN, FIELD = preset("mer-descent-flown"), preset("mer-descent-field")
+FLIGHT_CAMERA, FIELD_CAMERA = preset("mer-descent-flown"), preset("mer-descent-field")
 
 
 def _signal_to_noise(p: DetectorParameters, radiance_factor: float) -> float:
-    """Mean SNR of the rows on axis: noise of signal, dark current, readout and rounding; no smear, equal pixels."""
+    """Compute the mean SNR of the rows on axis: shot noise, dark current, readout and rounding; no smear."""
     signal = radiance_factor * p.responsivity_e_s * p.exposure_s * p.rows_summed
     dark = p.rows_summed * p.dark_e_s * p.dark_growth * dark_seconds(p, 1024)
     noise = np.sqrt(signal + dark + p.read_noise_e**2 + p.gain_e_dn**2 / 12.0)
@@ -22,14 +22,16 @@ def _signal_to_noise(p: DetectorParameters, radiance_factor: float) -> float:
 
 def test_total_sunlight_equals_the_solar_constant() -> None:
     wavelength_nm = np.linspace(150.0, 20000.0, 100000)
-    energy = 6.62607015e-34 * 2.99792458e8 / (wavelength_nm * 1e-9)
-    # 1361 W/m2, of which 0.2 % are outside the band.
-    assert np.trapezoid(solar_photons(wavelength_nm) * energy, wavelength_nm) == pytest.approx(1361.0, rel=0.003)
+    photon_energy_j = 6.62607015e-34 * 2.99792458e8 / (wavelength_nm * 1e-9)
+    # The solar constant is 1361 W/m2; 0.2 % of it are outside these wavelengths.
+    assert np.trapezoid(solar_photons(wavelength_nm) * photon_energy_j, wavelength_nm) == pytest.approx(
+        1361.0, rel=0.003
+    )
 
 
 def test_neutral_density_filters_match_the_paper() -> None:
-    """Field test paper, section III.B.2: optical density 0.67 and 22 %, 0.97 and 11 %."""
-    for camera, fraction in ((FLOWN, 0.22), (FIELD, 0.11)):
+    """Optical densities of 0.67 and 0.97 transmit 22 % and 11 % (field test paper, section III.B.2)."""
+    for camera, fraction in ((FLIGHT_CAMERA, 0.22), (FIELD_CAMERA, 0.11)):
         without_filter = replace(camera.light, neutral_density=None)
         transmission = camera.light.responsivity_e_s(1.5) / without_filter.responsivity_e_s(1.5)
         assert transmission == pytest.approx(fraction, abs=0.005)
@@ -41,30 +43,33 @@ def test_neutral_density_filters_match_the_paper() -> None:
 def test_signal_to_noise_and_dark_current_match_the_paper(
     temperature_c: float, ratio: float, dark_fraction: float | None
 ) -> None:
-    """Field test paper, section III.B.3, with one set of constants; tolerances: ratio 2, fractions a factor of 1.2."""
-    for camera in (FLOWN, FIELD):
+    """One set of constants reproduces the values of the field test paper, section III.B.3.
+
+    The tolerances are 2 for the ratio and a factor of 1.2 for the fractions of noise from dark current.
+    """
+    for camera in (FLIGHT_CAMERA, FIELD_CAMERA):
         p = camera.detector.model_copy(update={"temperature_c": temperature_c})
         assert _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) == pytest.approx(ratio, abs=2.0)
         without_dark = _signal_to_noise(p.model_copy(update={"dark_e_s": 0.0}), DARKEST_RADIANCE_FACTOR)
-        actual = 1.0 - _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) / without_dark
+        actual_fraction = 1.0 - _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) / without_dark
         if dark_fraction is None:
-            assert actual < 0.001
+            assert actual_fraction < 0.001
         else:
-            assert dark_fraction / 1.2 < actual < dark_fraction * 1.2
+            assert dark_fraction / 1.2 < actual_fraction < dark_fraction * 1.2
 
 
 def test_field_test_and_flight_collect_similar_charge() -> None:
-    flight, field = FLOWN.detector, FIELD.detector
+    flight, field = FLIGHT_CAMERA.detector, FIELD_CAMERA.detector
     electrons = flight.responsivity_e_s * flight.exposure_s
     assert field.responsivity_e_s * field.exposure_s == pytest.approx(electrons)
-    # On Mars the sunlight is 44 % and the filter transmits 22 %; on Earth 100 % and 11 %.
+    # On Mars the sunlight is 44 % of that on Earth. The filters transmit 22 % (flight) and 11 % (field test).
     assert flight.responsivity_e_s / field.responsivity_e_s == pytest.approx(0.44 * 0.22 / 0.11, rel=0.03)
     assert 0.003 < field.exposure_s < flight.exposure_s < 0.005
 
 
-def test_default_detector_equals_the_flown_descent_camera() -> None:
+def test_default_detector_equals_the_flight_descent_camera() -> None:
     p = DetectorParameters()
-    flight = FLOWN.detector.model_dump()
+    flight = FLIGHT_CAMERA.detector.model_dump()
     assert p.responsivity_e_s == pytest.approx(flight.pop("responsivity_e_s"), rel=2e-3)
     assert p.optics.diffraction_px == pytest.approx(flight.pop("optics")["diffraction_px"], abs=0.01)
     assert p.model_dump(include=set(flight)) == flight
@@ -72,6 +77,7 @@ def test_default_detector_equals_the_flown_descent_camera() -> None:
 
 
 def test_responsivity_depends_on_aperture_pixel_area_band_and_distance() -> None:
+    # Arguments: f-number, pixel pitch (um) and band (nm).
     light = LightPath(12.0, 12.0, (400.0, 1100.0))
     rate = light.responsivity_e_s(1.0)
     assert light.responsivity_e_s(2.0) == pytest.approx(rate / 4.0)

@@ -24,7 +24,7 @@ from marsyard.sim.sensor.ranging import RangingUnit, first_return, range_along
 from marsyard.sim.terrain import Surface
 from tests.sim.sensor.motions import Swaying
 
-#: Carrier phases with a nearby base station: 2 cm (the class of NovAtel's RT2 with fixed integers).
+#: A carrier-phase receiver with a nearby base station and errors of 2 cm (the class of NovAtel's RT2, fixed integers).
 RTK = GpsParameters(
     horizontal_noise_m=0.01,
     vertical_noise_m=0.015,
@@ -33,6 +33,7 @@ RTK = GpsParameters(
     correlation_s=120.0,
 )
 DESCENT = Swaying(position_m=(2500.0, 2500.0, 2000.0), velocity_m_s=(10.0, 0.0, -75.0))
+#: Samples per side of a surface, their spacing and the coordinate of its centre, m.
 SIDE, SPACING = 1024, 5.0
 MIDDLE = 0.5 * SIDE * SPACING
 
@@ -44,12 +45,12 @@ def _make_surface(heights: Float64[np.ndarray, "rows columns"], spacing: float =
 
 
 def _make_plane(slope: float) -> Surface:
-    """A plane that rises to the east through height 0 at the centre and falls at the distant border."""
+    """Make a plane that rises to the east, with height 0 at the centre; it falls at the distant periodic border."""
     return _make_surface(np.tile(slope * (np.arange(SIDE) * SPACING - MIDDLE), (SIDE, 1)))
 
 
 def _make_rough_surface(seed: int) -> Surface:
-    """Gaussian relief with a power law, 30 m RMS over 2 km."""
+    """Make Gaussian relief with a power-law spectrum and an RMS of 30 m over 2 km."""
     rng = np.random.default_rng(seed)
     wavenumbers = np.hypot(np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE)[None, :])
     wavenumbers[0, 0] = np.inf
@@ -58,6 +59,7 @@ def _make_rough_surface(seed: int) -> Surface:
 
 
 def _beam_axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray, "3"]:
+    """Compute the unit vector at a tilt from nadir towards an azimuth, world axes."""
     tilt, azimuth = np.radians([tilt_deg, azimuth_deg])
     return np.array([np.sin(tilt) * np.sin(azimuth), np.sin(tilt) * np.cos(azimuth), -np.cos(tilt)])
 
@@ -74,18 +76,18 @@ def _make_gps(rng: np.random.Generator, **errors: object) -> Instrument:
     return Gps.draw(GpsParameters.model_validate(errors), (-10.0, 30.0), rng)
 
 
-PERFECT: dict[Callable[..., Instrument], dict[str, object]] = {
+NO_ERRORS: dict[Callable[..., Instrument], dict[str, object]] = {
     _make_radar: {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": {}},
     _make_gps: dict.fromkeys(
         ("horizontal_noise_m", "vertical_noise_m", "horizontal_wander_m", "vertical_wander_m"), 0.0
     ),
 }
-with_each_instrument = pytest.mark.parametrize("make", PERFECT, ids=["radar", "gps"])
+with_each_instrument = pytest.mark.parametrize("make", NO_ERRORS, ids=["radar", "gps"])
 
 
 @with_each_instrument
 def test_error_free_readings_equal_the_truth(make: Callable[..., Instrument]) -> None:
-    instrument = make(np.random.default_rng(0), **PERFECT[make])
+    instrument = make(np.random.default_rng(0), **NO_ERRORS[make])
     times = instrument.sampling.within(0.0, 10.0)
     readings = instrument.measure(DESCENT, times, np.random.default_rng(1))
     truth = DESCENT.motion(times).positions_m
@@ -97,13 +99,13 @@ def test_error_free_readings_equal_the_truth(make: Callable[..., Instrument]) ->
 @with_each_instrument
 def test_readings_are_measured_at_the_true_time(make: Callable[..., Instrument]) -> None:
     clock = {"offset_s": 0.02, "jitter_sd_s": 0.001}
-    instrument = make(np.random.default_rng(0), **PERFECT[make] | {"clock": clock})
+    instrument = make(np.random.default_rng(0), **NO_ERRORS[make] | {"clock": clock})
     times = np.arange(400) * 0.02
     readings = instrument.measure(DESCENT, times, np.random.default_rng(1))
     heights = readings.values[:, 2] if readings.values.ndim == 2 else readings.values
     np.testing.assert_allclose(heights, 2000.0 - 75.0 * times, atol=1e-6)
     error = readings.times_s - times
-    # 400 values determine mean and standard deviation to 5e-5 s and 3.5 %.
+    # The standard errors from 400 values are 5e-5 s of the mean and 3.5 % of the standard deviation.
     assert error.mean() == pytest.approx(0.02, abs=2e-4)
     assert error.std() == pytest.approx(0.001, rel=0.15)
 
@@ -136,7 +138,7 @@ def test_radar_scale_is_common_and_noise_is_independent() -> None:
         first, second = radar.measure(static, np.array([0.0, 1.0]), rng).values
         common.append(0.5 * (first + second) - 1000.0)
         noise.append((first - second) / np.sqrt(2.0))
-    # 300 values determine the standard deviation to 4 %; the tolerance is three times that.
+    # The standard error of the deviation from 300 values is 4 %; the tolerance is three times that.
     assert np.std(common) == pytest.approx(10.0, rel=0.12)
     assert np.std(noise) == pytest.approx(1.0, rel=0.12)
 
@@ -169,7 +171,7 @@ def test_narrow_beam_measures_the_range_at_its_uphill_edge() -> None:
     surface = _make_plane(np.tan(np.radians(20.0)))
     position = np.array([MIDDLE, MIDDLE, 1000.0])
     result = first_return(surface, position, _beam_axis(0.0), np.radians(5.0), 5000.0)
-    # The ray 5 deg uphill of nadir: r cos 5 = 1000 - r sin 5 tan 20.
+    # The nearest ray is 5 deg uphill of nadir. Its range r solves r cos 5 = 1000 - r sin 5 tan 20.
     expected = 1000.0 / (np.cos(np.radians(5.0)) + np.sin(np.radians(5.0)) * np.tan(np.radians(20.0)))
     assert result == pytest.approx(expected, rel=5e-4)
 
@@ -188,7 +190,7 @@ def test_radar_near_a_cliff_measures_the_range_to_its_edge() -> None:
     heights[:, edge:] = 200.0
     position = np.array([MIDDLE, MIDDLE, 1500.0])
     result = first_return(_make_surface(heights), position, _beam_axis(0.0), np.radians(30.0), 5000.0)
-    # The spline makes a ramp of the step; its top is one cell beyond the edge.
+    # The spline turns the step into a ramp, whose top is one cell beyond the edge.
     assert result == pytest.approx(np.hypot(61 * SPACING, 1300.0), abs=0.1)
     # The edge is 13 deg from nadir, outside a beam with a half angle of 10 deg.
     assert first_return(_make_surface(heights), position, _beam_axis(0.0), np.radians(10.0), 5000.0) == pytest.approx(
@@ -206,7 +208,7 @@ def test_first_return_matches_a_dense_scan(height: float, tilt_deg: float) -> No
     ranges = np.sqrt(x**2 + y**2 + depth**2)
     in_beam = x * axis[0] + y * axis[1] - depth * axis[2] >= ranges * np.cos(np.radians(30.0))
     result = first_return(surface, position, axis, np.radians(30.0), 5000.0)
-    # Requirement: 0.05 % of the altitude.
+    # The requirement is 0.05 % of the altitude.
     assert result == pytest.approx(ranges[in_beam].min(), abs=5e-4 * height)
 
 
@@ -219,7 +221,7 @@ def test_radar_on_a_ledge_measures_the_ground_below() -> None:
     heights = np.zeros((SIDE, SIDE))
     edge = SIDE // 2
     heights[:, :edge] = 400.0
-    # 1 m above the ledge, 20 m from its edge, with a narrow beam 60 deg down to the east.
+    # The radar is 1 m above the ledge, 20 m from its edge. The narrow beam points east, 60 deg from nadir.
     position = np.array([edge * SPACING - 20.0, MIDDLE, 401.0])
     result = first_return(_make_surface(heights), position, _beam_axis(60.0), np.radians(2.0), 5000.0)
     assert result < 10.0
@@ -229,7 +231,7 @@ def test_radar_on_a_ledge_measures_the_ground_below() -> None:
 
 
 def test_laser_measures_slant_range_along_its_axis() -> None:
-    # Body -z rotated by 20 deg about north points west and down: r cos 20 = 100 + 0.1 r sin 20.
+    # The axis points west, 20 deg from nadir. The ground falls to the west, so that r cos 20 = 100 + 0.1 r sin 20.
     axis = np.array([-np.sin(np.radians(20.0)), 0.0, -np.cos(np.radians(20.0))])
     expected = 100.0 / (np.cos(np.radians(20.0)) - 0.1 * np.sin(np.radians(20.0)))
     position = np.array([MIDDLE, MIDDLE, 100.0])
@@ -238,9 +240,9 @@ def test_laser_measures_slant_range_along_its_axis() -> None:
     assert range_along(FLAT, position, np.array([0.0, 0.0, 1.0]), 300.0) == np.inf
 
 
-def test_laser_unit_adds_its_errors() -> None:
-    perfect = LaserParameters(noise_m=0.0, count_m=0.0, clock=ClockParameters())
-    unit = RangingUnit.draw(perfect, np.random.default_rng(0))
+def test_laser_has_no_reading_outside_its_range() -> None:
+    no_errors = LaserParameters(noise_m=0.0, count_m=0.0, clock=ClockParameters())
+    unit = RangingUnit.draw(no_errors, np.random.default_rng(0))
     readings = unit.readings(np.arange(3.0), np.array([10.0, np.inf, 301.0]), np.random.default_rng(0))
     np.testing.assert_array_equal(readings.values, [10.0, np.nan, np.nan])
 
@@ -248,13 +250,13 @@ def test_laser_unit_adds_its_errors() -> None:
 def test_boresight_error_has_the_specified_deviation() -> None:
     parameters = LaserParameters(boresight_deg=0.5)
     axes = np.array([RangingUnit.draw(parameters, np.random.default_rng(seed)).axis for seed in range(400)])
-    # 400 values determine the standard deviation to 3.5 %; the tolerance is three times that
+    # The standard error of the deviation from 400 values is 3.5 %; the tolerance is three times that.
     np.testing.assert_allclose(np.degrees(axes[:, :2].std(axis=0)), 0.5, rtol=0.11)
     np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0)
 
 
 def test_side_lobes_receive_the_ground_at_nadir() -> None:
-    """Tilted by 50 deg, the beam of 60 deg ends 20 deg from nadir; the side lobes reach the nadir."""
+    """Tilted by 50 deg, the beam of 60 deg width ends 20 deg from nadir. The side lobes include the nadir."""
     tilted = Swaying(position_m=(160.0, 160.0, 1000.0), tilt=Rotation.from_rotvec([0.0, np.radians(50.0), 0.0]))
     times = np.arange(100) * 0.1
     main_lobe, with_side_lobes = (
@@ -285,6 +287,6 @@ def test_receiver_errors_have_the_specified_deviations() -> None:
         rng = np.random.default_rng(seed)
         gps = Gps.draw(RTK, (0.0, 10.0), rng)
         errors.append(gps.measure(DESCENT, time, rng).values[0] - true_position)
-    # 400 and 200 values determine the standard deviation to 3.5 % and 5 %; the tolerance is three times that.
+    # The standard errors from 400 and 200 values are 3.5 % and 5 %; the tolerance is three times that.
     assert np.std(np.array(errors)[:, :2]) == pytest.approx(np.hypot(0.01, 0.01), rel=0.11)
     assert np.std(np.array(errors)[:, 2]) == pytest.approx(np.hypot(0.015, 0.02), rel=0.15)

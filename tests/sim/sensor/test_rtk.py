@@ -12,7 +12,7 @@ MOTION = Swaying(position_m=(10.0, 20.0, 30.0), velocity_m_s=(1.0, -0.5, 0.2), s
 SPAN = (0.0, 400.0)
 
 
-def _measure(seed: int, times: np.ndarray, **changes: object) -> tuple[RtkReceiver, RtkSolutions]:
+def _simulate(seed: int, times: np.ndarray, **changes: object) -> tuple[RtkReceiver, RtkSolutions]:
     rng = np.random.default_rng(seed)
     receiver = RtkReceiver.draw(RtkParameters.model_validate(changes), SPAN, rng)
     return receiver, receiver.measure(MOTION, times, rng)
@@ -23,9 +23,9 @@ def test_errors_match_specified_and_reported_deviation(kind: str) -> None:
     fraction = 1.0 if kind == "floating" else 0.0
     times = np.array([5.0])
     truth = MOTION.motion(times)
-    samples = [_measure(seed, times, float_fraction=fraction) for seed in range(400)]
+    samples = [_simulate(seed, times, float_fraction=fraction) for seed in range(400)]
     position_errors = np.array([(s.positions_m - truth.positions_m)[0] for _, s in samples])
-    # 400 values determine the standard deviation to 3.5 %; the tolerance is three times that.
+    # The standard error of a deviation from 400 values is 3.5 %; the tolerance is three times that.
     np.testing.assert_allclose(position_errors.std(axis=0), getattr(RtkParameters(), kind).total_m, rtol=0.11)
     reported = np.array([s.reported_m[0] for _, s in samples])
     factors = np.log(reported / getattr(RtkParameters(), kind).total_m)
@@ -36,35 +36,35 @@ def test_errors_match_specified_and_reported_deviation(kind: str) -> None:
 
 
 def test_slow_error_has_the_specified_correlation_time() -> None:
-    """A Gauss-Markov error has a correlation of exp(-1) after one correlation time."""
+    """A Gauss-Markov error has a correlation of exp(-1) after one correlation time, 120 s."""
     times = np.array([0.0, 1.0, 120.0])
     errors = np.array(
         [
-            (_measure(seed, times, float_fraction=1.0)[1].positions_m - MOTION.motion(times).positions_m)[:, :2] / 0.5
+            (_simulate(seed, times, float_fraction=1.0)[1].positions_m - MOTION.motion(times).positions_m)[:, :2] / 0.5
             for seed in range(400)
         ]
     )
     correlation = np.corrcoef(np.moveaxis(errors, 1, 0).reshape(3, -1))
     assert correlation[0, 1] == pytest.approx(np.exp(-1.0 / 120.0), abs=0.01)
-    # 800 values: three standard deviations of (1 - r^2) / sqrt(800).
+    # The tolerance is three standard errors (1 - r^2) / sqrt(800) of a correlation from 800 values.
     assert correlation[0, 2] == pytest.approx(np.exp(-1.0), abs=0.09)
 
 
 def test_solution_types_have_specified_fraction_and_duration() -> None:
     times = np.arange(0.0, 400.0, 0.5)
-    floating = np.array(
-        [_measure(seed, times, float_fraction=0.25, float_s=10.0)[0].is_floating(times) for seed in range(200)]
+    is_floating = np.array(
+        [_simulate(seed, times, float_fraction=0.25, float_s=10.0)[0].is_floating(times) for seed in range(200)]
     )
-    # 200 flights of about 10 cycles each.
-    assert floating.mean() == pytest.approx(0.25, abs=0.02)
-    np.testing.assert_allclose(floating[:, [0, -1]].mean(axis=0), 0.25, atol=0.1)
-    begins = np.count_nonzero(floating[:, 1:] & ~floating[:, :-1]) / (200 * 400.0)
-    assert begins == pytest.approx(1.0 / 40.0, rel=0.1)
+    # Each of the 200 flights has about 10 cycles of fixed and floating solutions, 40 s each.
+    assert is_floating.mean() == pytest.approx(0.25, abs=0.02)
+    np.testing.assert_allclose(is_floating[:, [0, -1]].mean(axis=0), 0.25, atol=0.1)
+    start_rate_per_s = np.count_nonzero(is_floating[:, 1:] & ~is_floating[:, :-1]) / (200 * 400.0)
+    assert start_rate_per_s == pytest.approx(1.0 / 40.0, rel=0.1)
 
 
 def test_outage_has_no_solutions() -> None:
     times = np.arange(0.0, 10.0, 0.1)
-    _, solutions = _measure(0, times, outages=(Outage(start_s=3.0, duration_s=2.0),))
+    _, solutions = _simulate(0, times, outages=(Outage(start_s=3.0, duration_s=2.0),))
     is_missing = np.isnan(solutions.positions_m).all(axis=1)
     np.testing.assert_array_equal(is_missing, (times >= 3.0) & (times < 5.0))
     assert np.isfinite(solutions.velocities_m_s[~is_missing]).all()

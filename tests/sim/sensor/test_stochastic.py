@@ -10,7 +10,8 @@ def test_process_is_stationary_from_the_start() -> None:
     rng = np.random.default_rng(0)
     process = GaussMarkov.draw(np.repeat([2.0, 5.0], 2000), 100.0, (-50.0, 250.0), rng)
     early, later = process.at(np.array([-50.0])), process.at(np.array([50.0]))
-    # 2,000 channels determine the standard deviation to 1.6 % and a correlation to 2 %; tolerances are four times that.
+    # The standard errors from 2,000 channels are 1.6 % of the deviation and 0.02 of a correlation; tolerances are four
+    # times that.
     for channels, sd in ((slice(0, 2000), 2.0), (slice(2000, 4000), 5.0)):
         assert np.std(early[0, channels]) == pytest.approx(sd, rel=0.065)
         assert np.std(later[0, channels]) == pytest.approx(sd, rel=0.065)

@@ -58,7 +58,7 @@ def test_damaged_file_is_rebuilt(cache: Path, damage: bytes | None) -> None:
 
 
 def test_zeroed_cache_file_is_rebuilt(cache: Path) -> None:
-    """The process has verified the file before; writing zeros changes its modification time."""
+    """The process has already verified the file. Writing zeros changes its modification time."""
     bank = TerrainBank(SMALL, seed=1)
     built = _terrain_bytes(bank, 0)
     assert _terrain_bytes(bank, 0) == built
@@ -75,11 +75,11 @@ def test_file_is_verified_once_per_process(cache: Path, monkeypatch: pytest.Monk
     built = _terrain_bytes(bank, 0)
     monkeypatch.setattr("marsyard.sim.cache._VERIFIED", {})
     checked_sizes: list[int] = []
-    checksum = cache_module._compute_checksum
+    compute_checksum = cache_module._compute_checksum
 
     def count_and_compute(array: np.ndarray) -> object:
         checked_sizes.append(array.size)
-        return checksum(array)
+        return compute_checksum(array)
 
     monkeypatch.setattr("marsyard.sim.cache._compute_checksum", count_and_compute)
     assert [_terrain_bytes(bank, 0), _terrain_bytes(bank, 0)] == [built, built]
@@ -88,20 +88,20 @@ def test_file_is_verified_once_per_process(cache: Path, monkeypatch: pytest.Monk
 
 def test_terrain_is_synced_before_rename(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[str] = []
-    replace, sync = Path.replace, os.fsync
+    rename, sync = Path.replace, os.fsync
 
     def record_sync(file: int) -> None:
         steps.append(str(Path(f"/proc/self/fd/{file}").readlink()))
         sync(file)
 
     def record_rename(self: Path, path: Path) -> Path:
-        steps.append("named")
-        return replace(self, path)
+        steps.append("renamed")
+        return rename(self, path)
 
     monkeypatch.setattr("os.fsync", record_sync)
     monkeypatch.setattr(Path, "replace", record_rename)
     TerrainBank(SMALL, seed=1).terrain(0)
-    assert [Path(step).suffix or Path(step).name for step in steps] == [".part", "named", "terrain"]
+    assert [Path(step).suffix or Path(step).name for step in steps] == [".part", "renamed", "terrain"]
 
 
 def test_terrains_are_built_without_a_writable_cache(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,6 +163,7 @@ def test_concurrent_builds_in_a_small_cache_are_complete(cache: Path, monkeypatc
         hashes = list(pool.map(_hash_terrains, range(3)))
     assert hashes[0] == hashes[1] == hashes[2]
     assert not list(cache.glob("*.part"))
+    # The limit of 200 kB holds five files of 45 kB. Each of the three processes may have one more file in use.
     assert sum(path.stat().st_size for path in cache.iterdir()) <= 5 * 45_000 + 3 * 45_000
 
 

@@ -20,7 +20,7 @@ def make_dem() -> np.ndarray:
 
 @pytest.fixture
 def npz(tmp_path: Path) -> Path:
-    """File with row 0 in the north, a hole of six posts, and an image at half the spacing, brighter to the east."""
+    """Write a file with row 0 in the north, a hole of six posts, and an image at half spacing, brighter in the east."""
     heights = make_dem().astype(np.float32)
     heights[40:42, 50:53] = np.nan
     image = np.broadcast_to(np.linspace(80, 160, 2 * COLUMNS), (2 * ROWS, 2 * COLUMNS)).astype(np.uint8).copy()
@@ -31,7 +31,7 @@ def npz(tmp_path: Path) -> Path:
     return path
 
 
-def make_surround(source: RealTerrain, **changes: object) -> TerrainParameters:
+def make_terrain_parameters(source: RealTerrain, **changes: object) -> TerrainParameters:
     values: dict[str, object] = {
         "samples": 256,
         "spacing_m": 1.0,
@@ -51,7 +51,7 @@ def test_surface_interpolates_the_posts(npz: Path) -> None:
     source = RealTerrain(dtm=npz, border_m=10.0, roughen=False)
     extent = embed(source, 256, 1.0).extent
     assert (extent.holes, extent.ortho_holes) == (6, 8 * COLUMNS)
-    surface = build_surface(make_surround(source))
+    surface = build_surface(make_terrain_parameters(source))
     full, _ = fill_holes(read_rasters(source)[0].values)
     x, y = np.meshgrid(extent.west_m + np.arange(11, COLUMNS - 11), extent.south_m + np.arange(11, ROWS - 11))
     expected = full[11:-11, 11:-11] - full.mean()
@@ -63,43 +63,47 @@ def test_surface_interpolates_the_posts(npz: Path) -> None:
 @pytest.mark.parametrize("spacing_m", [0.5, 1.5])
 def test_resampling_preserves_the_heights(npz: Path, spacing_m: float) -> None:
     source = RealTerrain(dtm=npz, border_m=10.0, roughen=False)
-    surface = build_surface(make_surround(source, samples=512 if spacing_m < 1 else 128, spacing_m=spacing_m))
+    surface = build_surface(make_terrain_parameters(source, samples=512 if spacing_m < 1 else 128, spacing_m=spacing_m))
     extent = embed(source, surface.levels[0].shape[0], spacing_m).extent
     x, y = np.meshgrid(np.arange(15.0, 45.0), np.arange(15.0, 35.0))
     expected = 3.0 * np.sin(x / 9.0) + 2.0 * np.cos((ROWS - 1 - y) / 7.0) + 0.05 * x + 100.0
     actual = surface.height(extent.west_m + x, extent.south_m + y)
-    # Smooth terrain with waves of at least 44 m: cubic interpolation is accurate to centimetres.
+    # The shortest waves are 44 m long, so cubic interpolation is accurate to centimetres.
     np.testing.assert_allclose(actual - actual.mean(), expected - expected.mean(), atol=0.02)
 
 
 def test_border_of_the_imported_terrain_has_no_step(npz: Path) -> None:
     source = RealTerrain(dtm=npz, border_m=15.0)
-    surface = build_surface(make_surround(source, rms_slope_deg=3.0))
+    surface = build_surface(make_terrain_parameters(source, rms_slope_deg=3.0))
     x, y = np.meshgrid(np.arange(256.0), np.arange(256.0))
     slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
-    # The DTM has slopes of 25 deg; a step of one metre between two posts would be 45 deg.
+    # The DTM has slopes of up to 25 deg. A step of one metre between two posts would have a slope of 45 deg.
     assert slope.max() < 42.0
 
 
 def test_roughness_finer_than_the_posts_is_optional(npz: Path) -> None:
     smooth, rough = (
-        build_surface(make_surround(RealTerrain(dtm=npz, roughen=r), samples=1024, spacing_m=0.25, rms_slope_deg=4.0))
-        for r in (False, True)
+        build_surface(
+            make_terrain_parameters(
+                RealTerrain(dtm=npz, roughen=roughen), samples=1024, spacing_m=0.25, rms_slope_deg=4.0
+            )
+        )
+        for roughen in (False, True)
     )
     middle = np.s_[480:560, 480:560, 0]
-    added = rough.levels[0][middle] - smooth.levels[0][middle]
-    assert 0.003 < added.std() < 0.3
-    assert abs(added.mean()) < 0.2 * added.std(), "the roughness does not change the mean height"
+    roughness_m = rough.levels[0][middle] - smooth.levels[0][middle]
+    assert 0.003 < roughness_m.std() < 0.3
+    assert abs(roughness_m.mean()) < 0.2 * roughness_m.std(), "the roughness does not change the mean height"
 
 
 def test_brightness_uses_the_image_offset(npz: Path) -> None:
     source = RealTerrain(dtm=npz, border_m=5.0, roughen=False)
-    surface = build_surface(make_surround(source, albedo=0.2, albedo_contrast=0.0))
+    surface = build_surface(make_terrain_parameters(source, albedo=0.2, albedo_contrast=0.0))
     extent = embed(source, 256, 1.0).extent
     row = surface.albedo(extent.west_m + np.arange(10.0, 100.0), np.full(90, extent.south_m + 40.0))
     assert row[-1] / row[0] == pytest.approx((80 + 80 * 99.5 / 110) / (80 + 80 * 9.5 / 110), rel=0.02)
     offset_surface = build_surface(
-        make_surround(source.model_copy(update={"ortho_east_m": 8.0}), albedo=0.2, albedo_contrast=0.0)
+        make_terrain_parameters(source.model_copy(update={"ortho_east_m": 8.0}), albedo=0.2, albedo_contrast=0.0)
     )
     offset_row = offset_surface.albedo(extent.west_m + np.arange(10.0, 90.0), np.full(80, extent.south_m + 40.0))
     np.testing.assert_allclose(offset_row, row[8:88], rtol=0.02)
@@ -107,7 +111,7 @@ def test_brightness_uses_the_image_offset(npz: Path) -> None:
 
 def test_changed_file_produces_another_terrain(npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path / "cache"))
-    bank = TerrainBank(make_surround(RealTerrain(dtm=npz)), seed=1)
+    bank = TerrainBank(make_terrain_parameters(RealTerrain(dtm=npz)), seed=1)
     original = bank.terrain(0).levels[0].tobytes()
     np.savez(npz, dem=make_dem() * 2.0, dem_gsd=1.0)
     assert bank.terrain(0).levels[0].tobytes() != original
@@ -119,7 +123,7 @@ def test_hirise_tile_is_imported(shared_data: Path) -> None:
         dtm=shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz", ortho_east_m=2.0, ortho_north_m=-1.0
     )
     assert choose_grid(source) == (1024, 1.0)
-    surface = build_surface(make_surround(source, samples=512))
+    surface = build_surface(make_terrain_parameters(source, samples=512))
     extent = embed(source, 512, 1.0).extent
     assert (extent.east_m - extent.west_m, extent.north_m - extent.south_m) == (347.0, 336.0)
     inside = surface.levels[0][100:400, 100:400, 0]
@@ -155,7 +159,7 @@ def test_missing_geotiff_reader_is_reported(tmp_path: Path, monkeypatch: pytest.
         read_rasters(RealTerrain(dtm=tmp_path / "dtm.tif"))
 
 
-# affine warns about its operators
+# The package affine warns about its operators.
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
 def test_geotiff_units_and_holes_are_read(tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio")
@@ -187,7 +191,7 @@ def test_geotiff_units_and_holes_are_read(tmp_path: Path) -> None:
 
 
 def test_statistics_use_only_valid_posts(tmp_path: Path) -> None:
-    """Half a tile of ridges is missing: slopes and relief are those of the valid half."""
+    """If half of a tile is missing, slopes and relief are those of the valid half."""
     x, y = np.meshgrid(np.arange(160.0), np.arange(140.0))
     heights = 3.0 * np.sin(x / 9.0) + 2.0 * np.cos(y / 7.0)
     heights[:, 80:] = np.nan
@@ -198,11 +202,11 @@ def test_statistics_use_only_valid_posts(tmp_path: Path) -> None:
     assert embedded.extent.hole_fraction == pytest.approx(0.5)
     assert embedded.real_samples(256).sum() == np.isfinite(heights).sum()
     assert embedded.filled_samples(256).sum() == np.isnan(heights).sum()
-    measured = terrain_statistics(build_surface(make_surround(source)), embedded.real_samples(256))
+    measured = terrain_statistics(build_surface(make_terrain_parameters(source)), embedded.real_samples(256))
     full = heights[:, :80]
     rises = (full[30:] - full[:-30], full[:, 30:] - full[:, :-30])
     expected = np.mean([np.degrees(np.arctan(np.abs(rise) / 30.0)).mean() for rise in rises])
-    # The outermost 2 m blend into the surround.
+    # The outermost 2 m blend into the synthetic terrain.
     assert measured.mean_slope_30_m_deg == pytest.approx(expected, rel=0.02)
     assert measured.relief_m == pytest.approx(float(np.ptp(full)), rel=0.02)
 

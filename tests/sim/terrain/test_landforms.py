@@ -23,7 +23,7 @@ def make_parameters(**changes: object) -> TerrainParameters:
     return SMOOTH.model_copy(update=changes)
 
 
-def synthesize_heights(parameters: TerrainParameters, seed: int = 1) -> np.ndarray:
+def synthesise_heights(parameters: TerrainParameters, seed: int = 1) -> np.ndarray:
     return synthesise(parameters, np.random.default_rng(seed)).levels[0][..., 0].astype(np.float64)
 
 
@@ -43,9 +43,9 @@ LANDFORMS = {
 def test_equal_seeds_produce_equal_bytes(name: str) -> None:
     parameters = make_parameters(**{name: LANDFORMS[name]})
     first, repeated, other_seed = (
-        synthesize_heights(parameters),
-        synthesize_heights(parameters),
-        synthesize_heights(parameters, seed=2),
+        synthesise_heights(parameters),
+        synthesise_heights(parameters),
+        synthesise_heights(parameters, seed=2),
     )
     assert first.tobytes() == repeated.tobytes()
     assert np.isfinite(first).all()
@@ -55,10 +55,10 @@ def test_equal_seeds_produce_equal_bytes(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["dunes", "lava", "swell", "ramp", "gullies", "playa"])
 def test_added_landform_does_not_change_others(name: str) -> None:
-    """Heights are additive: the contribution of a landform does not depend on the other landforms."""
+    """The contribution of a landform to the heights does not depend on the other landforms."""
     rough = make_parameters(rms_slope_deg=2.0, ripples=LANDFORMS["ripples"])
-    contribution = synthesize_heights(make_parameters(**{name: LANDFORMS[name]}))
-    difference = synthesize_heights(rough.model_copy(update={name: LANDFORMS[name]})) - synthesize_heights(rough)
+    contribution = synthesise_heights(make_parameters(**{name: LANDFORMS[name]}))
+    difference = synthesise_heights(rough.model_copy(update={name: LANDFORMS[name]})) - synthesise_heights(rough)
     np.testing.assert_allclose(difference, contribution, atol=1e-3)
 
 
@@ -87,7 +87,7 @@ def test_dunes_have_specified_wavelength_height_and_slip_faces() -> None:
     z = surface.levels[0][..., 0].astype(np.float64)
     power = (np.abs(np.fft.rfft(z, axis=1)) ** 2).mean(axis=0)
     assert np.argmax(power[1:]) + 1 == pytest.approx(1024 / 64, abs=1.5)
-    # Downwind is east: the lee slopes are steepest, at the angle of repose, and face east.
+    # Downwind is east. The lee slopes face east and are steepest, at the angle of repose.
     x, y = np.meshgrid(np.arange(0, 1024, 0.5), np.arange(0, 1024, 16.0))
     slope = surface.gradient(x, y)[..., 0]
     steepest = np.degrees(np.arctan(-np.quantile(slope, 0.01)))
@@ -102,14 +102,14 @@ def test_dune_crests_fork_without_height_steps() -> None:
     surface = synthesise(make_parameters(samples=1024, spacing_m=1.0, dunes=dunes), np.random.default_rng(3))
     x, y = np.meshgrid(np.arange(0, 1024, 1.0), np.arange(0, 1024, 1.0))
     slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
-    # Crests are dense at forks, where slip faces are slightly steeper.
+    # At forks crests are close together, and slip faces are slightly steeper.
     assert np.quantile(slope, 0.9999) < 42.0
     assert slope.max() < 55.0
 
 
 def test_wind_direction_rotates_the_crests() -> None:
-    crests_north = synthesize_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=270.0)))
-    crests_east = synthesize_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=180.0)))
+    crests_north = synthesise_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=270.0)))
+    crests_east = synthesise_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=180.0)))
 
     def mean_change(z: np.ndarray, axis: int) -> float:
         return float(np.abs(np.roll(z, -20, axis=axis) - z).mean())
@@ -142,7 +142,7 @@ def test_ramp_has_its_slope_in_the_specified_direction(slope_deg: float, uphill:
 
 
 def test_swell_has_the_specified_relief() -> None:
-    assert np.ptp(synthesize_heights(make_parameters(swell=Swell(relief_m=120.0)))) == pytest.approx(120.0, rel=0.01)
+    assert np.ptp(synthesise_heights(make_parameters(swell=Swell(relief_m=120.0)))) == pytest.approx(120.0, rel=0.01)
 
 
 def test_fans_descend_to_an_almost_level_playa() -> None:
@@ -222,8 +222,8 @@ def test_dune_kernel_matches_scipy() -> None:
     side, spacing, crest, steepest = 128, 3.0, 4.0, 0.6
     modulation = np.random.default_rng(2).normal(size=(32, 32, 2)).astype(np.float32)
     wave = 2.0 * np.pi / (side * spacing) * np.array([5.0, -3.0])
-    height, tone = np.zeros((2, side, side), dtype=np.float32)
-    add_dunes(height, tone, spacing, modulation, Bedforms(wave[0], wave[1], crest, steepest, 0.3))
+    height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
+    add_dunes(height, log_albedo, spacing, modulation, Bedforms(wave[0], wave[1], crest, steepest, 0.3))
     rows, columns = np.mgrid[:side, :side]
     real, imaginary = (
         map_coordinates(c.astype(np.float64), [rows / 4, columns / 4], order=3, mode="grid-wrap", prefilter=False)
@@ -241,15 +241,16 @@ def test_dune_kernel_matches_scipy() -> None:
         np.where(face > 0.5, 4.0 / 3.0 * face - 1.0 / 3.0, 4.0 / 3.0 * face**2),
     )
     np.testing.assert_allclose(height, crest_height * shape, atol=1e-5)
-    np.testing.assert_allclose(tone, 0.3 * (shape - 0.5) * np.minimum(strength, 1.0), atol=1e-5)
+    np.testing.assert_allclose(log_albedo, 0.3 * (shape - 0.5) * np.minimum(strength, 1.0), atol=1e-5)
 
 
 def test_ejecta_have_seven_and_twelve_rays() -> None:
-    """Outside the rim the ejecta height decreases with the cube of the distance and is modulated by rays in azimuth."""
+    """Outside the rim the ejecta height decreases with the cube of the distance. Rays modulate it in azimuth."""
     side, spacing, radius, rim, max_radius, phase = 128, 1.0, 12.0, 0.8, 4.0, 0.7
-    height, tone = np.zeros((2, side, side), dtype=np.float32)
+    height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
+    # Columns: see `stamp_craters`.
     crater = np.array([[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phase]])
-    stamp_craters(height, tone, spacing, crater, max_radius)
+    stamp_craters(height, log_albedo, spacing, crater, max_radius)
     y, x = np.mgrid[:side, :side] - 64.0
     r, azimuth = np.hypot(x, y) / radius, np.arctan2(y, x)
     outside = (r > 1.1) & (r < max_radius)
@@ -257,16 +258,16 @@ def test_ejecta_have_seven_and_twelve_rays() -> None:
     rays = np.cos(7.0 * azimuth + phase) + np.cos(12.0 * azimuth + 2.3 * phase)
     blanket = rim / np.maximum(r, 0.6) ** 3 * fade * (1.0 + 0.25 * rays * np.minimum(2.0 * (r - 1.0), 1.0))
     np.testing.assert_allclose(height[outside], blanket[outside], atol=1e-6)
-    ray_tone = np.maximum(fade**2 * (1.0 + 0.5 * rays), 0.0)
-    np.testing.assert_allclose(tone[outside], 0.2 * ray_tone[outside], atol=1e-6)
+    ray_contrast = np.maximum(fade**2 * (1.0 + 0.5 * rays), 0.0)
+    np.testing.assert_allclose(log_albedo[outside], 0.2 * ray_contrast[outside], atol=1e-6)
 
 
 def test_cracks_follow_periodic_voronoi_borders() -> None:
     side, spacing, count, width = 96, 0.5, 8, 0.8
     cell = side * spacing / count
     points = np.random.default_rng(4).uniform(0.1, 0.9, (count, count, 2))
-    height, tone = np.zeros((2, side, side), dtype=np.float32)
-    add_cracks(height, tone, spacing, points, cell, width, 0.2, -0.1)
+    height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
+    add_cracks(height, log_albedo, spacing, points, cell, width, 0.2, -0.1)
     row, column = np.mgrid[:count, :count]
     positions = (points + np.stack([column, row], axis=-1)).reshape(-1, 2)
     y, x = np.mgrid[:side, :side] * spacing / cell
@@ -276,13 +277,13 @@ def test_cracks_follow_periodic_voronoi_borders() -> None:
     separation = (positions[nearest[..., 1]] - positions[nearest[..., 0]] + count / 2) % count - count / 2
     border = 0.5 * (distance[..., 1] ** 2 - distance[..., 0] ** 2) / np.linalg.norm(separation, axis=-1) * cell
     fraction = np.clip(1.0 - border / width, 0.0, None)
-    # The two nearest points are within one cell on each side, except for wide cells.
+    # The kernel searches one cell on each side for the two nearest points; few of them are farther away.
     assert np.mean(np.isclose(height, -0.2 * fraction, atol=1e-6)) > 0.999
-    assert np.mean(np.isclose(tone, -0.1 * fraction, atol=1e-6)) > 0.999
+    assert np.mean(np.isclose(log_albedo, -0.1 * fraction, atol=1e-6)) > 0.999
 
 
 def test_dunes_finer_than_the_grid_are_sampled_directly() -> None:
-    """Dunes and their modulation are finer than the grid spacing."""
+    """Both the dunes and their modulation are finer than the grid spacing."""
     tiny = Dunes(wavelength_m=1.0, height_m=0.05, regularity=0.3, crest_length=0.5)
-    z = synthesize_heights(make_parameters(samples=64, spacing_m=3.0, ripples=tiny))
+    z = synthesise_heights(make_parameters(samples=64, spacing_m=3.0, ripples=tiny))
     assert 0.0 < np.ptp(z) < 0.1

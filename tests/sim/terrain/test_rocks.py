@@ -31,7 +31,7 @@ TARGET = PlacedRock(name="target", east_m=3.0, north_m=60.0, diameter_m=1.5, sha
 
 @pytest.fixture(scope="module")
 def ground() -> Surface:
-    """A bumpy ground of 64 m with slopes up to 20 deg."""
+    """Return ground of 64 m with waves and slopes up to 20 deg."""
     side, spacing = 256, 0.25
     phase = 2 * np.pi * np.arange(side) / side
     samples = np.full((side, side, 2), 0.2, dtype=np.float32)
@@ -78,7 +78,7 @@ def test_finest_shapes_have_specified_height_diameter_and_normals() -> None:
         above_ground = vertices[vertices[:, 2] >= 0.0, :2]
         widths = np.ptp(above_ground @ np.stack([np.cos(azimuth), np.sin(azimuth)]), axis=0)
         assert (widths.max() + widths.min()) / 2 == pytest.approx(1.0, abs=0.005 if number < SHAPES_OF_FORM else 0.01)
-        # Means of triangle normals agree with the stored normals except at the edges of the rock.
+        # The stored normals agree with means of triangle normals, except at the edges of the rock.
         agreement = np.sum(make_mesh(shapes, number).vertex_normals * shapes.normals[number], axis=1)
         assert np.median(agreement) > (0.999 if number < SHAPES_OF_FORM else 0.96)
 
@@ -91,7 +91,7 @@ def test_shapes_are_different() -> None:
 
 
 def _rocks_per_m2(abundance: float, smallest_m: float, largest_m: float) -> float:
-    """Number of rocks between two diameters: integral of the density of covered area divided by the rock area."""
+    """Compute the number of rocks between two diameters: the integral of the covered area density / rock area."""
     q = decay_per_m(abundance)
     return float(quad(lambda d: abundance * q * np.exp(-q * d) / (0.25 * np.pi * d * d), smallest_m, largest_m)[0])
 
@@ -105,7 +105,7 @@ def test_rock_sizes_follow_golombek(abundance: float) -> None:
     for min_diameter in (0.05, 0.1, 0.2, 0.4):
         above = diameters[diameters >= min_diameter]
         fraction = np.sum(np.pi / 4 * above**2) / area
-        # One sigma of a compound Poisson sum.
+        # Standard deviation of a compound Poisson sum.
         sigma = np.sqrt(np.sum((np.pi / 4 * above**2) ** 2)) / area
         expected = abundance * np.exp(-decay_per_m(abundance) * min_diameter)
         assert fraction == pytest.approx(expected, abs=max(0.1 * expected, 3 * sigma))
@@ -158,7 +158,7 @@ def test_placed_rock_has_its_name_and_position(ground: Surface, field: RockField
     mesh = field.rock(number)
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert body.is_watertight
-    # Along its vertical it rises half its diameter above the ground point.
+    # Along the local vertical its height is half its diameter.
     heights_m = (mesh.vertices - field.position_m[number]) @ field.up[number]
     assert heights_m.max() == pytest.approx(0.75)
     assert heights_m.min() < -0.1
@@ -193,12 +193,12 @@ def test_detail_follows_apparent_size_and_small_rocks_are_omitted(field: RockFie
 
 
 def test_clinker_has_rougher_shapes_than_blocks(ground: Surface) -> None:
-    """Angles between neighbouring triangles: the faces of a block are flat."""
+    """The roughness is the angle between neighbouring triangles. The faces of a block are flat."""
     shapes = rock_shapes(FINEST)
     meshes = [trimesh.Trimesh(vertices, shapes.faces, process=False) for vertices in shapes.vertices]
-    bends = [float(np.median(mesh.face_adjacency_angles)) for mesh in meshes]
+    median_angles = [float(np.median(mesh.face_adjacency_angles)) for mesh in meshes]
     clinker = slice(SHAPES_OF_FORM, 2 * SHAPES_OF_FORM)
-    assert max(bends[:SHAPES_OF_FORM]) < 0.07 < 0.18 < min(bends[clinker])
+    assert max(median_angles[:SHAPES_OF_FORM]) < 0.07 < 0.18 < min(median_angles[clinker])
     field = make_field(ground, form="clinker", placed=())
     assert set(np.unique(field.shape)) == set(range(SHAPES_OF_FORM, 2 * SHAPES_OF_FORM))
     assert set(np.unique(make_field(ground, placed=()).shape)) == set(range(SHAPES_OF_FORM))
@@ -252,7 +252,7 @@ def test_too_many_rocks_and_unknown_shapes_are_rejected(ground: Surface) -> None
 @pytest.mark.parametrize("number", [0, 9, 15, 16, 27, 32, 47, 50, 63, 70])
 @pytest.mark.parametrize("detail", [COARSEST, COARSE, MEDIUM, FINE])
 def test_coarse_rock_matches_the_finest_within_subpixels(number: int, detail: int) -> None:
-    """Requirement: 0.25 px rms above the ground, from the plane of the nearest coarse triangle."""
+    """The RMS distance above the ground to the plane of the nearest coarse triangle is about 0.25 px (requirement)."""
     coarse = make_mesh(rock_shapes(detail), number)
     samples, triangles = trimesh.sample.sample_surface(coarse, 200_000, seed=1)
     finest = trimesh.sample.sample_surface(make_mesh(rock_shapes(FINEST), number), 4_000, seed=2)[0]
@@ -284,7 +284,7 @@ def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.
         coarse = rock_shapes(COARSE)
         results.append([coarse.vertices, coarse.normals, coarse.reach, max_pixels()])
         files = sorted((tmp_path / "terrain").glob("rocks-*.npy"))
-    # Vertices of five levels, normals of two, sizes in pixels.
+    # The files contain vertices of five levels, normals of two levels, and the sizes in pixels.
     assert len(files) == 8
     for built, stored in zip(*results, strict=True):
         np.testing.assert_array_equal(built, stored)

@@ -11,16 +11,16 @@ from marsyard.sim.terrain.rocks import RockField
 from marsyard.sim.terrain.sites import PAPER
 from marsyard.sim.terrain.surface import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
 
-FIELD = ("pisgah", "kelso", "ivanpah")
-MARS = ("gusev", "meridiani")
-NAMES = (*FIELD, *MARS, "mars-yard", "heli-benign", "heli-hazardous")
+FIELD_SITES = ("pisgah", "kelso", "ivanpah")
+MARS_SITES = ("gusev", "meridiani")
+NAMES = (*FIELD_SITES, *MARS_SITES, "mars-yard", "heli-benign", "heli-hazardous")
 
 
 @pytest.fixture(scope="module")
 def site_statistics() -> dict[str, TerrainStatistics]:
-    """Statistics of the full extent of 6 km at half the post density, which reduces run time."""
+    """Compute statistics of the full extent of 6 km, at twice the sample spacing to reduce the run time."""
     result = {}
-    for name in (*FIELD, *MARS):
+    for name in (*FIELD_SITES, *MARS_SITES):
         parameters = site(name).terrain("descent")
         halved = parameters.model_copy(
             update={"samples": parameters.samples // 2, "spacing_m": 2 * parameters.spacing_m}
@@ -35,24 +35,24 @@ def test_all_sites_exist() -> None:
         site("jezero")
 
 
-@pytest.mark.parametrize("name", FIELD + MARS)
+@pytest.mark.parametrize("name", FIELD_SITES + MARS_SITES)
 def test_albedo_and_slopes_match_the_paper(name: str, site_statistics: dict[str, TerrainStatistics]) -> None:
-    paper, figures = PAPER[name], site_statistics[name]
-    assert paper.albedo[0] - 1e-6 <= figures.albedo <= paper.albedo[1] + 1e-6
+    paper, statistics = PAPER[name], site_statistics[name]
+    assert paper.albedo[0] - 1e-6 <= statistics.albedo <= paper.albedo[1] + 1e-6
     min_value, max_value = paper.mean_slope_deg
-    assert min_value <= figures.mean_slope_30_m_deg <= max_value
-    assert min_value <= figures.mean_slope_90_m_deg <= max_value
+    assert min_value <= statistics.mean_slope_30_m_deg <= max_value
+    assert min_value <= statistics.mean_slope_90_m_deg <= max_value
 
 
 @pytest.mark.parametrize("name", ["pisgah", "gusev", "meridiani"])
 def test_small_bank_terrains_match_the_paper(name: str) -> None:
     """2048 samples with 2 m spacing need 44 MB on disk instead of 178 MB, for banks of hundreds of terrains."""
-    figures = terrain_statistics(
+    statistics = terrain_statistics(
         synthesise(site(name).terrain("descent", {"samples": 2048, "spacing_m": 2.0}), np.random.default_rng(2))
     )
     min_value, max_value = PAPER[name].mean_slope_deg
-    assert min_value <= figures.mean_slope_30_m_deg <= max_value
-    assert min_value <= figures.mean_slope_90_m_deg <= max_value
+    assert min_value <= statistics.mean_slope_30_m_deg <= max_value
+    assert min_value <= statistics.mean_slope_90_m_deg <= max_value
 
 
 def test_kelso_rises_over_200_m_and_ivanpah_is_the_flattest(site_statistics: dict[str, TerrainStatistics]) -> None:
@@ -71,10 +71,13 @@ def _median_contrast(name: str) -> float:
 
 
 def test_contrast_of_pisgah_is_below_that_of_the_mars_sites() -> None:
-    """The paper: "similar to contrast measured on descent images synthesized" from MOC, which is a lower limit."""
+    """The paper states that the contrast is "similar to contrast measured on descent images synthesized" from MOC.
+
+    This is a lower limit of the contrast on Mars.
+    """
     pisgah = _median_contrast("pisgah")
     assert pisgah < 0.1
-    for name in MARS:
+    for name in MARS_SITES:
         assert 0.5 < pisgah / _median_contrast(name) < 1.0
 
 
@@ -85,7 +88,7 @@ def test_sites_have_complete_parameters() -> None:
         assert parameters.rock_texture.amplitudes
         finest_m = parameters.ground_texture.coarsest_m / 2 ** (len(parameters.ground_texture.amplitudes) - 1)
         assert finest_m < 0.002, "texture has details of a millimetre"
-    for name in FIELD + MARS:
+    for name in FIELD_SITES + MARS_SITES:
         assert site(name).terrain().spacing_m == 1.5
         assert site(name).terrain("ground").spacing_m == 0.025
     with pytest.raises(ValueError, match="mars-yard has no terrain at the scale 'descent'"):
@@ -115,7 +118,7 @@ def test_mean_slope_of_a_sine_wave_and_of_a_part_of_it() -> None:
     # The mean absolute slope of a sine is 2 / pi of its maximum; along its crests the slope is zero.
     steepest = 10.0 * 2 * 2 * np.pi / 512
     assert mean_slope_deg(surface, 16.0) == pytest.approx(np.degrees(steepest * 2 / np.pi) / 2, rel=0.02)
-    # Near the crossing at x = 256 m the slope is maximal along the complete line.
+    # The included part is near the zero crossing at x = 256 m, where the slope has its maximum.
     is_included = np.zeros((side, side), dtype=np.bool_)
     is_included[:251, 123:134] = True
     part_slope_deg = mean_slope_deg(surface, 4.0, is_included)
@@ -131,11 +134,11 @@ def test_contrast_of_checkered_level_ground_equals_albedo_contrast() -> None:
 
 
 def test_sky_light_increases_with_dust() -> None:
-    high = np.radians(45.0)
-    fractions = [Environment(optical_depth=tau).sky_fraction(high) for tau in (0.0, 0.2, 0.5, 0.9)]
+    sun_elevation = np.radians(45.0)
+    fractions = [Environment(optical_depth=tau).sky_fraction(sun_elevation) for tau in (0.0, 0.2, 0.5, 0.9)]
     assert fractions[0] == 0.0
     assert all(a < b for a, b in pairwise(fractions))
-    assert Environment(optical_depth=0.0).direct_fraction(high) == 1.0
+    assert Environment(optical_depth=0.0).direct_fraction(sun_elevation) == 1.0
     # Without absorption and with isotropic scattering Eddington's approximation has a closed form. Over black ground
     # the transmitted fraction is (2 + 3 mu + (2 - 3 mu) exp(-tau / mu)) / (4 + 3 tau) (Shettle & Weinman 1970).
     conservative = Environment(optical_depth=1.0, single_scattering_albedo=0.9999999, asymmetry=0.0)
@@ -190,7 +193,7 @@ def test_change_errors_are_reported(changes: dict[str, object], message: str) ->
 
 
 def test_imported_terrain_replaces_the_relief_of_a_site(shared_data: Path) -> None:
-    """The HiRISE tile can replace a preset: heights of the file, rocks and roughness of the site."""
+    """The terrain has the heights of the HiRISE tile, and the rocks and roughness of the site."""
     tile = shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz"
     changes = {"samples": 512, "spacing_m": 1.0, "source": {"dtm": tile, "ortho_east_m": 2.0, "ortho_north_m": -1.0}}
     parameters = site("gusev").terrain("descent", changes)
@@ -209,7 +212,7 @@ def test_solar_disc_is_smaller_at_mars() -> None:
 
 
 def test_relief_is_that_of_the_spline_surface() -> None:
-    """A chequerboard of control values of +1 and -1 m is +1/9 and -1/9 m at the knots: (4 - 2)**2 / 36."""
+    """Alternating control values of +1 and -1 m give heights of +1/9 and -1/9 m at the knots: (4 - 2)**2 / 36."""
     samples = np.full((32, 32, 2), 0.2, dtype=np.float32)
     rows, columns = np.indices((32, 32))
     samples[..., 0] = np.where((rows + columns) % 2 == 0, 1.0, -1.0)

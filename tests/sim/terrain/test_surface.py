@@ -17,7 +17,7 @@ def surface() -> Surface:
 @pytest.fixture(scope="module")
 def positions() -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(6)
-    # Several periods to each side: the ground is periodic.
+    # The positions cover several periods on each side.
     return rng.uniform(-500.0, 500.0, 400), rng.uniform(-500.0, 500.0, 400)
 
 
@@ -35,7 +35,7 @@ def test_height_matches_scipy_cubic_b_spline(
 
 def test_gradient_is_the_derivative_of_height(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
     x, y = positions
-    # Central differences of a piecewise cubic: the error is h^2/6 times a third derivative of order 1.
+    # The error of central differences of a piecewise cubic is h^2/6 times a third derivative of order 1.
     step = 1e-4
     along_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
     along_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
@@ -44,12 +44,12 @@ def test_gradient_is_the_derivative_of_height(surface: Surface, positions: tuple
 
 @pytest.mark.parametrize("level", [0, 2])
 def test_ceilings_bound_the_height(surface: Surface, level: int) -> None:
-    """The ceiling of a block is the maximum control value around it; no height in the block exceeds it."""
+    """The ceiling of a block is the maximum control value in and next to it; no height in the block exceeds it."""
     ceiling, spacing = surface.ceilings[level], surface.spacing_m * 2.0**level
     block = CEILING_BLOCK * spacing
     x, y = np.random.default_rng(7).uniform(-surface.period_m, 2.0 * surface.period_m, (2, 40000))
-    a, b = (np.floor(coordinate / block).astype(int) % len(ceiling) for coordinate in (y, x))
-    assert np.all(surface.height(x, y, level) <= ceiling[a, b])
+    block_row, block_column = (np.floor(coordinate / block).astype(int) % len(ceiling) for coordinate in (y, x))
+    assert np.all(surface.height(x, y, level) <= ceiling[block_row, block_column])
     samples = surface.levels[level][..., 0]
     for row, column in ((0, 0), (3, 1), (len(ceiling) - 1, 2)):
         indices = [
@@ -74,10 +74,10 @@ def test_resolution_levels_are_aligned() -> None:
     samples = np.zeros((side, side, 2), dtype=np.float32)
     samples[..., 0] = np.sin(2 * np.pi * x / period)[None, :] + np.cos(2 * np.pi * x / period)[:, None]
     surface = Surface.from_samples(samples, spacing)
-    t = np.linspace(0.0, period, 512, endpoint=False)
+    positions_m = np.linspace(0.0, period, 512, endpoint=False)
     for level in range(len(surface.levels) - 1):
-        wave = surface.height(t, np.zeros_like(t), level)
-        phase = np.angle(np.sum(wave * np.exp(-2j * np.pi * t / period))) + np.pi / 2
+        wave = surface.height(positions_m, np.zeros_like(positions_m), level)
+        phase = np.angle(np.sum(wave * np.exp(-2j * np.pi * positions_m / period))) + np.pi / 2
         assert abs(phase) < 1e-5, f"level {level}"
 
 

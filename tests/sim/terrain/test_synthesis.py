@@ -20,8 +20,8 @@ def test_equal_seeds_produce_equal_bytes() -> None:
     assert first.levels[0].tobytes() != other_seed.levels[0].tobytes()
 
 
-def test_mean_variance_of_random_fields_is_the_specified_one() -> None:
-    # 200 draws of about ten independent large-scale modes each determine the mean variance to about 3 %.
+def test_random_fields_have_the_specified_mean_variance() -> None:
+    # The standard error of the mean variance is about 3 % for 200 draws of about ten independent large-scale modes.
     spectrum = Spectrum.power_law(128, 1.0, 0.5, 60.0)
     variances = [spectrum.draw_field(np.random.default_rng(seed), 2.0).var() for seed in range(200)]
     assert np.mean(variances) == pytest.approx(4.0, rel=0.04)
@@ -44,7 +44,7 @@ def test_structure_function_has_specified_slope_and_exponent(hurst: float) -> No
     slope_deg = np.degrees(np.arctan(rms[2] / (lags[2] * parameters.spacing_m)))
     assert slope_deg == pytest.approx(3.0, rel=0.1)
     measured_hurst = np.polyfit(np.log(lags), np.log(rms), 1)[0]
-    # The band limits of the grid change the structure function by a few hundredths.
+    # The band limits of the grid change the exponent by a few hundredths.
     assert measured_hurst == pytest.approx(hurst, abs=0.05)
 
 
@@ -75,27 +75,27 @@ def test_crater_depths_range_from_degraded_to_fresh() -> None:
 
 
 def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
-    height, tone = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
+    height, log_albedo = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
     radius, depth, rim = 20.0, 6.4, 1.6
-    # Sharp rim and round outline, centred on the corner of the periodic border.
+    # A crater with a sharp rim and a round outline, centred on the corner of the grid. Columns: see `stamp_craters`.
     crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, *np.zeros(7), 0.3]
-    stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
     centred = np.roll(height, (128, 128), axis=(0, 1))
     assert centred[128, 128] == pytest.approx(-depth)
     assert tuple(map(int, np.unravel_index(centred.argmin(), centred.shape))) == (128, 128)
     assert centred[128, 128 + 20] == pytest.approx(rim)
     assert centred[128 - 20, 128] == pytest.approx(rim)
     assert np.count_nonzero(centred[:, :60]) == 0
-    assert np.roll(tone, 128, axis=1)[0, 128] == pytest.approx(0.1)
+    assert np.roll(log_albedo, 128, axis=1)[0, 128] == pytest.approx(0.1)
 
 
 def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
-    height, tone = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
+    height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
     crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, *np.zeros(7), 0.0]
-    stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
     assert height[64, 64] == pytest.approx(-3.0, abs=0.05)
     assert np.ptp(height[64, 56:73]) < 0.15
-    assert not tone.any()
+    assert not log_albedo.any()
 
 
 def test_unordered_crater_sizes_are_rejected() -> None:

@@ -1,6 +1,7 @@
 """Tests of surface units, crater populations, tracks and wind tails.
 
-The tone is the natural logarithm of the albedo relative to the mean albedo.
+The tone is the natural logarithm of the albedo relative to the mean albedo. The stamping kernels define the columns of
+craters and streaks.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from pydantic import ValidationError
 
 from marsyard.sim.terrain import RockField, RockParameters, Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms.ground import Ground, Spectrum
-from marsyard.sim.terrain.landforms.kernels import stamp_cover, stamp_craters, stamp_streaks
+from marsyard.sim.terrain.landforms.kernels import scale_roughness, stamp_craters, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import draw_craters
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rocks.field import RockForms
+from marsyard.sim.terrain.rocks.shapes import SHAPES_OF_FORM
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS, TEXTURE
 
 KINDS: list[dict[str, Any]] = [
@@ -49,13 +51,13 @@ def test_units_have_the_specified_areas_factors_and_tones() -> None:
         inside = np.isclose(cover[..., TEXTURE], kind.get("texture", 1.0), rtol=0.05)
         assert inside.mean() == pytest.approx(kind["fraction"], abs=0.05)
         assert np.median(cover[inside, ROUGHNESS]) == pytest.approx(kind.get("roughness", 1.0), rel=0.05)
-        assert np.median(ground.tone[::4, ::4][inside]) == pytest.approx(kind.get("tone", 0.0), abs=0.02)
+        assert np.median(ground.log_albedo[::4, ::4][inside]) == pytest.approx(kind.get("tone", 0.0), abs=0.02)
     assert cover[..., ROCKS].mean() == pytest.approx(1.0, rel=1e-4)
 
 
 def test_unit_areas_vary_between_terrains() -> None:
     dust = [np.mean(_apply(_make_units(), seed, 256)[1][..., TEXTURE] < 0.4) for seed in range(40)]
-    # The areas have a Dirichlet distribution: variance a (1 - a) / (concentration + 1)
+    # The areas have a Dirichlet distribution: variance a (1 - a) / (concentration + 1).
     assert np.std(dust) == pytest.approx(np.sqrt(0.3 * 0.7 / 9.0), rel=0.35)
     assert np.mean(dust) == pytest.approx(0.3, abs=0.08)
 
@@ -69,13 +71,13 @@ def test_patches_are_longer_along_the_wind() -> None:
 
 
 def test_units_increase_the_patchiness_of_the_albedo() -> None:
-    def patchiness(parameters: TerrainParameters) -> float:
+    def compute_patchiness(parameters: TerrainParameters) -> float:
         tone = np.log(synthesise(parameters, np.random.default_rng(3)).levels[0][..., 1].astype(float))
         blocks = tone.reshape(32, 16, 32, 16).std(axis=(1, 3))
         return float(np.percentile(blocks, 90) / np.percentile(blocks, 10))
 
-    without_units = patchiness(_make_parameters())
-    with_units = patchiness(_make_parameters(units=_make_units(boundary=0.2)))
+    without_units = compute_patchiness(_make_parameters())
+    with_units = compute_patchiness(_make_parameters(units=_make_units(boundary=0.2)))
     assert without_units < 2.3
     assert with_units > 1.5 * without_units
 
@@ -89,7 +91,7 @@ def test_sum_of_split_field_equals_the_field() -> None:
 
 
 def test_crater_sizes_follow_saturation_and_production() -> None:
-    """Cumulative numbers fall as D**-1.83 below the knee (saturation) and as D**-3.2 beyond it (production)."""
+    """Cumulative numbers vary as D**-1.83 below the knee (saturation) and as D**-3.2 above it (production)."""
     parameters = _make_parameters(
         samples=4096,
         spacing_m=3.0,
@@ -117,7 +119,7 @@ def test_crater_floor_has_its_tone() -> None:
 
 def test_crater_floors_are_smoother_and_ejecta_rougher() -> None:
     factors = np.ones((64, 64), dtype=np.float32)
-    stamp_cover(factors, 1.0, np.array([[32.0, 32.0, 10.0, 0.4, 1.8]]), 2.0)
+    scale_roughness(factors, 1.0, np.array([[32.0, 32.0, 10.0, 0.4, 1.8]]), 2.0)
     assert factors[32, 32] == pytest.approx(0.4)
     assert factors[32, 43] > 1.6
     assert factors[32, 54] == 1.0
@@ -135,14 +137,14 @@ def test_wind_tails_lie_downwind_of_their_craters() -> None:
 
 def test_dust_devil_tracks_are_darker() -> None:
     ground, _ = _apply(_make_units(kinds=PLAIN, tracks_per_km2=20.0, track_tone=-0.12))
-    assert -0.3 < ground.tone.min() < -0.08
-    assert ground.tone.max() < 1e-6
-    assert 0.02 < np.mean(ground.tone < -0.02) < 0.9
+    assert -0.3 < ground.log_albedo.min() < -0.08
+    assert ground.log_albedo.max() < 1e-6
+    assert 0.02 < np.mean(ground.log_albedo < -0.02) < 0.9
 
 
 def test_rocks_follow_the_density_of_units_with_the_same_total() -> None:
     surface = synthesise(_make_parameters(samples=256, spacing_m=0.5, units=_make_units()), np.random.default_rng(4))
-    parameters = RockParameters(abundance=0.005, smallest_m=0.02)  # so few that they rarely overlap
+    parameters = RockParameters(abundance=0.005, smallest_m=0.02)  # Few rocks rarely overlap.
     rocks = RockField.on(surface, parameters, np.random.default_rng(2))
     uniform_rocks = RockField.on(Surface(surface.levels, surface.spacing_m), parameters, np.random.default_rng(2))
     assert len(rocks) == len(uniform_rocks)
@@ -158,8 +160,9 @@ def test_rock_forms_have_the_specified_fractions() -> None:
     surface = synthesise(_make_parameters(samples=128, spacing_m=0.5), np.random.default_rng(4))
     parameters = RockParameters(abundance=0.1, smallest_m=0.05, forms=RockForms(block=3.0, slab=1.0), albedo_spread=0.3)
     rocks = RockField.on(surface, parameters, np.random.default_rng(2))
-    is_slab = rocks.shape // 16 == 3
-    assert set(np.unique(rocks.shape // 16)) == {0, 3}
+    # Shapes are numbered by form: blocks are form 0, slabs form 3.
+    is_slab = rocks.shape // SHAPES_OF_FORM == 3
+    assert set(np.unique(rocks.shape // SHAPES_OF_FORM)) == {0, 3}
     assert is_slab.mean() == pytest.approx(0.25, abs=0.02)
     ratio = rocks.height_m / rocks.diameter_m
     assert ratio[is_slab].mean() == pytest.approx(0.35 * ratio[~is_slab].mean(), rel=0.05)

@@ -12,65 +12,65 @@ SPACING_M, SIDE, ALBEDO = 0.02, 256, 0.25
 DIAMETER_M, HEIGHT_M, CENTRE_M = 0.4, 0.2, 2.5
 
 
-def _flat() -> Surface:
+def _make_flat_surface() -> Surface:
     samples = np.zeros((SIDE, SIDE, 2), dtype=np.float32)
     samples[..., 1] = ALBEDO
     return Surface.from_samples(samples, SPACING_M)
 
 
-def _with_tail(tails: WindTails, diameter_m: float = DIAMETER_M) -> Surface:
+def _make_surface_with_tail(tails: WindTails, diameter_m: float = DIAMETER_M) -> Surface:
     rock = PlacedRock(name="rock", east_m=CENTRE_M, north_m=CENTRE_M, diameter_m=diameter_m, height_m=HEIGHT_M)
-    rocks = RockField.on(_flat(), RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
-    return tails.apply(_flat(), rocks, np.random.default_rng(2))
+    rocks = RockField.on(_make_flat_surface(), RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
+    return tails.apply(_make_flat_surface(), rocks, np.random.default_rng(2))
 
 
 def test_ridge_has_the_height_length_and_direction_of_its_parameters() -> None:
     tails = WindTails(wind_from_deg=270.0, length_heights=4.0, length_spread=0.0, tone=0.2)
-    surface = _with_tail(tails)
-    # the angle of repose limits the height: half width times tan(20 deg) = 7.3 cm < 0.4 * 20 cm
+    surface = _make_surface_with_tail(tails)
+    # The angle of repose limits the height: half width times tan(20 deg) = 7.3 cm < 0.4 * 20 cm.
     height_m = 0.5 * DIAMETER_M * np.tan(np.radians(20.0))
     edge_m = CENTRE_M + 0.5 * DIAMETER_M
-    # the spline through smoothed control values lowers the kink at the rock's edge by less than a tenth
+    # The spline smooths the kink at the rock's edge, which lowers it by less than a tenth.
     assert float(surface.height(edge_m, CENTRE_M)) == pytest.approx(height_m, rel=0.1)
-    # the wind comes from the west, so the ridge extends to the east and ends 4 rock heights behind the edge
+    # The wind comes from the west. The ridge extends to the east and ends 4 rock heights from the edge.
     half_way = float(surface.height(edge_m + 2.0 * HEIGHT_M, CENTRE_M))
     assert half_way == pytest.approx(0.5 * height_m, rel=0.1)
     assert float(surface.height(edge_m + 4.0 * HEIGHT_M + 2 * SPACING_M, CENTRE_M)) == 0.0
     assert float(surface.height(CENTRE_M - 2 * SPACING_M, CENTRE_M)) == 0.0
     assert float(surface.height(edge_m, CENTRE_M + 0.5 * DIAMETER_M + 2 * SPACING_M)) == 0.0
-    # cross section at the edge: (1 - t**2)**2 = 0.5625 at half of the half width
+    # The cross section is (1 - t**2)**2, with t relative to the half width: 0.5625 at t = 0.5.
     assert float(surface.height(edge_m, CENTRE_M + 0.25 * DIAMETER_M)) == pytest.approx(0.5625 * height_m, rel=0.1)
     assert float(surface.albedo(edge_m, CENTRE_M)) == pytest.approx(ALBEDO * np.exp(0.2), rel=0.02)
 
 
 def test_sides_are_not_steeper_than_the_cross_section_allows() -> None:
-    surface = _with_tail(WindTails(wind_from_deg=45.0, repose_deg=20.0, height_fraction=1.0))
+    surface = _make_surface_with_tail(WindTails(wind_from_deg=45.0, repose_deg=20.0, height_fraction=1.0))
     x, y = np.meshgrid(np.arange(0.0, SIDE * SPACING_M, 0.01), np.arange(0.0, SIDE * SPACING_M, 0.01))
     steepest = np.linalg.norm(surface.gradient(x, y), axis=-1).max()
-    # the cross section is 1.54 times as steep as a triangle; along the narrowing ridge both slopes add in quadrature
+    # The cross section is 1.54 times as steep as a triangle. The slope along the narrowing ridge adds in quadrature.
     assert np.tan(np.radians(20.0)) < steepest < 1.7 * np.tan(np.radians(20.0))
 
 
 def test_rocks_narrower_than_four_samples_have_no_tail() -> None:
-    assert not _with_tail(WindTails(), diameter_m=3.9 * SPACING_M).levels[0][..., 0].any()
-    assert _with_tail(WindTails(), diameter_m=4.1 * SPACING_M).levels[0][..., 0].any()
+    assert not _make_surface_with_tail(WindTails(), diameter_m=3.9 * SPACING_M).levels[0][..., 0].any()
+    assert _make_surface_with_tail(WindTails(), diameter_m=4.1 * SPACING_M).levels[0][..., 0].any()
 
 
 def test_bank_includes_tails_and_keeps_the_positions_of_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
-    without = TerrainParameters(samples=256, spacing_m=0.05, rocks=RockParameters(abundance=0.05, smallest_m=0.2))
-    with_tails = without.with_changes({"rocks": {"tails": {}}})
-    plain, ridged = TerrainBank(without, 3), TerrainBank(with_tails, 3)
-    rise = ridged.terrain(0).levels[0][..., 0] - plain.terrain(0).levels[0][..., 0]
+    without_tails = TerrainParameters(samples=256, spacing_m=0.05, rocks=RockParameters(abundance=0.05, smallest_m=0.2))
+    with_tails = without_tails.with_changes({"rocks": {"tails": {}}})
+    plain_bank, tail_bank = TerrainBank(without_tails, 3), TerrainBank(with_tails, 3)
+    rise = tail_bank.terrain(0).levels[0][..., 0] - plain_bank.terrain(0).levels[0][..., 0]
     assert rise.min() == 0.0
     assert rise.max() > 0.02
-    rocks, rocks_of_plain = ridged.rocks(0), plain.rocks(0)
+    rocks, rocks_of_plain = tail_bank.rocks(0), plain_bank.rocks(0)
     assert rocks is not None
     assert rocks_of_plain is not None
     np.testing.assert_array_equal(rocks.position_m[:, :2], rocks_of_plain.position_m[:, :2])
-    # rocks stand on the ridged surface
+    # Rocks stand on the surface with ridges.
     x, y, z = rocks.position_m.T
-    np.testing.assert_array_equal(z, ridged.terrain(0).height(x, y))
+    np.testing.assert_array_equal(z, tail_bank.terrain(0).height(x, y))
 
 
 def test_rocks_identify_a_terrain_only_if_they_have_tails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
