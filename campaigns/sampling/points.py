@@ -1,0 +1,63 @@
+"""Cases as points in standard normal space: their coordinates, and the number of their random streams.
+
+Reliability methods need cases at chosen points. Each random dispersion is a function of one standard normal variable:
+its inverse distribution at Phi(z), after the correlation of its group. The random streams of a case (noise of the
+instruments, for example) are one further variable, which can only be drawn again or held.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy.special import ndtr
+
+from marsyard.campaigns.sampling.design import MAX_DRAW, MIN_DRAW, Correlation, correlate_uniform
+
+#: Column of stored rows that contains the point of the case, as text.
+POINT_COLUMN = "standard_point"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A case as a point.
+
+    - coordinates: independent standard normal numbers of the random dispersions, in the order of the campaign file
+    - stream: number of the random streams of the case (`marsyard.sim.streams`)
+    - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
+    """
+
+    coordinates: tuple[float, ...]
+    stream: int
+    nominal: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, text: str) -> Self:
+        """Read a point from its text. Raises ValueError for any other text."""
+        try:
+            coordinates, stream, nominal = json.loads(text)
+            return cls(tuple(map(float, coordinates)), int(stream), tuple(map(str, nominal)))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"not a point of a study: {text!r:.100}") from error
+
+    @property
+    def text(self) -> str:
+        """The point as text, without loss of precision."""
+        return json.dumps([self.coordinates, self.stream, self.nominal])
+
+
+def transform_to_uniform(
+    coordinates: Sequence[float], paths: Sequence[str], correlations: Sequence[Correlation]
+) -> dict[str, float]:
+    """Transform independent standard normal numbers to the uniform numbers of the dispersions `paths`."""
+    uniform: Mapping[str, float] = dict(
+        zip(paths, np.clip(ndtr(np.asarray(coordinates, dtype=np.float64)), MIN_DRAW, MAX_DRAW).tolist(), strict=True)
+    )
+    numbers = dict(uniform)
+    for group in correlations:
+        correlated = correlate_uniform(np.array([uniform[path] for path in group.parameters]), group.factor)
+        numbers.update(zip(group.parameters, correlated.tolist(), strict=True))
+    return numbers
