@@ -19,7 +19,7 @@ from marsyard.reports.statistics.proportions import (
     proportion_lower,
     proportion_upper,
 )
-from marsyard.reports.stored import StoredRun, read_run
+from marsyard.reports.stored import StoredRun, read_run, table
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, evaluate_requirements
 from marsyard.reports.wording import count, format_fraction, percent
 from marsyard.scenarios.systems import RowColumns, row_columns
@@ -118,7 +118,9 @@ class Evaluation:
 
     @property
     def exit_code(self) -> int:
-        """The exit status of the verdicts."""
+        """The exit status of the verdicts, or of the study."""
+        if not self.verdicts and self.overall_verdict.status is not None:
+            return {Status.PASS: 0, Status.FAIL: 1}.get(self.overall_verdict.status, 3)
         return compute_exit_code(self.verdicts, bool(self.overall_verdict.crashed))
 
 
@@ -126,6 +128,9 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     """Evaluate the campaign in a folder, or other requirements on its rows. Raises StoreError without rows."""
     run = read_run(directory, requirements)
     sampling = read_sampling_design(run.configuration)
+    study = table(run.record.get("study"))
+    if study:
+        return Evaluation(run, sampling, read_evidence(run.record), (), _judge_study(study, run.all_cases))
     evidence = read_evidence(run.record, own_requirements=requirements is None)
     columns = _shipped_columns(str(run.configuration.get("scenario") or ""))
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
@@ -135,6 +140,18 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
         verdicts = _add_joint_verdicts(verdicts, run, sampling, evidence.of_algorithm)
     overall = combine_verdicts(verdicts, run.all_cases, sampling, evidence)
     return Evaluation(run, sampling, evidence, verdicts, overall)
+
+
+def _judge_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdict:
+    """Return the verdict of a study; its cases are not random samples, so no requirement is evaluated by rates."""
+    crashed = int(engine_failed(frame).sum())
+    result = table(study.get("result"))
+    if not result:
+        return OverallVerdict(Status.INSUFFICIENT, crashed, "The study is not finished.")
+    if not result.get("verdict"):
+        return OverallVerdict(None, crashed, "The study has no verdict; see its section.")
+    section_text = "See the section on the probability of a violation."
+    return OverallVerdict(Status(result["verdict"]), crashed, f"{study.get('requirement')}. {section_text}")
 
 
 def _shipped_columns(scenario: str) -> RowColumns | None:

@@ -18,6 +18,7 @@ from benchmarks.validation import (
     landing_checks,
     light_checks,
     motion_checks,
+    rare_checks,
     reference_checks,
     sampling_checks,
     soak,
@@ -39,6 +40,7 @@ CHECKS = (
     *campaign_checks.CHECKS,
     *soak.CHECKS,
     *statistics_checks.CHECKS,
+    *rare_checks.CHECKS,
 )
 
 

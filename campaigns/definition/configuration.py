@@ -65,6 +65,16 @@ class Requirement(Parameters):
         default=None, description="requirement of a paper, observation of a paper, or our own requirement"
     )
     scale: _PositiveNumber = 1.0
+    margin: _Text | None = Field(
+        default=None,
+        description="for a boolean metric: column of numbers that are negative if and only if the metric is false",
+    )
+
+    @model_validator(mode="after")
+    def _check_margin(self) -> Requirement:
+        if self.margin is not None and self.bound is not None:
+            raise ValueError("margin is for a metric without a bound")
+        return self
 
     @model_validator(mode="after")
     def _check_accept_rate(self) -> Requirement:

@@ -31,7 +31,7 @@ from marsyard.campaigns.definition.configuration import (
 from marsyard.campaigns.definition.identity import find_scenario, list_algorithms
 from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_message
-from marsyard.campaigns.sampling.design import MATRICES
+from marsyard.campaigns.sampling.design import ADAPTIVE, MATRICES
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
 from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
@@ -250,6 +250,10 @@ def _validate(source: str, tables: Mapping[str, Any], options_by_key: Mapping[tu
 
 def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
     """List problems of the campaign's dispersions: keys, and messages with the allowed values."""
+    if campaign.configuration.design.kind == ADAPTIVE:
+        return [
+            (("design", "kind"), "adaptive is for studies (marsyard rare); allowed: random, latin-hypercube, sobol")
+        ]
     problems = [*campaign.configuration.find_sampling_problems(), *_check_names(campaign)] or _check_ranges(campaign)
     if problems or not campaign.configuration.dispersions:
         return problems
@@ -411,6 +415,7 @@ def find_unknown_columns(
         kind, allowed = (FLAGS, flags) if requirement.bound is None else (NUMBERS, numbers)
         columns = [("metric", name, kind, allowed) for name in requirement.metric_columns]
         columns += [("population", name, FLAGS, (*POPULATIONS, *flags)) for name in requirement.population_columns]
+        columns += [("margin", requirement.margin, NUMBERS, numbers)] if requirement.margin is not None else []
         for key, name, required_kind, choices in columns:
             if not is_known(name, required_kind):
                 problems.append((("requirements", index, key), unknown_name_message(required_kind, name, choices)))

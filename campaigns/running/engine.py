@@ -23,6 +23,7 @@ from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.running.preparation import plan_inputs, report_compilation
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
+from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import read_confirmations, reserve_confirmation
 from marsyard.campaigns.store.products import ProductStore, create_product_selection
@@ -109,6 +110,7 @@ def resume_campaign(
     record.read(directory)  # no lock file is created in a folder without a campaign
     with folder_lock(directory):
         configuration = record.stored_configuration(directory)
+        _reject_study(directory, configuration)
         if case_time_s is not None:
             try:
                 limits = Limits.model_validate({**configuration.limits.model_dump(), "case_time_s": case_time_s})
@@ -139,11 +141,18 @@ def append_cases(
 def campaign_with_block(directory: Path, cases: int) -> Campaign:
     """Load a stored campaign with an additional block of cases. Raises CampaignError like `append_cases`."""
     configuration = record.stored_configuration(directory)
+    _reject_study(directory, configuration)
     appended = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
     problems = [message for _, message in appended.find_sampling_problems()]
     if cases < 1 or problems:
         raise CampaignError(f"{cases} cases cannot be added to {directory}: {'; '.join(problems) or 'at least 1'}")
     return load_stored_campaign(directory, appended)
+
+
+def _reject_study(directory: Path, configuration: CampaignConfiguration) -> None:
+    """Raise CampaignError for the folder of a study, whose cases a campaign cannot continue."""
+    if configuration.design.kind == ADAPTIVE:
+        raise CampaignError(f"{directory} contains a study, which chooses its cases; this command is for campaigns")
 
 
 def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, retry: Sequence[str] = ()) -> None:

@@ -23,6 +23,8 @@ from marsyard.campaigns.execution.worker_process import (
     start_clock,
 )
 from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.sampling.design import ADAPTIVE
+from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import ALL_PRODUCTS, PackedProducts
 from marsyard.campaigns.store.rows import Row
@@ -70,6 +72,8 @@ def replay(directory: Path, case: int) -> Replay:
     stored = stored_row(directory, case)
     identity = record.read(directory).get("identity")
     changed = Identity.read(identity).differences(create_identity(configuration)) if identity else []
+    if stored is None and configuration.design.kind == ADAPTIVE:
+        raise CampaignError(f"{directory}: the study has not run case {case}")
     with LocalExecutor(1) as workers:
         return replay_in_executor(workers, configuration, case, stored, tuple(changed))
 
@@ -81,8 +85,10 @@ def replay_in_executor(
     stored: Row | None,
     changed: tuple[str, ...] = (),
 ) -> Replay:
-    """Run one case again in an executor, and compare it with its stored row."""
-    ((completed,),) = run_cases(executor, configuration, [case], selection=ALL_PRODUCTS)
+    """Run one case again in an executor, and compare it with its stored row, which contains the point of a study."""
+    text = None if stored is None else stored.get(POINT_COLUMN)
+    points = {case: Point.read(text)} if isinstance(text, str) else {}
+    ((completed,),) = run_cases(executor, configuration, [case], selection=ALL_PRODUCTS, points=points)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
     return Replay(case, completed.row, stored, differing, completed.products, completed.note, changed)
 

@@ -3,7 +3,8 @@
 ``random`` draws every number independently. Only this design allows probability statements. ``latin-hypercube`` and
 ``sobol`` are stratified: means and sensitivities have smaller errors with the same number of cases, but the cases are
 not independent, so there is no verdict at a confidence. Dispersions of kind ``grid`` form a full factorial with any
-design, which is not random either.
+design, which is not random either. ``adaptive`` marks the folder of a study (`marsyard.campaigns.studies`), which
+chooses its cases.
 
 Each case can be drawn alone. The number of the case determines its block (the first, or an appended block), its point
 of the grid (its number within the block, modulo the size of the grid), and its index in the design of this block and
@@ -25,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 from jaxtyping import Float64
@@ -45,7 +46,9 @@ MAX_STRATIFIED = 2**20
 _SOBOL_BITS = 52
 #: Number of designs that a process caches, since successive cases use the same design.
 _CACHED_DESIGNS = 4
-Kind = Literal["random", "latin-hypercube", "sobol"]
+Kind = Literal["random", "latin-hypercube", "sobol", "adaptive"]
+#: Kind of a study's folder: its cases are points that are stored with the rows.
+ADAPTIVE: Final = "adaptive"
 #: Indices of a correlated group's members among the dispersions, and the rows of its factor L.
 CorrelatedGroup = tuple[tuple[int, ...], tuple[tuple[float, ...], ...]]
 
@@ -164,7 +167,12 @@ def compute_grid_quantiles(sizes: Mapping[str, int], point: int) -> dict[str, fl
 
 def describe_design(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
     """Describe a sampling design in words."""
-    names = {"random": "random draws", "latin-hypercube": "Latin hypercube", "sobol": "scrambled Sobol"}
+    names = {
+        "random": "random draws",
+        "latin-hypercube": "Latin hypercube",
+        "sobol": "scrambled Sobol",
+        "adaptive": "points chosen by a study",
+    }
     text = names.get(kind, kind)
     if kind == "random" and not grids:
         text = f"independent {text}"

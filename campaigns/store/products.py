@@ -16,7 +16,8 @@ from zipfile import BadZipFile
 import numpy as np
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
-from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError, report_write_errors
+from marsyard.campaigns.definition.margins import compute_margin
+from marsyard.campaigns.errors import StoreError, report_write_errors
 
 #: Key of a table in `products.json` that refers to an array by its name in `products.npz`.
 _ARRAY_KEY = "__array__"
@@ -156,7 +157,7 @@ class ProductSelection:
         """Whether the case with this row is selected."""
         if self.every and row["case"] % self.every == 0:
             return True
-        return any(fails(row, requirement) for requirement in self.failed)
+        return any(compute_margin(row, requirement) < 0.0 for requirement in self.failed)
 
 
 ALL_PRODUCTS = ProductSelection(every=1)
@@ -170,24 +171,6 @@ def create_product_selection(configuration: CampaignConfiguration) -> ProductSel
     if retain.products == "every":
         return ProductSelection(every=retain.every)
     return ProductSelection(failed=configuration.requirements) if retain.products == "failed" else ProductSelection()
-
-
-def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
-    """Whether a row fails a requirement; an unfinished case fails if it may belong to the population."""
-    unfinished = row["outcome"] in ENGINE_FAILURES
-    memberships = {"all": True, "completed": not unfinished, "valid": row["answered"]}
-    populations = requirement.population.split(" and ")
-    flags = [memberships[name] if name in memberships else row.get(name) for name in populations]
-    if any(value is False for value in flags):
-        return False
-    if None in flags or unfinished:
-        return True
-    values: list[Any] = [row.get(name) for name in requirement.metric_columns]
-    if requirement.bound is None:
-        return values != [True]
-    if not all(isinstance(value, int | float) for value in values):
-        return True
-    return not abs(requirement.scale * sum(values)) <= requirement.bound
 
 
 class ProductStore:

@@ -104,7 +104,10 @@ def resume(
     from marsyard.campaigns.errors import RETRYABLE, CampaignError, unknown_name_message
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.cli.outcome import continue_until_decided
+    from marsyard.cli.studies import continue_study
 
+    if continue_study(directory, jobs, cluster):
+        return
     executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
     for name in retry or []:
         if name not in allowed:
@@ -123,17 +126,22 @@ def resume(
 @options.handle_user_errors
 def append(
     directory: options.DirectoryArgument,
-    cases: Annotated[int, Argument(metavar="N", help="Number of cases to add.", min=1)],
+    cases: Annotated[
+        int, Argument(metavar="N", help="Number of cases to add; for a study of rare violations, of replicates.", min=1)
+    ],
     jobs: options.JobsOption = None,
     cluster: options.ClusterOption = None,
     allow_changed: options.ChangedOption = False,
 ) -> None:
-    """Add cases to a finished campaign, run them, and evaluate all cases."""
+    """Add cases to a finished campaign, or replicates to a study, run them, and evaluate all cases."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
     from marsyard.cli import outcome
+    from marsyard.cli.studies import continue_study
 
+    if continue_study(directory, jobs, cluster, cases):
+        return
     if stored_configuration(directory).max_cases is not None:
         raise CampaignError(f"{directory} was run with --until-decided: cases added afterwards would bias the verdict")
     outcome.print_limits(campaign_with_block(directory, cases))

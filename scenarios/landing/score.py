@@ -45,7 +45,7 @@ MOTION_COLUMNS = (
     "matches_dissimilar", "matches_out_of_bounds", "matches_not_returned",
 )  # fmt: skip
 #: Columns of the true ground under a lander; their prefix is the name of the position (`site`, `touchdown`).
-GROUND_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m")
+GROUND_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m", "margin")
 TOUCHDOWN_COLUMNS = (
     "touchdown_error_gps_m", "touchdown_error_estimated_m", "touchdown_error_m", "gps_deviation_north_m",
     "gps_deviation_east_m", "gps_solutions", "landing_turns", "landing_moved_m", "landing_after_s",
@@ -107,7 +107,10 @@ def _ground_row(name: str, position: np.ndarray | None, truth: GroundTruth) -> d
     if position is None or footprint is None:
         return {f"{name}_safe": False, **dict.fromkeys(columns, NAN)}
     slope_deg, roughness_m = float(np.degrees(footprint.slope_rad[0])), float(footprint.roughness_m[0])
-    values = (*map(float, position), slope_deg, roughness_m, truth.distance_to_hazard_m(position))
+    # smaller of the two relative margins: 0.2 if slope or roughness is at 80 % of its limit
+    limits = truth.limits
+    margin = 1.0 - max(float(footprint.slope_rad[0]) / limits.max_slope_rad, roughness_m / limits.max_roughness_m)
+    values = (*map(float, position), slope_deg, roughness_m, truth.distance_to_hazard_m(position), margin)
     return {f"{name}_safe": bool(footprint.safe[0]), **dict(zip(columns, values, strict=True))}
 
 

@@ -83,6 +83,7 @@ def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "drift_u_px": float(last_error_px[0]),
         "drift_v_px": float(last_error_px[1]),
         "worst_error_px": _max(error_sizes_px),
+        "track_margin_px": p.score.tracked_px - _max(error_sizes_px),
         "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
         "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.found), NAN),
         "handed_over": run.handed_over,

@@ -13,9 +13,10 @@ import pytest
 
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.products import fails, load_products
+from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import find_showcase, find_worst_cases, write_table
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
@@ -125,7 +126,7 @@ def test_scaled_sum_of_columns_decides_failure() -> None:
     )
     # times of the workstation: 60 x 0.03 s is below 2 s, 60 x 0.04 s is above
     row = {"outcome": "VALID", "answered": True, "image_time_s": 0.02, "map_time_s": 0.01}
-    assert not fails(row, requirement)
-    assert fails({**row, "map_time_s": 0.02}, requirement)
-    assert fails({**row, "map_time_s": float("nan")}, requirement)
-    assert fails({"outcome": "VALID", "answered": True, "image_time_s": 0.02}, requirement)
+    assert compute_margin(row, requirement) == pytest.approx(0.2)
+    assert compute_margin({**row, "map_time_s": 0.02}, requirement) == pytest.approx(-0.4)
+    assert compute_margin({**row, "map_time_s": float("nan")}, requirement) == -math.inf
+    assert compute_margin({"outcome": "VALID", "answered": True, "image_time_s": 0.02}, requirement) == -math.inf

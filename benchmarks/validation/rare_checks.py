@@ -1,0 +1,107 @@
+"""Checks of subset simulation on limit states with known probabilities: coverage of intervals, and cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from scipy.stats import norm
+
+from benchmarks.validation.records import Check, Measure
+from marsyard.campaigns.studies.interval import replicate_interval
+from marsyard.campaigns.studies.subset import NEW_STREAM, Evaluated, SubsetResult, subset_simulation
+
+#: Cases per level and replicates of `marsyard rare`, and confidence of its interval.
+SAMPLES, REPLICATES, CONFIDENCE = 200, 4, 0.9
+#: Minimum coverage of the 90 % intervals, and minimum cost of counting divided by the cost of subset simulation.
+MIN_COVERAGE, MIN_SAVINGS = 0.87, {1e-4: 8.0, 1e-6: 300.0}
+PROBABILITIES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+#: Function of coordinates and stream numbers that returns margins.
+LimitState = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def linear_margin(dimension: int, probability: float, noise_fraction: float = 0.0) -> LimitState:
+    """Return a linear limit state; a fraction of the variance of its load is noise of the random streams."""
+    beta = float(norm.isf(probability))
+
+    def margins(coordinates: np.ndarray, streams: np.ndarray) -> np.ndarray:
+        load = math.sqrt(1.0 - noise_fraction) * coordinates.sum(axis=1) / math.sqrt(dimension)
+        return np.asarray(beta - load - math.sqrt(noise_fraction) * stream_noise(streams))
+
+    return margins
+
+
+def stream_noise(streams: np.ndarray) -> np.ndarray:
+    """Return one standard normal number per stream (SplitMix64; Steele et al. 2014)."""
+    state = (streams.astype(np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    state ^= state >> np.uint64(31)
+    return np.asarray(norm.ppf(((state >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53))
+
+
+def four_branch_margin(coordinates: np.ndarray, _streams: np.ndarray) -> np.ndarray:
+    """Series system with four branches (Waarts 2000), a usual test of reliability methods."""
+    x, y = coordinates.T
+    curved = 3.0 + 0.1 * (x - y) ** 2
+    branches = [curved - (x + y) / math.sqrt(2.0), curved + (x + y) / math.sqrt(2.0)]
+    branches += [(x - y) + 7.0 / math.sqrt(2.0), (y - x) + 7.0 / math.sqrt(2.0)]
+    return np.asarray(np.min(branches, axis=0))
+
+
+def run_subset(margins: LimitState, dimension: int, seed: int) -> tuple[SubsetResult, int]:
+    """Run one subset simulation; also return its number of cases."""
+    process = subset_simulation(dimension, SAMPLES, 1e-9, np.random.default_rng(seed))
+    cases, first_stream = 0, seed * 1_000_000
+    try:
+        proposals = next(process)
+        while True:
+            numbers = first_stream + cases + np.arange(len(proposals.streams))
+            streams = np.where(proposals.streams == NEW_STREAM, numbers, proposals.streams)
+            cases += len(streams)
+            proposals = process.send(Evaluated(streams, margins(proposals.coordinates, streams)))
+    except StopIteration as stop:
+        return stop.value, cases
+
+
+def limit_states() -> Iterator[tuple[str, LimitState, int, float]]:
+    """Yield name, margins, dimension and probability of each limit state."""
+    for dimension in (2, 20, 100):
+        for probability in PROBABILITIES:
+            name = f"linear, {dimension} dimensions, {probability:g}"
+            yield name, linear_margin(dimension, probability), dimension, probability
+    for probability in (1e-3, 1e-4):
+        name = f"linear with noise (30 % of the variance), 20 dimensions, {probability:g}"
+        yield name, linear_margin(20, probability, 0.3), 20, probability
+    rng, n = np.random.default_rng(0), 500_000
+    counted = [four_branch_margin(rng.standard_normal((n, 2)), np.empty(0)) < 0.0 for _ in range(40)]
+    probability = float(np.mean(counted))
+    yield f"four branches, {probability:.3g}", four_branch_margin, 2, probability
+
+
+def run_rare(quick: bool) -> Iterator[Measure]:
+    """Measure coverage and cost for each limit state."""
+    trials = 40 if quick else 300
+    for name, margins, dimension, probability in limit_states():
+        covered, cases, widths = 0, 0, []
+        for trial in range(trials):
+            runs = [run_subset(margins, dimension, 1 + trial * REPLICATES + index) for index in range(REPLICATES)]
+            results = [result for result, _ in runs]
+            cases += sum(count for _, count in runs)
+            estimates, reached = [item.probability for item in results], [item.reached for item in results]
+            interval = replicate_interval(estimates, reached, CONFIDENCE)
+            covered += interval.lower <= probability <= interval.upper
+            widths.append(math.log(interval.upper / interval.lower) if interval.lower > 0.0 else math.inf)
+        how = f"{trials} studies of {REPLICATES} replicates with {SAMPLES} cases per level"
+        yield Measure(f"coverage of the 90 % interval: {name}", covered / trials, "", MIN_COVERAGE, how, "at least")
+        if probability in MIN_SAVINGS:
+            # counting n cases has the interval p exp(+-z sqrt((1 - p) / (n p)))
+            z = float(norm.ppf(0.5 * (1.0 + CONFIDENCE)))
+            counting = (2.0 * z / float(np.median(widths))) ** 2 * (1.0 - probability) / probability
+            savings, how = counting * trials / cases, f"for an interval of the same width; {cases / trials:.0f} cases"
+            text = f"cost of counting divided by cost: {name}"
+            yield Measure(text, savings, "1", MIN_SAVINGS[probability], how, "at least")
+
+
+CHECKS = (Check("rare", "Statistics", run_rare),)

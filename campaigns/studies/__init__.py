@@ -1,0 +1,1 @@
+"""Studies that choose their cases: probabilities of rare violations, searches for failures, error budgets."""

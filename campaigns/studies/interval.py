@@ -1,0 +1,94 @@
+"""Intervals of a small probability from independent replicates, and the verdict on its upper limit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from scipy.stats import t as student_t
+
+
+class RareVerdict(StrEnum):
+    """Verdict on a probability that must not exceed a limit."""
+
+    PASS = "PASS"  # noqa: S105  (a verdict, not a password)
+    FAIL = "FAIL"
+    INSUFFICIENT = "INSUFFICIENT"
+
+
+@dataclass(frozen=True)
+class ProbabilityInterval:
+    """Estimate of a probability with its two-sided interval.
+
+    - estimate, lower, upper: probability, and bounds of the interval
+    - confidence: two-sided confidence; each bound alone holds at (1 + confidence) / 2
+    - log_sd: standard deviation of the logarithm of one replicate's estimate
+    """
+
+    estimate: float
+    lower: float
+    upper: float
+    confidence: float
+    log_sd: float
+
+
+def replicate_interval(estimates: Sequence[float], reached: Sequence[bool], confidence: float) -> ProbabilityInterval:
+    """Compute the interval of a probability from independent estimates, at least two.
+
+    Estimates of subset simulations are close to lognormal and unbiased. The interval is Cox's for the mean of a
+    lognormal distribution with Student's t quantile (Olsson 2005, Journal of Statistics Education 13). If a replicate
+    reached no violation, its estimate is an upper limit, and the lower bound is 0.
+    """
+    values = np.array(estimates, dtype=np.float64)
+    n = values.size
+    if n < 2:
+        raise ValueError(f"an interval needs at least 2 replicates, not {n}")
+    logarithms = np.log(values)
+    variance = float(logarithms.var(ddof=1))
+    centre = float(logarithms.mean()) + 0.5 * variance
+    quantile = float(student_t.ppf(0.5 * (1.0 + confidence), n - 1))
+    width = quantile * math.sqrt(variance / n + variance**2 / (2.0 * (n - 1)))
+    lower = math.exp(centre - width) if all(reached) else 0.0
+    return ProbabilityInterval(
+        float(values.mean()), lower, min(math.exp(centre + width), 1.0), confidence, math.sqrt(variance)
+    )
+
+
+def weighted_interval(contributions: Sequence[float], confidence: float) -> ProbabilityInterval:
+    """Compute the interval of a probability from the weighted violations of independent cases (importance sampling).
+
+    The logarithm of the mean is treated as normal. Without a violation the bounds are 0 and 1.
+    """
+    values = np.array(contributions, dtype=np.float64)
+    mean = float(values.mean())
+    if values.size < 2 or mean <= 0.0:
+        return ProbabilityInterval(0.0, 0.0, 1.0, confidence, math.inf)
+    relative_error = float(values.std(ddof=1)) / math.sqrt(values.size) / mean
+    factor = math.exp(float(student_t.ppf(0.5 * (1.0 + confidence), values.size - 1)) * relative_error)
+    return ProbabilityInterval(mean, mean / factor, min(mean * factor, 1.0), confidence, relative_error)
+
+
+def decide(interval: ProbabilityInterval, at_most: float) -> RareVerdict:
+    """Compare the bounds of a probability with its limit."""
+    if interval.upper <= at_most:
+        return RareVerdict.PASS
+    return RareVerdict.FAIL if interval.lower > at_most else RareVerdict.INSUFFICIENT
+
+
+def additional_replicates(interval: ProbabilityInterval, replicates: int, at_most: float) -> int | None:
+    """Estimate the number of additional replicates that decide the verdict; None if the estimate equals the limit.
+
+    The spread of the replicates is assumed to remain the same.
+    """
+    distance = abs(math.log(at_most / interval.estimate)) if interval.estimate > 0.0 else math.inf
+    if distance == 0.0:
+        return None
+    variance, confidence = interval.log_sd**2, interval.confidence
+    for n in range(replicates + 1, 10_000):
+        quantile = float(student_t.ppf(0.5 * (1.0 + confidence), n - 1))
+        if quantile * math.sqrt(variance / n + variance**2 / (2.0 * (n - 1))) <= distance:
+            return n - replicates
+    return None

@@ -1,0 +1,362 @@
+"""Study `rare`: probability that a case violates a requirement, with an interval and a verdict on its limit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.margins import compute_margin, describe_margin
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
+from marsyard.campaigns.running.engine import ProgressObserver
+from marsyard.campaigns.running.preparation import report_compilation
+from marsyard.campaigns.running.replay import load_stored_campaign
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore
+from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
+from marsyard.campaigns.studies.importance import fit_density
+from marsyard.campaigns.studies.interval import (
+    ProbabilityInterval,
+    RareVerdict,
+    additional_replicates,
+    decide,
+    replicate_interval,
+    weighted_interval,
+)
+from marsyard.campaigns.studies.runner import (
+    STUDY_KEY,
+    Candidate,
+    CaseLimitError,
+    PointRunner,
+    check_identity,
+    create_study,
+    find_requirement,
+    prepare_campaign,
+    read_study,
+)
+from marsyard.campaigns.studies.subset import LEVEL_FRACTION, NEW_STREAM, Evaluated, Proposals, SubsetResult, subset_simulation
+from marsyard.sim.streams import Streams
+
+#: Value of the key `kind` in the settings of this study.
+KIND = "rare"
+#: Methods: the verdict rests on the replicates of subset simulation, or on importance sampling after them.
+METHODS = ("subset", "importance")
+#: Fraction of the limit at which subset simulation stops: levels less likely than this cannot change the verdict.
+_MIN_PROBABILITY_FRACTION = 0.01
+#: Minimum number of effective violations (Kish) at which the interval of importance sampling is used.
+MIN_EFFECTIVE_VIOLATIONS = 30.0
+#: Number of importance samples that are evaluated together.
+_IMPORTANCE_BATCH = 100
+
+
+@dataclass(frozen=True)
+class RareSettings:
+    """Settings of the study.
+
+    - requirement: id of the requirement; at_most: limit of the probability that a case violates it
+    - method: see `METHODS`
+    - samples: cases per level of one subset simulation
+    - replicates: numbers of replicates that run together: those of the first run, and of each continuation
+    - importance_cases: cases of importance sampling
+    - confidence: two-sided confidence of the interval
+    """
+
+    requirement: str
+    at_most: float
+    method: str = "subset"
+    samples: int = 200
+    replicates: tuple[int, ...] = (4,)
+    importance_cases: int = 600
+    confidence: float = 0.9
+
+    def __post_init__(self) -> None:
+        problems = {
+            f"--at-most {self.at_most}: allowed: above 0 and below 1": 0.0 < self.at_most < 1.0,
+            f"--method {self.method}: allowed: {', '.join(METHODS)}": self.method in METHODS,
+            f"--samples {self.samples}: at least 50": self.samples >= 50,
+            f"--replicates {self.replicates[0]}: at least 2": self.replicates[0] >= 2,
+            f"--importance-cases {self.importance_cases}: at least 50": self.importance_cases >= 50,
+            f"--confidence {self.confidence}: allowed: 0.5 to 0.999": 0.5 <= self.confidence <= 0.999,
+        }
+        for message, is_met in problems.items():
+            if not is_met:
+                raise CampaignError(message)
+
+
+@dataclass(frozen=True)
+class Replicate:
+    """One subset simulation: estimated probability, whether a violation was reached, and margins of its levels."""
+
+    probability: float
+    reached: bool
+    thresholds: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class RareResult:
+    """Result of the study.
+
+    - verdict, interval: verdict, and estimate with the interval on which it rests
+    - cases, violations: numbers of evaluated cases, and of those that violate the requirement
+    - replicates: subset simulations; subset_interval: their interval
+    - effective_violations: effective number of violations of importance sampling; NaN without it
+    - additional_cases: estimated number of further cases until the verdict is decided; None if decided or unknown
+    - counting_cases: number of independent cases that would give an interval of the same relative width
+    - margin_text: definition of the margin; reason: why the verdict is withheld; may be empty
+    """
+
+    verdict: RareVerdict
+    interval: ProbabilityInterval
+    cases: int
+    violations: int
+    replicates: tuple[Replicate, ...]
+    subset_interval: ProbabilityInterval
+    effective_violations: float
+    additional_cases: int | None
+    counting_cases: float
+    margin_text: str
+    reason: str = ""
+
+    @property
+    def exit_code(self) -> int:
+        """Exit status of the verdict."""
+        return {RareVerdict.PASS: 0, RareVerdict.FAIL: 1, RareVerdict.INSUFFICIENT: 3}[self.verdict]
+
+
+def start_rare(
+    campaign: Campaign,
+    settings: RareSettings,
+    max_cases: int,
+    directory: Path,
+    executor: ExecutorConfig,
+    observer: ProgressObserver,
+) -> RareResult:
+    """Run the study in a new folder.
+
+    Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
+    stored, and `continue_rare` continues.
+    """
+    requirement = find_requirement(campaign, settings.requirement)
+    if requirement.bound is None and requirement.margin is None:
+        raise CampaignError(
+            f"{requirement.id}: the metric '{requirement.metric}' is only true or false. Give the requirement a "
+            "`margin`: a column of numbers that are negative if and only if the metric is false"
+        )
+    adaptive = prepare_campaign(campaign, max_cases)
+    record.claim_folder(directory)
+    with record.folder_lock(directory):
+        record.claim_folder(directory)
+        create_study(adaptive, directory, executor.describe(), {"kind": KIND, **asdict(settings)})
+        return _run(adaptive, settings, directory, executor, observer)
+
+
+def continue_rare(
+    directory: Path, executor: ExecutorConfig, observer: ProgressObserver, additional: int = 0
+) -> RareResult:
+    """Continue an interrupted study, or add replicates to a finished one.
+
+    additional: number of replicates to add; at least 1 if the study is finished
+    Raises CampaignError if the folder contains no such study, or the program has changed.
+    """
+    study = read_study(directory) or {}
+    if study.get("kind") != KIND:
+        raise CampaignError(f"{directory} does not contain a study of rare violations (marsyard rare)")
+    values = {name: study[name] for name in RareSettings.__dataclass_fields__}
+    settings = RareSettings(**{**values, "replicates": tuple(values["replicates"])})
+    with record.folder_lock(directory):
+        if additional:
+            settings = replace(settings, replicates=(*settings.replicates, additional))
+        campaign = load_stored_campaign(directory, record.stored_configuration(directory))
+        check_identity(campaign, directory)
+        stored = record.read(directory)
+        session = record.describe_session("resume", executor.describe(), int(stored["cases_finished"]))
+        changes = {"state": "running", "finished_utc": None, "sessions": [*stored["sessions"], session]}
+        record.update(directory, {**changes, STUDY_KEY: {"kind": KIND, **asdict(settings)}})
+        return _run(campaign, settings, directory, executor, observer)
+
+
+def _run(
+    campaign: Campaign, settings: RareSettings, directory: Path, config: ExecutorConfig, observer: ProgressObserver
+) -> RareResult:
+    with RowStore(directory / ROWS_FILE, thorough=True) as store:
+        try:
+            with (
+                create_executor(config) as executor,
+                report_compilation(campaign.configuration.scenario, observer.note) as first_case_ended,
+            ):
+                runner = PointRunner(campaign, directory, store, executor, observer)
+                study = _Study(campaign, settings, runner, first_case_ended)
+                result = study.estimate(observer)
+        finally:
+            counts = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}
+            record.update(directory, {"state": "interrupted", "finished_utc": record.utc_now(), **counts})
+        write_table(directory / TABLE_FILE, store, numeric_metrics(campaign.configuration.requirements))
+    settings_and_result = {"kind": KIND, **asdict(settings), "result": _to_json(result)}
+    changes = {"state": "finished", "exit_code": result.exit_code, STUDY_KEY: settings_and_result}
+    record.update(directory, changes)
+    return result
+
+
+def _to_json(result: RareResult) -> dict[str, Any]:
+    """Convert a result to JSON types; numbers that are not finite become null."""
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: convert(inner) for name, inner in value.items()}
+        if isinstance(value, list | tuple):
+            return [convert(inner) for inner in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return dict(convert(asdict(result)))
+
+
+class _Study:
+    """State of a running study: its cases so far, and the violations among them."""
+
+    def __init__(self, campaign: Campaign, settings: RareSettings, runner: PointRunner, first_case_ended: Any) -> None:
+        self._campaign, self._settings, self._runner = campaign, settings, runner
+        self._requirement: Requirement = find_requirement(campaign, settings.requirement)
+        self._first_case_ended = first_case_ended
+        self._violations = 0
+
+    def estimate(self, observer: ProgressObserver) -> RareResult:
+        """Run all replicates and the importance sampling; estimate the probability and decide."""
+        settings = self._settings
+        results: list[SubsetResult] = []
+        reason, contributions = "", list[float]()
+        try:
+            for block in settings.replicates:
+                observer.begin("cases", self._max_cases_of(block))
+                results += self._run_replicates(range(len(results), len(results) + block))
+            if settings.method == "importance":
+                observer.begin("cases", settings.importance_cases)
+                contributions = self._run_importance(results)
+                if not contributions:
+                    reason = "The replicates found too few violations to fit a density for importance sampling."
+        except CaseLimitError as error:
+            reason = f"The limit of cases was reached: {error}."
+        if len(results) < 2:
+            unknown = ProbabilityInterval(math.nan, 0.0, 1.0, settings.confidence, math.nan)
+            return self._finish(RareVerdict.INSUFFICIENT, unknown, results, unknown, math.nan, None, reason)
+        estimates, reached = [item.probability for item in results], [item.reached for item in results]
+        subset_interval = replicate_interval(estimates, reached, settings.confidence)
+        interval, effective = subset_interval, math.nan
+        if contributions:
+            squares = sum(value**2 for value in contributions)
+            effective = sum(contributions) ** 2 / squares if squares else 0.0
+            interval = weighted_interval(contributions, settings.confidence)
+            if effective < MIN_EFFECTIVE_VIOLATIONS:
+                reason = (
+                    f"Importance sampling has only {effective:.0f} effective violations, fewer than "
+                    f"{MIN_EFFECTIVE_VIOLATIONS:.0f}: its interval is not reliable. Use more cases, or --method subset."
+                )
+        verdict = RareVerdict.INSUFFICIENT if reason else decide(interval, settings.at_most)
+        additional = None
+        if verdict is RareVerdict.INSUFFICIENT and not contributions:
+            needed = additional_replicates(subset_interval, len(results), settings.at_most)
+            cases_per_replicate = self._runner.n_cases / len(results)
+            additional = None if needed is None else math.ceil(needed * cases_per_replicate)
+        return self._finish(verdict, interval, results, subset_interval, effective, additional, reason)
+
+    def _finish(
+        self,
+        verdict: RareVerdict,
+        interval: ProbabilityInterval,
+        results: Sequence[SubsetResult],
+        subset_interval: ProbabilityInterval,
+        effective: float,
+        additional: int | None,
+        reason: str,
+    ) -> RareResult:
+        # counting n cases has the interval p exp(+-z sqrt((1 - p) / (n p)))
+        width = math.log(interval.upper / interval.lower) if interval.lower > 0.0 else math.inf
+        p = interval.estimate
+        z = float(ndtri(0.5 * (1.0 + self._settings.confidence)))
+        counting = (2.0 * z / width) ** 2 * (1.0 - p) / p if 0.0 < width < math.inf and p > 0.0 else math.nan
+        replicates = tuple(Replicate(item.probability, item.reached, item.thresholds) for item in results)
+        return RareResult(
+            verdict,
+            interval,
+            self._runner.n_cases,
+            self._violations,
+            replicates,
+            subset_interval,
+            effective,
+            additional,
+            counting,
+            describe_margin(self._requirement),
+            reason,
+        )
+
+    def _max_cases_of(self, replicates: int) -> int:
+        """Compute the number of cases of replicates that reach their least likely level."""
+        levels = math.ceil(-math.log10(_MIN_PROBABILITY_FRACTION * self._settings.at_most))
+        return math.ceil(replicates * self._settings.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
+
+    def _generator(self, name: str) -> np.random.Generator:
+        """Create a random generator of the study, which does not depend on the cases."""
+        return Streams(self._campaign.configuration.seed, self._campaign.configuration.name, 0).generator(name)
+
+    def _run_replicates(self, numbers: range) -> list[SubsetResult]:
+        """Run subset simulations side by side: the next cases of all of them are evaluated together."""
+        settings, dimension = self._settings, len(self._campaign.drawn_paths)
+        min_probability = _MIN_PROBABILITY_FRACTION * settings.at_most
+        runs = {
+            number: subset_simulation(
+                dimension, settings.samples, min_probability, self._generator(f"subset simulation {number}")
+            )
+            for number in numbers
+        }
+        pending = {number: next(run) for number, run in runs.items()}
+        results: dict[int, SubsetResult] = {}
+        while pending:
+            answers = self._evaluate(list(pending.values()))
+            next_pending: dict[int, Proposals] = {}
+            for number, answer in zip(pending, answers, strict=True):
+                try:
+                    next_pending[number] = runs[number].send(answer)
+                except StopIteration as stop:
+                    results[number] = stop.value
+            pending = next_pending
+        return [results[number] for number in numbers]
+
+    def _evaluate(self, proposals: Sequence[Proposals]) -> Iterator[Evaluated]:
+        """Evaluate several groups of proposed cases together."""
+        streams = np.concatenate([group.streams for group in proposals])
+        coordinates = np.concatenate([group.coordinates for group in proposals])
+        first = self._runner.n_cases
+        candidates = [
+            Candidate(tuple(point.tolist()), None if stream == NEW_STREAM else int(stream))
+            for point, stream in zip(coordinates, streams, strict=True)
+        ]
+        rows = self._runner.run(candidates)
+        self._first_case_ended()
+        margins = np.array([compute_margin(row, self._requirement) for row in rows])
+        self._violations += int(np.sum(margins < 0.0))
+        streams = np.where(streams == NEW_STREAM, first + np.arange(len(streams)), streams)
+        ends = np.cumsum([len(group.streams) for group in proposals])
+        for start, end in zip([0, *ends[:-1]], ends, strict=True):
+            yield Evaluated(streams[start:end], margins[start:end])
+
+    def _run_importance(self, results: Sequence[SubsetResult]) -> list[float]:
+        """Sample around the violations of the replicates; return the weight of each violation, 0 for other cases."""
+        density = fit_density(np.concatenate([result.violations for result in results]))
+        if density is None:
+            return []
+        n = self._settings.importance_cases
+        coordinates, weights = density.draw(n, self._generator("importance sampling"))
+        contributions: list[float] = []
+        for first in range(0, n, _IMPORTANCE_BATCH):
+            part = slice(first, first + _IMPORTANCE_BATCH)
+            proposal = Proposals(coordinates[part], np.full(len(coordinates[part]), NEW_STREAM))
+            (evaluated,) = self._evaluate([proposal])
+            contributions += (weights[part] * (evaluated.margins < 0.0)).tolist()
+        return contributions

@@ -1,0 +1,147 @@
+"""Evaluation of chosen points by rendered cases: rows are stored, and a study that was stopped can continue.
+
+A study is a deterministic function of its settings and of the rows of its cases. It continues by running again from its
+start: cases with a stored row are not run again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
+from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
+from marsyard.campaigns.execution.cases import run_cases
+from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.running.engine import ProgressObserver, check_metrics
+from marsyard.campaigns.sampling.design import ADAPTIVE, Design
+from marsyard.campaigns.sampling.dispersions import CyclicInteger, Grid
+from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.products import ProductSelection
+from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
+
+#: Key of a study's settings and results in the record of its folder.
+STUDY_KEY = "study"
+
+
+class CaseLimitError(Exception):
+    """The study needs more cases than its limit."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A point to be evaluated; without a `stream` it gets new random streams."""
+
+    coordinates: tuple[float, ...]
+    stream: int | None = None
+    nominal: tuple[str, ...] = ()
+
+
+class PointRunner:
+    """Runs the cases of a study in the order of their numbers, and reads those that are stored.
+
+    - campaign: campaign with the design `adaptive`; its number of cases is the limit of the study
+    - directory, store: folder of the study, and its rows
+    """
+
+    def __init__(
+        self, campaign: Campaign, directory: Path, store: RowStore, executor: Executor, observer: ProgressObserver
+    ) -> None:
+        self._campaign, self._directory, self._store = campaign, directory, store
+        self._executor, self._observer = executor, observer
+        self._is_checked = False
+        #: Number of cases evaluated so far.
+        self.n_cases = 0
+
+    def run(self, candidates: Sequence[Candidate]) -> list[Row]:
+        """Evaluate points in parallel; return their rows in the same order.
+
+        Raises CaseLimitError before the first case beyond the limit, and StoreError if a stored row has another point.
+        """
+        first = self.n_cases
+        limit = self._campaign.configuration.total_cases
+        if first + len(candidates) > limit:
+            raise CaseLimitError(f"the study needs more than {limit} cases")
+        points = {
+            case: Point(item.coordinates, case if item.stream is None else item.stream, item.nominal)
+            for case, item in enumerate(candidates, start=first)
+        }
+        rows = {case: row for case in points if (row := self._store.row(case)) is not None}
+        for case, row in rows.items():
+            if row.get(POINT_COLUMN) != points[case].text:
+                raise StoreError(f"{self._directory}: case {case} was run at another point; the study has changed")
+        missing = [case for case in points if case not in rows]
+        configuration = self._campaign.configuration
+        for batch in run_cases(
+            self._executor,
+            configuration,
+            missing,
+            selection=ProductSelection(),
+            total=len(missing),
+            points={case: points[case] for case in missing},
+        ):
+            self._store.add(completed.row for completed in batch)
+            for completed in batch:
+                if completed.note:
+                    self._observer.note(completed.note)
+                if not self._is_checked and completed.row["outcome"] not in ENGINE_FAILURES:
+                    check_metrics(configuration, completed.row, self._directory)
+                    self._is_checked = True
+                rows[int(completed.row["case"])] = completed.row
+                self._observer.step()
+        self.n_cases += len(candidates)
+        return [rows[case] for case in points]
+
+
+def prepare_campaign(campaign: Campaign, max_cases: int) -> Campaign:
+    """Return the campaign with the design `adaptive` and at most `max_cases` cases.
+
+    Raises CampaignError if a dispersion cannot be a standard normal variable.
+    """
+    configuration = campaign.configuration
+    for path, dispersion in configuration.dispersions.items():
+        if isinstance(dispersion, Grid | CyclicInteger):
+            reason = f"is a distribution '{dispersion.distribution}', which has no probabilities"
+            remedy = f"fix it with --set {path}=VALUE, or give it a random distribution"
+            raise CampaignError(f"dispersions.{path}: {reason}; {remedy}")
+    if not campaign.drawn_paths:
+        raise CampaignError(f"campaign '{configuration.name}' has no random dispersion")
+    changes = {"design": Design(kind=ADAPTIVE), "cases": max_cases, "appended": (), "max_cases": None}
+    return replace(campaign, configuration=configuration.model_copy(update=changes))
+
+
+def find_requirement(campaign: Campaign, requirement_id: str) -> Requirement:
+    """Find a requirement of the campaign by its id. Raises CampaignError for an unknown id."""
+    requirements = {item.id: item for item in campaign.configuration.requirements}
+    if requirement_id not in requirements:
+        raise CampaignError(f"--requirement: {unknown_name_message('requirement', requirement_id, requirements)}")
+    return requirements[requirement_id]
+
+
+def create_study(campaign: Campaign, directory: Path, executor: str, settings: dict[str, Any]) -> None:
+    """Create the folder of a study; `settings` are stored in its record. Raises StoreError like a campaign's folder."""
+    identity = create_identity(campaign.configuration)
+    create_store(directory / ROWS_FILE, {"identity": identity.configuration})
+    record.write_first_record(
+        directory, campaign.configuration, identity, executor, command=(), algorithms=describe_algorithms(campaign)
+    )
+    record.update(directory, {STUDY_KEY: settings})
+
+
+def check_identity(campaign: Campaign, directory: Path) -> None:
+    """Raise CampaignError if program, configuration or input files differ from those of the stored study."""
+    changes = Identity.read(record.read(directory)["identity"]).differences(create_identity(campaign.configuration))
+    if changes:
+        text = "\n  ".join(changes)
+        raise CampaignError(f"{directory} was run with another program, configuration or input files:\n  {text}")
+
+
+def read_study(directory: Path) -> dict[str, Any] | None:
+    """Read the settings and results of a study from the record of its folder; None for an ordinary campaign."""
+    study = record.read(directory).get(STUDY_KEY)
+    return study if isinstance(study, dict) else None

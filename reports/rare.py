@@ -1,0 +1,133 @@
+"""Results of a study of rare violations (`marsyard.campaigns.studies.rare`): sentences, and a section of the report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from marsyard.campaigns.studies.subset import LEVEL_FRACTION
+from marsyard.reports.section import (
+    MARKERS,
+    REQUIREMENT,
+    SERIES,
+    Block,
+    Grid,
+    Section,
+    Subject,
+    in_page_style,
+    new_axes,
+    svg_figure,
+)
+from marsyard.reports.stored import read_run, table
+from marsyard.reports.wording import count, percent
+
+#: Replicates drawn in the figure.
+_MAX_DRAWN = 8
+
+
+def read_result(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the settings of a rare study with its `result`; empty for another folder or an unfinished study."""
+    study = table(record.get("study"))
+    return study if study.get("kind") == "rare" and table(study.get("result")) else {}
+
+
+def describe_result(directory: Path) -> list[str]:
+    """Describe the result of the study in a folder, one sentence each; empty without a result."""
+    study = read_result(read_run(directory).record)
+    return result_sentences(study) if study else []
+
+
+def probability_text(value: object) -> str:
+    """Format a probability with two significant digits; a dash if it is unknown."""
+    return f"{value:.2g}" if isinstance(value, int | float) and math.isfinite(value) else "–"
+
+
+def result_sentences(study: Mapping[str, Any]) -> list[str]:
+    """Describe estimate, interval, verdict and cost of a study."""
+    result = table(study.get("result"))
+    interval, cases = table(result.get("interval")), int(result["cases"])
+    limit = probability_text(study["at_most"])
+    method = "subset simulation" if study["method"] == "subset" else "importance sampling"
+    bounds = f"{probability_text(interval.get('lower'))} to {probability_text(interval.get('upper'))}"
+    sentences = [
+        f"{study['requirement']}: {result['verdict']}.",
+        f"Probability of a violation per case: {probability_text(interval.get('estimate'))}, "
+        f"{percent(study['confidence'])} interval {bounds} by {method}; the limit is {limit}.",
+    ]
+    if result.get("reason"):
+        sentences.append(str(result["reason"]))
+    counting = result.get("counting_cases")
+    cost = f"The study ran {count(cases, 'case')}; {int(result['violations']):,} of them violate the requirement."
+    if isinstance(counting, int | float) and counting > cases:
+        cost += f" Counting would need about {counting:,.0f} independent cases for an interval of the same width."
+    sentences.append(cost)
+    if not all(item["reached"] for item in result["replicates"]):
+        sentences.append(
+            "Some replicates reached no violation before their levels became less likely than a hundredth of the "
+            "limit. The probability of their last level is an upper limit, and the lower bound is 0."
+        )
+    additional = result.get("additional_cases")
+    if additional:
+        per_replicate = cases / len(result["replicates"])
+        replicates = math.ceil(additional / per_replicate)
+        sentences.append(
+            f"About {additional:,} additional cases ({count(replicates, 'replicate')}) would decide the verdict if the "
+            f"estimate remains: marsyard append DIR {replicates}."
+        )
+    sentences.append(str(result["margin_text"]))
+    return sentences
+
+
+def rare_section(subject: Subject) -> Section | None:
+    """Create the section of a rare study; None for another campaign."""
+    study = read_result(subject.run.record)
+    if not study:
+        return None
+    result = table(study.get("result"))
+    replicates = result["replicates"]
+    rows = [
+        [
+            str(index + 1),
+            probability_text(item["probability"]),
+            str(len(item["thresholds"])),
+            "yes" if item["reached"] else "no",
+        ]
+        for index, item in enumerate(replicates)
+    ]
+    grid = Grid(["Replicate", "Probability", "Levels", "Violation reached"], rows)
+    note = (
+        "Each replicate is an independent subset simulation. Each level contains a tenth of the previous one's cases. "
+        "The interval comes from the spread of the replicates, since the error that one replicate estimates for itself "
+        "is too small."
+    )
+    figure = svg_figure(
+        _draw_levels(replicates, float(study["at_most"])),
+        "rare-levels",
+        "Probability that a case has at most a margin. Each line is one replicate; a violation is a margin below 0. "
+        "Dashed: limit of the probability.",
+    )
+    blocks = (
+        Block(text=" ".join(result_sentences(study))),
+        Block("Replicates", figures=[figure], grid=grid, note=note),
+    )
+    data = {**result, "requirement": study["requirement"], "at_most": study["at_most"], "method": study["method"]}
+    return Section("rare", "Rare violation", "Probability of a rare violation", blocks, data)
+
+
+@in_page_style
+def _draw_levels(replicates: list[Mapping[str, Any]], at_most: float) -> Figure:
+    figure, axes = new_axes(6.0, 3.4)
+    for index, item in enumerate(replicates[:_MAX_DRAWN]):
+        thresholds = [value for value in item["thresholds"] if value is not None]
+        probabilities = [LEVEL_FRACTION ** (level + 1) for level in range(len(thresholds))]
+        margins = [*thresholds, 0.0] if item["reached"] else thresholds
+        probabilities = [*probabilities, item["probability"]] if item["reached"] else probabilities
+        style: dict[str, Any] = {"color": SERIES[index % len(SERIES)], "marker": MARKERS[index % len(MARKERS)]}
+        axes.plot(margins, probabilities, markersize=4, linewidth=1.0, **style)
+    axes.axhline(at_most, color=REQUIREMENT, linestyle="--", linewidth=1.0)
+    axes.set(yscale="log", xlabel="margin, unit of the requirement", ylabel="probability of at most this margin")
+    return figure

@@ -1,0 +1,76 @@
+"""A fast scenario with a known probability of a violation: the load is normal, and its limit is a quantile."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from pydantic import BaseModel, ConfigDict
+
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.streams import Streams
+
+CAMPAIGN = """
+name = "limit-state"
+scenario = "tests.campaigns.studies.limit_state:LimitStateScenario"
+cases = 100
+seed = 3
+
+[dispersions]
+"loads.0" = { distribution = "normal", mean = 0.0, sd = 1.0 }
+"loads.1" = { distribution = "normal", mean = 0.0, sd = 1.0 }
+kind = { distribution = "choice", values = ["plain", "rough"] }
+
+[[requirements]]
+id = "LOAD"
+metric = "load"
+bound = 100.0
+probability = 0.99
+confidence = 0.9
+
+[[requirements]]
+id = "FLAG"
+metric = "is_safe"
+probability = 0.99
+confidence = 0.9
+
+[[requirements]]
+id = "MARGIN"
+metric = "is_safe"
+margin = "safety_margin"
+probability = 0.99
+confidence = 0.9
+"""
+
+
+class LimitStateParameters(BaseModel):
+    """The load is 100 plus `beta` if (loads[0] + loads[1]) / sqrt(2), mixed with noise, equals its `beta`-quantile."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    loads: tuple[float, float] = (0.0, 0.0)
+    kind: str = "plain"
+    noise: float = 0.0
+    beta: float = 3.0
+    sleep_s: float = 0.0
+
+
+class LimitStateScenario:
+    """A violation of LOAD has the probability Phi(-beta) for any fraction of `noise`."""
+
+    name = "limit-state"
+    parameters_type = LimitStateParameters
+
+    def shared_inputs(self, parameters: LimitStateParameters) -> tuple[int, ...]:
+        return ()
+
+    def prepare(self, parameters: LimitStateParameters, shared_input: int) -> None:
+        raise NotImplementedError
+
+    def run(self, parameters: LimitStateParameters, streams: Streams) -> CaseResult:
+        time.sleep(parameters.sleep_s)
+        noise = float(streams.generator("noise").standard_normal())
+        mixed = math.sqrt(1.0 - parameters.noise**2) * sum(parameters.loads) / math.sqrt(2.0) + parameters.noise * noise
+        margin = parameters.beta - mixed
+        row = {"load": 100.0 - margin, "is_safe": margin >= 0.0, "safety_margin": margin, "noise": noise}
+        return CaseResult("VALID", True, row, {})

@@ -1,0 +1,188 @@
+"""Tests of studies of rare violations: estimates, continuation after kill -9, replay, replicates, report and errors."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from scipy.stats import norm
+
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError, ConfigurationError
+from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.running.engine import append_cases, resume_campaign
+from marsyard.campaigns.running.replay import replay
+from marsyard.campaigns.store import record
+from marsyard.campaigns.studies.interval import RareVerdict
+from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_rare, start_rare
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
+from tests.campaigns.studies.limit_state import CAMPAIGN
+
+#: A confidence of 0.99, so that the fixed seeds give correct intervals.
+SETTINGS = RareSettings("LOAD", 1e-2, samples=100, replicates=(4,), confidence=0.99)
+TIMES = ("wall_time_s", "cpu_time_s")
+
+
+@pytest.fixture
+def campaign_path(tmp_path: Path) -> Path:
+    path = tmp_path / "limit-state.toml"
+    path.write_text(CAMPAIGN)
+    return path
+
+
+def start(
+    path: Path, directory: Path, settings: RareSettings = SETTINGS, *overrides: str, max_cases: int = 5000
+) -> RareResult:
+    campaign = load_campaign(str(path), overrides)
+    return start_rare(campaign, settings, max_cases, directory, ExecutorConfig(1), RecordingWatch())
+
+
+def rows_without_times(directory: Path) -> list[dict[str, object]]:
+    return [{name: value for name, value in row.items() if name not in TIMES} for row in read_case_rows(directory)]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.6])
+def test_interval_contains_the_probability(campaign_path: Path, tmp_path: Path, noise: float) -> None:
+    result = start(campaign_path, tmp_path / "run", SETTINGS, f"noise={noise}")
+    assert result.interval.lower < norm.sf(3.0) < result.interval.upper
+    assert result.verdict is RareVerdict.PASS
+    assert 0 < result.cases == len(read_case_rows(tmp_path / "run"))
+    assert result.violations == sum(row["load"] > 100.0 for row in read_case_rows(tmp_path / "run"))
+
+
+def test_importance_sampling_decides(campaign_path: Path, tmp_path: Path) -> None:
+    settings = RareSettings("LOAD", 1e-2, "importance", 100, (3,), 300, 0.99)
+    result = start(campaign_path, tmp_path / "run", settings)
+    assert result.effective_violations > 30.0
+    assert result.interval.lower < norm.sf(3.0) < result.interval.upper
+    assert result.interval.upper / result.interval.lower < 2.0
+
+
+def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: Path) -> None:
+    by_bound = start(campaign_path, tmp_path / "bound")
+    by_margin = start(campaign_path, tmp_path / "margin", replace(SETTINGS, requirement="MARGIN"))
+    assert by_margin.interval == by_bound.interval
+
+
+@pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
+def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
+    options = ["--requirement", "LOAD", "--at-most", "1e-2", "--samples", "100", "--replicates", "3", "--jobs", "2"]
+    command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--set", "sleep_s=0.02"]
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    with subprocess.Popen([*command, "--out", str(killed)], stderr=subprocess.DEVNULL) as process:
+        log, deadline = killed / "cases.sqlite-wal", time.monotonic() + 120.0
+        while not (log.exists() and log.stat().st_size > 30_000) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        os.kill(process.pid, signal.SIGKILL)
+    assert record.read(killed)["state"] == "running"
+    resumed = subprocess.run(
+        [sys.executable, "-m", "marsyard", "resume", str(killed)], capture_output=True, text=True, check=False
+    )
+    undisturbed = subprocess.run([*command, "--out", str(whole)], capture_output=True, text=True, check=False)
+    assert resumed.returncode == undisturbed.returncode == 0, resumed.stderr
+    assert "LOAD: PASS" in resumed.stdout
+    assert rows_without_times(killed) == rows_without_times(whole)
+    assert record.read(killed)["study"]["result"] == record.read(whole)["study"]["result"]
+
+
+def test_added_replicates_narrow_the_interval(campaign_path: Path, tmp_path: Path) -> None:
+    first = start(campaign_path, tmp_path / "run")
+    rows = rows_without_times(tmp_path / "run")
+    second = continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), additional=5)
+    assert len(second.replicates) == 9
+    assert second.replicates[:4] == first.replicates
+    assert rows_without_times(tmp_path / "run")[: len(rows)] == rows
+    assert second.interval.upper / second.interval.lower < first.interval.upper / first.interval.lower
+
+
+def test_case_of_a_study_replays(campaign_path: Path, tmp_path: Path) -> None:
+    start(campaign_path, tmp_path / "run", SETTINGS, "noise=0.5")
+    # a late case of a Markov chain, in general with the random streams of an earlier case
+    cases = [row["case"] for row in read_case_rows(tmp_path / "run")]
+    for case in cases[-3:]:
+        assert replay(tmp_path / "run", case).differing == ()
+    with pytest.raises(CampaignError, match="has not run case"):
+        replay(tmp_path / "run", cases[-1] + 1)
+
+
+def test_limit_of_cases_leaves_the_study_undecided(campaign_path: Path, tmp_path: Path) -> None:
+    result = start(campaign_path, tmp_path / "run", max_cases=350)
+    assert result.verdict is RareVerdict.INSUFFICIENT
+    assert "limit of cases" in result.reason
+    assert len(read_case_rows(tmp_path / "run")) <= 350
+
+
+def test_cases_near_the_limit_are_too_few(campaign_path: Path, tmp_path: Path) -> None:
+    settings = RareSettings("LOAD", float(norm.sf(3.0)), samples=50, replicates=(2,))
+    result = start(campaign_path, tmp_path / "run", settings)
+    assert result.verdict is RareVerdict.INSUFFICIENT
+    assert result.exit_code == 3
+
+
+def test_campaign_commands_reject_a_study(campaign_path: Path, tmp_path: Path) -> None:
+    start(campaign_path, tmp_path / "run")
+    with pytest.raises(CampaignError, match="contains a study"):
+        resume_campaign(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    with pytest.raises(CampaignError, match="contains a study"):
+        append_cases(tmp_path / "run", 10, ExecutorConfig(1), RecordingWatch())
+
+
+def test_changed_program_is_rejected(campaign_path: Path, tmp_path: Path) -> None:
+    start(campaign_path, tmp_path / "run")
+    stored = record.read(tmp_path / "run")
+    record.update(tmp_path / "run", {"identity": {**stored["identity"], "code": "other"}})
+    with pytest.raises(CampaignError, match="another program"):
+        continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+
+
+@pytest.mark.parametrize(
+    ("requirement", "changes", "message"),
+    [
+        ("LAOD", {}, "did you mean 'LOAD'"),
+        ("FLAG", {}, "only true or false"),
+        ("LOAD", {"samples": 10}, "--samples 10"),
+        ("LOAD", {"method": "guess"}, "--method guess: allowed: subset, importance"),
+        ("LOAD", {"replicates": (1,)}, "--replicates 1: at least 2"),
+        ("LOAD", {"at_most": 0.0}, "--at-most"),
+    ],
+)
+def test_wrong_settings_are_explained(
+    campaign_path: Path, tmp_path: Path, requirement: str, changes: dict[str, object], message: str
+) -> None:
+    values = {"requirement": requirement, "at_most": 1e-2, **changes}
+    with pytest.raises(CampaignError, match=message):
+        start(campaign_path, tmp_path / "run", RareSettings(**values))  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()
+
+
+def test_grid_has_no_probabilities(campaign_path: Path, tmp_path: Path) -> None:
+    grid = 'kind = { distribution = "grid", values = ["plain", "rough"] }'
+    campaign_path.write_text(CAMPAIGN.replace('kind = { distribution = "choice", values = ["plain", "rough"] }', grid))
+    with pytest.raises(CampaignError, match=r"dispersions\.kind: is a distribution 'grid'"):
+        start(campaign_path, tmp_path / "run")
+
+
+def test_campaign_file_cannot_be_adaptive(campaign_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="adaptive is for studies"):
+        load_campaign(str(campaign_path), ["design.kind=adaptive"])
+
+
+def test_report_shows_the_verdict_of_the_study(campaign_path: Path, tmp_path: Path) -> None:
+    options = ["--requirement", "LOAD", "--at-most", "1e-2", "--samples", "100", "--jobs", "1"]
+    command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--out", str(tmp_path / "run")]
+    completed = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert completed.returncode == 0, completed.stderr
+    assert "LOAD: PASS." in completed.stdout
+    data = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert (data["verdict"], data["exit_code"], data["verdicts"]) == ("PASS", 0, [])
+    assert data["sections"]["rare"]["interval"]["lower"] < norm.sf(3.0)
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "Probability of a rare violation" in page
+    assert "No requirement is evaluated" not in page

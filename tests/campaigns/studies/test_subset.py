@@ -1,0 +1,159 @@
+"""Tests of subset simulation, importance sampling and intervals on limit states with known probabilities."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from marsyard.campaigns.studies.importance import fit_density
+from marsyard.campaigns.studies.interval import (
+    ProbabilityInterval,
+    RareVerdict,
+    additional_replicates,
+    decide,
+    replicate_interval,
+    weighted_interval,
+)
+from marsyard.campaigns.studies.subset import NEW_STREAM, Evaluated, SubsetResult, subset_simulation
+
+LimitState = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def linear(dimension: int, probability: float, noise_fraction: float = 0.0) -> LimitState:
+    """Return margins that are below 0 with a probability; a fraction of the variance is noise of the streams."""
+    beta = float(norm.isf(probability))
+
+    def margins(coordinates: np.ndarray, streams: np.ndarray) -> np.ndarray:
+        load = math.sqrt(1.0 - noise_fraction) * coordinates.sum(axis=1) / math.sqrt(dimension)
+        if noise_fraction:
+            noise = np.array([np.random.default_rng(int(stream)).standard_normal() for stream in streams])
+            load += math.sqrt(noise_fraction) * noise
+        return np.asarray(beta - load)
+
+    return margins
+
+
+def run(margins: LimitState, dimension: int, samples: int, rng: np.random.Generator) -> tuple[SubsetResult, int]:
+    """Run one subset simulation; also return its number of cases."""
+    process, cases = subset_simulation(dimension, samples, 1e-9, rng), 0
+    first_stream = int(rng.integers(2**40))
+    try:
+        proposals = next(process)
+        while True:
+            numbers = first_stream + cases + np.arange(len(proposals.streams))
+            streams = np.where(proposals.streams == NEW_STREAM, numbers, proposals.streams)
+            cases += len(streams)
+            proposals = process.send(Evaluated(streams, margins(proposals.coordinates, streams)))
+    except StopIteration as stop:
+        return stop.value, cases
+
+
+@pytest.mark.parametrize(
+    ("dimension", "probability", "noise_fraction"), [(2, 1e-2, 0.0), (20, 1e-4, 0.0), (100, 1e-6, 0.0), (5, 1e-3, 0.3)]
+)
+def test_estimates_are_unbiased(dimension: int, probability: float, noise_fraction: float) -> None:
+    rng = np.random.default_rng(1)
+    margins = linear(dimension, probability, noise_fraction)
+    estimates = [run(margins, dimension, 300, rng)[0].probability for _ in range(40)]
+    ratio = np.array(estimates) / probability
+    assert abs(ratio.mean() - 1.0) < 3.0 * ratio.std(ddof=1) / math.sqrt(len(ratio))
+    assert ratio.std() < 1.5
+
+
+def test_intervals_of_replicates_cover_the_probability() -> None:
+    rng, covered = np.random.default_rng(2), 0
+    margins = linear(10, 1e-3)
+    for _ in range(100):
+        results = [run(margins, 10, 100, rng)[0] for _ in range(4)]
+        interval = replicate_interval([item.probability for item in results], [item.reached for item in results], 0.9)
+        covered += interval.lower <= 1e-3 <= interval.upper
+    # 90 expected; the standard deviation of the count is 3
+    assert covered >= 82
+
+
+def test_cost_is_a_small_fraction_of_counting() -> None:
+    rng = np.random.default_rng(3)
+    results = [run(linear(20, 1e-4), 20, 300, rng) for _ in range(40)]
+    estimates, cases = np.array([item.probability for item, _ in results]), np.mean([n for _, n in results])
+    counting_cases = 1e4 / (estimates.std() / 1e-4) ** 2
+    assert cases < counting_cases / 8.0
+
+
+def test_cases_that_cannot_violate_do_not_stop_the_simulation() -> None:
+    def margins(coordinates: np.ndarray, streams: np.ndarray) -> np.ndarray:
+        # 95 % of the cases are outside the population
+        return np.where(coordinates[:, 0] > 1.645, 2.5 - coordinates[:, 1], np.inf)
+
+    rng = np.random.default_rng(4)
+    estimates = [run(margins, 2, 300, rng)[0].probability for _ in range(30)]
+    assert np.mean(estimates) == pytest.approx(0.05 * norm.sf(2.5), rel=0.4)
+
+
+def test_margin_without_levels_gives_an_upper_limit() -> None:
+    rng = np.random.default_rng(5)
+    result, cases = run(lambda coordinates, _: np.where(coordinates[:, 0] > 8.0, -1.0, 1.0), 2, 100, rng)
+    assert not result.reached
+    assert result.probability == 1.0
+    assert cases == 100
+
+
+@pytest.mark.parametrize("dimension", [2, 20])
+def test_importance_sampling_is_unbiased_and_precise(dimension: int) -> None:
+    rng = np.random.default_rng(6)
+    margins = linear(dimension, 1e-4)
+    violations = np.concatenate([run(margins, dimension, 200, rng)[0].violations for _ in range(4)])
+    density = fit_density(violations)
+    assert density is not None
+    coordinates, weights = density.draw(4000, rng)
+    assert weights.max() <= 10.0
+    interval = weighted_interval((weights * (margins(coordinates, weights) < 0.0)).tolist(), 0.99)
+    assert interval.lower < 1e-4 < interval.upper
+    assert interval.upper / interval.lower < 2.0
+
+
+def test_separate_failure_regions_have_separate_densities() -> None:
+    rng = np.random.default_rng(7)
+    coordinates = rng.standard_normal((200_000, 2))
+    violations = coordinates[np.abs(coordinates[:, 0]) > 3.0]
+    density = fit_density(violations)
+    assert density is not None
+    assert sorted(np.sign(density.centres[:, 0])) == [-1.0, 1.0]
+
+
+def test_too_few_violations_have_no_density() -> None:
+    assert fit_density(np.ones((9, 2))) is None
+
+
+def test_replicate_without_violation_has_no_lower_bound() -> None:
+    interval = replicate_interval([1e-4, 1e-5], [True, False], 0.9)
+    assert interval.lower == 0.0
+    assert interval.upper >= 1e-4
+
+
+def test_interval_needs_two_replicates() -> None:
+    with pytest.raises(ValueError, match="at least 2 replicates"):
+        replicate_interval([1e-4], [True], 0.9)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "verdict"), [(1e-6, 1e-4, "PASS"), (2e-4, 1e-3, "FAIL"), (5e-5, 5e-4, "INSUFFICIENT")]
+)
+def test_verdict_compares_the_bounds_with_the_limit(lower: float, upper: float, verdict: str) -> None:
+    assert decide(ProbabilityInterval(math.sqrt(lower * upper), lower, upper, 0.9, 0.4), 1e-4) == verdict
+
+
+def test_more_replicates_are_needed_near_the_limit() -> None:
+    interval = replicate_interval([0.8e-4, 0.5e-4, 1.2e-4, 0.7e-4], [True] * 4, 0.9)
+    near, far = (additional_replicates(interval, 4, at_most) for at_most in (1e-4, 2e-4))
+    assert near is not None
+    assert far is not None
+    assert near > far >= 1
+
+
+def test_no_violation_gives_no_information() -> None:
+    interval = weighted_interval([0.0, 0.0, 0.0], 0.9)
+    assert (interval.lower, interval.upper) == (0.0, 1.0)
