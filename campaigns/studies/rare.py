@@ -42,7 +42,14 @@ from marsyard.campaigns.studies.runner import (
     prepare_campaign,
     read_study,
 )
-from marsyard.campaigns.studies.subset import LEVEL_FRACTION, NEW_STREAM, Evaluated, Proposals, SubsetResult, subset_simulation
+from marsyard.campaigns.studies.subset import (
+    LEVEL_FRACTION,
+    NEW_STREAM,
+    Evaluated,
+    Proposals,
+    SubsetResult,
+    subset_simulation,
+)
 from marsyard.sim.streams import Streams
 
 #: Value of the key `kind` in the settings of this study.

@@ -12,7 +12,6 @@ from scipy.stats import norm
 from marsyard.campaigns.studies.importance import fit_density
 from marsyard.campaigns.studies.interval import (
     ProbabilityInterval,
-    RareVerdict,
     additional_replicates,
     decide,
     replicate_interval,
