@@ -13,7 +13,7 @@ from marsyard.campaigns.studies.interval import replicate_interval
 from marsyard.campaigns.studies.subset import NEW_STREAM, Evaluated, SubsetResult, subset_simulation
 
 #: Cases per level and replicates of `marsyard rare`, and confidence of its interval.
-SAMPLES, REPLICATES, CONFIDENCE = 200, 4, 0.9
+SAMPLES, REPLICATES, CONFIDENCE = 200, 6, 0.9
 #: Minimum coverage of the 90 % intervals, and minimum cost of counting divided by the cost of subset simulation.
 MIN_COVERAGE, MIN_SAVINGS = 0.87, {1e-4: 8.0, 1e-6: 300.0}
 PROBABILITIES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
@@ -15,13 +14,8 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import ProgressObserver
-from marsyard.campaigns.running.preparation import report_compilation
-from marsyard.campaigns.running.replay import load_stored_campaign
-from marsyard.campaigns.store import record
-from marsyard.campaigns.store.rows import ROWS_FILE, RowStore
-from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
 from marsyard.campaigns.studies.importance import fit_density
 from marsyard.campaigns.studies.interval import (
     ProbabilityInterval,
@@ -32,15 +26,14 @@ from marsyard.campaigns.studies.interval import (
     weighted_interval,
 )
 from marsyard.campaigns.studies.runner import (
-    STUDY_KEY,
     Candidate,
     CaseLimitError,
     PointRunner,
-    check_identity,
-    create_study,
+    StudySession,
+    continue_study,
     find_requirement,
-    prepare_campaign,
     read_study,
+    start_study,
 )
 from marsyard.campaigns.studies.subset import (
     LEVEL_FRACTION,
@@ -80,7 +73,7 @@ class RareSettings:
     at_most: float
     method: str = "subset"
     samples: int = 200
-    replicates: tuple[int, ...] = (4,)
+    replicates: tuple[int, ...] = (6,)
     importance_cases: int = 600
     confidence: float = 0.9
 
@@ -157,12 +150,10 @@ def start_rare(
             f"{requirement.id}: the metric '{requirement.metric}' is only true or false. Give the requirement a "
             "`margin`: a column of numbers that are negative if and only if the metric is false"
         )
-    adaptive = prepare_campaign(campaign, max_cases)
-    record.claim_folder(directory)
-    with record.folder_lock(directory):
-        record.claim_folder(directory)
-        create_study(adaptive, directory, executor.describe(), {"kind": KIND, **asdict(settings)})
-        return _run(adaptive, settings, directory, executor, observer)
+    session = StudySession(
+        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+    )
+    return start_study(campaign, max_cases, directory, session, {"kind": KIND, **asdict(settings)})
 
 
 def continue_rare(
@@ -178,63 +169,23 @@ def continue_rare(
         raise CampaignError(f"{directory} does not contain a study of rare violations (marsyard rare)")
     values = {name: study[name] for name in RareSettings.__dataclass_fields__}
     settings = RareSettings(**{**values, "replicates": tuple(values["replicates"])})
-    with record.folder_lock(directory):
-        if additional:
-            settings = replace(settings, replicates=(*settings.replicates, additional))
-        campaign = load_stored_campaign(directory, record.stored_configuration(directory))
-        check_identity(campaign, directory)
-        stored = record.read(directory)
-        session = record.describe_session("resume", executor.describe(), int(stored["cases_finished"]))
-        changes = {"state": "running", "finished_utc": None, "sessions": [*stored["sessions"], session]}
-        record.update(directory, {**changes, STUDY_KEY: {"kind": KIND, **asdict(settings)}})
-        return _run(campaign, settings, directory, executor, observer)
-
-
-def _run(
-    campaign: Campaign, settings: RareSettings, directory: Path, config: ExecutorConfig, observer: ProgressObserver
-) -> RareResult:
-    with RowStore(directory / ROWS_FILE, thorough=True) as store:
-        try:
-            with (
-                create_executor(config) as executor,
-                report_compilation(campaign.configuration.scenario, observer.note) as first_case_ended,
-            ):
-                runner = PointRunner(campaign, directory, store, executor, observer)
-                study = _Study(campaign, settings, runner, first_case_ended)
-                result = study.estimate(observer)
-        finally:
-            counts = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}
-            record.update(directory, {"state": "interrupted", "finished_utc": record.utc_now(), **counts})
-        write_table(directory / TABLE_FILE, store, numeric_metrics(campaign.configuration.requirements))
-    settings_and_result = {"kind": KIND, **asdict(settings), "result": _to_json(result)}
-    changes = {"state": "finished", "exit_code": result.exit_code, STUDY_KEY: settings_and_result}
-    record.update(directory, changes)
-    return result
-
-
-def _to_json(result: RareResult) -> dict[str, Any]:
-    """Convert a result to JSON types; numbers that are not finite become null."""
-
-    def convert(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {name: convert(inner) for name, inner in value.items()}
-        if isinstance(value, list | tuple):
-            return [convert(inner) for inner in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return dict(convert(asdict(result)))
+    if additional:
+        settings = replace(settings, replicates=(*settings.replicates, additional))
+    session = StudySession(
+        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+    )
+    return continue_study(directory, session, {"kind": KIND, **asdict(settings)})
 
 
 class _Study:
     """State of a running study: its cases so far, and the violations among them."""
 
-    def __init__(self, campaign: Campaign, settings: RareSettings, runner: PointRunner, first_case_ended: Any) -> None:
+    def __init__(self, campaign: Campaign, settings: RareSettings, runner: PointRunner) -> None:
         self._campaign, self._settings, self._runner = campaign, settings, runner
         self._requirement: Requirement = find_requirement(campaign, settings.requirement)
-        self._first_case_ended = first_case_ended
         self._violations = 0
 
-    def estimate(self, observer: ProgressObserver) -> RareResult:
+    def run(self, observer: ProgressObserver) -> RareResult:
         """Run all replicates and the importance sampling; estimate the probability and decide."""
         settings = self._settings
         results: list[SubsetResult] = []
@@ -345,7 +296,6 @@ class _Study:
             for point, stream in zip(coordinates, streams, strict=True)
         ]
         rows = self._runner.run(candidates)
-        self._first_case_ended()
         margins = np.array([compute_margin(row, self._requirement) for row in rows])
         self._violations += int(np.sum(margins < 0.0))
         streams = np.where(streams == NEW_STREAM, first + np.arange(len(streams)), streams)

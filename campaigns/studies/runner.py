@@ -6,10 +6,11 @@ start: cases with a stored row are not run again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import Requirement
@@ -17,16 +18,42 @@ from marsyard.campaigns.definition.identity import Identity, create_identity, de
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
 from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.running.engine import ProgressObserver, check_metrics
+from marsyard.campaigns.running.preparation import report_compilation
+from marsyard.campaigns.running.replay import load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE, Design
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, Grid
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
+from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
 
 #: Key of a study's settings and results in the record of its folder.
 STUDY_KEY = "study"
+
+
+class StudyResult(Protocol):
+    """Result of a study: a dataclass of JSON types with an exit status."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def exit_code(self) -> int:
+        """Exit status of the command."""
+
+
+Result = TypeVar("Result", bound=StudyResult)
+
+
+@dataclass(frozen=True)
+class StudySession(Generic[Result]):
+    """Workers and progress of a study, and the function that runs it."""
+
+    executor: ExecutorConfig
+    observer: ProgressObserver
+    execute: Callable[[Campaign, PointRunner], Result]
 
 
 class CaseLimitError(Exception):
@@ -57,6 +84,8 @@ class PointRunner:
         self._is_checked = False
         #: Number of cases evaluated so far.
         self.n_cases = 0
+        #: Function that is called when the first cases have ended.
+        self.first_case_ended: Callable[[], None] = lambda: None
 
     def run(self, candidates: Sequence[Candidate]) -> list[Row]:
         """Evaluate points in parallel; return their rows in the same order.
@@ -95,6 +124,7 @@ class PointRunner:
                 rows[int(completed.row["case"])] = completed.row
                 self._observer.step()
         self.n_cases += len(candidates)
+        self.first_case_ended()
         return [rows[case] for case in points]
 
 
@@ -131,6 +161,66 @@ def create_study(campaign: Campaign, directory: Path, executor: str, settings: d
         directory, campaign.configuration, identity, executor, command=(), algorithms=describe_algorithms(campaign)
     )
     record.update(directory, {STUDY_KEY: settings})
+
+
+def start_study(
+    campaign: Campaign, max_cases: int, directory: Path, session: StudySession[Result], settings: Mapping[str, Any]
+) -> Result:
+    """Create the folder of a study, and run it. Raises CampaignError for an unsuitable campaign or folder.
+
+    settings: settings of the study with its `kind`, as JSON types
+    """
+    adaptive = prepare_campaign(campaign, max_cases)
+    record.claim_folder(directory)
+    with record.folder_lock(directory):
+        record.claim_folder(directory)
+        create_study(adaptive, directory, session.executor.describe(), dict(settings))
+        return _run_study(adaptive, directory, session, settings)
+
+
+def continue_study(directory: Path, session: StudySession[Result], settings: Mapping[str, Any]) -> Result:
+    """Continue a stored study with its settings or changed ones. Raises CampaignError if the program has changed."""
+    with record.folder_lock(directory):
+        campaign = load_stored_campaign(directory, record.stored_configuration(directory))
+        check_identity(campaign, directory)
+        stored = record.read(directory)
+        description = record.describe_session("resume", session.executor.describe(), int(stored["cases_finished"]))
+        changes = {"state": "running", "finished_utc": None, "sessions": [*stored["sessions"], description]}
+        record.update(directory, {**changes, STUDY_KEY: dict(settings)})
+        return _run_study(campaign, directory, session, settings)
+
+
+def _run_study(
+    campaign: Campaign, directory: Path, session: StudySession[Result], settings: Mapping[str, Any]
+) -> Result:
+    """Run a study from its start; stored rows are not run again. Store its result and the table of its cases."""
+    observer = session.observer
+    with RowStore(directory / ROWS_FILE, thorough=True) as store:
+        try:
+            with (
+                create_executor(session.executor) as executor,
+                report_compilation(campaign.configuration.scenario, observer.note) as first_case_ended,
+            ):
+                runner = PointRunner(campaign, directory, store, executor, observer)
+                runner.first_case_ended = first_case_ended
+                result = session.execute(campaign, runner)
+        finally:
+            counts = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}
+            record.update(directory, {"state": "interrupted", "finished_utc": record.utc_now(), **counts})
+        write_table(directory / TABLE_FILE, store, numeric_metrics(campaign.configuration.requirements))
+    stored_result = convert_to_json(asdict(result))
+    changes = {"state": "finished", "exit_code": result.exit_code, STUDY_KEY: {**settings, "result": stored_result}}
+    record.update(directory, changes)
+    return result
+
+
+def convert_to_json(value: Any) -> Any:
+    """Convert nested tables and lists to JSON types; numbers that are not finite become null."""
+    if isinstance(value, dict):
+        return {name: convert_to_json(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [convert_to_json(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def check_identity(campaign: Campaign, directory: Path) -> None:

@@ -5,7 +5,7 @@ the cases with a margin of at most its threshold, a quantile of the previous lev
 by Markov chains that start at the cases of the previous level below the threshold: conditional sampling with an
 adaptive step in standard normal space (Papaioannou et al. 2015, Probabilistic Engineering Mechanics 41, 89-103,
 algorithm with acceptance 0.44). The random streams of a case are a further variable: a step draws them again with
-probability 0.5, and holds them otherwise.
+probability 0.25, and holds them otherwise.
 
 The estimated coefficient of variation of one run is too small, because its chains are correlated. Intervals therefore
 use the spread of independent replicates (`marsyard.campaigns.studies.interval`).
@@ -25,7 +25,7 @@ LEVEL_FRACTION = 0.1
 #: Acceptance rate of the chains to which their step is adapted, and first step.
 _ACCEPTANCE, _FIRST_STEP = 0.44, 0.6
 #: Probability that a step draws new random streams.
-_NEW_STREAM_PROBABILITY = 0.5
+_NEW_STREAM_PROBABILITY = 0.25
 #: Stream number of a proposed case that gets new random streams.
 NEW_STREAM = -1
 

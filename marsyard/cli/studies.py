@@ -31,7 +31,7 @@ class RareOptions:
         str, Option(metavar="METHOD", help="subset, or importance: importance sampling after the subset simulations.")
     ] = "subset"
     samples: Annotated[int, Option(metavar="N", help="Cases per level of a subset simulation.")] = 200
-    replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, from 2.")] = 4
+    replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, from 2.")] = 6
     importance_cases: Annotated[int, Option(metavar="N", help="Cases of importance sampling.")] = 600
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the interval.")] = 0.9
     max_cases: MaxCasesOption = 20_000

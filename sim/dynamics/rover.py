@@ -27,6 +27,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.dynamics.kernels import suspension
+from marsyard.sim.dynamics.kernels.rock_heights import rasterize_heights
 from marsyard.sim.frames import rigid, rotation_matrix
 from marsyard.sim.parameters import Parameters, bounded_field
 
@@ -89,21 +90,8 @@ class RockyGround:
         """
         cells = 2 * int(np.ceil(half_m / CELL_M)) + 1
         corner = np.array(centre_m) - 0.5 * (cells - 1) * CELL_M
-        # sample points on the triangles, at most `_SAMPLE_SPACING` cells apart
-        edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-        steps = np.ceil(edges / (_SAMPLE_SPACING * CELL_M)).astype(np.int64)
-        samples = [np.empty((0, 3))]
-        for count in np.unique(steps):
-            i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1))
-            first, second = i[i + j <= count] / count, j[i + j <= count] / count
-            weights = np.stack([1.0 - first - second, first, second], axis=1)
-            samples.append(np.einsum("pk,tki->tpi", weights, triangles[steps == count]).reshape(-1, 3))
-        points = np.concatenate(samples)
-        cell = np.rint((points[:, :2] - corner) / CELL_M).astype(np.int64)
-        is_inside = np.all((cell >= 0) & (cell < cells), axis=1)
-        column, row = cell[is_inside].T
         top = np.full((cells, cells), -np.inf)
-        np.maximum.at(top, (row, column), points[is_inside, 2])
+        rasterize_heights(np.ascontiguousarray(triangles), *corner, CELL_M, _SAMPLE_SPACING * CELL_M, top)
         y, x = np.nonzero(np.isfinite(top))
         above = np.zeros((cells, cells))
         ground_height = ground.height(corner[0] + CELL_M * x, corner[1] + CELL_M * y)

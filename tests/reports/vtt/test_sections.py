@@ -161,7 +161,7 @@ def test_single_runs_are_compared_with_the_paper() -> None:
     assert table["maximum correction (px)"]["Ours"] == "–"
     roll_rows = make_rows(4, roll_compensated=[True, True, False, False], tracked=[True, True, True, False])
     table = {row[""]: row for row in read_table(SINGLE_RUNS(make_subject(roll_rows, "vtt-roll")))}
-    assert table["tracked with compensation"]["Ours"] == "2 of 2: 100 %"
+    assert table["tracked with roll compensation"]["Ours"] == "2 of 2: 100 %"
     assert SINGLE_RUNS(make_subject(frame, "another")) is None
 
 

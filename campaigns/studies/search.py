@@ -1,0 +1,405 @@
+"""Study `search`: look for violations of a requirement with a limited number of cases, and reduce them.
+
+1. Half of the cases explore the dispersions by a scrambled Sobol sequence.
+2. Evolution strategies (CMA-ES; Hansen 2016, arXiv:1604.00772) minimise the margin from the best explored cases.
+3. The most likely violation is reduced: dispersions go back to the campaign's parameter, in groups that are halved
+   (delta debugging; Zeller & Hildebrandt 2002, IEEE Trans. Softw. Eng. 28, 183-200), then the remaining coordinates are
+   bisected towards their median, as long as the case violates the requirement with the same random streams.
+4. Violations that are close to a reduced one in its remaining dispersions have the same cause. Step 3 is repeated with
+   the other violations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cma
+import numpy as np
+import tomli_w
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.margins import compute_margin, describe_margin
+from marsyard.campaigns.errors import CampaignError, report_write_errors
+from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.running.engine import ProgressObserver
+from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.studies.runner import (
+    Candidate,
+    CaseLimitError,
+    PointRunner,
+    StudySession,
+    continue_study,
+    find_requirement,
+    read_study,
+    start_study,
+)
+from marsyard.sim.streams import Streams
+
+#: Value of the key `kind` in the settings of this study.
+KIND = "search"
+#: Fraction of the cases that explore.
+_EXPLORED_FRACTION = 0.5
+#: Initial step of an evolution strategy, and limit of its coordinates, standard deviations.
+_STEP, _MAX_COORDINATE = 0.5, 4.0
+#: Distance between the starts of two evolution strategies per square root of the dimension, standard deviations.
+_MIN_START_DISTANCE = 0.5
+#: Maximum distance of violations with the same cause, standard deviations, in the dispersions of the reduced one.
+_MAX_CAUSE_DISTANCE = 1.5
+#: Steps of the bisection of a coordinate.
+_BISECTION_STEPS = 4
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Settings of the study.
+
+    - requirement: id of the requirement
+    - cases: number of cases of exploration and evolution strategies
+    - restarts: number of evolution strategies
+    - max_failures: maximum number of reduced violations
+    - repetitions: number of new random streams with which each reduced violation runs again
+    """
+
+    requirement: str
+    cases: int = 300
+    restarts: int = 3
+    max_failures: int = 5
+    repetitions: int = 4
+
+    def __post_init__(self) -> None:
+        problems = {
+            f"--cases {self.cases}: at least 20": self.cases >= 20,
+            f"--restarts {self.restarts}: at least 1": self.restarts >= 1,
+            f"--failures {self.max_failures}: at least 1": self.max_failures >= 1,
+        }
+        for message, is_met in problems.items():
+            if not is_met:
+                raise CampaignError(message)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A reduced violation.
+
+    - case: number of the reduced case; found_case: number of the case before the reduction
+    - margin: margin of the reduced case
+    - values: values of the dispersions that differ from the campaign's parameters, by path
+    - distance: distance of these values from the medians, standard deviations; a small distance is likely
+    - similar: number of violations with the same cause
+    - repeated, repetitions: number of violations among the repetitions with new random streams
+    - outcome: outcome of the reduced case
+    """
+
+    case: int
+    found_case: int
+    margin: float
+    values: dict[str, Any]
+    distance: float
+    similar: int
+    repeated: int
+    repetitions: int
+    outcome: str
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """Result of the study: reduced violations, the most likely one first, and numbers of cases.
+
+    - searched, cases: numbers of cases before the reduction, and in all
+    - violations: number of violations among the searched cases; min_margin: their smallest margin
+    - first_violation: number of searched cases up to the first violation; None without a violation
+    """
+
+    failures: tuple[Failure, ...]
+    searched: int
+    cases: int
+    violations: int
+    min_margin: float
+    first_violation: int | None
+    margin_text: str
+    reason: str = ""
+
+    @property
+    def exit_code(self) -> int:
+        """Exit status of the command: 1 if violations were found."""
+        return int(bool(self.violations))
+
+
+@dataclass
+class _Evaluated:
+    """An evaluated case: its number, point, margin and outcome."""
+
+    case: int
+    point: Point
+    margin: float
+    outcome: str
+
+
+def start_search(
+    campaign: Campaign,
+    settings: SearchSettings,
+    max_cases: int,
+    directory: Path,
+    executor: ExecutorConfig,
+    observer: ProgressObserver,
+) -> SearchResult:
+    """Run the study in a new folder.
+
+    Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
+    stored, and `continue_search` continues.
+    """
+    find_requirement(campaign, settings.requirement)
+    session = StudySession(
+        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+    )
+    return start_study(campaign, max_cases, directory, session, {"kind": KIND, **asdict(settings)})
+
+
+def continue_search(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> SearchResult:
+    """Continue an interrupted study. Raises CampaignError if there is none, or the program has changed."""
+    study = read_study(directory) or {}
+    if study.get("kind") != KIND:
+        raise CampaignError(f"{directory} does not contain a search for violations (marsyard search)")
+    settings = SearchSettings(**{name: study[name] for name in SearchSettings.__dataclass_fields__})
+    session = StudySession(
+        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+    )
+    return continue_study(directory, session, {"kind": KIND, **asdict(settings)})
+
+
+class _Study:
+    """A running search."""
+
+    def __init__(self, campaign: Campaign, settings: SearchSettings, runner: PointRunner) -> None:
+        self.campaign, self.settings, self.runner = campaign, settings, runner
+        self._requirement: Requirement = find_requirement(campaign, settings.requirement)
+        self._evaluated: list[_Evaluated] = []
+
+    def run(self, observer: ProgressObserver) -> SearchResult:
+        """Search and reduce; a limit of cases ends the study with the failures so far."""
+        observer.begin("search", self.settings.cases)
+        failures: list[Failure] = []
+        reason = ""
+        searched = violations = 0
+        try:
+            self._explore()
+            self._evolve()
+            searched = len(self._evaluated)
+            found = [item for item in self._evaluated if item.margin < 0.0]
+            violations = len(found)
+            observer.begin("reduction", 0)
+            failures = self._reduce_all(found)
+        except CaseLimitError as error:
+            reason = f"The limit of cases was reached: {error}."
+            searched = searched or len(self._evaluated)
+        explored = self._evaluated[:searched]
+        numbers = [index + 1 for index, item in enumerate(explored) if item.margin < 0.0]
+        return SearchResult(
+            tuple(sorted(failures, key=lambda failure: failure.distance)),
+            searched,
+            self.runner.n_cases,
+            violations or len(numbers),
+            min((item.margin for item in explored), default=math.nan),
+            numbers[0] if numbers else None,
+            describe_margin(self._requirement),
+            reason,
+        )
+
+    def _evaluate(self, candidates: Sequence[Candidate]) -> list[_Evaluated]:
+        first = self.runner.n_cases
+        rows = self.runner.run(candidates)
+        evaluated = [
+            _Evaluated(
+                first + index,
+                Point.read(str(row[POINT_COLUMN])),
+                compute_margin(row, self._requirement),
+                str(row["outcome"]),
+            )
+            for index, row in enumerate(rows)
+        ]
+        self._evaluated += evaluated
+        return evaluated
+
+    def _seed(self, name: str) -> int:
+        configuration = self.campaign.configuration
+        generator = Streams(configuration.seed, configuration.name, 0).generator(f"search: {name}")
+        return int(generator.integers(1, 2**31))
+
+    def _explore(self) -> None:
+        """Evaluate a Sobol sequence, the largest power of 2 within half of the cases."""
+        dimension = len(self.campaign.drawn_paths)
+        exponent = int(math.log2(max(_EXPLORED_FRACTION * self.settings.cases, 2.0)))
+        sequence = qmc.Sobol(dimension, rng=np.random.default_rng(self._seed("exploration"))).random_base2(exponent)
+        coordinates = ndtri(np.clip(sequence, 1e-6, 1.0 - 1e-6))
+        self._evaluate([Candidate(tuple(point.tolist())) for point in coordinates])
+
+    def _evolve(self) -> None:
+        """Run evolution strategies side by side until the cases are used."""
+        settings, starts = self.settings, self._select_starts()
+        strategies = [
+            cma.CMAEvolutionStrategy(
+                list(start),
+                _STEP,
+                {
+                    "seed": self._seed(f"strategy {number}"),
+                    "bounds": [-_MAX_COORDINATE, _MAX_COORDINATE],
+                    "verbose": -9,
+                    "verb_log": 0,
+                    # margins are noisy, and equal margins are usual
+                    "tolfun": 0.0,
+                    "tolfunhist": 0.0,
+                    "tolflatfitness": 10**6,
+                },
+            )
+            for number, start in enumerate(starts)
+        ]
+        size = strategies[0].popsize
+        while self.runner.n_cases + size * len(strategies) <= settings.cases:
+            populations = [strategy.ask() for strategy in strategies]
+            candidates = [Candidate(tuple(map(float, point))) for points in populations for point in points]
+            margins = _replace_infinite(np.array([item.margin for item in self._evaluate(candidates)]))
+            for number, (strategy, points) in enumerate(zip(strategies, populations, strict=True)):
+                strategy.tell(points, margins[number * size : (number + 1) * size].tolist())
+
+    def _select_starts(self) -> list[tuple[float, ...]]:
+        """Select the best explored cases that differ from each other."""
+        ordered = sorted(self._evaluated, key=lambda item: item.margin)
+        starts: list[tuple[float, ...]] = []
+        for item in ordered:
+            point = np.array(item.point.coordinates)
+            min_distance = _MIN_START_DISTANCE * math.sqrt(point.size)
+            if all(np.linalg.norm(point - np.array(other)) >= min_distance for other in starts):
+                starts.append(item.point.coordinates)
+            if len(starts) == self.settings.restarts:
+                break
+        return starts
+
+    def _reduce_all(self, found: list[_Evaluated]) -> list[Failure]:
+        """Reduce the most likely violation, remove those with the same cause, and repeat with the others."""
+        remaining = sorted(found, key=lambda item: float(np.linalg.norm(item.point.coordinates)))
+        failures: list[Failure] = []
+        while remaining and len(failures) < self.settings.max_failures:
+            first = remaining[0]
+            reduced = self._shrink(self._remove_dispersions(first))
+            paths = [path for path in self.campaign.drawn_paths if path not in reduced.point.nominal]
+            indices = [self.campaign.drawn_paths.index(path) for path in paths]
+            kept = np.array(reduced.point.coordinates)[indices]
+            coordinates = np.array([item.point.coordinates for item in remaining])[:, indices]
+            similar = np.linalg.norm(coordinates - coordinates[0], axis=1) <= _MAX_CAUSE_DISTANCE
+            remaining = [item for item, is_similar in zip(remaining, similar, strict=True) if not is_similar]
+            repetitions = self._evaluate(
+                [
+                    Candidate(reduced.point.coordinates, None, reduced.point.nominal)
+                    for _ in range(self.settings.repetitions)
+                ]
+            )
+            values = self.campaign.draws_at(reduced.point)
+            failures.append(
+                Failure(
+                    reduced.case,
+                    first.case,
+                    reduced.margin,
+                    {path: values[path] for path in paths},
+                    float(np.linalg.norm(kept)),
+                    int(similar.sum()),
+                    sum(item.margin < 0.0 for item in repetitions),
+                    len(repetitions),
+                    reduced.outcome,
+                )
+            )
+        return failures
+
+    def _remove_dispersions(self, failure: _Evaluated) -> _Evaluated:
+        """Return dispersions to the campaign's parameters in groups, as long as the case remains a violation."""
+        paths = [path for path in self.campaign.drawn_paths if path not in failure.point.nominal]
+        groups = 2
+        while paths:
+            size = math.ceil(len(paths) / groups)
+            parts = [paths[start : start + size] for start in range(0, len(paths), size)]
+            candidates = [
+                Candidate(failure.point.coordinates, failure.point.stream, (*failure.point.nominal, *part))
+                for part in parts
+            ]
+            tested = self._evaluate(candidates)
+            removed = next((index for index, item in enumerate(tested) if item.margin < 0.0), None)
+            if removed is not None:
+                failure = tested[removed]
+                paths = [path for path in paths if path not in parts[removed]]
+                groups = max(groups - 1, 2)
+            elif size == 1:
+                break
+            else:
+                groups = min(2 * groups, len(paths))
+        return failure
+
+    def _shrink(self, failure: _Evaluated) -> _Evaluated:
+        """Bisect each remaining coordinate towards its median, as long as the case remains a violation."""
+        for index, path in enumerate(self.campaign.drawn_paths):
+            if path in failure.point.nominal:
+                continue
+            low, high = 0.0, failure.point.coordinates[index]
+            for _ in range(_BISECTION_STEPS):
+                middle = 0.5 * (low + high)
+                coordinates = list(failure.point.coordinates)
+                coordinates[index] = middle
+                (tested,) = self._evaluate([Candidate(tuple(coordinates), failure.point.stream, failure.point.nominal)])
+                if tested.margin < 0.0:
+                    failure, high = tested, middle
+                else:
+                    low = middle
+        return failure
+
+
+def _replace_infinite(margins: np.ndarray) -> np.ndarray:
+    """Replace infinite margins by numbers beyond the finite ones, which an evolution strategy can rank."""
+    finite = margins[np.isfinite(margins)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    width = max(high - low, 1.0)
+    return np.asarray(np.clip(margins, low - width, high + width))
+
+
+def write_regression_campaigns(campaign: Campaign, result: SearchResult, directory: Path) -> list[Path]:
+    """Write one campaign file per reduced violation into DIR/failures, and a plan of nightly runs with all of them.
+
+    Each file has the parameters of the reduced case, no dispersions, and new random streams for each of its cases.
+    """
+    folder, paths = directory / "failures", list[Path]()
+    configuration = campaign.configuration
+    requirement = find_requirement(campaign, str((read_study(directory) or {})["requirement"]))
+    with report_write_errors(folder):
+        folder.mkdir(exist_ok=True)
+        for number, failure in enumerate(result.failures, start=1):
+            name = f"{configuration.name}-failure-{number}"
+            story = ", ".join(f"{path} = {_short_text(value)}" for path, value in failure.values.items())
+            tables = {
+                "name": name,
+                "scenario": configuration.scenario,
+                "description": f"Violation of {requirement.id} with {story or 'the parameters of the campaign'}.",
+                "cases": max(failure.repetitions, 1),
+                "seed": configuration.seed,
+                "parameters": campaign.with_values(failure.values).model_dump(mode="json"),
+                "requirements": [requirement.model_dump(mode="json")],
+            }
+            paths.append(folder / f"{name}.toml")
+            paths[-1].write_text(tomli_w.dumps(_without_none(tables)), encoding="utf-8")
+        plan = {"campaigns": [{"campaign": path.name} for path in paths]}
+        (folder / "nightly.toml").write_text(tomli_w.dumps(plan), encoding="utf-8")
+    return paths
+
+
+def _short_text(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _without_none(value: Any) -> Any:
+    """Remove keys without a value, which TOML cannot represent; they have their default."""
+    if isinstance(value, dict):
+        return {name: _without_none(inner) for name, inner in value.items() if inner is not None}
+    return [_without_none(inner) for inner in value] if isinstance(value, list | tuple) else value
