@@ -21,6 +21,7 @@ from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
 from marsyard.reports.presentation import presentations, showcase_views
 from marsyard.reports.rare import rare_section
 from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.search import search_section
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
@@ -30,7 +31,7 @@ from marsyard.reports.wording import count, label, number, numbers, primary_metr
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
-    rare_section, common_sections.answers_section, comparison_section, common_sections.scatter_section,
+    rare_section, search_section, common_sections.answers_section, comparison_section, common_sections.scatter_section,
     common_sections.drivers_section, common_sections.convergence_section, common_sections.consistency_section,
     common_sections.faults_section,
 )  # fmt: skip

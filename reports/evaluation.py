@@ -148,8 +148,9 @@ def _judge_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdic
     result = table(study.get("result"))
     if not result:
         return OverallVerdict(Status.INSUFFICIENT, crashed, "The study is not finished.")
-    if not result.get("verdict"):
-        return OverallVerdict(None, crashed, "The study has no verdict; see its section.")
+    if study.get("kind") == "search":
+        found = f"{count(int(result.get('violations') or 0), 'violation')} of {study.get('requirement')} found"
+        return OverallVerdict(Status.FAIL if result.get("violations") else None, crashed, f"{found}. See the section.")
     section_text = "See the section on the probability of a violation."
     return OverallVerdict(Status(result["verdict"]), crashed, f"{study.get('requirement')}. {section_text}")
 

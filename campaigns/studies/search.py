@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -285,6 +285,7 @@ class _Study:
         """Reduce the most likely violation, remove those with the same cause, and repeat with the others."""
         remaining = sorted(found, key=lambda item: float(np.linalg.norm(item.point.coordinates)))
         failures: list[Failure] = []
+        reduced_points: list[tuple[list[str], np.ndarray]] = []
         while remaining and len(failures) < self.settings.max_failures:
             first = remaining[0]
             reduced = self._shrink(self._remove_dispersions(first))
@@ -294,13 +295,14 @@ class _Study:
             coordinates = np.array([item.point.coordinates for item in remaining])[:, indices]
             similar = np.linalg.norm(coordinates - coordinates[0], axis=1) <= _MAX_CAUSE_DISTANCE
             remaining = [item for item, is_similar in zip(remaining, similar, strict=True) if not is_similar]
-            repetitions = self._evaluate(
-                [
-                    Candidate(reduced.point.coordinates, None, reduced.point.nominal)
-                    for _ in range(self.settings.repetitions)
-                ]
-            )
             values = self.campaign.draws_at(reduced.point)
+            earlier = next((index for index, other in enumerate(reduced_points) if _is_close(kept, paths, other)), None)
+            if earlier is not None:
+                failures[earlier] = replace(failures[earlier], similar=failures[earlier].similar + int(similar.sum()))
+                continue
+            reduced_points.append((paths, kept))
+            repetition = Candidate(reduced.point.coordinates, None, reduced.point.nominal)
+            repetitions = self._evaluate([repetition] * self.settings.repetitions)
             failures.append(
                 Failure(
                     reduced.case,
@@ -355,6 +357,11 @@ class _Study:
                 else:
                     low = middle
         return failure
+
+
+def _is_close(coordinates: np.ndarray, paths: list[str], other: tuple[list[str], np.ndarray]) -> bool:
+    """Whether two reduced violations have the same dispersions, with similar coordinates."""
+    return paths == other[0] and float(np.linalg.norm(coordinates - other[1])) <= _MAX_CAUSE_DISTANCE
 
 
 def _replace_infinite(margins: np.ndarray) -> np.ndarray:

@@ -104,10 +104,10 @@ def resume(
     from marsyard.campaigns.errors import RETRYABLE, CampaignError, unknown_name_message
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.cli.outcome import continue_until_decided
-    from marsyard.cli.studies import continue_study
+    from marsyard.cli.studies import contains_study, continue_study
 
-    if continue_study(directory, jobs, cluster):
-        return
+    if contains_study(directory):
+        continue_study(directory, jobs, cluster)
     executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
     for name in retry or []:
         if name not in allowed:
@@ -138,10 +138,10 @@ def append(
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
     from marsyard.cli import outcome
-    from marsyard.cli.studies import continue_study
+    from marsyard.cli.studies import contains_study, continue_study
 
-    if continue_study(directory, jobs, cluster, cases):
-        return
+    if contains_study(directory):
+        continue_study(directory, jobs, cluster, cases)
     if stored_configuration(directory).max_cases is not None:
         raise CampaignError(f"{directory} was run with --until-decided: cases added afterwards would bias the verdict")
     outcome.print_limits(campaign_with_block(directory, cases))

@@ -1,10 +1,10 @@
-"""Command `marsyard rare`: studies that choose their cases."""
+"""Commands `marsyard rare` and `marsyard search`: studies that choose their cases."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from typer import Option
@@ -14,6 +14,7 @@ from marsyard.cli.campaign import default_directory, make_executor, show_progres
 
 if TYPE_CHECKING:
     from marsyard.campaigns.studies.rare import RareResult
+    from marsyard.campaigns.studies.search import SearchResult
 
 MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Maximum number of cases of the study.")]
 
@@ -70,21 +71,96 @@ def rare(arguments: RareOptions) -> None:
     finish_rare(directory, result)
 
 
-def continue_study(directory: Path, jobs: int | None, cluster: str | None, additional: int = 0) -> bool:
-    """Continue the study in a folder, and exit with the status of its verdict; return False for a campaign."""
-    from marsyard.campaigns.studies.rare import continue_rare
+@dataclass(frozen=True)
+class SearchOptions:
+    """Arguments and options of `marsyard search`."""
+
+    campaign: options.CampaignArgument
+    requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign to be violated.")]
+    cases: Annotated[int, Option("-n", "--cases", metavar="N", help="Number of cases to search with.")] = 300
+    restarts: Annotated[int, Option(metavar="N", help="Number of evolution strategies.")] = 3
+    failures: Annotated[int, Option(metavar="N", help="Maximum number of violations to reduce.")] = 5
+    max_cases: MaxCasesOption = 5_000
+    seed: options.SeedOption = None
+    jobs: options.JobsOption = None
+    cluster: options.ClusterOption = None
+    out: options.OutOption = None
+    override: options.SetOption = None
+    algorithm: options.AlgorithmOption = None
+
+
+@options.handle_user_errors
+@options.with_options(SearchOptions)
+def search(arguments: SearchOptions) -> None:
+    """Search for violations of a requirement, and reduce each to the few parameters that cause it."""
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.studies.search import SearchSettings, start_search
+
+    settings = SearchSettings(arguments.requirement, arguments.cases, arguments.restarts, arguments.failures)
+    campaign = load_campaign(
+        arguments.campaign, arguments.override or [], None, arguments.seed, arguments.algorithm or []
+    )
+    executor = make_executor(arguments.jobs, arguments.cluster)
+    name = campaign.configuration.name
+    directory = arguments.out if arguments.out is not None else default_directory(f"{name}-search")
+    with show_progress(directory, f"marsyard resume {directory}") as progress:
+        result = start_search(campaign, settings, arguments.max_cases, directory, executor, progress)
+    finish_search(directory, result)
+
+
+def contains_study(directory: Path) -> bool:
+    """Whether the folder contains a study, not an ordinary campaign."""
     from marsyard.campaigns.studies.runner import read_study
 
-    if read_study(directory) is None:
-        return False
-    executor = make_executor(jobs, cluster)
-    with show_progress(directory, f"marsyard resume {directory}") as progress:
-        result = continue_rare(directory, executor, progress, additional)
-    finish_rare(directory, result)
-    return True
+    return read_study(directory) is not None
 
 
-def finish_rare(directory: Path, result: RareResult) -> None:
+def continue_study(directory: Path, jobs: int | None, cluster: str | None, additional: int = 0) -> NoReturn:
+    """Continue the study in a folder, with a number of additional replicates; exit with the status of its verdict."""
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.studies import rare as rare_study
+    from marsyard.campaigns.studies import search as search_study
+    from marsyard.campaigns.studies.runner import read_study
+
+    study = read_study(directory) or {}
+    executor, next_command = make_executor(jobs, cluster), f"marsyard resume {directory}"
+    if study.get("kind") == search_study.KIND:
+        if additional:
+            raise CampaignError(f"{directory} contains a search, which cannot be extended; start a new one")
+        with show_progress(directory, next_command) as progress:
+            searched = search_study.continue_search(directory, executor, progress)
+        finish_search(directory, searched)
+    with show_progress(directory, next_command) as progress:
+        estimated = rare_study.continue_rare(directory, executor, progress, additional)
+    finish_rare(directory, estimated)
+
+
+def finish_search(directory: Path, result: SearchResult) -> NoReturn:
+    """Store files and images of the reduced violations, write the report, print the result, and exit."""
+    from marsyard.campaigns.errors import report_write_errors
+    from marsyard.campaigns.running.replay import load_stored_campaign, replay
+    from marsyard.campaigns.store.products import case_directory, save_packed
+    from marsyard.campaigns.store.record import read, stored_configuration
+    from marsyard.campaigns.studies.search import write_regression_campaigns
+    from marsyard.reports.campaign import write_report
+    from marsyard.reports.search import read_search, search_sentences
+
+    campaign = load_stored_campaign(directory, stored_configuration(directory))
+    files = write_regression_campaigns(campaign, result, directory)
+    for failure in result.failures:
+        replayed = replay(directory, failure.case)
+        if replayed.products is not None:
+            save_packed(case_directory(directory, failure.case), replayed.products, replayed.row)
+    with report_write_errors("the report"):
+        page = write_report(directory)
+    console = options.console()
+    lines = [*search_sentences(read_search(read(directory))), *(f"campaign: {path}" for path in files)]
+    for line in (*lines, f"report: {page}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    raise typer.Exit(result.exit_code)
+
+
+def finish_rare(directory: Path, result: RareResult) -> NoReturn:
     """Write the report of a study, print its result, and exit with the status of its verdict."""
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.reports.campaign import write_report

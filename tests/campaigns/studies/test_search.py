@@ -1,0 +1,124 @@
+"""Tests of the search for violations: a planted defect is found and reduced; continuation, files, report and errors."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.running.replay import replay
+from marsyard.campaigns.store import record
+from marsyard.campaigns.studies.rare import continue_rare
+from marsyard.campaigns.studies.search import SearchResult, SearchSettings, start_search
+from tests.campaigns.fake_campaign import RecordingWatch
+from tests.campaigns.studies import limit_state
+from tests.campaigns.studies.planted_defect import CAMPAIGN
+
+
+@pytest.fixture
+def campaign_path(tmp_path: Path) -> Path:
+    path = tmp_path / "planted-defect.toml"
+    path.write_text(CAMPAIGN)
+    return path
+
+
+def start(
+    path: Path, directory: Path, settings: SearchSettings, *, seed: int = 1, max_cases: int = 5000
+) -> SearchResult:
+    campaign = load_campaign(str(path), (), None, seed)
+    return start_search(campaign, settings, max_cases, directory, ExecutorConfig(1), RecordingWatch())
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_planted_defect_is_found_and_reduced_to_its_two_causes(campaign_path: Path, tmp_path: Path, seed: int) -> None:
+    result = start(campaign_path, tmp_path / "run", SearchSettings("VELOCITY"), seed=seed)
+    assert result.first_violation is not None
+    assert result.first_violation <= result.searched <= 300
+    failure = result.failures[0]
+    assert set(failure.values) == {"sun_deg", "yaw_deg"}
+    assert 10.0 <= failure.values["sun_deg"] < 15.0
+    assert 80.0 <= failure.values["yaw_deg"] <= 100.0
+    assert failure.repeated == failure.repetitions == 4
+    assert replay(tmp_path / "run", failure.case).differing == ()
+
+
+def test_campaign_without_violation_reports_the_smallest_margin(tmp_path: Path) -> None:
+    path = tmp_path / "limit-state.toml"
+    path.write_text(limit_state.CAMPAIGN)
+    campaign = load_campaign(str(path), ["beta=20.0"])
+    result = start_search(
+        campaign, SearchSettings("LOAD", 60), 1000, tmp_path / "run", ExecutorConfig(1), RecordingWatch()
+    )
+    assert (result.violations, result.failures, result.exit_code) == (0, (), 0)
+    # the evolution strategies approach the corner of the allowed coordinates, at a load of 100 - 20 + 4 sqrt(2)
+    assert 14.3 < result.min_margin < 18.0
+
+
+def test_limit_of_cases_ends_the_search(campaign_path: Path, tmp_path: Path) -> None:
+    result = start(campaign_path, tmp_path / "run", SearchSettings("VELOCITY"), max_cases=200)
+    assert "limit of cases" in result.reason
+    assert result.cases <= 200
+
+
+@pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
+def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "marsyard",
+        "search",
+        str(campaign_path),
+        "--requirement",
+        "VELOCITY",
+        "--jobs",
+        "2",
+    ]
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    with subprocess.Popen([*command, "--out", str(killed)], stderr=subprocess.DEVNULL) as process:
+        log, deadline = killed / "cases.sqlite-wal", time.monotonic() + 120.0
+        while not (log.exists() and log.stat().st_size > 20_000) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        os.kill(process.pid, signal.SIGKILL)
+    resumed = subprocess.run(
+        [sys.executable, "-m", "marsyard", "resume", str(killed)], capture_output=True, text=True, check=False
+    )
+    undisturbed = subprocess.run([*command, "--out", str(whole)], capture_output=True, text=True, check=False)
+    assert resumed.returncode == undisturbed.returncode == 1, resumed.stderr
+    assert record.read(killed)["study"]["result"] == record.read(whole)["study"]["result"]
+    # the campaign file of the reduced violation violates the requirement in each of its cases
+    (plan,) = tomllib.loads((whole / "failures" / "nightly.toml").read_text())["campaigns"][:1]
+    file = whole / "failures" / plan["campaign"]
+    options = ["--out", str(tmp_path / "regression"), "--jobs", "1"]
+    regression = subprocess.run(
+        [sys.executable, "-m", "marsyard", "run", str(file), *options], capture_output=True, text=True, check=False
+    )
+    assert regression.returncode == 1, regression.stderr
+    data = json.loads((whole / "report.json").read_text())
+    assert data["verdict"] == "FAIL"
+    assert data["sections"]["search"]["failures"][0]["values"].keys() == {"sun_deg", "yaw_deg"}
+    assert "Reduced violations" in (whole / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"cases": 5}, "--cases 5"), ({"restarts": 0}, "--restarts 0"), ({"max_failures": 0}, "--failures 0")],
+)
+def test_wrong_settings_are_explained(settings: dict[str, int], message: str) -> None:
+    with pytest.raises(CampaignError, match=message):
+        SearchSettings("VELOCITY", **settings)
+
+
+def test_search_is_not_a_study_of_rare_violations(campaign_path: Path, tmp_path: Path) -> None:
+    start(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
+    with pytest.raises(CampaignError, match="does not contain a study of rare violations"):
+        continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
