@@ -88,7 +88,7 @@ class SiteGround:
             sky_fraction=sky,
             sky_radiance=sky,
             surrounding_albedo=self.terrain.albedo,
-            # a uniform sky without scattering, or with backward scattering
+            # None is a uniform sky; the model of a dusty sky needs forward scattering
             sky=None
             if air.optical_depth == 0.0 or air.single_scattering_albedo == 0.0 or air.asymmetry < 0.0
             else DustySky(air.optical_depth, air.single_scattering_albedo, air.asymmetry),
@@ -97,7 +97,7 @@ class SiteGround:
 
 @dataclass(frozen=True)
 class Eye:
-    """Position, sector and resolution of a camera, which determine the detail of a scene.
+    """Viewpoint of a camera: position, visible sector and resolution, which determine the detail of a scene.
 
     - east_m, north_m, height_m: position, and height above the ground
     - pixel_rad: angle of a pixel
@@ -168,11 +168,12 @@ def micro_relief(ground: SiteGround) -> MicroRelief:
 
 
 def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Objects:
-    """Select the rocks that the eye resolves, and near rocks for their shadows; body numbers are the rocks' numbers.
+    """Select the rocks that a camera resolves (`eye`), and near rocks for their shadows.
 
-    If rocks of `SMALLEST_ROCK_PX` need more than about `ROCK_TRIANGLES`, only larger rocks are selected. The level of
-    detail makes rocks look like their finest shape (`marsyard.sim.terrain.rocks.shapes.DEVIATION_PX`), within the limit
-    of `DETAIL_TRIANGLES`.
+    The names of the objects are the rocks' numbers in the field; each periodic copy of a rock is a body of its own. If
+    rocks of `SMALLEST_ROCK_PX` need more than about `ROCK_TRIANGLES`, only larger rocks are selected. The level of
+    detail is high enough that a rock cannot be distinguished from its finest mesh
+    (`marsyard.sim.terrain.rocks.shapes.DEVIATION_PX`), within the limit of `DETAIL_TRIANGLES`.
     """
     field = ground.rocks
     if field is None or len(field) == 0:
@@ -237,9 +238,10 @@ def _detail_pixel_rad(field: RockField, eye: Eye) -> float:
 
 @dataclass(frozen=True)
 class Stance:
-    """Typical terrain scale, height above the ground, and elevation of the optical axis of a camera.
+    """Typical mounting of a camera: terrain scale, height above the ground, and elevation of the optical axis.
 
-    `on_rover_m` is the position of a camera that is fixed to a rover's body, in the rover's frame; None for others.
+    `on_rover_m` is the position x, y, z of a camera that is fixed to a rover's body, in the rover's frame; None for
+    other cameras.
     """
 
     scale: Scale
@@ -248,7 +250,7 @@ class Stance:
     on_rover_m: tuple[float, float, float] | None = None
 
 
-#: Typical stances of the cameras of `marsyard.sim.sensor.PRESETS`: first image of a descent, masts of 1.5 m, MER's
+#: Typical mountings of the cameras of `marsyard.sim.sensor.PRESETS`: first image of a descent, masts of 1.5 m, MER's
 #: hazcams 0.53 m above the ground (Maki et al. 2003) at the front of the body, a helicopter at 10 m.
 STANCES: Mapping[str, Stance] = {
     "mer-descent-flown": Stance("descent", 2000.0, -90.0),
@@ -302,7 +304,10 @@ def _above(surface: Surface, east_m: float, north_m: float, height_m: float) -> 
 def _find_near_rocks(
     field: RockField, members: Int64[np.ndarray, "members"], eye: Eye, radius_m: float
 ) -> Bool[np.ndarray, "members"]:
-    """Select rocks with a periodic position within a radius of the eye; a superset of `_find_visible_triangles`."""
+    """Select rocks of which a copy is within a radius of the eye; the rock field repeats with its period.
+
+    All rocks with triangles of `_find_visible_triangles` are among them.
+    """
     period, selected = field.period_m, np.zeros(members.size, dtype=np.bool_)
     # larger than any shape on the steepest ground
     extent = field.diameter_m[members] + field.height_m[members]

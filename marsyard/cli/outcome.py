@@ -1,4 +1,7 @@
-"""Evaluation of stored campaigns for the commands: verdicts, exit status, report, CSV and PDF; dashboard server."""
+"""Functions of the commands around a campaign: estimate before a run, evaluation and report after it, dashboard server.
+
+Sequential runs (`--until-decided`) and reruns of notable cases are also here.
+"""
 
 from __future__ import annotations
 
@@ -182,9 +185,10 @@ _MAX_DRAWS = 5000
 
 
 def evidence_limits(campaign: Campaign) -> list[str]:
-    """Explain which requirements cannot be PASS even without a failure, with a remedy; empty if all can be PASS.
+    """Explain why the strictest requirement cannot be PASS even without a failure, with a remedy; empty if it can.
 
-    Includes requirements with a confidence level. Each is assumed to apply to all cases; subsets require more cases.
+    Only requirements that are decided at a confidence are considered. The population is assumed to be all cases; a
+    smaller population requires more cases.
     """
     configuration = campaign.configuration
     requirements = [item for item in configuration.requirements if item.decide_by != ESTIMATE]

@@ -131,7 +131,7 @@ def _find_triple(p: FieldTestParameters, case: int) -> tuple[int, int]:
 
 def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
     """Return the run and triple of each case; the first n cases contain all runs and categories in proportion."""
-    # the fraction of a category's triples up to and including half of this one determines the order
+    # triple k of n in its category has the rank (k + 0.5) / n; the cases are sorted by rank
     ranked = []
     for number, run in enumerate(p.runs):
         start = 0
@@ -144,7 +144,9 @@ def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
 def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, "2 3"]:
     """Compute the paper's truth velocities: GPS differences divided by the virtual interval, world axes (III.D.3).
 
-    The paper's "biased IMU velocities" are the same differences (III.D.5).
+    The helicopter is slower than a lander. The paper therefore treats the images as if they had been taken at the
+    lander's image interval, the virtual interval. The velocities between images, which the inertial unit of a lander
+    would give to the estimator, are the same differences ("biased IMU velocities", III.D.5).
     """
     fixes = case.run.images.position_m[list(case.triple.image_indices)]
     return np.asarray(np.diff(fixes, axis=0) / p.triples.virtual_interval_s)
@@ -157,7 +159,7 @@ def measure(
     detector: Detector,
     camera: CameraModel,
 ) -> DescentMeasurements:
-    """Create the inputs of an estimator: time tags at virtual intervals, and the calibrated camera (paper, III.D)."""
+    """Create the inputs of an estimator: time tags at the virtual interval, and the calibrated camera (paper, III.D)."""
     tags = [number * p.triples.virtual_interval_s for number in range(len(images))]
     tagged_indices = list(zip(case.triple.image_indices, tags, strict=True))
     altitudes = case.run.images.altitude_m

@@ -1,4 +1,7 @@
-"""Tests that names, docstrings, comments and pages use the project's vocabulary (docs/glossary.md)."""
+"""Tests that names, docstrings, comments and pages contain no words for which the field has a standard term.
+
+The rejected words occurred in earlier versions with a private meaning. docs/glossary.md defines the accepted terms.
+"""
 
 from __future__ import annotations
 
