@@ -142,11 +142,11 @@ def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
 
 
 def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, "2 3"]:
-    """Compute the paper's truth velocities: GPS differences divided by the virtual interval, world axes (III.D.3).
+    """Compute the paper's truth velocities: GPS differences divided by the virtual interval, world axes (III.D.5).
 
-    The helicopter is slower than a lander. The paper therefore treats the images as if they had been taken at the
-    lander's image interval, the virtual interval. The velocities between images, which the inertial unit of a lander
-    would give to the estimator, are the same differences ("biased IMU velocities", III.D.5).
+    The images of a triple are not consecutive, so the time between them has no meaning for an inertial unit. The paper
+    assigns a fixed virtual interval to each pair. The velocities that a lander's inertial unit would give to the
+    estimator are the same differences ("biased IMU velocities", III.D.3).
     """
     fixes = case.run.images.position_m[list(case.triple.image_indices)]
     return np.asarray(np.diff(fixes, axis=0) / p.triples.virtual_interval_s)
@@ -159,7 +159,7 @@ def measure(
     detector: Detector,
     camera: CameraModel,
 ) -> DescentMeasurements:
-    """Create the inputs of an estimator: time tags at the virtual interval, and the calibrated camera (paper, III.D)."""
+    """Create an estimator's inputs: time tags at the virtual interval, and the calibrated camera (paper, III.D)."""
     tags = [number * p.triples.virtual_interval_s for number in range(len(images))]
     tagged_indices = list(zip(case.triple.image_indices, tags, strict=True))
     altitudes = case.run.images.altitude_m
