@@ -1,4 +1,4 @@
-"""Detect hot paths that are slower than their stored ratios: ``python -m benchmarks.check [--keep]``.
+"""Detect hot paths that became slower, by their stored time ratios: ``python -m benchmarks.check [--keep]``.
 
 Runs of each path alternate with runs of a reference workload (matrix products, filters, sorting, copies), so that a
 slow or busy machine affects both. Welch's test compares the logarithms of the ratios of their processor times with the

@@ -19,7 +19,6 @@ from marsyard.sim.measurements import DescentMeasurements
 #: Compared estimators, by name.
 ESTIMATORS: Mapping[str, VelocityEstimator] = {
     "DIMES": DimesEstimator(),
-    "DIMES, quadric peak fit without alignment": DimesEstimator(DimesOptions(align=False)),
     "DIMES, without sub-pixel refinement": DimesEstimator(DimesOptions(subpixel=False)),
     "OpenCV's phase correlation": PhaseCorrelationEstimator(),
     "OpenCV's ORB and homography": HomographyEstimator(),

@@ -1,7 +1,8 @@
 """Minimum cost of a `dimes-gusev` case: core-seconds of the necessary operations, measured separately, and their sum.
 
 A case has three images of 1024 x 1024 pixels. Each pixel needs one spline evaluation for its intersection, one for its
-radiance, a Poisson number of electrons and a normal number for readout noise. The shadow sweep reads every height once.
+radiance, a Poisson number of electrons and a normally distributed number for readout noise. The shadow sweep reads
+every height once.
 The costs of OpenGL drawing and of DIMES' transforms are those of the library calls in profiled cases.
 """
 
@@ -78,7 +79,7 @@ def _sum_strip(cells: FetchedCells) -> float:
 
 
 def _prepare_random_numbers() -> Callable[[], object]:
-    """Return a function that draws one Poisson and one normal number per pixel."""
+    """Return a function that draws one Poisson and one normally distributed number per pixel."""
     rng = np.random.default_rng(0)
     mean: NDArray[np.float32] = np.full((SIDE_PX, SIDE_PX), ELECTRONS, dtype=np.float32)
 

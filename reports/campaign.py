@@ -154,7 +154,8 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     if run.is_truncated:
         texts.append(
             f"Verdicts, outcomes, answers, statistics and convergence use all {len(run.all_cases):,} cases. Scatter "
-            f"plots, conditions and drivers use the first {len(run.frame):,} cases, which are also a random sample."
+            f"plots, conditions and drivers use the first {len(run.frame):,} cases"
+            f"{', which are also a random sample' if sampling.independent else ''}."
         )
     nominal = run.frame[run.frame["case"] == 0] if sampling.nominal and "case" in run.frame else run.frame[:0]
     if len(nominal):

@@ -150,11 +150,13 @@ class RateTable:
     def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
         """Create a table of the rates that have cases."""
         rates_by_name = self.rates(frame) if callable(self.rates) else {r.name: r.compute(frame) for r in self.rates}
-        rows = [
-            [name, rates.fraction_text(rate), rates.interval_text(rate, shared=self.shared)]
-            for name, rate in rates_by_name.items()
-            if isinstance(rate, CaseFraction) and rate.n
-        ]
+        rows = []
+        for name, rate in rates_by_name.items():
+            if isinstance(rate, CaseFraction) and rate.n:
+                rows.append([name, rates.fraction_text(rate), rates.interval_text(rate, shared=self.shared)])
+            elif isinstance(rate, rates.PooledRate) and rate.of:
+                fraction = f"{rate.hits:,} of {rate.of:,}: {percent(rate.share)}"
+                rows.append([name, fraction, rates.range_text(rate.lower, rate.upper)])
         grid = Grid(["", self.cases, f"{format_fraction(CONFIDENCE)} interval"], rows)
         blocks = [Block(heading=self.heading, grid=grid, note=self.note)] if rows else []
         return blocks, {self.data: {name: asdict(rate) for name, rate in rates_by_name.items()}}

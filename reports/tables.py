@@ -1,4 +1,7 @@
-"""Tables of verdicts (terminal; texts are `Text` objects, not markup), confirmations, outcomes, error statistics."""
+"""Tables of verdicts and confirmations for terminals, and of outcomes and error statistics for pages.
+
+Cells of terminal tables are `Text` objects, so that brackets in names are not read as markup.
+"""
 
 from __future__ import annotations
 
@@ -121,7 +124,10 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
 
 
 def confirmations_table(entries: Sequence[Confirmation]) -> Table:
-    """Create a table of confirmations for terminals; numbers count those of an algorithm on a campaign."""
+    """Create a table of confirmations (`marsyard run --confirm`) for terminals.
+
+    The column Number counts the confirmations of one algorithm on one campaign.
+    """
     table = Table(title="Confirmations", box=box.SIMPLE_HEAD, title_justify="left")
     for heading in ("Campaign", "Algorithm"):
         table.add_column(heading, overflow="fold")

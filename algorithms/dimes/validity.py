@@ -1,4 +1,4 @@
-"""Checks of tracks: the four validity metrics (section II.A) and the agreement with the IMU (section II.B).
+"""Checks of tracks: the validity metrics (section II.A) and the agreement with the IMU (section II.B).
 
 Sections are those of Johnson et al., "Field Testing of the MER DIMES".
 """

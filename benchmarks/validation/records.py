@@ -35,7 +35,7 @@ class Measure:
         """Whether the limit is met; True without a limit."""
         if self.limit is None:
             return True
-        # NaN exceeds every limit
+        # NaN passes neither limit
         return self.measured <= self.limit if self.sense == "at most" else self.measured >= self.limit
 
 

@@ -320,10 +320,9 @@ def _sample_kernels(path: str) -> tuple[str, Float64[np.ndarray, "n 8"]]:
         with spiceypy.KernelPool([str(kernel) for kernel in kernels]):
             begin, end = (float(spiceypy.str2et(utc)) for utc in (flight.begin, flight.end))
             count = int(np.floor((end - begin) / flight.step_s + 1e-9)) + 1
-            if not 1 < count <= MAX_SPICE_POSES:
-                raise ValueError(
-                    f"begin, end and step_s result in {max(count, 0)} poses; allowed: 2 to {MAX_SPICE_POSES}"
-                )
+            if not MIN_POSES <= count <= MAX_SPICE_POSES:
+                allowed = f"{MIN_POSES} to {MAX_SPICE_POSES}"
+                raise ValueError(f"begin, end and step_s result in {max(count, 0)} poses; allowed: {allowed}")
             times = flight.step_s * np.arange(count)
             positions = spiceypy.spkpos(flight.target, begin + times, flight.world, "NONE", flight.observer)[0]
             rotations = np.stack([spiceypy.pxform(flight.axes, flight.world, begin + time) for time in times])

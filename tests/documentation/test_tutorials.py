@@ -32,6 +32,7 @@ EXPECTED_FILES = {
         "first/campaign.json",
         "first/cases/3/dimes.png",
     ),
+    "custom-lander": ("mylander/report.html",),
     "measured-data": ("checked/report.html",),
     "custom-dynamics": ("powered/report.html",),
     "custom-instrument": ("lidar/report.html",),

@@ -74,7 +74,7 @@ def test_robust_fit_tolerates_almost_half_outliers() -> None:
     assert slope_x == pytest.approx(0.2, abs=2e-3)
     assert slope_y == pytest.approx(-0.1, abs=2e-3)
     assert value == pytest.approx(3.0, abs=0.02)
-    # The slopes of the ordinary least-squares plane are wrong by several tenths.
+    # The constant of the ordinary least-squares plane is wrong by several tenths.
     least_squares = np.linalg.lstsq(np.column_stack([np.ones(100), x, y]), z, rcond=None)[0]
     assert abs(least_squares[0] - 3.0) > 0.3
 
