@@ -92,5 +92,5 @@ def _describe_environments(checks: Sequence[Check], stored: dict[str, dict]) -> 
         common_value = max(groups, key=lambda value: len(groups[value]))
         common.append(f"{label}{common_value}")
         different += [f"{', '.join(names)}: {label}{value}" for value, names in groups.items() if value != common_value]
-    exceptions = "".join(f" Except {exception}." for exception in different)
+    exceptions = f" Exceptions, by the names of checks (`--only NAME`): {'; '.join(different)}." if different else ""
     return f"Measured on {'; '.join(common)}.{exceptions}"

@@ -79,15 +79,15 @@ def limit_states() -> Iterator[tuple[str, LimitState, int, float]]:
     """Yield name, margins, dimension and probability of each limit state."""
     for dimension in (2, 20, 100):
         for probability in PROBABILITIES:
-            name = f"linear, {dimension} dimensions, {probability:g}"
+            name = f"probability {probability:g}, linear, {dimension} variables"
             yield name, linear_margin(dimension, probability), dimension, probability
     for probability in (1e-3, 1e-4):
-        name = f"linear with noise (30 % of the variance), 20 dimensions, {probability:g}"
+        name = f"probability {probability:g}, linear with noise (30 % of the variance), 20 variables"
         yield name, linear_margin(20, probability, 0.3), 20, probability
     rng, n = np.random.default_rng(0), 500_000
     violation_rates = [np.mean(four_branch_margin(rng.standard_normal((n, 2)), np.empty(0)) < 0.0) for _ in range(40)]
     probability = float(np.mean(violation_rates))
-    yield f"four branches, {probability:.3g}", four_branch_margin, 2, probability
+    yield f"probability {probability:.3g}, four regions, 2 variables", four_branch_margin, 2, probability
 
 
 def run_rare(quick: bool) -> Iterator[Measure]:
@@ -103,15 +103,22 @@ def run_rare(quick: bool) -> Iterator[Measure]:
             interval = replicate_interval(estimates, reached, CONFIDENCE)
             covered += interval.lower <= probability <= interval.upper
             widths.append(math.log(interval.upper / interval.lower) if interval.lower > 0.0 else math.inf)
-        how = f"{trials} studies of {REPLICATES} replicates with {SAMPLES} cases per level"
-        yield Measure(f"coverage of the 90 % interval: {name}", covered / trials, "", MIN_COVERAGE, how, "at least")
+        how = f"{trials} studies, each of {REPLICATES} simulations with {SAMPLES} cases per level"
+        yield Measure(
+            f"rare violations, coverage of the 90 % interval: {name}",
+            covered / trials,
+            "",
+            MIN_COVERAGE,
+            how,
+            "at least",
+        )
         if probability in MIN_SAVINGS:
             # n cases of crude Monte Carlo have the interval p exp(+-z sqrt((1 - p) / (n p)))
             z = float(norm.ppf(0.5 * (1.0 + CONFIDENCE)))
             crude_cases = (2.0 * z / float(np.median(widths))) ** 2 * (1.0 - probability) / probability
             savings = crude_cases * trials / cases
             how = f"for an interval of the same width; {cases / trials:.0f} cases"
-            text = f"cases of crude Monte Carlo divided by cases of subset simulation: {name}"
+            text = f"rare violations, cases of counting divided by cases of the study: {name}"
             yield Measure(text, savings, "1", MIN_SAVINGS[probability], how, "at least")
 
 

@@ -52,6 +52,8 @@ _STEP, _MAX_COORDINATE = 0.5, 4.0
 _MIN_START_DISTANCE = 0.5
 #: Maximum distance of violations with the same cause, standard deviations, in the dispersions of the reduced one.
 _MAX_CAUSE_DISTANCE = 1.5
+#: Usual number of cases of one reduction, for the progress report.
+_REDUCTION_CASES = 25
 #: Steps of the bisection of a coordinate.
 _BISECTION_STEPS = 4
 
@@ -194,7 +196,7 @@ class _Study:
             searched = len(self._evaluated)
             found = [item for item in self._evaluated if item.margin < 0.0]
             violations = len(found)
-            observer.begin("reduction", 0)
+            observer.begin("reduction", _REDUCTION_CASES * min(violations, self.settings.max_failures))
             failures = self._reduce_all(found)
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
