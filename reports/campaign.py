@@ -19,9 +19,9 @@ from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
 from marsyard.reports.presentation import presentations, showcase_views
-from marsyard.reports.rare import rare_section
+from marsyard.reports.rare import rare_section, read_result, result_sentences
 from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.search import search_section
+from marsyard.reports.search import read_search, search_section, search_sentences
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
@@ -31,10 +31,13 @@ from marsyard.reports.wording import count, label, number, numbers, primary_metr
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
-    rare_section, search_section, common_sections.answers_section, comparison_section, common_sections.scatter_section,
+    common_sections.answers_section, comparison_section, common_sections.scatter_section,
     common_sections.drivers_section, common_sections.convergence_section, common_sections.consistency_section,
     common_sections.faults_section,
 )  # fmt: skip
+
+#: Sections of a study (`marsyard rare`, `marsyard search`).
+STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section)
 
 #: Maximum number of sites and algorithms in `report.json`.
 _MAX_LISTED = 24
@@ -66,10 +69,13 @@ def write_evaluation(evaluation: Evaluation) -> Path:
     # statistics use only random cases
     exclude_nominal = evaluation.sampling.exclude_nominal_case
     random_run = replace(run, frame=exclude_nominal(run.frame), all_cases=exclude_nominal(run.all_cases))
-    metric = primary_metric(random_run.frame, run.requirements)
+    is_study = bool(run.recorded("study"))
+    # the cases of a study are no random sample, so that statistics of their errors have no meaning
+    metric = None if is_study else primary_metric(random_run.frame, run.requirements)
     bound = next((v.bound / v.scale for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
     subject = Subject(random_run, metric, bound)
-    extra_sections = [section for make in section_makers() if (section := make(subject)) is not None]
+    makers = STUDY_SECTIONS if is_study else section_makers()
+    extra_sections = [section for make in makers if (section := make(subject)) is not None]
     report_data = build_report_data(evaluation, subject, extra_sections)
     algorithms = read_algorithms(run.record)
     write_atomic(directory / REPORT_JSON, json.dumps(report_data, indent=2, allow_nan=False) + "\n")
@@ -100,6 +106,7 @@ def page_context(
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.recorded("description") or ""),
+        "study_sentences": [*result_sentences(read_result(run.record)), *search_sentences(read_search(run.record))],
         "overall_verdict": overall,
         "cautions": [*cautions, *sampling_cautions(run, metric)],
         "interrupted": run.recorded("state") not in (None, "finished"),
@@ -146,7 +153,7 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     """List warnings about the sampling: a design that is not random, plots of a part of the cases, a nominal case."""
     sampling = read_sampling_design(run.configuration)
     texts = []
-    if not sampling.independent:
+    if not sampling.independent and not run.recorded("study"):
         texts.append(
             f"The cases are not independent random samples: {sampling.text}. Statistics describe these cases; "
             "intervals, bounds and probabilities on this page assume independent samples and do not apply to them."

@@ -151,8 +151,8 @@ def _judge_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdic
     if study.get("kind") == "search":
         found = f"{count(int(result.get('violations') or 0), 'violation')} of {study.get('requirement')} found"
         return OverallVerdict(Status.FAIL if result.get("violations") else None, crashed, f"{found}. See the section.")
-    section_text = "See the section on the probability of a violation."
-    return OverallVerdict(Status(result["verdict"]), crashed, f"{study.get('requirement')}. {section_text}")
+    limit = f"a violation of {study.get('requirement')} has a probability of at most {study.get('at_most')}"
+    return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {limit}.")
 
 
 def _shipped_columns(scenario: str) -> RowColumns | None:

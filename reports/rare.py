@@ -38,7 +38,7 @@ def read_result(record: Mapping[str, Any]) -> Mapping[str, Any]:
 def describe_result(directory: Path) -> list[str]:
     """Describe the result of the study in a folder, one sentence each; empty without a result."""
     study = read_result(read_run(directory).record)
-    return result_sentences(study) if study else []
+    return result_sentences(study)
 
 
 def probability_text(value: object) -> str:
@@ -47,7 +47,9 @@ def probability_text(value: object) -> str:
 
 
 def result_sentences(study: Mapping[str, Any]) -> list[str]:
-    """Describe estimate, interval, verdict and cost of a study."""
+    """Describe estimate, interval, verdict and cost of a study; empty without a result."""
+    if not study:
+        return []
     result = table(study.get("result"))
     interval, cases = table(result.get("interval")), int(result["cases"])
     limit = probability_text(study["at_most"])
@@ -110,10 +112,7 @@ def rare_section(subject: Subject) -> Section | None:
         "Probability that a case has at most a margin. Each line is one replicate; a violation is a margin below 0. "
         "Dashed: limit of the probability.",
     )
-    blocks = (
-        Block(text=" ".join(result_sentences(study))),
-        Block("Replicates", figures=[figure], grid=grid, note=note),
-    )
+    blocks = (Block("Replicates", figures=[figure], grid=grid, note=note),)
     data = {**result, "requirement": study["requirement"], "at_most": study["at_most"], "method": study["method"]}
     return Section("rare", "Rare violation", "Probability of a rare violation", blocks, data)
 

@@ -17,7 +17,9 @@ def read_search(record: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def search_sentences(study: Mapping[str, Any]) -> list[str]:
-    """Describe the result of a search: number of violations, reduced violations, and cost."""
+    """Describe the result of a search: violations, reduced violations, and cost; empty without a result."""
+    if not study:
+        return []
     result = table(study.get("result"))
     searched = count(int(result["searched"]), "case")
     total = f"{count(int(result['cases']), 'case')} in all"
@@ -75,7 +77,7 @@ def search_section(subject: Subject) -> Section | None:
         "how unlikely they are; the most likely violation is the first. Each violation has a campaign file in the "
         "folder failures, and nightly.toml lists them for nightly runs."
     )
-    blocks = [Block(text=search_sentences(study)[0])]
-    if rows:
-        blocks.append(Block("Reduced violations", grid=Grid(head, rows), note=note))
-    return Section("search", "Search", "Search for violations", blocks, {**result, "requirement": study["requirement"]})
+    block = Block("Reduced violations", grid=Grid(head, rows), note=note) if rows else Block(text="No violation.")
+    return Section(
+        "search", "Search", "Search for violations", (block,), {**result, "requirement": study["requirement"]}
+    )

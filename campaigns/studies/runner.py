@@ -29,6 +29,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
+from marsyard.sim.kernel_cache import mark_ready
 
 #: Key of a study's settings and results in the record of its folder.
 STUDY_KEY = "study"
@@ -84,7 +85,7 @@ class PointRunner:
         self._is_checked = False
         #: Number of cases evaluated so far.
         self.n_cases = 0
-        #: Function that is called when the first cases have ended.
+        #: Function that is called when the first case has ended.
         self.first_case_ended: Callable[[], None] = lambda: None
 
     def run(self, candidates: Sequence[Candidate]) -> list[Row]:
@@ -120,11 +121,12 @@ class PointRunner:
                     self._observer.note(completed.note)
                 if not self._is_checked and completed.row["outcome"] not in ENGINE_FAILURES:
                     check_metrics(configuration, completed.row, self._directory)
+                    mark_ready(configuration.scenario)
+                    self.first_case_ended()
                     self._is_checked = True
                 rows[int(completed.row["case"])] = completed.row
                 self._observer.step()
         self.n_cases += len(candidates)
-        self.first_case_ended()
         return [rows[case] for case in points]
 
 
