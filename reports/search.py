@@ -42,7 +42,7 @@ def failure_sentence(index: int, failure: Mapping[str, Any]) -> str:
     margin = failure["margin"]
     margin_text = f"margin {number(float(margin))}" if margin is not None else str(failure["outcome"])
     return (
-        f"{index}. {values or 'No dispersion is needed'}, all else as in the campaign: {margin_text} (case "
+        f"{index}. {values or 'No dispersion is needed'}, other parameters not dispersed: {margin_text} (case "
         f"{failure['case']}); {failure['repeated']} of {failure['repetitions']} repetitions with new random streams "
         "violate the requirement."
     )
