@@ -151,7 +151,7 @@ def _judge_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdic
     if study.get("kind") == "search":
         found = f"{count(int(result.get('violations') or 0), 'violation')} of {study.get('requirement')} found"
         return OverallVerdict(Status.FAIL if result.get("violations") else None, crashed, f"{found}. See the section.")
-    limit = f"a violation of {study.get('requirement')} has a probability of at most {study.get('at_most')}"
+    limit = f"a violation of {study.get('requirement')} has a probability of at most {study.get('max_probability')}"
     return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {limit}.")
 
 

@@ -52,7 +52,7 @@ def result_sentences(study: Mapping[str, Any]) -> list[str]:
         return []
     result = table(study.get("result"))
     interval, cases = table(result.get("interval")), int(result["cases"])
-    limit = probability_text(study["at_most"])
+    limit = probability_text(study["max_probability"])
     method = "subset simulation" if study["method"] == "subset" else "importance sampling"
     bounds = f"{probability_text(interval.get('lower'))} to {probability_text(interval.get('upper'))}"
     sentences = [
@@ -85,7 +85,7 @@ def result_sentences(study: Mapping[str, Any]) -> list[str]:
 
 
 def rare_section(subject: Subject) -> Section | None:
-    """Create the section of a rare study; None for another campaign."""
+    """Create the section of a study of rare violations; None for another run."""
     study = read_result(subject.run.record)
     if not study:
         return None
@@ -107,18 +107,23 @@ def rare_section(subject: Subject) -> Section | None:
         "is too small."
     )
     figure = svg_figure(
-        _draw_levels(replicates, float(study["at_most"])),
+        _draw_levels(replicates, float(study["max_probability"])),
         "rare-levels",
         "Probability that a case has at most a margin. Each line is one replicate; a violation is a margin below 0. "
         "Dashed: limit of the probability.",
     )
     blocks = (Block("Replicates", figures=[figure], grid=grid, note=note),)
-    data = {**result, "requirement": study["requirement"], "at_most": study["at_most"], "method": study["method"]}
+    data = {
+        **result,
+        "requirement": study["requirement"],
+        "max_probability": study["max_probability"],
+        "method": study["method"],
+    }
     return Section("rare", "Rare violation", "Probability of a rare violation", blocks, data)
 
 
 @in_page_style
-def _draw_levels(replicates: list[Mapping[str, Any]], at_most: float) -> Figure:
+def _draw_levels(replicates: list[Mapping[str, Any]], max_probability: float) -> Figure:
     figure, axes = new_axes(6.0, 3.4)
     for index, item in enumerate(replicates[:_MAX_DRAWN]):
         thresholds = [value for value in item["thresholds"] if value is not None]
@@ -127,6 +132,6 @@ def _draw_levels(replicates: list[Mapping[str, Any]], at_most: float) -> Figure:
         probabilities = [*probabilities, item["probability"]] if item["reached"] else probabilities
         style: dict[str, Any] = {"color": SERIES[index % len(SERIES)], "marker": MARKERS[index % len(MARKERS)]}
         axes.plot(margins, probabilities, markersize=4, linewidth=1.0, **style)
-    axes.axhline(at_most, color=REQUIREMENT, linestyle="--", linewidth=1.0)
+    axes.axhline(max_probability, color=REQUIREMENT, linestyle="--", linewidth=1.0)
     axes.set(yscale="log", xlabel="margin, unit of the requirement", ylabel="probability of at most this margin")
     return figure

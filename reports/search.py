@@ -1,4 +1,7 @@
-"""Results of a search for violations (`marsyard.campaigns.studies.search`): sentences, and a section of the report."""
+"""Results of a search for violations (`marsyard.campaigns.studies.search`): sentences, and a section of the report.
+
+A reduced violation is a violating case in which as few parameters as possible differ from those of the campaign file.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from marsyard.reports.wording import NOTHING, count, number
 
 
 def read_search(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the settings of a search with its `result`; empty for another folder or an unfinished study."""
+    """Return the settings of a search with its `result`; empty for a run that is no search, or is not finished."""
     study = table(record.get("study"))
     return study if study.get("kind") == "search" and table(study.get("result")) else {}
 
@@ -42,9 +45,9 @@ def failure_sentence(index: int, failure: Mapping[str, Any]) -> str:
     margin = failure["margin"]
     margin_text = f"margin {number(float(margin))}" if margin is not None else str(failure["outcome"])
     return (
-        f"{index}. {values or 'No dispersion is needed'}, other parameters not dispersed: {margin_text} (case "
-        f"{failure['case']}); {failure['repeated']} of {failure['repetitions']} repetitions with new random streams "
-        "violate the requirement."
+        f"{index}. {values or 'The parameters of the campaign file'}, other parameters not dispersed: {margin_text} "
+        f"(case {failure['case']}); {failure['repeated']} of {failure['repetitions']} repetitions with new random "
+        "streams violate the requirement."
     )
 
 
@@ -54,7 +57,7 @@ def value_text(value: object) -> str:
 
 
 def search_section(subject: Subject) -> Section | None:
-    """Create the section of a search; None for another campaign."""
+    """Create the section of a search; None for a run that is no search."""
     study = read_search(subject.run.record)
     if not study:
         return None

@@ -1,4 +1,4 @@
-"""Contents of the report's page: rows of its tables, figures with captions, and the points of its explorer."""
+"""Contents of the report's page: rows of tables, figures with captions, and points of the interactive scatter plot."""
 
 from __future__ import annotations
 

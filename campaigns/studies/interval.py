@@ -71,19 +71,19 @@ def weighted_interval(contributions: Sequence[float], confidence: float) -> Prob
     return ProbabilityInterval(mean, mean / factor, min(mean * factor, 1.0), confidence, relative_error)
 
 
-def decide(interval: ProbabilityInterval, at_most: float) -> RareVerdict:
+def decide(interval: ProbabilityInterval, max_probability: float) -> RareVerdict:
     """Compare the bounds of a probability with its limit."""
-    if interval.upper <= at_most:
+    if interval.upper <= max_probability:
         return RareVerdict.PASS
-    return RareVerdict.FAIL if interval.lower > at_most else RareVerdict.INSUFFICIENT
+    return RareVerdict.FAIL if interval.lower > max_probability else RareVerdict.INSUFFICIENT
 
 
-def additional_replicates(interval: ProbabilityInterval, replicates: int, at_most: float) -> int | None:
+def additional_replicates(interval: ProbabilityInterval, replicates: int, max_probability: float) -> int | None:
     """Estimate the number of additional replicates that decide the verdict; None if the estimate equals the limit.
 
     The spread of the replicates is assumed to remain the same.
     """
-    distance = abs(math.log(at_most / interval.estimate)) if interval.estimate > 0.0 else math.inf
+    distance = abs(math.log(max_probability / interval.estimate)) if interval.estimate > 0.0 else math.inf
     if distance == 0.0:
         return None
     variance, confidence = interval.log_sd**2, interval.confidence

@@ -61,7 +61,7 @@ _IMPORTANCE_BATCH = 100
 class RareSettings:
     """Settings of the study.
 
-    - requirement: id of the requirement; at_most: limit of the probability that a case violates it
+    - requirement: id of the requirement; max_probability: limit of the probability that a case violates it
     - method: see `METHODS`
     - samples: cases per level of one subset simulation
     - replicates: numbers of replicates that run together: those of the first run, and of each continuation
@@ -70,7 +70,7 @@ class RareSettings:
     """
 
     requirement: str
-    at_most: float
+    max_probability: float
     method: str = "subset"
     samples: int = 200
     replicates: tuple[int, ...] = (6,)
@@ -79,7 +79,7 @@ class RareSettings:
 
     def __post_init__(self) -> None:
         problems = {
-            f"--at-most {self.at_most}: allowed: above 0 and below 1": 0.0 < self.at_most < 1.0,
+            f"--max-probability {self.max_probability}: allowed: above 0 and below 1": 0.0 < self.max_probability < 1.0,
             f"--method {self.method}: allowed: {', '.join(METHODS)}": self.method in METHODS,
             f"--samples {self.samples}: at least 50": self.samples >= 50,
             f"--replicates {self.replicates[0]}: at least 2": self.replicates[0] >= 2,
@@ -216,10 +216,10 @@ class _Study:
                     f"Importance sampling has only {effective:.0f} effective violations, fewer than "
                     f"{MIN_EFFECTIVE_VIOLATIONS:.0f}: its interval is not reliable. Use more cases, or --method subset."
                 )
-        verdict = RareVerdict.INSUFFICIENT if reason else decide(interval, settings.at_most)
+        verdict = RareVerdict.INSUFFICIENT if reason else decide(interval, settings.max_probability)
         additional = None
         if verdict is RareVerdict.INSUFFICIENT and not contributions:
-            needed = additional_replicates(subset_interval, len(results), settings.at_most)
+            needed = additional_replicates(subset_interval, len(results), settings.max_probability)
             cases_per_replicate = self._runner.n_cases / len(results)
             additional = None if needed is None else math.ceil(needed * cases_per_replicate)
         return self._finish(verdict, interval, results, subset_interval, effective, additional, reason)
@@ -256,7 +256,7 @@ class _Study:
 
     def _max_cases_of(self, replicates: int) -> int:
         """Compute the number of cases of replicates that reach their least likely level."""
-        levels = math.ceil(-math.log10(_MIN_PROBABILITY_FRACTION * self._settings.at_most))
+        levels = math.ceil(-math.log10(_MIN_PROBABILITY_FRACTION * self._settings.max_probability))
         return math.ceil(replicates * self._settings.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
 
     def _generator(self, name: str) -> np.random.Generator:
@@ -266,7 +266,7 @@ class _Study:
     def _run_replicates(self, numbers: range) -> list[SubsetResult]:
         """Run subset simulations side by side: the next cases of all of them are evaluated together."""
         settings, dimension = self._settings, len(self._campaign.drawn_paths)
-        min_probability = _MIN_PROBABILITY_FRACTION * settings.at_most
+        min_probability = _MIN_PROBABILITY_FRACTION * settings.max_probability
         runs = {
             number: subset_simulation(
                 dimension, settings.samples, min_probability, self._generator(f"subset simulation {number}")

@@ -25,7 +25,7 @@ class RareOptions:
 
     campaign: options.CampaignArgument
     requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign whose violations are rare.")]
-    at_most: Annotated[
+    max_probability: Annotated[
         float, Option(metavar="P", help="Maximum probability of a violation per case, such as 1e-4.")
     ] = 1e-4
     method: Annotated[
@@ -53,7 +53,7 @@ def rare(arguments: RareOptions) -> None:
 
     settings = RareSettings(
         arguments.requirement,
-        arguments.at_most,
+        arguments.max_probability,
         arguments.method,
         arguments.samples,
         (arguments.replicates,),

@@ -73,7 +73,18 @@ def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: 
 
 @pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
-    options = ["--requirement", "LOAD", "--at-most", "1e-2", "--samples", "100", "--replicates", "3", "--jobs", "2"]
+    options = [
+        "--requirement",
+        "LOAD",
+        "--max-probability",
+        "1e-2",
+        "--samples",
+        "100",
+        "--replicates",
+        "3",
+        "--jobs",
+        "2",
+    ]
     command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--set", "sleep_s=0.02"]
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     with subprocess.Popen([*command, "--out", str(killed)], stderr=subprocess.DEVNULL) as process:
@@ -150,13 +161,13 @@ def test_changed_program_is_rejected(campaign_path: Path, tmp_path: Path) -> Non
         ("LOAD", {"samples": 10}, "--samples 10"),
         ("LOAD", {"method": "guess"}, "--method guess: allowed: subset, importance"),
         ("LOAD", {"replicates": (1,)}, "--replicates 1: at least 2"),
-        ("LOAD", {"at_most": 0.0}, "--at-most"),
+        ("LOAD", {"max_probability": 0.0}, "--max-probability"),
     ],
 )
 def test_wrong_settings_are_explained(
     campaign_path: Path, tmp_path: Path, requirement: str, changes: dict[str, object], message: str
 ) -> None:
-    values = {"requirement": requirement, "at_most": 1e-2, **changes}
+    values = {"requirement": requirement, "max_probability": 1e-2, **changes}
     with pytest.raises(CampaignError, match=message):
         start(campaign_path, tmp_path / "run", RareSettings(**values))  # type: ignore[arg-type]
     assert not (tmp_path / "run").exists()
@@ -175,7 +186,7 @@ def test_campaign_file_cannot_be_adaptive(campaign_path: Path) -> None:
 
 
 def test_report_shows_the_verdict_of_the_study(campaign_path: Path, tmp_path: Path) -> None:
-    options = ["--requirement", "LOAD", "--at-most", "1e-2", "--samples", "100", "--jobs", "1"]
+    options = ["--requirement", "LOAD", "--max-probability", "1e-2", "--samples", "100", "--jobs", "1"]
     command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--out", str(tmp_path / "run")]
     completed = subprocess.run(command, capture_output=True, text=True, check=False)
     assert completed.returncode == 0, completed.stderr
