@@ -93,11 +93,15 @@ def compare(
 
     The exit status is 0 even if the campaigns differ.
     """
+    from marsyard.campaigns.errors import CampaignError
     from marsyard.cli.showing import grid_table
     from marsyard.reports import comparison
     from marsyard.reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
+    for run in runs:
+        if run.recorded("study"):
+            raise CampaignError(f"{run.directory} contains a study: its cases are chosen, so rates cannot be compared")
     is_paired, differences = comparison.compare_campaigns(*runs)
     names, have_same_terrains = [str(run.directory) for run in runs], comparison.have_same_terrains(*runs)
     if as_json:

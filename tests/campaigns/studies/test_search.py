@@ -122,3 +122,11 @@ def test_search_is_not_a_study_of_rare_violations(campaign_path: Path, tmp_path:
     start(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
     with pytest.raises(CampaignError, match="does not contain a study of rare violations"):
         continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+
+
+def test_rates_of_studies_cannot_be_compared(campaign_path: Path, tmp_path: Path) -> None:
+    start(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
+    command = [sys.executable, "-m", "marsyard", "compare", str(tmp_path / "run"), str(tmp_path / "run")]
+    completed = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert completed.returncode == 2
+    assert "contains a study" in completed.stderr
