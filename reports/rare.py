@@ -133,5 +133,7 @@ def _draw_levels(replicates: list[Mapping[str, Any]], max_probability: float) ->
         style: dict[str, Any] = {"color": SERIES[index % len(SERIES)], "marker": MARKERS[index % len(MARKERS)]}
         axes.plot(margins, probabilities, markersize=4, linewidth=1.0, **style)
     axes.axhline(max_probability, color=REQUIREMENT, linestyle="--", linewidth=1.0)
-    axes.set(yscale="log", xlabel="margin, unit of the requirement", ylabel="probability of at most this margin")
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(lambda value, _: probability_text(value))
+    axes.set(xlabel="margin, unit of the requirement", ylabel="probability of at most this margin")
     return figure

@@ -217,6 +217,9 @@ class _Study:
                     f"{MIN_EFFECTIVE_VIOLATIONS:.0f}: its interval is not reliable. Use more cases, or --method subset."
                 )
         verdict = RareVerdict.INSUFFICIENT if reason else decide(interval, settings.max_probability)
+        evidence = self._runner.evidence
+        if verdict is RareVerdict.PASS and evidence.withheld:
+            verdict, reason = RareVerdict.INSUFFICIENT, f"The verdict would be PASS. {evidence.text}"
         additional = None
         if verdict is RareVerdict.INSUFFICIENT and not contributions:
             needed = additional_replicates(subset_interval, len(results), settings.max_probability)

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.evidence import Evidence, classify_evidence, freeze_algorithm
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
 from marsyard.campaigns.execution.cases import run_cases
@@ -26,6 +27,7 @@ from marsyard.campaigns.sampling.design import ADAPTIVE, Design
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, Grid
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.confirmations import read_confirmations
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
@@ -87,6 +89,11 @@ class PointRunner:
         self.n_cases = 0
         #: Function that is called when the first case has ended.
         self.first_case_ended: Callable[[], None] = lambda: None
+
+    @property
+    def evidence(self) -> Evidence:
+        """Kind of evidence of the study's seed."""
+        return Evidence.read(record.read(self._directory).get("evidence"))
 
     def run(self, candidates: Sequence[Candidate]) -> list[Row]:
         """Evaluate points in parallel; return their rows in the same order.
@@ -158,9 +165,16 @@ def find_requirement(campaign: Campaign, requirement_id: str) -> Requirement:
 def create_study(campaign: Campaign, directory: Path, executor: str, settings: dict[str, Any]) -> None:
     """Create the folder of a study; `settings` are stored in its record. Raises StoreError like a campaign's folder."""
     identity = create_identity(campaign.configuration)
+    confirmations = read_confirmations(campaign.confirmations)
+    evidence = classify_evidence(campaign, confirmations, freeze_algorithm(campaign))
     create_store(directory / ROWS_FILE, {"identity": identity.configuration})
     record.write_first_record(
-        directory, campaign.configuration, identity, executor, command=(), algorithms=describe_algorithms(campaign)
+        directory,
+        campaign.configuration,
+        identity,
+        executor,
+        algorithms=describe_algorithms(campaign),
+        evidence=evidence.to_table(),
     )
     record.update(directory, {STUDY_KEY: settings})
 

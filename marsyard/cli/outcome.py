@@ -71,7 +71,8 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
         refresh_table(directory)
     evaluation, page = evaluate_and_store(directory, requirements)
     run, verdicts = evaluation.run, evaluation.verdicts
-    console.print(verdict_table(verdicts))
+    if not run.recorded("study"):
+        console.print(verdict_table(verdicts))
     for table in _comparison_tables(evaluation.sampling.exclude_nominal_case(run.frame), run.requirements, verdicts):
         console.print(table)
     lines = [f"verdict: {evaluation.overall_verdict.word}", evaluation.overall_verdict.sentence]
