@@ -229,15 +229,16 @@ def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _N_BINS) -
 
 @dataclass(frozen=True)
 class OutcomesBySize:
-    """Outcomes of cases by fault type and severity: a table and stacked bars.
+    """Outcomes of cases by type and severity of their fault: a table and stacked bars.
 
     - outcomes: function that returns a mask of the rows for each outcome, by its key in `report.json`; the table shows
       a confidence interval for the last outcome
     - styles: for each outcome, its label and the style of its bars (`marsyard.reports.section.BARS`), in order
     - cases: heading of the number of rows
     - wording: function that returns fault type and severity in words; an unknown severity is empty
-    - extra_columns: heading, key of `report.json`, function of the rows, and function that formats its value
-    - kind, size, none: columns of fault type and severity, and the type of cases without a fault
+    - extra_columns: further columns of the table, each with its heading, its key in `report.json`, a function that
+      computes its value from the rows, and a function that formats the value
+    - kind, size: columns of the rows with fault type and severity; none: fault type of cases without a fault
     """
 
     outcomes: Callable[[Rows, Subject], Mapping[str, Bool[np.ndarray, " n"]]]
@@ -259,7 +260,7 @@ class OutcomesBySize:
             last_outcome = [*self.styles][-1]
             last_fraction = rates.fraction_of(masks[last_outcome], rows)
             counts = {name: int(mask.sum()) for name, mask in masks.items()}
-            values = {name: value(rows) for _, name, value, _ in self.extra_columns}
+            values = {name: compute(rows) for _, name, compute, _ in self.extra_columns}
             head = {self.kind: kind, "size": size, "n": len(rows)}
             records.append({**head, **counts, f"{last_outcome}_fraction": last_fraction, **values})
         return records
@@ -278,15 +279,15 @@ class OutcomesBySize:
         rows = [
             [
                 *(name, size or NOTHING, f"{record['n']:,}"),
-                *(f"{record[kind]:,} ({percent(record[kind] / record['n'])})" for kind in self.styles),
+                *(f"{record[outcome]:,} ({percent(record[outcome] / record['n'])})" for outcome in self.styles),
                 rates.interval_text(record[f"{last}_fraction"]),
-                *(text(record[name]) for _, name, _, text in self.extra_columns),
+                *(format_value(record[name]) for _, name, _, format_value in self.extra_columns),
             ]
             for record, (name, size) in zip(records, texts, strict=True)
         ]
         percentages = {
-            name: (style, [100.0 * record[kind] / record["n"] for record in records])
-            for kind, (name, style) in self.styles.items()
+            name: (style, [100.0 * record[outcome] / record["n"] for record in records])
+            for outcome, (name, style) in self.styles.items()
         }
         figure = stacked_bars([" ".join(pair).strip() for pair in texts], percentages, f"% of {self.cases.lower()}")
         caption = self.caption or " ".join(f"{style.capitalize()}: {name}." for name, style in self.styles.values())
@@ -328,7 +329,7 @@ class Distribution:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Mean, standard deviation and quantiles of a column and of its signed parts, with intervals."""
+    """Mean, standard deviation and quantiles of an error and of its signed components (x and y), with intervals."""
 
     column: str
     heading: str = ""
@@ -342,7 +343,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Quantiles:
-    """Quantiles of quantities; `columns` maps headings to probabilities."""
+    """Quantiles of quantities; `columns` maps headings to probabilities, `data` is the key of the number of rows."""
 
     quantities: Sequence[Quantity]
     columns: Mapping[str, float]

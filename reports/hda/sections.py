@@ -145,7 +145,10 @@ FAULTS = kinds.SectionDeclaration("landing-faults", "Faults", "Faults by size", 
 
 
 def map_rows(subject: Subject) -> pd.DataFrame | None:
-    """Select cases with a map and add errors relative to height and range; None for too few or equal conditions."""
+    """Select cases with a map, and add errors relative to height and range.
+
+    Returns None for fewer than `MIN_MAPS` maps, or if texture or baseline do not vary.
+    """
     frame = landing_rows(subject)
     if frame is None or not (rates.varies(frame, "texture") and rates.varies(frame, "baseline_fraction")):
         return None

@@ -88,6 +88,7 @@ def take_images(p: LandingScenarioParameters, world: World, flight: Flight, opti
     """Take both images of a flight; the first image determines the exposure of both."""
     settings = add_detector_faults(p.faults, p.detector)
     detector = Detector.draw(optics.fall_off, settings, streams.generator("detector response"))
+    # a disc at the camera casts the vehicle's shadow; a fault can enlarge it
     shadow_disc_m = max(p.lander.caster_diameter_m, p.faults.vehicle_shadow_m)
     lowest = min(flight.states, key=lambda state: float(state.position_m[2]))
     # one scene for both images, with the level of detail for the lower image
@@ -121,19 +122,19 @@ def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: S
     calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
     camera = calibrated.bin(columns=1, rows=p.detector.rows_summed)
     first, second = (replace(image, camera=camera) for image in pair.images)
-    axis_m = (slant if np.isfinite(slant) else p.height_m) * camera.a
+    camera_to_site_m = (slant if np.isfinite(slant) else p.height_m) * camera.a
     return LandingMeasurements(
         images=(first, second),
         poses=flight.poses,
         slant_range_m=slant,
         up_body=flight.up_body,
-        apriori_site_world=np.asarray(flight.poses[0].world_from_body.apply(axis_m)),
+        apriori_site_world=np.asarray(flight.poses[0].world_from_body.apply(camera_to_site_m)),
     )
 
 
 #: Spacing of the ground-truth grid divided by the diameter of a footprint: 0.2 m for a footprint of 2 m.
 STEP_DIAMETERS = 0.1
-#: Width of the relief outside the visible ground, in footprint diameters, for footprints and landings there.
+#: Width of the margin of relief around the visible ground, in footprint diameters: touchdowns can lie outside it.
 MARGIN_DIAMETERS = 1.5
 #: Values of a hazard map: the footprint around the pixel's ground point is safe, unsafe, or partly out of view.
 SAFE, UNSAFE, UNKNOWN = 0, 1, 255
@@ -246,7 +247,7 @@ class RenderedFlight:
 #: Bounds of the classes of slope or roughness divided by its limit, and the names of the classes.
 CLASS_BOUNDS = (1.0, 1.5, 2.0, 3.0)
 CLASS_NAMES = ("below_1", "1_to_1.5", "1.5_to_2", "2_to_3", "above_3")
-#: Gross hazards (criterion 2 of the validation): minimum diameter in map cells, and minimum roughness / limit.
+#: Gross hazards: minimum diameter in map cells, and minimum roughness / limit.
 MIN_GROSS_CELLS, MIN_GROSS_ROUGHNESS = 3.0, 2.0
 
 
@@ -257,7 +258,7 @@ class SampledMap:
     #: whether the map has slope and roughness at the position, and both images show the whole footprint
     valid: Bool[np.ndarray, "rows columns"]
     safe: Bool[np.ndarray, "rows columns"]  #: whether the map classifies the position as safe
-    flagged: Bool[np.ndarray, "rows columns"]  #: whether a hazard cell, before growth, is under the lander
+    flagged: Bool[np.ndarray, "rows columns"]  #: whether a hazard cell, before dilation, is under the lander
     slope_rad: Float[np.ndarray, "rows columns"]
 
     @classmethod
@@ -287,7 +288,10 @@ def count_hazards(ground: Ground, sampled: SampledMap, truth: GroundTruth) -> di
 
     - `footprints_*`: number of footprints
     - `footprints_*_safe`: number that the map classifies as safe
-    - `footprints_*_unflagged`: number without a hazard cell before growth
+    - `footprints_*_unflagged`: number without a hazard cell, before the algorithm dilates the hazard cells
+
+    Over all classes, `footprints_called_safe` counts the footprints that the map classifies as safe, and
+    `footprints_called_safe_unsafe` those of them that are unsafe in truth.
 
     `gross_*` hazards have at least twice the roughness limit and a diameter of at least three cells. `false_alarms` are
     safe footprints with a hazard cell; `missed` are unsafe footprints without one.

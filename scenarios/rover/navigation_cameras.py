@@ -21,10 +21,12 @@ from marsyard.sim.render import PixelRays
 from marsyard.sim.sensor import Detector, StereoHead, natural_fall_off, preset, stereo_mast
 from marsyard.sim.streams import Streams
 
-#: Preset of the mast's navigation cameras by the preset of the tracking cameras, and preset of the body's cameras.
+#: Presets of the mast's navigation cameras; keys: presets of the tracking cameras.
 NAVCAMS = {"mer-navcam": "mer-navcam", "research-navcam": "research-navcam", "research-pancam": "research-navcam"}
+#: Preset of the body's hazard cameras.
 HAZCAM = "mer-hazcam"
-#: Rays along each side of a pixel at an edge, for odometry and for the map. Block matching does not need antialiasing.
+#: Supersampling of edge pixels (rays along each side of a pixel) for odometry and for the map. Block matching does not
+#: need antialiasing.
 ODOMETRY_EDGE_RAYS, MAP_EDGE_RAYS = 2, 1
 #: Circle that contains the imaged ground near the rover, for the test of the rover's shadow: distance ahead and radius,
 #: metres.
@@ -50,6 +52,7 @@ class _StereoPair:
         binned = [(mast.left.scale(factor), mast.right.scale(factor)) for mast in (head.true, head.calibrated)]
         settings, rng = preset(name).detector.bin(p.navigation.binning), streams.generator(f"{name} response")
         left, right = (Detector.draw(natural_fall_off(camera), settings, rng) for camera in binned[0])
+        # the exposure is metered in the binned image, which is the whole subframe
         exposure = p.exposure.model_copy(update={"of": "subframe"})
         parameters = p.model_copy(update={"exposure": exposure})
         camera = StereoCamera(parameters, (left, right), streams.generator(f"{name} noise"))
@@ -106,12 +109,13 @@ class NavigationCameras:
             mast = _StereoPair.draw(p, name, head, streams)
         if uses_map and any((leg.autonav or leg.maps_first) and leg.map_by == "body" for leg in p.legs):
             left, right = preset(HAZCAM).cameras()
+            # calibration errors of the body's cameras are drawn like those of a mast's cameras
             design = MastCalibration(rig.calibrated.geometry, left, right)
             head = StereoHead.draw(design, p.stereo, streams.generator("hazcam calibration"))
             body = _StereoPair.draw(p, HAZCAM, head, streams)
-        stance = STANCES[HAZCAM]
-        tilt = Rotation.from_rotvec([0.0, -np.radians(stance.elevation_deg), 0.0])
-        return cls(mast, body, rigid(tilt, np.array(stance.on_rover_m)))
+        mounting = STANCES[HAZCAM]
+        tilt = Rotation.from_rotvec([0.0, -np.radians(mounting.elevation_deg), 0.0])
+        return cls(mast, body, rigid(tilt, np.array(mounting.on_rover_m)))
 
     def take_mast_pair(
         self,

@@ -43,11 +43,11 @@ def _compare_with_ray_cast(frame: Frame, scene: Scene, count: int, step: float) 
     points = frame.points_world().reshape(-1, 3)[pixels]
     to_sun = scene.sun.direction
     cos_incidence = frame.normal.reshape(-1, 3)[pixels].astype(np.float64) @ to_sun
-    fraction = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(cos_incidence, 1e-6))
+    sun_fraction = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(cos_incidence, 1e-6))
     is_shaded = Ground(scene.surface).is_occluded(points, to_sun, step)
     rays = np.broadcast_to(to_sun, points.shape)
     is_shaded |= np.isfinite(cast_triangles(scene.objects, points, rays, nearest=2e-3))
-    actual, expected = (cos_incidence > 0.0) & (fraction > 0.5), (cos_incidence > 0.0) & ~is_shaded
+    actual, expected = (cos_incidence > 0.0) & (sun_fraction > 0.5), (cos_incidence > 0.0) & ~is_shaded
     return float(np.mean(actual == expected)), float(np.mean((cos_incidence > 0.0) & is_shaded))
 
 
@@ -146,6 +146,7 @@ def test_shadow_sweep_of_an_area_equals_the_full_sweep(terrain: Surface, azimuth
     assert len(area) < len(full)
     x, y = (np.arange(int(a / spacing) - 1, int(b / spacing) + 3) for a, b in (area_m[:2], area_m[2:]))
     rows, columns = (x, y) if full_shadow.along_x else (y, x)
+    # grids are periodic; their number of rows and columns is a power of 2
     full_values, part_values = (
         grid[np.ix_(rows & (len(grid) - 1), columns & (len(grid) - 1))] for grid in (full, area)
     )
@@ -172,6 +173,7 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
     assert is_sun_above_slopes(just_above, max_slopes)
     assert slope_bounds(terrain, just_above) == max_slopes
     assert not is_sun_above_slopes(just_below, max_slopes)
+    # below this elevation ground may hide part of the sun, which infinite bounds report
     assert slope_bounds(terrain, just_below) == (np.inf, np.inf)
     # The sweep finds no shadow; the tolerance covers rounding.
     shadow = ground_shadow(terrain, just_above, height_range(terrain.levels[0]))
@@ -183,16 +185,19 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
 
 
 def test_bounds_contain_all_ground_in_a_cone() -> None:
+    """The ground is not below -0.4 m. Positions are drawn in the cone, most of them near that height."""
+    lowest_m = -0.4
     rng = np.random.default_rng(2)
     apex, half_angle_rad = np.array([3.0, -2.0, 1.5]), 0.12
     axis = direction(2.0, -0.3)
-    bounds = ground_in_cones([(apex, axis, half_angle_rad)], -0.4)
+    bounds = ground_in_cones([(apex, axis, half_angle_rad)], lowest_m)
     assert bounds is not None
     rays = axis + np.tan(half_angle_rad) * rng.uniform(-1.0, 1.0, (20000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     rays = rays[rays @ axis >= np.cos(half_angle_rad)]
-    positions = apex + (rng.uniform(0.0, 1.0, len(rays)) ** 0.1 * (-0.4 - apex[2]) / rays[:, 2])[:, None] * rays
+    positions = apex + (rng.uniform(0.0, 1.0, len(rays)) ** 0.1 * (lowest_m - apex[2]) / rays[:, 2])[:, None] * rays
     low, high = np.array(bounds).reshape(2, 2).T
     assert np.all((positions[:, :2] > low) & (positions[:, :2] < high))
     assert np.all(high - low < 1.1 * np.ptp(np.vstack([positions, apex])[:, :2], axis=0))
-    assert ground_in_cones([(apex, direction(2.0, -0.1), half_angle_rad)], -0.4) is None
+    # a cone that contains the horizon has no bounds
+    assert ground_in_cones([(apex, direction(2.0, -0.1), half_angle_rad)], lowest_m) is None
