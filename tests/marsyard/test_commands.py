@@ -23,7 +23,7 @@ PRINTING = {
 }
 WRITING = {
     "run", "resume", "append", "replay", "report", "dashboard", "nightly", "gallery", "render", "dataset", "new",
-    "ingest", "export", "score", "compile",
+    "ingest", "export", "score", "compile", "rare", "search",
 }  # fmt: skip
 
 

@@ -193,7 +193,12 @@ def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
         ("latin-hypercube", 1, {"nominal": True}, "no case remains"),
         ("latin-hypercube", 2**20 + 1, {}, "has at most 1048576 cases"),
         ("sobol", 8, {"extra_keys": "appended = [8, 3]"}, "appended[1]: 3 cases do not fit the sampling design"),
-        ("halton", 8, {}, "design.kind: input should be 'random', 'latin-hypercube' or 'sobol', got 'halton'"),
+        (
+            "halton",
+            8,
+            {},
+            "design.kind: input should be 'random', 'latin-hypercube', 'sobol' or 'adaptive', got 'halton'",
+        ),
     ],
 )
 def test_invalid_designs_are_rejected(

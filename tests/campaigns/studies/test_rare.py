@@ -86,8 +86,9 @@ def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path
     resumed = subprocess.run(
         [sys.executable, "-m", "marsyard", "resume", str(killed)], capture_output=True, text=True, check=False
     )
-    undisturbed = subprocess.run([*command, "--out", str(whole)], capture_output=True, text=True, check=False)
-    assert resumed.returncode == undisturbed.returncode, resumed.stderr
+    settings = RareSettings("LOAD", 0.1, samples=50, replicates=(2,))
+    undisturbed = start(campaign_path, whole, settings, "sleep_s=0.03", max_cases=20_000)
+    assert resumed.returncode == undisturbed.exit_code, resumed.stderr
     assert "Probability of a violation per case" in resumed.stdout
     assert rows_without_times(killed) == rows_without_times(whole)
     assert record.read(killed)["study"]["result"] == record.read(whole)["study"]["result"]

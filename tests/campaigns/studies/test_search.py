@@ -72,17 +72,8 @@ def test_limit_of_cases_ends_the_search(campaign_path: Path, tmp_path: Path) -> 
 
 @pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "marsyard",
-        "search",
-        str(campaign_path),
-        "--requirement",
-        "VELOCITY",
-        "--jobs",
-        "2",
-    ]
+    options = ["--requirement", "VELOCITY", "-n", "150", "--jobs", "2"]
+    command = [sys.executable, "-m", "marsyard", "search", str(campaign_path), *options]
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     with subprocess.Popen([*command, "--out", str(killed)], stderr=subprocess.DEVNULL) as process:
         log, deadline = killed / "cases.sqlite-wal", time.monotonic() + 120.0
@@ -92,21 +83,21 @@ def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_pat
     resumed = subprocess.run(
         [sys.executable, "-m", "marsyard", "resume", str(killed)], capture_output=True, text=True, check=False
     )
-    undisturbed = subprocess.run([*command, "--out", str(whole)], capture_output=True, text=True, check=False)
-    assert resumed.returncode == undisturbed.returncode == 1, resumed.stderr
+    undisturbed = start(campaign_path, whole, SearchSettings("VELOCITY", 150))
+    assert resumed.returncode == undisturbed.exit_code == 1, resumed.stderr
     assert record.read(killed)["study"]["result"] == record.read(whole)["study"]["result"]
     # the campaign file of the reduced violation violates the requirement in each of its cases
-    (plan,) = tomllib.loads((whole / "failures" / "nightly.toml").read_text())["campaigns"][:1]
-    file = whole / "failures" / plan["campaign"]
-    options = ["--out", str(tmp_path / "regression"), "--jobs", "1"]
+    (plan,) = tomllib.loads((killed / "failures" / "nightly.toml").read_text())["campaigns"][:1]
+    file = killed / "failures" / plan["campaign"]
+    run_options = ["--out", str(tmp_path / "regression"), "--jobs", "1"]
     regression = subprocess.run(
-        [sys.executable, "-m", "marsyard", "run", str(file), *options], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "marsyard", "run", str(file), *run_options], capture_output=True, text=True, check=False
     )
     assert regression.returncode == 1, regression.stderr
-    data = json.loads((whole / "report.json").read_text())
+    data = json.loads((killed / "report.json").read_text())
     assert data["verdict"] == "FAIL"
     assert data["sections"]["search"]["failures"][0]["values"].keys() == {"sun_deg", "yaw_deg"}
-    assert "Reduced violations" in (whole / "report.html").read_text()
+    assert "Reduced violations" in (killed / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
