@@ -147,7 +147,7 @@ def test_changed_program_is_rejected(campaign_path: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("requirement", "changes", "message"),
     [
-        ("LAOD", {}, "did you mean 'LOAD'"),
+        ("LOADS", {}, "did you mean 'LOAD'"),
         ("FLAG", {}, "only true or false"),
         ("LOAD", {"samples": 10}, "--samples 10"),
         ("LOAD", {"method": "guess"}, "--method guess: allowed: subset, importance"),
