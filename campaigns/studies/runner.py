@@ -244,7 +244,8 @@ def check_identity(campaign: Campaign, directory: Path) -> None:
     changes = Identity.read(record.read(directory)["identity"]).differences(create_identity(campaign.configuration))
     if changes:
         text = "\n  ".join(changes)
-        raise CampaignError(f"{directory} was run with another program, configuration or input files:\n  {text}")
+        reason = "was run with another program, configuration or input files; its rows would not be comparable"
+        raise CampaignError(f"{directory} {reason}. Changed:\n  {text}\nStart a new study in another folder")
 
 
 def read_study(directory: Path) -> dict[str, Any] | None:
