@@ -56,13 +56,13 @@ def four_branch_margin(coordinates: np.ndarray, _streams: np.ndarray) -> np.ndar
     return np.asarray(np.min(branches, axis=0))
 
 
-def run_subset(margins: LimitState, dimension: int, seed: int) -> tuple[SubsetResult, int]:
+def run_subset(margins: LimitState, dimension: int, seed: int, samples: int = SAMPLES) -> tuple[SubsetResult, int]:
     """Run one subset simulation; also return its number of cases.
 
     The simulation is a coroutine: it yields proposed cases and receives their margins. Proposals with `NEW_STREAM` get
     the next stream number.
     """
-    process = subset_simulation(dimension, SAMPLES, LOWEST_LEVEL, np.random.default_rng(seed))
+    process = subset_simulation(dimension, samples, LOWEST_LEVEL, np.random.default_rng(seed))
     cases, first_stream = 0, seed * 1_000_000
     try:
         proposals = next(process)

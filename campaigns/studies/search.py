@@ -159,7 +159,7 @@ def start_search(
     """
     find_requirement(campaign, settings.requirement)
     session = StudySession(
-        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: SearchStudy(campaign, settings, runner).run(observer)
     )
     return start_study(campaign, max_cases, directory, session, {"kind": KIND, **asdict(settings)})
 
@@ -171,12 +171,12 @@ def continue_search(directory: Path, executor: ExecutorConfig, observer: Progres
         raise CampaignError(f"{directory} does not contain a search for violations (marsyard search)")
     settings = SearchSettings(**{name: study[name] for name in SearchSettings.__dataclass_fields__})
     session = StudySession(
-        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: SearchStudy(campaign, settings, runner).run(observer)
     )
     return continue_study(directory, session, {"kind": KIND, **asdict(settings)})
 
 
-class _Study:
+class SearchStudy:
     """A running search."""
 
     def __init__(self, campaign: Campaign, settings: SearchSettings, runner: PointRunner) -> None:

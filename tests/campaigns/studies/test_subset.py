@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+from benchmarks.validation.rare_checks import LimitState, linear_margin, run_subset
 from marsyard.campaigns.studies.importance import fit_density
 from marsyard.campaigns.studies.interval import (
     ProbabilityInterval,
@@ -17,38 +17,12 @@ from marsyard.campaigns.studies.interval import (
     replicate_interval,
     weighted_interval,
 )
-from marsyard.campaigns.studies.subset import NEW_STREAM, Evaluated, SubsetResult, subset_simulation
-
-LimitState = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def linear(dimension: int, probability: float, noise_fraction: float = 0.0) -> LimitState:
-    """Return margins that are below 0 with a probability; a fraction of the variance is noise of the streams."""
-    beta = float(norm.isf(probability))
-
-    def margins(coordinates: np.ndarray, streams: np.ndarray) -> np.ndarray:
-        load = math.sqrt(1.0 - noise_fraction) * coordinates.sum(axis=1) / math.sqrt(dimension)
-        if noise_fraction:
-            noise = np.array([np.random.default_rng(int(stream)).standard_normal() for stream in streams])
-            load += math.sqrt(noise_fraction) * noise
-        return np.asarray(beta - load)
-
-    return margins
+from marsyard.campaigns.studies.subset import SubsetResult
 
 
 def run(margins: LimitState, dimension: int, samples: int, rng: np.random.Generator) -> tuple[SubsetResult, int]:
-    """Run one subset simulation; also return its number of cases."""
-    process, cases = subset_simulation(dimension, samples, 1e-9, rng), 0
-    first_stream = int(rng.integers(2**40))
-    try:
-        proposals = next(process)
-        while True:
-            numbers = first_stream + cases + np.arange(len(proposals.streams))
-            streams = np.where(proposals.streams == NEW_STREAM, numbers, proposals.streams)
-            cases += len(streams)
-            proposals = process.send(Evaluated(streams, margins(proposals.coordinates, streams)))
-    except StopIteration as stop:
-        return stop.value, cases
+    """Run one subset simulation with a new seed; also return its number of cases."""
+    return run_subset(margins, dimension, int(rng.integers(2**31)), samples)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +30,7 @@ def run(margins: LimitState, dimension: int, samples: int, rng: np.random.Genera
 )
 def test_estimates_are_unbiased(dimension: int, probability: float, noise_fraction: float) -> None:
     rng = np.random.default_rng(1)
-    margins = linear(dimension, probability, noise_fraction)
+    margins = linear_margin(dimension, probability, noise_fraction)
     estimates = [run(margins, dimension, 300, rng)[0].probability for _ in range(40)]
     ratio = np.array(estimates) / probability
     assert abs(ratio.mean() - 1.0) < 3.0 * ratio.std(ddof=1) / math.sqrt(len(ratio))
@@ -65,7 +39,7 @@ def test_estimates_are_unbiased(dimension: int, probability: float, noise_fracti
 
 def test_intervals_of_replicates_cover_the_probability() -> None:
     rng, covered = np.random.default_rng(2), 0
-    margins = linear(10, 1e-3)
+    margins = linear_margin(10, 1e-3)
     for _ in range(100):
         results = [run(margins, 10, 100, rng)[0] for _ in range(4)]
         interval = replicate_interval([item.probability for item in results], [item.reached for item in results], 0.9)
@@ -76,7 +50,7 @@ def test_intervals_of_replicates_cover_the_probability() -> None:
 
 def test_cost_is_a_small_fraction_of_counting() -> None:
     rng = np.random.default_rng(3)
-    results = [run(linear(20, 1e-4), 20, 300, rng) for _ in range(40)]
+    results = [run(linear_margin(20, 1e-4), 20, 300, rng) for _ in range(40)]
     estimates, cases = np.array([item.probability for item, _ in results]), np.mean([n for _, n in results])
     counting_cases = 1e4 / (estimates.std() / 1e-4) ** 2
     assert cases < counting_cases / 8.0
@@ -103,7 +77,7 @@ def test_margin_without_levels_gives_an_upper_limit() -> None:
 @pytest.mark.parametrize("dimension", [2, 20])
 def test_importance_sampling_is_unbiased_and_precise(dimension: int) -> None:
     rng = np.random.default_rng(6)
-    margins = linear(dimension, 1e-4)
+    margins = linear_margin(dimension, 1e-4)
     violations = np.concatenate([run(margins, dimension, 200, rng)[0].violations for _ in range(4)])
     density = fit_density(violations)
     assert density is not None
