@@ -58,7 +58,7 @@ def result_sentences(study: Mapping[str, Any]) -> list[str]:
     sentences = [
         f"{study['requirement']}: {result['verdict']}.",
         f"Probability of a violation per case: {probability_text(interval.get('estimate'))}, "
-        f"{percent(study['confidence'])} interval {bounds} by {method}; the limit is {limit}.",
+        f"{percent(interval['confidence'])} interval {bounds} by {method}; the limit is {limit}.",
     ]
     if result.get("reason"):
         sentences.append(str(result["reason"]))

@@ -169,6 +169,8 @@ def continue_rare(
         raise CampaignError(f"{directory} does not contain a study of rare violations (marsyard rare)")
     values = {name: study[name] for name in RareSettings.__dataclass_fields__}
     settings = RareSettings(**{**values, "replicates": tuple(values["replicates"])})
+    if additional and settings.method == "importance":
+        raise CampaignError(f"{directory}: importance sampling cannot be extended; start a new study with more cases")
     if additional:
         settings = replace(settings, replicates=(*settings.replicates, additional))
     session = StudySession(
@@ -205,7 +207,10 @@ class _Study:
             unknown = ProbabilityInterval(math.nan, 0.0, 1.0, settings.confidence, math.nan)
             return self._finish(RareVerdict.INSUFFICIENT, unknown, results, unknown, math.nan, None, reason)
         estimates, reached = [item.probability for item in results], [item.reached for item in results]
-        subset_interval = replicate_interval(estimates, reached, settings.confidence)
+        # each evaluation after added replicates uses half of the previous risk, so that all together use at most twice
+        # that of the first; each bound then has at most the risk 1 - confidence over all evaluations
+        confidence = 1.0 - (1.0 - settings.confidence) / 2.0 ** (len(settings.replicates) - 1)
+        subset_interval = replicate_interval(estimates, reached, confidence)
         interval, effective = subset_interval, math.nan
         if contributions:
             squares = sum(value**2 for value in contributions)
@@ -240,7 +245,7 @@ class _Study:
         # counting n cases has the interval p exp(+-z sqrt((1 - p) / (n p)))
         width = math.log(interval.upper / interval.lower) if interval.lower > 0.0 else math.inf
         p = interval.estimate
-        z = float(ndtri(0.5 * (1.0 + self._settings.confidence)))
+        z = float(ndtri(0.5 * (1.0 + interval.confidence)))
         counting = (2.0 * z / width) ** 2 * (1.0 - p) / p if 0.0 < width < math.inf and p > 0.0 else math.nan
         replicates = tuple(Replicate(item.probability, item.reached, item.thresholds) for item in results)
         return RareResult(

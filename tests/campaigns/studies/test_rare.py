@@ -61,6 +61,8 @@ def test_importance_sampling_decides(campaign_path: Path, tmp_path: Path) -> Non
     settings = RareSettings("LOAD", 1e-2, "importance", 100, (3,), 300, 0.99)
     result = start(campaign_path, tmp_path / "run", settings)
     assert result.effective_violations > 30.0
+    with pytest.raises(CampaignError, match="importance sampling cannot be extended"):
+        continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), additional=2)
     assert result.interval.lower < norm.sf(3.0) < result.interval.upper
     assert result.interval.upper / result.interval.lower < 2.0
 
@@ -100,6 +102,7 @@ def test_added_replicates_narrow_the_interval(campaign_path: Path, tmp_path: Pat
     second = continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), additional=5)
     assert len(second.replicates) == 9
     assert second.replicates[:4] == first.replicates
+    assert (first.interval.confidence, second.interval.confidence) == (0.99, 0.995)
     assert rows_without_times(tmp_path / "run")[: len(rows)] == rows
     assert second.interval.upper / second.interval.lower < first.interval.upper / first.interval.lower
 
