@@ -15,6 +15,7 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from marsyard.reports import common_sections, sections
+from marsyard.reports.budget import budget_section, budget_sentences, read_budget
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
@@ -36,8 +37,8 @@ COMMON_SECTIONS: tuple[SectionMaker, ...] = (
     common_sections.faults_section,
 )  # fmt: skip
 
-#: Sections of a study (`marsyard rare`, `marsyard search`).
-STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section)
+#: Sections of a study (`marsyard rare`, `marsyard search`, `marsyard budget`).
+STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section, budget_section)
 
 #: Maximum number of sites and algorithms in `report.json`.
 _MAX_LISTED = 24
@@ -106,7 +107,11 @@ def page_context(
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.recorded("description") or ""),
-        "study_sentences": [*result_sentences(read_result(run.record)), *search_sentences(read_search(run.record))],
+        "study_sentences": [
+            *result_sentences(read_result(run.record)),
+            *search_sentences(read_search(run.record)),
+            *budget_sentences(read_budget(run.record)),
+        ],
         "overall_verdict": overall,
         "cautions": [*cautions, *sampling_cautions(run, metric)],
         "interrupted": run.recorded("state") not in (None, "finished"),

@@ -54,6 +54,7 @@ class System:
     - requirements: file of the requirements that campaigns reference by id, as `scenarios/requirements.toml`
     - columns: file of the columns of each scenario's rows, as `scenarios/columns.toml`. Without it, requirements are
       checked against the first finished case.
+    - error_sources: file of the sources of error of each scenario's cases, as `scenarios/error_sources.toml`
     - compiled_by: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small: one case of each
       calls all numeric kernels of its scenario (`marsyard compile`)
     - templates: each a `marsyard.scenarios.template.CampaignTemplate`, by the values of ``marsyard new --system``
@@ -70,6 +71,7 @@ class System:
     catalogue: Path | None = None
     requirements: Path | None = None
     columns: Path | None = None
+    error_sources: Path | None = None
     compiled_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     templates: Mapping[str, str] = field(default_factory=dict)
     ingest: str = ""
@@ -89,6 +91,7 @@ GROUP = "marsyard.systems"
 #: Files that the systems of Marsyard share.
 _CATALOGUE = SCENARIOS_FOLDER / "catalogue"
 _REQUIREMENTS, _COLUMNS = SCENARIOS_FOLDER / "requirements.toml", SCENARIOS_FOLDER / "columns.toml"
+_ERROR_SOURCES = SCENARIOS_FOLDER / "error_sources.toml"
 
 #: The systems of Marsyard. Recorded images come first, because their cases also contain products of other systems.
 BUILT_IN = (
@@ -115,6 +118,7 @@ BUILT_IN = (
         catalogue=_CATALOGUE / "dimes-*.toml",
         requirements=_REQUIREMENTS,
         columns=_COLUMNS,
+        error_sources=_ERROR_SOURCES,
         compiled_by={"dimes-smoke": ("terrain.samples=512",)},
         templates={"velocity": "marsyard.scenarios.template:VELOCITY"},
         report="marsyard.reports.dimes.presentation:DIMES",
@@ -127,6 +131,7 @@ BUILT_IN = (
         tasks=("marsyard.scenarios.estimators:VELOCITY",),
         catalogue=_CATALOGUE / "dimes-fieldtest.toml",
         columns=_COLUMNS,
+        error_sources=_ERROR_SOURCES,
         report="marsyard.reports.dimes.presentation:FIELD_TEST",
     ),
     System(
@@ -141,6 +146,7 @@ BUILT_IN = (
         catalogue=_CATALOGUE / "vtt-*.toml",
         requirements=_REQUIREMENTS,
         columns=_COLUMNS,
+        error_sources=_ERROR_SOURCES,
         compiled_by={"vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")},
         templates={"tracking": "marsyard.scenarios.template:TRACKING"},
         report="marsyard.reports.vtt.presentation:VTT",
@@ -154,6 +160,7 @@ BUILT_IN = (
         catalogue=_CATALOGUE / "hda-*.toml",
         requirements=_REQUIREMENTS,
         columns=_COLUMNS,
+        error_sources=_ERROR_SOURCES,
         compiled_by={"hda-benign": ("terrain.samples=512",)},
         templates={"landing": "marsyard.scenarios.template:LANDING"},
         report="marsyard.reports.hda.presentation:HDA",
@@ -215,7 +222,11 @@ def _load(point: EntryPoint, earlier_systems: list[System]) -> System:
         raise ValueError(f"it cannot be imported: {error}") from error
     if not isinstance(system, System):
         raise ValueError(f"it is a {type(system).__name__}; allowed: a marsyard.scenarios.systems.System")
-    missing = [str(path) for path in (system.requirements, system.columns) if path is not None and not path.is_file()]
+    missing = [
+        str(path)
+        for path in (system.requirements, system.columns, system.error_sources)
+        if path is not None and not path.is_file()
+    ]
     if system.catalogue is not None and not system.campaigns:
         missing.append(str(system.catalogue))
     if missing:

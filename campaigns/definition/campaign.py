@@ -23,6 +23,7 @@ from marsyard.campaigns.sampling.design import (
 from marsyard.campaigns.sampling.dispersion import Dispersion
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, Derived, Fixed, Grid, Normal
 from marsyard.campaigns.sampling.points import Point, transform_to_uniform
+from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.interface import Scenario
 from marsyard.sim.parameters import stream_name
 from marsyard.sim.streams import Streams
@@ -156,14 +157,22 @@ class Campaign:
 
     def parameters_at(self, point: Point) -> BaseModel:
         """Create the parameters of a case at a point of a study. Raises ValueError like `parameters`."""
-        return self.with_values(self.draws_at(point))
+        tree = replace_values(self.configuration.parameters, self.draws_at(point))
+        for source in error_sources(self.configuration.scenario):
+            if source.name in point.removed:
+                tree = replace_values(tree, source.exact_values(tree))
+        return self.scenario.parameters_type.model_validate(tree)
 
     def with_values(self, values: Mapping[str, Any]) -> BaseModel:
         """Create the campaign's parameters with other values at some paths."""
-        tree: Any = self.configuration.parameters
-        for path, value in values.items():
-            tree = replace_value(tree, path.split("."), value)
-        return self.scenario.parameters_type.model_validate(tree)
+        return self.scenario.parameters_type.model_validate(replace_values(self.configuration.parameters, values))
+
+
+def replace_values(tree: Any, values: Mapping[str, Any]) -> Any:
+    """Copy nested tables and lists with new values at dotted paths."""
+    for path, value in values.items():
+        tree = replace_value(tree, path.split("."), value)
+    return tree
 
 
 def replace_value(tree: Any, path: Sequence[str], value: Any) -> Any:

@@ -28,25 +28,27 @@ class Point:
     - coordinates: independent standard normal numbers of the random dispersions, in the order of the campaign file
     - stream: number of the random streams of the case (`marsyard.sim.streams`)
     - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
+    - removed: names of the sources of error that the case does not have (`marsyard.scenarios.error_sources`)
     """
 
     coordinates: tuple[float, ...]
     stream: int
     nominal: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, text: str) -> Self:
         """Read a point from its text. Raises ValueError for any other text."""
         try:
-            coordinates, stream, nominal = json.loads(text)
-            return cls(tuple(map(float, coordinates)), int(stream), tuple(map(str, nominal)))
+            coordinates, stream, nominal, removed = json.loads(text)
+            return cls(tuple(map(float, coordinates)), int(stream), tuple(map(str, nominal)), tuple(map(str, removed)))
         except (TypeError, ValueError) as error:
             raise ValueError(f"not a point of a study: {text!r:.100}") from error
 
     @property
     def text(self) -> str:
         """The point as text, without loss of precision."""
-        return json.dumps([self.coordinates, self.stream, self.nominal])
+        return json.dumps([self.coordinates, self.stream, self.nominal, self.removed])
 
 
 def transform_to_uniform(

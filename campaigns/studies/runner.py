@@ -70,6 +70,7 @@ class Candidate:
     coordinates: tuple[float, ...]
     stream: int | None = None
     nominal: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
 
 
 class PointRunner:
@@ -105,7 +106,7 @@ class PointRunner:
         if first + len(candidates) > limit:
             raise CaseLimitError(f"the study needs more than {limit} cases")
         points = {
-            case: Point(item.coordinates, case if item.stream is None else item.stream, item.nominal)
+            case: Point(item.coordinates, case if item.stream is None else item.stream, item.nominal, item.removed)
             for case, item in enumerate(candidates, start=first)
         }
         rows = {case: row for case in points if (row := self._store.row(case)) is not None}

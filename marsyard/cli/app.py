@@ -24,7 +24,7 @@ from marsyard.cli.new import ingest, new
 from marsyard.cli.offline import conformance, dataset, export, score
 from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, console, handle_user_errors
 from marsyard.cli.report import compare, confirmations, dashboard, nightly, report
-from marsyard.cli.studies import rare, search
+from marsyard.cli.studies import budget, rare, search
 from marsyard.cli.terrain import app as terrain
 from marsyard.cli.terrain import gallery, render
 
@@ -147,7 +147,7 @@ def _define_global_options(
 
 #: Commands by help panel; the first word of a function's name is the command's name.
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {
-    "Run campaigns": (list_campaigns, show, run, resume, append, replay, rare, search, nightly),
+    "Run campaigns": (list_campaigns, show, run, resume, append, replay, rare, search, budget, nightly),
     "Results": (report, confirmations, compare, dashboard),
     "Worlds and images": (render, gallery, dataset),
     "Custom campaigns and algorithms": (new, ingest, conformance, export, score),

@@ -1,7 +1,8 @@
-"""Commands `marsyard rare` and `marsyard search`: studies that choose their cases."""
+"""Commands `marsyard rare`, `marsyard search` and `marsyard budget`: studies that choose their cases."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -13,6 +14,7 @@ from marsyard.cli import options
 from marsyard.cli.campaign import default_directory, make_executor, show_progress
 
 if TYPE_CHECKING:
+    from marsyard.campaigns.studies.budget import BudgetResult
     from marsyard.campaigns.studies.rare import RareResult
     from marsyard.campaigns.studies.search import SearchResult
 
@@ -108,6 +110,44 @@ def search(arguments: SearchOptions) -> None:
     finish_search(directory, result)
 
 
+@dataclass(frozen=True)
+class BudgetOptions:
+    """Arguments and options of `marsyard budget`."""
+
+    campaign: options.CampaignArgument
+    requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign whose metric is the error.")]
+    cases: Annotated[int, Option("-n", "--cases", metavar="N", help="Base cases, each in all configurations.")] = 100
+    sobol: Annotated[
+        int, Option(metavar="N", help="Base samples of Sobol indices of the dispersions, a power of 2; 0: none.")
+    ] = 0
+    confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the intervals.")] = 0.9
+    seed: options.SeedOption = None
+    jobs: options.JobsOption = None
+    cluster: options.ClusterOption = None
+    out: options.OutOption = None
+    override: options.SetOption = None
+    algorithm: options.AlgorithmOption = None
+
+
+@options.handle_user_errors
+@options.with_options(BudgetOptions)
+def budget(arguments: BudgetOptions) -> None:
+    """Compute the error budget: remove each source of error, and keep each one alone, in the same cases."""
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.studies.budget import BudgetSettings, start_budget
+
+    settings = BudgetSettings(arguments.requirement, arguments.cases, arguments.sobol, arguments.confidence)
+    campaign = load_campaign(
+        arguments.campaign, arguments.override or [], None, arguments.seed, arguments.algorithm or []
+    )
+    executor = make_executor(arguments.jobs, arguments.cluster)
+    name = campaign.configuration.name
+    directory = arguments.out if arguments.out is not None else default_directory(f"{name}-budget")
+    with show_progress(directory, f"marsyard resume {directory}") as progress:
+        result = start_budget(campaign, settings, directory, executor, progress)
+    finish_budget(directory, result)
+
+
 def contains_study(directory: Path) -> bool:
     """Whether the folder contains a study, not an ordinary campaign."""
     from marsyard.campaigns.studies.runner import read_study
@@ -118,6 +158,7 @@ def contains_study(directory: Path) -> bool:
 def continue_study(directory: Path, jobs: int | None, cluster: str | None, additional: int = 0) -> NoReturn:
     """Continue the study in a folder, with a number of additional replicates; exit with the status of its verdict."""
     from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.studies import budget as budget_study
     from marsyard.campaigns.studies import rare as rare_study
     from marsyard.campaigns.studies import search as search_study
     from marsyard.campaigns.studies.runner import read_study
@@ -130,6 +171,12 @@ def continue_study(directory: Path, jobs: int | None, cluster: str | None, addit
         with show_progress(directory, next_command) as progress:
             searched = search_study.continue_search(directory, executor, progress)
         finish_search(directory, searched)
+    if study.get("kind") == budget_study.KIND:
+        if additional:
+            raise CampaignError(f"{directory} contains an error budget, which cannot be extended; start a new one")
+        with show_progress(directory, next_command) as progress:
+            computed = budget_study.continue_budget(directory, executor, progress)
+        finish_budget(directory, computed)
     with show_progress(directory, next_command) as progress:
         estimated = rare_study.continue_rare(directory, executor, progress, additional)
     finish_rare(directory, estimated)
@@ -137,12 +184,10 @@ def continue_study(directory: Path, jobs: int | None, cluster: str | None, addit
 
 def finish_search(directory: Path, result: SearchResult) -> NoReturn:
     """Store files and images of the reduced violations, write the report, print the result, and exit."""
-    from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.running.replay import load_stored_campaign, replay
     from marsyard.campaigns.store.products import case_directory, save_packed
     from marsyard.campaigns.store.record import read, stored_configuration
     from marsyard.campaigns.studies.search import write_regression_campaigns
-    from marsyard.reports.campaign import write_report
     from marsyard.reports.search import read_search, search_sentences
 
     campaign = load_stored_campaign(directory, stored_configuration(directory))
@@ -151,24 +196,35 @@ def finish_search(directory: Path, result: SearchResult) -> NoReturn:
         replayed = replay(directory, failure.case)
         if replayed.products is not None:
             save_packed(case_directory(directory, failure.case), replayed.products, replayed.row)
-    with report_write_errors("the report"):
-        page = write_report(directory)
-    console = options.console()
-    lines = [*search_sentences(read_search(read(directory))), *(f"campaign: {path}" for path in files)]
-    for line in (*lines, f"report: {page}"):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    sentences = search_sentences(read_search(read(directory)))
+    _write_and_print(directory, [*sentences, *(f"campaign: {path}" for path in files)])
     raise typer.Exit(result.exit_code)
 
 
 def finish_rare(directory: Path, result: RareResult) -> NoReturn:
-    """Write the report of a study, print its result, and exit with the status of its verdict."""
+    """Write the report of a study of rare violations, print its result, and exit with the status of its verdict."""
+    from marsyard.reports.rare import describe_result
+
+    _write_and_print(directory, describe_result(directory))
+    raise typer.Exit(result.exit_code)
+
+
+def finish_budget(directory: Path, result: BudgetResult) -> NoReturn:
+    """Write the report of an error budget, print its result, and exit."""
+    from marsyard.campaigns.store.record import read
+    from marsyard.reports.budget import budget_sentences, read_budget
+
+    _write_and_print(directory, budget_sentences(read_budget(read(directory))))
+    raise typer.Exit(result.exit_code)
+
+
+def _write_and_print(directory: Path, sentences: Sequence[str]) -> None:
+    """Write the report of a study, and print sentences and the path of the report."""
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.reports.campaign import write_report
-    from marsyard.reports.rare import describe_result
 
     with report_write_errors("the report"):
         page = write_report(directory)
     console = options.console()
-    for line in (*describe_result(directory), f"report: {page}"):
+    for line in (*sentences, f"report: {page}"):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    raise typer.Exit(result.exit_code)

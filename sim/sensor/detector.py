@@ -71,6 +71,7 @@ class DetectorParameters(Parameters):
     readout_row_s: Annotated[NonNegative, Field(description="time to read out a delivered row, s")] = 5.3e-3
     full_well_e: Annotated[Positive, Field(description="full well, electrons")] = 170000.0
     gain_e_dn: Annotated[Positive, Field(description="electrons per count")] = 41.5
+    photon_noise: Annotated[bool, Field(description="whether the charge has Poisson noise")] = True
     read_noise_e: Annotated[NonNegative, Field(description="read noise, electrons")] = 25.0
     offset_dn: Annotated[NonNegative, Field(description="counts without light")] = 20.0
     bits: Annotated[int, Field(ge=8, le=16, description="bits of a count")] = 12
@@ -223,7 +224,8 @@ class Detector:
         p = self.parameters
         mean = _sum_rows(self.charge(radiance, motion), p.rows_summed) + self.dark_charge()
         # the point spread kernel has negative weights, so that the mean can be negative next to a bright edge
-        electrons = rng.poisson(np.maximum(mean, 0.0)).astype(np.float32)
+        mean = np.maximum(mean, 0.0)
+        electrons = (rng.poisson(mean) if p.photon_noise else mean).astype(np.float32)
         electrons += np.float32(p.read_noise_e) * rng.standard_normal(electrons.shape, dtype=np.float32)
         np.minimum(electrons, np.float32(p.full_well_e), out=electrons)
         counts = electrons / np.float32(p.gain_e_dn) + np.float32(p.offset_dn)

@@ -1,0 +1,437 @@
+"""Study `budget`: contribution of each source of error and of each dispersion to the error of a campaign.
+
+Each base case runs with all sources of error, without any, without each one, and with each one alone, with the same
+dispersions and random streams.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from SALib.analyze import sobol as sobol_indices
+from SALib.sample import sobol as sobol_design
+from scipy.special import ndtri
+
+from marsyard.campaigns.definition.campaign import Campaign, value_at
+from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.margins import compute_margin
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.running.engine import ProgressObserver
+from marsyard.campaigns.sampling.design import MAX_DRAW, MIN_DRAW
+from marsyard.campaigns.store.rows import Row
+from marsyard.campaigns.studies.runner import (
+    Candidate,
+    CaseLimitError,
+    PointRunner,
+    StudySession,
+    continue_study,
+    find_requirement,
+    read_study,
+    start_study,
+)
+from marsyard.scenarios.error_sources import ErrorSource, error_sources
+from marsyard.sim.streams import Streams
+
+#: Value of the key `kind` in the settings of this study.
+KIND = "budget"
+#: Name of the variable of the random streams among Sobol's indices.
+STREAMS = "random streams"
+#: Number of bootstrap resamples of intervals.
+_RESAMPLES = 2000
+#: Number of base cases that are evaluated together.
+_BATCH = 8
+#: Minimum number of base cases with an error in all configurations.
+MIN_COMMON = 10
+
+
+@dataclass(frozen=True)
+class BudgetSettings:
+    """Settings of the study.
+
+    - requirement: id of the requirement whose metric is the error; without a bound, its margin is used
+    - cases: number of base cases; each runs once per configuration
+    - sobol: base samples of Saltelli's design, a power of 2; 0: no indices
+    - confidence: two-sided confidence of the intervals
+    """
+
+    requirement: str
+    cases: int = 100
+    sobol: int = 0
+    confidence: float = 0.9
+
+    def __post_init__(self) -> None:
+        is_power = self.sobol == 0 or (self.sobol >= 16 and self.sobol & (self.sobol - 1) == 0)
+        problems = {
+            f"--cases {self.cases}: at least {2 * MIN_COMMON}": self.cases >= 2 * MIN_COMMON,
+            f"--sobol {self.sobol}: allowed: 0, or a power of 2 from 16": is_power,
+            f"--confidence {self.confidence}: allowed: 0.5 to 0.999": 0.5 <= self.confidence <= 0.999,
+        }
+        for message, is_met in problems.items():
+            if not is_met:
+                raise CampaignError(message)
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A set of sources that the cases have.
+
+    - name: `all`, `none`, `without SOURCE`, or `only SOURCE`; removed: names of the sources that the cases do not have
+    """
+
+    name: str
+    removed: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """Contribution of a source of error to the mean square of the error, in its squared unit.
+
+    - source, title: see `ErrorSource`
+    - alone: mean square with this source only, minus that without any source
+    - removed: mean square with all sources, minus that without this one
+    - mean, lower, upper: mean of `alone` and `removed`, and bounds of its interval; without interactions of more than
+      two sources, these means and the mean square without any source add up to the mean square with all sources
+    - answered: numbers of base cases with an error, without the source and with the source alone
+    """
+
+    source: str
+    title: str
+    alone: float
+    removed: float
+    mean: float
+    lower: float
+    upper: float
+    answered: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class SobolIndex:
+    """First-order and total Sobol index of a dispersion or the random streams, with half-widths of their intervals."""
+
+    name: str
+    first: float
+    first_width: float
+    total: float
+    total_width: float
+
+
+@dataclass(frozen=True)
+class Budget:
+    """An error budget: mean squares of the error over the base cases that have an error in all configurations.
+
+    - contributions: one per source, the largest first
+    - total, total_lower, total_upper: mean square with all sources, and bounds of its interval
+    - remaining: mean square without any source, caused by images, matching and scene
+    - closure, closure_lower, closure_upper: (remaining + sum of the means of the contributions) / total
+    - common: number of base cases with an error in all configurations
+    """
+
+    contributions: tuple[Contribution, ...]
+    total: float
+    total_lower: float
+    total_upper: float
+    remaining: float
+    closure: float
+    closure_lower: float
+    closure_upper: float
+    common: int
+
+
+@dataclass(frozen=True)
+class BudgetResult:
+    """Result of the study.
+
+    - quantity: metric or margin that is the error; centred: whether its mean square is taken about the mean
+    - inactive: titles of the sources that the campaign does not have
+    - budget: error budget; None for a campaign without sources, or with too few common cases
+    - cases, violations: number of base cases, and of violations of the requirement among them with all sources
+    - indices: Sobol indices, the largest total index first; index_samples: complete base samples
+    - evaluated: number of cases in all
+    - reason: why the result is incomplete; empty if it is complete
+    """
+
+    quantity: str
+    centred: bool
+    inactive: tuple[str, ...]
+    budget: Budget | None
+    cases: int
+    violations: int
+    indices: tuple[SobolIndex, ...]
+    index_samples: int
+    evaluated: int
+    reason: str = ""
+
+    @property
+    def exit_code(self) -> int:
+        """Exit status of the command."""
+        return 0 if not self.reason else 3
+
+
+def start_budget(
+    campaign: Campaign, settings: BudgetSettings, directory: Path, executor: ExecutorConfig, observer: ProgressObserver
+) -> BudgetResult:
+    """Run the study in a new folder.
+
+    Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
+    stored, and `continue_budget` continues.
+    """
+    requirement = find_requirement(campaign, settings.requirement)
+    if requirement.bound is None and requirement.margin is None:
+        raise CampaignError(
+            f"{requirement.id}: the metric '{requirement.metric}' is only true or false. Select a requirement with a "
+            "number as metric, or give it a `margin`: a column of numbers that are negative if and only if it is false"
+        )
+    sources, _ = active_sources(campaign)
+    if not sources and not settings.sobol:
+        scenario = campaign.configuration.scenario
+        reason = "has no active source of error"
+        if not error_sources(scenario):
+            reason = f"has the scenario '{scenario}', which names no sources of error"
+        raise CampaignError(f"campaign '{campaign.configuration.name}' {reason}; allowed: --sobol N")
+    n_cases = settings.cases * len(list_configurations(sources)) if sources else 0
+    n_cases += settings.sobol * (len(campaign.drawn_paths) + 3) if settings.sobol else 0
+    session = StudySession(
+        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+    )
+    return start_study(campaign, n_cases, directory, session, {"kind": KIND, **asdict(settings)})
+
+
+def continue_budget(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> BudgetResult:
+    """Continue an interrupted study. Raises CampaignError if there is none, or the program has changed."""
+    study = read_study(directory) or {}
+    if study.get("kind") != KIND:
+        raise CampaignError(f"{directory} does not contain an error budget (marsyard budget)")
+    settings = BudgetSettings(**{name: study[name] for name in BudgetSettings.__dataclass_fields__})
+    session = StudySession(
+        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+    )
+    return continue_study(directory, session, {"kind": KIND, **asdict(settings)})
+
+
+def active_sources(campaign: Campaign) -> tuple[tuple[ErrorSource, ...], tuple[str, ...]]:
+    """Return the sources of error that the campaign has, and the titles of those that it does not have.
+
+    A campaign has a source if a parameter of the source is dispersed, or differs from its value without the error.
+    """
+    parameters, dispersed = campaign.configuration.parameters, campaign.configuration.dispersions
+    active: list[ErrorSource] = []
+    inactive: list[str] = []
+    for source in error_sources(campaign.configuration.scenario):
+        exact = source.exact_values(parameters)
+        has_source = any(path in dispersed or value_at(parameters, path) != value for path, value in exact.items())
+        if has_source:
+            active.append(source)
+        else:
+            inactive.append(source.title)
+    return tuple(active), tuple(inactive)
+
+
+def list_configurations(sources: Sequence[ErrorSource]) -> list[Configuration]:
+    """List the configurations of an error budget: all sources, none, without each one, and each one alone."""
+    names = tuple(source.name for source in sources)
+    return [
+        Configuration("all", ()),
+        Configuration("none", names),
+        *(Configuration(f"without {name}", (name,)) for name in names),
+        *(Configuration(f"only {name}", tuple(other for other in names if other != name)) for name in names),
+    ]
+
+
+class _Study:
+    """A running error budget."""
+
+    def __init__(self, campaign: Campaign, settings: BudgetSettings, runner: PointRunner) -> None:
+        self._campaign, self._settings, self._runner = campaign, settings, runner
+        self._requirement: Requirement = find_requirement(campaign, settings.requirement)
+        self._sources, self._inactive = active_sources(campaign)
+
+    def run(self, observer: ProgressObserver) -> BudgetResult:
+        """Evaluate all configurations and Saltelli's design; compute contributions and indices."""
+        settings = self._settings
+        configurations = list_configurations(self._sources) if self._sources else []
+        n = len(configurations)
+        errors = np.full((n, settings.cases), np.nan)
+        groups = np.arange(settings.cases)
+        violations, reason, index_samples = 0, "", 0
+        indices: tuple[SobolIndex, ...] = ()
+        try:
+            if n:
+                observer.begin("cases", n * settings.cases)
+                errors, groups, violations = self._run_configurations(configurations)
+            if settings.sobol:
+                observer.begin("cases of Saltelli's design", settings.sobol * (len(self._campaign.drawn_paths) + 3))
+                indices, index_samples = self._run_design()
+        except CaseLimitError as error:
+            reason = f"The limit of cases was reached: {error}."
+        budget = compute_budget(errors, groups, self._sources, self._is_centred, settings.confidence)
+        if budget is None and n and not reason:
+            reason = (
+                f"Fewer than {MIN_COMMON} base cases have an error in all configurations, so that there is no budget."
+            )
+        return BudgetResult(
+            self._quantity,
+            self._is_centred,
+            self._inactive,
+            budget,
+            settings.cases if n else 0,
+            violations,
+            indices,
+            index_samples,
+            self._runner.n_cases,
+            reason,
+        )
+
+    @property
+    def _is_centred(self) -> bool:
+        """Whether the mean square is taken about the mean: for a margin, not for an error."""
+        return self._requirement.bound is None
+
+    @property
+    def _quantity(self) -> str:
+        return str(self._requirement.margin if self._is_centred else self._requirement.metric)
+
+    def _error(self, row: Row) -> float:
+        """Return the error of a case; NaN outside of the population, or without a value."""
+        margin = compute_margin(row, self._requirement)
+        if not math.isfinite(margin):
+            return math.nan
+        return margin if self._requirement.bound is None else self._requirement.bound - margin
+
+    def _generator(self, name: str) -> np.random.Generator:
+        """Create a random generator of the study, which does not depend on the cases."""
+        configuration = self._campaign.configuration
+        return Streams(configuration.seed, configuration.name, 0).generator(f"budget: {name}")
+
+    def _run_configurations(
+        self, configurations: Sequence[Configuration]
+    ) -> tuple[Float64[np.ndarray, "configurations n"], np.ndarray, int]:
+        """Evaluate the base cases in all configurations; return errors, terrain groups, and number of violations."""
+        n, dimension = self._settings.cases, len(self._campaign.drawn_paths)
+        points = self._generator("base cases").standard_normal((n, dimension))
+        errors = np.full((len(configurations), n), np.nan)
+        terrains: list[str] = []
+        violations = 0
+        for first in range(0, n, _BATCH):
+            cases = range(first, min(first + _BATCH, n))
+            candidates = [
+                Candidate(tuple(points[case].tolist()), case, (), configuration.removed)
+                for case in cases
+                for configuration in configurations
+            ]
+            rows = self._runner.run(candidates)
+            errors[:, list(cases)] = np.reshape([self._error(row) for row in rows], (len(cases), -1)).T
+            complete = rows[:: len(configurations)]
+            violations += sum(compute_margin(row, self._requirement) < 0.0 for row in complete)
+            terrains += [str(row.get("terrain", f"case {case}")) for case, row in zip(cases, complete, strict=True)]
+        return errors, np.unique(terrains, return_inverse=True)[1], violations
+
+    def _run_design(self) -> tuple[tuple[SobolIndex, ...], int]:
+        """Evaluate Saltelli's design, and compute Sobol's indices of the base samples without a missing error.
+
+        The random streams are one variable: a uniform number selects their number.
+        """
+        paths = [*self._campaign.drawn_paths, STREAMS]
+        problem = {"num_vars": len(paths), "names": paths, "bounds": [[0.0, 1.0]] * len(paths)}
+        seed = int(self._generator("Saltelli's design").integers(2**31))
+        uniform = sobol_design.sample(problem, self._settings.sobol, calc_second_order=False, seed=seed)
+        coordinates = ndtri(np.clip(uniform[:, :-1], MIN_DRAW, MAX_DRAW))
+        streams = np.minimum(uniform[:, -1] * 2.0**31, 2.0**31 - 1.0).astype(np.int64)
+        errors: list[float] = []
+        block = len(paths) + 2
+        for first in range(0, len(uniform), block):
+            part = range(first, first + block)
+            rows = self._runner.run([Candidate(tuple(coordinates[i].tolist()), int(streams[i])) for i in part])
+            errors += [self._error(row) for row in rows]
+        return compute_indices(np.array(errors), problem, self._settings.confidence, seed)
+
+
+def compute_budget(
+    errors: Float64[np.ndarray, "configurations n"],
+    groups: np.ndarray,
+    sources: Sequence[ErrorSource],
+    is_centred: bool,
+    confidence: float,
+) -> Budget | None:
+    """Compute the contributions from the base cases with an error in all configurations; None for too few of them.
+
+    The intervals are percentiles of a bootstrap over groups of cases (terrains).
+
+    - errors: errors of each configuration of `list_configurations`, NaN if missing
+    - groups: number of the group of each case
+    """
+    has_error = np.isfinite(errors)
+    is_common: Bool[np.ndarray, "n"] = has_error.all(axis=0)
+    n_sources = len(sources)
+    if not n_sources or is_common.sum() < MIN_COMMON:
+        return None
+    values = errors[:, is_common]
+    codes = np.unique(groups[is_common], return_inverse=True)[1]
+    n_groups = int(codes.max()) + 1
+    rng = np.random.default_rng(0)
+    resampled = rng.multinomial(n_groups, np.full(n_groups, 1.0 / n_groups), size=_RESAMPLES)
+    weights = np.concatenate([np.ones((1, codes.size)), resampled[:, codes]])
+    weights /= weights.sum(axis=1, keepdims=True)
+    squares = weights @ (values**2).T
+    if is_centred:
+        squares = squares - (weights @ values.T) ** 2
+    total, none = squares[:, 0], squares[:, 1]
+    removed = total[:, None] - squares[:, 2 : 2 + n_sources]
+    alone = squares[:, 2 + n_sources :] - none[:, None]
+    mean = 0.5 * (removed + alone)
+    closure = (none + mean.sum(axis=1)) / total
+    risk = 50.0 * (1.0 - confidence)
+    bounds = (risk, 100.0 - risk)
+    lower, upper = np.percentile(mean, bounds, axis=0)
+    counts = has_error.sum(axis=1)
+    contributions = [
+        Contribution(
+            source.name,
+            source.title,
+            float(alone[0, index]),
+            float(removed[0, index]),
+            float(mean[0, index]),
+            float(lower[index]),
+            float(upper[index]),
+            (int(counts[2 + index]), int(counts[2 + n_sources + index])),
+        )
+        for index, source in enumerate(sources)
+    ]
+    total_bounds, closure_bounds = np.percentile(total, bounds), np.percentile(closure, bounds)
+    return Budget(
+        tuple(sorted(contributions, key=lambda item: -item.mean)),
+        float(total[0]),
+        *map(float, total_bounds),
+        float(none[0]),
+        float(closure[0]),
+        *map(float, closure_bounds),
+        int(is_common.sum()),
+    )
+
+
+def compute_indices(
+    errors: Float64[np.ndarray, "n"], problem: Mapping[str, Any], confidence: float, seed: int
+) -> tuple[tuple[SobolIndex, ...], int]:
+    """Compute Sobol's indices from Saltelli's design without second order; also return the number of complete samples.
+
+    Base samples with a missing error in any of their cases are omitted. No indices for fewer than 8 samples, or if all
+    errors are equal.
+    """
+    blocks = errors.reshape(-1, problem["num_vars"] + 2)
+    complete = blocks[np.isfinite(blocks).all(axis=1)]
+    if len(complete) < 8 or np.ptp(complete) == 0.0:
+        return (), len(complete)
+    values = sobol_indices.analyze(
+        problem, complete.ravel(), calc_second_order=False, conf_level=confidence, num_resamples=500, seed=seed
+    )
+    indices = [
+        SobolIndex(name, *(float(values[key][index]) for key in ("S1", "S1_conf", "ST", "ST_conf")))
+        for index, name in enumerate(problem["names"])
+    ]
+    return tuple(sorted(indices, key=lambda item: -item.total)), len(complete)

@@ -1,0 +1,195 @@
+"""Results of an error budget (`marsyard.campaigns.studies.budget`): sentences, and a section of the report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from marsyard.reports.section import (
+    GRID,
+    INK,
+    SERIES,
+    Block,
+    Grid,
+    Section,
+    Subject,
+    in_page_style,
+    new_axes,
+    svg_figure,
+)
+from marsyard.reports.stored import table
+from marsyard.reports.wording import count, label, number, percent, split_unit
+
+#: Difference of the closure from 1 above which the contributions are not additive.
+MAX_CLOSURE_ERROR = 0.1
+#: Title of the mean square without any source of error.
+REMAINING = "images, matching and scene"
+#: Number of dispersions in the table of Sobol's indices.
+_MAX_INDICES = 12
+
+
+def read_budget(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the settings of an error budget with its `result`; empty for another run or an unfinished study."""
+    study = table(record.get("study"))
+    return study if study.get("kind") == "budget" and table(study.get("result")) else {}
+
+
+def budget_sentences(study: Mapping[str, Any]) -> list[str]:
+    """Describe total, largest contributions and additivity of an error budget; empty without a result."""
+    if not study:
+        return []
+    result = table(study.get("result"))
+    sentences: list[str] = []
+    budget = table(result.get("budget"))
+    if budget:
+        unit = split_unit(result["quantity"])[1]
+        total = budget["total"]
+        largest = ", ".join(
+            f"{item['title']} {percent(item['mean'] / total)}"
+            for item in budget["contributions"][:3]
+            if item["mean"] > 0
+        )
+        sentences += [
+            f"{study['requirement']}: {_statistic(result)} of {label(result['quantity'])} {number(math.sqrt(total))} "
+            f"{unit} with all sources of error, {number(math.sqrt(max(budget['remaining'], 0.0)))} {unit} without any, "
+            f"in {budget['common']} of {count(int(result['cases']), 'base case')} with an error in all configurations.",
+            f"Largest contributions to the mean square: {largest}; {REMAINING} {percent(budget['remaining'] / total)}.",
+            _closure_sentence(budget, float(study["confidence"])),
+        ]
+    if result["indices"]:
+        first = ", ".join(f"{item['name']} {number(item['total'])}" for item in result["indices"][:3])
+        sentences.append(
+            f"Largest total Sobol indices: {first}, from {count(int(result['index_samples']), 'base sample')}."
+        )
+    elif study["sobol"]:
+        sentences.append("Sobol indices are not available: fewer than 8 complete base samples, or equal errors.")
+    if result.get("reason"):
+        sentences.append(str(result["reason"]))
+    return [*sentences, f"The study ran {count(int(result['evaluated']), 'case')}."]
+
+
+def _statistic(result: Mapping[str, Any]) -> str:
+    return "standard deviation" if result["centred"] else "RMS"
+
+
+def _closure_sentence(budget: Mapping[str, Any], confidence: float) -> str:
+    bounds = f"{percent(budget['closure_lower'])} to {percent(budget['closure_upper'])}"
+    interval = f"{percent(confidence)} interval {bounds}"
+    text = f"The contributions add up to {percent(budget['closure'])} of the total ({interval})"
+    if abs(budget["closure"] - 1.0) > MAX_CLOSURE_ERROR:
+        return f"{text}: interactions of three or more sources matter, and the contributions are not additive."
+    return f"{text}."
+
+
+def budget_section(subject: Subject) -> Section | None:
+    """Create the section of an error budget; None for another run."""
+    study = read_budget(subject.run.record)
+    if not study:
+        return None
+    result = table(study.get("result"))
+    blocks: list[Block] = []
+    budget = table(result.get("budget"))
+    if budget:
+        blocks.append(_budget_block(result, budget, float(study["confidence"])))
+    if result["indices"]:
+        blocks.append(_index_block(result))
+    if not blocks:
+        blocks.append(Block(text=str(result.get("reason") or "No result.")))
+    data = {**result, "requirement": study["requirement"]}
+    return Section("budget", "Error budget", "Error budget", tuple(blocks), data)
+
+
+def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confidence: float) -> Block:
+    unit, total, n_cases = split_unit(result["quantity"])[1], budget["total"], int(result["cases"])
+    root_unit = f", {unit}" if unit else ""
+    head = [
+        "Source of error", "Contribution", f"{percent(confidence)} interval", "Interaction", f"Alone{root_unit}",
+        f"Without{root_unit}", "Answered alone", "Answered without",
+    ]  # fmt: skip
+    rows = [
+        [
+            item["title"],
+            percent(item["mean"] / total),
+            f"{percent(item['lower'] / total)} to {percent(item['upper'] / total)}",
+            percent(0.5 * (item["removed"] - item["alone"]) / total),
+            _signed_root(item["alone"] + budget["remaining"]),
+            _signed_root(total - item["removed"]),
+            f"{item['answered'][1]} of {n_cases}",
+            f"{item['answered'][0]} of {n_cases}",
+        ]
+        for item in budget["contributions"]
+    ]
+    rows.append(
+        [REMAINING, percent(budget["remaining"] / total), "", "", _signed_root(budget["remaining"]), "", "", ""]
+    )
+    statistic = _statistic(result)
+    figure = svg_figure(
+        _draw_waterfall(budget, f"mean square of {label(result['quantity'])}, {unit}²" if unit else "mean square"),
+        "budget-waterfall",
+        f"Mean square of {label(result['quantity'])} without any source of error, contributions of the sources, and "
+        "mean square with all sources. Lines: intervals.",
+        wide=True,
+    )
+    inactive = f" Not in this campaign: {'; '.join(result['inactive'])}." if result["inactive"] else ""
+    note = (
+        f"Each base case runs with the same dispersions and random streams in all configurations. 'Alone' is the "
+        f"{statistic} with the source and no other source, 'Without' that with all other sources. The contribution is "
+        "the mean of two changes of the mean square: adding the source to none, and to all others. The interaction is "
+        "half of their difference. Intervals: bootstrap over terrains. "
+        f"{_closure_sentence(budget, confidence)}{inactive}"
+    )
+    return Block("Sources of error", figures=[figure], grid=Grid(head, rows), note=note)
+
+
+def _signed_root(square: float) -> str:
+    """Format the root of a mean square; rounding may make it slightly negative."""
+    return number(math.sqrt(max(square, 0.0)))
+
+
+def _index_block(result: Mapping[str, Any]) -> Block:
+    indices: Sequence[Mapping[str, Any]] = result["indices"]
+    rows = [
+        [
+            item["name"],
+            f"{number(item['total'])} ± {number(item['total_width'])}",
+            f"{number(item['first'])} ± {number(item['first_width'])}",
+        ]
+        for item in indices[:_MAX_INDICES]
+    ]
+    note = (
+        f"Saltelli's design with {count(int(result['index_samples']), 'complete base sample')}. The first-order index "
+        "is the fraction of the variance that a variable causes alone, the total index the fraction with all its "
+        "interactions. Correlated dispersions are represented by their independent variables. An index whose interval "
+        "contains 0 is not significant."
+    )
+    return Block(
+        "Sobol indices",
+        grid=Grid(["Variable", "Total", "First order"], rows, max(len(indices) - _MAX_INDICES, 0)),
+        note=note,
+    )
+
+
+@in_page_style
+def _draw_waterfall(budget: Mapping[str, Any], axis_label: str) -> Figure:
+    contributions = budget["contributions"]
+    figure, axes = new_axes(9.0, 1.2 + 0.34 * (len(contributions) + 2))
+    titles = [REMAINING, *(item["title"] for item in contributions), "all sources of error"]
+    rows = range(len(titles))
+    level = budget["remaining"]
+    axes.barh(0, level, color=SERIES[5], height=0.62)
+    for row, item in enumerate(contributions, start=1):
+        color = SERIES[0] if item["mean"] >= 0.0 else SERIES[1]
+        axes.barh(row, item["mean"], left=level, color=color, height=0.62)
+        axes.plot([level + item["lower"], level + item["upper"]], [row, row], color=INK, linewidth=1.2)
+        axes.plot([level, level], [row - 1.31, row + 0.31], color=GRID, linewidth=0.8, zorder=0)
+        level += item["mean"]
+    last = len(titles) - 1
+    axes.barh(last, budget["total"], color=SERIES[2], height=0.62)
+    axes.plot([budget["total_lower"], budget["total_upper"]], [last, last], color=INK, linewidth=1.2)
+    axes.set_yticks(list(rows), titles)
+    axes.invert_yaxis()
+    axes.set(xlabel=axis_label)
+    return figure

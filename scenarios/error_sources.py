@@ -1,0 +1,75 @@
+"""Sources of error of a scenario's cases; an error budget removes them one by one (`marsyard budget`)."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from marsyard.scenarios.systems import find_system
+
+
+@dataclass(frozen=True)
+class ErrorSource:
+    """A source of error.
+
+    - name: short name, unique in its scenario; title: noun phrase for tables and figures
+    - parameters: dotted paths of the parameters that cause the error
+    """
+
+    name: str
+    title: str
+    parameters: tuple[str, ...]
+
+    def exact_values(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of the parameters without this error, by path; missing parameters are omitted.
+
+        A number becomes 0, a switch false, each number of a list 0, and a table None. Raises ValueError for a text.
+        """
+        values = {path: value for path in self.parameters for value in _find(parameters, path)}
+        return {path: _exact_value(path, value) for path, value in values.items()}
+
+
+def _find(tree: Any, path: str) -> Iterator[Any]:
+    """Yield the value at a dotted path, or nothing if there is none."""
+    for name in path.split("."):
+        if not isinstance(tree, Mapping) or name not in tree:
+            return
+        tree = tree[name]
+    yield tree
+
+
+def _exact_value(path: str, value: Any) -> Any:
+    if isinstance(value, bool):
+        return False
+    if isinstance(value, int | float):
+        return type(value)(0)
+    if isinstance(value, list | tuple):
+        return [_exact_value(path, item) for item in value]
+    if value is None or isinstance(value, Mapping):
+        return None
+    raise ValueError(f"{path}: a source of error must be a number, a switch or a table, not {value!r}")
+
+
+@cache
+def error_sources(scenario: str) -> tuple[ErrorSource, ...]:
+    """Return the sources of error of a scenario; empty if its system has no such file.
+
+    Raises ValueError for an invalid file.
+    """
+    system = find_system(scenario)
+    if system is None or system.error_sources is None:
+        return ()
+    try:
+        scenarios = tomllib.loads(system.error_sources.read_text(encoding="utf-8"))
+        tables = scenarios.get(scenario, {})
+        tables = scenarios[tables["sources_of"]] if "sources_of" in tables else tables
+        return tuple(
+            ErrorSource(name, str(table["title"]), tuple(map(str, table["parameters"])))
+            for name, table in tables.items()
+        )
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        message = f"{system.error_sources}: invalid sources of error: {type(error).__name__}: {error}"
+        raise ValueError(message) from error
