@@ -83,7 +83,7 @@ def select_features(counts: Counts, options: HdaOptions) -> Points2:
     padded = np.pad(interest, [(0, -extent % side) for extent in interest.shape], constant_values=-np.inf)
     blocks = padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side).swapaxes(1, 2)
     best = blocks.reshape(*blocks.shape[:2], -1).argmax(axis=-1)
-    row, column = (i * side for i in np.indices(best.shape))
+    row, column = (index * side for index in np.indices(best.shape))
     row, column = row + best // side, column + best % side
     has_feature = np.isfinite(blocks.max(axis=(2, 3)))
     return np.column_stack([column[has_feature], row[has_feature]]).astype(np.float64)

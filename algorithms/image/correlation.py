@@ -60,8 +60,9 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
 def peak_width(surface: Raster, peak: Peak, level: float = 0.75) -> float:
     """Full width of the peak at `level` times its height along its longest direction, in pixels.
 
-    The width is the major axis of the ellipse with the second moments of the connected region above that value. It is
-    1.15 for a peak of one pixel, and the length of a ridge. Without a positive peak the surface's diagonal is returned.
+    The width is the major axis (four standard deviations) of the ellipse with the second moments of the connected
+    region above that value. Each pixel contributes the variance of its own extent, 1/12. The width is 1.15 for a region
+    of one pixel, and 1.15 times the length of a ridge. Without a positive peak the surface's diagonal is returned.
     """
     if peak.value <= 0.0:
         return float(np.hypot(*surface.shape))

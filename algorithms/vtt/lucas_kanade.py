@@ -30,7 +30,7 @@ def match_by_lucas_kanade(
     window, corner = search_window(image, predicted, options.search_px)
     if min(window.shape) < options.template_px:
         return None
-    side = options.search_px | 1
+    side = options.search_px | 1  # odd
     old_patch = extract_patch(sighting.image, sighting.pixel, side, change)
     half, centre = (options.template_px - 1) // 2, (side - 1) // 2
     template = old_patch[centre - half : centre + half + 1, centre - half : centre + half + 1]

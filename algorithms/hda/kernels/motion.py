@@ -68,7 +68,10 @@ def rotate_quaternion(q: Array, step: Array) -> Array:
 
 @njit(cache=True)
 def residuals(matches: Matches, motion: Motion) -> Array:
-    """Reprojection minus measurement in the second image, pixels, shape (n, 2); inf behind the camera."""
+    """Reprojection minus measurement in the second image, pixels, shape (n, 2); inf behind the camera.
+
+    A feature (x, y) with inverse depth rho is projected along R (x, y, 1) + rho t.
+    """
     first, second, focal, _ = matches
     q, t, inverse_depths = motion
     R = rotation_matrix(q)
@@ -146,6 +149,7 @@ def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, wi
             for b in range(6):
                 S[a, b] += weight * (Jm[0, a] * Jm[0, b] + Jm[1, a] * Jm[1, b])
                 S[a, b] -= mixed[i, a] * mixed[i, b] * inverse_curvature
+    # damping, and a small regularisation of unknowns that are not observable
     for a in range(6):
         S[a, a] += damping * diagonal[a] + 1e-15 * focal**2
     step, depth_steps = np.full(6, math.nan), np.zeros(n)

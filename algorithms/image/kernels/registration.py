@@ -27,18 +27,18 @@ def build_design_matrix(template: Array, unknowns: int) -> Array:
         for j in range(side):
             up, down = max(i - 1, 0), min(i + 1, side - 1)
             left, right = max(j - 1, 0), min(j + 1, side - 1)
-            by_row = (template[down, j] - template[up, j]) / (down - up)
-            by_column = (template[i, right] - template[i, left]) / (right - left)
+            slope_y = (template[down, j] - template[up, j]) / (down - up)
+            slope_x = (template[i, right] - template[i, left]) / (right - left)
             design_row = matrix[i * side + j]
             design_row[0], design_row[1] = template[i, j] - mean, 1.0
-            design_row[2], design_row[3] = by_row, by_column
+            design_row[2], design_row[3] = slope_y, slope_x
             y, x = i - half, j - half
             if unknowns >= 8:
-                design_row[4], design_row[5] = by_row * y, by_row * x
-                design_row[6], design_row[7] = by_column * y, by_column * x
+                design_row[4], design_row[5] = slope_y * y, slope_y * x
+                design_row[6], design_row[7] = slope_x * y, slope_x * x
             if unknowns >= 14:
-                design_row[8], design_row[9], design_row[10] = by_row * y * y, by_row * y * x, by_row * x * x
-                design_row[11], design_row[12], design_row[13] = by_column * y * y, by_column * y * x, by_column * x * x
+                design_row[8], design_row[9], design_row[10] = slope_y * y * y, slope_y * y * x, slope_y * x * x
+                design_row[11], design_row[12], design_row[13] = slope_x * y * y, slope_x * y * x, slope_x * x * x
     return matrix
 
 
@@ -202,7 +202,7 @@ def register(
         v, u = v - dv, u - du
         if math.hypot(v - row, u - column) > limits[0] or warp_size(warp, half) > limits[1]:
             return failed
-        # at the template's border the last change of the warp is less than ten tolerances
+        # the last change of the warp moves the template's border, side / 2 from the centre, by less than ten tolerances
         if math.hypot(dv, du) < tolerance and warp_change * side < 20.0 * tolerance:
             return True, v, u, score
     return failed
