@@ -181,8 +181,8 @@ _MEASURING_PROGRAM = """
 import json, os, sys
 discard_output = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
 command = [sys.executable, "-m", "marsyard", *sys.argv[1:]]
-_, status, used = os.wait4(os.posix_spawn(sys.executable, command, os.environ, file_actions=discard_output), 0)
-print(json.dumps([os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9]))
+_, status, usage = os.wait4(os.posix_spawn(sys.executable, command, os.environ, file_actions=discard_output), 0)
+print(json.dumps([os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e9]))
 """
 
 

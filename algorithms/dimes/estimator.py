@@ -30,7 +30,7 @@ def match_corner(
     peak: Peak,
     options: DimesOptions,
 ) -> Vector2:
-    """Position (row, column) of the matched template's upper left pixel in the window; the options select the refinement."""
+    """Match position (row, column) of the template's upper left pixel in the window, refined as `options` select."""
     integer_peak = np.array([peak.row, peak.column], dtype=np.float64)
     if not options.subpixel:
         return integer_peak

@@ -30,7 +30,7 @@ def check_imu_threshold(quick: bool) -> Iterator[Measure]:
     single = reference.single()
     how = f"{descents} descents of a second implementation by first-order propagation; threshold {threshold:g} m/s"
     # The limits are three standard errors of a quantile. The relative standard error of the quantile q is
-    # sqrt(q (1 - q) / n) / (density * quantile). The product in the denominator is 0.44 at the median, 0.03 at 99.5 %.
+    # sqrt(q (1 - q) / n) / (probability density * quantile). The denominator is 0.44 at the median, 0.03 at 99.5 %.
     median_error = float(np.median(single)) / _read_stored_median_m_s() - 1.0
     limit = 3.4 / math.sqrt(descents)
     yield Measure(

@@ -36,11 +36,11 @@ def format_value(measure: Measure, value: float) -> str:
     return f"{format_number(value)} {measure.unit}".strip()
 
 
-def store(measured: dict[str, list[Measure]], quick: bool) -> dict[str, dict]:
+def store(results: dict[str, list[Measure]], quick: bool) -> dict[str, dict]:
     """Add the measurements of these checks to the stored measurements, and return all."""
     stored: dict[str, dict] = json.loads(RESULTS.read_text())["checks"] if RESULTS.exists() else {}
     environment = _read_environment(quick)
-    for name, measures in measured.items():
+    for name, measures in results.items():
         stored[name] = {"environment": environment, "measures": [asdict(measure) for measure in measures]}
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps({"checks": {name: stored[name] for name in sorted(stored)}}, indent=1) + "\n")
