@@ -158,13 +158,13 @@ def _draw_views(
     inputs: ThresholdInputs, camera: CameraModel, rng: np.random.Generator
 ) -> tuple[list[View], list[View]]:
     """Draw three true views and three measured views of a descent."""
-    common = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
+    common_error = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
     true_views, measured_views = [], []
     for number, altitude in enumerate(inputs.altitudes_m):
         attitude = _draw_attitude(inputs, rng)
         rate = np.radians(inputs.max_rate_deg_s) * rng.uniform() * np.array([*_draw_direction(rng), 0.0])
-        independent = np.radians(inputs.attitude_sd_deg) * rng.standard_normal(3)
-        error = Rotation.from_rotvec(common + independent + rate * inputs.tag_sd_s * rng.standard_normal())
+        independent_error = np.radians(inputs.attitude_sd_deg) * rng.standard_normal(3)
+        error = Rotation.from_rotvec(common_error + independent_error + rate * inputs.tag_sd_s * rng.standard_normal())
         height = altitude * (1.0 + inputs.altitude_sd * rng.standard_normal())
         time = number * inputs.interval_s
         true_views.append(_create_view(camera, attitude, altitude, time))

@@ -205,9 +205,10 @@ def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptio
         rays = rectification.rectified_from_first.apply(np.column_stack([coordinates, np.ones(len(coordinates))]))
         column, row = np.rint(rectification.camera.project(rays)[0]).astype(np.int64).T
         depths = rectification.focal_px * rectification.baseline_m / disparities[row, column] / rays[:, 2]
-    accepted = (depths > bounds[0]) & (depths < bounds[1])
-    statuses = np.where(accepted, structure.MatchStatus.ACCEPTED, structure.MatchStatus.OUT_OF_BOUNDS).astype(np.uint8)
+    is_accepted = (depths > bounds[0]) & (depths < bounds[1])
+    statuses = np.full(len(pixels), structure.MatchStatus.OUT_OF_BOUNDS, dtype=np.uint8)
+    statuses[is_accepted] = structure.MatchStatus.ACCEPTED
     points = points_at_depth(coordinates, depths)
     matched_pixels, _ = project_points(second.camera, motion.second_from_first.apply(points))
     no_scores = np.full(len(pixels), np.nan)
-    return structure.Matches(pixels, starts, ends, matched_pixels, no_scores, depths, statuses, points[accepted])
+    return structure.Matches(pixels, starts, ends, matched_pixels, no_scores, depths, statuses, points[is_accepted])

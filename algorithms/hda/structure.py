@@ -137,8 +137,8 @@ def match_pixels(
             views, second_from_first, *accepted_matches, bounds_m, options.search_half_px
         )
         statuses[indices[errors_px > options.max_return_px]] = MatchStatus.NOT_RETURNED
-    accepted = statuses == MatchStatus.ACCEPTED
-    points = points_at_depth(coordinates[accepted], depths[accepted])
+    is_accepted = statuses == MatchStatus.ACCEPTED
+    points = points_at_depth(coordinates[is_accepted], depths[is_accepted])
     return Matches(pixels, starts, ends, matched_pixels, correlations, depths, statuses, points)
 
 

@@ -1,6 +1,7 @@
 """Normalised and pseudo-normalised correlation of a template with a window, and peaks of correlation surfaces.
 
-The tracking paper is Kim et al., "Targeted Driving Using Visual Tracking".
+Section II.A is that of Johnson et al., "Field Testing of the MER DIMES". The tracking paper is Kim et al., "Targeted
+Driving Using Visual Tracking".
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ 
 
 
 def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Raster) -> Float[np.ndarray, "_ _"]:
-    """Pseudo-normalised correlation ``2 sum(A B) / (sum(A A) + sum(B B))`` (DIMES, section II.A).
+    """Pseudo-normalised correlation ``2 sum(A B) / (sum(A A) + sum(B B))`` (II.A).
 
     A is the template and B a patch of the window, each minus its mean. Entry (i, j) belongs to the patch with its upper
     left pixel at (i, j) of the window; the shape is (rows - n + 1, columns - m + 1). Values lie in [-1, 1] and decrease

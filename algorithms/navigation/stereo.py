@@ -145,7 +145,7 @@ def track_features(
     first: UInt8[np.ndarray, "rows columns"],
     second: UInt8[np.ndarray, "rows columns"],
     pixels: Points2,
-    predicted: Points2,
+    predicted_pixels: Points2,
 ) -> tuple[Points2, Flags]:
     """Track features from one image to another by Lucas-Kanade with pyramids, starting at predicted pixels.
 
@@ -155,7 +155,7 @@ def track_features(
         return np.empty((0, 2)), np.zeros(0, dtype=np.bool_)
     settings: dict[str, Any] = {"winSize": (_FEATURE_PX, _FEATURE_PX), "maxLevel": _LEVELS}
     settings["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
-    start, initial = pixels.astype(np.float32), predicted.astype(np.float32)
+    start, initial = pixels.astype(np.float32), predicted_pixels.astype(np.float32)
     end, status, _ = cv2.calcOpticalFlowPyrLK(first, second, start, initial.copy(), **settings)
     reverse_end, reverse_status, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **settings)
     valid = (status.ravel() == 1) & (reverse_status.ravel() == 1)

@@ -102,10 +102,12 @@ def estimate_motion(
     disparities, valid = first_pair.feature_disparities(pixels, options.min_range_m)
     pixels, disparities = pixels[valid], disparities[valid]
     points = first_pair.triangulate(pixels, disparities)
-    expected, visible = second_pair.camera.project(np.asarray(predicted.inv().apply(points.copy())).reshape(-1, 3))
-    inside = visible & second_pair.camera.in_frame(expected)
-    pixels, disparities, points, expected = (values[inside] for values in (pixels, disparities, points, expected))
-    second_pixels, valid = track_features(first_pair.left, second_pair.left, pixels, expected)
+    expected_pixels, visible = second_pair.camera.project(
+        np.asarray(predicted.inv().apply(points.copy())).reshape(-1, 3)
+    )
+    inside = visible & second_pair.camera.in_frame(expected_pixels)
+    pixels, disparities, points = (values[inside] for values in (pixels, disparities, points))
+    second_pixels, valid = track_features(first_pair.left, second_pair.left, pixels, expected_pixels[inside])
     second_disparities, is_matched = second_pair.feature_disparities(second_pixels, options.min_range_m)
     valid &= is_matched
     count = int(np.count_nonzero(valid))

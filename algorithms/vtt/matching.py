@@ -164,11 +164,11 @@ def refine_match(
 
 
 def match_by_correlation(
-    sighting: Sighting, image: MastImage, predicted: Vector2, change: ViewChange, options: VttOptions
+    sighting: Sighting, image: MastImage, predicted_pixel: Vector2, change: ViewChange, options: VttOptions
 ) -> Match | None:
     """Match the magnified, rolled template in a window by coarse-to-fine normalised correlation (paper's matcher)."""
     template = extract_patch(sighting.image, sighting.pixel, options.template_px, change)
-    counts, window_corner = search_window(image, predicted, options.search_px)
+    counts, window_corner = search_window(image, predicted_pixel, options.search_px)
     if min(counts.shape) < options.template_px:
         return None
     window = counts.astype(np.float64)

@@ -83,10 +83,11 @@ def compare_estimators(quick: bool) -> Iterator[Measure]:
         results = run_estimator(estimator, descents)
         valid = results.valid_errors_m_s
         rms = float(np.sqrt(np.mean(valid**2))) if valid.size else float("nan")
-        wrong = int(np.sum(valid > REQUIREMENT_M_S))
+        wrong_count = int(np.sum(valid > REQUIREMENT_M_S))
+        largest_error = valid.max() if valid.size else float("nan")
         how = (
-            f"{valid.size} of {len(descents)} descents of dimes-smoke answered, {wrong} wrong by more than 5 m/s, "
-            f"largest error {valid.max() if valid.size else float('nan'):.2g} m/s, "
+            f"{valid.size} of {len(descents)} descents of dimes-smoke answered, "
+            f"{wrong_count} wrong by more than 5 m/s, largest error {largest_error:.2g} m/s, "
             f"{1e3 * float(np.median(results.seconds)):.0f} core-ms for three images"
         )
         yield Measure(f"velocity error, rms: {name}", rms, "m/s", None, how)

@@ -84,13 +84,17 @@ def _describe_environments(checks: Sequence[Check], stored: dict[str, dict]) -> 
     if not environments:
         return "Nothing has been measured yet."
     labels = {"machine": "", "gl": "OpenGL ", "versions": "", "samples": "samples: "}
-    common, different = [], []
+    common_values, exceptions = [], []
     for key, label in labels.items():
         groups: dict[str, list[str]] = {}
         for name, environment in environments.items():
             groups.setdefault(environment[key], []).append(name)
         common_value = max(groups, key=lambda value: len(groups[value]))
-        common.append(f"{label}{common_value}")
-        different += [f"{', '.join(names)}: {label}{value}" for value, names in groups.items() if value != common_value]
-    exceptions = f" Exceptions, by the names of checks (`--only NAME`): {'; '.join(different)}." if different else ""
-    return f"Measured on {'; '.join(common)}.{exceptions}"
+        common_values.append(f"{label}{common_value}")
+        exceptions += [
+            f"{', '.join(names)}: {label}{value}" for value, names in groups.items() if value != common_value
+        ]
+    exception_text = (
+        f" Exceptions, by the names of checks (`--only NAME`): {'; '.join(exceptions)}." if exceptions else ""
+    )
+    return f"Measured on {'; '.join(common_values)}.{exception_text}"

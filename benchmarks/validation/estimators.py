@@ -39,8 +39,8 @@ class SmoothImage:
     """Image smoothed by a Gaussian of one pixel, interpolated by a quintic spline."""
 
     def __init__(self, image: np.ndarray) -> None:
-        smoothed = ndimage.gaussian_filter(image.astype(np.float64), SIGMA_PX)
-        self._coefficients = ndimage.spline_filter(smoothed, order=5)
+        smooth_image = ndimage.gaussian_filter(image.astype(np.float64), SIGMA_PX)
+        self._coefficients = ndimage.spline_filter(smooth_image, order=5)
 
     def patches(self, centres: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values of patches around `centres` + `shift` (both (u, v), shape (n, 2)), and their derivatives by u and v.

@@ -73,8 +73,8 @@ class Reference:
         tracks = self.tracks[:, :, :templates].copy()
         n = len(tracks)
         angle, size = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(*wrong_by_m_s, n)
-        wrong = np.column_stack([size * np.cos(angle), size * np.sin(angle)])
-        tracks[np.arange(n), rng.integers(2, size=n), rng.integers(templates, size=n)] += wrong
+        wrong_errors = np.column_stack([size * np.cos(angle), size * np.sin(angle)])
+        tracks[np.arange(n), rng.integers(2, size=n), rng.integers(templates, size=n)] += wrong_errors
         discrepancies = _discrepancies(tracks, self.imu).reshape(n, -1)
         second = tracks[np.arange(n), 1, discrepancies.argmin(axis=1) % templates]
         is_accepted = discrepancies.min(axis=1) < threshold_m_s
@@ -126,13 +126,13 @@ def _draw_attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotatio
 
 def _draw_attitude_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
     """Draw the rotation of each measured attitude relative to the true attitude, radians, world axes."""
-    common = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
-    independent = np.radians(inputs.attitude_sd_deg) * rng.standard_normal((3, 3))
+    common_error = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
+    independent_errors = np.radians(inputs.attitude_sd_deg) * rng.standard_normal((3, 3))
     rates = np.radians(inputs.max_rate_deg_s) * rng.uniform(size=3)
     azimuths = rng.uniform(0.0, 2.0 * np.pi, 3)
     tag_errors_s = inputs.tag_sd_s * rng.standard_normal(3)
     axes = np.column_stack([np.cos(azimuths), np.sin(azimuths), np.zeros(3)])
-    return np.asarray(common + independent + (rates * tag_errors_s)[:, None] * axes)
+    return np.asarray(common_error + independent_errors + (rates * tag_errors_s)[:, None] * axes)
 
 
 def _rotate_slopes(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:

@@ -34,12 +34,12 @@ MANY_FEATURES = replace(PAPER_FEATURES, block_px=32)
 def make_noise_free_detector(camera: str) -> DetectorParameters:
     """Return a camera's detector with 16 bits and a large full well, so that shot noise is below 1e-4 of the signal."""
     full_well_e = 1e9
-    original = preset(camera).detector
-    return original.model_copy(
+    detector = preset(camera).detector
+    return detector.model_copy(
         update={
             "full_well_e": full_well_e,
             "gain_e_dn": full_well_e / 2**16,
-            "responsivity_e_s": original.responsivity_e_s * full_well_e / original.full_well_e,
+            "responsivity_e_s": detector.responsivity_e_s * full_well_e / detector.full_well_e,
             "bits": 16,
             "read_noise_e": 0.0,
             "dark_e_s": 0.0,

@@ -164,6 +164,7 @@ def _render_brightness(law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) 
 
 def _reflectance(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: npt.ArrayLike) -> np.ndarray:
     """Independent implementation of the law of `Photometry`, for unit albedo and K."""
+    # phase angle
     g = np.arccos(np.clip(cos_g, -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
     lunar = law.lunar_fraction
@@ -185,15 +186,15 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
             forward, backward = _render_brightness(sun_only, first, second), _render_brightness(sun_only, second, first)
             # I/F divided by the cosine of incidence is pi times the bidirectional reflectance
             reciprocity_errors.append(abs(forward / first[2] / (backward / second[2]) - 1.0))
-            expected = (
+            expected_brightness = (
                 FLAT_ALBEDO
                 * sun_only.normalisation()
                 * _reflectance(sun_only, first[2], second[2], float(first @ second))
             )
-            formula_errors.append(float(abs(forward / expected - 1.0)))
+            formula_errors.append(float(abs(forward / expected_brightness - 1.0)))
         how = f"{pairs} pairs of sun and camera directions over flat ground"
         albedo = abs(_spherical_albedo(sun_only, 20) * sun_only.normalisation() - 1.0)
-        for claim, measured, method in (
+        for claim, value, method in (
             ("rendered reflectance is reciprocal", max(reciprocity_errors), how),
             ("rendered brightness compared with the formula", max(formula_errors), how),
             (
@@ -202,7 +203,7 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
                 "the law integrated over sun and camera directions by Sobol points",
             ),
         ):
-            yield Measure(f"{claim}: {name}", measured, "", find_limit(f"{claim}: {name}"), method)
+            yield Measure(f"{claim}: {name}", value, "", find_limit(f"{claim}: {name}"), method)
 
 
 def _spherical_albedo(law: Photometry, log2_points: int) -> float:

@@ -124,8 +124,8 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
     inliers = np.empty(n, dtype=np.bool_)
     for m in range(n):
         inliers[m] = abs(z[m] - plane[0] - plane[1] * x[m] - plane[2] * y[m]) <= limit
-    refined = _fit_least_squares_plane(x, y, z, inliers)
-    return plane if math.isnan(refined[0]) else refined
+    refined_plane = _fit_least_squares_plane(x, y, z, inliers)
+    return plane if math.isnan(refined_plane[0]) else refined_plane
 
 
 @njit(cache=True)

@@ -100,7 +100,10 @@ def cauchy_cost(r: Array, scale: float) -> float:
 
 @njit(cache=True)
 def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, Jm: Array, Jd: Array) -> None:
-    """Jacobian of one residual: rotation (left perturbation) and translation (`Jm`, 2 x 6), inverse depth (`Jd`, 2)."""
+    """Jacobian of one residual: rotation (left perturbation) and translation (`Jm`, 2 x 6), inverse depth (`Jd`, 2).
+
+    (ax, ay, az) is R (x, y, 1), the feature's direction in the second camera's frame; pz is its depth times rho.
+    """
     ax = R[0, 0] * x + R[0, 1] * y + R[0, 2]
     ay = R[1, 0] * x + R[1, 1] * y + R[1, 2]
     az = R[2, 0] * x + R[2, 1] * y + R[2, 2]

@@ -152,14 +152,14 @@ def register(
     unknowns = UNKNOWNS[order]
     matrix = build_design_matrix(template, unknowns)
     scales = np.sqrt(np.sum(matrix * matrix, axis=0))
-    failed = (False, row, column, 0.0)
+    failure = (False, row, column, 0.0)
     for p in range(unknowns):
         if not scales[p] > 0.0:
-            return failed
+            return failure
     matrix /= scales
     lower = normal_matrix(matrix)
     if not factorize_cholesky(lower, min_pivot):
-        return failed
+        return failure
     values = np.empty(side * side)
     solution = np.empty(unknowns)
     warp, change = np.eye(2, 5), np.zeros((2, 5))
@@ -170,19 +170,19 @@ def register(
         else:
             is_inside = sample_shifted(coefficients, side, v, u, values)
         if not is_inside:
-            return failed
+            return failure
         values -= values.mean()
         multiply_transposed(matrix, values, solution)
         norm = math.sqrt(np.sum(values * values))
         if not (solution[0] > 0.0 and norm > 0.0):
-            return failed
+            return failure
         score = solution[0] / norm
         solve(lower, solution)
         for p in range(unknowns):
             solution[p] /= scales[p]
         gain = solution[0]
         if not gain > 0.0:
-            return failed
+            return failure
         warp_change = 0.0
         if order > 0:
             # inverse compositional: the solution warps the template, so compose the warp with its inverse
@@ -192,7 +192,7 @@ def register(
                     for k in range(3):
                         change[i, 2 + k] = solution[8 + 3 * i + k] / gain
             if not compose_with_inverse(warp, change):
-                return failed
+                return failure
             # `warp_size` expects the complete warp, including the identity
             change[0, 0] += 1.0
             change[1, 1] += 1.0
@@ -201,8 +201,8 @@ def register(
         du = (warp[1, 0] * solution[2] + warp[1, 1] * solution[3]) / gain
         v, u = v - dv, u - du
         if math.hypot(v - row, u - column) > limits[0] or warp_size(warp, half) > limits[1]:
-            return failed
+            return failure
         # the last change of the warp moves the template's border, side / 2 from the centre, by less than ten tolerances
         if math.hypot(dv, du) < tolerance and warp_change * side < 20.0 * tolerance:
             return True, v, u, score
-    return failed
+    return failure
