@@ -83,12 +83,12 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
             raise bad_answer(f"covariance_m2_s2 is not symmetric: {covariance.tolist()}")
         if scale == 0.0 or float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
             raise bad_answer(f"covariance_m2_s2 is not positive definite: {covariance.tolist()}")
-    span, given_span = None, answer.span_s
-    if given_span is not None:
-        is_pair = isinstance(given_span, tuple) and len(given_span) == 2
-        if not is_pair or not all(isinstance(tag, float | int) for tag in given_span):
-            raise bad_answer(f"span_s is {given_span!r}; allowed: a tuple of two time tags, or None")
-        span = (float(given_span[0]), float(given_span[1]))
+    span, answer_span = None, answer.span_s
+    if answer_span is not None:
+        is_pair = isinstance(answer_span, tuple) and len(answer_span) == 2
+        if not is_pair or not all(isinstance(tag, float | int) for tag in answer_span):
+            raise bad_answer(f"span_s is {answer_span!r}; allowed: a tuple of two time tags, or None")
+        span = (float(answer_span[0]), float(answer_span[1]))
         if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
             raise bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
         if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:

@@ -55,8 +55,8 @@ def prepare_frame(inputs: Mapping[str, Any]) -> Callable[[], object]:
 
 def main(file: Path, repeats: int) -> None:
     """Render the frames and print their core-seconds."""
-    with np.load(file) as stored:
-        render_frame = prepare_frame({name: stored[name] for name in stored.files})
+    with np.load(file) as arrays:
+        render_frame = prepare_frame({name: arrays[name] for name in arrays.files})
     render_frame()
     times = []
     for _ in range(repeats):

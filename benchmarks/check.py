@@ -109,13 +109,13 @@ class Comparison:
     p_value: float
 
 
-def compare(measured: Mapping[str, Sequence[float]], stored: Mapping[str, Sequence[float]]) -> list[Comparison]:
-    """Compare every path that both records contain."""
+def compare(current: Mapping[str, Sequence[float]], stored: Mapping[str, Sequence[float]]) -> list[Comparison]:
+    """Compare the log ratios of every path that both records contain."""
     comparisons = []
-    for name in measured.keys() & stored.keys():
-        current, earlier = np.asarray(measured[name]), np.asarray(stored[name])
-        test = stats.ttest_ind(current - np.log(ALLOWED_GROWTH), earlier, equal_var=False, alternative="greater")
-        comparisons.append(Comparison(name, float(np.exp(current.mean() - earlier.mean())), float(test.pvalue)))
+    for name in current.keys() & stored.keys():
+        ratios, stored_ratios = np.asarray(current[name]), np.asarray(stored[name])
+        test = stats.ttest_ind(ratios - np.log(ALLOWED_GROWTH), stored_ratios, equal_var=False, alternative="greater")
+        comparisons.append(Comparison(name, float(np.exp(ratios.mean() - stored_ratios.mean())), float(test.pvalue)))
     return sorted(comparisons, key=lambda comparison: comparison.name)
 
 
@@ -140,24 +140,24 @@ def main() -> int:
         return 2
     cv2.setNumThreads(1)
     reference = reference_workload()
-    measured = {name: log_ratios(prepare(), reference, PAIRS) for name, prepare in PATHS.items()}
+    ratios = {name: log_ratios(prepare(), reference, PAIRS) for name, prepare in PATHS.items()}
     if keep:
         record = {
             "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
             "processor": processor_features(),
-            "log_ratios": measured,
+            "log_ratios": ratios,
         }
         RATIOS.write_text(json.dumps(record, indent=2) + "\n")
         print(f"stored in {RATIOS}")
         return 0
     assert stored is not None, "the program ends earlier without stored ratios"
-    return _print_comparison(compare(measured, stored["log_ratios"]), stored["measured"])
+    return _print_comparison(compare(ratios, stored["log_ratios"]), stored["measured"])
 
 
-def _print_comparison(comparisons: Sequence[Comparison], measured_on: str) -> int:
+def _print_comparison(comparisons: Sequence[Comparison], date: str) -> int:
     """Print the comparison. Returns 1 if a path is slower."""
     slower = select_slower(comparisons)
-    print(f"{'ratio divided by that of ' + measured_on[:10]:<40}{'factor':>8}{'p':>10}")
+    print(f"{'ratio divided by that of ' + date[:10]:<40}{'factor':>8}{'p':>10}")
     for comparison in comparisons:
         mark = "  SLOWER" if comparison in slower else ""
         print(f"{comparison.name:<40}{comparison.growth:8.2f}{comparison.p_value:10.2g}{mark}")

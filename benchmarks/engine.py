@@ -64,16 +64,16 @@ class Stopwatch:
     def __init__(self, case_counts: tuple[int, ...]) -> None:
         self.records: dict[int, tuple[float, float]] = {}
         self._case_counts = case_counts
-        self._done = 0
+        self._finished_cases = 0
         self._is_counting = False
 
     def begin(self, stage: str, total: int) -> None:
         self._is_counting = stage == "cases"
 
     def step(self) -> None:
-        self._done += self._is_counting
-        if self._is_counting and self._done in self._case_counts:
-            self.records[self._done] = (time.perf_counter(), resident_bytes([os.getpid()]) / 1e6)
+        self._finished_cases += self._is_counting
+        if self._is_counting and self._finished_cases in self._case_counts:
+            self.records[self._finished_cases] = (time.perf_counter(), resident_bytes([os.getpid()]) / 1e6)
 
     def note(self, text: str) -> None:
         print(f"note: {text}")
@@ -89,7 +89,7 @@ class CaseCost:
 
 
 def measure(repeats: int = 3) -> list[Measurement]:
-    """Measure the overhead of the engine. Ratios use wall-clock time, so that load of other programs cancels."""
+    """Measure the overhead of the engine. Ratios compare wall-clock times, because other programs affect both."""
     empty = [measure_case_cost(0.0, 2_000, 12_000) for _ in range(repeats)]
     busy = [measure_case_cost(0.05, 20, 140) for _ in range(repeats)]
     long_run = measure_case_cost(0.0, 10_000, 100_000)
@@ -156,16 +156,16 @@ def measure_case_cost(busy_s: float, first: int, last: int) -> CaseCost:
         parameters={"busy_s": busy_s},
         retain=Retain(showcase="none"),
     )
-    watch = Stopwatch((first, last))
+    stopwatch = Stopwatch((first, last))
     with TemporaryDirectory() as folder:
-        run_campaign(Campaign(configuration, BusyScenario()), Path(folder, "run"), ExecutorConfig(1), watch)
+        run_campaign(Campaign(configuration, BusyScenario()), Path(folder, "run"), ExecutorConfig(1), stopwatch)
         seconds = pq.read_table(Path(folder, "run", "cases.parquet"), columns=["wall_time_s"])["wall_time_s"]
         inside_case_s = pc.mean(seconds.slice(first, last - first)).as_py()
-    (start_s, start_mb), (end_s, end_mb) = watch.records[first], watch.records[last]
+    (start_s, start_mb), (end_s, end_mb) = stopwatch.records[first], stopwatch.records[last]
     return CaseCost((end_s - start_s) / (last - first), inside_case_s, end_mb - start_mb)
 
 
-def measure_speed_up(campaign: str = "dimes-smoke", cases: int = 120) -> float:
+def measure_speed_up(campaign_name: str = "dimes-smoke", cases: int = 120) -> float:
     """Measure the speed-up of two workers with rendered cases; needs idle cores.
 
     The measurement excludes the start-up of the workers and the last batches.
@@ -173,11 +173,11 @@ def measure_speed_up(campaign: str = "dimes-smoke", cases: int = 120) -> float:
     first, last = 24, cases - 8
     times = []
     for jobs in (1, 2):
-        watch = Stopwatch((first, last))
+        stopwatch = Stopwatch((first, last))
         with TemporaryDirectory() as folder:
-            loaded = load_campaign(campaign, ["retain.showcase=none"], cases)
-            run_campaign(loaded, Path(folder, "run"), ExecutorConfig(jobs), watch)
-        times.append(watch.records[last][0] - watch.records[first][0])
+            campaign = load_campaign(campaign_name, ["retain.showcase=none"], cases)
+            run_campaign(campaign, Path(folder, "run"), ExecutorConfig(jobs), stopwatch)
+        times.append(stopwatch.records[last][0] - stopwatch.records[first][0])
     return times[0] / times[1]
 
 

@@ -30,11 +30,11 @@ REPEATS = 3
 class Recorder:
     """Estimator that records its measurements for other estimators."""
 
-    recorded: ClassVar[list[DescentMeasurements]] = []
+    measurements_of_runs: ClassVar[list[DescentMeasurements]] = []
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """Record the measurements without an answer."""
-        self.recorded.append(measurements)
+        self.measurements_of_runs.append(measurements)
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 
 
@@ -52,10 +52,10 @@ def record_descents(campaign_name: str, cases: int) -> list[Descent]:
     campaign = load_campaign(campaign_name, ["parameters.algorithm=benchmarks.estimators:Recorder"])
     descents = []
     for case in range(cases):
-        Recorder.recorded.clear()
+        Recorder.measurements_of_runs.clear()
         row = campaign.scenario.run(campaign.parameters(case), campaign.streams(case)).row
         velocity = np.array([row["velocity_true_x_m_s"], row["velocity_true_y_m_s"]])
-        descents.append(Descent(Recorder.recorded[0], velocity, bool(row["feasible_overlap"])))
+        descents.append(Descent(Recorder.measurements_of_runs[0], velocity, bool(row["feasible_overlap"])))
     return descents
 
 

@@ -154,11 +154,11 @@ def _measure_campaign_s(cases: int, waiting_s: float, executor: ExecutorConfig) 
     configuration = CampaignConfiguration(
         name="growth", scenario=scenario, cases=cases, parameters={"busy_s": waiting_s}, retain=Retain(showcase="none")
     )
-    watch = Stopwatch((1, cases))
+    stopwatch = Stopwatch((1, cases))
     with TemporaryDirectory() as folder:
         instance = WaitingScenario() if waiting_s else BusyScenario()
-        run_campaign(Campaign(configuration, instance), Path(folder, "run"), executor, watch)
-    return watch.records[cases][0] - watch.records[1][0]
+        run_campaign(Campaign(configuration, instance), Path(folder, "run"), executor, stopwatch)
+    return stopwatch.records[cases][0] - stopwatch.records[1][0]
 
 
 def _measure_reports(cases: Sequence[int]) -> list[tuple[float, float]]:

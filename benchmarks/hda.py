@@ -38,6 +38,7 @@ TEXEL_M = 0.005
 def make_measurements() -> LandingMeasurements:
     """Make two images of textured level ground from a height of 10 m with a baseline of 0.36 m."""
     values = np.random.default_rng(1).standard_normal((2400, 2400)).astype(np.float32)
+    # the standard deviation of smoothed white noise is proportional to 1 / sigma; coarse texture has a larger weight
     texture = sum(
         sigma * ndimage.gaussian_filter(values, sigma, mode="wrap", truncate=3.0) * sigma**0.5 for sigma in (4, 12, 36)
     )

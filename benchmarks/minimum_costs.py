@@ -2,8 +2,8 @@
 
 A case has three images of 1024 x 1024 pixels. Each pixel needs one spline evaluation for its intersection, one for its
 radiance, a Poisson number of electrons and a normally distributed number for readout noise. The shadow sweep reads
-every height once.
-The costs of OpenGL drawing and of DIMES' transforms are those of the library calls in profiled cases.
+every height once. The costs of OpenGL drawing and of DIMES' transforms are those of the library calls in profiled
+cases.
 """
 
 from __future__ import annotations

@@ -103,11 +103,11 @@ def _compile_shaders_once(renderer: Any) -> None:
     """Make pyrender reuse its compiled shaders.
 
     pyrender finds compiled shaders by the current context. PyOpenGL represents the OSMesa context by a new pointer
-    object each time. Without the change, every frame would compile its shaders again and leak about 0.3 MB.
+    object each time. Therefore every frame would compile its shaders again and leak about 0.3 MB.
     """
     programs = renderer._program_cache
     compile_program = programs.get_program
-    compiled: dict[Any, Any] = {}
+    programs_by_key: dict[Any, Any] = {}
 
     def get_program(
         vertex_shader: str,
@@ -116,9 +116,9 @@ def _compile_shaders_once(renderer: Any) -> None:
         defines: dict[str, Any] | None = None,
     ) -> Any:
         key = (vertex_shader, fragment_shader, geometry_shader, tuple(sorted((defines or {}).items())))
-        if key not in compiled:
-            compiled[key] = compile_program(vertex_shader, fragment_shader, geometry_shader, defines)
-        return compiled[key]
+        if key not in programs_by_key:
+            programs_by_key[key] = compile_program(vertex_shader, fragment_shader, geometry_shader, defines)
+        return programs_by_key[key]
 
     programs.get_program = get_program
 
@@ -160,8 +160,8 @@ def _prepare_vtk(inputs: Mapping[str, Any]) -> Callable[[], object]:
 
 def _measure_vtk(file: Path, repeats: int) -> None:
     """Render frames with VTK and print the core-seconds of each, summed over all threads."""
-    with np.load(file) as stored:
-        draw = _prepare_vtk({name: stored[name] for name in stored.files})
+    with np.load(file) as arrays:
+        draw = _prepare_vtk({name: arrays[name] for name in arrays.files})
     print(json.dumps(core_seconds(draw, repeats)))
 
 

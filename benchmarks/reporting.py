@@ -137,23 +137,23 @@ def _make_record(cases: int, seed: int, site: str) -> dict[str, Any]:
     }
 
 
-def _copy_campaigns(folder: Path, original: Path, campaigns: int) -> Path:
+def _copy_campaigns(folder: Path, original_run: Path, campaigns: int) -> Path:
     """Copy a campaign and its report several times with different records. Returns the folder for the dashboard."""
     for number in range(campaigns):
         run = folder / "runs" / f"run-{number:04}"
-        shutil.copytree(original, run, copy_function=os.link)
+        shutil.copytree(original_run, run, copy_function=os.link)
         site = ("gusev", "meridiani", "isidis")[number % 3]
         for name, content in (
             ("campaign.json", _make_record(24, number, site)),
-            ("report.json", _rename_report(original, site)),
+            ("report.json", _rename_report(original_run, site)),
         ):
             (run / name).unlink()
             (run / name).write_text(json.dumps(content), encoding="utf-8")
     return folder / "site"
 
 
-def _rename_report(original: Path, site: str) -> dict[str, Any]:
-    report: dict[str, Any] = json.loads((original / "report.json").read_text(encoding="utf-8"))
+def _rename_report(original_run: Path, site: str) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((original_run / "report.json").read_text(encoding="utf-8"))
     return {**report, "campaign": f"dimes-{site}"}
 
 
@@ -181,8 +181,8 @@ _MEASURING_PROGRAM = """
 import json, os, sys
 discard_output = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
 command = [sys.executable, "-m", "marsyard", *sys.argv[1:]]
-_, status, used = os.wait4(os.posix_spawn(sys.executable, command, os.environ, file_actions=discard_output), 0)
-print(json.dumps([os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9]))
+_, status, usage = os.wait4(os.posix_spawn(sys.executable, command, os.environ, file_actions=discard_output), 0)
+print(json.dumps([os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 / 1e9]))
 """
 
 

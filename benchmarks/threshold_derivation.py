@@ -116,6 +116,7 @@ def _draw_descent_errors(
 ) -> Float[np.ndarray, "2 2 2"] | None:
     """Draw the velocity errors of one descent; None if a pair has no feasible overlap for two templates."""
     true_views, measured_views = _draw_views(inputs, camera, rng)
+    # the square root makes the density uniform over the disc
     velocity = inputs.max_speed_m_s * np.sqrt(rng.uniform()) * _draw_direction(rng)
     no_sun = np.array([0.0, 0.0, -1.0])  # below the horizon, so that no template is masked
     errors = np.empty((2, 2, 2))
@@ -123,16 +124,16 @@ def _draw_descent_errors(
         first, second = measured_views[pair], measured_views[pair + 1]
         candidates = template_candidates(first, second, search_geometry(first, second, options), no_sun, options)
         scores = rng.uniform(size=len(candidates.pixels))
-        selected = best_candidates(scores, candidates.pixels, candidates.preferred, 2, options.exclusion_px)
-        if len(selected) < 2:
+        indices = best_candidates(scores, candidates.pixels, candidates.preferred, 2, options.exclusion_px)
+        if len(indices) < 2:
             return None
         heights = inputs.feature_height_sd_m * rng.standard_normal(2)
         displacement_m = velocity * inputs.interval_s
         pixels = _project_features(
-            true_views[pair], true_views[pair + 1], candidates.pixels[selected], heights, displacement_m
+            true_views[pair], true_views[pair + 1], candidates.pixels[indices], heights, displacement_m
         )
         ground, _ = ground_from_pixels(second, pixels, options.max_off_nadir_rad)
-        errors[pair] = (candidates.ground[selected] - ground - displacement_m) / inputs.interval_s
+        errors[pair] = (candidates.ground[indices] - ground - displacement_m) / inputs.interval_s
     return np.asarray(errors + inputs.match_sd_m_s * rng.standard_normal((2, 2, 2)))
 
 
@@ -157,18 +158,18 @@ def _draw_views(
     inputs: ThresholdInputs, camera: CameraModel, rng: np.random.Generator
 ) -> tuple[list[View], list[View]]:
     """Draw three true views and three measured views of a descent."""
-    common = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
-    true, measured = [], []
+    common_error = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
+    true_views, measured_views = [], []
     for number, altitude in enumerate(inputs.altitudes_m):
         attitude = _draw_attitude(inputs, rng)
         rate = np.radians(inputs.max_rate_deg_s) * rng.uniform() * np.array([*_draw_direction(rng), 0.0])
-        independent = np.radians(inputs.attitude_sd_deg) * rng.standard_normal(3)
-        error = Rotation.from_rotvec(common + independent + rate * inputs.tag_sd_s * rng.standard_normal())
+        independent_error = np.radians(inputs.attitude_sd_deg) * rng.standard_normal(3)
+        error = Rotation.from_rotvec(common_error + independent_error + rate * inputs.tag_sd_s * rng.standard_normal())
         height = altitude * (1.0 + inputs.altitude_sd * rng.standard_normal())
         time = number * inputs.interval_s
-        true.append(_create_view(camera, attitude, altitude, time))
-        measured.append(_create_view(camera, error * attitude, height, time))
-    return true, measured
+        true_views.append(_create_view(camera, attitude, altitude, time))
+        measured_views.append(_create_view(camera, error * attitude, height, time))
+    return true_views, measured_views
 
 
 def _draw_attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
@@ -217,6 +218,7 @@ def discrepancies(errors: TrackErrors, imu_sd_m_s: float, rng: np.random.Generat
 
 def threshold_m_s(single: Float[np.ndarray, " descents"], kept: float, step_m_s: float) -> float:
     """Return the smallest multiple of the step that exceeds the fraction `kept` of the discrepancies."""
+    # remove the rounding error of the product
     return round(step_m_s * float(np.ceil(np.quantile(single, kept) / step_m_s)), 9)
 
 

@@ -76,21 +76,24 @@ class HomographyEstimator:
         )
         if homography is None or not inliers.any():
             return None
-        inlier = inliers.ravel().astype(bool)
-        centroid = points[0][inlier].mean(axis=0).astype(np.float64)
+        is_inlier = inliers.ravel().astype(bool)
+        centroid = points[0][is_inlier].mean(axis=0).astype(np.float64)
         homogeneous = homography @ np.array([*centroid, 1.0])
         depth = homogeneous[2]
         if abs(depth) < 1e-9:
             return None
         mapped_point = homogeneous[:2] / depth
-        count = int(inlier.sum())
+        count = int(is_inlier.sum())
         distortion = max_length_change(homography, depth, mapped_point)
         valid = count >= options.min_inliers and distortion <= options.max_distortion
         return PairMatch(np.asarray(mapped_point - centroid), float(count), valid)
 
 
 def max_length_change(homography: Float[np.ndarray, "3 3"], depth: float | np.floating, mapped_point: Vector2) -> float:
-    """Largest relative length change near the point mapped to `mapped_point`, with homogeneous component `depth`."""
+    """Largest relative change of a length near a point, from the singular values of the homography's Jacobian.
+
+    `mapped_point` is the mapped point, `depth` its homogeneous component.
+    """
     jacobian = (homography[:2, :2] - np.outer(mapped_point, homography[2, :2])) / depth
     return float(np.abs(np.linalg.svd(jacobian, compute_uv=False) - 1.0).max())
 
@@ -111,7 +114,7 @@ def match_features(patches: PairPatches, options: HomographyOptions) -> tuple[Po
         return None
     neighbours = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(descriptors_1, descriptors_2, k=2)
     matches = [best for best, second_best in neighbours if best.distance < options.max_ratio * second_best.distance]
-    if len(matches) < 4:
+    if len(matches) < 4:  # the minimum for a homography
         return None
     return (
         np.array([keypoints_1[match.queryIdx].pt for match in matches], dtype=np.float32),

@@ -99,10 +99,10 @@ def find_common_square(
     visible = np.ones(lattice.shape[:2], dtype=bool)
     for view in (first, second):
         visible &= binning.inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
-    # half sides of the squares around each point: chessboard distance to the nearest invisible point, lattice steps
-    half_sides = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
-    row, column = np.unravel_index(int(np.argmax(half_sides)), half_sides.shape)
-    side = min(2 * (int(half_sides[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
+    # chessboard distance to the nearest invisible point, lattice steps; all closer points are visible
+    distances = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
+    row, column = np.unravel_index(int(np.argmax(distances)), distances.shape)
+    side = min(2 * (int(distances[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
     return (lattice[row, column], side, gsd) if side >= options.min_side_px else None
 
 

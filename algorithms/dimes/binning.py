@@ -1,10 +1,10 @@
-"""Binning, rectification and correction of descent images for DIMES and its baselines (section II.A).
+"""Binning, rectification and correction of descent images for DIMES and its baselines.
 
 The virtual camera looks straight down. Its pixels are squares of ground, `gsd_m` on a side, in the plane at the
 measured altitude; rows run south and columns east. Both views of a pair are rectified to the same virtual camera,
-assuming no horizontal motion: a patch is identified by the ground point at its centre, east and north of the camera's
-nadir point. The paper uses a homography. This module projects each point with the full camera model and interpolates
-between pixels by a cubic spline.
+assuming no horizontal motion. A patch is identified by the ground point at its centre, east and north of the camera's
+nadir point. The paper (Johnson et al., "Field Testing of the MER DIMES", section II.A) uses a homography. This module
+can also project each point with the full camera model. It interpolates between pixels by a cubic spline.
 
 Dark current is not corrected, as in the paper. It is a ramp along the columns. Over the 31 rows of a template it is
 0.05 counts at -34 deg C (flight) and 2.5 counts at 0 deg C (field test). Both are below a pixel's noise of 6 counts and
@@ -84,9 +84,9 @@ def place_camera(camera: CameraModel, world_from_body: Rotation, altitude_m: flo
 
     The altitude is that of the body's origin; the camera's height follows from its lever arm.
     """
-    lever = world_from_body.as_matrix() @ camera.c
-    camera_pose = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
-    return camera.transform(camera_pose), np.array([0.0, 0.0, altitude_m + lever[2]])
+    lever_arm = world_from_body.as_matrix() @ camera.c
+    camera_pose = rigid(world_from_body, np.array([-lever_arm[0], -lever_arm[1], altitude_m]))
+    return camera.transform(camera_pose), np.array([0.0, 0.0, altitude_m + lever_arm[2]])
 
 
 def build_view(
@@ -212,7 +212,8 @@ def correct_patch(view: View, rows: slice, columns: slice) -> Float[np.ndarray, 
     return np.asarray(exposure_signal[rows] / np.maximum(view.flat_field[rows, columns], MIN_RESPONSE))
 
 
-#: Margin of the spline around a patch, pixels; pixels outside it change the result by 1e-6 of their value.
+#: Margin of the spline around a patch, pixels. The influence of a pixel decreases by 2 - sqrt(3) = 0.268 per pixel:
+#: pixels outside the margin change the result by about 1e-6 of their value.
 SPLINE_MARGIN = 10
 
 

@@ -1,4 +1,7 @@
-"""Intermediate products of DIMES (paper: Figs. 7-9), and their conversion to plain arrays for storage and figures."""
+"""Intermediate products of DIMES, and their conversion to plain arrays for storage and figures.
+
+Figures are those of Johnson et al., "Field Testing of the MER DIMES".
+"""
 
 from __future__ import annotations
 
@@ -140,7 +143,9 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
         failed = (check in track.failed for check in ValidityCheck)
         pixel_values = (*track.template_pixel, *track.match_pixel)
         rows.append([track.pair, track.index, *pixel_values, *metric_values, track.valid, *vectors, *failed])
-    combination_rows = [[c.first, c.second, c.discrepancy_m_s] for c in details.combinations]
+    combination_rows = [
+        [combination.first, combination.second, combination.discrepancy_m_s] for combination in details.combinations
+    ]
     products: dict[str, Any] = {
         "tracks": np.array(rows, dtype=np.float64).reshape(-1, len(TRACK_COLUMNS)),
         "tracks_columns": list(TRACK_COLUMNS),

@@ -1,4 +1,7 @@
-"""The DIMES estimator: horizontal velocity from templates tracked in two image pairs (section II)."""
+"""The DIMES estimator: horizontal velocity from templates tracked in two image pairs.
+
+The method is section II of Johnson et al., "Field Testing of the MER DIMES".
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ def match_corner(
     peak: Peak,
     options: DimesOptions,
 ) -> Vector2:
-    """Position (row, column) in the window of the matched template's upper left pixel, refined as in the options."""
+    """Match position (row, column) of the template's upper left pixel in the window, refined as `options` select."""
     integer_peak = np.array([peak.row, peak.column], dtype=np.float64)
     if not options.subpixel:
         return integer_peak

@@ -84,6 +84,7 @@ def anti_solar_direction(sun_direction: Vector3) -> Vector3:
 
 def zero_phase_pixel(view: binning.View, sun_direction: Vector3) -> Vector2:
     """Pixel (u, v) of the centre of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
+    # a point at 10 000 km represents infinity
     pixels, visible = view.camera.project((view.centre + 1e7 * anti_solar_direction(sun_direction))[None, :])
     return np.asarray(pixels[0]) if visible[0] else np.full(2, np.nan)
 
@@ -121,6 +122,7 @@ def template_candidates(
     pixels = grid_pixels(first.size, options.grid_step_px)
     ground, visible = binning.ground_from_pixels(first, pixels, limit)
     pixels, ground = pixels[visible], ground[visible]
+    # a fast test of the template centre first, to reduce the number of positions
     for view, half_m in ((second, 0.0), (first, geometry.template_half_m), (second, geometry.window_half_m)):
         outline = binning.square_outline(half_m, 3) if half_m > 0.0 else np.zeros((1, 2))
         feasible = binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)

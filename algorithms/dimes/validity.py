@@ -92,8 +92,11 @@ def rank_combinations(
     `interval_velocities_m_s` are the IMU's mean velocities over both pairs.
     """
     change = (interval_velocities_m_s[1] - interval_velocities_m_s[0])[:2]
-    candidates = [Combination(i, j, float(np.hypot(*(b - a - change)))) for (i, a), (j, b) in product(first, second)]
-    return tuple(sorted(candidates, key=lambda c: c.discrepancy_m_s))
+    combinations = [
+        Combination(first_index, second_index, float(np.hypot(*(second_velocity - first_velocity - change))))
+        for (first_index, first_velocity), (second_index, second_velocity) in product(first, second)
+    ]
+    return tuple(sorted(combinations, key=lambda combination: combination.discrepancy_m_s))
 
 
 def propagate_velocity(
@@ -102,6 +105,7 @@ def propagate_velocity(
     """Propagate a horizontal velocity by the IMU, for example to thruster firing near 100 m (section I), m/s.
 
     `inertial_at_estimate_m_s` is the mean inertial velocity over the interval of the estimate (second pair),
-    `inertial_at_end_m_s` the inertial velocity at the end of the propagation. Their common error cancels.
+    `inertial_at_end_m_s` the inertial velocity at the end of the propagation. An error
+    common to both has no effect on their difference.
     """
     return np.asarray(velocity_m_s + (inertial_at_end_m_s - inertial_at_estimate_m_s))

@@ -1,8 +1,8 @@
 """Exchange files: cases, frames and rover stops with images as 16-bit PGM or PNG, cameras as `.cahvor`, and JSON.
 
 The files are written for external programs. Reading restores counts, flat fields and numbers exactly, because JSON
-stores the shortest decimal text that reads back as the same float64. Attitudes are restored except for rounding of the
-quaternion's norm.
+stores the shortest decimal text that reads back as the same float64. Attitudes can differ by rounding errors, because
+quaternions are normalised when they are read.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ def parse_command(text: str) -> Command | None:
 
     Raises ValueError if the program does not exist or a quote is not closed.
     """
-    prefix = next((p for p in PREFIXES if text.startswith(p)), None)
+    prefix = next((prefix for prefix in PREFIXES if text.startswith(prefix)), None)
     if prefix is None:
         return None
     try:
@@ -210,7 +210,7 @@ class RunningProgram:
                 status = self._process.wait(_POLL_S)
                 break
         if status < 0:
-            name = next((s.name for s in signal.Signals if s == -status), f"signal {-status}")
+            name = next((member.name for member in signal.Signals if member == -status), f"signal {-status}")
             raise self._end_with_fault(Fault.CRASHED, f"it was ended by {name}")
         if status > 0:
             raise self._end_with_fault(Fault.CRASHED, f"it ended with status {status}")
@@ -258,6 +258,6 @@ def shorten(raw: bytes) -> str:
 
 
 def _decode_tail(raw: bytearray) -> str:
-    """Decode the end of an output as printable text."""
+    """Decode the end of an output as printable text; a character has at most 4 bytes in UTF-8."""
     text = bytes(raw[-4 * MAX_STDERR_CHARACTERS :]).decode("utf-8", errors="replace")[-MAX_STDERR_CHARACTERS:]
     return "".join(character if character.isprintable() or character in "\n\t" else "�" for character in text)

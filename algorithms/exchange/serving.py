@@ -186,7 +186,7 @@ class Session:
         self._command, self._limits = command, limits
         self._server: Server | None = None
         self._release: weakref.finalize[Any, Any] | None = None
-        self.folder = Path(tempfile.mkdtemp(prefix="marsyard-talk-"))
+        self.folder = Path(tempfile.mkdtemp(prefix="marsyard-session-"))
         weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
 
     def send_request(

@@ -80,8 +80,8 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
     The motion is scaled so that the median depth of the tracks equals the laser range. None without a solution.
     """
     focal = scene.views[1].focal_px
-    accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
-    first, second = (undistort(view.camera, pixels) for view, pixels in zip(scene.views, accepted, strict=True))
+    track_pixels = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
+    first, second = (undistort(view.camera, pixels) for view, pixels in zip(scene.views, track_pixels, strict=True))
     intrinsics = np.diag([focal, focal, 1.0])
     poses = []
     for method, inlier_px in ATTEMPTS:
@@ -172,10 +172,10 @@ def match_disparities(
         images.append(np.rint(cv2.remap(grey, grid, None, cv2.INTER_LINEAR)).astype(np.uint8))
     disparity_times_depth_px_m = rectification.focal_px * rectification.baseline_m
     min_disparity = int(disparity_times_depth_px_m / bounds_m[1])
-    count = DISPARITY_STEP * (int(disparity_times_depth_px_m / bounds_m[0] - min_disparity) // DISPARITY_STEP + 1)
+    disparity_range = int(disparity_times_depth_px_m / bounds_m[0] - min_disparity)
     matcher = cv2.StereoSGBM.create(
         minDisparity=min_disparity,
-        numDisparities=count,
+        numDisparities=DISPARITY_STEP * (disparity_range // DISPARITY_STEP + 1),
         blockSize=BLOCK_PX,
         P1=SMALL_STEP_PENALTY,
         P2=LARGE_STEP_PENALTY,
@@ -205,9 +205,10 @@ def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptio
         rays = rectification.rectified_from_first.apply(np.column_stack([coordinates, np.ones(len(coordinates))]))
         column, row = np.rint(rectification.camera.project(rays)[0]).astype(np.int64).T
         depths = rectification.focal_px * rectification.baseline_m / disparities[row, column] / rays[:, 2]
-    accepted = (depths > bounds[0]) & (depths < bounds[1])
-    statuses = np.where(accepted, structure.MatchStatus.ACCEPTED, structure.MatchStatus.OUT_OF_BOUNDS).astype(np.uint8)
+    is_accepted = (depths > bounds[0]) & (depths < bounds[1])
+    statuses = np.full(len(pixels), structure.MatchStatus.OUT_OF_BOUNDS, dtype=np.uint8)
+    statuses[is_accepted] = structure.MatchStatus.ACCEPTED
     points = points_at_depth(coordinates, depths)
     matched_pixels, _ = project_points(second.camera, motion.second_from_first.apply(points))
     no_scores = np.full(len(pixels), np.nan)
-    return structure.Matches(pixels, starts, ends, matched_pixels, no_scores, depths, statuses, points[accepted])
+    return structure.Matches(pixels, starts, ends, matched_pixels, no_scores, depths, statuses, points[is_accepted])

@@ -117,8 +117,8 @@ def expected_pixels(scene: LandingScene, features: Points2, options: HdaOptions)
 
 def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion:
     """Solve for the motion by robust least squares, starting from the on-board poses and from zero motion."""
-    accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
-    first, second = (undistort(view.camera, pixels) for view, pixels in zip(scene.views, accepted, strict=True))
+    track_pixels = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
+    first, second = (undistort(view.camera, pixels) for view, pixels in zip(scene.views, track_pixels, strict=True))
     depths = plane_depths(first, scene.range_m, scene.up_camera)
     initial_motions: tuple[RigidTransform, ...] = (scene.second_from_first, rigid(Rotation.identity(), np.zeros(3)))
     return estimate_motion(first, second, scene.views[1].focal_px, depths, initial_motions, options)

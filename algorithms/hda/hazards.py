@@ -17,7 +17,7 @@ from marsyard.algorithms.hda.kernels import elevation as kernels
 from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.options import HdaOptions
 
-#: Minimum sum of bilinear weights of a valid cell: one point at a distance of 0.9 cells along an axis.
+#: Minimum sum of bilinear weights of a valid cell: the weight of a single point 0.9 cells away along an axis.
 MIN_WEIGHT = 0.1
 
 
@@ -183,17 +183,20 @@ def safe_landing_map(
     return np.asarray(safety.astype(np.uint8))
 
 
-def grassfire(marked: Mask) -> Raster:
-    """Grassfire transform (Blum 1973): distance of every cell to the nearest marked cell, in cells; inf without any."""
-    if not np.any(marked):
-        return np.full(marked.shape, np.inf)
-    distances = cv2.distanceTransform((~marked).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+def grassfire(mask: Mask) -> Raster:
+    """Grassfire transform (Blum 1973): distance of every cell to the nearest true cell of a mask, in cells.
+
+    Infinite if no cell is true.
+    """
+    if not np.any(mask):
+        return np.full(mask.shape, np.inf)
+    distances = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(distances.astype(np.float64))
 
 
-def _dilate(marked: Mask, radius_cells: float) -> Mask:
-    """Mark also the cells within `radius_cells` of a marked cell."""
-    return np.asarray(marked | (grassfire(marked) <= radius_cells))
+def _dilate(mask: Mask, radius_cells: float) -> Mask:
+    """Dilate a mask by a disc: a cell becomes true within `radius_cells` of a true cell."""
+    return np.asarray(mask | (grassfire(mask) <= radius_cells))
 
 
 def safe_site(safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Vector2) -> tuple[int, int] | None:
@@ -205,6 +208,7 @@ def safe_site(safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Vector2) 
     farthest = float(distances.max(initial=0.0))
     if farthest == 0.0:
         return None
+    # equal distances can differ by float32 rounding
     best_cells = np.argwhere(distances >= farthest - 1e-4)
     nearest = np.argmin(np.hypot(*(best_cells - apriori_cell).T))
     return int(best_cells[nearest, 0]), int(best_cells[nearest, 1])

@@ -170,7 +170,10 @@ class Motion:
 
 
 def plane_depths(coordinates: Points2, range_m: float, up_camera: Vector3) -> Vector:
-    """Depths of level ground at the distance `range_m` on the optical axis; implausible depths become `range_m`."""
+    """Depths of level ground at the distance `range_m` on the optical axis.
+
+    Depths below 0.2 or above 5 times `range_m` are replaced by `range_m`.
+    """
     up_components = np.column_stack([coordinates, np.ones(len(coordinates))]) @ up_camera
     with np.errstate(divide="ignore", invalid="ignore"):
         depths = range_m * up_camera[2] / up_components
@@ -226,12 +229,13 @@ def assess_motion(
     # with measurements of zero, residuals are the projections of the features, pixels
     zero_matches = kernels.Matches(first, np.zeros_like(first), focal_px, 1.0)
     translations = (np.zeros(3), np.array(second_from_first.translation))
-    without_t, with_t = (
-        kernels.residuals(zero_matches, kernels.Motion(quaternion, t, inverse_depths)) for t in translations
+    without_translation, with_translation = (
+        kernels.residuals(zero_matches, kernels.Motion(quaternion, translation, inverse_depths))
+        for translation in translations
     )
-    residuals = np.hypot(*(with_t - focal_px * second).T)
+    residuals = np.hypot(*(with_translation - focal_px * second).T)
     has_small_residual = residuals <= options.max_residual_px
-    shifts_px = np.hypot(*(with_t - without_t)[has_small_residual].T)
+    shifts_px = np.hypot(*(with_translation - without_translation)[has_small_residual].T)
     return Motion(
         second_from_first=second_from_first,
         depths=depths,
@@ -245,7 +249,7 @@ def assess_motion(
 def _has_plausible_depth(first: Points2, inverse_depths: Vector, has_small_residual: Flags) -> Flags:
     """Whether inverse depths are near those of the ground plane, linear in normalised image coordinates.
 
-    A wrong match along the epipolar line fits any motion; only its depth is wrong.
+    A wrong match on the epipolar line has a small residual; only its depth is wrong.
     """
     design = np.column_stack([first, np.ones(len(first))])
     mask = has_small_residual & (inverse_depths > 0.0)

@@ -115,7 +115,7 @@ def match_pixels(
     `max_return_px`, the check of the reverse match.
     """
     first, second = views
-    border = options.search_half_px + 1
+    border = options.search_half_px + 1  # one pixel more for the neighbours of the peak
     coordinates = undistort(first.camera, pixels)
     starts, ends, valid = epipolar_segments(second, second_from_first, coordinates, bounds_m, border)
     pixels, coordinates, starts, ends = pixels[valid], coordinates[valid], starts[valid], ends[valid]
@@ -137,8 +137,8 @@ def match_pixels(
             views, second_from_first, *accepted_matches, bounds_m, options.search_half_px
         )
         statuses[indices[errors_px > options.max_return_px]] = MatchStatus.NOT_RETURNED
-    accepted = statuses == MatchStatus.ACCEPTED
-    points = points_at_depth(coordinates[accepted], depths[accepted])
+    is_accepted = statuses == MatchStatus.ACCEPTED
+    points = points_at_depth(coordinates[is_accepted], depths[is_accepted])
     return Matches(pixels, starts, ends, matched_pixels, correlations, depths, statuses, points)
 
 
@@ -161,7 +161,7 @@ def forward_backward_error(
     depths = [second_from_first.apply(points_at_depth(coordinates, np.full(count, z)))[:, 2] for z in bounds_m]
     match_coordinates = undistort(second.camera, matches.astype(np.float64))
     points = [first_from_second.apply(points_at_depth(match_coordinates, z)) for z in depths]
-    ends = [project_points(first.camera, point)[0] for point in points]
+    ends = [project_points(first.camera, end_points)[0] for end_points in points]
     starts, stops = (clip_to_image(first.camera.size, pixels.astype(np.float64), end, half_px + 1.0) for end in ends)
     reverse_matches = matching.match_along_epipolar_segments(
         second.counts, first.counts, matches, starts, stops, half_px
@@ -211,4 +211,5 @@ def scale_factor(views: Views, motion: Motion, coordinates: Points2, range_m: fl
         return range_m / float(np.median(depths))
     design_matrix = np.column_stack([coordinates, np.ones(len(coordinates))])[motion.inliers]
     plane = np.linalg.lstsq(design_matrix, 1.0 / motion.depths[motion.inliers], rcond=None)[0]
+    # the third coefficient is the inverse depth on the optical axis
     return range_m * float(plane[2])

@@ -80,10 +80,11 @@ def select_features(counts: Counts, options: HdaOptions) -> Points2:
     interest[:border] = interest[-border:] = -np.inf
     interest[:, :border] = interest[:, -border:] = -np.inf
     side = options.block_px
-    padded = np.pad(interest, [(0, -extent % side) for extent in interest.shape], constant_values=-np.inf)
-    blocks = padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side).swapaxes(1, 2)
+    padded_interest = np.pad(interest, [(0, -extent % side) for extent in interest.shape], constant_values=-np.inf)
+    block_rows, block_columns = (extent // side for extent in padded_interest.shape)
+    blocks = padded_interest.reshape(block_rows, side, block_columns, side).swapaxes(1, 2)
     best = blocks.reshape(*blocks.shape[:2], -1).argmax(axis=-1)
-    row, column = (i * side for i in np.indices(best.shape))
+    row, column = (index * side for index in np.indices(best.shape))
     row, column = row + best // side, column + best % side
     has_feature = np.isfinite(blocks.max(axis=(2, 3)))
     return np.column_stack([column[has_feature], row[has_feature]]).astype(np.float64)
@@ -110,7 +111,9 @@ class Tracks:
     accepted: Flags
 
 
-def track_features(first: Counts, second: Counts, features: Points2, expected: Points2, options: HdaOptions) -> Tracks:
+def track_features(
+    first: Counts, second: Counts, features: Points2, expected_pixels: Points2, options: HdaOptions
+) -> Tracks:
     """Track features by correlation, coarse to fine, within the window around their expected pixels (u, v).
 
     Twice the best shift of a level is the start of the search at the next finer level. The result is the biquadratic
@@ -120,7 +123,7 @@ def track_features(first: Counts, second: Counts, features: Points2, expected: P
     first_levels, second_levels = (pyramid(counts, len(sizes)) for counts in (first, second))
     pixels = np.rint(features[:, ::-1]).astype(np.int64)
     max_shift = float(max(first.shape))
-    expected_shifts = np.clip(np.nan_to_num(expected - features, nan=0.0), -max_shift, max_shift)[:, ::-1]
+    expected_shifts = np.clip(np.nan_to_num(expected_pixels - features, nan=0.0), -max_shift, max_shift)[:, ::-1]
     shifts = np.rint(expected_shifts / 2 ** (len(sizes) - 1)).astype(np.int64)
     for level in range(len(sizes) - 1, -1, -1):
         size = sizes[level]
@@ -128,16 +131,16 @@ def track_features(first: Counts, second: Counts, features: Points2, expected: P
             first_levels[level], second_levels[level], pixels >> level, shifts, size.template_half, size.window_half
         )
         shifts = 2 * shifts if level else shifts
-    tracked, correlations = matching.refine_positions(
+    second_pixels, correlations = matching.refine_positions(
         first_levels[0], second_levels[0], pixels, shifts, options.template_half_px
     )
-    accepted = correlations >= options.min_track_correlation
+    is_accepted = correlations >= options.min_track_correlation
     if options.align:
-        for k in np.flatnonzero(accepted):
-            match = align_track(first_levels[0], second_levels[0], pixels[k], tracked[k], options)
-            accepted[k] = match is not None
-            tracked[k] = tracked[k] if match is None else match
-    return Tracks(features, tracked, correlations, accepted)
+        for k in np.flatnonzero(is_accepted):
+            match = align_track(first_levels[0], second_levels[0], pixels[k], second_pixels[k], options)
+            is_accepted[k] = match is not None
+            second_pixels[k] = second_pixels[k] if match is None else match
+    return Tracks(features, second_pixels, correlations, is_accepted)
 
 
 def align_track(

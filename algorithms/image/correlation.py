@@ -1,6 +1,7 @@
 """Normalised and pseudo-normalised correlation of a template with a window, and peaks of correlation surfaces.
 
-The tracking paper is Kim et al., "Targeted Driving Using Visual Tracking".
+Section II.A is that of Johnson et al., "Field Testing of the MER DIMES". The tracking paper is Kim et al., "Targeted
+Driving Using Visual Tracking".
 """
 
 from __future__ import annotations
@@ -60,8 +61,9 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
 def peak_width(surface: Raster, peak: Peak, level: float = 0.75) -> float:
     """Full width of the peak at `level` times its height along its longest direction, in pixels.
 
-    The width is the major axis of the ellipse with the second moments of the connected region above that value. It is
-    1.15 for a peak of one pixel, and the length of a ridge. Without a positive peak the surface's diagonal is returned.
+    The width is the major axis (four standard deviations) of the ellipse with the second moments of the connected
+    region above that value. Each pixel contributes the variance of its own extent, 1/12. The width is 1.15 for a region
+    of one pixel, and 1.15 times the length of a ridge. Without a positive peak the surface's diagonal is returned.
     """
     if peak.value <= 0.0:
         return float(np.hypot(*surface.shape))
@@ -93,7 +95,7 @@ def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ 
 
 
 def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Raster) -> Float[np.ndarray, "_ _"]:
-    """Pseudo-normalised correlation ``2 sum(A B) / (sum(A A) + sum(B B))`` (DIMES, section II.A).
+    """Pseudo-normalised correlation ``2 sum(A B) / (sum(A A) + sum(B B))`` (II.A).
 
     A is the template and B a patch of the window, each minus its mean. Entry (i, j) belongs to the patch with its upper
     left pixel at (i, j) of the window; the shape is (rows - n + 1, columns - m + 1). Values lie in [-1, 1] and decrease

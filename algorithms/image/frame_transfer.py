@@ -1,4 +1,4 @@
-"""Removal of the frame-transfer ramp of a camera without shutter (DIMES paper, section II.A).
+"""Removal of the frame-transfer ramp of a camera without shutter ("Field Testing of the MER DIMES", section II.A).
 
 Without a shutter a charge packet collects light in every row that it passes. The packet of physical row r passes rows
 r+1 .. N-1 while the detector is cleared before the exposure (`clear_row_s` in each), and rows r-1 .. 0 during the
@@ -33,6 +33,7 @@ def remove_frame_transfer(signal: Raster, calibration: DetectorCalibration, rows
         return signal
     row_gain = calibration.exposure_s + 0.5 * (n - 1) * (a + b) - n * b
     sum_gain = n * (a - b)
+    # the recursion's factor 1 - sum_gain / row_gain must lie between -1 and 3
     if row_gain <= 0.5 * abs(sum_gain):
         raise ValueError(
             f"an exposure of {calibration.exposure_s} s is too short to invert a frame transfer of "

@@ -194,12 +194,13 @@ def _generate_paths(goal: Float[np.ndarray, "2"], options: NavigationOptions) ->
     lengths = 0.75 * float(np.hypot(*goal)) * np.linspace(0.0, 1.0, 9)
     turn, curvature_1, length_1 = (grid.ravel() for grid in np.meshgrid(turns, curvatures, lengths, indexing="ij"))
     # the end of the first arc, and distance and direction from it to the goal
-    half = 0.5 * curvature_1 * length_1
-    chord = length_1 * np.sinc(half / np.pi)
-    heading = turn + 2.0 * half
-    to_goal_x, to_goal_y = goal[0] - chord * np.cos(turn + half), goal[1] - chord * np.sin(turn + half)
+    half_turn = 0.5 * curvature_1 * length_1
+    chord = length_1 * np.sinc(half_turn / np.pi)
+    heading = turn + 2.0 * half_turn
+    to_goal_x, to_goal_y = goal[0] - chord * np.cos(turn + half_turn), goal[1] - chord * np.sin(turn + half_turn)
     range_m, angle = np.hypot(to_goal_x, to_goal_y), np.arctan2(to_goal_y, to_goal_x) - heading
     angle = (angle + np.pi) % (2.0 * np.pi) - np.pi
+    # the chord of the second arc has the length `range_m` and the angle `angle` to the heading
     curvature_2 = 2.0 * np.sin(angle) / np.maximum(range_m, AT_GOAL_M)
     length_2 = range_m / np.sinc(angle / np.pi)
     feasible = (range_m >= AT_GOAL_M) & (np.abs(angle) <= _MAX_HEADING_RAD)

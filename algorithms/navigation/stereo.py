@@ -116,9 +116,9 @@ class RectifiedPair:
         matcher.setDisp12MaxDiff(_LEFT_RIGHT_PX)
         matcher.setSpeckleWindowSize(_SPECKLE_PX)
         matcher.setSpeckleRange(_SPECKLE_RANGE)
-        # columns on the left whose match may be outside of the right image need a border
-        bordered = (cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_CONSTANT) for image in (self.left, self.right))
-        disparity = matcher.compute(*bordered)[:, count:].astype(np.float32) * np.float32(_DISPARITY_UNIT)
+        # a border on the left, because the matches of the first columns may be outside the right image
+        padded = (cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_CONSTANT) for image in (self.left, self.right))
+        disparity = matcher.compute(*padded)[:, count:].astype(np.float32) * np.float32(_DISPARITY_UNIT)
         return np.where((disparity > 0.0) & (self.left > 0), disparity, np.float32(np.nan))
 
     def points(self, min_range_m: float, max_range_m: float) -> Points3:
@@ -135,9 +135,9 @@ class RectifiedPair:
         columns, rows = np.clip(np.rint(pixels).astype(int), 0, np.array(self.camera.size) - 1).T
         initial = dense[rows, columns].astype(np.float64)
         shifts = np.column_stack([np.nan_to_num(initial), np.zeros(len(initial))])
-        matched, valid = track_features(self.left, self.right, pixels, pixels - shifts)
-        disparity = pixels[:, 0] - matched[:, 0]
-        valid &= np.isfinite(initial) & (np.abs(matched[:, 1] - pixels[:, 1]) <= _EPIPOLAR_PX) & (disparity > 0.0)
+        right_pixels, valid = track_features(self.left, self.right, pixels, pixels - shifts)
+        disparity = pixels[:, 0] - right_pixels[:, 0]
+        valid &= np.isfinite(initial) & (np.abs(right_pixels[:, 1] - pixels[:, 1]) <= _EPIPOLAR_PX) & (disparity > 0.0)
         return disparity, valid
 
 
@@ -145,7 +145,7 @@ def track_features(
     first: UInt8[np.ndarray, "rows columns"],
     second: UInt8[np.ndarray, "rows columns"],
     pixels: Points2,
-    predicted: Points2,
+    predicted_pixels: Points2,
 ) -> tuple[Points2, Flags]:
     """Track features from one image to another by Lucas-Kanade with pyramids, starting at predicted pixels.
 
@@ -155,11 +155,11 @@ def track_features(
         return np.empty((0, 2)), np.zeros(0, dtype=np.bool_)
     settings: dict[str, Any] = {"winSize": (_FEATURE_PX, _FEATURE_PX), "maxLevel": _LEVELS}
     settings["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
-    start, guess = pixels.astype(np.float32), predicted.astype(np.float32)
-    end, forward, _ = cv2.calcOpticalFlowPyrLK(first, second, start, guess.copy(), **settings)
-    back, reverse, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **settings)
-    valid = (forward.ravel() == 1) & (reverse.ravel() == 1)
-    valid &= np.hypot(*(back - start).T) <= _FORWARD_BACKWARD_PX
+    start, initial = pixels.astype(np.float32), predicted_pixels.astype(np.float32)
+    end, status, _ = cv2.calcOpticalFlowPyrLK(first, second, start, initial.copy(), **settings)
+    reverse_end, reverse_status, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **settings)
+    valid = (status.ravel() == 1) & (reverse_status.ravel() == 1)
+    valid &= np.hypot(*(reverse_end - start).T) <= _FORWARD_BACKWARD_PX
     return end.astype(np.float64), np.asarray(valid)
 
 

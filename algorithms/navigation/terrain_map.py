@@ -131,10 +131,11 @@ class TerrainMap:
 
     def goodness(self, limits: GroundLimits) -> Goodness:
         """Evaluate the ground under a disc at each cell."""
-        mapped = self.mapped_cells
-        reference = float(np.nanmean(self.median_m)) if mapped.any() else 0.0
-        z = np.where(mapped, self.median_m - reference, 0.0)
-        weight = mapped.astype(np.float64)
+        is_mapped = self.mapped_cells
+        # heights relative to their mean, to reduce rounding errors
+        reference = float(np.nanmean(self.median_m)) if is_mapped.any() else 0.0
+        z = np.where(is_mapped, self.median_m - reference, 0.0)
+        weight = is_mapped.astype(np.float64)
         disc, x, y = _disc(limits.radius_m)
 
         def sum_over_disc(values: Raster, kernel: Float[np.ndarray, "_ _"]) -> Raster:
@@ -151,7 +152,7 @@ class TerrainMap:
         squared_residuals = szz[is_known] - np.sum(planes * right_hand_sides, axis=-1)
         centre = np.full(z.shape, np.nan)
         centre[is_known] = planes[:, 0] + reference
-        hazard = is_known & mapped
+        hazard = is_known & is_mapped
         with np.errstate(invalid="ignore"):
             step = np.maximum(self.upper_m - centre, centre - self.lower_m)
             hazard &= step > limits.climb_m
@@ -159,7 +160,7 @@ class TerrainMap:
         tilt = np.arctan(np.hypot(planes[:, 1], planes[:, 2]))
         roughness = np.sqrt(np.maximum(squared_residuals, 0.0) / count[is_known])
         # largest step of any cell in the disc
-        steps = np.where(is_known & mapped, np.nan_to_num(step), 0.0)
+        steps = np.where(is_known & is_mapped, np.nan_to_num(step), 0.0)
         max_steps = cv2.dilate(steps, (disc > 0.0).astype(np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
         margins = [
             1.0 - tilt / limits.tilt_rad,

@@ -102,22 +102,24 @@ def estimate_motion(
     disparities, valid = first_pair.feature_disparities(pixels, options.min_range_m)
     pixels, disparities = pixels[valid], disparities[valid]
     points = first_pair.triangulate(pixels, disparities)
-    expected, visible = second_pair.camera.project(np.asarray(predicted.inv().apply(points.copy())).reshape(-1, 3))
-    inside = visible & second_pair.camera.in_frame(expected)
-    pixels, disparities, points, expected = (values[inside] for values in (pixels, disparities, points, expected))
-    tracked, valid = track_features(first_pair.left, second_pair.left, pixels, expected)
-    second_disparities, matched = second_pair.feature_disparities(tracked, options.min_range_m)
-    valid &= matched
+    expected_pixels, visible = second_pair.camera.project(
+        np.asarray(predicted.inv().apply(points.copy())).reshape(-1, 3)
+    )
+    inside = visible & second_pair.camera.in_frame(expected_pixels)
+    pixels, disparities, points = (values[inside] for values in (pixels, disparities, points))
+    second_pixels, valid = track_features(first_pair.left, second_pair.left, pixels, expected_pixels[inside])
+    second_disparities, is_matched = second_pair.feature_disparities(second_pixels, options.min_range_m)
+    valid &= is_matched
     count = int(np.count_nonzero(valid))
     if count < options.min_features:
         return VisualOdometry(VisualOdometryOutcome.TOO_FEW_FEATURES, None, count, 0, float("nan"))
     pixels, disparities, points = pixels[valid], disparities[valid], points[valid]
-    tracked, second_disparities = tracked[valid], second_disparities[valid]
-    second_points = second_pair.triangulate(tracked, second_disparities)
-    inliers = _find_inliers(second_pair, points, tracked, predicted, options)
+    second_pixels, second_disparities = second_pixels[valid], second_disparities[valid]
+    second_points = second_pair.triangulate(second_pixels, second_disparities)
+    inliers = _find_inliers(second_pair, points, second_pixels, predicted, options)
     covariances = (
         first_pair.covariances(pixels, disparities, options.match_error_px),
-        second_pair.covariances(tracked, second_disparities, options.match_error_px),
+        second_pair.covariances(second_pixels, second_disparities, options.match_error_px),
     )
     motion, sigma_m = predicted, float("nan")
     for _ in range(_ADJUSTMENTS):
@@ -174,7 +176,7 @@ def _compute_whitening(
 def _residuals(
     points: Points3, second_points: Points3, whitening: Float64[np.ndarray, "n 3 3"], motion: RigidTransform
 ) -> Points3:
-    """Compute the normalised differences between the points of the first pair and the moved points of the second."""
+    """Compute the normalised differences between the first pair's points and the second pair's transformed points."""
     difference = points - motion.apply(second_points.copy())
     return np.asarray((whitening @ difference[..., None])[..., 0])
 
@@ -189,17 +191,18 @@ def _refine_motion(
     """Minimise the normalised distances of the inliers; return the motion and the position's standard deviation."""
     first, second, weights = points[inliers], second_points[inliers], whitening[inliers]
 
-    def apply(x: Float64[np.ndarray, "6"]) -> RigidTransform:
-        return rigid(start.rotation * Rotation.from_rotvec(x[:3]), start.translation + x[3:])
+    # a correction is a rotation vector and a translation
+    def correct_motion(correction: Float64[np.ndarray, "6"]) -> RigidTransform:
+        return rigid(start.rotation * Rotation.from_rotvec(correction[:3]), start.translation + correction[3:])
 
-    def compute_residuals(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "n"]:
-        return _residuals(first, second, weights, apply(x)).ravel()
+    def compute_residuals(correction: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "n"]:
+        return _residuals(first, second, weights, correct_motion(correction)).ravel()
 
-    def compute_jacobian(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "n 6"]:
+    def compute_jacobian(correction: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "n 6"]:
         # a small rotation w moves a point q by w x q
-        axes = apply(x).rotation.as_matrix()
+        rotation = correct_motion(correction).rotation.as_matrix()
         crosses = np.cross(np.eye(3)[None], second[:, None])
-        rotation_jacobian = (axes @ crosses.transpose(0, 2, 1)).astype(np.float64)
+        rotation_jacobian = (rotation @ crosses.transpose(0, 2, 1)).astype(np.float64)
         columns = np.concatenate([rotation_jacobian, np.broadcast_to(np.eye(3), rotation_jacobian.shape)], axis=2)
         return np.asarray(-(weights @ columns).reshape(-1, 6))
 
@@ -207,9 +210,9 @@ def _refine_motion(
     jacobian = np.asarray(solution.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian)
     # residuals larger than the assumed match error increase the uncertainty
-    variance = max(float(np.mean(_residuals(first, second, weights, apply(solution.x)) ** 2)), 1.0)
+    variance = max(float(np.mean(_residuals(first, second, weights, correct_motion(solution.x)) ** 2)), 1.0)
     sigma = np.sqrt(variance * np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-    return apply(solution.x), float(sigma)
+    return correct_motion(solution.x), float(sigma)
 
 
 def _check_motion(

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from marsyard.algorithms.arrays import Vector2
 from marsyard.algorithms.vtt.matching import Match, Sighting, ViewChange, extract_patch, search_window, window_fits
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker
@@ -21,16 +22,16 @@ SIGMA_GREY, MEAN_GREY = 40.0, 128.0
 
 
 def match_by_lucas_kanade(
-    sighting: Sighting, image: MastImage, predicted: Float[np.ndarray, "2"], change: ViewChange, options: VttOptions
+    sighting: Sighting, image: MastImage, predicted_pixel: Vector2, change: ViewChange, options: VttOptions
 ) -> Match | None:
     """Match the target by its optical flow from the old image, magnified and rolled, to the new image; a `Matcher`.
 
     The score is the normalised correlation at the match; 0 if the flow does not converge or leaves the image.
     """
-    window, corner = search_window(image, predicted, options.search_px)
+    window, corner = search_window(image, predicted_pixel, options.search_px)
     if min(window.shape) < options.template_px:
         return None
-    side = options.search_px | 1
+    side = options.search_px | 1  # odd
     old_patch = extract_patch(sighting.image, sighting.pixel, side, change)
     half, centre = (options.template_px - 1) // 2, (side - 1) // 2
     template = old_patch[centre - half : centre + half + 1, centre - half : centre + half + 1]
@@ -38,7 +39,7 @@ def match_by_lucas_kanade(
     rows, columns = window.shape
     new_patch = np.pad(window.astype(np.float64), ((0, side - rows), (0, side - columns)), mode="edge")
     start_point = np.full((1, 1, 2), centre, dtype=np.float32)
-    predicted_point = (predicted - corner).astype(np.float32).reshape(1, 1, 2)
+    predicted_point = (predicted_pixel - corner).astype(np.float32).reshape(1, 1, 2)
     tracked_point, status, _ = cv2.calcOpticalFlowPyrLK(
         _normalize_to_8_bits(old_patch),
         _normalize_to_8_bits(new_patch),
@@ -50,15 +51,15 @@ def match_by_lucas_kanade(
     )
     pixel = np.asarray(tracked_point, dtype=np.float64).reshape(2) + corner
     if not status[0, 0] or not window_fits(image, pixel, options.template_px):
-        return Match(predicted, 0.0, template)
+        return Match(predicted_pixel, 0.0, template)
     return Match(pixel, correlation(template, extract_patch(image, pixel, options.template_px)), template)
 
 
 def correlation(a: Float[np.ndarray, "n m"], b: Float[np.ndarray, "n m"]) -> float:
     """Normalised correlation of two patches, Eq. 11; 0 if either is flat."""
-    x, y = a - a.mean(), b - b.mean()
-    energy = float(np.sqrt(np.sum(x * x) * np.sum(y * y)))
-    return float(np.sum(x * y)) / energy if energy > 0.0 else 0.0
+    a, b = a - a.mean(), b - b.mean()
+    energy = float(np.sqrt(np.sum(a * a) * np.sum(b * b)))
+    return float(np.sum(a * b)) / energy if energy > 0.0 else 0.0
 
 
 def _normalize_to_8_bits(image: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:

@@ -143,32 +143,32 @@ def refine_match(
     (`warp` is ``none``), or if the shift cannot be registered, `corner + offset` is returned; if a warp cannot be
     registered, the result of the previous model.
     """
-    fitted = Refinement(corner + offset, integer_peak.value, integer_peak.value)
+    peak_fit = Refinement(corner + offset, integer_peak.value, integer_peak.value)
     if options.warp == "none":
-        return fitted
+        return peak_fit
     start = np.maximum(corner.astype(int) - MARGIN_PX - 2, 0)
     end = corner.astype(int) + len(template) + MARGIN_PX + 2
     region = image.counts[start[0] : end[0], start[1] : end[1]].astype(np.float64)
     part = build_spline(region, corner + offset - start, len(template))
-    shifted = register_template(template, part, corner + offset - start, "shift")
-    if shifted is None:
-        return fitted
-    best = shifted
+    shift_match = register_template(template, part, corner + offset - start, "shift")
+    if shift_match is None:
+        return peak_fit
+    best = shift_match
     for warp in _WARPS_BY_OPTION[options.warp]:
         part = build_spline(region, best.corner, len(template), previous=part)
-        warped = register_template(template, part, best.corner, warp)
-        if warped is None:
+        warp_match = register_template(template, part, best.corner, warp)
+        if warp_match is None:
             break
-        best = warped
-    return Refinement(best.corner + start, shifted.score, best.score)
+        best = warp_match
+    return Refinement(best.corner + start, shift_match.score, best.score)
 
 
 def match_by_correlation(
-    sighting: Sighting, image: MastImage, predicted: Vector2, change: ViewChange, options: VttOptions
+    sighting: Sighting, image: MastImage, predicted_pixel: Vector2, change: ViewChange, options: VttOptions
 ) -> Match | None:
     """Match the magnified, rolled template in a window by coarse-to-fine normalised correlation (paper's matcher)."""
     template = extract_patch(sighting.image, sighting.pixel, options.template_px, change)
-    counts, window_corner = search_window(image, predicted, options.search_px)
+    counts, window_corner = search_window(image, predicted_pixel, options.search_px)
     if min(counts.shape) < options.template_px:
         return None
     window = counts.astype(np.float64)
@@ -220,6 +220,7 @@ def magnification(old_position: Vector3, old_centre: Vector3, new_position: Vect
 
 def horizontal_axis(camera: CameraModel) -> Vector3:
     """Unit vector Hx along the image's x axis, Eqs. 7 to 9; A and H of the camera model may not be perpendicular."""
+    # horizontal focal length and image centre of the CAHV model, pixels
     h_s = np.linalg.norm(np.cross(camera.a, camera.h))
     h_c = camera.a @ camera.h
     return np.asarray((camera.h - h_c * camera.a) / h_s)

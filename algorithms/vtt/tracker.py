@@ -103,15 +103,15 @@ def find_losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) ->
     return tuple(loss for loss, is_exceeded in criteria.items() if is_exceeded)
 
 
-def next_state(state: TrackingState, lost_updates: int, found: bool, limit: int) -> tuple[TrackingState, int]:
+def next_state(state: TrackingState, lost_updates: int, is_matched: bool, limit: int) -> tuple[TrackingState, int]:
     """Return the state after an update, and the number of updates since the loss (Fig. 6).
 
-    `found`: whether the update matched the target. After a loss the state is LOST. Up to `limit` further updates can
-    recover the target; afterwards the state is FAILURE until the target is cleared.
+    `is_matched`: whether the update matched the target. After a loss the state is LOST. Up to `limit` further updates
+    can recover the target; afterwards the state is FAILURE until the target is cleared.
     """
     if state in (TrackingState.FAILURE, TrackingState.NO_TARGET):
         return state, lost_updates
-    if found:
+    if is_matched:
         return TrackingState.NORMAL, 0
     if state is TrackingState.NORMAL:
         return (TrackingState.LOST, 0) if limit else (TrackingState.FAILURE, 0)

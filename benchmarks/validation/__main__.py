@@ -68,20 +68,20 @@ def _print_table(console: Console, title: str, measures: list[Measure]) -> None:
 def main() -> int:
     arguments = _parse_arguments()
     console = Console()
-    measured: dict[str, list[Measure]] = {}
+    results: dict[str, list[Measure]] = {}
     for check in CHECKS:
         if arguments.only and check.name not in arguments.only:
             continue
         start = time.perf_counter()
-        measured[check.name] = list(check.run(arguments.quick))
-        _print_table(console, f"{check.name} ({time.perf_counter() - start:.0f} s)", measured[check.name])
+        results[check.name] = list(check.run(arguments.quick))
+        _print_table(console, f"{check.name} ({time.perf_counter() - start:.0f} s)", results[check.name])
         if not arguments.quick:
             # after each check, so that an interruption loses only the current check
-            document.write_page(CHECKS, document.store({check.name: measured[check.name]}, arguments.quick))
-    missed = [measure.claim for measures in measured.values() for measure in measures if not measure.passed]
-    for claim in missed:
+            document.write_page(CHECKS, document.store({check.name: results[check.name]}, arguments.quick))
+    missed_claims = [measure.claim for measures in results.values() for measure in measures if not measure.passed]
+    for claim in missed_claims:
         console.print(f"[bold red]missed:[/] {claim}")
-    return 1 if missed else 0
+    return 1 if missed_claims else 0
 
 
 if __name__ == "__main__":

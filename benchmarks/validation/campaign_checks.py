@@ -52,13 +52,13 @@ class SilentProgress:
 def check_rows(quick: bool) -> Iterator[Measure]:
     """Compare the rows of all ways to run a campaign with those of one worker, for faulty and for rendered cases."""
     faulty_fraction, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
-    with TemporaryDirectory() as name:
-        folder = Path(name)
+    with TemporaryDirectory() as directory:
+        folder = Path(directory)
         settings = [f"faulty_fraction={faulty_fraction}", f"cases={cases}"]
         population = f"cases, {100 * faulty_fraction:g} % of which misbehave"
         yield from _compare_executors(str(_write_campaign(folder)), folder / "chaos", settings, kills, population)
-        rendered = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
-        yield from _compare_executors("dimes-smoke", folder / "rendered", rendered, kills, "rendered descents")
+        settings = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
+        yield from _compare_executors("dimes-smoke", folder / "rendered", settings, kills, "rendered descents")
 
 
 def _compare_executors(
@@ -66,33 +66,33 @@ def _compare_executors(
 ) -> Iterator[Measure]:
     """Compare the rows of each executor, of interrupted runs and of replays with those of one worker."""
     folder.mkdir()
-    expected = _run_campaign(campaign, folder / "one", ExecutorConfig(1), settings)
-    cases = len(expected)
-    replayed = range(0, cases, max(cases // 8, 1))
+    expected_rows = _run_campaign(campaign, folder / "one", ExecutorConfig(1), settings)
+    cases = len(expected_rows)
+    replay_cases = range(0, cases, max(cases // 8, 1))
     cluster = ExecutorConfig(cluster="local:2")
     runs: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "two workers": lambda: _run_campaign(campaign, folder / "two", ExecutorConfig(2), settings),
         "a Dask cluster of two": lambda: _run_campaign(campaign, folder / "cluster", cluster, settings),
         f"a runner killed {kills} times": lambda: _run_with_kills(campaign, folder / "killed", settings, kills),
-        "single replays": lambda: [dict(replay(folder / "one", case).row) for case in replayed],
+        "single replays": lambda: [dict(replay(folder / "one", case).row) for case in replay_cases],
     }
     for name, run in runs.items():
         rows = run()
-        differing = sum(bool(differing_columns(row, expected[int(row["case"])])) for row in rows)
-        missing = (len(replayed) if name == "single replays" else cases) - len(rows)
+        differing_count = sum(bool(differing_columns(row, expected_rows[int(row["case"])])) for row in rows)
+        missing_count = (len(replay_cases) if name == "single replays" else cases) - len(rows)
         how = f"{len(rows)} of {cases} {population}; all columns except times"
         claim = f"{population}: rows of {name} that are missing or differ from those of one worker"
-        yield Measure(claim, differing + missing, "", 0, how)
+        yield Measure(claim, differing_count + missing_count, "", 0, how)
 
 
 def check_survival(quick: bool) -> Iterator[Measure]:
     """Compare a campaign with random faults with the same campaign without faults."""
-    cases, faulty = (60, 0.15) if quick else (400, 0.03)
-    with TemporaryDirectory() as name:
-        folder = Path(name)
+    cases, faulty_fraction = (60, 0.15) if quick else (400, 0.03)
+    with TemporaryDirectory() as directory:
+        folder = Path(directory)
         file = _write_campaign(folder)
         elapsed_s, rows = {}, {}
-        for fraction in (0.0, faulty):
+        for fraction in (0.0, faulty_fraction):
             start_s = time.monotonic()
             rows[fraction] = _run_campaign(
                 file,
@@ -101,20 +101,21 @@ def check_survival(quick: bool) -> Iterator[Measure]:
                 [f"faulty_fraction={fraction}", f"cases={cases}", "work_s=0.4"],
             )
             elapsed_s[fraction] = time.monotonic() - start_s
-        campaign = load_campaign(str(file), [f"faulty_fraction={faulty}"])
+        campaign = load_campaign(str(file), [f"faulty_fraction={faulty_fraction}"])
         faults = [_draw_fault(campaign, case) for case in range(cases)]
-        wrong = sum(
-            row["outcome"] != FAULTS.get(fault, "VALID") for row, fault in zip(rows[faulty], faults, strict=True)
+        faulty_rows, reference_rows = rows[faulty_fraction], rows[0.0]
+        wrong_count = sum(
+            row["outcome"] != FAULTS.get(fault, "VALID") for row, fault in zip(faulty_rows, faults, strict=True)
         )
-        healthy = [case for case, fault in enumerate(faults) if not fault]
-        changed = sum(bool(differing_columns(rows[faulty][case], rows[0.0][case])) for case in healthy)
-        loops = faults.count("loop")
+        healthy_cases = [case for case, fault in enumerate(faults) if not fault]
+        changed_count = sum(bool(differing_columns(faulty_rows[case], reference_rows[case])) for case in healthy_cases)
         counts = ", ".join(f"{faults.count(fault)} {fault}" for fault in FAULTS)
         how = f"{cases} cases of 0.4 s on two workers; {counts}"
-        yield Measure("outcomes that do not match the fault of the case", wrong, "", 0, how)
-        yield Measure("cases without fault whose rows changed", changed, "", 0, f"{how}; {len(healthy)} without fault")
-        limits_s = loops * campaign.configuration.limits.case_time_s
-        ratio = (elapsed_s[faulty] - limits_s) / elapsed_s[0.0]
+        yield Measure("outcomes that do not match the fault of the case", wrong_count, "", 0, how)
+        healthy_how = f"{how}; {len(healthy_cases)} without fault"
+        yield Measure("cases without fault whose rows changed", changed_count, "", 0, healthy_how)
+        limits_s = faults.count("loop") * campaign.configuration.limits.case_time_s
+        ratio = (elapsed_s[faulty_fraction] - limits_s) / elapsed_s[0.0]
         yield Measure(
             "time minus time limits, divided by the time without faults",
             ratio,
@@ -144,7 +145,7 @@ def _run_campaign(
 
 
 def _run_with_kills(campaign: str, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
-    """Rows of a campaign that is killed at random times and resumed each time."""
+    """Run a campaign that is killed at random times and resumed each time; return its rows."""
     rng = np.random.default_rng(7)
     program = [sys.executable, "-m", "marsyard"]
     command = [*program, "run", campaign, "--out", str(directory), "--jobs", "2"]

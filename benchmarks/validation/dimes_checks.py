@@ -30,7 +30,7 @@ def check_imu_threshold(quick: bool) -> Iterator[Measure]:
     single = reference.single()
     how = f"{descents} descents of a second implementation by first-order propagation; threshold {threshold:g} m/s"
     # The limits are three standard errors of a quantile. The relative standard error of the quantile q is
-    # sqrt(q (1 - q) / n) / (density * quantile). The product in the denominator is 0.44 at the median, 0.03 at 99.5 %.
+    # sqrt(q (1 - q) / n) / (probability density * quantile). The denominator is 0.44 at the median, 0.03 at 99.5 %.
     median_error = float(np.median(single)) / _read_stored_median_m_s() - 1.0
     limit = 3.4 / math.sqrt(descents)
     yield Measure(
@@ -83,10 +83,11 @@ def compare_estimators(quick: bool) -> Iterator[Measure]:
         results = run_estimator(estimator, descents)
         valid = results.valid_errors_m_s
         rms = float(np.sqrt(np.mean(valid**2))) if valid.size else float("nan")
-        wrong = int(np.sum(valid > REQUIREMENT_M_S))
+        wrong_count = int(np.sum(valid > REQUIREMENT_M_S))
+        largest_error = valid.max() if valid.size else float("nan")
         how = (
-            f"{valid.size} of {len(descents)} descents of dimes-smoke answered, {wrong} wrong by more than 5 m/s, "
-            f"largest error {valid.max() if valid.size else float('nan'):.2g} m/s, "
+            f"{valid.size} of {len(descents)} descents of dimes-smoke answered, "
+            f"{wrong_count} wrong by more than 5 m/s, largest error {largest_error:.2g} m/s, "
             f"{1e3 * float(np.median(results.seconds)):.0f} core-ms for three images"
         )
         yield Measure(f"velocity error, rms: {name}", rms, "m/s", None, how)

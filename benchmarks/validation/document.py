@@ -36,11 +36,11 @@ def format_value(measure: Measure, value: float) -> str:
     return f"{format_number(value)} {measure.unit}".strip()
 
 
-def store(measured: dict[str, list[Measure]], quick: bool) -> dict[str, dict]:
+def store(results: dict[str, list[Measure]], quick: bool) -> dict[str, dict]:
     """Add the measurements of these checks to the stored measurements, and return all."""
     stored: dict[str, dict] = json.loads(RESULTS.read_text())["checks"] if RESULTS.exists() else {}
     environment = _read_environment(quick)
-    for name, measures in measured.items():
+    for name, measures in results.items():
         stored[name] = {"environment": environment, "measures": [asdict(measure) for measure in measures]}
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps({"checks": {name: stored[name] for name in sorted(stored)}}, indent=1) + "\n")
@@ -84,13 +84,17 @@ def _describe_environments(checks: Sequence[Check], stored: dict[str, dict]) -> 
     if not environments:
         return "Nothing has been measured yet."
     labels = {"machine": "", "gl": "OpenGL ", "versions": "", "samples": "samples: "}
-    common, different = [], []
+    common_values, exceptions = [], []
     for key, label in labels.items():
         groups: dict[str, list[str]] = {}
         for name, environment in environments.items():
             groups.setdefault(environment[key], []).append(name)
         common_value = max(groups, key=lambda value: len(groups[value]))
-        common.append(f"{label}{common_value}")
-        different += [f"{', '.join(names)}: {label}{value}" for value, names in groups.items() if value != common_value]
-    exceptions = f" Exceptions, by the names of checks (`--only NAME`): {'; '.join(different)}." if different else ""
-    return f"Measured on {'; '.join(common)}.{exceptions}"
+        common_values.append(f"{label}{common_value}")
+        exceptions += [
+            f"{', '.join(names)}: {label}{value}" for value, names in groups.items() if value != common_value
+        ]
+    exception_text = (
+        f" Exceptions, by the names of checks (`--only NAME`): {'; '.join(exceptions)}." if exceptions else ""
+    )
+    return f"Measured on {'; '.join(common_values)}.{exception_text}"

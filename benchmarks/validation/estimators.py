@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 from scipy.interpolate import BSpline
 
-#: Side of a patch and half of it, pixels.
+#: Side and half width of a patch, pixels.
 PATCH, HALF = 31, 15
 #: Standard deviation of the smoothing of both images, pixels.
 SIGMA_PX = 1.0
@@ -39,8 +39,8 @@ class SmoothImage:
     """Image smoothed by a Gaussian of one pixel, interpolated by a quintic spline."""
 
     def __init__(self, image: np.ndarray) -> None:
-        smoothed = ndimage.gaussian_filter(image.astype(np.float64), SIGMA_PX)
-        self._coefficients = ndimage.spline_filter(smoothed, order=5)
+        smooth_image = ndimage.gaussian_filter(image.astype(np.float64), SIGMA_PX)
+        self._coefficients = ndimage.spline_filter(smooth_image, order=5)
 
     def patches(self, centres: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values of patches around `centres` + `shift` (both (u, v), shape (n, 2)), and their derivatives by u and v.
@@ -58,9 +58,9 @@ class SmoothImage:
         row_slope = np.einsum("nrck,nk->nrc", row_windows, du)
         column_windows = sliding_window_view(row_value, 6, axis=1)
         value = np.einsum("nrck,nk->nrc", column_windows, wv)
-        by_v = np.einsum("nrck,nk->nrc", column_windows, dv)
-        by_u = np.einsum("nrck,nk->nrc", sliding_window_view(row_slope, 6, axis=1), wv)
-        return value, np.stack([by_u, by_v], axis=1)
+        slope_v = np.einsum("nrck,nk->nrc", column_windows, dv)
+        slope_u = np.einsum("nrck,nk->nrc", sliding_window_view(row_slope, 6, axis=1), wv)
+        return value, np.stack([slope_u, slope_v], axis=1)
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,9 @@ def symmetric_shifts(first: SmoothImage, second: SmoothImage, centres: np.ndarra
         a, slope_a = first.patches(centres, -0.5 * shift)
         b, slope_b = second.patches(centres, 0.5 * shift)
         residual = a - gain[:, None, None] * b - offset[:, None, None]
-        by_shift = 0.5 * (slope_a + gain[:, None, None, None] * slope_b)
+        jacobian = 0.5 * (slope_a + gain[:, None, None, None] * slope_b)
         design = np.concatenate(
-            [by_shift.reshape(count, 2, -1), b.reshape(count, 1, -1), np.ones((count, 1, PATCH * PATCH))], axis=1
+            [jacobian.reshape(count, 2, -1), b.reshape(count, 1, -1), np.ones((count, 1, PATCH * PATCH))], axis=1
         )
         normal = design @ design.transpose(0, 2, 1)
         step = np.linalg.solve(normal, (design @ residual.reshape(count, -1, 1)))[..., 0]
@@ -105,7 +105,7 @@ def symmetric_shifts(first: SmoothImage, second: SmoothImage, centres: np.ndarra
         if np.abs(step[:, :2]).max() < 1e-5:
             break
     solver = np.linalg.solve(normal, design)[:, :2].reshape(count, 2, PATCH, PATCH)
-    response = solver[..., None] * by_shift.transpose(0, 2, 3, 1)[:, None]
+    response = solver[..., None] * jacobian.transpose(0, 2, 3, 1)[:, None]
     return Shifts(shift, response)
 
 
@@ -120,8 +120,8 @@ def peak_fits(first: np.ndarray, second: np.ndarray, centres: np.ndarray) -> tup
     surface = np.empty((len(centres), 5, 5))
     for i in range(5):
         for j in range(5):
-            shifted = _normalise(second[(rows + i - 2)[:, :, None], (columns + j - 2)[:, None, :]])
-            surface[:, i, j] = np.sum(template * shifted, axis=(1, 2))
+            shifted_patches = _normalise(second[(rows + i - 2)[:, :, None], (columns + j - 2)[:, None, :]])
+            surface[:, i, j] = np.sum(template * shifted_patches, axis=(1, 2))
     best = surface[:, 1:4, 1:4].reshape(len(centres), -1).argmax(axis=1)
     top, left = best // 3, best % 3
     neighbours = np.arange(3)
@@ -145,6 +145,7 @@ def _fit_quadric(z: np.ndarray) -> np.ndarray:
     """Maximum (u, v) of the least-squares quadric through 3 x 3 values."""
     v, u = np.mgrid[-1.0:2.0, -1.0:2.0]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(9, 6)
+    # coefficients of u, v, u^2, u v and v^2
     _, bu, bv, uu, uv, vv = np.linalg.pinv(terms) @ z.reshape(-1, 9).T
     determinant = 4.0 * uu * vv - uv**2
     return np.stack([(uv * bv - 2.0 * vv * bu) / determinant, (uv * bu - 2.0 * uu * bv) / determinant], axis=-1)

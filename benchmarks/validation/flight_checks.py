@@ -54,7 +54,7 @@ def run_descent(quick: bool) -> Iterator[Measure]:
 
 def run_mast(quick: bool) -> Iterator[Measure]:
     """Compare mast images with those of both rovers."""
-    for site, flown in (("gusev", "Spirit: 0.061 to 0.065"), ("meridiani", "Opportunity: 0.046 to 0.055")):
+    for site, reference in (("gusev", "Spirit: 0.061 to 0.065"), ("meridiani", "Opportunity: 0.046 to 0.055")):
         seeds = range(1, 2 if quick else 6)
         rows = [
             _render_statistics(site, "mer-navcam", azimuth_deg=azimuth, elevation_deg=ELEVATION_DEG, seed=seed)
@@ -62,7 +62,7 @@ def run_mast(quick: bool) -> Iterator[Measure]:
             for azimuth in AZIMUTHS_DEG
         ]
         contrast = float(np.median([row.local_p50 for row in rows]))
-        how = f"median of {len(rows)} images of {len(seeds)} terrains; {flown}"
+        how = f"median of {len(rows)} images of {len(seeds)} terrains; {reference}"
         claim = f"contrast of blocks of mast images, {site}"
         yield Measure(claim, contrast, "1", 0.045, how, "at least")
         yield Measure(f"{claim}, upper limit", contrast, "1", 0.075, how)
@@ -91,11 +91,10 @@ def run_templates(quick: bool) -> Iterator[Measure]:
         text = f"{how}; median {median:.2g}, 5 to 95 % {low_5:.2g} to {high_95:.2g}"
         yield Measure(f"{name}: minimum", float(values.min()), "1", low, text)
         yield Measure(f"{name}: maximum", float(values.max()), "1", high, text, "at least")
-    rejected = float(np.mean(valid == 0.0))
-    yield Measure("refused templates", rejected, "1", FLOWN_REJECTED_FRACTION[1], f"{how}, one refused")
-    yield Measure(
-        "refused templates, lower limit", rejected, "1", FLOWN_REJECTED_FRACTION[0], f"{how}, one refused", "at least"
-    )
+    rejected_fraction = float(np.mean(valid == 0.0))
+    yield Measure("refused templates", rejected_fraction, "1", FLOWN_REJECTED_FRACTION[1], f"{how}, one refused")
+    claim = "refused templates, lower limit"
+    yield Measure(claim, rejected_fraction, "1", FLOWN_REJECTED_FRACTION[0], f"{how}, one refused", "at least")
 
 
 CHECKS = (

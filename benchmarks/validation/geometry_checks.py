@@ -35,7 +35,7 @@ LIBRARIES = {"osmesa": "libOSMesa.so.8", "egl": "libEGL.so.1"}
 #: Maximum relative difference of a pixel's range from the mean of its neighbours; larger values mark silhouettes.
 #: Smooth ground seen from a mast at 3 deg differs by less.
 MAX_RANGE_CURVATURE = 0.003
-#: Number of terrain samples per pixel along the line of sight from which the renderer smooths the ground.
+#: Maximum number of terrain samples per pixel along the line of sight; above it the renderer smooths the ground.
 MAX_SAMPLES_PER_PIXEL = 8.0
 #: Maximum range from a mast over rough ground, m; beyond it pixels cover metres of ground and contain silhouettes.
 MAX_MAST_RANGE_M = 40.0
@@ -90,8 +90,8 @@ def _tilted_plane(slope: tuple[float, float], side: int, spacing: float) -> Surf
 def run_planes(quick: bool) -> Iterator[Measure]:
     """Compare the world points of a tilted plane with its equation, for all cameras."""
     slope, side = (0.15, -0.1), 1024
-    upward = np.array([-slope[0], -slope[1], 1.0])
-    upward /= np.linalg.norm(upward)
+    normal = np.array([-slope[0], -slope[1], 1.0])
+    normal /= np.linalg.norm(normal)
     for name, camera in cameras().items():
         attitude = Rotation.align_vectors(np.array([[0.15, 0.1, -1.0]]), camera.boresight()[None])[0]
         # points beyond two camera heights are excluded because wide cameras see the horizon
@@ -102,7 +102,7 @@ def run_planes(quick: bool) -> Iterator[Measure]:
         frame = render(renderer(), view)
         points = frame.points_world() - [position[0], position[1], 0.0]
         is_near = np.hypot(points[..., 0], points[..., 1]) < 2.0 * height
-        error = np.abs(points @ upward / frame.range_m)[is_near].max()
+        error = np.abs(points @ normal / frame.range_m)[is_near].max()
         how = f"all {int(is_near.sum())} pixels within two heights of a plane tilted by 10 deg"
         claim = f"world points of a tilted plane: {name}"
         yield Measure(claim, float(error), "of range", find_limit(claim), how)
@@ -110,18 +110,18 @@ def run_planes(quick: bool) -> Iterator[Measure]:
 
 @dataclass(frozen=True)
 class Ranges:
-    """Ranges of pixels away from silhouettes: rendered and from independent ray casting."""
+    """Ranges of pixels away from silhouettes, m: rendered and from independent ray casting."""
 
-    rendered: np.ndarray
-    cast: np.ndarray
+    rendered_m: np.ndarray
+    reference_m: np.ndarray
     #: Fractions of pixels near silhouettes, and of pixels with smoothed ground.
-    near_silhouettes: float
-    smoothed: float
+    silhouette_fraction: float
+    smoothed_fraction: float
 
     @property
     def agreement(self) -> float:
         """Fraction of ranges within 1e-4 of the independent ray casting."""
-        return float(np.mean(np.abs(self.rendered / self.cast - 1.0) < 1e-4))
+        return float(np.mean(np.abs(self.rendered_m / self.reference_m - 1.0) < 1e-4))
 
 
 def cast_ranges(view: View, count: int, max_range_m: float, step: float) -> Ranges:
@@ -135,8 +135,8 @@ def cast_ranges(view: View, count: int, max_range_m: float, step: float) -> Rang
     columns, rows = view.camera.size
     rng = np.random.default_rng(5)
     pixels = np.stack([rng.integers(1, columns - 1, count), rng.integers(1, rows - 1, count)], axis=-1)
-    rendered = frame.range_m[pixels[:, 1], pixels[:, 0]]
-    pixels, rendered = pixels[rendered < max_range_m], rendered[rendered < max_range_m]
+    rendered_m = frame.range_m[pixels[:, 1], pixels[:, 0]]
+    pixels, rendered_m = pixels[rendered_m < max_range_m], rendered_m[rendered_m < max_range_m]
     camera, ground = view.camera.transform(view.world_from_body), Ground(view.scene.surface)
 
     def cast(right: float, down: float) -> tuple[np.ndarray, np.ndarray]:
@@ -157,17 +157,17 @@ def cast_ranges(view: View, count: int, max_range_m: float, step: float) -> Rang
     downward = -camera.rays(pixels.astype(np.float64))[1][:, 2]
     pixel_rad = 1.0 / np.sqrt(np.prod(view.camera.focal_lengths))
     is_resolved = (
-        rendered * pixel_rad / np.maximum(downward, 0.01) < MAX_SAMPLES_PER_PIXEL * view.scene.surface.spacing_m
+        rendered_m * pixel_rad / np.maximum(downward, 0.01) < MAX_SAMPLES_PER_PIXEL * view.scene.surface.spacing_m
     )
-    compared = is_smooth & is_resolved
-    return Ranges(rendered[compared], ranges[compared], 1.0 - is_smooth.mean(), 1.0 - is_resolved.mean())
+    is_compared = is_smooth & is_resolved
+    return Ranges(rendered_m[is_compared], ranges[is_compared], 1.0 - is_smooth.mean(), 1.0 - is_resolved.mean())
 
 
 def _measure_ranges(name: str, view: View, count: int, max_range_m: float, step: float) -> Measure:
     ranges = cast_ranges(view, count, max_range_m, step)
     how = (
-        f"{ranges.cast.size} random pixels; excluded: {ranges.near_silhouettes:.1%} near silhouettes, "
-        f"{ranges.smoothed:.1%} that cover several samples"
+        f"{ranges.reference_m.size} random pixels; excluded: {ranges.silhouette_fraction:.1%} near silhouettes, "
+        f"{ranges.smoothed_fraction:.1%} that cover several samples"
     )
     return Measure(
         f"ranges within 1e-4 of independent ray casting: {name}", ranges.agreement, "", 0.999, how, "at least"

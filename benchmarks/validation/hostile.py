@@ -37,7 +37,7 @@ class HostileParameters(BaseModel):
 
 
 def _leave_thread() -> None:
-    """Leave a sleeping thread."""
+    """Leave a thread that sleeps after the end of the case."""
     threading.Thread(target=time.sleep, args=(3600,)).start()
 
 
@@ -95,7 +95,7 @@ def _print_endlessly() -> None:
         os.write(1, b"and so on\n" * 1000)
 
 
-def _allocate() -> None:
+def _allocate_endlessly() -> None:
     arrays = []
     while True:
         arrays.append(np.ones(4_000_000))
@@ -115,7 +115,7 @@ def _change_state() -> None:
     sys.setrecursionlimit(200)
 
 
-def _raise_long() -> None:
+def _raise_long_message() -> None:
     raise RuntimeError("a long text " * 20_000)
 
 
@@ -131,7 +131,7 @@ def _change_inputs() -> None:
 
 
 #: Entry of `_remaining_objects` after a case that changed the state of this process.
-_CHANGED_STATE = "spoiled"
+_CHANGED_STATE = "changed state"
 
 #: Faults of misbehaving cases and their expected outcomes; a VALID case must have the row of a healthy case.
 FAULTS: Mapping[str, tuple[Callable[[], object], str]] = {
@@ -149,14 +149,14 @@ FAULTS: Mapping[str, tuple[Callable[[], object], str]] = {
     "kill the supervisor": (_kill_supervisor, "CRASHED"),
     "abort": (os.abort, "CRASHED"),
     "exit": (lambda: os._exit(0), "CRASHED"),
-    "raise with a long message": (_raise_long, "CRASHED"),
+    "raise with a long message": (_raise_long_message, "CRASHED"),
     "close all files": (lambda: os.closerange(3, 1024), "CRASHED"),
     "close standard output": (_close_stream, "VALID"),
     "change the process state": (_change_state, "VALID"),
     "change state that is not compared": (lambda: _remaining_objects.append(_CHANGED_STATE), "VALID"),
     "handle signals": (lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN), "VALID"),
     "print without end": (_print_endlessly, "TOO_MUCH_OUTPUT"),
-    "allocate without end": (_allocate, "OUT_OF_MEMORY"),
+    "allocate without end": (_allocate_endlessly, "OUT_OF_MEMORY"),
     "answer with an array": (lambda: {"number": np.zeros(3)}, "CRASHED"),
     "answer with an integer of 5000 digits": (lambda: {"number": 10**5000}, "CRASHED"),
     "answer with text in a metric": (lambda: {"number": "far"}, "CRASHED"),

@@ -2,7 +2,7 @@
 
 `benchmarks.threshold_derivation` uses DIMES' ground intersection, template grid, combination of tracks and camera
 models. Here templates are at random positions with feasible overlap, cameras are slopes of rays, and each error changes
-the velocity by its partial derivative. Only the distributions are common (`ThresholdInputs`).
+the velocity by its partial derivative. Both implementations use the distributions of `ThresholdInputs`.
 
 Let s be the slope of a ray (horizontal over downward), H the height and T the time between images. A feature is located
 at H s. Relative errors a of both heights, rotations e of both attitudes and a height h of the feature change the
@@ -53,7 +53,7 @@ class Reference:
         """Draw descents with feasible overlap for two templates in each pair."""
         tracks = np.empty((descents, 2, 2, 2))
         for number in range(descents):
-            while (errors := _descent_errors(inputs, rng)) is None:
+            while (errors := _draw_descent_errors(inputs, rng)) is None:
                 pass
             tracks[number] = errors
         return cls(tracks, inputs.imu_sd_m_s * rng.standard_normal((descents, 2)))
@@ -73,13 +73,13 @@ class Reference:
         tracks = self.tracks[:, :, :templates].copy()
         n = len(tracks)
         angle, size = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(*wrong_by_m_s, n)
-        wrong = np.column_stack([size * np.cos(angle), size * np.sin(angle)])
-        tracks[np.arange(n), rng.integers(2, size=n), rng.integers(templates, size=n)] += wrong
+        wrong_errors = np.column_stack([size * np.cos(angle), size * np.sin(angle)])
+        tracks[np.arange(n), rng.integers(2, size=n), rng.integers(templates, size=n)] += wrong_errors
         discrepancies = _discrepancies(tracks, self.imu).reshape(n, -1)
         second = tracks[np.arange(n), 1, discrepancies.argmin(axis=1) % templates]
-        passed = discrepancies.min(axis=1) < threshold_m_s
-        correct = passed & (np.linalg.norm(second, axis=1) <= REQUIRED_M_S)
-        return float(correct.mean()), float(np.mean(~passed))
+        is_accepted = discrepancies.min(axis=1) < threshold_m_s
+        is_correct = is_accepted & (np.linalg.norm(second, axis=1) <= REQUIRED_M_S)
+        return float(is_correct.mean()), float(np.mean(~is_accepted))
 
 
 def _discrepancies(
@@ -90,7 +90,7 @@ def _discrepancies(
     return np.asarray(np.linalg.norm(change, axis=-1))
 
 
-def _descent_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "2 2 2"] | None:
+def _draw_descent_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "2 2 2"] | None:
     """Draw velocity errors by pair and template; None if a pair has no feasible overlap for two templates."""
     heights, interval = np.array(inputs.altitudes_m), inputs.interval_s
     attitudes = [_draw_attitude(inputs, rng) for _ in heights]
@@ -126,13 +126,13 @@ def _draw_attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotatio
 
 def _draw_attitude_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
     """Draw the rotation of each measured attitude relative to the true attitude, radians, world axes."""
-    common = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
-    independent = np.radians(inputs.attitude_sd_deg) * rng.standard_normal((3, 3))
+    common_error = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
+    independent_errors = np.radians(inputs.attitude_sd_deg) * rng.standard_normal((3, 3))
     rates = np.radians(inputs.max_rate_deg_s) * rng.uniform(size=3)
     azimuths = rng.uniform(0.0, 2.0 * np.pi, 3)
     tag_errors_s = inputs.tag_sd_s * rng.standard_normal(3)
     axes = np.column_stack([np.cos(azimuths), np.sin(azimuths), np.zeros(3)])
-    return np.asarray(common + independent + (rates * tag_errors_s)[:, None] * axes)
+    return np.asarray(common_error + independent_errors + (rates * tag_errors_s)[:, None] * axes)
 
 
 def _rotate_slopes(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:

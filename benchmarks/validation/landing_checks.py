@@ -34,12 +34,12 @@ MANY_FEATURES = replace(PAPER_FEATURES, block_px=32)
 def make_noise_free_detector(camera: str) -> DetectorParameters:
     """Return a camera's detector with 16 bits and a large full well, so that shot noise is below 1e-4 of the signal."""
     full_well_e = 1e9
-    original = preset(camera).detector
-    return original.model_copy(
+    detector = preset(camera).detector
+    return detector.model_copy(
         update={
             "full_well_e": full_well_e,
             "gain_e_dn": full_well_e / 2**16,
-            "responsivity_e_s": original.responsivity_e_s * full_well_e / original.full_well_e,
+            "responsivity_e_s": detector.responsivity_e_s * full_well_e / detector.full_well_e,
             "bits": 16,
             "read_noise_e": 0.0,
             "dark_e_s": 0.0,
@@ -99,9 +99,9 @@ def simulate_errors(number: int) -> dict[str, dict[str, Scalar]]:
     return rows
 
 
-def _rms(rows: Sequence[dict[str, Scalar]], value: Callable[[dict[str, Scalar]], float]) -> float:
+def _rms(rows: Sequence[dict[str, Scalar]], read_value: Callable[[dict[str, Scalar]], float]) -> float:
     """Root mean square over all pairs; NaN, which exceeds every limit, if a pair has no map."""
-    return float(np.sqrt(np.mean([value(row) ** 2 for row in rows])))
+    return float(np.sqrt(np.mean([read_value(row) ** 2 for row in rows])))
 
 
 def check_accuracy(quick: bool) -> Iterator[Measure]:
@@ -115,20 +115,21 @@ def check_accuracy(quick: bool) -> Iterator[Measure]:
         how = (
             f"{population}, height 8 to 15 m, baseline 0.2 of the height, {tracks:.0f} tracks, exact scale and vertical"
         )
-        yield Measure("rotation error, rms", _rms(rows, _column("rotation_error_deg")), "deg", limits[0], how)
-        baseline = _rms(rows, _column("baseline_error_fraction"))
+        yield Measure("rotation error, rms", _rms(rows, _read_column("rotation_error_deg")), "deg", limits[0], how)
+        baseline = _rms(rows, _read_column("baseline_error_fraction"))
         yield Measure("baseline error, direction and length, divided by its length, rms", baseline, "", limits[1], how)
         elevation = _rms(rows, lambda row: float(row.get("elevation_rms_m", np.nan)) / float(row["range_m"]))
         yield Measure("elevation error divided by the height, rms", elevation, "", limits[2], how)
     paper_rows = [pair["paper"] for pair in pairs]
     tracks = float(np.median([float(row["tracks"]) for row in paper_rows]))
     how = f"the same {len(paper_rows)} pairs"
-    rotation = _rms(paper_rows, _column("rotation_error_deg"))
+    rotation = _rms(paper_rows, _read_column("rotation_error_deg"))
     claim = f"rotation error with the paper's features, {tracks:.0f} tracks, rms"
     yield Measure(claim, rotation, "deg", ROTATION_LIMIT_DEG, how)
 
 
-def _column(name: str) -> Callable[[dict[str, Scalar]], float]:
+def _read_column(name: str) -> Callable[[dict[str, Scalar]], float]:
+    """Return a function that reads a column of a row."""
     return lambda row: float(row[name])
 
 

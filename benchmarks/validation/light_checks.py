@@ -98,7 +98,7 @@ def _compare_shadows(name: str, view: View, sun: Sun, count: int, max_range_m: f
     to_sun = np.asarray(sun.direction, dtype=np.float64)
     cos_i = normals @ to_sun
     sunlit_fraction = frame.radiance.ravel()[pixels] / (FLAT_ALBEDO * np.maximum(cos_i, 1e-6))
-    rendered_lit = (cos_i > 0.0) & (sunlit_fraction > 0.5)
+    is_lit_in_image = (cos_i > 0.0) & (sunlit_fraction > 0.5)
     ground = Ground(view.scene.surface)
     # the renderer smooths distant ground; exact heights are used, because only shadows are compared
     on_ground = frame.body.ravel()[pixels] < 0
@@ -106,15 +106,15 @@ def _compare_shadows(name: str, view: View, sun: Sun, count: int, max_range_m: f
     is_occluded = ground.is_occluded(points, to_sun, step)
     rays = np.broadcast_to(to_sun, points.shape)
     is_occluded |= np.isfinite(cast_triangles(view.scene.objects, points, rays, nearest=2e-3))
-    reference_lit = (cos_i > 0.0) & ~is_occluded
-    agreement = float(np.mean(rendered_lit == reference_lit))
-    in_cast_shadow = (cos_i > 0.0) & is_occluded
-    rendered_dark = ~rendered_lit[in_cast_shadow]
-    dark_text = f", of which {np.mean(rendered_dark):.0%} are dark in the image" if in_cast_shadow.any() else ""
+    is_lit_in_reference = (cos_i > 0.0) & ~is_occluded
+    agreement = float(np.mean(is_lit_in_image == is_lit_in_reference))
+    is_in_cast_shadow = (cos_i > 0.0) & is_occluded
+    is_dark_in_image = ~is_lit_in_image[is_in_cast_shadow]
+    dark_text = f", of which {np.mean(is_dark_in_image):.0%} are dark in the image" if is_in_cast_shadow.any() else ""
     how = (
         f"{pixels.size} random pixels, {np.mean(cos_i <= 0.0):.1%} facing away from the sun, "
-        f"{np.mean(in_cast_shadow):.1%} in cast shadow{dark_text}; "
-        f"{np.mean(reference_lit & ~rendered_lit):.2%} wrongly dark"
+        f"{np.mean(is_in_cast_shadow):.1%} in cast shadow{dark_text}; "
+        f"{np.mean(is_lit_in_reference & ~is_lit_in_image):.2%} wrongly dark"
     )
     # about three times the maximum disagreement from the air (0.03 %), and twice that from a mast (0.24 %)
     limit = 0.999 if max_range_m > MAX_MAST_RANGE_M else 0.995
@@ -164,6 +164,7 @@ def _render_brightness(law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) 
 
 def _reflectance(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: npt.ArrayLike) -> np.ndarray:
     """Independent implementation of the law of `Photometry`, for unit albedo and K."""
+    # phase angle
     g = np.arccos(np.clip(cos_g, -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
     lunar = law.lunar_fraction
@@ -185,15 +186,15 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
             forward, backward = _render_brightness(sun_only, first, second), _render_brightness(sun_only, second, first)
             # I/F divided by the cosine of incidence is pi times the bidirectional reflectance
             reciprocity_errors.append(abs(forward / first[2] / (backward / second[2]) - 1.0))
-            expected = (
+            expected_brightness = (
                 FLAT_ALBEDO
                 * sun_only.normalisation()
                 * _reflectance(sun_only, first[2], second[2], float(first @ second))
             )
-            formula_errors.append(float(abs(forward / expected - 1.0)))
+            formula_errors.append(float(abs(forward / expected_brightness - 1.0)))
         how = f"{pairs} pairs of sun and camera directions over flat ground"
         albedo = abs(_spherical_albedo(sun_only, 20) * sun_only.normalisation() - 1.0)
-        for claim, measured, method in (
+        for claim, value, method in (
             ("rendered reflectance is reciprocal", max(reciprocity_errors), how),
             ("rendered brightness compared with the formula", max(formula_errors), how),
             (
@@ -202,7 +203,7 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
                 "the law integrated over sun and camera directions by Sobol points",
             ),
         ):
-            yield Measure(f"{claim}: {name}", measured, "", find_limit(f"{claim}: {name}"), method)
+            yield Measure(f"{claim}: {name}", value, "", find_limit(f"{claim}: {name}"), method)
 
 
 def _spherical_albedo(law: Photometry, log2_points: int) -> float:
@@ -247,7 +248,7 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
         how,
     )
     how = "two images 3.75 s apart, the second camera moved with the wind; change divided by slope at the edges"
-    # the same function is evaluated at a shifted position: the limit allows for rounding
+    # both images evaluate the same function of position; the limit allows for rounding errors
     yield Measure("motion of cloud shadows, difference from the wind", max(motion_errors), "px", 1e-4, how)
 
 
@@ -269,6 +270,7 @@ def run_sun(quick: bool) -> Iterator[Measure]:
         scene = Scene(_make_flat_surface(), (0.0, 0.0), sun, law, mesh_finest_m=0.5, mesh_reach_m=2000.0)
         rays = PixelRays.of(camera)
         radiance = renderer().render(scene, rays, pose).radiance.astype(np.float64)
+        # only the sun's disc is brighter
         sun_radiance = np.where(radiance > 1000.0, radiance, 0.0)
         rows, columns = np.indices(radiance.shape)
         centre = np.array([(sun_radiance * columns).sum(), (sun_radiance * rows).sum()]) / sun_radiance.sum()

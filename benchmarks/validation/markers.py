@@ -87,6 +87,7 @@ def create_marked_view(camera: CameraModel, height_m: float, rng: np.random.Gene
     for point, sigma in zip(points, sigmas, strict=True):
         _add_spot(samples[..., 1], point / spacing, sigma / spacing)
     surface = Surface.from_samples(samples, spacing)
+    # a sample is a cubic B-spline, which adds the variance spacing^2 / 3 to that of the spot
     expected = np.stack(
         [
             _expected_centre(world_camera, ground, point, np.hypot(sigma, spacing / np.sqrt(3.0)))
@@ -107,7 +108,7 @@ def create_marked_view(camera: CameraModel, height_m: float, rng: np.random.Gene
 
 def _scatter_points(size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     """Draw random pixels with a minimum distance, on a jittered grid."""
-    cell = MIN_DISTANCE + 12
+    cell = MIN_DISTANCE + 12  # at least 12 pixels of jitter
     columns, rows = (side // cell for side in size)
     corners = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
     scale = np.array(size) / [columns, rows]
@@ -121,8 +122,8 @@ def _image_area(camera: CameraModel, ground: Ground, points: np.ndarray) -> np.n
     """Image area of one square metre of horizontal ground, pixels."""
     jacobian = camera.projection_jacobian(points)
     gradient = ground.gradient(points[..., 0], points[..., 1])
-    by_plan = jacobian[..., :2] + jacobian[..., 2:] * gradient[..., None, :]
-    return np.abs(np.linalg.det(by_plan))
+    ground_jacobian = jacobian[..., :2] + jacobian[..., 2:] * gradient[..., None, :]
+    return np.abs(np.linalg.det(ground_jacobian))
 
 
 def _add_spot(albedo: np.ndarray, position: np.ndarray, sigma: float) -> None:

@@ -115,8 +115,8 @@ def compute_true_motion(frame: Frame, view: View, target: View) -> np.ndarray:
     camera = view.camera.transform(target.world_from_body)
     pixels, _ = camera.project(points)
     # the difference of two projections is more accurate than the pixel position of a ray in single precision (1e-4 px)
-    original, _ = view.camera.transform(view.world_from_body).project(points)
-    return pixels - original
+    original_pixels, _ = view.camera.transform(view.world_from_body).project(points)
+    return pixels - original_pixels
 
 
 def _extract_patches(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
@@ -149,11 +149,12 @@ def measure(
     one_pixel = compute_true_motion(first, view, view.shift(offset_per_px_m))
     centres = _select_patches(one_pixel, patch_grid(view.camera.size, stride))
     for step in steps:
-        shifted = view.shift(step * offset_per_px_m)
-        second = render(renderer, shifted, samples)
+        shifted_view = view.shift(step * offset_per_px_m)
+        second = render(renderer, shifted_view, samples)
         shifts = symmetric_shifts(first_smooth, SmoothImage(second.radiance), centres)
         # motion relative to the midpoint of both images, as in the estimator
-        forward, backward = compute_true_motion(first, view, shifted), compute_true_motion(second, shifted, view)
+        forward = compute_true_motion(first, view, shifted_view)
+        backward = compute_true_motion(second, shifted_view, view)
         is_visible_in_both = ~np.isnan(_extract_patches(forward - backward, centres)).any(axis=(1, 2, 3))
         motion = 0.5 * (_extract_patches(forward, centres) - _extract_patches(backward, centres))
         mean_forward = _extract_patches(forward, centres).mean(axis=(1, 2))
@@ -163,11 +164,11 @@ def measure(
             (shifts.motion_px - shifts.expected(motion))[is_visible_in_both],
             (parabola - mean_forward)[is_visible_in_both],
             (biquadratic - mean_forward)[is_visible_in_both],
-            _body_of_patches(_extract_patches(first.body, centres))[is_visible_in_both],
+            _find_patch_bodies(_extract_patches(first.body, centres))[is_visible_in_both],
         )
 
 
-def _body_of_patches(bodies: np.ndarray) -> np.ndarray:
+def _find_patch_bodies(bodies: np.ndarray) -> np.ndarray:
     """Body of each patch, or `MIXED`."""
     lowest, highest = bodies.min(axis=(1, 2)), bodies.max(axis=(1, 2))
     return np.where(lowest == highest, lowest, MIXED)

@@ -88,8 +88,8 @@ def run_motion(quick: bool) -> Iterator[Measure]:
                 surrounding_errors,
                 steps,
             )
-    point_sampled = replace(rock_view(ROCK_SITE, 10.0), footprint=1.0 / 64.0)
-    errors = [motion.error for motion in measure(renderer(), point_sampled, np.array([0.25, 0.5, 0.75]))]
+    point_sample_view = replace(rock_view(ROCK_SITE, 10.0), footprint=1.0 / 64.0)
+    errors = [motion.error for motion in measure(renderer(), point_sample_view, np.array([0.25, 0.5, 0.75]))]
     yield Measure(
         "bias of motion with point samples (aliasing), rock and ground from 10 m",
         max_bias(errors),
@@ -98,7 +98,7 @@ def run_motion(quick: bool) -> Iterator[Measure]:
         "3 steps",
     )
     for index, fit in enumerate(("parabola", "biquadratic")):
-        max_error = max(errors[index] for errors in fits)
+        max_error = max(fit_errors[index] for fit_errors in fits)
         yield Measure(
             f"pixel locking of a {fit} through the correlation peak", max_error, "px", None, "the same images"
         )
@@ -141,10 +141,10 @@ def _measure_edge_error(view: View) -> tuple[float, float, int]:
 
     The reference has 256 rays per pixel, with ground and texture as smooth as in the pixel.
     """
-    single = replace(view, scene=replace(view.scene, edge_rays=1))
-    one_ray, several_rays = render(renderer(), single), render(renderer(), view)
+    single_ray_view = replace(view, scene=replace(view.scene, edge_rays=1))
+    one_ray, several_rays = render(renderer(), single_ray_view), render(renderer(), view)
     edges = edge_pixels(one_ray.radiance, one_ray.range_m, one_ray.body)
-    reference = supersample(renderer(), replace(single, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
+    reference = supersample(renderer(), replace(single_ray_view, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
     one_ray_error, several_rays_error = (
         float(np.sqrt(np.mean((frame.radiance - reference).ravel()[edges] ** 2)) / reference.mean())
         for frame in (one_ray, several_rays)

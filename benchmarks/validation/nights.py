@@ -45,16 +45,18 @@ class CampaignSimulator:
         self._number += 1
         terrains, (scale_m, answer_probability) = self._draw_terrains_of_cases(kind)
         errors = error_factor * scale_m[terrains] * np.abs(self._rng.standard_t(4, CASES))
-        answered = self._rng.random(CASES) < answer_probability[terrains]
+        is_answered = self._rng.random(CASES) < answer_probability[terrains]
         # terrains of a bank have the same numbers in every nightly run; other terrains are new
         terrain_numbers = terrains if kind == KINDS[0] else terrains + 1000 * self._number
-        is_within_bound = (answered & (errors < _LIMIT_M)).astype(np.float64)
-        errors = np.where(answered, errors, np.nan)
+        is_within_bound = (is_answered & (errors < _LIMIT_M)).astype(np.float64)
+        errors = np.where(is_answered, errors, np.nan)
         return [
             NightMetric(
                 "within the bound", True, float(is_within_bound.mean()), Sample(is_within_bound, terrain_numbers)
             ),
-            NightMetric("answered", True, float(answered.mean()), Sample(answered.astype(np.float64), terrain_numbers)),
+            NightMetric(
+                "answered", True, float(is_answered.mean()), Sample(is_answered.astype(np.float64), terrain_numbers)
+            ),
             NightMetric("error (m)", False, float(np.nanmedian(errors)), Sample(errors, terrain_numbers)),
         ]
 
@@ -76,25 +78,25 @@ def count_false_alarms(nights: int, seed: int) -> int:
 
     The runs are stored in a history, so that effects of a false alarm on later runs are included.
     """
-    simulator, alarms = CampaignSimulator(seed), 0
+    simulator, alarm_count = CampaignSimulator(seed), 0
     with TemporaryDirectory() as folder, History(Path(folder, "history.sqlite")) as history:
         for _ in range(nights):
             night = history.begin(None)
             for kind in KINDS:
                 history.add(night, NightCampaign(kind, "", "", "PASS", 0, ""), simulator.draw_metrics(kind))
-            flagged = find_changes(list_comparisons(history, night))
+            changes = find_changes(list_comparisons(history, night))
             history.finish(
                 night,
                 FINISHED,
-                [(change.campaign, change.metric, change.p_value, change.is_regression) for change in flagged],
+                [(change.campaign, change.metric, change.p_value, change.is_regression) for change in changes],
             )
-            alarms += bool(flagged)
-    return alarms
+            alarm_count += bool(changes)
+    return alarm_count
 
 
 def count_detections(changed_kind: str, nights: int, seed: int) -> int:
     """Count nightly runs in which an increase of errors is detected for the correct campaign and metric."""
-    simulator, detected = CampaignSimulator(seed), 0
+    simulator, detection_count = CampaignSimulator(seed), 0
     for _ in range(nights):
         comparisons = []
         for kind in KINDS:
@@ -102,5 +104,5 @@ def count_detections(changed_kind: str, nights: int, seed: int) -> int:
             for index, metric in enumerate(simulator.draw_metrics(kind, ERROR_FACTOR if kind == changed_kind else 1.0)):
                 comparisons.append(Comparison(kind, metric, [run[index].sample for run in earlier_runs]))
         changes = {(change.campaign, change.metric) for change in find_changes(comparisons)}
-        detected += (changed_kind, "error (m)") in changes
-    return detected
+        detection_count += (changed_kind, "error (m)") in changes
+    return detection_count

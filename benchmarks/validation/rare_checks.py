@@ -27,7 +27,7 @@ LimitState = Callable[[np.ndarray, np.ndarray], np.ndarray]
 def linear_margin(dimension: int, probability: float, noise_fraction: float = 0.0) -> LimitState:
     """Return a linear limit state; a fraction of the variance of its load is noise, which the stream number determines.
 
-    Like the noise of a rendered case, it is not a coordinate: it can only be held or drawn again.
+    Like the noise of a rendered case, the noise is not a coordinate: a simulation can only keep it or draw it again.
     """
     beta = float(norm.isf(probability))
 
@@ -50,8 +50,8 @@ def stream_noise(streams: np.ndarray) -> np.ndarray:
 def four_branch_margin(coordinates: np.ndarray, _streams: np.ndarray) -> np.ndarray:
     """Series system with four branches (Waarts 2000), a usual test of reliability methods."""
     x, y = coordinates.T
-    curved = 3.0 + 0.1 * (x - y) ** 2
-    branches = [curved - (x + y) / math.sqrt(2.0), curved + (x + y) / math.sqrt(2.0)]
+    curved_branch = 3.0 + 0.1 * (x - y) ** 2
+    branches = [curved_branch - (x + y) / math.sqrt(2.0), curved_branch + (x + y) / math.sqrt(2.0)]
     branches += [(x - y) + 7.0 / math.sqrt(2.0), (y - x) + 7.0 / math.sqrt(2.0)]
     return np.asarray(np.min(branches, axis=0))
 
@@ -94,19 +94,19 @@ def run_rare(quick: bool) -> Iterator[Measure]:
     """Measure coverage and cost for each limit state."""
     trials = 40 if quick else 300
     for name, margins, dimension, probability in limit_states():
-        covered, cases, widths = 0, 0, []
+        covered_count, cases, widths = 0, 0, []
         for trial in range(trials):
             runs = [run_subset(margins, dimension, 1 + trial * REPLICATES + index) for index in range(REPLICATES)]
             results = [result for result, _ in runs]
             cases += sum(count for _, count in runs)
-            estimates, reached = [item.probability for item in results], [item.reached for item in results]
-            interval = replicate_interval(estimates, reached, CONFIDENCE)
-            covered += interval.lower <= probability <= interval.upper
+            estimates, is_reached = [result.probability for result in results], [result.reached for result in results]
+            interval = replicate_interval(estimates, is_reached, CONFIDENCE)
+            covered_count += interval.lower <= probability <= interval.upper
             widths.append(math.log(interval.upper / interval.lower) if interval.lower > 0.0 else math.inf)
         how = f"{trials} studies, each of {REPLICATES} simulations with {SAMPLES} cases per level"
         yield Measure(
             f"rare violations, coverage of the 90 % interval: {name}",
-            covered / trials,
+            covered_count / trials,
             "",
             MIN_COVERAGE,
             how,
@@ -118,8 +118,8 @@ def run_rare(quick: bool) -> Iterator[Measure]:
             crude_cases = (2.0 * z / float(np.median(widths))) ** 2 * (1.0 - probability) / probability
             savings = crude_cases * trials / cases
             how = f"for an interval of the same width; {cases / trials:.0f} cases"
-            text = f"rare violations, cases of counting divided by cases of the study: {name}"
-            yield Measure(text, savings, "1", MIN_SAVINGS[probability], how, "at least")
+            claim = f"rare violations, cases of counting divided by cases of the study: {name}"
+            yield Measure(claim, savings, "1", MIN_SAVINGS[probability], how, "at least")
 
 
 CHECKS = (Check("rare", "Statistics", run_rare),)

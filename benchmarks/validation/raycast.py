@@ -34,9 +34,9 @@ class Ground:
     def gradient(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Slopes by central differences over a hundredth of a sample."""
         delta = 0.01 * self._spacing
-        by_x = (self.height(x + delta, y) - self.height(x - delta, y)) / (2.0 * delta)
-        by_y = (self.height(x, y + delta) - self.height(x, y - delta)) / (2.0 * delta)
-        return np.stack([by_x, by_y], axis=-1)
+        slope_x = (self.height(x + delta, y) - self.height(x - delta, y)) / (2.0 * delta)
+        slope_y = (self.height(x, y + delta) - self.height(x, y - delta)) / (2.0 * delta)
+        return np.stack([slope_x, slope_y], axis=-1)
 
     def clearance(self, origins: np.ndarray, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Height above ground of the points at distances `t` along the rays."""

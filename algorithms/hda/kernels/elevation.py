@@ -56,33 +56,33 @@ def _fit_exact_plane(x: Array, y: Array, z: Array, i: int, j: int, k: int) -> tu
 @njit(cache=True)
 def _fit_least_squares_plane(x: Array, y: Array, z: Array, mask: NDArray[np.bool_]) -> tuple[float, float, float]:
     """Value at (0, 0) and slopes of the least-squares plane of the points in `mask`; NaN if they are collinear."""
-    n, mx, my, mz = 0, 0.0, 0.0, 0.0
+    n, mean_x, mean_y, mean_z = 0, 0.0, 0.0, 0.0
     for i in range(x.size):
         if mask[i]:
             n += 1
-            mx += x[i]
-            my += y[i]
-            mz += z[i]
+            mean_x += x[i]
+            mean_y += y[i]
+            mean_z += z[i]
     if n < 3:
         return math.nan, math.nan, math.nan
-    mx /= n
-    my /= n
-    mz /= n
-    xx, yy, xy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
+    mean_x /= n
+    mean_y /= n
+    mean_z /= n
+    sum_xx, sum_yy, sum_xy, sum_xz, sum_yz = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(x.size):
         if mask[i]:
-            dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
-            xx += dx * dx
-            yy += dy * dy
-            xy += dx * dy
-            xz += dx * dz
-            yz += dy * dz
-    determinant = xx * yy - xy * xy
-    if determinant < 1e-9 * (xx + yy) ** 2 or determinant <= 0.0:
+            dx, dy, dz = x[i] - mean_x, y[i] - mean_y, z[i] - mean_z
+            sum_xx += dx * dx
+            sum_yy += dy * dy
+            sum_xy += dx * dy
+            sum_xz += dx * dz
+            sum_yz += dy * dz
+    determinant = sum_xx * sum_yy - sum_xy * sum_xy
+    if determinant < 1e-9 * (sum_xx + sum_yy) ** 2 or determinant <= 0.0:
         return math.nan, math.nan, math.nan
-    slope_x = (xz * yy - yz * xy) / determinant
-    slope_y = (yz * xx - xz * xy) / determinant
-    return mz - slope_x * mx - slope_y * my, slope_x, slope_y
+    slope_x = (sum_xz * sum_yy - sum_yz * sum_xy) / determinant
+    slope_y = (sum_yz * sum_xx - sum_xz * sum_xy) / determinant
+    return mean_z - slope_x * mean_x - slope_y * mean_y, slope_x, slope_y
 
 
 @njit(cache=True)
@@ -90,8 +90,8 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
     """Value at (0, 0) and slopes of the least-median-of-squares plane (section III): the best plane of random triples.
 
     `triples` are uniform random numbers in [0, 1), one row per trial. x and y are integers (cells). The median of n
-    values is their (n / 2 + 2)-th smallest, for three unknowns (Rousseeuw & Leroy 1987). With `refine` the plane is
-    fitted to the inliers by least squares.
+    values is their ([n / 2] + [(p + 1) / 2])-th smallest, with p = 3 unknowns (Rousseeuw & Leroy 1987). With `refine`
+    the plane is fitted to the inliers by least squares.
     """
     n = x.size
     median_index = min(n // 2 + 2, n) - 1
@@ -101,7 +101,7 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
     for trial in range(triples.shape[0]):
         i = int(triples[trial, 0] * n)
         j = int(triples[trial, 1] * (n - 1))
-        j += j >= i
+        j += j >= i  # skip i, and below skip i and j: the three points differ
         k = int(triples[trial, 2] * (n - 2))
         low, high = min(i, j), max(i, j)
         k += k >= low
@@ -124,8 +124,8 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
     inliers = np.empty(n, dtype=np.bool_)
     for m in range(n):
         inliers[m] = abs(z[m] - plane[0] - plane[1] * x[m] - plane[2] * y[m]) <= limit
-    refined = _fit_least_squares_plane(x, y, z, inliers)
-    return plane if math.isnan(refined[0]) else refined
+    refined_plane = _fit_least_squares_plane(x, y, z, inliers)
+    return plane if math.isnan(refined_plane[0]) else refined_plane
 
 
 @njit(cache=True)

@@ -18,7 +18,10 @@ MIN_VARIANCE = 1e-6
 
 @njit(cache=True)
 def correlation(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int) -> float:
-    """Correlation (Eq. 3, section II.A) of two patches, each minus its mean, centred at (r1, c1) and (r2, c2)."""
+    """Correlation (Eq. 3, section II.A) of two patches, each minus its mean.
+
+    The patches have the half width `half` and the centres (r1, c1) and (r2, c2).
+    """
     sum_a, sum_b, sum_aa, sum_bb, sum_ab = 0.0, 0.0, 0.0, 0.0, 0.0
     # Subtract the centre value first to avoid cancellation in the variances.
     centre_a = np.float64(first[r1, c1])

@@ -68,7 +68,10 @@ def rotate_quaternion(q: Array, step: Array) -> Array:
 
 @njit(cache=True)
 def residuals(matches: Matches, motion: Motion) -> Array:
-    """Reprojection minus measurement in the second image, pixels, shape (n, 2); inf behind the camera."""
+    """Reprojection minus measurement in the second image, pixels, shape (n, 2); inf behind the camera.
+
+    A feature (x, y) with inverse depth rho is projected along R (x, y, 1) + rho t.
+    """
     first, second, focal, _ = matches
     q, t, inverse_depths = motion
     R = rotation_matrix(q)
@@ -97,7 +100,10 @@ def cauchy_cost(r: Array, scale: float) -> float:
 
 @njit(cache=True)
 def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, Jm: Array, Jd: Array) -> None:
-    """Jacobian of one residual: rotation (left perturbation) and translation (`Jm`, 2 x 6), inverse depth (`Jd`, 2)."""
+    """Jacobian of one residual: rotation (left perturbation) and translation (`Jm`, 2 x 6), inverse depth (`Jd`, 2).
+
+    (ax, ay, az) is R (x, y, 1), the feature's direction in the second camera's frame; pz is its depth times rho.
+    """
     ax = R[0, 0] * x + R[0, 1] * y + R[0, 2]
     ay = R[1, 0] * x + R[1, 1] * y + R[1, 2]
     az = R[2, 0] * x + R[2, 1] * y + R[2, 2]
@@ -146,6 +152,7 @@ def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, wi
             for b in range(6):
                 S[a, b] += weight * (Jm[0, a] * Jm[0, b] + Jm[1, a] * Jm[1, b])
                 S[a, b] -= mixed[i, a] * mixed[i, b] * inverse_curvature
+    # damping, and a small regularisation of unknowns that are not observable
     for a in range(6):
         S[a, a] += damping * diagonal[a] + 1e-15 * focal**2
     step, depth_steps = np.full(6, math.nan), np.zeros(n)

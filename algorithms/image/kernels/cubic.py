@@ -23,8 +23,8 @@ def sample(coefficients: Array, pixels: Array, row: int, column: int, values: Ar
         for j in range(pixels.shape[1]):
             y, x = pixels[i, j, 1] - row, pixels[i, j, 0] - column
             r, c = int(y) - 1, int(x) - 1
-            _weights(y - math.floor(y), weights_v)
-            _weights(x - math.floor(x), weights_u)
+            _compute_weights(y - math.floor(y), weights_v)
+            _compute_weights(x - math.floor(x), weights_u)
             is_inside = r >= 0 and c >= 0 and r + 3 < rows and c + 3 < columns
             total = 0.0
             for a in range(4):
@@ -36,7 +36,7 @@ def sample(coefficients: Array, pixels: Array, row: int, column: int, values: Ar
 
 
 @njit(cache=True)
-def _weights(fraction: float, weights: Array) -> None:
+def _compute_weights(fraction: float, weights: Array) -> None:
     """Store the cubic B-spline weights of four coefficients; the point is `fraction` pixels after the second one."""
     complement = 1.0 - fraction
     weights[0] = complement * complement * complement / 6.0

@@ -32,7 +32,7 @@ def _spline_2_to_3(x: float) -> float:
 
 @njit(cache=True, inline="always")
 def _all_weights(fraction: float) -> tuple[float, float, float, float, float, float]:
-    """Weights of the six coefficients around a point `fraction` pixels after its pixel, from two pixels before it."""
+    """Weights of the coefficients at -2 .. 3 pixels from a pixel, for a point `fraction` pixels after that pixel."""
     return (
         _spline_2_to_3(fraction + 2.0),
         _spline_1_to_2(fraction + 1.0),
@@ -132,7 +132,7 @@ def sample_with_derivatives(
 ) -> None:
     """Evaluate a patch of the spline and its two derivatives; the upper left pixel is (row, column) plus a fraction.
 
-    `row_taps` and `column_taps` are the six filter taps for values and for slopes, shape (2, 6), from two pixels before
+    `row_taps` and `column_taps` are the six filter taps for values and for slopes, shape (2, 6), at -2 .. 3 pixels from
     the pixel. Values and derivatives with respect to row and column are stored in `output`, (3, rows, columns).
     """
     _, height, width = output.shape
@@ -146,9 +146,9 @@ def sample_with_derivatives(
                 slope += row_taps[1, k] * coefficient
             values[j], slopes[j] = value, slope
         for j in range(width):
-            value, by_row, by_column = 0.0, 0.0, 0.0
+            value, row_slope, column_slope = 0.0, 0.0, 0.0
             for k in range(6):
                 value += column_taps[0, k] * values[j + k]
-                by_row += column_taps[0, k] * slopes[j + k]
-                by_column += column_taps[1, k] * values[j + k]
-            output[0, i, j], output[1, i, j], output[2, i, j] = value, by_row, by_column
+                row_slope += column_taps[0, k] * slopes[j + k]
+                column_slope += column_taps[1, k] * values[j + k]
+            output[0, i, j], output[1, i, j], output[2, i, j] = value, row_slope, column_slope

@@ -27,18 +27,18 @@ def build_design_matrix(template: Array, unknowns: int) -> Array:
         for j in range(side):
             up, down = max(i - 1, 0), min(i + 1, side - 1)
             left, right = max(j - 1, 0), min(j + 1, side - 1)
-            by_row = (template[down, j] - template[up, j]) / (down - up)
-            by_column = (template[i, right] - template[i, left]) / (right - left)
+            slope_y = (template[down, j] - template[up, j]) / (down - up)
+            slope_x = (template[i, right] - template[i, left]) / (right - left)
             design_row = matrix[i * side + j]
             design_row[0], design_row[1] = template[i, j] - mean, 1.0
-            design_row[2], design_row[3] = by_row, by_column
+            design_row[2], design_row[3] = slope_y, slope_x
             y, x = i - half, j - half
             if unknowns >= 8:
-                design_row[4], design_row[5] = by_row * y, by_row * x
-                design_row[6], design_row[7] = by_column * y, by_column * x
+                design_row[4], design_row[5] = slope_y * y, slope_y * x
+                design_row[6], design_row[7] = slope_x * y, slope_x * x
             if unknowns >= 14:
-                design_row[8], design_row[9], design_row[10] = by_row * y * y, by_row * y * x, by_row * x * x
-                design_row[11], design_row[12], design_row[13] = by_column * y * y, by_column * y * x, by_column * x * x
+                design_row[8], design_row[9], design_row[10] = slope_y * y * y, slope_y * y * x, slope_y * x * x
+                design_row[11], design_row[12], design_row[13] = slope_x * y * y, slope_x * y * x, slope_x * x * x
     return matrix
 
 
@@ -152,14 +152,14 @@ def register(
     unknowns = UNKNOWNS[order]
     matrix = build_design_matrix(template, unknowns)
     scales = np.sqrt(np.sum(matrix * matrix, axis=0))
-    failed = (False, row, column, 0.0)
+    failure = (False, row, column, 0.0)
     for p in range(unknowns):
         if not scales[p] > 0.0:
-            return failed
+            return failure
     matrix /= scales
     lower = normal_matrix(matrix)
     if not factorize_cholesky(lower, min_pivot):
-        return failed
+        return failure
     values = np.empty(side * side)
     solution = np.empty(unknowns)
     warp, change = np.eye(2, 5), np.zeros((2, 5))
@@ -170,19 +170,19 @@ def register(
         else:
             is_inside = sample_shifted(coefficients, side, v, u, values)
         if not is_inside:
-            return failed
+            return failure
         values -= values.mean()
         multiply_transposed(matrix, values, solution)
         norm = math.sqrt(np.sum(values * values))
         if not (solution[0] > 0.0 and norm > 0.0):
-            return failed
+            return failure
         score = solution[0] / norm
         solve(lower, solution)
         for p in range(unknowns):
             solution[p] /= scales[p]
         gain = solution[0]
         if not gain > 0.0:
-            return failed
+            return failure
         warp_change = 0.0
         if order > 0:
             # inverse compositional: the solution warps the template, so compose the warp with its inverse
@@ -192,7 +192,7 @@ def register(
                     for k in range(3):
                         change[i, 2 + k] = solution[8 + 3 * i + k] / gain
             if not compose_with_inverse(warp, change):
-                return failed
+                return failure
             # `warp_size` expects the complete warp, including the identity
             change[0, 0] += 1.0
             change[1, 1] += 1.0
@@ -201,8 +201,8 @@ def register(
         du = (warp[1, 0] * solution[2] + warp[1, 1] * solution[3]) / gain
         v, u = v - dv, u - du
         if math.hypot(v - row, u - column) > limits[0] or warp_size(warp, half) > limits[1]:
-            return failed
-        # at the template's border the last change of the warp is less than ten tolerances
+            return failure
+        # the last change of the warp moves the template's border, side / 2 from the centre, by less than ten tolerances
         if math.hypot(dv, du) < tolerance and warp_change * side < 20.0 * tolerance:
             return True, v, u, score
-    return failed
+    return failure
