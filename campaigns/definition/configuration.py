@@ -1,4 +1,4 @@
-"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits), and renamed keys."""
+"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits); update of old names."""
 
 from __future__ import annotations
 
@@ -355,12 +355,12 @@ _NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
 _TEXT_KEYS = ("distribution", "source", "description", "unit")
 
 
-def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str, Any]:
+def use_current_names(tables: Mapping[str, Any], selected_scenario: Scenario) -> dict[str, Any]:
     """Replace former names of dispersed parameters and columns in the tables of a campaign file, with warnings.
 
     The parameter models replace the former keys of the parameters themselves.
     """
-    rename_path = partial(current_path, selected.parameters_type)
+    rename_path = partial(current_path, selected_scenario.parameters_type)
     rename_column = _column_renamer(str(tables.get("scenario")))
     current = dict(tables)
     dispersions, correlations = tables.get("dispersions"), tables.get("correlations")
@@ -388,9 +388,9 @@ def update_stored_configuration(stored: Mapping[str, Any]) -> dict[str, Any]:
         warnings.simplefilter("ignore", DeprecatedNameWarning)
         stored = {current_key(key, CampaignConfiguration.model_fields): value for key, value in stored.items()}
         try:
-            selected = scenario(str(stored.get("scenario")))
-            current = use_current_names(stored, selected)
-            parameters = selected.parameters_type.model_validate(stored.get("parameters", {}))
+            selected_scenario = scenario(str(stored.get("scenario")))
+            current = use_current_names(stored, selected_scenario)
+            parameters = selected_scenario.parameters_type.model_validate(stored.get("parameters", {}))
         except (UnknownScenarioError, ValidationError, ImportError):
             return dict(stored)
         return {**current, "parameters": parameters.model_dump(mode="json", round_trip=True, exclude_unset=True)}

@@ -204,6 +204,7 @@ def read_versions() -> dict[str, str]:
 
 
 def _distribution_version(name: str) -> str | None:
+    """Return the version of an installed distribution; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -232,8 +233,8 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
         if shipped:
             configured_options = (value for _, value in parameters if isinstance(value, selected_scenario.task.options))
             algorithm = selected_scenario.task.shipped[spec](next(configured_options, selected_scenario.task.options()))
-            kind, version = type(algorithm), _distribution_version("marsyard")
-            path = f"{kind.__module__}:{kind.__qualname__}"
+            algorithm_class, version = type(algorithm), _distribution_version("marsyard")
+            path = f"{algorithm_class.__module__}:{algorithm_class.__qualname__}"
             options = _plain_options(getattr(algorithm, "options", None))
         else:
             path, version, options = _describe_custom(spec)

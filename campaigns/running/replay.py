@@ -140,11 +140,11 @@ def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject
     if task is not None and task not in suite.SUBJECT_KINDS:
         raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(suite.SUBJECT_KINDS)}")
     try:
-        name = suite.determine_task(spec) if task is None else task
-        suite.check_subject(spec, name)
+        task_name = suite.determine_task(spec) if task is None else task
+        suite.check_subject(spec, task_name)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return suite.Subject(spec, name, limit_s)
+    return suite.Subject(spec, task_name, limit_s)
 
 
 def run_conformance_checks(subject: suite.Subject) -> Iterator[suite.Finding]:

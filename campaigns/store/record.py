@@ -190,14 +190,14 @@ def git_commit() -> str | None:
     try:
         for arguments in commands if git is not None else ():
             command = [str(git), "-C", str(source.parent), *arguments]
-            completed = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
-            outputs.append(completed.stdout.strip())
+            process = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
+            outputs.append(process.stdout.strip())
     except (subprocess.SubprocessError, OSError):
         return None
     if git is None or not outputs[1]:
         return None
-    commit, _, edited = outputs
-    return f"{commit}+changes" if edited else commit
+    commit, _, changes = outputs
+    return f"{commit}+changes" if changes else commit
 
 
 def describe_machine() -> dict[str, Any]:
