@@ -29,10 +29,10 @@ class _Hash:
         self._constant = _INITIAL_CONSTANT
 
     def __call__(self, value: np.ndarray) -> np.ndarray:
-        mixed = value ^ np.uint32(self._constant)
+        word = value ^ np.uint32(self._constant)
         self._constant = self._constant * _MULTIPLIER & _MASK
-        mixed = mixed * np.uint32(self._constant)
-        return mixed ^ (mixed >> np.uint32(_SHIFT_BITS))
+        word = word * np.uint32(self._constant)
+        return word ^ (word >> np.uint32(_SHIFT_BITS))
 
 
 def _mix(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -44,6 +44,7 @@ def _min_coverage(nominal: float, trials: int) -> float:
 
 
 def _fraction(successes: Iterator[bool], trials: int) -> float:
+    """Return the fraction of successful trials."""
     return sum(bool(success) for success in successes) / trials
 
 
@@ -52,8 +53,8 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
     trials = 200 if quick else 1000
     rng = np.random.default_rng(1)
     draws: tuple[tuple[str, Callable[[int], np.ndarray], float, float], ...] = (
-        ("normal errors", lambda n: rng.normal(size=n), 0.0, 1.0),
-        ("radial errors", lambda n: rng.rayleigh(size=n), math.sqrt(math.pi / 2), math.sqrt(2.0 - math.pi / 2)),
+        ("normal errors", lambda size: rng.normal(size=size), 0.0, 1.0),
+        ("radial errors", lambda size: rng.rayleigh(size=size), math.sqrt(math.pi / 2), math.sqrt(2.0 - math.pi / 2)),
     )
     intervals: tuple[tuple[str, Callable[[np.ndarray, float], Interval]], ...] = (
         ("mean", mean_interval),
@@ -147,8 +148,8 @@ def run_shared(quick: bool) -> Iterator[Measure]:
 def _draw_errors(rng: np.random.Generator, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
     """Draw standard normal errors that are correlated within a terrain, and their terrains."""
     terrain = np.repeat(np.arange(terrains), rng.integers(1, 15, terrains))
-    shared, independent = rng.normal(size=terrains)[terrain], rng.normal(size=terrain.size)
-    return math.sqrt(correlation) * shared + math.sqrt(1.0 - correlation) * independent, terrain
+    common_errors, independent_errors = rng.normal(size=terrains)[terrain], rng.normal(size=terrain.size)
+    return math.sqrt(correlation) * common_errors + math.sqrt(1.0 - correlation) * independent_errors, terrain
 
 
 def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
@@ -204,22 +205,22 @@ def _simulate_decision(
 
 def run_nights(quick: bool) -> Iterator[Measure]:
     """Measure false alarms of nightly runs without a change, and detection of simulated regressions."""
-    unchanged, changed = (100, 100) if quick else (2000, 1000)
-    alarms = count_false_alarms(unchanged, seed=4)
+    nights_without_change, nights_with_change = (100, 100) if quick else (2000, 1000)
+    alarms = count_false_alarms(nights_without_change, seed=4)
     campaigns = f"three campaigns of {CASES} cases: {', '.join(KINDS)}"
     comparison = f"each compared with up to {MAX_EARLIER_NIGHTS} earlier nights"
-    how = f"{alarms} of {unchanged} successive nights, {comparison}; {campaigns}"
-    yield Measure("nights with a false alarm", alarms / unchanged, "", 0.01, how)
+    how = f"{alarms} of {nights_without_change} successive nights, {comparison}; {campaigns}"
+    yield Measure("nights with a false alarm", alarms / nights_without_change, "", 0.01, how)
     if not quick:
-        upper_bound = proportion_upper(alarms, unchanged, 0.95)
+        upper_bound = proportion_upper(alarms, nights_without_change, 0.95)
         yield Measure(
             "nights with a false alarm, upper bound at 95 % confidence", upper_bound, "", 0.01, "the same nights"
         )
-    for kind, nights in ((KINDS[0], changed), (KINDS[1], changed // 4)):
-        detected = count_detections(kind, nights, seed=5) / nights
+    for kind, nights in ((KINDS[0], nights_with_change), (KINDS[1], nights_with_change // 4)):
+        detection_rate = count_detections(kind, nights, seed=5) / nights
         claim = f"nights that detect a regression, errors {ERROR_FACTOR:g} times as large, {kind}"
         how = f"{nights} nights, each compared with {EARLIER_NIGHTS} earlier nights; {campaigns}"
-        yield Measure(claim, detected, "", 0.95, how, "at least")
+        yield Measure(claim, detection_rate, "", 0.95, how, "at least")
 
 
 CHECKS = (

@@ -82,11 +82,11 @@ def _measure_drifts(rows: list[dict[str, Scalar]], name: str, *, has_limit: bool
     )
     if has_limit:
         yield _measure_losses(f"targets lost before 2 m: {name}", int(np.isnan(drifts_px).sum()), len(drifts_px), how)
-    tracked = drifts_px[~np.isnan(drifts_px)]
-    rms, worst = float(np.sqrt(np.mean(tracked**2))), float(tracked.max())
+    tracked_px = drifts_px[~np.isnan(drifts_px)]
+    rms, maximum = float(np.sqrt(np.mean(tracked_px**2))), float(tracked_px.max())
     yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_LIMIT_PX if has_limit else None, how)
     yield Measure(
-        f"drift of the tracked point, maximum: {name}", worst, "px", DRIFT_WORST_LIMIT_PX if has_limit else None, how
+        f"drift of the tracked point, maximum: {name}", maximum, "px", DRIFT_WORST_LIMIT_PX if has_limit else None, how
     )
 
 
@@ -103,9 +103,9 @@ def check_stereo(quick: bool) -> Iterator[Measure]:
     """Compare the range error of the first pair at 10 m with Eq. 1 (tracking paper) for the true disparity errors."""
     for camera in CAMERAS:
         simulations = [_simulate_designation(number, camera) for number in range(10 if quick else 60)]
-        selectable = [errors_m for errors_m in simulations if errors_m is not None]
-        matched = [errors_m for errors_m in selectable if np.isfinite(errors_m[0])]
-        errors, expected_errors = np.array(matched).reshape(-1, 2).T
+        selectable_errors = [errors_m for errors_m in simulations if errors_m is not None]
+        measured_errors = [errors_m for errors_m in selectable_errors if np.isfinite(errors_m[0])]
+        errors, expected_errors = np.array(measured_errors).reshape(-1, 2).T
         ratio = float(np.sqrt(np.mean(errors**2) / np.mean(expected_errors**2)))
         how = f"first pairs of {len(errors)} runs of vtt-accuracy at rocks of 1.5 m, disparity error 1/3 px rms"
         yield Measure(
@@ -115,11 +115,11 @@ def check_stereo(quick: bool) -> Iterator[Measure]:
             RANGE_LIMIT,
             how,
         )
-        how = f"of {len(selectable)} selectable targets; the row above excludes these pairs"
+        how = f"of {len(selectable_errors)} selectable targets; the row above excludes these pairs"
         yield _measure_losses(
             f"first stereo pairs in which the target is not found: {camera}",
-            len(selectable) - len(matched),
-            len(selectable),
+            len(selectable_errors) - len(measured_errors),
+            len(selectable_errors),
             how,
         )
 
@@ -153,6 +153,7 @@ def _range_error_m(run: Run) -> float:
 
 
 def _expected_range_error_m(run: Run, disparity_error_px: float) -> float:
+    """Compute the range error of the first pair by Eq. 1 of the tracking paper, metres."""
     rig = run.rig.calibrated
     return stereo_range_error_m(run.stops[0].range_m, disparity_px_m(rig.left, rig.right), 1.0, disparity_error_px)
 

@@ -178,9 +178,9 @@ class CampaignConfiguration(Parameters):
     @model_validator(mode="after")
     def _check_unique_ids(self) -> CampaignConfiguration:
         ids = [requirement.id for requirement in self.requirements]
-        repeated = sorted({name for name in ids if ids.count(name) > 1})
-        if repeated:
-            raise ValueError(f"requirements share an id: {', '.join(repeated)}")
+        repeated_ids = sorted({name for name in ids if ids.count(name) > 1})
+        if repeated_ids:
+            raise ValueError(f"requirements share an id: {', '.join(repeated_ids)}")
         return self
 
     @property
@@ -296,8 +296,8 @@ def key_text(key: Iterable[str | int]) -> str:
         if isinstance(part, int):
             text += f"[{part}]"
         else:
-            quoted = part if part.replace("-", "_").isidentifier() or part.isdigit() else f'"{part}"'
-            text += f".{quoted}" if text else quoted
+            key_part = part if part.replace("-", "_").isidentifier() or part.isdigit() else f'"{part}"'
+            text += f".{key_part}" if text else key_part
     return text
 
 

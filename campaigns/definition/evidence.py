@@ -72,29 +72,29 @@ class FrozenAlgorithm:
             if old != new:
                 texts.append(f"{name} ({json.dumps(old)}, now {json.dumps(new)})")
         names = sorted({*self.hashes, *other.hashes})
-        changed = [name for name in names if self.hashes.get(name) != other.hashes.get(name)]
-        if texts and "configuration" in changed:
-            changed.remove("configuration")  # it includes the named parameters
-        return [*texts, *changed]
+        changed_hashes = [name for name in names if self.hashes.get(name) != other.hashes.get(name)]
+        if texts and "configuration" in changed_hashes:
+            changed_hashes.remove("configuration")  # it includes the named parameters
+        return [*texts, *changed_hashes]
 
 
 def freeze_algorithm(campaign: Campaign) -> FrozenAlgorithm:
     """Describe all choices that a confirmation of a campaign freezes."""
     configuration = campaign.configuration
     algorithms = describe_algorithms(campaign)
-    tested = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), configuration.scenario)
+    algorithm = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), configuration.scenario)
     options = {f"{entry['spec']}.{name}": value for entry in algorithms for name, value in entry["options"].items()}
     values = configuration.model_dump(mode="json")
     options |= dict(leaves(values["parameters"], "parameters"))
-    frozen = {name: value for name, value in values.items() if name not in _KEYS_NOT_FROZEN}
+    frozen_values = {name: value for name, value in values.items() if name not in _KEYS_NOT_FROZEN}
     identity = create_identity(configuration)
     contents = {
         "sources": [(entry["spec"], entry["source_hash"]) for entry in algorithms],
-        "configuration": [frozen, identity.inputs],
+        "configuration": [frozen_values, identity.inputs],
         "requirements": values["requirements"],
         "code": identity.code,
     }
-    return FrozenAlgorithm(tested, options, {name: _hash(content) for name, content in contents.items()})
+    return FrozenAlgorithm(algorithm, options, {name: _hash(content) for name, content in contents.items()})
 
 
 def _hash(content: Any) -> str:

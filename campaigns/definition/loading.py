@@ -404,8 +404,8 @@ def _check_metrics(campaign: Campaign) -> list[tuple[Key, str]]:
     compared = labels(list_algorithms(campaign.configuration))[1:]
 
     def is_known(name: str, kind: str) -> bool:
-        unlabelled = next((name.removeprefix(f"{spec}.") for spec in compared if name.startswith(f"{spec}.")), name)
-        return columns.has_number(unlabelled) if kind == NUMBERS else columns.has_flag(unlabelled)
+        column = next((name.removeprefix(f"{spec}.") for spec in compared if name.startswith(f"{spec}.")), name)
+        return columns.has_number(column) if kind == NUMBERS else columns.has_flag(column)
 
     return find_unknown_columns(campaign.configuration.requirements, columns.flags, columns.numbers, is_known)
 

@@ -42,9 +42,9 @@ def read_requirements(path: Path) -> tuple[SharedRequirement, ...]:
     """
     requirements = read_table(path, _RequirementsFile).requirements
     ids = [requirement.id for requirement in requirements]
-    repeated = sorted({name for name in ids if ids.count(name) > 1})
-    if repeated:
-        raise ConfigurationError([Problem(str(path), "requirements", f"share an id: {', '.join(repeated)}")])
+    repeated_ids = sorted({name for name in ids if ids.count(name) > 1})
+    if repeated_ids:
+        raise ConfigurationError([Problem(str(path), "requirements", f"share an id: {', '.join(repeated_ids)}")])
     return requirements
 
 

@@ -191,8 +191,8 @@ class ProcessState:
                 new, saved = _PARTS[index].read(), self._parts[index]
                 if isinstance(saved, dict):
                     remaining = {name: value for name, value in saved.items() if name in new or name not in old}
-                    changed = {name: value for name, value in new.items() if old.get(name) != value}
-                    self._parts[index] = remaining | changed
+                    changed_values = {name: value for name, value in new.items() if old.get(name) != value}
+                    self._parts[index] = remaining | changed_values
                 elif saved == old:
                     self._parts[index] = new
 

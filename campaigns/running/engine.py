@@ -142,11 +142,11 @@ def campaign_with_block(directory: Path, cases: int) -> Campaign:
     """Load a stored campaign with an additional block of cases. Raises CampaignError like `append_cases`."""
     configuration = record.stored_configuration(directory)
     _reject_study(directory, configuration)
-    extended = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
-    problems = [message for _, message in extended.find_sampling_problems()]
+    extended_configuration = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
+    problems = [message for _, message in extended_configuration.find_sampling_problems()]
     if cases < 1 or problems:
         raise CampaignError(f"{cases} cases cannot be added to {directory}: {'; '.join(problems) or 'at least 1'}")
-    return load_stored_campaign(directory, extended)
+    return load_stored_campaign(directory, extended_configuration)
 
 
 def _reject_study(directory: Path, configuration: CampaignConfiguration) -> None:
@@ -295,12 +295,12 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
     (`marsyard.campaigns.definition.loading`). Raises ConfigurationError if a column of a requirement is missing or has
     the wrong type: a metric with a bound needs numbers, a metric without a bound and a population need booleans.
     """
-    declared = row_columns(configuration.scenario) or RowColumns((), ())
+    declared_columns = row_columns(configuration.scenario) or RowColumns((), ())
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
 
     def is_known(name: str, kind: str) -> bool:
-        is_declared = name not in row and (declared.has_flag(name) or declared.has_number(name))
+        is_declared = name not in row and (declared_columns.has_flag(name) or declared_columns.has_number(name))
         return is_declared or name in (numbers if kind == NUMBERS else flags)
 
     unknown_columns = find_unknown_columns(configuration.requirements, flags, numbers, is_known)

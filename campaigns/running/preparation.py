@@ -99,15 +99,15 @@ def find_used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...
     all_inputs = campaign.scenario.shared_inputs(campaign.base_parameters())
     if not all_inputs or not isinstance(campaign.scenario, SelectsInputs):
         return all_inputs
-    allowed, used = set(all_inputs), set[int]()
+    input_set, used_inputs = set(all_inputs), set[int]()
     for case in cases:
         try:
-            used |= allowed.intersection(campaign.scenario.case_inputs(campaign.parameters(case), case))
+            used_inputs |= input_set.intersection(campaign.scenario.case_inputs(campaign.parameters(case), case))
         except ValueError:
             continue  # the case's row will contain the reason
-        if used == allowed:
+        if used_inputs == input_set:
             break
-    return tuple(sorted(used))
+    return tuple(sorted(used_inputs))
 
 
 @contextmanager

@@ -98,12 +98,12 @@ def differing_columns(row: Row, stored: Row) -> tuple[str, ...]:
 
     The traceback of an unfinished case is not compared, since a process is not always terminated at the same line.
     """
-    excluded = {"traceback"} if row.get("outcome") in ENGINE_FAILURES else set()
+    excluded_columns = {"traceback"} if row.get("outcome") in ENGINE_FAILURES else set()
     differing = []
     for name in dict.fromkeys((*row, *stored)):
         # NaN differs from itself
         values = [None if value is None or value != value else value for value in (row.get(name), stored.get(name))]
-        if "time" not in name and name not in excluded and values[0] != values[1]:
+        if "time" not in name and name not in excluded_columns and values[0] != values[1]:
             differing.append(name)
     return tuple(differing)
 

@@ -32,7 +32,7 @@ class ImportanceDensity:
     centres: Float64[np.ndarray, "clusters dimensions"]
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[Coordinates, Float64[np.ndarray, " n"]]:
-        """Draw cases; return their coordinates and weights (nominal density divided by sampling density)."""
+        """Draw n cases; return their coordinates and weights (nominal density divided by sampling density)."""
         coordinates = rng.standard_normal((n, self.centres.shape[1]))
         shifted_cases = np.flatnonzero(rng.random(n) >= NOMINAL_FRACTION)
         clusters = rng.choice(len(self.weights), shifted_cases.size, p=self.weights)

@@ -229,9 +229,9 @@ class _Study:
             verdict, reason = RareVerdict.INSUFFICIENT, f"The verdict would be PASS. {evidence.text}"
         additional = None
         if verdict is RareVerdict.INSUFFICIENT and not contributions:
-            needed = additional_replicates(subset_interval, len(results), settings.max_probability)
+            replicates_needed = additional_replicates(subset_interval, len(results), settings.max_probability)
             cases_per_replicate = self._runner.n_cases / len(results)
-            additional = None if needed is None else math.ceil(needed * cases_per_replicate)
+            additional = None if replicates_needed is None else math.ceil(replicates_needed * cases_per_replicate)
         return self._finish(verdict, interval, results, subset_interval, effective, additional, reason)
 
     def _finish(

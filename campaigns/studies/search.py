@@ -202,14 +202,14 @@ class SearchStudy:
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
             searched = searched or len(self._evaluated)
-        explored = self._evaluated[:searched]
-        violation_numbers = [index + 1 for index, item in enumerate(explored) if item.margin < 0.0]
+        searched_cases = self._evaluated[:searched]
+        violation_numbers = [index + 1 for index, item in enumerate(searched_cases) if item.margin < 0.0]
         return SearchResult(
             tuple(sorted(failures, key=lambda failure: failure.distance)),
             searched,
             self.runner.n_cases,
             violations or len(violation_numbers),
-            min((item.margin for item in explored), default=math.nan),
+            min((item.margin for item in searched_cases), default=math.nan),
             violation_numbers[0] if violation_numbers else None,
             describe_margin(self._requirement),
             reason,
@@ -275,9 +275,9 @@ class SearchStudy:
 
     def _select_starts(self) -> list[tuple[float, ...]]:
         """Select the best explored cases that differ from each other."""
-        ordered = sorted(self._evaluated, key=lambda item: item.margin)
+        sorted_cases = sorted(self._evaluated, key=lambda item: item.margin)
         starts: list[tuple[float, ...]] = []
-        for item in ordered:
+        for item in sorted_cases:
             point = np.array(item.point.coordinates)
             min_distance = _MIN_START_DISTANCE * math.sqrt(point.size)
             if all(np.linalg.norm(point - np.array(other)) >= min_distance for other in starts):
@@ -293,14 +293,14 @@ class SearchStudy:
         reduced_points: list[tuple[list[str], np.ndarray]] = []
         while remaining and len(failures) < self.settings.max_failures:
             first = remaining[0]
-            reduced = self._shrink(self._remove_dispersions(first))
-            paths = [path for path in self.campaign.drawn_paths if path not in reduced.point.nominal]
+            reduction = self._shrink(self._remove_dispersions(first))
+            paths = [path for path in self.campaign.drawn_paths if path not in reduction.point.nominal]
             indices = [self.campaign.drawn_paths.index(path) for path in paths]
-            reduced_coordinates = np.array(reduced.point.coordinates)[indices]
+            reduced_coordinates = np.array(reduction.point.coordinates)[indices]
             coordinates = np.array([item.point.coordinates for item in remaining])[:, indices]
             has_same_cause = np.linalg.norm(coordinates - coordinates[0], axis=1) <= _MAX_CAUSE_DISTANCE
             remaining = [item for item, is_similar in zip(remaining, has_same_cause, strict=True) if not is_similar]
-            values = self.campaign.draws_at(reduced.point)
+            values = self.campaign.draws_at(reduction.point)
             failure_index = next(
                 (index for index, other in enumerate(reduced_points) if _is_close(reduced_coordinates, paths, other)),
                 None,
@@ -311,19 +311,19 @@ class SearchStudy:
                 )
                 continue
             reduced_points.append((paths, reduced_coordinates))
-            repetition = Candidate(reduced.point.coordinates, None, reduced.point.nominal)
+            repetition = Candidate(reduction.point.coordinates, None, reduction.point.nominal)
             repetitions = self._evaluate([repetition] * self.settings.repetitions)
             failures.append(
                 Failure(
-                    reduced.case,
+                    reduction.case,
                     first.case,
-                    reduced.margin,
+                    reduction.margin,
                     {path: values[path] for path in paths},
                     float(np.linalg.norm(reduced_coordinates)),
                     int(has_same_cause.sum()),
                     sum(item.margin < 0.0 for item in repetitions),
                     len(repetitions),
-                    reduced.outcome,
+                    reduction.outcome,
                 )
             )
         return failures

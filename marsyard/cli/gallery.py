@@ -159,8 +159,8 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
         height, width = image.grey.shape
         cropped_height = min(height, round(width * cell_height / cell_width))
         first_row = (height - cropped_height) // 3  # crop more rows at the bottom: the horizon is in the upper part
-        cropped = image.grey[first_row : first_row + cropped_height]
-        cell = cv2.resize(cropped, CELL_PX, interpolation=cv2.INTER_AREA)
+        crop = image.grey[first_row : first_row + cropped_height]
+        cell = cv2.resize(crop, CELL_PX, interpolation=cv2.INTER_AREA)
         sheet[top : top + cell_height, left : left + cell_width] = cell
         label = f"{Path(image.request.site).name}  {image.request.camera}  {image.request.altitude_m:g} m"
         position = (left + 1, top + cell_height + LABEL_PX - 8)
@@ -177,7 +177,7 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
 
 def encode_image(extension: str, grey: Grey, options: Sequence[int]) -> bytes:
     """Encode an image in the format of a file extension. Raises ValueError."""
-    is_encoded, encoded = cv2.imencode(extension, grey, options)
+    is_encoded, buffer = cv2.imencode(extension, grey, options)
     if not is_encoded:
         raise ValueError(f"an image could not be encoded as {extension}")
-    return encoded.tobytes()
+    return buffer.tobytes()

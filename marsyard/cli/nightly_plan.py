@@ -82,8 +82,8 @@ def night_seed(seed: int, night: int) -> int:
 
 def hash_definition(campaign: Campaign) -> str:
     """Hash a campaign's definition except seed, texts and number of cases; only equal definitions are compared."""
-    excluded = {"seed", "description", "retain", "limits", "cases"}
-    definition = campaign.configuration.model_dump(mode="json", exclude=excluded)
+    excluded_keys = {"seed", "description", "retain", "limits", "cases"}
+    definition = campaign.configuration.model_dump(mode="json", exclude=excluded_keys)
     return hashlib.sha256(json.dumps(definition, sort_keys=True).encode()).hexdigest()
 
 

@@ -239,10 +239,10 @@ def truth_layers(image: RenderedImage) -> dict[str, Any]:
 def write_image(image: RenderedImage, request: ImageRequest, prefix: Path) -> list[Path]:
     """Write the files of an image (see `SUFFIXES`); return their paths."""
     png, npz, cahvor, metadata = (_build_path(prefix, image.suffix, ending) for ending in SUFFIXES)
-    is_encoded, encoded = cv2.imencode(".png", image.to_uint16())
+    is_encoded, png_bytes = cv2.imencode(".png", image.to_uint16())
     if not is_encoded:
         raise ValueError(f"{png} could not be encoded")
-    png.write_bytes(encoded.tobytes())
+    png.write_bytes(png_bytes.tobytes())
     with npz.open("wb") as file:
         np.savez(file, **truth_layers(image))
     write_cahvor(image.camera_body, cahvor, f"{request.camera}{image.suffix} at {request.site}", frame=BODY_FRAME)
