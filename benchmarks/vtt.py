@@ -21,6 +21,7 @@ from marsyard.sim.measurements import RoverMeasurements, RoverTarget
 from marsyard.sim.streams import Streams
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, draw_waves, navcam, pose
 
+#: Position of the target in the world frame, m.
 TARGET = np.array([10.0, 0.1, 0.2])
 #: Runs averaged into one measurement, because one run is near the resolution of the clock.
 BATCH = 20
@@ -52,6 +53,7 @@ def prepare_update(tracker: VisualTargetTracker | None = None) -> Callable[[], o
 
 
 def _measure_update_ms(tracker: VisualTargetTracker, repeats: int) -> list[float]:
+    """Measure the time of one update, ms, averaged over each batch."""
     update = prepare_update(tracker)
     batches = core_seconds(lambda: [update() for _ in range(BATCH)], repeats)
     return [1e3 * seconds / BATCH for seconds in batches]
@@ -116,5 +118,5 @@ def measure_runs(repeats: int) -> list[Measurement]:
 
 
 def measure(repeats: int) -> list[Measurement]:
-    """Measure target tracking."""
+    """Measure all run times of target tracking."""
     return [*measure_updates(repeats), *measure_searches(repeats), *measure_runs(min(repeats, 3))]

@@ -56,8 +56,8 @@ def suggest_similar(word: str, allowed: Iterable[str]) -> str:
 def unknown_name_message(kind: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
     """Create the message about an unknown word, with a similar word and the allowed words (or `listed_only`)."""
     allowed_words = sorted(allowed)
-    listed = ", ".join(allowed_words if listed_only is None else sorted(listed_only)) or "none"
-    return f"unknown {kind} '{word}'{suggest_similar(word, allowed_words)}; allowed: {listed}"
+    words_text = ", ".join(allowed_words if listed_only is None else sorted(listed_only)) or "none"
+    return f"unknown {kind} '{word}'{suggest_similar(word, allowed_words)}; allowed: {words_text}"
 
 
 #: The case raised an exception, or its worker process died.

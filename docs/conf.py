@@ -44,7 +44,7 @@ def split_attributes(_app: Sphinx, _what: str, _name: str, _object: object, _opt
 
     In ``:ivar first, second: ...``, Sphinx would interpret ``first,`` as the type of ``second``.
     """
-    split: list[str] = []
+    split_lines: list[str] = []
     names: list[str] = []
     description: list[str] = []
     for line in [*lines, ""]:
@@ -53,12 +53,12 @@ def split_attributes(_app: Sphinx, _what: str, _name: str, _object: object, _opt
             description.append(line)
             continue
         for name in names:
-            split += [f":ivar {name}:{description[0]}", *description[1:]]
+            split_lines += [f":ivar {name}:{description[0]}", *description[1:]]
         names = [name.strip() for name in entry[1].split(",")] if entry else []
         description = [entry[2]] if entry else []
         if not entry:
-            split.append(line)
-    lines[:] = split[:-1]
+            split_lines.append(line)
+    lines[:] = split_lines[:-1]
 
 
 def setup(app: Sphinx) -> None:

@@ -14,7 +14,9 @@ from marsyard.sim.render import Photometry
 from marsyard.sim.sensor.presets import preset
 
 mpl.rcParams["svg.hashsalt"] = "marsyard"
+#: Incidence angle of the sunlight in the figure of the reflectance.
 INCIDENCE_DEG = 30.0
+#: Reflectance laws by the label in the figure.
 LAWS = {
     "Lambert": Photometry(lunar_fraction=0.0, surge_amplitude=0.0),
     "Lommel-Seeliger": Photometry(lunar_fraction=1.0, surge_amplitude=0.0),
@@ -94,7 +96,7 @@ def draw_lower_bounds() -> Figure:
     figure = Figure(figsize=(7.0, 3.6), layout="constrained")
     axes = figure.subplots()
     for failures, style in enumerate(("-", "--", "-.", ":")):
-        bounds = [100.0 * proportion_lower(int(n) - failures, int(n), 0.9) for n in cases]
+        bounds = [100.0 * proportion_lower(int(number) - failures, int(number), 0.9) for number in cases]
         axes.semilogx(cases, bounds, style, label=f"{failures} failed")
     axes.axhline(99.0, color="0.7", linewidth=0.8)
     axes.text(11, 99.15, "99 % required", color="0.35")

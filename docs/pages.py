@@ -104,13 +104,14 @@ def format_ingest_keys() -> str:
 def _walk_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     """Yield keys and fields of a model and of its nested models, in order."""
     for name, field in model.model_fields.items():
-        nested = _nested_models(field.annotation)
-        if not nested:
+        nested_models = _nested_models(field.annotation)
+        if not nested_models:
             yield prefix + name, field
-        listed: set[str] = set()
-        for nested_model in nested:
-            fields = {key: entry for key, entry in _walk_fields(nested_model, f"{prefix}{name}.") if key not in listed}
-            listed.update(fields)
+        # alternative models can have the same key: yield the first
+        keys: set[str] = set()
+        for nested_model in nested_models:
+            fields = {key: entry for key, entry in _walk_fields(nested_model, f"{prefix}{name}.") if key not in keys}
+            keys.update(fields)
             yield from fields.items()
 
 
@@ -124,6 +125,7 @@ def _nested_models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _is_union(annotation: Any) -> bool:
+    """Whether a type is a union of alternatives."""
     return get_origin(annotation) in (typing.Union, types.UnionType)
 
 
@@ -134,6 +136,7 @@ def _format_type(field: FieldInfo) -> str:
 
 
 def _format_limits(metadata: BaseMetadata) -> str:
+    """Format the limits of a number, such as ``> 0``."""
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
     limits = [f"{sign} {getattr(metadata, name):g}" for name, sign in signs.items() if hasattr(metadata, name)]
     return " ".join(limits)
@@ -157,6 +160,7 @@ def _type_name(annotation: Any) -> str:
 
 
 def _format_default(field: FieldInfo) -> str:
+    """Format the default of a field; empty if the field is required or the text is long."""
     if field.default is PydanticUndefined:
         return "" if field.default_factory is None else "computed"
     text = "none" if field.default is None else str(field.default)

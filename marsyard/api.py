@@ -140,6 +140,7 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
 
 
 def _format_toml(value: Any) -> str:
+    """Format a value in TOML syntax."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{json.dumps(str(key))} = {_format_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Results of validation checks: claim, limit and measured value."""
+"""Records of validation checks: claim, limit and measured value."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Measure:
-    """One row of the tables in docs/validation.md.
+    """One measurement: a row of the tables in docs/validation.md.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Check:
-    """A group of measurements.
+    """A group of measurements that run together.
 
     Attributes
     ----------

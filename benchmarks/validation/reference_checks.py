@@ -49,7 +49,7 @@ def make_ground_mesh(
 
 
 def _load_mesh(mi: Any, path: Path, vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> Any:
-    """Load a mesh with interpolated normals from a file; other ways need a newer LLVM than Debian's."""
+    """Load a mesh with interpolated normals from a PLY file; other interfaces need a newer LLVM than Debian's."""
     mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False, validate=False)
     path.write_bytes(trimesh.exchange.ply.export_ply(mesh, vertex_normal=True))
     reflectance = {"type": "uniform", "value": FLAT_ALBEDO}
@@ -67,7 +67,7 @@ def render_reference(
     sun = np.asarray(view.scene.sun.direction, dtype=np.float64)
     points = frame.points_world().reshape(-1, 3)
     visible = points[np.isfinite(points).all(axis=1)]
-    # terrain that may shade the visible points is in the direction of the sun
+    # maximum horizontal distance to ground that shades a point: height range of the terrain / tan(sun elevation)
     shadow_offset = np.ptp(view.scene.surface.levels[0][..., 0]) / sun[2] * sun[:2]
     low = np.minimum(visible[:, :2].min(axis=0), (visible[:, :2] + np.minimum(shadow_offset, 0.0)).min(axis=0)) - 5.0
     high = np.maximum(visible[:, :2].max(axis=0), (visible[:, :2] + np.maximum(shadow_offset, 0.0)).max(axis=0)) + 5.0
@@ -75,13 +75,14 @@ def render_reference(
     origin = visible.mean(axis=0)
     vertices, normals, faces = make_ground_mesh(view.scene.surface, low, high)
     objects = view.scene.objects
-    corners = objects.triangles.reshape(-1, 3) - origin
-    numbers = np.arange(len(corners)).reshape(-1, 3)
+    corner_positions = objects.triangles.reshape(-1, 3) - origin
+    vertex_indices = np.arange(len(corner_positions)).reshape(-1, 3)
     with tempfile.TemporaryDirectory() as folder:
         shapes = {"ground": _load_mesh(mi, Path(folder) / "ground.ply", vertices - origin, normals, faces)}
         if len(objects):
             path = Path(folder) / "objects.ply"
-            shapes["objects"] = _load_mesh(mi, path, corners, objects.normals.reshape(-1, 3), numbers)
+            shapes["objects"] = _load_mesh(mi, path, corner_positions, objects.normals.reshape(-1, 3), vertex_indices)
+    # with the irradiance pi, the radiance equals the radiance factor
     light = {"type": "directional", "direction": list(-sun), "irradiance": {"type": "uniform", "value": np.pi}}
     scene = mi.load_dict({"type": "scene", "light": light, **shapes})
     pose, rays = frame.world_from_body, frame.rays
@@ -98,24 +99,26 @@ def render_reference(
 
 
 def _compare(name: str, view: View, sun: Sun) -> Iterator[Measure]:
+    """Measure the fractions of pixels with equal radiance and with equal shadows."""
     view = make_uniform(view, sun)
     frame = render(renderer(), view)
     reference, in_shadow = render_reference(view, frame)
-    facing = frame.normal @ np.asarray(sun.direction) > 0.0
+    faces_sun = frame.normal @ np.asarray(sun.direction) > 0.0
     lit = frame.radiance > 0.0
     reference_lit = reference > 0.0
-    edge = ndimage.binary_dilation(
+    is_near_edge = ndimage.binary_dilation(
         ndimage.maximum_filter(reference_lit, 3) != ndimage.minimum_filter(reference_lit, 3), iterations=EDGE_PX
     )
     difference = np.abs(frame.radiance - reference)
-    equal = difference <= MAX_RELATIVE_DIFFERENCE * np.maximum(reference, 0.02 * FLAT_ALBEDO)
+    # the tolerance of dark pixels is absolute: that of a radiance factor of 2 % of the albedo
+    is_equal = difference <= MAX_RELATIVE_DIFFERENCE * np.maximum(reference, 0.02 * FLAT_ALBEDO)
     how = (
-        f"{equal.size:,} pixels, {np.mean(edge):.1%} near a shadow's edge, "
-        f"{np.mean(in_shadow & facing):.1%} in cast shadow; median difference "
-        f"{np.median(difference[~edge] / np.maximum(reference[~edge], 1e-3)):.2%}"
+        f"{is_equal.size:,} pixels, {np.mean(is_near_edge):.1%} near a shadow's edge, "
+        f"{np.mean(in_shadow & faces_sun):.1%} in cast shadow; median difference "
+        f"{np.median(difference[~is_near_edge] / np.maximum(reference[~is_near_edge], 1e-3)):.2%}"
     )
     claim = f"radiance within 1 % of Mitsuba's: {name}"
-    yield Measure(claim, float(np.mean(equal[~edge])), "", 0.995, how, "at least")
+    yield Measure(claim, float(np.mean(is_equal[~is_near_edge])), "", 0.995, how, "at least")
     yield Measure(f"shadows as Mitsuba's: {name}", float(np.mean(lit == reference_lit)), "", 0.995, how, "at least")
 
 

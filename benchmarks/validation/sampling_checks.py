@@ -10,11 +10,15 @@ from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.streams import stream_key
 
-#: Constants of NumPy's `SeedSequence` (numpy/random/bit_generator.pyx), whose algorithm is fixed.
-_INIT, _MULT, _MIX_LEFT, _MIX_RIGHT, _SHIFT = 0x43B0D7E5, 0x931E8875, 0xCA01F9DD, 0x4973F715, 16
-_POOL = 4
+#: Constants INIT_A, MULT_A, MIX_MULT_L, MIX_MULT_R and XSHIFT of NumPy's `SeedSequence`
+#: (numpy/random/bit_generator.pyx), whose algorithm is fixed.
+_INITIAL_CONSTANT, _MULTIPLIER, _MIX_LEFT, _MIX_RIGHT, _SHIFT_BITS = 0x43B0D7E5, 0x931E8875, 0xCA01F9DD, 0x4973F715, 16
+#: Number of 32-bit words of a pool.
+_POOL_WORDS = 4
+#: Mask of the lower 32 bits.
 _MASK = 2**32 - 1
 
+#: Numbers of campaigns, and of cases per campaign: with 20 streams per case, ten million streams.
 CAMPAIGNS, CASES = 25, 20_000
 
 
@@ -22,19 +26,19 @@ class _Hash:
     """Vectorised hash of `SeedSequence`; its constant changes with every call."""
 
     def __init__(self) -> None:
-        self._constant = _INIT
+        self._constant = _INITIAL_CONSTANT
 
     def __call__(self, value: np.ndarray) -> np.ndarray:
-        mixed = value ^ np.uint32(self._constant)
-        self._constant = self._constant * _MULT & _MASK
-        mixed = mixed * np.uint32(self._constant)
-        return mixed ^ (mixed >> np.uint32(_SHIFT))
+        word = value ^ np.uint32(self._constant)
+        self._constant = self._constant * _MULTIPLIER & _MASK
+        word = word * np.uint32(self._constant)
+        return word ^ (word >> np.uint32(_SHIFT_BITS))
 
 
 def _mix(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Combine two words of the pool, as in `SeedSequence`."""
     result = np.asarray(np.uint32(_MIX_LEFT) * x - np.uint32(_MIX_RIGHT) * y, dtype=np.uint32)
-    return result ^ (result >> np.uint32(_SHIFT))
+    return result ^ (result >> np.uint32(_SHIFT_BITS))
 
 
 def seeds(words: np.ndarray) -> np.ndarray:
@@ -51,25 +55,25 @@ def seeds(words: np.ndarray) -> np.ndarray:
     -------
     Pools, (sequences, 2) of uint64.
     """
-    hashed = _Hash()
-    pool = [hashed(words[:, index]) for index in range(_POOL)]
-    for source in range(_POOL):
-        for target in range(_POOL):
+    hash_word = _Hash()
+    pool = [hash_word(words[:, index]) for index in range(_POOL_WORDS)]
+    for source in range(_POOL_WORDS):
+        for target in range(_POOL_WORDS):
             if source != target:
-                pool[target] = _mix(pool[target], hashed(pool[source]))
-    for source in range(_POOL, words.shape[1]):
-        for target in range(_POOL):
-            pool[target] = _mix(pool[target], hashed(words[:, source]))
+                pool[target] = _mix(pool[target], hash_word(pool[source]))
+    for source in range(_POOL_WORDS, words.shape[1]):
+        for target in range(_POOL_WORDS):
+            pool[target] = _mix(pool[target], hash_word(words[:, source]))
     return np.ascontiguousarray(np.stack(pool, axis=1)).view(np.uint64)
 
 
 def stream_words(seed: int, campaign: str, cases: np.ndarray, name: str) -> np.ndarray:
-    """Entropy of one stream for many cases, in the layout of `seeds`."""
+    """Return the entropy of one stream for many cases, in the layout of `seeds`."""
     root_words = [seed & _MASK, seed >> 32, 0, 0]
     key = list(stream_key(campaign, 0, name))
     words = np.tile(np.array([*root_words, *key], dtype=np.uint32), (cases.size, 1))
-    # the case is the word of the spawn key that `stream_key` leaves at 0
-    words[:, _POOL + 4] = cases
+    # the spawn key consists of four words of the campaign's name, the case, and four words of the stream's name
+    words[:, _POOL_WORDS + 4] = cases
     return words
 
 
@@ -80,7 +84,7 @@ def list_stream_names() -> list[str]:
 
 
 def all_seeds(campaigns: int, cases: int, names: Sequence[str]) -> np.ndarray:
-    """Seeds of all streams of campaigns with two alternating names and increasing root seeds."""
+    """Compute the seeds of all streams of campaigns with two alternating names and increasing root seeds."""
     numbers = np.arange(cases)
     return np.concatenate(
         [
@@ -100,9 +104,9 @@ def collisions(pools: np.ndarray) -> int:
 def run_streams(quick: bool) -> Iterator[Measure]:
     """Count equal seeds of neighbouring campaigns, cases and streams."""
     names = list_stream_names()
-    results = all_seeds(CAMPAIGNS // 5 if quick else CAMPAIGNS, CASES // 10 if quick else CASES, names)
-    how = f"{len(results):,} streams: {len(names)} names, cases from 0, root seeds from 0, two campaigns; 128-bit seeds"
-    yield Measure("pairs of random streams with equal seeds", collisions(results), "pairs", 0.0, how)
+    pools = all_seeds(CAMPAIGNS // 5 if quick else CAMPAIGNS, CASES // 10 if quick else CASES, names)
+    how = f"{len(pools):,} streams: {len(names)} names, cases from 0, root seeds from 0, two campaigns; 128-bit seeds"
+    yield Measure("pairs of random streams with equal seeds", collisions(pools), "pairs", 0.0, how)
 
 
 CHECKS = (Check("streams", "Random streams", run_streams),)

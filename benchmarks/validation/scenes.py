@@ -21,6 +21,7 @@ from marsyard.sim.terrain.sites import Site, SiteTexture, site
 
 #: Seed of the terrain bank of the checks.
 SEED = 20
+#: Image of Opportunity's front hazcam, whose label contains the camera model.
 HAZCAM_LABEL = Path(__file__).parents[3] / "shared/data/mer_opportunity/1F483288473EFFCMUFP1214L0M1.IMG"
 #: HiRISE tile in Gale: 1 m posts, 0.5 m orthoimage.
 TILE = Path(__file__).parents[3] / "shared/data/gale_hirise/gale_1m_dem_0p5m_ortho.npz"
@@ -134,7 +135,7 @@ def crop_centre(camera: CameraModel, size: tuple[int, int]) -> CameraModel:
 
 
 def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
-    """Central crop of a nadir descent image of the HiRISE tile in Gale with its orthoimage; None without the data."""
+    """View of the HiRISE tile in Gale with its orthoimage: central crop of a descent image; None without the data."""
     if not TILE.exists():
         return None
     # the orthoimage is shifted by about 2 m east and 1 m south; detail below the 1 m posts is synthetic
@@ -156,7 +157,7 @@ def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
 
 
 def descent_view(name: str, height_m: float, size: tuple[int, int]) -> View:
-    """Central crop of a slightly tilted descent image of a site, from a height above the ground."""
+    """View of a site from a height above the ground: central crop of a slightly tilted descent image."""
     site_parameters, surface = site(name), descent_surface(name)
     camera = crop_centre(preset("mer-descent-flown").cameras()[0], size)
     scene = Scene(
@@ -184,7 +185,7 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
     """View of a large rock from a mast; `distance_m` is the distance from the camera to the near side of the rock."""
     site_parameters, surface = site(name), ground_surface(name)
     ground = float(surface.height(*ROCK_POSITION))
-    # the near side is about half a diameter from the centre
+    # approximation: the near side is 0.4 diameters from the rock's centre and sqrt(0.5) mast heights below the camera
     ground_distance_m = np.sqrt(max(distance_m**2 - 0.5 * MAST_M**2, 0.0)) + 0.4 * ROCK_DIAMETER_M
     eye = np.array([ROCK_POSITION[0] - ground_distance_m, ROCK_POSITION[1], ground + MAST_M])
     target = PlacedRock(
@@ -215,6 +216,7 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
         mesh_lines=641,
         among_objects=True,
     )
+    # the camera points at 0.3 diameters above the ground, 0.3 diameters in front of the rock's centre
     pitch_rad = np.arctan2(MAST_M - 0.3 * ROCK_DIAMETER_M, ground_distance_m - 0.3 * ROCK_DIAMETER_M)
     return View(scene, camera, rigid(Rotation.from_euler("y", pitch_rad), eye))
 

@@ -58,31 +58,31 @@ class SoakResult:
     Attributes
     ----------
     kills
-        Number of kills before the end of a run.
-    ended
-        Whether the last run ended by itself.
+        Number of runs that were killed before their end.
+    finished
+        Whether the last run finished the campaign.
     seconds
         Duration of all runs.
     faults
         Fault of each case; empty for cases without fault.
-    wrong_outcomes, changed
+    wrong_outcomes, changed_cases
         Cases with an unexpected outcome; valid cases whose row differs from the undisturbed campaign.
-    processes, files
-        Remaining processes and temporary files after the last run.
+    remaining_processes, remaining_files
+        Numbers of processes and temporary files after the last run.
     """
 
     kills: int
-    ended: bool
+    finished: bool
     seconds: float
     faults: tuple[str, ...]
     wrong_outcomes: tuple[str, ...]
-    changed: tuple[int, ...]
-    processes: int
-    files: int
+    changed_cases: tuple[int, ...]
+    remaining_processes: int
+    remaining_files: int
 
 
 def run_soak_test(
-    folder: Path, cases: int, kills: int, misbehaving: float, killed_after_s: tuple[float, float]
+    folder: Path, cases: int, kills: int, fault_fraction: float, kill_delay_s: tuple[float, float]
 ) -> SoakResult:
     """Run the soak test in a folder, with and without faults.
 
@@ -90,31 +90,32 @@ def run_soak_test(
     ----------
     folder
         Empty folder.
-    cases, misbehaving
-        Number of cases, and fraction of misbehaving cases.
-    kills, killed_after_s
+    cases, fault_fraction
+        Number of cases, and fraction of cases with a fault.
+    kills, kill_delay_s
         Number of kills, and minimum and maximum of the uniform time before each kill.
     """
     temporary = folder / "tmp"
     temporary.mkdir()
     environment = {**os.environ, _MARK: str(folder), "TMPDIR": str(temporary)}
     (folder / "soak.toml").write_text(f"cases = {cases}\n{CAMPAIGN_TEXT}")
-    healthy = _run(folder, "healthy", 0.0, environment, cases)
+    undisturbed_status = _run(folder, "healthy", 0.0, environment, cases)
     start_s = time.monotonic()
-    killed = _run_with_kills(folder, misbehaving, kills, killed_after_s, environment)
-    ended = _run(folder, "soaked", None, environment, cases) == 0 or (folder / "soaked" / "cases.parquet").exists()
+    successful_kills = _run_with_kills(folder, fault_fraction, kills, kill_delay_s, environment)
+    # the exit status is not 0 if cases crashed
+    finished = _run(folder, "soaked", None, environment, cases) == 0 or (folder / "soaked" / "cases.parquet").exists()
     seconds = time.monotonic() - start_s
     deadline = time.monotonic() + _MAX_SHUTDOWN_S
     while _find_processes(folder) and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert healthy == 0, "the undisturbed campaign failed"
+    assert undisturbed_status == 0, "the undisturbed campaign failed"
     rows = {name: read_rows(folder / name / "cases.parquet") for name in ("healthy", "soaked")}
-    campaign = load_campaign(str(folder / "soak.toml"), [f"misbehaving={misbehaving}"])
+    campaign = load_campaign(str(folder / "soak.toml"), [f"misbehaving={fault_fraction}"])
     faults = tuple(_draw_fault(campaign, case) for case in range(cases))
     pairs = list(zip(faults, rows["soaked"], rows["healthy"], strict=True))
     return SoakResult(
-        kills=killed,
-        ended=ended,
+        kills=successful_kills,
+        finished=finished,
         seconds=seconds,
         faults=faults,
         wrong_outcomes=tuple(
@@ -122,54 +123,54 @@ def run_soak_test(
             for fault, row, _ in pairs
             if row["outcome"] != (FAULTS[fault][1] if fault else "VALID")
         ),
-        changed=tuple(
+        changed_cases=tuple(
             int(row["case"])
             for _, row, undisturbed in pairs
             if row["outcome"] == "VALID" and differing_columns(row, undisturbed)
         ),
-        processes=len(_find_processes(folder)),
-        files=len(list(temporary.iterdir())),
+        remaining_processes=len(_find_processes(folder)),
+        remaining_files=len(list(temporary.iterdir())),
     )
 
 
-def _build_command(folder: Path, name: str, misbehaving: float | None) -> list[str]:
-    """Build the command that runs the campaign with a fraction of misbehaving cases, or resumes it (None)."""
+def _build_command(folder: Path, name: str, fault_fraction: float | None) -> list[str]:
+    """Build the command that runs the campaign with a fraction of faulty cases, or resumes it (None)."""
     program = [sys.executable, "-m", "marsyard"]
-    if misbehaving is None:
+    if fault_fraction is None:
         return [*program, "resume", str(folder / name), "--jobs", "2"]
-    settings = ["--set", f"misbehaving={misbehaving}", "--jobs", "2", "--out", str(folder / name)]
+    settings = ["--set", f"misbehaving={fault_fraction}", "--jobs", "2", "--out", str(folder / name)]
     return [*program, "run", str(folder / "soak.toml"), *settings]
 
 
-def _run(folder: Path, name: str, misbehaving: float | None, environment: Mapping[str, str], cases: int) -> int:
+def _run(folder: Path, name: str, fault_fraction: float | None, environment: Mapping[str, str], cases: int) -> int:
     """Run or resume a campaign without interruption; return the exit status."""
     no_output = subprocess.DEVNULL
-    command = _build_command(folder, name, misbehaving)
+    command = _build_command(folder, name, fault_fraction)
     return subprocess.run(
         command, env=environment, stdout=no_output, stderr=no_output, timeout=60.0 + cases * _MAX_CASE_S, check=False
     ).returncode
 
 
 def _run_with_kills(
-    folder: Path, misbehaving: float, kills: int, after_s: tuple[float, float], environment: Mapping[str, str]
+    folder: Path, fault_fraction: float, kills: int, kill_delay_s: tuple[float, float], environment: Mapping[str, str]
 ) -> int:
-    """Run and resume the campaign, killing each run; return the number of runs killed before their end."""
+    """Start the campaign, then resume it; kill each run. Return the number of runs killed before their end."""
     rng = np.random.default_rng(21)
-    killed = 0
+    successful_kills = 0
     for number in range(kills):
-        command = _build_command(folder, "soaked", None if number else misbehaving)
+        command = _build_command(folder, "soaked", None if number else fault_fraction)
         no_output = subprocess.DEVNULL
         with subprocess.Popen(command, env=environment, stdout=no_output, stderr=no_output) as runner:
             while not (folder / "soaked" / "cases.sqlite").exists() and runner.poll() is None:
                 time.sleep(0.02)
-            time.sleep(rng.uniform(*after_s))
-            killed += runner.poll() is None
+            time.sleep(rng.uniform(*kill_delay_s))
+            successful_kills += runner.poll() is None
             runner.kill()
-    return killed
+    return successful_kills
 
 
 def _find_processes(folder: Path) -> list[int]:
-    """Ids of living processes whose environment contains the mark of the soak test."""
+    """List the ids of processes whose environment contains the mark of the soak test."""
     mark = f"{_MARK}={folder}".encode()
     ids = []
     for process in Path("/proc").glob("[1-9]*"):
@@ -180,6 +181,7 @@ def _find_processes(folder: Path) -> list[int]:
 
 
 def _draw_fault(campaign: Any, case: int) -> str:
+    """Draw the fault of a case; empty without a fault."""
     parameters = campaign.parameters(case)
     assert isinstance(parameters, HostileParameters)
     return draw_fault(parameters, campaign.streams(case))
@@ -187,19 +189,19 @@ def _draw_fault(campaign: Any, case: int) -> str:
 
 def check_isolation(quick: bool) -> Iterator[Measure]:
     """Run the soak test and compare it with the same campaign without faults."""
-    cases, kills, misbehaving = (60, 1, 0.4) if quick else (300, 3, 0.4)
+    cases, kills, fault_fraction = (60, 1, 0.4) if quick else (300, 3, 0.4)
     with TemporaryDirectory() as name:
-        result = run_soak_test(Path(name), cases, kills, misbehaving, (5.0, 40.0))
+        result = run_soak_test(Path(name), cases, kills, fault_fraction, (5.0, 40.0))
     healthy = result.faults.count("")
     kinds = len(set(result.faults)) - 1
     how = f"{cases} cases, {cases - healthy} of which misbehave in {kinds} ways; killed {result.kills} times"
-    yield Measure("soak: campaigns that did not end by themselves", float(not result.ended), "", 0, how)
+    yield Measure("soak: campaigns that did not end by themselves", float(not result.finished), "", 0, how)
     yield Measure("soak: outcomes that do not match the fault of the case", len(result.wrong_outcomes), "", 0, how)
     yield Measure(
-        "soak: rows of valid cases that differ from the campaign without faults", len(result.changed), "", 0, how
+        "soak: rows of valid cases that differ from the campaign without faults", len(result.changed_cases), "", 0, how
     )
-    yield Measure("soak: remaining processes", result.processes, "", 0, how)
-    yield Measure("soak: remaining temporary files", result.files, "", 0, how)
+    yield Measure("soak: remaining processes", result.remaining_processes, "", 0, how)
+    yield Measure("soak: remaining temporary files", result.remaining_files, "", 0, how)
     yield Measure("soak: time of the campaign", result.seconds, "s", None, how)
     for text in result.wrong_outcomes:
         print(text)

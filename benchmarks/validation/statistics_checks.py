@@ -39,11 +39,12 @@ _CASES_PER_TERRAIN = 8
 
 
 def _min_coverage(nominal: float, trials: int) -> float:
-    """Limit of a simulated coverage: nominal coverage minus three standard deviations of the simulation."""
+    """Minimum of a simulated coverage: nominal coverage minus three standard deviations of the simulation."""
     return nominal - 3.0 * math.sqrt(nominal * (1.0 - nominal) / trials)
 
 
 def _fraction(successes: Iterator[bool], trials: int) -> float:
+    """Return the fraction of successful trials."""
     return sum(bool(success) for success in successes) / trials
 
 
@@ -52,8 +53,8 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
     trials = 200 if quick else 1000
     rng = np.random.default_rng(1)
     draws: tuple[tuple[str, Callable[[int], np.ndarray], float, float], ...] = (
-        ("normal errors", lambda n: rng.normal(size=n), 0.0, 1.0),
-        ("radial errors", lambda n: rng.rayleigh(size=n), math.sqrt(math.pi / 2), math.sqrt(2.0 - math.pi / 2)),
+        ("normal errors", lambda size: rng.normal(size=size), 0.0, 1.0),
+        ("radial errors", lambda size: rng.rayleigh(size=size), math.sqrt(math.pi / 2), math.sqrt(2.0 - math.pi / 2)),
     )
     intervals: tuple[tuple[str, Callable[[np.ndarray, float], Interval]], ...] = (
         ("mean", mean_interval),
@@ -63,17 +64,19 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         for statistic, interval in intervals:
             truth = mean if statistic == "mean" else deviation
             interval_pairs = (interval(draw(30), 0.95) for _ in range(trials))
-            covered = _fraction((low <= truth <= high for low, high in interval_pairs), trials)
+            coverage = _fraction((low <= truth <= high for low, high in interval_pairs), trials)
             how = f"{trials} samples of 30; BCa, widened; limit: nominal minus three deviations of the simulation"
             yield Measure(
-                f"95 % interval of the {statistic}, {name}", covered, "", _min_coverage(0.95, trials), how, "at least"
+                f"95 % interval of the {statistic}, {name}", coverage, "", _min_coverage(0.95, trials), how, "at least"
             )
     truth = float(stats.norm.ppf(0.95))
     bounds = [quantile_bounds(rng.normal(size=80), 0.95, CONFIDENCE) for _ in range(20 * trials)]
-    worst = min(np.mean([low <= truth for low, _ in bounds]), np.mean([high >= truth for _, high in bounds]))
+    bound_coverage = min(np.mean([low <= truth for low, _ in bounds]), np.mean([high >= truth for _, high in bounds]))
     how = f"{20 * trials} samples of 80; the worse of the lower and the upper bound"
-    yield Measure("90 % bounds of a 95 % quantile", float(worst), "", _min_coverage(0.9, 20 * trials), how, "at least")
-    inside = 0
+    yield Measure(
+        "90 % bounds of a 95 % quantile", float(bound_coverage), "", _min_coverage(0.9, 20 * trials), how, "at least"
+    )
+    inside_count = 0
     for _ in range(4 * trials):
         points = rng.normal(size=(21, 2)) @ np.array([[2.0, 0.0], [0.9, 0.4]])
         ellipse = error_ellipse(points[:20], 0.95)
@@ -81,11 +84,11 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         angle = math.radians(ellipse.angle_deg)
         x, y = points[20] - ellipse.centre
         major, minor = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
-        inside += (major / ellipse.semi_major) ** 2 + (minor / ellipse.semi_minor) ** 2 <= 1.0
+        inside_count += (major / ellipse.semi_major) ** 2 + (minor / ellipse.semi_minor) ** 2 <= 1.0
     how = f"{4 * trials} samples of 20 errors, each with one further error"
     yield Measure(
         "95 % ellipse contains the next error",
-        inside / (4 * trials),
+        inside_count / (4 * trials),
         "",
         _min_coverage(0.95, 4 * trials),
         how,
@@ -96,7 +99,11 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
 def _draw_successes(
     rng: np.random.Generator, rate: float, correlation: float, terrains: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw successes on terrains with beta-distributed rates."""
+    """Draw successes on terrains with beta-distributed rates; return the successes and their terrains.
+
+    The beta distribution has the parameters rate * weight and (1 - rate) * weight. The correlation of two cases on one
+    terrain is then 1 / (weight + 1).
+    """
     weight = (1.0 - correlation) / correlation
     rates = rng.beta(rate * weight, (1.0 - rate) * weight, terrains)
     terrain = np.repeat(np.arange(terrains), _CASES_PER_TERRAIN)
@@ -128,33 +135,33 @@ def run_shared(quick: bool) -> Iterator[Measure]:
     truths = {"mean": 0.0, "standard deviation": 1.0, "95 % quantile": float(stats.norm.ppf(0.95))}
     for correlation in (0.05, 0.3, 0.9):
         for terrains in (12, 60, 250):
-            coverage = [_check_coverage(*_draw_errors(rng, correlation, terrains), truths) for _ in range(trials)]
+            trial_coverage = [_check_coverage(*_draw_errors(rng, correlation, terrains), truths) for _ in range(trials)]
             for statistic, nominal in (("mean", 0.95), ("standard deviation", 0.95), ("95 % quantile", CONFIDENCE)):
-                covered = float(np.min(np.mean([covers[statistic] for covers in coverage], axis=0)))
+                coverage = float(np.min(np.mean([covers[statistic] for covers in trial_coverage], axis=0)))
                 interval = "bounds" if statistic.endswith("quantile") else "interval"
                 claim = f"{100 * nominal:.0f} % {interval} of the {statistic}, "
                 claim += f"correlation {correlation}, {terrains} terrains"
                 how = f"{trials} campaigns, 1 to 14 normal errors per terrain"
-                yield Measure(claim, covered, "", _min_coverage(nominal, trials), how, "at least")
+                yield Measure(claim, coverage, "", _min_coverage(nominal, trials), how, "at least")
 
 
 def _draw_errors(rng: np.random.Generator, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
     """Draw standard normal errors that are correlated within a terrain, and their terrains."""
     terrain = np.repeat(np.arange(terrains), rng.integers(1, 15, terrains))
-    shared, independent = rng.normal(size=terrains)[terrain], rng.normal(size=terrain.size)
-    return math.sqrt(correlation) * shared + math.sqrt(1.0 - correlation) * independent, terrain
+    common_errors, independent_errors = rng.normal(size=terrains)[terrain], rng.normal(size=terrain.size)
+    return math.sqrt(correlation) * common_errors + math.sqrt(1.0 - correlation) * independent_errors, terrain
 
 
 def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
     """Return whether each interval contains the true value; the two bounds of the quantile are checked separately."""
     lower, upper = quantile_bounds(errors, 0.95, CONFIDENCE, terrain)
-    covered: dict[str, tuple[bool, ...]] = {
+    contains_truth: dict[str, tuple[bool, ...]] = {
         "95 % quantile": (lower <= truths["95 % quantile"], upper >= truths["95 % quantile"])
     }
     for statistic, interval in (("mean", mean_interval), ("standard deviation", standard_deviation_interval)):
         low, high = interval(errors, 0.95, terrain)
-        covered[statistic] = (low <= truths[statistic] <= high,)
-    return covered
+        contains_truth[statistic] = (low <= truths[statistic] <= high,)
+    return contains_truth
 
 
 def run_sequential(quick: bool) -> Iterator[Measure]:
@@ -184,12 +191,12 @@ def _simulate_decision(
         order = rng.permutation(success.size)
         success, terrain = success[order][:max_cases], terrain[order][:max_cases]
     for look in planned_looks(max_cases):
-        confidence, first = confidence_at(CONFIDENCE, look.risk_fraction), success[: look.cases]
+        confidence, first_successes = confidence_at(CONFIDENCE, look.risk_fraction), success[: look.cases]
         if correlation is None:
-            counts = int(first.sum()), look.cases, confidence
+            counts = int(first_successes.sum()), look.cases, confidence
             lower, upper = proportion_lower(*counts), proportion_upper(*counts)
         else:
-            evidence = clustered_evidence(first, terrain[: look.cases], confidence)
+            evidence = clustered_evidence(first_successes, terrain[: look.cases], confidence)
             lower, upper = evidence.lower, evidence.upper
         if lower >= required or upper < required:
             return lower >= required, upper < required
@@ -198,22 +205,22 @@ def _simulate_decision(
 
 def run_nights(quick: bool) -> Iterator[Measure]:
     """Measure false alarms of nightly runs without a change, and detection of simulated regressions."""
-    unchanged, changed = (100, 100) if quick else (2000, 1000)
-    alarms = count_false_alarms(unchanged, seed=4)
+    nights_without_change, nights_with_change = (100, 100) if quick else (2000, 1000)
+    alarms = count_false_alarms(nights_without_change, seed=4)
     campaigns = f"three campaigns of {CASES} cases: {', '.join(KINDS)}"
     comparison = f"each compared with up to {MAX_EARLIER_NIGHTS} earlier nights"
-    how = f"{alarms} of {unchanged} successive nights, {comparison}; {campaigns}"
-    yield Measure("nights with a false alarm", alarms / unchanged, "", 0.01, how)
+    how = f"{alarms} of {nights_without_change} successive nights, {comparison}; {campaigns}"
+    yield Measure("nights with a false alarm", alarms / nights_without_change, "", 0.01, how)
     if not quick:
-        upper_bound = proportion_upper(alarms, unchanged, 0.95)
+        upper_bound = proportion_upper(alarms, nights_without_change, 0.95)
         yield Measure(
             "nights with a false alarm, upper bound at 95 % confidence", upper_bound, "", 0.01, "the same nights"
         )
-    for kind, nights in ((KINDS[0], changed), (KINDS[1], changed // 4)):
-        detected = count_detections(kind, nights, seed=5) / nights
+    for kind, nights in ((KINDS[0], nights_with_change), (KINDS[1], nights_with_change // 4)):
+        detection_rate = count_detections(kind, nights, seed=5) / nights
         claim = f"nights that detect a regression, errors {ERROR_FACTOR:g} times as large, {kind}"
         how = f"{nights} nights, each compared with {EARLIER_NIGHTS} earlier nights; {campaigns}"
-        yield Measure(claim, detected, "", 0.95, how, "at least")
+        yield Measure(claim, detection_rate, "", 0.95, how, "at least")
 
 
 CHECKS = (

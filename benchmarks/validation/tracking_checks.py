@@ -22,7 +22,7 @@ from marsyard.sim.streams import Streams
 SEED = 20061108
 #: Limits of the drift (rms, maximum), and of the relative deviation of the range error from Eq. 1.
 DRIFT_RMS_LIMIT_PX, DRIFT_WORST_LIMIT_PX, RANGE_LIMIT = 1.0, 2.5, 0.15
-#: Maximum fraction of lost targets: 2 of 100 measured, plus three standard deviations (4).
+#: Maximum fraction of lost targets: 2 of 100 were lost; three standard deviations of this number are 4.
 LOST_LIMIT = 0.06
 CAMERAS = ("research-navcam", "research-pancam")
 #: Parameters without errors of cameras, mast and odometry.
@@ -38,8 +38,10 @@ NO_ERRORS: dict[str, Any] = {
 def draw_exact_parameters(number: int, camera: str) -> RoverScenarioParameters:
     """Draw the parameters of a run of `vtt-montecarlo` with exact pose, cameras and mast, without noise."""
     campaign = load_campaign("vtt-montecarlo")
-    drawn = campaign.with_values({**campaign.draws(number), "camera.preset": camera, "world.terrain": number % 8})
-    settings = drawn.model_dump()
+    case_parameters = campaign.with_values(
+        {**campaign.draws(number), "camera.preset": camera, "world.terrain": number % 8}
+    )
+    settings = case_parameters.model_dump()
     (leg,) = settings["legs"]
     return RoverScenarioParameters.model_validate(
         settings
@@ -80,11 +82,11 @@ def _measure_drifts(rows: list[dict[str, Scalar]], name: str, *, has_limit: bool
     )
     if has_limit:
         yield _measure_losses(f"targets lost before 2 m: {name}", int(np.isnan(drifts_px).sum()), len(drifts_px), how)
-    tracked = drifts_px[~np.isnan(drifts_px)]
-    rms, worst = float(np.sqrt(np.mean(tracked**2))), float(tracked.max())
+    tracked_px = drifts_px[~np.isnan(drifts_px)]
+    rms, maximum = float(np.sqrt(np.mean(tracked_px**2))), float(tracked_px.max())
     yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_LIMIT_PX if has_limit else None, how)
     yield Measure(
-        f"drift of the tracked point, maximum: {name}", worst, "px", DRIFT_WORST_LIMIT_PX if has_limit else None, how
+        f"drift of the tracked point, maximum: {name}", maximum, "px", DRIFT_WORST_LIMIT_PX if has_limit else None, how
     )
 
 
@@ -100,11 +102,11 @@ def _median_sun_motion_deg(rows: list[dict[str, Scalar]]) -> float:
 def check_stereo(quick: bool) -> Iterator[Measure]:
     """Compare the range error of the first pair at 10 m with Eq. 1 (tracking paper) for the true disparity errors."""
     for camera in CAMERAS:
-        rows = [_simulate_designation(number, camera) for number in range(10 if quick else 60)]
-        pairs = [row for row in rows if row is not None]
-        measured = [row for row in pairs if np.isfinite(row[0])]
-        errors, expected = np.array(measured).reshape(-1, 2).T
-        ratio = float(np.sqrt(np.mean(errors**2) / np.mean(expected**2)))
+        simulations = [_simulate_designation(number, camera) for number in range(10 if quick else 60)]
+        selectable_errors = [errors_m for errors_m in simulations if errors_m is not None]
+        measured_errors = [errors_m for errors_m in selectable_errors if np.isfinite(errors_m[0])]
+        errors, expected_errors = np.array(measured_errors).reshape(-1, 2).T
+        ratio = float(np.sqrt(np.mean(errors**2) / np.mean(expected_errors**2)))
         how = f"first pairs of {len(errors)} runs of vtt-accuracy at rocks of 1.5 m, disparity error 1/3 px rms"
         yield Measure(
             f"stereo range error at 10 m divided by that of Eq. 1, minus 1: {camera}",
@@ -113,11 +115,11 @@ def check_stereo(quick: bool) -> Iterator[Measure]:
             RANGE_LIMIT,
             how,
         )
-        how = f"of {len(pairs)} selectable targets; the row above excludes these pairs"
+        how = f"of {len(selectable_errors)} selectable targets; the row above excludes these pairs"
         yield _measure_losses(
             f"first stereo pairs in which the target is not found: {camera}",
-            len(pairs) - len(measured),
-            len(pairs),
+            len(selectable_errors) - len(measured_errors),
+            len(selectable_errors),
             how,
         )
 
@@ -130,8 +132,10 @@ def _simulate_designation(number: int, camera: str) -> tuple[float, float] | Non
     campaign = load_campaign("vtt-accuracy")
     # large rock: the template contains only the rock and no ground behind it
     rock = {"target.diameter_m": 1.5, "target.up": 0.5, "camera.preset": camera, "world.terrain": number % 8}
-    drawn = campaign.with_values(campaign.draws(number) | rock)
-    parameters = RoverScenarioParameters.model_validate(drawn.model_dump() | {"legs": [{"motion": "stay", "steps": 1}]})
+    case_parameters = campaign.with_values(campaign.draws(number) | rock)
+    parameters = RoverScenarioParameters.model_validate(
+        case_parameters.model_dump() | {"legs": [{"motion": "stay", "steps": 1}]}
+    )
     run = run_case(parameters, Streams(SEED, "validation stereo", number))
     row = fixed_conditions(parameters, run)
     if not row["selectable"]:
@@ -149,6 +153,7 @@ def _range_error_m(run: Run) -> float:
 
 
 def _expected_range_error_m(run: Run, disparity_error_px: float) -> float:
+    """Compute the range error of the first pair by Eq. 1 of the tracking paper, metres."""
     rig = run.rig.calibrated
     return stereo_range_error_m(run.stops[0].range_m, disparity_px_m(rig.left, rig.right), 1.0, disparity_error_px)
 

@@ -92,7 +92,7 @@ class Campaign:
         position = locate_case(configuration.design, configuration.blocks, configuration.grid_size, case)
         if position is None:
             return None
-        grid_point, first, size, index = position
+        grid_point, first_case, case_count, index = position
         if configuration.design.kind == "random":
             streams = self.streams(case)
             uniform = {path: streams.generator(f"dispersion:{stream_name(path)}").random() for path in paths}
@@ -109,8 +109,8 @@ class Campaign:
                 configuration.design.kind,
                 configuration.seed,
                 configuration.name,
-                first,
-                size,
+                first_case,
+                case_count,
                 tuple(map(stream_name, paths)),
                 groups,
             )
@@ -124,8 +124,8 @@ class Campaign:
         marginals: dict[str, Dispersion] = dict(self.configuration.dispersions)
         for group in self.configuration.correlations:
             for index, row in enumerate(group.covariance or ()):
-                path, sd = group.parameters[index], math.sqrt(row[index])
-                marginals[path] = Normal.model_validate({**marginals[path].model_dump(), "sd": sd})
+                path, standard_deviation = group.parameters[index], math.sqrt(row[index])
+                marginals[path] = Normal.model_validate({**marginals[path].model_dump(), "sd": standard_deviation})
         return marginals
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits), and renamed keys."""
+"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits); update of old names."""
 
 from __future__ import annotations
 
@@ -178,9 +178,9 @@ class CampaignConfiguration(Parameters):
     @model_validator(mode="after")
     def _check_unique_ids(self) -> CampaignConfiguration:
         ids = [requirement.id for requirement in self.requirements]
-        repeated = sorted({name for name in ids if ids.count(name) > 1})
-        if repeated:
-            raise ValueError(f"requirements share an id: {', '.join(repeated)}")
+        repeated_ids = sorted({name for name in ids if ids.count(name) > 1})
+        if repeated_ids:
+            raise ValueError(f"requirements share an id: {', '.join(repeated_ids)}")
         return self
 
     @property
@@ -296,8 +296,8 @@ def key_text(key: Iterable[str | int]) -> str:
         if isinstance(part, int):
             text += f"[{part}]"
         else:
-            quoted = part if part.replace("-", "_").isidentifier() or part.isdigit() else f'"{part}"'
-            text += f".{quoted}" if text else quoted
+            key_part = part if part.replace("-", "_").isidentifier() or part.isdigit() else f'"{part}"'
+            text += f".{key_part}" if text else key_part
     return text
 
 
@@ -355,12 +355,12 @@ _NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
 _TEXT_KEYS = ("distribution", "source", "description", "unit")
 
 
-def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str, Any]:
+def use_current_names(tables: Mapping[str, Any], selected_scenario: Scenario) -> dict[str, Any]:
     """Replace former names of dispersed parameters and columns in the tables of a campaign file, with warnings.
 
     The parameter models replace the former keys of the parameters themselves.
     """
-    rename_path = partial(current_path, selected.parameters_type)
+    rename_path = partial(current_path, selected_scenario.parameters_type)
     rename_column = _column_renamer(str(tables.get("scenario")))
     current = dict(tables)
     dispersions, correlations = tables.get("dispersions"), tables.get("correlations")
@@ -388,9 +388,9 @@ def update_stored_configuration(stored: Mapping[str, Any]) -> dict[str, Any]:
         warnings.simplefilter("ignore", DeprecatedNameWarning)
         stored = {current_key(key, CampaignConfiguration.model_fields): value for key, value in stored.items()}
         try:
-            selected = scenario(str(stored.get("scenario")))
-            current = use_current_names(stored, selected)
-            parameters = selected.parameters_type.model_validate(stored.get("parameters", {}))
+            selected_scenario = scenario(str(stored.get("scenario")))
+            current = use_current_names(stored, selected_scenario)
+            parameters = selected_scenario.parameters_type.model_validate(stored.get("parameters", {}))
         except (UnknownScenarioError, ValidationError, ImportError):
             return dict(stored)
         return {**current, "parameters": parameters.model_dump(mode="json", round_trip=True, exclude_unset=True)}

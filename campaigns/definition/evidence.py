@@ -1,8 +1,8 @@
 """Kind of evidence of a run: calibration, confirmation or exploration, by its seed and its frozen algorithm.
 
-Options that were set by looking at results fit the cases of these results. Only cases that were drawn afterwards, once,
-can confirm the algorithm. `marsyard run --confirm` draws the seed of such a run from a namespace, and enters the run in
-a record of confirmations (`marsyard.campaigns.store.confirmations`).
+Options that were set by looking at results fit the cases of these results. Only new cases, drawn once after the
+algorithm was frozen, can confirm it. `marsyard run --confirm` draws the seed of such a run from a namespace, and enters
+the run in a record of confirmations (`marsyard.campaigns.store.confirmations`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NAMESPACE = "confirmation"
 _KEYS_NOT_FROZEN = frozenset(
     {"appended", "calibration", "cases", "description", "limits", "max_cases", "requirements", "retain", "seed"}
 )
-#: Confirmation numbers up to this one have seeds that are recognised without an entry in the record.
+#: Maximum number of a confirmation whose seed is recognised without an entry in the record.
 _MAX_RESERVED_NUMBER = 1000
 
 
@@ -72,32 +72,33 @@ class FrozenAlgorithm:
             if old != new:
                 texts.append(f"{name} ({json.dumps(old)}, now {json.dumps(new)})")
         names = sorted({*self.hashes, *other.hashes})
-        changed = [name for name in names if self.hashes.get(name) != other.hashes.get(name)]
-        if texts and "configuration" in changed:
-            changed.remove("configuration")  # it includes the named parameters
-        return [*texts, *changed]
+        changed_hashes = [name for name in names if self.hashes.get(name) != other.hashes.get(name)]
+        if texts and "configuration" in changed_hashes:
+            changed_hashes.remove("configuration")  # it includes the named parameters
+        return [*texts, *changed_hashes]
 
 
 def freeze_algorithm(campaign: Campaign) -> FrozenAlgorithm:
     """Describe all choices that a confirmation of a campaign freezes."""
     configuration = campaign.configuration
     algorithms = describe_algorithms(campaign)
-    tested = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), configuration.scenario)
+    algorithm = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), configuration.scenario)
     options = {f"{entry['spec']}.{name}": value for entry in algorithms for name, value in entry["options"].items()}
     values = configuration.model_dump(mode="json")
     options |= dict(leaves(values["parameters"], "parameters"))
-    frozen = {name: value for name, value in values.items() if name not in _KEYS_NOT_FROZEN}
+    frozen_values = {name: value for name, value in values.items() if name not in _KEYS_NOT_FROZEN}
     identity = create_identity(configuration)
     contents = {
         "sources": [(entry["spec"], entry["source_hash"]) for entry in algorithms],
-        "configuration": [frozen, identity.inputs],
+        "configuration": [frozen_values, identity.inputs],
         "requirements": values["requirements"],
         "code": identity.code,
     }
-    return FrozenAlgorithm(tested, options, {name: _hash(content) for name, content in contents.items()})
+    return FrozenAlgorithm(algorithm, options, {name: _hash(content) for name, content in contents.items()})
 
 
 def _hash(content: Any) -> str:
+    """Compute the first 16 digits of the SHA-256 of a content in JSON."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -141,7 +142,7 @@ class Evidence:
     """Kind of evidence of a run, stored in its record.
 
     - number: number of the confirmation; 0 for other kinds
-    - of_algorithm: number of confirmations of the algorithm (by name) on this campaign up to this one
+    - of_algorithm: number of confirmations of the algorithm (by name) on this campaign, including this one
     - record: file of the record of confirmations; empty for other kinds
     - changes: differences from the frozen algorithm, if the seed was reused; or the options set on these cases
     """
@@ -186,13 +187,13 @@ class Evidence:
     def text(self) -> str:
         """Meaning of the kind of evidence for the verdicts, in a sentence or two."""
         changes = "; ".join(self.changes)
-        groups = ", ".join(name if "." in name else f"{name}.*" for name in self.changes)
+        parameter_names = ", ".join(name if "." in name else f"{name}.*" for name in self.changes)
         return {
             EvidenceKind.CONFIRMATION: f"Confirmation {self.number} in the namespace '{self.namespace}': the seed was "
             f"drawn after the algorithm was frozen. {self._multiplicity_text()}",
             EvidenceKind.REPETITION: f"The run repeats confirmation {self.number} without a change; it is no new "
             "evidence.",
-            EvidenceKind.CALIBRATION: f"Calibrated on these cases: the parameters {groups} were set by "
+            EvidenceKind.CALIBRATION: f"Calibrated on these cases: the parameters {parameter_names} were set by "
             f"looking at the results of these cases. PASS is possible only on new cases (`marsyard run --confirm`).",
             EvidenceKind.EXPLORATION: "Exploration: the seed was chosen freely. A confirmation is a run with "
             "--confirm, on cases that nobody has seen.",
@@ -202,6 +203,7 @@ class Evidence:
         }[self.kind]
 
     def _multiplicity_text(self) -> str:
+        """Describe the effect of repeated confirmations: up to n times the risk of a false PASS (union bound)."""
         if self.of_algorithm <= 1:
             return "It is the first confirmation of this algorithm on this campaign."
         return (

@@ -96,8 +96,8 @@ def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
     except ValidationError as error:
         reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors(include_url=False))
         raise CampaignError(f"the campaign's parameters are no longer valid: {reasons}") from error
-    dispersed = [item for item in configuration.dispersions.values() if isinstance(item, Choice | Fixed | Grid)]
-    values = [value for item in dispersed for extreme in item.extremes() for _, value in leaves(extreme)]
+    dispersions = [item for item in configuration.dispersions.values() if isinstance(item, Choice | Fixed | Grid)]
+    values = [value for item in dispersions for extreme in item.extremes() for _, value in leaves(extreme)]
     hashes: dict[str, str] = {}
     for name in dict.fromkeys((*input_files(parameters), *(value for value in values if isinstance(value, str)))):
         if Path(name).is_file():
@@ -114,10 +114,12 @@ def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     selected_scenario = find_scenario(configuration.scenario)
     if not isinstance(selected_scenario, HasAlgorithms):
         return ()
-    tested, compared = (".".join((*selected_scenario.algorithm_table, name)) for name in ("algorithm", "compared"))
-    specs = [find_value(configuration.parameters, tested), *find_value(configuration.parameters, compared)]
-    if tested in configuration.dispersions:
-        specs += configuration.dispersions[tested].extremes()
+    tested_key, compared_key = (
+        ".".join((*selected_scenario.algorithm_table, name)) for name in ("algorithm", "compared")
+    )
+    specs = [find_value(configuration.parameters, tested_key), *find_value(configuration.parameters, compared_key)]
+    if tested_key in configuration.dispersions:
+        specs += configuration.dispersions[tested_key].extremes()
     return tuple(dict.fromkeys(str(spec) for spec in specs if spec))
 
 
@@ -204,6 +206,7 @@ def read_versions() -> dict[str, str]:
 
 
 def _distribution_version(name: str) -> str | None:
+    """Return the version of an installed distribution; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -227,13 +230,13 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
         parameters = getattr(parameters, name)
     entries = []
     for spec in list_algorithms(campaign.configuration):
-        shipped = spec in selected_scenario.task.shipped
-        sources = list(source_files("algorithms:") if shipped else custom_sources(spec))
-        if shipped:
+        is_shipped = spec in selected_scenario.task.shipped
+        sources = list(source_files("algorithms:") if is_shipped else custom_sources(spec))
+        if is_shipped:
             configured_options = (value for _, value in parameters if isinstance(value, selected_scenario.task.options))
             algorithm = selected_scenario.task.shipped[spec](next(configured_options, selected_scenario.task.options()))
-            kind, version = type(algorithm), _distribution_version("marsyard")
-            path = f"{kind.__module__}:{kind.__qualname__}"
+            algorithm_class, version = type(algorithm), _distribution_version("marsyard")
+            path = f"{algorithm_class.__module__}:{algorithm_class.__qualname__}"
             options = _plain_options(getattr(algorithm, "options", None))
         else:
             path, version, options = _describe_custom(spec)

@@ -51,9 +51,10 @@ _FILE_KEYS = (
 )
 #: Number of cases whose sampled values are validated before the campaign starts; ranges are always checked.
 _CHECKED_CASES = 32
-#: Maximum number of dispersed parameters in the formulas of a dispersion: all combinations of extremes are checked.
+#: Maximum number of dispersed parameters in the formulas of a dispersion, since all combinations of their extremes are
+#: checked.
 _MAX_VARYING = 8
-#: Kinds of columns in requirements.
+#: Kinds of columns in requirements, as in messages.
 FLAGS, NUMBERS = "column of true and false", "column of numbers"
 #: Columns that the engine writes.
 _ENGINE_FLAGS, _ENGINE_NUMBERS = ("answered",), ("wall_time_s", "cpu_time_s")
@@ -116,6 +117,7 @@ def load_campaign(
 
 
 def _parse_override(override: str, option: str, selected_scenario: Scenario | None) -> dict[str, Any]:
+    """Parse ``KEY=VALUE`` into nested tables of a campaign file; a value that is not TOML is a text."""
     key, separator, value = override.partition("=")
     if not separator or not key.strip() or "\n" in override:
         raise ConfigurationError([Problem(option, "", "expected KEY=VALUE, such as --set render.backend=egl")])
@@ -146,10 +148,10 @@ def _select_algorithms(
         ("compared", list(algorithms[1:]), " ".join(options[1:]) or options[0]),
     )
     for key, value, option in settings:
-        inner: dict[str, Any] = {key: value}
+        nested_table: dict[str, Any] = {key: value}
         for part in reversed(("parameters", *selected_scenario.algorithm_table)):
-            inner = {part: inner}
-        tables = _apply_option(tables, inner, option, options_by_key)
+            nested_table = {part: nested_table}
+        tables = _apply_option(tables, nested_table, option, options_by_key)
     return tables
 
 
@@ -160,24 +162,26 @@ def _apply_option(
     merged = _merge(tables, settings)
     paths = _list_paths(settings)
     options_by_key.update(dict.fromkeys(paths, option))
-    fixed = [".".join(path[1:]) for path in paths if path[0] == "parameters"]
+    parameter_paths = [".".join(path[1:]) for path in paths if path[0] == "parameters"]
     dispersions = merged.get("dispersions")
     if isinstance(dispersions, dict):
-        related = ((path, key) for path in dispersions for key in fixed)
-        removed = {path for path, key in related if f"{path}.".startswith(f"{key}.") or key.startswith(f"{path}.")}
-        merged["dispersions"] = {path: item for path, item in dispersions.items() if path not in removed}
-        if removed and isinstance(merged.get("correlations"), list):
-            groups = [_remove_members(group, removed) for group in merged["correlations"]]
+        path_pairs = ((path, key) for path in dispersions for key in parameter_paths)
+        removed_paths = {
+            path for path, key in path_pairs if f"{path}.".startswith(f"{key}.") or key.startswith(f"{path}.")
+        }
+        merged["dispersions"] = {path: item for path, item in dispersions.items() if path not in removed_paths}
+        if removed_paths and isinstance(merged.get("correlations"), list):
+            groups = [_remove_members(group, removed_paths) for group in merged["correlations"]]
             merged["correlations"] = [group for group in groups if group != {}]
     return merged
 
 
-def _remove_members(group: Any, removed: set[str]) -> Any:
+def _remove_members(group: Any, removed_paths: set[str]) -> Any:
     """Remove dispersions from a correlated group; an empty table if none remains; an invalid group is unchanged."""
     names = group.get("parameters") if isinstance(group, Mapping) else None
     if not isinstance(names, list):
         return group
-    indices = [index for index, name in enumerate(names) if name not in removed]
+    indices = [index for index, name in enumerate(names) if name not in removed_paths]
     try:
         matrices = {
             kind: [[rows[i][j] for j in indices] for i in indices] for kind in MATRICES if (rows := group.get(kind))
@@ -188,14 +192,16 @@ def _remove_members(group: Any, removed: set[str]) -> Any:
 
 
 def _list_paths(tables: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """List the paths of all values in nested tables."""
     paths: list[tuple[str, ...]] = []
     for name, inner in tables.items():
-        nested = isinstance(inner, Mapping) and inner
-        paths += [(name, *path) for path in _list_paths(inner)] if nested else [(name,)]
+        is_table = isinstance(inner, Mapping) and inner
+        paths += [(name, *path) for path in _list_paths(inner)] if is_table else [(name,)]
     return paths
 
 
 def _merge(tables: Mapping[str, Any], updates: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge nested tables; values of `updates` replace those of `tables`."""
     merged = dict(tables)
     for name, value in updates.items():
         current = merged.get(name)
@@ -348,26 +354,26 @@ def _check_extremes(campaign: Campaign, path: str, extremes: Mapping[str, list[A
     varying = [name for name in dispersion.names if name in extremes]
     if len(varying) > _MAX_VARYING:
         raise ValueError(f"its formulas contain {len(varying)} varying parameters; allowed: up to {_MAX_VARYING}")
-    fixed = {name: value_at(parameters, name) for name in dispersion.names if name not in varying}
-    limits: list[Any] = []
+    fixed_values = {name: value_at(parameters, name) for name in dispersion.names if name not in varying}
+    extreme_values: list[Any] = []
     for corner in itertools.product(*(extremes[name] for name in varying)):
         values = dict(zip(varying, corner, strict=True))
-        distribution = dispersion.insert_values({**fixed, **values})
+        distribution = dispersion.insert_values({**fixed_values, **values})
         for value in distribution.extremes():
             error_text = _find_validation_error(campaign, {**values, path: value})
             if error_text:
                 condition = "".join(f" where {name} = {number}" for name, number in values.items())
                 text = f"{distribution.describe()} includes {value!r}{condition}, which is not valid: {error_text}"
                 raise ValueError(text)
-            limits.append(value)
-    return limits
+            extreme_values.append(value)
+    return extreme_values
 
 
 def _find_validation_error(campaign: Campaign, values: Mapping[str, Any]) -> str:
     """Return the validation error of the parameters with these values; empty if they are valid."""
-    infinite = [path for path, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
-    if infinite:
-        return f"{infinite[0]} must be finite"
+    infinite_paths = [path for path, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
+    if infinite_paths:
+        return f"{infinite_paths[0]} must be finite"
     try:
         campaign.with_values(values)
     except ValidationError as error:
@@ -377,6 +383,7 @@ def _find_validation_error(campaign: Campaign, values: Mapping[str, Any]) -> str
 
 
 def _extract_message(error: ValueError) -> str:
+    """Return the message of an error, without the additions of pydantic."""
     if isinstance(error, ValidationError):
         return "; ".join(str(detail["msg"]).removeprefix("Value error, ") for detail in error.errors())
     return str(error)
@@ -397,8 +404,8 @@ def _check_metrics(campaign: Campaign) -> list[tuple[Key, str]]:
     compared = labels(list_algorithms(campaign.configuration))[1:]
 
     def is_known(name: str, kind: str) -> bool:
-        unlabelled = next((name.removeprefix(f"{spec}.") for spec in compared if name.startswith(f"{spec}.")), name)
-        return columns.has_number(unlabelled) if kind == NUMBERS else columns.has_flag(unlabelled)
+        column = next((name.removeprefix(f"{spec}.") for spec in compared if name.startswith(f"{spec}.")), name)
+        return columns.has_number(column) if kind == NUMBERS else columns.has_flag(column)
 
     return find_unknown_columns(campaign.configuration.requirements, columns.flags, columns.numbers, is_known)
 

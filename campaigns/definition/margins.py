@@ -16,8 +16,8 @@ from typing import Any
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.errors import ENGINE_FAILURES
 
-#: Largest margin of a violation whose margin column contradicts its boolean metric.
-_VIOLATED = -1e-12
+#: Margin of a violation whose margin column is not negative, although its boolean metric is false.
+_MAX_VIOLATION_MARGIN = -1e-12
 
 
 def compute_margin(row: Mapping[str, Any], requirement: Requirement) -> float:
@@ -37,7 +37,7 @@ def compute_margin(row: Mapping[str, Any], requirement: Requirement) -> float:
         margin = None if requirement.margin is None else row.get(requirement.margin)
         if not isinstance(margin, int | float) or math.isnan(margin):
             return 1.0 if is_met else -1.0
-        return max(margin, 0.0) if is_met else min(margin, _VIOLATED)
+        return max(margin, 0.0) if is_met else min(margin, _MAX_VIOLATION_MARGIN)
     if not all(isinstance(value, int | float) for value in values):
         return -math.inf
     margin = requirement.bound - abs(requirement.scale * sum(values))
@@ -45,7 +45,7 @@ def compute_margin(row: Mapping[str, Any], requirement: Requirement) -> float:
 
 
 def describe_margin(requirement: Requirement) -> str:
-    """Describe the margin of a requirement, and what cases without a value count as, in two sentences."""
+    """Describe the margin of a requirement, and the treatment of cases without a value, in two sentences."""
     if requirement.bound is not None:
         factor = "" if requirement.scale == 1.0 else f"{requirement.scale:g} * "
         text = f"The margin is {requirement.bound:g} - |{factor}{requirement.metric}|"

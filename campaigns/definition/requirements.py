@@ -30,6 +30,8 @@ class SharedRequirement(Requirement):
 
 
 class _RequirementsFile(Parameters):
+    """Contents of a requirements file."""
+
     requirements: Annotated[tuple[SharedRequirement, ...], Field(strict=False)]
 
 
@@ -40,9 +42,9 @@ def read_requirements(path: Path) -> tuple[SharedRequirement, ...]:
     """
     requirements = read_table(path, _RequirementsFile).requirements
     ids = [requirement.id for requirement in requirements]
-    repeated = sorted({name for name in ids if ids.count(name) > 1})
-    if repeated:
-        raise ConfigurationError([Problem(str(path), "requirements", f"share an id: {', '.join(repeated)}")])
+    repeated_ids = sorted({name for name in ids if ids.count(name) > 1})
+    if repeated_ids:
+        raise ConfigurationError([Problem(str(path), "requirements", f"share an id: {', '.join(repeated_ids)}")])
     return requirements
 
 
@@ -79,10 +81,10 @@ def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[t
     if not isinstance(entries, list):
         return dict(tables), []
     problems: list[tuple[Key, str]] = []
-    entries_filled = []
+    complete_entries = []
     for index, entry in enumerate(entries):
         if not isinstance(entry, Mapping) or "metric" in entry or "id" not in entry:
-            entries_filled.append(entry)
+            complete_entries.append(entry)
             continue
         shipped, file_problems = _read_shipped()
         requirement = shipped.get(str(entry["id"]))
@@ -92,5 +94,5 @@ def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[t
             problems.append((("requirements", index, "id"), f"{message}; or define a metric"))
         problems += [(("requirements", index, key), "is already defined in requirements.toml") for key in fixed_keys]
         if requirement is not None and not fixed_keys:
-            entries_filled.append({**requirement.to_table(), **entry})
-    return {**tables, "requirements": entries_filled}, problems
+            complete_entries.append({**requirement.to_table(), **entry})
+    return {**tables, "requirements": complete_entries}, problems

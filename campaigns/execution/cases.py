@@ -119,7 +119,7 @@ def run_cases(
     total: int | None = None,
     points: Mapping[int, Point] = MappingProxyType({}),
 ) -> Iterator[list[CompletedCase]]:
-    """Run cases and yield them as they end, also cases whose worker died or was terminated.
+    """Run cases; yield the results as the cases end, including cases whose worker died or was terminated.
 
     points: see `run_case`; rows of these cases contain their point
     """
@@ -127,7 +127,7 @@ def run_cases(
     note_counts: Counter[str] = Counter()
     limits = work_limits(configuration.limits, configuration.limits.case_time_s)
     for results in executor.run(Work(task, cases, limits, total)):
-        completed = []
+        completed_cases = []
         for task_result in results:
             times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
             case_result = task_result.result or CompletedCase(
@@ -136,8 +136,8 @@ def run_cases(
             note = "; ".join(filter(None, (case_result.note, *_describe_changes(task_result, note_counts))))
             row, point = case_result.row, points.get(task_result.item)
             row = row if point is None else {**row, POINT_COLUMN: point.text}
-            completed.append(replace(case_result, row=row, note=note))
-        yield completed
+            completed_cases.append(replace(case_result, row=row, note=note))
+        yield completed_cases
 
 
 def work_limits(limits: Limits, time_s: float) -> WorkLimits:
@@ -156,13 +156,13 @@ def _build_terminated_row(case: int, error: Exception | None) -> Row:
     if call_index is not None:
         # remove the frames above the engine's call of the scenario
         next_thread = next(
-            (k for k in range(call_index + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines)
+            (index for index in range(call_index + 1, len(lines)) if not lines[index].startswith("  File ")), len(lines)
         )
         trace = "\n".join([*lines[: call_index + 1], *lines[next_thread:]])
     # the process may have ended while writing the note, and other code may have written to the file
     with suppress(ValueError, TypeError, LookupError, AttributeError, RecursionError):
-        recorded = json.loads(error.note)
-        conditions = _convert_columns(recorded["conditions"]) if recorded["case"] == case else {}
+        note = json.loads(error.note)
+        conditions = _convert_columns(note["conditions"]) if note["case"] == case else {}
     return make_unfinished_row(case, error.outcome, str(error), trace, conditions)
 
 
@@ -208,8 +208,12 @@ def _build_finished_row(case: int, result: CaseResult, requirements: Sequence[Re
             if type(columns.get(name, 0.0)) is str:
                 raise TypeError(f"column {name} contains {columns[name]!r:.100}; {requirement.id} needs a number")
     error, trace = ("", "") if failure is None else (_clean_text(failure.error), _clean_text(failure.trace))
-    engine: Row = {"case": case, "outcome": _replace_surrogates(str(result.outcome)), "answered": bool(result.answered)}
-    return {**engine, **columns, "error": error, "traceback": trace}
+    engine_columns: Row = {
+        "case": case,
+        "outcome": _replace_surrogates(str(result.outcome)),
+        "answered": bool(result.answered),
+    }
+    return {**engine_columns, **columns, "error": error, "traceback": trace}
 
 
 def _convert_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:

@@ -84,32 +84,32 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         machines: Counter[str] = Counter()
         for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
             machines[worker["host"]] += worker["nthreads"]
-        # maximum number of threads that share the memory of one machine
-        executors = max(machines.values(), default=1)
+        # each thread starts one executor; the executors of a machine share its memory
+        executors_per_machine = max(machines.values(), default=1)
         threads = sum(self._client.nthreads().values())
         batches = Batches(work.items, work.total, threads)
         pending = self._distributed.as_completed(loop=self._client.loop)
         batches_by_future: dict[Any, Sequence[int]] = {}
 
-        def send(batch: Sequence[int]) -> None:
+        def submit_batch(batch: Sequence[int]) -> None:
             if batch:
                 batch_work = replace(work, items=tuple(batch), total=len(batch))
-                future = self._client.submit(_run_batch_isolated, batch_work, executors, pure=False)
+                future = self._client.submit(_run_batch_isolated, batch_work, executors_per_machine, pure=False)
                 batches_by_future[future] = batch
                 pending.add(future)
 
         try:
             for _ in range(_QUEUED_BATCHES * threads):
-                send(batches.next())
+                submit_batch(batches.next())
             while batches_by_future:
                 future = next(pending)
                 batch = batches_by_future.pop(future)
                 results = self._collect(future, batch, batches)
                 if results is None:
                     for item in batch:
-                        send((item,))
+                        submit_batch((item,))
                 else:
-                    send(batches.next())
+                    submit_batch(batches.next())
                 future.release()
                 if results:
                     yield results
@@ -145,6 +145,7 @@ def _start_local_cluster(address: str) -> Any:
 
 
 def _identify_code() -> tuple[str, dict[str, str]]:
+    """Return the hash of the code and the versions of the packages in this process."""
     return hash_code(()), read_versions()
 
 

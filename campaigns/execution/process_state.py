@@ -89,7 +89,7 @@ def _read_decimal_context() -> tuple[Any, ...]:
         context.Emax,
         context.capitals,
         context.clamp,
-        [],
+        [],  # no flags
         enabled_traps,
     )
 
@@ -108,7 +108,8 @@ def _set_opencv(saved: tuple[bool, int]) -> None:
 
 def _read_arithmetic() -> tuple[bool, ...]:
     """Determine the rounding mode of floating-point numbers, and whether subnormal numbers are flushed to zero."""
-    # the rounding mode determines whether adding less than half the distance to the next float changes the number 1
+    # the rounding mode determines whether adding less than half the distance to the next float changes the number 1;
+    # `float("1")` is no constant, so that the compiler cannot compute the sums
     unit, increment, min_normal = float("1"), 2.0**-60, sys.float_info.min
     return unit + increment == unit, -unit - increment == -unit, unit - increment == unit, min_normal * 0.5 > 0.0
 
@@ -190,8 +191,8 @@ class ProcessState:
                 new, saved = _PARTS[index].read(), self._parts[index]
                 if isinstance(saved, dict):
                     remaining = {name: value for name, value in saved.items() if name in new or name not in old}
-                    changed = {name: value for name, value in new.items() if old.get(name) != value}
-                    self._parts[index] = remaining | changed
+                    changed_values = {name: value for name, value in new.items() if old.get(name) != value}
+                    self._parts[index] = remaining | changed_values
                 elif saved == old:
                     self._parts[index] = new
 

@@ -63,8 +63,8 @@ def _supervise(worker: int, parent: int, folder: Path, handled_signals: set[sign
             status = -signal.SIGKILL
         else:
             with suppress(ChildProcessError):
-                while (ended := os.waitpid(-1, os.WNOHANG))[0]:
-                    process, wait_status = ended
+                while (wait_result := os.waitpid(-1, os.WNOHANG))[0]:
+                    process, wait_status = wait_result
                     if process == worker:
                         status = os.waitstatus_to_exitcode(wait_status)
     deadline = time.monotonic() + _KILLING_S

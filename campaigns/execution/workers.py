@@ -209,8 +209,8 @@ class MonitoredWorker:
             item, cause = self._termination
         else:
             # loky's message contains the exit status: ``SIGABRT(-6)``
-            codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
-            status = ", ".join(f"{name} ({code})" for name, code in codes) or "exit status unknown"
+            exit_codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
+            status = ", ".join(f"{name} ({code})" for name, code in exit_codes) or "exit status unknown"
             reason = f"the worker process died: {status}"
             if status == f"EXIT ({worker_process.FILES_CLOSED})":
                 reason = "the case closed or replaced the worker's file descriptors"
@@ -272,10 +272,10 @@ class LocalExecutor(AbstractContextManager["LocalExecutor"]):
             _remove_abandoned_folders()
             self._folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
             # the lock file is locked before it gets its final name, so that no other process can lock it first
-            partial = self._folder / "lock.partial"
-            self._lock = os.open(partial, os.O_RDWR | os.O_CREAT, 0o600)
+            temporary_path = self._folder / "lock.partial"
+            self._lock = os.open(temporary_path, os.O_RDWR | os.O_CREAT, 0o600)
             fcntl.flock(self._lock, fcntl.LOCK_EX)
-            partial.rename(self._folder / _LOCK)
+            temporary_path.rename(self._folder / _LOCK)
             self._workers = [MonitoredWorker(self._folder / str(number)) for number in range(jobs)]
         except OSError as error:
             raise CampaignError(f"temporary files cannot be written (TMPDIR defines their folder): {error}") from error
@@ -325,6 +325,7 @@ class _WorkProgress:
                 yield results
 
     def _submit_batches(self) -> None:
+        """Submit a batch to each idle worker; items to be run again come first."""
         while self._idle:
             batch = self._retries.popleft() if self._retries else self._batches.next()
             if not batch:
@@ -335,6 +336,7 @@ class _WorkProgress:
         self._running[worker.submit(self._work.task, batch)] = (worker, batch)
 
     def _collect(self, future: Future[Any]) -> list[TaskResult[Any]]:
+        """Return the results of a finished batch, and arrange its unfinished items to run again."""
         worker, batch = self._running.pop(future)
         error = future.exception()
         if isinstance(error, BrokenProcessPool):
@@ -350,6 +352,7 @@ class _WorkProgress:
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
     def _handle_batch_result(self, worker: MonitoredWorker, batch_result: BatchResult[Any]) -> list[TaskResult[Any]]:
+        """Return the final results of a batch; an item that crashed after others runs again in a fresh process."""
         self._retries.extend([item] for item in batch_result.to_isolate)
         if batch_result.not_started:
             self._retries.append(list(batch_result.not_started))
@@ -366,8 +369,8 @@ class _WorkProgress:
             self._submit(worker, [suspect.item])
         if not crashed_results:
             self._idle.append(worker)
-        finished = [result for result in batch_result.results if result not in crashed_results]
-        pairs = [(result, self._suspect_predecessors.pop(result.item, None)) for result in finished]
+        final_results = [result for result in batch_result.results if result not in crashed_results]
+        pairs = [(result, self._suspect_predecessors.pop(result.item, None)) for result in final_results]
         # an item that does not crash in a fresh process crashed because of the previous item
         return [
             result if result.crashed else replace(result, crashed_only_after=predecessor)

@@ -142,11 +142,11 @@ def campaign_with_block(directory: Path, cases: int) -> Campaign:
     """Load a stored campaign with an additional block of cases. Raises CampaignError like `append_cases`."""
     configuration = record.stored_configuration(directory)
     _reject_study(directory, configuration)
-    appended = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
-    problems = [message for _, message in appended.find_sampling_problems()]
+    extended_configuration = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
+    problems = [message for _, message in extended_configuration.find_sampling_problems()]
     if cases < 1 or problems:
         raise CampaignError(f"{cases} cases cannot be added to {directory}: {'; '.join(problems) or 'at least 1'}")
-    return load_stored_campaign(directory, appended)
+    return load_stored_campaign(directory, extended_configuration)
 
 
 def _reject_study(directory: Path, configuration: CampaignConfiguration) -> None:
@@ -251,14 +251,14 @@ def _run_cases(
     run: _CampaignRun,
     store: RowStore,
     executor: Executor,
-    parts: Sequence[Sequence[int]],
+    case_groups: Sequence[Sequence[int]],
     first_case_ended: Callable[[], None],
 ) -> None:
     """Run cases; store products before their rows, and the rows of one batch in one transaction."""
     configuration, observer = run.campaign.configuration, run.observer
-    total = sum(len(part) for part in parts)
+    total = sum(len(group) for group in case_groups)
     products = ProductStore(run.directory, configuration.retain.budget_gb)
-    cases = itertools.chain.from_iterable(parts)
+    cases = itertools.chain.from_iterable(case_groups)
     observer.begin("cases", total)
     is_checked = False
     for batch in run_cases(
@@ -267,9 +267,9 @@ def _run_cases(
         for completed in batch:
             _store_products(products, completed, observer)
         store.add(completed.row for completed in batch)
-        finished = next((item.row for item in batch if item.row["outcome"] not in ENGINE_FAILURES), None)
-        if not is_checked and finished is not None:
-            check_metrics(configuration, finished, run.directory)
+        finished_row = next((item.row for item in batch if item.row["outcome"] not in ENGINE_FAILURES), None)
+        if not is_checked and finished_row is not None:
+            check_metrics(configuration, finished_row, run.directory)
             mark_ready(configuration.scenario)
             first_case_ended()
             is_checked = True
@@ -278,6 +278,7 @@ def _run_cases(
 
 
 def _store_products(products: ProductStore, completed: CompletedCase, observer: ProgressObserver) -> None:
+    """Store the products of a case, if it has any and the disk space suffices; report its note."""
     if completed.note:
         observer.note(completed.note)
     if completed.products is None or products.full:
@@ -294,12 +295,12 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
     (`marsyard.campaigns.definition.loading`). Raises ConfigurationError if a column of a requirement is missing or has
     the wrong type: a metric with a bound needs numbers, a metric without a bound and a population need booleans.
     """
-    declared = row_columns(configuration.scenario) or RowColumns((), ())
+    declared_columns = row_columns(configuration.scenario) or RowColumns((), ())
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
 
     def is_known(name: str, kind: str) -> bool:
-        is_declared = name not in row and (declared.has_flag(name) or declared.has_number(name))
+        is_declared = name not in row and (declared_columns.has_flag(name) or declared_columns.has_number(name))
         return is_declared or name in (numbers if kind == NUMBERS else flags)
 
     unknown_columns = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
@@ -322,12 +323,10 @@ def _rerun_for_products(run: _CampaignRun, store: RowStore, executor: Executor) 
     run.observer.begin("showcase", len(cases))
     products = ProductStore(run.directory, configuration.retain.budget_gb)
     for case in cases:
-        replayed = replay_in_executor(executor, configuration, case, store.row(case))
-        if replayed.differing:
-            record.update(run.directory, {"showcase_differs": list(replayed.differing)})
-            run.observer.note(
-                f"case {case}, run again, differs from its stored row in: {', '.join(replayed.differing)}"
-            )
-        _store_products(products, CompletedCase(replayed.row, replayed.products, replayed.note), run.observer)
+        rerun = replay_in_executor(executor, configuration, case, store.row(case))
+        if rerun.differing:
+            record.update(run.directory, {"showcase_differs": list(rerun.differing)})
+            run.observer.note(f"case {case}, run again, differs from its stored row in: {', '.join(rerun.differing)}")
+        _store_products(products, CompletedCase(rerun.row, rerun.products, rerun.note), run.observer)
         run.observer.step()
     record.update(run.directory, {"showcase": showcase})

@@ -92,7 +92,7 @@ def create_scoring_campaign(directory: Path, truth: Path, answers: Path) -> Camp
         manifest = json.loads(path.read_text(encoding="utf-8"))
         if manifest["schema"] != SCHEMA:
             raise ValueError(f"has schema {manifest['schema']}; this version of Marsyard reads {SCHEMA}")
-        exported = str(manifest["campaign"]), int(manifest["cases"])
+        export_identity = str(manifest["campaign"]), int(manifest["cases"])
     except OSError as error:
         reason = f"{path.name}: {error.strerror or error}"
         raise StoreError(f"{directory} contains no finished export: {reason}") from error
@@ -101,7 +101,7 @@ def create_scoring_campaign(directory: Path, truth: Path, answers: Path) -> Camp
     stored = record.stored_configuration(truth)
     if record.read(truth)["state"] != "finished":
         raise CampaignError(f"{truth} is not finished: export again to continue")
-    if exported != (stored.name, stored.total_cases):
+    if export_identity != (stored.name, stored.total_cases):
         raise CampaignError(f"{directory} and {truth} belong to different exports")
     export = Campaign(stored, scenario(stored.scenario))
     _check_answers(_find_task(export), stored, answers)
@@ -112,6 +112,7 @@ def create_scoring_campaign(directory: Path, truth: Path, answers: Path) -> Camp
 
 
 def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, answers: Path) -> None:
+    """Raise CampaignError unless the table answers each case of the export once."""
     if task.offline is None:
         raise CampaignError(f"{configuration.name} cannot be answered in a table")
     try:
@@ -119,15 +120,15 @@ def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, a
     except ValueError as error:
         raise CampaignError(str(error)) from error
     total = configuration.total_cases
-    unknown = sorted(case for case in answers_by_case if case >= total)
-    if unknown:
-        raise CampaignError(f"{answers}: unknown case {_list_first(unknown)}; allowed: 0 to {total - 1}")
-    missing = [case for case in range(total) if case not in answers_by_case]
-    if missing:
-        failures = list(task.offline.outcomes.__members__)[1:]
-        advice = f"a case without an answer needs a line with its outcome, such as {failures[0]}"
+    unknown_cases = sorted(case for case in answers_by_case if case >= total)
+    if unknown_cases:
+        raise CampaignError(f"{answers}: unknown case {_list_first(unknown_cases)}; allowed: 0 to {total - 1}")
+    missing_cases = [case for case in range(total) if case not in answers_by_case]
+    if missing_cases:
+        refusals = list(task.offline.outcomes.__members__)[1:]
+        advice = f"a case without an answer needs a line with its outcome, such as {refusals[0]}"
         raise CampaignError(
-            f"{answers}: no answer to {len(missing)} of {total} cases: {_list_first(missing)}; {advice}"
+            f"{answers}: no answer to {len(missing_cases)} of {total} cases: {_list_first(missing_cases)}; {advice}"
         )
 
 
@@ -137,6 +138,7 @@ def _list_first(cases: Sequence[int]) -> str:
 
 
 def _find_task(campaign: Campaign) -> Task[Any, Any]:
+    """Return the task of a campaign's algorithms. Raises CampaignError if the scenario has none."""
     if not isinstance(campaign.scenario, HasAlgorithms):
         raise CampaignError(f"the scenario of {campaign.configuration.name} has no selectable algorithms")
     return campaign.scenario.task
@@ -144,6 +146,6 @@ def _find_task(campaign: Campaign) -> Task[Any, Any]:
 
 def find_cases_with_changed_images(truth: Path, scored: Path) -> list[int]:
     """Return the cases whose images differ between export and scoring."""
-    exported = {row["case"]: row.get("image_hash") for row in read_rows(truth / TABLE_FILE)}
+    exported_hashes = {row["case"]: row.get("image_hash") for row in read_rows(truth / TABLE_FILE)}
     rows = read_rows(scored / TABLE_FILE)
-    return [int(row["case"]) for row in rows if row.get("image_hash") != exported.get(row["case"])]
+    return [int(row["case"]) for row in rows if row.get("image_hash") != exported_hashes.get(row["case"])]

@@ -78,13 +78,16 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
     try:
         folder = cache_directory("terrain")
         limit = limit_bytes(folder, cached_bytes(folder))
-        sizes = {n: scenario.missing_bytes(base, n) if isinstance(scenario, SelectsInputs) else 0 for n in numbers}
+        sizes = {
+            number: scenario.missing_bytes(base, number) if isinstance(scenario, SelectsInputs) else 0
+            for number in numbers
+        }
     except OSError as error:
         raise CampaignError(f"the cache cannot be used: {error}") from error
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    present = tuple(n for n in numbers if reports_inputs and sizes[n] == 0)
-    return InputPlan(present, {n: size for n, size in sizes.items() if n not in present}, limit)
+    present = tuple(number for number in numbers if reports_inputs and sizes[number] == 0)
+    return InputPlan(present, {number: size for number, size in sizes.items() if number not in present}, limit)
 
 
 def find_used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...]:
@@ -96,15 +99,15 @@ def find_used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...
     all_inputs = campaign.scenario.shared_inputs(campaign.base_parameters())
     if not all_inputs or not isinstance(campaign.scenario, SelectsInputs):
         return all_inputs
-    allowed, used = set(all_inputs), set[int]()
+    input_set, used_inputs = set(all_inputs), set[int]()
     for case in cases:
         try:
-            used |= allowed.intersection(campaign.scenario.case_inputs(campaign.parameters(case), case))
+            used_inputs |= input_set.intersection(campaign.scenario.case_inputs(campaign.parameters(case), case))
         except ValueError:
             continue  # the case's row will contain the reason
-        if used == allowed:
+        if used_inputs == input_set:
             break
-    return tuple(sorted(used))
+    return tuple(sorted(used_inputs))
 
 
 @contextmanager
@@ -170,10 +173,10 @@ def estimate_campaign(campaign: Campaign, jobs: int) -> Estimate:
     trials: list[CompletedCase] = []
     times: list[float] = []
     build_times: list[float] = []
-    number = min(_MAX_TRIALS, total)
+    trial_count = min(_MAX_TRIALS, total)
     with create_executor(ExecutorConfig()) as executor:
         start_s = time.monotonic()
-        for case in (index * total // number for index in range(number)):
+        for case in (index * total // trial_count for index in range(trial_count)):
             if trials and time.monotonic() - start_s > _MAX_TRIAL_TIME_S:
                 break
             build_times += _build_inputs(campaign, executor, case)
@@ -187,8 +190,8 @@ def estimate_campaign(campaign: Campaign, jobs: int) -> Estimate:
     product_bytes = statistics.fmean(trial.products.size if trial.products else 0 for trial in trials)
     retain = configuration.retain
     # the number of failed cases is unknown before the campaign, so the upper bound (all cases) is used
-    kept_cases = {"none": 0, "worst": retain.worst, "every": -(-total // retain.every), "all": total, "failed": total}
-    products = min(total, kept_cases[retain.products] + int(retain.showcase != "none")) * product_bytes
+    stored_cases = {"none": 0, "worst": retain.worst, "every": -(-total // retain.every), "all": total, "failed": total}
+    products = min(total, stored_cases[retain.products] + int(retain.showcase != "none")) * product_bytes
     return Estimate(
         trials=len(trials),
         unfinished=sum(trial.row["outcome"] in ENGINE_FAILURES for trial in trials),

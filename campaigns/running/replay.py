@@ -98,12 +98,12 @@ def differing_columns(row: Row, stored: Row) -> tuple[str, ...]:
 
     The traceback of an unfinished case is not compared, since a process is not always terminated at the same line.
     """
-    excluded = {"traceback"} if row.get("outcome") in ENGINE_FAILURES else set()
+    excluded_columns = {"traceback"} if row.get("outcome") in ENGINE_FAILURES else set()
     differing = []
     for name in dict.fromkeys((*row, *stored)):
         # NaN differs from itself
         values = [None if value is None or value != value else value for value in (row.get(name), stored.get(name))]
-        if "time" not in name and name not in excluded and values[0] != values[1]:
+        if "time" not in name and name not in excluded_columns and values[0] != values[1]:
             differing.append(name)
     return tuple(differing)
 
@@ -140,11 +140,11 @@ def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject
     if task is not None and task not in suite.SUBJECT_KINDS:
         raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(suite.SUBJECT_KINDS)}")
     try:
-        name = suite.determine_task(spec) if task is None else task
-        suite.check_subject(spec, name)
+        task_name = suite.determine_task(spec) if task is None else task
+        suite.check_subject(spec, task_name)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return suite.Subject(spec, name, limit_s)
+    return suite.Subject(spec, task_name, limit_s)
 
 
 def run_conformance_checks(subject: suite.Subject) -> Iterator[suite.Finding]:

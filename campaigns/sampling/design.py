@@ -12,8 +12,8 @@ grid point. A stratified design is computed for all its cases, from one random s
 
 Correlated groups are defined by a covariance, a correlation or a rank correlation. In all three cases the members are
 coupled by a Gaussian copula (Nelsen, An Introduction to Copulas, 2006, section 2.3). Independent uniform numbers u are
-converted to normal numbers z = Phi^-1(u), which are correlated, z' = L z, with the Cholesky factor of their correlation
-R = L L^T. Phi(z') then replaces u. The distribution of each member does not depend on R. Since L is lower triangular, a
+converted to normal numbers z = Phi^-1(u). The product z' = L z with a Cholesky factor L has the correlation R = L L^T.
+Phi(z') then replaces u. The distribution of each member does not depend on R. Since L is lower triangular, a
 member that is added at the end of a group does not change the numbers of the other members.
 
 - ``covariance`` and ``correlation`` (Pearson's) are for normal dispersions without truncation, whose draws are exactly
@@ -36,7 +36,7 @@ from scipy.special import ndtr, ndtri
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
 
-#: Minimum draw, half the step of `Generator.random`, since unbounded distributions have no value at 0.
+#: Minimum draw, half the step 2**-53 of `Generator.random`, since unbounded distributions have no value at 0.
 MIN_DRAW = 2.0**-54
 #: Maximum draw, the largest float below 1.
 MAX_DRAW = 1.0 - 2.0**-53
@@ -75,7 +75,7 @@ class Design(Parameters):
                     problem = f"the grid has {grid_size} points; allowed: a multiple of this number"
             elif self.kind != "random" and size > MAX_STRATIFIED:
                 problem = f"a {self.kind} design has at most {MAX_STRATIFIED} cases per point of the grid"
-            elif self.kind == "sobol" and size & (size - 1):
+            elif self.kind == "sobol" and size & (size - 1):  # not a power of 2
                 lower_power = 1 << (size.bit_length() - 1)
                 condition = " at each point of the grid" if grid_size > 1 else ""
                 problem = f"a Sobol design needs a power of 2{condition}, such as {lower_power} or {2 * lower_power}"
@@ -109,16 +109,16 @@ def build_stratified_design(
     kind: Kind,
     seed: int,
     campaign: str,
-    first: int,
-    size: int,
+    first_case: int,
+    case_count: int,
     paths: tuple[str, ...],
     groups: tuple[CorrelatedGroup, ...],
 ) -> Float64[np.ndarray, "cases dispersions"]:
     """Create the uniform numbers of a stratified design, each above 0 and below 1.
 
     - kind: `latin-hypercube` or `sobol`
-    - seed, campaign, first: identify the random streams; `first` is the first case of the design
-    - size: number of cases; paths: dispersions, in the order of their dimensions; groups: see `CorrelatedGroup`
+    - seed, campaign, first_case: identify the random streams; `first_case` is the first case of the design
+    - case_count: number of cases; paths: dispersions, in the order of their dimensions; groups: see `CorrelatedGroup`
 
     Each dispersion has its own stream. A Latin hypercube is an independent random permutation of the strata for each
     dispersion. The dimensions of a Sobol sequence follow the order of the file; each dimension is scrambled (Matousek
@@ -130,16 +130,16 @@ def build_stratified_design(
     """
     from scipy.stats import qmc
 
-    streams = Streams(seed, campaign, first)
-    points = np.zeros((size, len(paths)))
-    for k, path in enumerate(paths):
+    streams = Streams(seed, campaign, first_case)
+    points = np.zeros((case_count, len(paths)))
+    for dimension, path in enumerate(paths):
         rng = streams.generator(f"design:{path}")
         if kind == "latin-hypercube":
-            points[:, k] = qmc.LatinHypercube(d=1, rng=rng).random(size)[:, 0]
+            points[:, dimension] = qmc.LatinHypercube(d=1, rng=rng).random(case_count)[:, 0]
         else:
-            sequence = qmc.Sobol(d=k + 1, scramble=True, bits=_SOBOL_BITS, rng=rng).random(size)
+            sobol_points = qmc.Sobol(d=dimension + 1, scramble=True, bits=_SOBOL_BITS, rng=rng).random(case_count)
             # use the centre of the step, which is never 0
-            points[:, k] = sequence[:, k] + 2.0 ** -(_SOBOL_BITS + 1)
+            points[:, dimension] = sobol_points[:, dimension] + 2.0 ** -(_SOBOL_BITS + 1)
     points = np.clip(points, MIN_DRAW, MAX_DRAW)
     for members, factor in groups:
         values = points[:, list(members)]
@@ -240,8 +240,8 @@ class Correlation(Parameters):
         if self.kind == "rank":
             symmetric = 2.0 * np.sin(np.pi / 6.0 * symmetric)
         elif self.kind == "covariance":
-            sd = np.sqrt(np.diag(symmetric))
-            symmetric = symmetric / sd[:, None] / sd
+            standard_deviations = np.sqrt(np.diag(symmetric))
+            symmetric = symmetric / standard_deviations[:, None] / standard_deviations
         np.fill_diagonal(symmetric, 1.0)
         return symmetric
 

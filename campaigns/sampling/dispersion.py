@@ -117,13 +117,14 @@ def _list_names(node: ast.expr) -> list[str]:
                     f"unknown function '{name}'{suggest_similar(name, allowed)}; allowed: {', '.join(allowed)}"
                 )
             if not minimum <= len(arguments) <= maximum:
-                accepted = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
-                raise ValueError(f"{name} takes {accepted} arguments, not {len(arguments)}")
+                accepted_numbers = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
+                raise ValueError(f"{name} takes {accepted_numbers} arguments, not {len(arguments)}")
             return [path for argument in arguments for path in _list_names(argument)]
     raise ValueError("allowed: numbers, names of parameters, + - * / **, parentheses and functions")
 
 
 def _format_path(node: ast.expr) -> str:
+    """Return the dotted path of a parameter name. Raises ValueError for other syntax."""
     match node:
         case ast.Name(id=name):
             return name
@@ -135,6 +136,7 @@ def _format_path(node: ast.expr) -> str:
 
 
 def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
+    """Evaluate a syntax tree that `_list_names` accepted."""
     match node:
         case ast.Constant(value=value):
             return float(value)  # type: ignore[arg-type]  # `_list_names` accepts numbers only
@@ -220,6 +222,7 @@ class Dispersion(Parameters, ABC):
 
 
 def _find_formulas(tree: Any, key: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Formula]]:
+    """Yield the formulas in nested tables and lists, with their keys."""
     if isinstance(tree, str):
         yield key, parse_formula(tree)
         return
@@ -229,6 +232,7 @@ def _find_formulas(tree: Any, key: tuple[str | int, ...] = ()) -> Iterator[tuple
 
 
 def _check_number(value: Any) -> float | str:
+    """Return a finite number, or the text of a formula."""
     if isinstance(value, str):
         return parse_formula(value).text
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -242,6 +246,7 @@ def _check_number(value: Any) -> float | str:
 
 
 def _check_positive_number(value: Any) -> float | str:
+    """Return a positive number, or the text of a formula."""
     number = _check_number(value)
     if isinstance(number, float) and not number > 0.0:
         raise PydanticKnownError("greater_than", {"gt": 0})
@@ -346,13 +351,13 @@ def create_scipy_distribution(distribution: str, parameters: Mapping[str, float]
             raise ValueError(f"{failure}: {error}") from error
 
     def evaluate(function: str, x: float) -> float:
-        result = call_without_warnings(lambda: float(getattr(frozen, function)(x)))
+        result = call_without_warnings(lambda: float(getattr(scipy_distribution, function)(x)))
         if math.isnan(result):
             raise ValueError(f"{failure}: its {function} at {x} is not a number")
         return float(result)
 
-    frozen = call_without_warnings(lambda: getattr(stats, distribution)(**parameters))
-    low, high = call_without_warnings(lambda: [float(limit) for limit in frozen.support()])
+    scipy_distribution = call_without_warnings(lambda: getattr(stats, distribution)(**parameters))
+    low, high = call_without_warnings(lambda: [float(limit) for limit in scipy_distribution.support()])
     if not low <= high:
         raise ValueError(failure)
     return UnivariateDistribution(evaluate, (low, high), scipy_distributions()[distribution])
@@ -385,9 +390,10 @@ def _find_truncated_inverse(distribution: UnivariateDistribution, low: float, hi
     """Return the name of the inverse function with the higher precision, and its arguments at the two limits."""
     if not (low <= high if distribution.is_discrete else low < high):
         raise ValueError(f"truncate = [{low}, {high}]: the first limit must be below the second")
-    start = math.ceil(low) - 1.0 if distribution.is_discrete else low
-    function, inverse = ("sf", "isf") if distribution.evaluate("cdf", start) > 0.5 else ("cdf", "ppf")
-    at_low, at_high = distribution.evaluate(function, start), distribution.evaluate(function, high)
+    # the lower limit of a discrete distribution is included: F is evaluated at the previous integer
+    low_argument = math.ceil(low) - 1.0 if distribution.is_discrete else low
+    function, inverse = ("sf", "isf") if distribution.evaluate("cdf", low_argument) > 0.5 else ("cdf", "ppf")
+    at_low, at_high = distribution.evaluate(function, low_argument), distribution.evaluate(function, high)
     if not abs(at_high - at_low) > 0.0:
         raise ValueError(f"truncate = [{low}, {high}]: the distribution has no probability between the limits")
     return inverse, at_low, at_high

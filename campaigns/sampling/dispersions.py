@@ -202,8 +202,8 @@ class Normal(base.Dispersion):
         return float(self.sd)
 
     def quantile(self, probability: float) -> float:
-        standard = base.truncated_quantile(base.STANDARD_NORMAL, self._standard_limits, probability)
-        value = float(self.mean) + self._sd * standard
+        standard_quantile = base.truncated_quantile(base.STANDARD_NORMAL, self._standard_limits, probability)
+        value = float(self.mean) + self._sd * standard_quantile
         return value if self.truncate is None else min(max(value, float(self.truncate[0])), float(self.truncate[1]))
 
     def bounds(self) -> tuple[float, float] | None:
@@ -335,6 +335,7 @@ BUILT_IN: Mapping[str, type[base.Dispersion]] = {
 
 
 def _select_tag(value: Any) -> str:
+    """Return the tag of the class that a dispersion's distribution selects."""
     name = value.get("distribution") if isinstance(value, Mapping) else getattr(value, "distribution", None)
     return name if isinstance(name, str) and name in BUILT_IN else "scipy"
 

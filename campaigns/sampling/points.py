@@ -2,7 +2,7 @@
 
 Reliability methods need cases at chosen points. Each random dispersion is a function of one standard normal variable:
 its inverse distribution at Phi(z), after the correlation of its group. The random streams of a case (noise of the
-instruments, for example) are one further variable, which can only be drawn again or held.
+instruments, for example) are one further variable, which can only be drawn again or kept.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ POINT_COLUMN = "standard_point"
 
 @dataclass(frozen=True)
 class Point:
-    """A case as a point.
+    """A case as a point in standard normal space.
 
     - coordinates: independent standard normal numbers of the random dispersions, in the order of the campaign file
     - stream: number of the random streams of the case (`marsyard.sim.streams`)

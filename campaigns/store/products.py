@@ -147,17 +147,17 @@ class ProductSelection:
     """Selection of the cases whose products are stored.
 
     - every: step between the numbers of selected cases; 0 to select none by number
-    - failed: requirements; a case that fails any of them is selected
+    - requirements: a case that fails any of these requirements is selected
     """
 
     every: int = 0
-    failed: tuple[Requirement, ...] = ()
+    requirements: tuple[Requirement, ...] = ()
 
     def selects(self, row: Mapping[str, Any]) -> bool:
         """Whether the case with this row is selected."""
         if self.every and row["case"] % self.every == 0:
             return True
-        return any(compute_margin(row, requirement) < 0.0 for requirement in self.failed)
+        return any(compute_margin(row, requirement) < 0.0 for requirement in self.requirements)
 
 
 ALL_PRODUCTS = ProductSelection(every=1)
@@ -170,7 +170,9 @@ def create_product_selection(configuration: CampaignConfiguration) -> ProductSel
         return ALL_PRODUCTS
     if retain.products == "every":
         return ProductSelection(every=retain.every)
-    return ProductSelection(failed=configuration.requirements) if retain.products == "failed" else ProductSelection()
+    if retain.products == "failed":
+        return ProductSelection(requirements=configuration.requirements)
+    return ProductSelection()
 
 
 class ProductStore:

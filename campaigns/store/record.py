@@ -158,8 +158,8 @@ def read(directory: Path) -> dict[str, Any]:
     if schema != SCHEMA:
         raise StoreError(f"{path} has schema {schema}; this version of Marsyard reads {SCHEMA}")
     # records of earlier versions have no identity and fewer keys; reports can still be created for them
-    required = _KEY_TYPES if "identity" in record else ("name", "state", "cases", "configuration")
-    problems = [f"it has no {key}" for key in required if key not in record]
+    required_keys = _KEY_TYPES if "identity" in record else ("name", "state", "cases", "configuration")
+    problems = [f"it has no {key}" for key in required_keys if key not in record]
     for key, (kind, type_text) in _KEY_TYPES.items():
         if key in record and (not isinstance(record[key], kind) or isinstance(record[key], bool)):
             problems.append(f"{key} is not {type_text}")
@@ -190,14 +190,14 @@ def git_commit() -> str | None:
     try:
         for arguments in commands if git is not None else ():
             command = [str(git), "-C", str(source.parent), *arguments]
-            completed = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
-            outputs.append(completed.stdout.strip())
+            process = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
+            outputs.append(process.stdout.strip())
     except (subprocess.SubprocessError, OSError):
         return None
     if git is None or not outputs[1]:
         return None
-    commit, _, edited = outputs
-    return f"{commit}+changes" if edited else commit
+    commit, _, changes = outputs
+    return f"{commit}+changes" if changes else commit
 
 
 def describe_machine() -> dict[str, Any]:

@@ -108,6 +108,7 @@ class RowStore(AbstractContextManager["RowStore"]):
             raise
 
     def _store_error(self, error: sqlite3.Error) -> StoreError:
+        """Create the error for the user, with a remedy if the disk is full."""
         text = str(error)
         if "full" in text:
             advice = "free disk space and resume"
@@ -129,7 +130,7 @@ class RowStore(AbstractContextManager["RowStore"]):
     def add(self, rows: Iterable[Row]) -> None:
         """Store rows in one transaction; a new row of a case replaces the existing row.
 
-        Raises StoreError on failure; no row is then stored.
+        Raises StoreError on failure; none of the rows is then stored.
         """
         execute = self._connection.execute
         try:
@@ -166,7 +167,7 @@ class RowStore(AbstractContextManager["RowStore"]):
     def list_missing_cases(self, total: int) -> list[range]:
         """List the cases below `total` that have no row, as ranges."""
         ends = [-1, *(number for (number,) in self._query("SELECT case_number FROM cases ORDER BY 1")), total]
-        return [range(last + 1, next_row) for last, next_row in pairwise(ends) if next_row > last + 1]
+        return [range(previous + 1, following) for previous, following in pairwise(ends) if following > previous + 1]
 
     def list_cases_with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
         """List the cases with one of these outcomes."""
@@ -219,6 +220,7 @@ class RowStore(AbstractContextManager["RowStore"]):
             yield [(layout, row) for (layout, _), row in zip(records, values, strict=True)]
 
     def _query(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
+        """Execute a query. Raises StoreError on failure."""
         try:
             return self._connection.execute(query, values)
         except sqlite3.Error as error:

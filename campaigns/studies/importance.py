@@ -1,7 +1,8 @@
 """Importance sampling around known violations: cases are drawn where violations occur, and weighted.
 
-The sampling density is a mixture: of the nominal density, with a tenth of the cases, so that no weight exceeds ten; and
-of standard normal densities moved to the centres of clusters of violations (Melchers 1989, Structural Safety 6, 3-10).
+The sampling density is a mixture of the nominal density and of standard normal densities that are shifted to the
+centres of clusters of violations (Melchers 1989, Structural Safety 6, 3-10). A tenth of the cases come from the nominal
+density, so no weight exceeds ten.
 """
 
 from __future__ import annotations
@@ -25,21 +26,21 @@ _MAX_CLUSTERS, _MIN_VIOLATIONS = 4, 10
 
 @dataclass(frozen=True)
 class ImportanceDensity:
-    """Sampling density in standard normal space: weights and centres of the moved densities."""
+    """Sampling density in standard normal space: weights and centres of the shifted densities."""
 
     weights: Float64[np.ndarray, " clusters"]
     centres: Float64[np.ndarray, "clusters dimensions"]
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[Coordinates, Float64[np.ndarray, " n"]]:
-        """Draw cases; return their coordinates and weights (nominal density divided by sampling density)."""
+        """Draw n cases; return their coordinates and weights (nominal density divided by sampling density)."""
         coordinates = rng.standard_normal((n, self.centres.shape[1]))
-        is_moved = np.flatnonzero(rng.random(n) >= NOMINAL_FRACTION)
-        clusters = rng.choice(len(self.weights), is_moved.size, p=self.weights)
-        coordinates[is_moved] += self.centres[clusters]
-        # logarithm of each moved density divided by the nominal one
-        ratios = coordinates @ self.centres.T - 0.5 * np.sum(self.centres**2, axis=1)
-        moved = logsumexp(ratios, axis=1, b=self.weights)
-        return coordinates, 1.0 / (NOMINAL_FRACTION + (1.0 - NOMINAL_FRACTION) * np.exp(moved))
+        shifted_cases = np.flatnonzero(rng.random(n) >= NOMINAL_FRACTION)
+        clusters = rng.choice(len(self.weights), shifted_cases.size, p=self.weights)
+        coordinates[shifted_cases] += self.centres[clusters]
+        # phi(z - c) / phi(z) = exp(z c - c^2 / 2) for the standard normal density phi and the centre c
+        log_ratios = coordinates @ self.centres.T - 0.5 * np.sum(self.centres**2, axis=1)
+        log_mixture_ratio = logsumexp(log_ratios, axis=1, b=self.weights)
+        return coordinates, 1.0 / (NOMINAL_FRACTION + (1.0 - NOMINAL_FRACTION) * np.exp(log_mixture_ratio))
 
 
 def fit_density(violations: Coordinates) -> ImportanceDensity | None:

@@ -39,28 +39,30 @@ def replicate_interval(estimates: Sequence[float], reached: Sequence[bool], conf
     """Compute the interval of a probability from independent estimates, at least two.
 
     Estimates of subset simulations are close to lognormal and unbiased. The interval is Cox's for the mean of a
-    lognormal distribution with Student's t quantile (Olsson 2005, Journal of Statistics Education 13). If a replicate
+    lognormal distribution with Student's t quantile (Olsson 2005, Journal of Statistics Education 13): with the mean m
+    and variance v of n logarithms, m + v / 2 +- t sqrt(v / n + v^2 / (2 (n - 1))). If a replicate
     reached no violation, its estimate is an upper limit, and the lower bound is 0.
     """
     values = np.array(estimates, dtype=np.float64)
-    n = values.size
-    if n < 2:
-        raise ValueError(f"an interval needs at least 2 replicates, not {n}")
+    count = values.size
+    if count < 2:
+        raise ValueError(f"an interval needs at least 2 replicates, not {count}")
     logarithms = np.log(values)
     variance = float(logarithms.var(ddof=1))
     centre = float(logarithms.mean()) + 0.5 * variance
-    quantile = float(student_t.ppf(0.5 * (1.0 + confidence), n - 1))
-    width = quantile * math.sqrt(variance / n + variance**2 / (2.0 * (n - 1)))
-    lower = math.exp(centre - width) if all(reached) else 0.0
+    quantile = float(student_t.ppf(0.5 * (1.0 + confidence), count - 1))
+    half_width = quantile * math.sqrt(variance / count + variance**2 / (2.0 * (count - 1)))
+    lower = math.exp(centre - half_width) if all(reached) else 0.0
     return ProbabilityInterval(
-        float(values.mean()), lower, min(math.exp(centre + width), 1.0), confidence, math.sqrt(variance)
+        float(values.mean()), lower, min(math.exp(centre + half_width), 1.0), confidence, math.sqrt(variance)
     )
 
 
 def weighted_interval(contributions: Sequence[float], confidence: float) -> ProbabilityInterval:
     """Compute the interval of a probability from the weighted violations of independent cases (importance sampling).
 
-    The logarithm of the mean is treated as normal. Without a violation the bounds are 0 and 1.
+    The logarithm of the mean is treated as normal; its standard deviation is the relative standard error of the mean.
+    Without a violation the bounds are 0 and 1.
     """
     values = np.array(contributions, dtype=np.float64)
     mean = float(values.mean())
@@ -87,8 +89,8 @@ def additional_replicates(interval: ProbabilityInterval, replicates: int, max_pr
     if distance == 0.0:
         return None
     variance, confidence = interval.log_sd**2, interval.confidence
-    for n in range(replicates + 1, 10_000):
-        quantile = float(student_t.ppf(0.5 * (1.0 + confidence), n - 1))
-        if quantile * math.sqrt(variance / n + variance**2 / (2.0 * (n - 1))) <= distance:
-            return n - replicates
+    for count in range(replicates + 1, 10_000):
+        quantile = float(student_t.ppf(0.5 * (1.0 + confidence), count - 1))
+        if quantile * math.sqrt(variance / count + variance**2 / (2.0 * (count - 1))) <= distance:
+            return count - replicates
     return None

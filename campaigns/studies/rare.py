@@ -110,7 +110,7 @@ class RareResult:
     - effective_violations: effective number of violations of importance sampling; NaN without it
     - additional_cases: estimated number of further cases until the verdict is decided; None if decided or unknown
     - counting_cases: number of independent cases that would give an interval of the same relative width
-    - margin_text: definition of the margin; reason: why the verdict is withheld; may be empty
+    - margin_text: definition of the margin; reason: reason of a withheld verdict; may be empty
     """
 
     verdict: RareVerdict
@@ -194,7 +194,7 @@ class _Study:
         reason, contributions = "", list[float]()
         try:
             for block in settings.replicates:
-                observer.begin("cases", self._max_cases_of(block))
+                observer.begin("cases", self._max_cases(block))
                 results += self._run_replicates(range(len(results), len(results) + block))
             if settings.method == "importance":
                 observer.begin("cases", settings.importance_cases)
@@ -204,11 +204,13 @@ class _Study:
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
         if len(results) < 2:
-            unknown = ProbabilityInterval(math.nan, 0.0, 1.0, settings.confidence, math.nan)
-            return self._finish(RareVerdict.INSUFFICIENT, unknown, results, unknown, math.nan, None, reason)
+            unknown_interval = ProbabilityInterval(math.nan, 0.0, 1.0, settings.confidence, math.nan)
+            return self._finish(
+                RareVerdict.INSUFFICIENT, unknown_interval, results, unknown_interval, math.nan, None, reason
+            )
         estimates, reached = [item.probability for item in results], [item.reached for item in results]
-        # each evaluation after added replicates uses half of the previous risk, so that all together use at most twice
-        # that of the first; each bound then has at most the risk 1 - confidence over all evaluations
+        # each evaluation after the first uses half of the risk of the previous one: the sum of all risks is below twice
+        # the first, so each one-sided bound has at most the risk 1 - confidence over all evaluations
         confidence = 1.0 - (1.0 - settings.confidence) / 2.0 ** (len(settings.replicates) - 1)
         subset_interval = replicate_interval(estimates, reached, confidence)
         interval, effective = subset_interval, math.nan
@@ -227,9 +229,9 @@ class _Study:
             verdict, reason = RareVerdict.INSUFFICIENT, f"The verdict would be PASS. {evidence.text}"
         additional = None
         if verdict is RareVerdict.INSUFFICIENT and not contributions:
-            needed = additional_replicates(subset_interval, len(results), settings.max_probability)
+            replicates_needed = additional_replicates(subset_interval, len(results), settings.max_probability)
             cases_per_replicate = self._runner.n_cases / len(results)
-            additional = None if needed is None else math.ceil(needed * cases_per_replicate)
+            additional = None if replicates_needed is None else math.ceil(replicates_needed * cases_per_replicate)
         return self._finish(verdict, interval, results, subset_interval, effective, additional, reason)
 
     def _finish(
@@ -242,11 +244,12 @@ class _Study:
         additional: int | None,
         reason: str,
     ) -> RareResult:
-        # counting n cases has the interval p exp(+-z sqrt((1 - p) / (n p)))
+        """Create the result; compute the number of independent cases for an interval of the same relative width."""
+        # the rate of n independent cases has the interval p exp(+-z sqrt((1 - p) / (n p)))
         width = math.log(interval.upper / interval.lower) if interval.lower > 0.0 else math.inf
         p = interval.estimate
         z = float(ndtri(0.5 * (1.0 + interval.confidence)))
-        counting = (2.0 * z / width) ** 2 * (1.0 - p) / p if 0.0 < width < math.inf and p > 0.0 else math.nan
+        counting_cases = (2.0 * z / width) ** 2 * (1.0 - p) / p if 0.0 < width < math.inf and p > 0.0 else math.nan
         replicates = tuple(Replicate(item.probability, item.reached, item.thresholds) for item in results)
         return RareResult(
             verdict,
@@ -257,13 +260,13 @@ class _Study:
             subset_interval,
             effective,
             additional,
-            counting,
+            counting_cases,
             describe_margin(self._requirement),
             reason,
         )
 
-    def _max_cases_of(self, replicates: int) -> int:
-        """Compute the number of cases of replicates that reach their least likely level."""
+    def _max_cases(self, replicates: int) -> int:
+        """Compute the number of cases of replicates that reach their least likely level, with a factor 10 per level."""
         levels = math.ceil(-math.log10(_MIN_PROBABILITY_FRACTION * self._settings.max_probability))
         return math.ceil(replicates * self._settings.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
 
@@ -272,23 +275,23 @@ class _Study:
         return Streams(self._campaign.configuration.seed, self._campaign.configuration.name, 0).generator(name)
 
     def _run_replicates(self, numbers: range) -> list[SubsetResult]:
-        """Run subset simulations side by side: the next cases of all of them are evaluated together."""
+        """Run subset simulations in parallel: the next cases of all of them are evaluated together."""
         settings, dimension = self._settings, len(self._campaign.drawn_paths)
         min_probability = _MIN_PROBABILITY_FRACTION * settings.max_probability
-        runs = {
+        simulations = {
             number: subset_simulation(
                 dimension, settings.samples, min_probability, self._generator(f"subset simulation {number}")
             )
             for number in numbers
         }
-        pending = {number: next(run) for number, run in runs.items()}
+        pending = {number: next(simulation) for number, simulation in simulations.items()}
         results: dict[int, SubsetResult] = {}
         while pending:
             answers = self._evaluate(list(pending.values()))
             next_pending: dict[int, Proposals] = {}
             for number, answer in zip(pending, answers, strict=True):
                 try:
-                    next_pending[number] = runs[number].send(answer)
+                    next_pending[number] = simulations[number].send(answer)
                 except StopIteration as stop:
                     results[number] = stop.value
             pending = next_pending
@@ -316,12 +319,12 @@ class _Study:
         density = fit_density(np.concatenate([result.violations for result in results]))
         if density is None:
             return []
-        n = self._settings.importance_cases
-        coordinates, weights = density.draw(n, self._generator("importance sampling"))
+        case_count = self._settings.importance_cases
+        coordinates, weights = density.draw(case_count, self._generator("importance sampling"))
         contributions: list[float] = []
-        for first in range(0, n, _IMPORTANCE_BATCH):
-            part = slice(first, first + _IMPORTANCE_BATCH)
-            proposal = Proposals(coordinates[part], np.full(len(coordinates[part]), NEW_STREAM))
+        for first in range(0, case_count, _IMPORTANCE_BATCH):
+            batch = slice(first, first + _IMPORTANCE_BATCH)
+            proposal = Proposals(coordinates[batch], np.full(len(coordinates[batch]), NEW_STREAM))
             (evaluated,) = self._evaluate([proposal])
-            contributions += (weights[part] * (evaluated.margins < 0.0)).tolist()
+            contributions += (weights[batch] * (evaluated.margins < 0.0)).tolist()
         return contributions

@@ -1,4 +1,4 @@
-"""Evaluation of chosen points by rendered cases: rows are stored, and a study that was stopped can continue.
+"""Evaluation of chosen points by rendered cases: rows are stored, so that an interrupted study can continue.
 
 A study is a deterministic function of its settings and of the rows of its cases. It continues by running again from its
 start: cases with a stored row are not run again.
@@ -74,7 +74,7 @@ class Candidate:
 
 
 class PointRunner:
-    """Runs the cases of a study in the order of their numbers, and reads those that are stored.
+    """Runner of the cases of a study, in the order of their numbers; cases with a stored row are read.
 
     - campaign: campaign with the design `adaptive`; its number of cases is the limit of the study
     - directory, store: folder of the study, and its rows
@@ -187,12 +187,12 @@ def start_study(
 
     settings: settings of the study with its `kind`, as JSON types
     """
-    adaptive = prepare_campaign(campaign, max_cases)
+    study_campaign = prepare_campaign(campaign, max_cases)
     record.claim_folder(directory)
     with record.folder_lock(directory):
         record.claim_folder(directory)
-        create_study(adaptive, directory, session.executor.describe(), dict(settings))
-        return _run_study(adaptive, directory, session, settings)
+        create_study(study_campaign, directory, session.executor.describe(), dict(settings))
+        return _run_study(study_campaign, directory, session, settings)
 
 
 def continue_study(directory: Path, session: StudySession[Result], settings: Mapping[str, Any]) -> Result:

@@ -2,9 +2,10 @@
 
 1. Half of the cases explore the dispersions by a scrambled Sobol sequence.
 2. Evolution strategies (CMA-ES; Hansen 2016, arXiv:1604.00772) minimise the margin from the best explored cases.
-3. The most likely violation is reduced: dispersions go back to the campaign's parameter, in groups that are halved
-   (delta debugging; Zeller & Hildebrandt 2002, IEEE Trans. Softw. Eng. 28, 183-200), then the remaining coordinates are
-   bisected towards their median, as long as the case violates the requirement with the same random streams.
+3. The most likely violation is reduced. Groups of dispersions are reset to the campaign's parameter, and the groups are
+   halved (delta debugging; Zeller & Hildebrandt 2002, IEEE Trans. Softw. Eng. 28, 183-200). The remaining coordinates
+   are then bisected towards their median. A change is kept only if the case still violates the requirement with the
+   same random streams.
 4. Violations that are close to a reduced one in its remaining dispersions have the same cause. Step 3 is repeated with
    the other violations.
 """
@@ -44,8 +45,8 @@ from marsyard.sim.streams import Streams
 
 #: Value of the key `kind` in the settings of this study.
 KIND = "search"
-#: Fraction of the cases that explore.
-_EXPLORED_FRACTION = 0.5
+#: Fraction of the cases that are used for exploration.
+_EXPLORATION_FRACTION = 0.5
 #: Initial step of an evolution strategy, and limit of its coordinates, standard deviations.
 _STEP, _MAX_COORDINATE = 0.5, 4.0
 #: Distance between the starts of two evolution strategies per square root of the dimension, standard deviations.
@@ -194,30 +195,31 @@ class SearchStudy:
             self._explore()
             self._evolve()
             searched = len(self._evaluated)
-            found = [item for item in self._evaluated if item.margin < 0.0]
-            violations = len(found)
+            violating_cases = [item for item in self._evaluated if item.margin < 0.0]
+            violations = len(violating_cases)
             observer.begin("reduction", _REDUCTION_CASES * min(violations, self.settings.max_failures))
-            failures = self._reduce_all(found)
+            failures = self._reduce_all(violating_cases)
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
             searched = searched or len(self._evaluated)
-        explored = self._evaluated[:searched]
-        numbers = [index + 1 for index, item in enumerate(explored) if item.margin < 0.0]
+        searched_cases = self._evaluated[:searched]
+        violation_numbers = [index + 1 for index, item in enumerate(searched_cases) if item.margin < 0.0]
         return SearchResult(
             tuple(sorted(failures, key=lambda failure: failure.distance)),
             searched,
             self.runner.n_cases,
-            violations or len(numbers),
-            min((item.margin for item in explored), default=math.nan),
-            numbers[0] if numbers else None,
+            violations or len(violation_numbers),
+            min((item.margin for item in searched_cases), default=math.nan),
+            violation_numbers[0] if violation_numbers else None,
             describe_margin(self._requirement),
             reason,
         )
 
     def _evaluate(self, candidates: Sequence[Candidate]) -> list[_Evaluated]:
+        """Run cases, and add them to the evaluated cases of the study."""
         first = self.runner.n_cases
         rows = self.runner.run(candidates)
-        evaluated = [
+        new_cases = [
             _Evaluated(
                 first + index,
                 Point.read(str(row[POINT_COLUMN])),
@@ -226,10 +228,11 @@ class SearchStudy:
             )
             for index, row in enumerate(rows)
         ]
-        self._evaluated += evaluated
-        return evaluated
+        self._evaluated += new_cases
+        return new_cases
 
     def _seed(self, name: str) -> int:
+        """Derive the seed of one part of the study from the seed of the campaign."""
         configuration = self.campaign.configuration
         generator = Streams(configuration.seed, configuration.name, 0).generator(f"search: {name}")
         return int(generator.integers(1, 2**31))
@@ -237,13 +240,13 @@ class SearchStudy:
     def _explore(self) -> None:
         """Evaluate a Sobol sequence, the largest power of 2 within half of the cases."""
         dimension = len(self.campaign.drawn_paths)
-        exponent = int(math.log2(max(_EXPLORED_FRACTION * self.settings.cases, 2.0)))
+        exponent = int(math.log2(max(_EXPLORATION_FRACTION * self.settings.cases, 2.0)))
         sequence = qmc.Sobol(dimension, rng=np.random.default_rng(self._seed("exploration"))).random_base2(exponent)
         coordinates = ndtri(np.clip(sequence, 1e-6, 1.0 - 1e-6))
         self._evaluate([Candidate(tuple(point.tolist())) for point in coordinates])
 
     def _evolve(self) -> None:
-        """Run evolution strategies side by side until the cases are used."""
+        """Run evolution strategies in parallel until the cases are used."""
         settings, starts = self.settings, self._select_starts()
         strategies = [
             cma.CMAEvolutionStrategy(
@@ -272,9 +275,9 @@ class SearchStudy:
 
     def _select_starts(self) -> list[tuple[float, ...]]:
         """Select the best explored cases that differ from each other."""
-        ordered = sorted(self._evaluated, key=lambda item: item.margin)
+        sorted_cases = sorted(self._evaluated, key=lambda item: item.margin)
         starts: list[tuple[float, ...]] = []
-        for item in ordered:
+        for item in sorted_cases:
             point = np.array(item.point.coordinates)
             min_distance = _MIN_START_DISTANCE * math.sqrt(point.size)
             if all(np.linalg.norm(point - np.array(other)) >= min_distance for other in starts):
@@ -283,45 +286,50 @@ class SearchStudy:
                 break
         return starts
 
-    def _reduce_all(self, found: list[_Evaluated]) -> list[Failure]:
+    def _reduce_all(self, violating_cases: list[_Evaluated]) -> list[Failure]:
         """Reduce the most likely violation, remove those with the same cause, and repeat with the others."""
-        remaining = sorted(found, key=lambda item: float(np.linalg.norm(item.point.coordinates)))
+        remaining = sorted(violating_cases, key=lambda item: float(np.linalg.norm(item.point.coordinates)))
         failures: list[Failure] = []
         reduced_points: list[tuple[list[str], np.ndarray]] = []
         while remaining and len(failures) < self.settings.max_failures:
             first = remaining[0]
-            reduced = self._shrink(self._remove_dispersions(first))
-            paths = [path for path in self.campaign.drawn_paths if path not in reduced.point.nominal]
+            reduction = self._shrink(self._remove_dispersions(first))
+            paths = [path for path in self.campaign.drawn_paths if path not in reduction.point.nominal]
             indices = [self.campaign.drawn_paths.index(path) for path in paths]
-            kept = np.array(reduced.point.coordinates)[indices]
+            reduced_coordinates = np.array(reduction.point.coordinates)[indices]
             coordinates = np.array([item.point.coordinates for item in remaining])[:, indices]
-            similar = np.linalg.norm(coordinates - coordinates[0], axis=1) <= _MAX_CAUSE_DISTANCE
-            remaining = [item for item, is_similar in zip(remaining, similar, strict=True) if not is_similar]
-            values = self.campaign.draws_at(reduced.point)
-            earlier = next((index for index, other in enumerate(reduced_points) if _is_close(kept, paths, other)), None)
-            if earlier is not None:
-                failures[earlier] = replace(failures[earlier], similar=failures[earlier].similar + int(similar.sum()))
+            has_same_cause = np.linalg.norm(coordinates - coordinates[0], axis=1) <= _MAX_CAUSE_DISTANCE
+            remaining = [item for item, is_similar in zip(remaining, has_same_cause, strict=True) if not is_similar]
+            values = self.campaign.draws_at(reduction.point)
+            failure_index = next(
+                (index for index, other in enumerate(reduced_points) if _is_close(reduced_coordinates, paths, other)),
+                None,
+            )
+            if failure_index is not None:
+                failures[failure_index] = replace(
+                    failures[failure_index], similar=failures[failure_index].similar + int(has_same_cause.sum())
+                )
                 continue
-            reduced_points.append((paths, kept))
-            repetition = Candidate(reduced.point.coordinates, None, reduced.point.nominal)
+            reduced_points.append((paths, reduced_coordinates))
+            repetition = Candidate(reduction.point.coordinates, None, reduction.point.nominal)
             repetitions = self._evaluate([repetition] * self.settings.repetitions)
             failures.append(
                 Failure(
-                    reduced.case,
+                    reduction.case,
                     first.case,
-                    reduced.margin,
+                    reduction.margin,
                     {path: values[path] for path in paths},
-                    float(np.linalg.norm(kept)),
-                    int(similar.sum()),
+                    float(np.linalg.norm(reduced_coordinates)),
+                    int(has_same_cause.sum()),
                     sum(item.margin < 0.0 for item in repetitions),
                     len(repetitions),
-                    reduced.outcome,
+                    reduction.outcome,
                 )
             )
         return failures
 
     def _remove_dispersions(self, failure: _Evaluated) -> _Evaluated:
-        """Return dispersions to the campaign's parameters in groups, as long as the case remains a violation."""
+        """Reset groups of dispersions to the campaign's parameters, as long as the case remains a violation."""
         paths = [path for path in self.campaign.drawn_paths if path not in failure.point.nominal]
         groups = 2
         while paths:
@@ -331,11 +339,11 @@ class SearchStudy:
                 Candidate(failure.point.coordinates, failure.point.stream, (*failure.point.nominal, *part))
                 for part in parts
             ]
-            tested = self._evaluate(candidates)
-            removed = next((index for index, item in enumerate(tested) if item.margin < 0.0), None)
-            if removed is not None:
-                failure = tested[removed]
-                paths = [path for path in paths if path not in parts[removed]]
+            trials = self._evaluate(candidates)
+            removed_part = next((index for index, item in enumerate(trials) if item.margin < 0.0), None)
+            if removed_part is not None:
+                failure = trials[removed_part]
+                paths = [path for path in paths if path not in parts[removed_part]]
                 groups = max(groups - 1, 2)
             elif size == 1:
                 break
@@ -353,9 +361,9 @@ class SearchStudy:
                 middle = 0.5 * (low + high)
                 coordinates = list(failure.point.coordinates)
                 coordinates[index] = middle
-                (tested,) = self._evaluate([Candidate(tuple(coordinates), failure.point.stream, failure.point.nominal)])
-                if tested.margin < 0.0:
-                    failure, high = tested, middle
+                (trial,) = self._evaluate([Candidate(tuple(coordinates), failure.point.stream, failure.point.nominal)])
+                if trial.margin < 0.0:
+                    failure, high = trial, middle
                 else:
                     low = middle
         return failure
@@ -386,11 +394,11 @@ def write_regression_campaigns(campaign: Campaign, result: SearchResult, directo
         folder.mkdir(exist_ok=True)
         for number, failure in enumerate(result.failures, start=1):
             name = f"{configuration.name}-failure-{number}"
-            story = ", ".join(f"{path} = {_short_text(value)}" for path, value in failure.values.items())
+            values_text = ", ".join(f"{path} = {_short_text(value)}" for path, value in failure.values.items())
             tables = {
                 "name": name,
                 "scenario": configuration.scenario,
-                "description": f"Violation of {requirement.id} with {story or 'the parameters of the campaign'}.",
+                "description": f"Violation of {requirement.id} with {values_text or 'the parameters of the campaign'}.",
                 "cases": max(failure.repetitions, 1),
                 "seed": configuration.seed,
                 "parameters": campaign.with_values(failure.values).model_dump(mode="json"),

@@ -5,7 +5,7 @@ the cases with a margin of at most its threshold, a quantile of the previous lev
 by Markov chains that start at the cases of the previous level below the threshold: conditional sampling with an
 adaptive step in standard normal space (Papaioannou et al. 2015, Probabilistic Engineering Mechanics 41, 89-103,
 algorithm with acceptance 0.44). The random streams of a case are a further variable: a step draws them again with
-probability 0.25, and holds them otherwise.
+probability 0.25, and keeps them otherwise.
 
 The estimated coefficient of variation of one run is too small, because its chains are correlated. Intervals therefore
 use the spread of independent replicates (`marsyard.campaigns.studies.interval`).
@@ -22,8 +22,8 @@ from jaxtyping import Float64, Int64
 
 #: Fraction of the cases that define the next level.
 LEVEL_FRACTION = 0.1
-#: Acceptance rate of the chains to which their step is adapted, and first step.
-_ACCEPTANCE, _FIRST_STEP = 0.44, 0.6
+#: Target acceptance rate of the chains, to which their step is adapted, and initial step.
+_TARGET_ACCEPTANCE, _INITIAL_STEP = 0.44, 0.6
 #: Probability that a step draws new random streams.
 _NEW_STREAM_PROBABILITY = 0.25
 #: Stream number of a proposed case that gets new random streams.
@@ -78,7 +78,7 @@ def subset_simulation(dimension: int, samples: int, min_probability: float, rng:
     coordinates = rng.standard_normal((samples, dimension))
     evaluated = yield Proposals(coordinates, np.full(samples, NEW_STREAM))
     streams, margins = evaluated.streams, evaluated.margins
-    probability, step, thresholds = 1.0, _FIRST_STEP, list[float]()
+    probability, step, thresholds = 1.0, _INITIAL_STEP, list[float]()
     while True:
         is_violation = margins < 0.0
         threshold = _next_threshold(margins)
@@ -89,24 +89,24 @@ def subset_simulation(dimension: int, samples: int, min_probability: float, rng:
         thresholds.append(threshold)
         seeds = rng.permutation(np.flatnonzero(margins <= threshold))
         probability *= seeds.size / samples
-        # all chains advance together; the cases of the level are their states, including the seeds
+        # all chains advance together; the cases of the level are the states of the chains, including the seeds
         states = coordinates[seeds], streams[seeds], margins[seeds]
         level = [states]
         for chain_step in range(1, math.ceil(samples / seeds.size)):
             size = min(seeds.size, samples - chain_step * seeds.size)
-            position, held_streams, held_margins = (values[:size] for values in states)
-            proposed = math.sqrt(1.0 - step**2) * position + step * rng.standard_normal(position.shape)
-            new_streams = np.where(rng.random(size) < _NEW_STREAM_PROBABILITY, NEW_STREAM, held_streams)
-            evaluated = yield Proposals(proposed, new_streams)
+            points, previous_streams, previous_margins = (values[:size] for values in states)
+            proposed_points = math.sqrt(1.0 - step**2) * points + step * rng.standard_normal(points.shape)
+            new_streams = np.where(rng.random(size) < _NEW_STREAM_PROBABILITY, NEW_STREAM, previous_streams)
+            evaluated = yield Proposals(proposed_points, new_streams)
             is_accepted = evaluated.margins <= threshold
             states = (
-                np.where(is_accepted[:, None], proposed, position),
-                np.where(is_accepted, evaluated.streams, held_streams),
-                np.where(is_accepted, evaluated.margins, held_margins),
+                np.where(is_accepted[:, None], proposed_points, points),
+                np.where(is_accepted, evaluated.streams, previous_streams),
+                np.where(is_accepted, evaluated.margins, previous_margins),
             )
             level.append(states)
-            change = (float(is_accepted.mean()) - _ACCEPTANCE) / math.sqrt(chain_step)
-            step = min(step * math.exp(change), 1.0)
+            log_step_change = (float(is_accepted.mean()) - _TARGET_ACCEPTANCE) / math.sqrt(chain_step)
+            step = min(step * math.exp(log_step_change), 1.0)
         coordinates, streams, margins = (np.concatenate(values) for values in zip(*level, strict=True))
 
 
@@ -115,13 +115,13 @@ def _next_threshold(margins: Margins) -> float | None:
 
     Equal margins (infinite ones, for example) may cover the quantile. The threshold is then the next lower margin.
     """
-    ordered = np.sort(margins)
-    index = round(LEVEL_FRACTION * ordered.size)
-    below, above = float(ordered[index - 1]), float(ordered[index])
+    sorted_margins = np.sort(margins)
+    index = round(LEVEL_FRACTION * sorted_margins.size)
+    below, above = float(sorted_margins[index - 1]), float(sorted_margins[index])
     threshold = 0.5 * (below + above) if math.isfinite(below + above) else below
-    if threshold >= ordered[-1]:
-        lower = ordered[ordered < ordered[-1]]
-        if lower.size == 0:
+    if threshold >= sorted_margins[-1]:
+        lower_margins = sorted_margins[sorted_margins < sorted_margins[-1]]
+        if lower_margins.size == 0:
             return None
-        threshold = float(lower[-1])
+        threshold = float(lower_margins[-1])
     return threshold if threshold >= 0.0 else 0.0

@@ -8,7 +8,7 @@ import numpy as np
 import marsyard
 from marsyard.sim.camera import read_calibrations
 
-# EuRoC's first camera in Kalibr's format
+# the first camera of the EuRoC data set, in Kalibr's format
 CALIBRATION_FILE = """cam0:
   camera_model: pinhole
   distortion_coeffs: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]

@@ -28,7 +28,7 @@ class Glider:
     height_m: float = 1800.0  # at the first image, above the ground at the landing location
     speed_m_s: float = 60.0
     glide_ratio: float = 0.5  # horizontal divided by vertical distance
-    rocking_deg: float = 8.0  # amplitude of the roll angle
+    roll_deg: float = 8.0  # amplitude of the roll angle, which has a period of 3 s
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.glide_ratio <= 5.0:
@@ -38,12 +38,13 @@ class Glider:
         """Return the poses of one glide over the landing location."""
         heading, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
         descent_rate = self.speed_m_s / np.hypot(1.0, self.glide_ratio)
+        # the glide ends at half of the firing height, or later if the images require it
         end_s = (self.height_m - 0.5 * place.firing_height_m) / descent_rate
         times = np.arange(place.from_s - 0.1, max(place.until_s, end_s) + 0.1, 0.05)
         course = np.array([np.sin(heading), np.cos(heading), 0.0])
         positions = descent_rate * times[:, None] * (self.glide_ratio * course + np.array([0.0, 0.0, -1.0]))
         positions[:, 2] += self.height_m
-        roll = np.radians(self.rocking_deg) * np.sin(2.0 * np.pi * times / 3.0 + phase)
+        roll = np.radians(self.roll_deg) * np.sin(2.0 * np.pi * times / 3.0 + phase)
         attitudes = Rotation.from_rotvec(roll[:, None] * course) * Rotation.from_euler("z", -heading)
         return Poses(times, positions, attitudes.as_quat(), {"heading_deg": float(np.degrees(heading))})
 
@@ -58,7 +59,7 @@ class PulsedLidar:
     beam_deg: float = 1.0
     scale_error: float = 0.005  # 1 sigma of the relative error, constant in a descent
     noise_m: float = 0.5  # 1 sigma of a reading
-    late_s: float = 0.02  # age of a reading when it arrives
+    delay_s: float = 0.02  # age of a reading when it arrives
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.beam_deg <= 20.0:
@@ -67,7 +68,7 @@ class PulsedLidar:
     def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
         """Return the altitudes of one descent."""
         scale = 1.0 + self.scale_error * rng.standard_normal()
-        times = truth.times_s - self.late_s
+        times = truth.times_s - self.delay_s
         ranges = np.array([truth.first_return_m(time, 0.5 * self.beam_deg, 10000.0) for time in times])
         cos_tilt = np.array([truth.motion.state(time).attitude.as_matrix()[2, 2] for time in times])
         altitudes = scale * ranges * cos_tilt + self.noise_m * rng.standard_normal(times.size)
@@ -76,7 +77,7 @@ class PulsedLidar:
 
 @dataclass(frozen=True)
 class StarTracker:
-    """An attitude source with independent errors."""
+    """An attitude source with independent normal errors."""
 
     quantity: ClassVar[str] = "attitude"
     random: ClassVar[bool] = True
@@ -97,4 +98,5 @@ def lateral_impact(case: ScoredDescent) -> dict[str, float | bool]:
     """Score the kinetic energy of the horizontal velocity at touchdown, and whether the answer reduced the velocity."""
     touchdown_m_s = float(np.hypot(*case.touchdown_m_s))
     firing_m_s = float(np.hypot(*case.at_firing.velocity_m_s[:2]))
+    # kinetic energy m v^2 / 2, in kJ
     return {"energy_kj": 5e-4 * MASS_KG * touchdown_m_s**2, "slower": touchdown_m_s < firing_m_s}

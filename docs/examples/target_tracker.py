@@ -35,7 +35,7 @@ class WholePixelTracker:
     def __init__(self) -> None:
         self.state = "NO_TARGET"
         self.target_world: np.ndarray | None = None
-        self.designated: PixelTarget | None = None
+        self.pixel_target: PixelTarget | None = None
         self.template: np.ndarray | None = None
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -54,7 +54,7 @@ class WholePixelTracker:
         target, pose = read_target(request["target"]), read_pose(request["world_from_rover"])
         self.state = "NORMAL"
         if isinstance(target, PixelTarget):
-            self.designated = target
+            self.pixel_target = target
         elif isinstance(target, RoverTarget):
             self.target_world = pose.apply(target.position_rover)
         else:
@@ -66,18 +66,18 @@ class WholePixelTracker:
         if self.target_world is not None:
             x, y, z = pose.inv().apply(self.target_world) - mast.geometry.base_m - mast.geometry.elbow_m
             angles = (float(np.arctan2(-y, x)), float(np.arctan2(z - mast.geometry.head_m[2], np.hypot(x, y))))
-        elif self.designated is not None:
-            angles = (self.designated.azimuth_rad, self.designated.elevation_rad)
+        elif self.pixel_target is not None:
+            angles = (self.pixel_target.azimuth_rad, self.pixel_target.elevation_rad)
         else:
             return None
         limits = (mast.geometry.azimuth_limits_rad, mast.geometry.elevation_limits_rad)
         if not all(low <= angle <= high for angle, (low, high) in zip(angles, limits, strict=True)):
             return None
-        boxes = {
+        image_areas = {
             name: {"corner": [0, 0], "size": list(camera.size)}
             for name, camera in (("left", mast.left), ("right", mast.right))
         }
-        return {"azimuth_rad": angles[0], "elevation_rad": angles[1], **boxes}
+        return {"azimuth_rad": angles[0], "elevation_rad": angles[1], **image_areas}
 
     def update(self, stop: RoverMeasurements) -> dict[str, Any]:
         """Search the target in the images of a stop."""
@@ -98,19 +98,19 @@ class WholePixelTracker:
         if patch is None:
             return self.report_loss("OUT_OF_VIEW", stop)
         # predicted pixel in the right image, for the last position of the target or for the assumed range
-        assumed = self.target_world if self.target_world is not None else point_at(left, pixel, ASSUMED_RANGE_M)
-        predicted = np.asarray(right.project(assumed)[0])
-        right_pixel, score = find_template(stop.right, predicted, SEARCH_PX, STEREO_ROWS_PX, patch)
+        position_world = self.target_world if self.target_world is not None else point_at(left, pixel, ASSUMED_RANGE_M)
+        predicted_pixel = np.asarray(right.project(position_world)[0])
+        right_pixel, score = find_template(stop.right, predicted_pixel, SEARCH_PX, STEREO_ROWS_PX, patch)
         if score < MIN_SCORE:
             return self.report_loss("LOW_STEREO_SCORE", stop)
         self.target_world = intersect_rays(left, pixel, right, right_pixel)
-        self.template, self.designated, self.state = patch, None, "NORMAL"
+        self.template, self.pixel_target, self.state = patch, None, "NORMAL"
         return {"state": self.state, "losses": [], "position_rover": self.position_rover(stop)}
 
     def predict_pixel(self, left: CameraModel) -> np.ndarray | None:
         """Return the expected pixel of the target in the left image; None if it is not visible."""
         if self.target_world is None:
-            return None if self.designated is None else np.asarray(self.designated.pixel)
+            return None if self.pixel_target is None else np.asarray(self.pixel_target.pixel)
         pixel, is_in_front = left.project(self.target_world)
         return np.asarray(pixel) if bool(is_in_front) else None
 

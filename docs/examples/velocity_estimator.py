@@ -23,7 +23,7 @@ MIN_VARIANCE_M2_S2 = 0.01  # due to attitude errors, which are common to all tem
 
 
 class MedianShift:
-    """Implements `marsyard.algorithms.interface.VelocityEstimator`; created without arguments."""
+    """Estimator that follows `marsyard.algorithms.interface.VelocityEstimator`; created without arguments."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """Return the median velocity of the matched templates."""
@@ -41,33 +41,34 @@ class MedianShift:
 
 def _measure_velocities(measurements: DescentMeasurements) -> np.ndarray:
     """Measure the velocity of each matched template, shape (n, 2), m/s east and north."""
-    second, third = (measurements.images[k].counts.astype(np.float32) for k in (1, 2))
+    second, third = (measurements.images[number].counts.astype(np.float32) for number in (1, 2))
     interval_s = measurements.images[2].time_s - measurements.images[1].time_s
     displacement = -measurements.interval_velocities_m_s[1] * interval_s
     rows, columns = second.shape
+    # templates on a grid with a spacing of one sixth of the image
     velocities = []
     for row in range(rows // 6, rows - HALF_SIZE_PX[1] - 1, rows // 6):
         for column in range(columns // 6, columns - HALF_SIZE_PX[0] - 1, columns // 6):
             pixel = np.array([column, row])
             ground = _intersect_ground(measurements, 1, pixel)
-            predicted = _project(measurements, 2, ground + displacement)
-            match = _match_template(second, third, pixel, predicted)
-            if match is not None:
-                velocities.append((ground - _intersect_ground(measurements, 2, match))[:2] / interval_s)
+            predicted_pixel = _project(measurements, 2, ground + displacement)
+            matched_pixel = _match_template(second, third, pixel, predicted_pixel)
+            if matched_pixel is not None:
+                velocities.append((ground - _intersect_ground(measurements, 2, matched_pixel))[:2] / interval_s)
     return np.array(velocities).reshape(-1, 2)
 
 
 def _match_template(
-    second: np.ndarray, third: np.ndarray, pixel: np.ndarray, predicted: np.ndarray
+    second: np.ndarray, third: np.ndarray, pixel: np.ndarray, predicted_pixel: np.ndarray
 ) -> np.ndarray | None:
     """Return the pixel (column, row) of the best match in the third image; None without a match."""
-    if not np.all(np.isfinite(predicted)):
+    if not np.all(np.isfinite(predicted_pixel)):
         return None
     columns, rows = HALF_SIZE_PX
     template = second[pixel[1] - rows : pixel[1] + rows + 1, pixel[0] - columns : pixel[0] + columns + 1]
-    corner = np.rint(predicted).astype(int) - np.array(HALF_SIZE_PX) - np.array(SEARCH_PX)
+    corner = np.rint(predicted_pixel).astype(int) - np.array(HALF_SIZE_PX) - np.array(SEARCH_PX)
     corner = np.maximum(corner, 0)
-    end = np.rint(predicted).astype(int) + np.array(HALF_SIZE_PX) + np.array(SEARCH_PX) + 1
+    end = np.rint(predicted_pixel).astype(int) + np.array(HALF_SIZE_PX) + np.array(SEARCH_PX) + 1
     window = third[corner[1] : max(end[1], 0), corner[0] : max(end[0], 0)]
     if window.shape[0] < template.shape[0] or window.shape[1] < template.shape[1] or template.std() < 1.0:
         return None

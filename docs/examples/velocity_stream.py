@@ -44,7 +44,7 @@ class Pair:
 
 
 class ChainedShifts:
-    """Implements `marsyard.algorithms.interface.VelocityStream`; created without arguments."""
+    """Estimator that follows `marsyard.algorithms.interface.VelocityStream`; created without arguments."""
 
     def start(self) -> None:
         """Reset the state for a new descent."""

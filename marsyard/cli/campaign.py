@@ -172,32 +172,32 @@ def replay(
     from marsyard.cli.showing import write_stages
     from marsyard.reports.presentation import write_case_figures
 
-    replayed = rerun_case(directory, case)
+    rerun = rerun_case(directory, case)
     target = out if out is not None else case_directory(directory, case)
-    if (replayed.failed or replayed.products is None) and (target / "products.json").exists():
+    if (rerun.failed or rerun.products is None) and (target / "products.json").exists():
         output_lines = [f"{target} keeps its previous products: this run of the case produced none"]
     else:  # replace the products, stages and figures together or not at all
-        packed = replayed.products or pack_products({})
+        packed = rerun.products or pack_products({})
         products = unpack_products(packed)
         with replace_files(target) as folder:
-            write_packed(folder, packed, replayed.row)
+            write_packed(folder, packed, rerun.row)
             stages = write_stages(folder / "stages", products) if save_stages else 0
             figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
         stage_lines = [f"stages: {stages} files in {target / 'stages'}"] if save_stages else []
         output_lines = [f"products: {target}", *stage_lines, *(f"figure: {figure}" for figure in figures)]
-    typer.echo(f"case {case}: {replayed.row['outcome']}")
-    for line in (replayed.row["error"] and (replayed.row["traceback"] or replayed.row["error"]), replayed.note):
+    typer.echo(f"case {case}: {rerun.row['outcome']}")
+    for line in (rerun.row["error"] and (rerun.row["traceback"] or rerun.row["error"]), rerun.note):
         if line:
             typer.echo(line)
     typer.echo("\n".join(output_lines))
-    if replayed.changed:
-        typer.echo(f"changed since the campaign was run: {'; '.join(replayed.changed)}")
-    if replayed.stored is None:
+    if rerun.changed:
+        typer.echo(f"changed since the campaign was run: {'; '.join(rerun.changed)}")
+    if rerun.stored is None:
         typer.echo("the campaign has no stored row of this case to compare with")
-    elif replayed.differing:
-        typer.echo(f"the row differs from the stored one in: {', '.join(replayed.differing)}")
-        for column in replayed.differing:
-            typer.echo(f"  {column}: {replayed.stored.get(column)!r} stored, {replayed.row.get(column)!r} now")
+    elif rerun.differing:
+        typer.echo(f"the row differs from the stored one in: {', '.join(rerun.differing)}")
+        for column in rerun.differing:
+            typer.echo(f"  {column}: {rerun.stored.get(column)!r} stored, {rerun.row.get(column)!r} now")
         raise typer.Exit(options.Exit.FAILED)
     else:
         typer.echo("the row equals the stored one")
@@ -268,7 +268,7 @@ def stop_on_signals() -> Iterator[None]:
 
 
 def default_directory(name: str) -> Path:
-    """Return a new folder ``runs/<campaign>-<UTC time>``, with a number if that folder exists."""
+    """Return the path of a new folder ``runs/<campaign>-<UTC time>``, with a number if that folder exists."""
     from datetime import UTC, datetime
 
     base = Path("runs") / f"{name}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"

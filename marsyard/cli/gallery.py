@@ -113,9 +113,9 @@ def map_to_grey(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.nda
     white = float(np.percentile(signal[ground] if ground.any() else signal, WHITE_PERCENTILE))
     black = BLACK_FRACTION * float(np.percentile(signal, BLACK_PERCENTILE))
     ratio = np.clip((signal - black) / max(white - black, 1.0), 0.0, None)
-    brightest = max(float(np.percentile(ratio, WHITE_PERCENTILE)), 1.0)
-    compressed = np.clip(ratio * (1.0 + ratio / brightest**2) / (1.0 + ratio), 0.0, 1.0)
-    grey: Grey = np.rint(255.0 * compressed**GAMMA).astype(np.uint8)
+    brightest_ratio = max(float(np.percentile(ratio, WHITE_PERCENTILE)), 1.0)
+    tone_mapped = np.clip(ratio * (1.0 + ratio / brightest_ratio**2) / (1.0 + ratio), 0.0, 1.0)
+    grey: Grey = np.rint(255.0 * tone_mapped**GAMMA).astype(np.uint8)
     return grey
 
 
@@ -128,8 +128,8 @@ def write_gallery(images: Sequence[GalleryImage], folder: Path) -> Path:
         full_size_jpeg = encode_image(".jpg", image.grey, [cv2.IMWRITE_JPEG_QUALITY, FULL_QUALITY])
         (folder / image.file).write_bytes(full_size_jpeg)
         width = min(PAGE_WIDTH_PX, columns)
-        reduced = cv2.resize(image.grey, (width, round(rows * width / columns)), interpolation=cv2.INTER_AREA)
-        page_jpeg = encode_image(".jpg", reduced, [cv2.IMWRITE_JPEG_QUALITY, PAGE_QUALITY])
+        page_image = cv2.resize(image.grey, (width, round(rows * width / columns)), interpolation=cv2.INTER_AREA)
+        page_jpeg = encode_image(".jpg", page_image, [cv2.IMWRITE_JPEG_QUALITY, PAGE_QUALITY])
         command = (
             f"marsyard render {request.site} --camera {request.camera} --scale {request.scale} "
             f"--altitude {request.altitude_m:g} --east {request.east_m:g} --north {request.north_m:g} "
@@ -159,25 +159,25 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
         height, width = image.grey.shape
         cropped_height = min(height, round(width * cell_height / cell_width))
         first_row = (height - cropped_height) // 3  # crop more rows at the bottom: the horizon is in the upper part
-        cropped = image.grey[first_row : first_row + cropped_height]
-        cell = cv2.resize(cropped, CELL_PX, interpolation=cv2.INTER_AREA)
+        crop = image.grey[first_row : first_row + cropped_height]
+        cell = cv2.resize(crop, CELL_PX, interpolation=cv2.INTER_AREA)
         sheet[top : top + cell_height, left : left + cell_width] = cell
         label = f"{Path(image.request.site).name}  {image.request.camera}  {image.request.altitude_m:g} m"
         position = (left + 1, top + cell_height + LABEL_PX - 8)
         cv2.putText(sheet, label, position, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 235, 1, cv2.LINE_AA)
-    encoded = b""
+    png = b""
     for grey_levels in SHEET_GREYS:
         step = 255.0 / (grey_levels - 1)
         quantised = np.rint(np.rint(sheet / step) * step).astype(np.uint8)
-        encoded = encode_image(".png", quantised, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-        if len(encoded) <= SHEET_BYTES:
+        png = encode_image(".png", quantised, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        if len(png) <= SHEET_BYTES:
             break
-    return encoded
+    return png
 
 
 def encode_image(extension: str, grey: Grey, options: Sequence[int]) -> bytes:
     """Encode an image in the format of a file extension. Raises ValueError."""
-    is_encoded, encoded = cv2.imencode(extension, grey, options)
+    is_encoded, buffer = cv2.imencode(extension, grey, options)
     if not is_encoded:
         raise ValueError(f"an image could not be encoded as {extension}")
-    return encoded.tobytes()
+    return buffer.tobytes()

@@ -93,6 +93,7 @@ def new(arguments: NewOptions) -> None:
 
 
 def _is_terminal() -> bool:
+    """Whether a user can answer questions on standard input."""
     return sys.stdin.isatty()
 
 
@@ -128,17 +129,20 @@ def _ask_user(question: str, default: str, is_interactive: bool, find_problem: C
 
 
 def _find_name_problem(allowed: Sequence[str], answer: str) -> str:
+    """Return the problem of an answer that must be an allowed name; empty if there is none."""
     from marsyard.campaigns.errors import unknown_name_message
 
     return "" if answer in allowed else unknown_name_message("answer", answer, allowed)
 
 
 def _find_file_problem(answer: str) -> str:
+    """Return the problem of an answer that must be an existing file or empty; empty if there is none."""
     is_missing = answer and not Path(answer).is_file()
     return f"{answer}: no such file; allowed: the path of a file, or an empty answer" if is_missing else ""
 
 
 def _find_camera_problem(answer: str) -> str:
+    """Return the problem of an answer that must be a camera file or empty; empty if there is none."""
     from marsyard.sim.camera import CameraFileError, read_camera
 
     try:
@@ -150,6 +154,7 @@ def _find_camera_problem(answer: str) -> str:
 
 
 def _find_number_problem(limit: float, answer: str) -> str:
+    """Return the problem of an answer that must be a number above 0 and below `limit`; empty if there is none."""
     try:
         number = float(answer)
     except ValueError:
@@ -187,19 +192,19 @@ def ingest(
         raise CampaignError(f"--system: {unknown_name_message('system', name, importers)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StoreError(f"{out} exists and is not empty; give a new folder with --out")
-    unfinished = out.with_name(f"{out.name}.part{os.getpid()}")
+    partial_folder = out.with_name(f"{out.name}.part{os.getpid()}")
     try:
         with report_write_errors(f"{out}:"):
-            unfinished.mkdir(parents=True)
-            ingested: Ingested = import_object(importers[name])(folder, unfinished, out.resolve())
-            (unfinished / CAMPAIGN_FILE).write_text(ingested.campaign, encoding="utf-8")
+            partial_folder.mkdir(parents=True)
+            ingested: Ingested = import_object(importers[name])(folder, partial_folder, out.resolve())
+            (partial_folder / CAMPAIGN_FILE).write_text(ingested.campaign, encoding="utf-8")
             if out.exists():
                 out.rmdir()
-            unfinished.rename(out)
+            partial_folder.rename(out)
     except ValueError as error:
         raise CampaignError(str(error)) from error
     finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+        shutil.rmtree(partial_folder, ignore_errors=True)
     try:
         load_campaign(str(out / CAMPAIGN_FILE))
     except CampaignError:  # remove a campaign that cannot be run

@@ -63,7 +63,7 @@ class Plan(Parameters):
 
     @model_validator(mode="after")
     def _check_names(self) -> Plan:
-        names = [planned.campaign for planned in self.campaigns]
+        names = [entry.campaign for entry in self.campaigns]
         if len(set(names)) < len(names):
             raise ValueError("the plan contains a campaign twice; copy it to a second file with another name")
         return self
@@ -82,8 +82,8 @@ def night_seed(seed: int, night: int) -> int:
 
 def hash_definition(campaign: Campaign) -> str:
     """Hash a campaign's definition except seed, texts and number of cases; only equal definitions are compared."""
-    excluded = {"seed", "description", "retain", "limits", "cases"}
-    definition = campaign.configuration.model_dump(mode="json", exclude=excluded)
+    excluded_keys = {"seed", "description", "retain", "limits", "cases"}
+    definition = campaign.configuration.model_dump(mode="json", exclude=excluded_keys)
     return hashlib.sha256(json.dumps(definition, sort_keys=True).encode()).hexdigest()
 
 
@@ -98,11 +98,11 @@ class NightlyRun:
     plan: Plan
 
 
-def run_scheduled_campaign(run: NightlyRun, planned: PlannedCampaign, folder: Path, observer: ProgressObserver) -> None:
+def run_scheduled_campaign(run: NightlyRun, entry: PlannedCampaign, folder: Path, observer: ProgressObserver) -> None:
     """Run a campaign, evaluate it, and store its metrics; its errors do not affect the other campaigns."""
     night_metrics = []
     try:
-        campaign = planned.load(run.plan.seed, run.number, folder)
+        campaign = entry.load(run.plan.seed, run.number, folder)
         name = campaign.configuration.name
         directory = run.out / RUNS / f"night-{run.number:05d}-{name}"
         run_campaign(campaign, directory, run.executor, observer)
@@ -118,7 +118,7 @@ def run_scheduled_campaign(run: NightlyRun, planned: PlannedCampaign, folder: Pa
         night_metrics = []
         if not isinstance(error, CampaignError):
             traceback.print_exc()
-        result = NightCampaign(planned.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
+        result = NightCampaign(entry.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
     run.history.add(run.number, result, night_metrics)
 
 
@@ -132,8 +132,8 @@ def publish_page(history: History, night: int, out: Path, changes: Sequence[Chan
 def write_page(history: History, night: int, out: Path, changes: Sequence[Change]) -> str:
     """Write the page with the results of the night so far, and the significant changes; return its text."""
     nights = {record.night: record for record in history.nights()}
-    earlier = [record for number, record in nights.items() if number < night]
-    compared = sum(bool(comparison.before) for comparison in list_comparisons(history, night))
-    text = format_night_page(nights[night], earlier, history.campaigns(night), changes, compared)
+    earlier_nights = [record for number, record in nights.items() if number < night]
+    comparisons = sum(bool(comparison.before) for comparison in list_comparisons(history, night))
+    text = format_night_page(nights[night], earlier_nights, history.campaigns(night), changes, comparisons)
     write_atomic(out / PAGE_FILE, text)
     return text

@@ -41,8 +41,8 @@ def export(
     truth = truth_folder(out) if truth is None else truth
     no_products = ["retain.products=none", "retain.showcase=none"]
     # the "algorithm" of an export writes the cases to the folder
-    exporter = f"{EXPORT}{out.resolve()}" + ("" if bits_per_pixel is None else f"{LOSSY}{bits_per_pixel:g}")
-    export_definition = load_campaign(campaign, [*(override or []), *no_products], cases, seed, [exporter])
+    export_algorithm = f"{EXPORT}{out.resolve()}" + ("" if bits_per_pixel is None else f"{LOSSY}{bits_per_pixel:g}")
+    export_definition = load_campaign(campaign, [*(override or []), *no_products], cases, seed, [export_algorithm])
     command = ["marsyard", "export", campaign, "--out", str(out), "--truth", str(truth)]
     command += [] if cases is None else ["-n", str(cases)]
     command += [] if seed is None else ["--seed", str(seed)]
@@ -51,13 +51,13 @@ def export(
     export_definition = replace(export_definition, command=tuple(command))
     with show_progress(truth, f"the same command again ({out})") as observer:
         export_campaign(export_definition, out, truth, make_executor(jobs, cluster), observer)
-    crashed = int(record.read(truth)["cases_crashed"])
+    crashes = int(record.read(truth)["cases_crashed"])
     total = export_definition.configuration.total_cases
-    typer.echo(f"exported {total - crashed} of {count(total, 'case')} to {out}")
+    typer.echo(f"exported {total - crashes} of {count(total, 'case')} to {out}")
     typer.echo(f"ground truth (do not distribute with the cases): {truth}")
     typer.echo(f"to score the results: marsyard score {out} ANSWERS.csv")
-    if crashed:
-        typer.echo(f"{count(crashed, 'case')} not exported; for the reasons: marsyard report {truth}", err=True)
+    if crashes:
+        typer.echo(f"{count(crashes, 'case')} not exported; for the reasons: marsyard report {truth}", err=True)
         raise typer.Exit(options.Exit.FAILED)
 
 
@@ -87,10 +87,11 @@ def score(
 
     def run(observer: ProgressObserver) -> None:
         run_campaign(campaign, target, make_executor(jobs, cluster), observer)
-        changed = find_cases_with_changed_images(truth, target)
-        if changed:
+        changed_cases = find_cases_with_changed_images(truth, target)
+        if changed_cases:
             observer.note(
-                f"the images of {count(len(changed), 'case')} (first: case {changed[0]}) differ from the export"
+                f"the images of {count(len(changed_cases), 'case')} (first: case {changed_cases[0]}) "
+                "differ from the export"
             )
 
     run_and_evaluate(target, run)
@@ -160,13 +161,13 @@ def conformance(
             lines += [f"{'':20}{line}" for line in (finding.problem, f"to fix: {finding.next_step}")]
         for line in lines:
             console().print(line, markup=False, highlight=False, soft_wrap=True)
-    failed = sum(not finding.passed for finding in findings)
+    failures = sum(not finding.passed for finding in findings)
     if as_json:
         checks = [{**asdict(finding), "passed": finding.passed} for finding in findings]
         checks = [{"asked" if key == "requirement" else key: value for key, value in check.items()} for check in checks]
-        data = {"algorithm": candidate.spec, "task": candidate.task, "passed": not failed, "checks": checks}
+        data = {"algorithm": candidate.spec, "task": candidate.task, "passed": not failures, "checks": checks}
         typer.echo(json.dumps(data, indent=2))
     else:
-        typer.echo(f"{len(findings) - failed} of {len(findings)} checks passed")
-    if failed:
+        typer.echo(f"{len(findings) - failures} of {len(findings)} checks passed")
+    if failures:
         raise typer.Exit(Exit.FAILED)

@@ -52,7 +52,7 @@ from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import ESTIMATE, Verdict, evaluate_requirements
 from marsyard.reports.wording import count, format_fraction, primary_metric
 
-#: Browsers that can print pages, in order of preference.
+#: Browsers that can print pages, in order of preference, and the time limit of printing.
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _PRINT_TIMEOUT_S = 600.0
 Requirements: TypeAlias = Sequence[Mapping[str, Any]]
@@ -66,8 +66,8 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     Raises StoreError if the folder contains no campaign with rows, or the report cannot be written.
     """
     stored = record.read(directory)
-    finished = stored["state"] == "finished"
-    if not finished:
+    is_finished = stored["state"] == "finished"
+    if not is_finished:
         refresh_table(directory)
     evaluation, page = evaluate_and_store(directory, requirements)
     run, verdicts = evaluation.run, evaluation.verdicts
@@ -79,7 +79,7 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     if not any(verdict.withheld_status for verdict in verdicts):
         lines.append(f"evidence: {evaluation.evidence.text}")
     lines.append(f"report: {page}")
-    if not finished:
+    if not is_finished:
         state = "killed" if stored["state"] == "running" else stored["state"]
         reason = f"the campaign was {state}; to continue: marsyard resume {directory}"
         reason = "the campaign is running" if is_locked(directory) else reason
@@ -87,7 +87,7 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     # an unfinished campaign cannot meet its requirements: replace status 0
-    return evaluation.exit_code if finished else evaluation.exit_code or Exit.INSUFFICIENT
+    return evaluation.exit_code if is_finished else evaluation.exit_code or Exit.INSUFFICIENT
 
 
 def evaluate_and_store(directory: Path, requirements: Requirements | None = None) -> tuple[Evaluation, Path]:
@@ -109,7 +109,7 @@ def evaluate_and_store(directory: Path, requirements: Requirements | None = None
 def _comparison_tables(frame: pd.DataFrame, requirements: Requirements, verdicts: Sequence[Verdict]) -> list[Table]:
     """Compare algorithms on the same cases; return no table for a single algorithm."""
     metric = primary_metric(frame, requirements)
-    bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
+    bound = next((item.bound for item in verdicts if item.metric == metric and math.isfinite(item.bound)), None)
     algorithms, differences = compare_algorithms(frame, metric, bound)
     if not algorithms:
         return []
@@ -172,16 +172,16 @@ def rerun_notable_cases(directory: Path) -> None:
     load_stored_campaign(directory, configuration)
     with LocalExecutor(1) as workers:
         for case in missing:
-            replayed = replay_in_executor(workers, configuration, case, stored_row(directory, case))
-            if replayed.products is None or replayed.failed:
+            rerun = replay_in_executor(workers, configuration, case, stored_row(directory, case))
+            if rerun.products is None or rerun.failed:
                 typer.echo(f"case {case}: rerun, but no images were produced")
                 continue
-            save_packed(case_directory(directory, case), replayed.products, replayed.row)
-            differences = f"; the new row differs in: {', '.join(replayed.differing)}" if replayed.differing else ""
+            save_packed(case_directory(directory, case), rerun.products, rerun.row)
+            differences = f"; the new row differs in: {', '.join(rerun.differing)}" if rerun.differing else ""
             typer.echo(f"case {case}: rerun for its images{differences}")
 
 
-#: Maximum number of cases for which distinct terrains are counted; each draw takes milliseconds.
+#: Maximum number of cases whose distinct terrains are counted; the draws of a case take milliseconds.
 _MAX_DRAWS = 5000
 
 
@@ -222,24 +222,24 @@ def evidence_limits(campaign: Campaign) -> list[str]:
 def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
     """Print the estimated time and disk space of a campaign."""
     workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1
-    estimated = estimate_campaign(campaign, workers)
+    estimate = estimate_campaign(campaign, workers)
     total = campaign.configuration.total_cases
-    low, high = estimated.case_range_s
-    time_s = estimated.time_s
+    low, high = estimate.case_range_s
+    time_s = estimate.time_s
     duration = f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.1f} h"
     duration = f"{time_s:.0f} s" if time_s < 120.0 else duration
     typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {duration}")
-    if estimated.inputs:
-        typer.echo(f"  {count(estimated.inputs, 'terrain')} (shared inputs) to build, {estimated.input_s:.3g} s each")
-    trials = count(estimated.trials, "trial case")
-    typer.echo(f"  {estimated.case_s:.3g} s per case ({low:.3g} to {high:.3g} s in {trials})")
-    if estimated.unfinished:
-        typer.echo(f"  {estimated.unfinished} of the trial cases did not finish")
-    rows, products = size_text(estimated.rows_bytes), size_text(estimated.products_bytes)
+    if estimate.inputs:
+        typer.echo(f"  {count(estimate.inputs, 'terrain')} (shared inputs) to build, {estimate.input_s:.3g} s each")
+    trials = count(estimate.trials, "trial case")
+    typer.echo(f"  {estimate.case_s:.3g} s per case ({low:.3g} to {high:.3g} s in {trials})")
+    if estimate.unfinished:
+        typer.echo(f"  {estimate.unfinished} of the trial cases did not finish")
+    rows, products = size_text(estimate.rows_bytes), size_text(estimate.products_bytes)
     typer.echo(f"disk: {rows} of rows, up to {products} of products")
-    if estimated.inputs_bytes:
-        limit = size_text(estimated.cache_limit_bytes)
-        typer.echo(f"  {size_text(estimated.inputs_bytes)} of terrains in the cache (maximum {limit})")
+    if estimate.inputs_bytes:
+        limit = size_text(estimate.cache_limit_bytes)
+        typer.echo(f"  {size_text(estimate.inputs_bytes)} of terrains in the cache (maximum {limit})")
 
 
 def print_limits(campaign: Campaign) -> None:

@@ -142,8 +142,8 @@ def render_images(request: ImageRequest, *, detector: bool = True, both: bool = 
     cameras = preset.cameras()
     position = (request.east_m, request.north_m, request.altitude_m)
     pose = camera_pose(ground.surface, preset.design, *position, request.azimuth_deg, request.elevation_deg)
-    towards_sun = direction(np.radians(request.sun_azimuth_deg), np.radians(request.sun_elevation_deg))
-    sun = Sun(towards_sun, ground.site.environment.sun_radius_rad)
+    sun_direction = direction(np.radians(request.sun_azimuth_deg), np.radians(request.sun_elevation_deg))
+    sun = Sun(sun_direction, ground.site.environment.sun_radius_rad)
     rendered_cameras = cameras if both else cameras[:1]
     rays = [PixelRays.of(camera) for camera in rendered_cameras]
     # The baseline of a stereo pair is short: both cameras use the scene built for the left camera.
@@ -179,10 +179,10 @@ def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows col
     if terrain.source is None:
         return None
     holes = embed(terrain.source, terrain.samples, terrain.spacing_m).filled_samples(terrain.samples)
-    visible = np.isfinite(frame.range_m)
-    points = np.where(visible[..., None], frame.points_world(), 0.0)
+    is_ground = np.isfinite(frame.range_m)
+    points = np.where(is_ground[..., None], frame.points_world(), 0.0)
     column, row = (np.rint(points[..., axis] / terrain.spacing_m).astype(int) % terrain.samples for axis in (0, 1))
-    return np.asarray(visible & holes[row, column])
+    return np.asarray(is_ground & holes[row, column])
 
 
 def _expose(
@@ -200,8 +200,8 @@ def _expose(
     # the top of the atmosphere
     position = np.asarray(frame.world_from_body.translation)
     height = float(position[2]) - float(ground.surface.height(*position[:2]))
-    hazy = add_haze(frame, environment, sun, environment.mean_extinction_m(height))
-    radiance = hazy * np.float32(environment.direct_fraction(math.radians(request.sun_elevation_deg)))
+    hazy_radiance = add_haze(frame, environment, sun, environment.mean_extinction_m(height))
+    radiance = hazy_radiance * np.float32(environment.direct_fraction(math.radians(request.sun_elevation_deg)))
     auto_exposure = sensor.auto_expose(
         detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
     )
@@ -216,7 +216,7 @@ def truth_layers(image: RenderedImage) -> dict[str, Any]:
     frame, scene = image.frame, image.scene
     directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
     phase = np.degrees(np.arccos(np.clip(-(directions @ scene.sun.direction), -1.0, 1.0)))
-    ground = np.isfinite(frame.range_m)
+    is_ground = np.isfinite(frame.range_m)
     # Render again without diffuse light: pixels with zero radiance are in shadow.
     direct_light = replace(scene.photometry, sky_fraction=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
     direct_frame = process_renderer(default_backend()).render(
@@ -229,8 +229,8 @@ def truth_layers(image: RenderedImage) -> dict[str, Any]:
         "point_m": frame.points_world(),
         "normal": frame.normal,
         "object": names[frame.body].astype(np.int32),
-        "shadow": ground & (direct_frame.radiance <= 0.0),
-        "phase_deg": np.where(ground, phase.reshape(ground.shape), np.nan).astype(np.float32),
+        "shadow": is_ground & (direct_frame.radiance <= 0.0),
+        "phase_deg": np.where(is_ground, phase.reshape(is_ground.shape), np.nan).astype(np.float32),
         "world_from_body": frame.world_from_body.as_matrix(),
         **({} if image.filled is None else {"filled": image.filled}),
     }
@@ -239,10 +239,10 @@ def truth_layers(image: RenderedImage) -> dict[str, Any]:
 def write_image(image: RenderedImage, request: ImageRequest, prefix: Path) -> list[Path]:
     """Write the files of an image (see `SUFFIXES`); return their paths."""
     png, npz, cahvor, metadata = (_build_path(prefix, image.suffix, ending) for ending in SUFFIXES)
-    is_encoded, encoded = cv2.imencode(".png", image.to_uint16())
+    is_encoded, png_bytes = cv2.imencode(".png", image.to_uint16())
     if not is_encoded:
         raise ValueError(f"{png} could not be encoded")
-    png.write_bytes(encoded.tobytes())
+    png.write_bytes(png_bytes.tobytes())
     with npz.open("wb") as file:
         np.savez(file, **truth_layers(image))
     write_cahvor(image.camera_body, cahvor, f"{request.camera}{image.suffix} at {request.site}", frame=BODY_FRAME)
@@ -316,6 +316,6 @@ def _check_name(kind: str, name: str, names: Iterable[str]) -> None:
     allowed = list(names)
     if name in allowed:
         return
-    similar = get_close_matches(name, allowed, n=1) or [known for known in allowed if name and name in known]
+    similar = get_close_matches(name, allowed, n=1) or [item for item in allowed if name and name in item]
     hint = f"; did you mean {' or '.join(similar)}?" if similar else "."
     raise ValueError(f"no {kind} is called '{name}'{hint} Allowed: {', '.join(allowed)}")

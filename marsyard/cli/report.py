@@ -189,16 +189,16 @@ def nightly(
         try:
             with stop_on_signals(), campaign_progress(console(stderr=True)) as observer:
                 run = plans.NightlyRun(history, night, out, executor, plan_definition)
-                for planned in plan_definition.campaigns:
-                    plans.run_scheduled_campaign(run, planned, path.parent, observer)
+                for entry in plan_definition.campaigns:
+                    plans.run_scheduled_campaign(run, entry, path.parent, observer)
         except KeyboardInterrupt:
             history.finish(night, INTERRUPTED)
             plans.publish_page(history, night, out, ())
             raise typer.Exit(Exit.INTERRUPTED) from None
-        significant = find_changes(list_comparisons(history, night))
-        rows = [(change.campaign, change.metric, change.p_value, change.is_regression) for change in significant]
+        changes = find_changes(list_comparisons(history, night))
+        rows = [(change.campaign, change.metric, change.p_value, change.is_regression) for change in changes]
         history.finish(night, FINISHED, rows)
-        plans.publish_page(history, night, out, significant)
+        plans.publish_page(history, night, out, changes)
         statuses = {campaign.exit_code for campaign in history.campaigns(night)}
-    statuses |= {int(Exit.FAILED) for change in significant if change.is_regression}
+    statuses |= {int(Exit.FAILED) for change in changes if change.is_regression}
     raise typer.Exit(next((status for status in (Exit.FAILED, Exit.INSUFFICIENT) if status in statuses), Exit.MET))

@@ -156,6 +156,7 @@ def list_drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
 
 
 def _print_header(configuration: CampaignConfiguration, console: Console) -> None:
+    """Print name, description, scenario, size and sampling of a campaign."""
     for line in (
         f"{configuration.name}: {configuration.description}",
         f"scenario {configuration.scenario}, {count(configuration.total_cases, 'case')}, seed {configuration.seed}",
@@ -189,12 +190,14 @@ def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:
 
 
 def _format_value(value: Any) -> str:
+    """Format a sampled value in a few characters."""
     if isinstance(value, float):
         return f"{value:.5g}"
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
 def _create_table(title: str, *headings: str) -> Table:
+    """Create an empty table with columns for the headings."""
     table = Table(title=title or None, title_justify="left")
     for heading in headings:
         table.add_column(heading, overflow="fold")
@@ -248,6 +251,7 @@ def _write_products(directory: Path, products: Mapping[str, Any]) -> int:
 
 
 def _contains_arrays(value: Any) -> bool:
+    """Whether a product is an array, or contains arrays at any depth."""
     if isinstance(value, Mapping):
         return any(_contains_arrays(item) for item in value.values())
     return isinstance(value, np.ndarray) or (isinstance(value, list) and any(_contains_arrays(item) for item in value))

@@ -169,17 +169,17 @@ def continue_study(directory: Path, jobs: int | None, cluster: str | None, addit
         if additional:
             raise CampaignError(f"{directory} contains a search, which cannot be extended; start a new one")
         with show_progress(directory, next_command) as progress:
-            searched = search_study.continue_search(directory, executor, progress)
-        finish_search(directory, searched)
+            search_result = search_study.continue_search(directory, executor, progress)
+        finish_search(directory, search_result)
     if study.get("kind") == budget_study.KIND:
         if additional:
             raise CampaignError(f"{directory} contains an error budget, which cannot be extended; start a new one")
         with show_progress(directory, next_command) as progress:
-            computed = budget_study.continue_budget(directory, executor, progress)
-        finish_budget(directory, computed)
+            budget_result = budget_study.continue_budget(directory, executor, progress)
+        finish_budget(directory, budget_result)
     with show_progress(directory, next_command) as progress:
-        estimated = rare_study.continue_rare(directory, executor, progress, additional)
-    finish_rare(directory, estimated)
+        rare_result = rare_study.continue_rare(directory, executor, progress, additional)
+    finish_rare(directory, rare_result)
 
 
 def finish_search(directory: Path, result: SearchResult) -> NoReturn:
@@ -193,9 +193,9 @@ def finish_search(directory: Path, result: SearchResult) -> NoReturn:
     campaign = load_stored_campaign(directory, stored_configuration(directory))
     files = write_regression_campaigns(campaign, result, directory)
     for failure in result.failures:
-        replayed = replay(directory, failure.case)
-        if replayed.products is not None:
-            save_packed(case_directory(directory, failure.case), replayed.products, replayed.row)
+        rerun = replay(directory, failure.case)
+        if rerun.products is not None:
+            save_packed(case_directory(directory, failure.case), rerun.products, rerun.row)
     sentences = search_sentences(read_search(read(directory)))
     _write_and_print(directory, [*sentences, *(f"campaign: {path}" for path in files)])
     raise typer.Exit(result.exit_code)

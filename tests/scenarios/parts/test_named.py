@@ -50,7 +50,7 @@ def find_problem(**parts: Any) -> tuple[str, str]:
         (
             {"flight": {"motion": "custom_parts:Glider", "options": {"glide": 1.0}}},
             "flight",
-            "unexpected keyword argument 'glide'; available options: height_m, speed_m_s, glide_ratio, rocking_deg",
+            "unexpected keyword argument 'glide'; available options: height_m, speed_m_s, glide_ratio, roll_deg",
         ),
         (
             {"flight": {"motion": "custom_parts:Glider", "options": {"glide_ratio": 9.0}}},
@@ -95,7 +95,7 @@ def test_options_of_parts_have_defaults_and_round_trip() -> None:
         {"flight": {"motion": "custom_parts:Glider", "options": {"glide_ratio": 0.25}}}
     )
     assert isinstance(p.flight, CustomMotion)
-    assert p.flight.options == {"height_m": 1800.0, "speed_m_s": 60.0, "glide_ratio": 0.25, "rocking_deg": 8.0}
+    assert p.flight.options == {"height_m": 1800.0, "speed_m_s": 60.0, "glide_ratio": 0.25, "roll_deg": 8.0}
     assert p.flight.create().glide_ratio == 0.25
     assert DescentScenarioParameters.model_validate(p.model_dump(mode="json")) == p
 
