@@ -50,13 +50,15 @@ def write_dataset(
     shards = {
         path: range(start, min(start + cases_per_shard, total)) for path, start in zip(paths, starts, strict=True)
     }
-    missing = [(path, cases) for path, cases in shards.items() if not path.exists()]
-    if missing:
+    missing_shards = [(path, cases) for path, cases in shards.items() if not path.exists()]
+    if missing_shards:
         from joblib import Parallel, delayed
 
         # build terrains once here; otherwise each worker process would build them
-        _prepare_terrains(campaign, itertools.chain.from_iterable(cases for _, cases in missing))
-        Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases, bits_per_pixel) for path, cases in missing)
+        _prepare_terrains(campaign, itertools.chain.from_iterable(cases for _, cases in missing_shards))
+        Parallel(n_jobs=jobs)(
+            delayed(_write_shard)(campaign, path, cases, bits_per_pixel) for path, cases in missing_shards
+        )
     return paths
 
 

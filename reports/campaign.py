@@ -198,7 +198,10 @@ def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: 
         "verdict": overall_verdict.word,
         "sentence": overall_verdict.sentence,
         "exit_code": evaluation.exit_code,
-        "verdicts": [asdict(v) | {name: getattr(v, name) for name in _VERDICT_PROPERTIES} for v in evaluation.verdicts],
+        "verdicts": [
+            asdict(verdict) | {name: getattr(verdict, name) for name in _VERDICT_PROPERTIES}
+            for verdict in evaluation.verdicts
+        ],
         "outcomes": dict(outcome_counts(run.all_cases)),
         "metric": metric,
         "statistics": {name: asdict(values) for name, values in summaries},

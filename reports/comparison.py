@@ -91,8 +91,8 @@ def list_compared_algorithms(frame: pd.DataFrame) -> list[str]:
 def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     """Return the rows with the results of a compared algorithm instead of the algorithm under test."""
     prefix = f"{name}."
-    names = [str(column) for column in frame.columns if str(column).startswith(prefix)]
-    new_names = {name: name.removeprefix(prefix) for name in names}
+    columns = [str(column) for column in frame.columns if str(column).startswith(prefix)]
+    new_names = {name: name.removeprefix(prefix) for name in columns}
     return frame.drop(columns=[name for name in new_names.values() if name in frame]).rename(columns=new_names)
 
 
@@ -150,8 +150,11 @@ def compare_algorithms(
         correct_holm([difference.success_p for difference in differences]),
         correct_holm([difference.error_p for difference in differences]),
     )
-    corrected = zip(differences, success_p, error_p, strict=True)
-    return results, [replace(difference, success_p=p, error_p=q) for difference, p, q in corrected]
+    corrected_p_values = zip(differences, success_p, error_p, strict=True)
+    return results, [
+        replace(difference, success_p=success_p_value, error_p=error_p_value)
+        for difference, success_p_value, error_p_value in corrected_p_values
+    ]
 
 
 def comparison_section(subject: Subject) -> Section | None:
@@ -285,8 +288,8 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
         metrics[column] = Metric(label(column), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
     if rates.is_flag(frame, "answered"):
         metrics["answered"] = Metric("answered", True, rates.population_mask(frame, "valid").astype(np.float64))
-    completed = rates.population_mask(frame, "completed").astype(np.float64)
-    metrics["came to an end"] = Metric("came to an end", True, completed)
+    completion = rates.population_mask(frame, "completed").astype(np.float64)
+    metrics["came to an end"] = Metric("came to an end", True, completion)
     return frame, list(metrics.values())
 
 

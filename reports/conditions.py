@@ -135,11 +135,11 @@ def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
 def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
     """Summarize a bin: answers, mean and standard deviation of the signed errors, bound of the 99 % quantile."""
     is_answered = rates.population_mask(rows, "valid")
-    valid = rows[is_answered]
-    magnitude, groups = np.abs(numbers(valid, metric)), rates.terrain_groups(valid)
+    answered_rows = rows[is_answered]
+    magnitude, groups = np.abs(numbers(answered_rows, metric)), rates.terrain_groups(answered_rows)
     finite = np.isfinite(magnitude)
     magnitude, finite_groups = magnitude[finite], None if groups is None else groups[finite]
-    components = [rates.finite_values(valid, column) for column in _signed_components(rows, metric)]
+    components = [rates.finite_values(answered_rows, column) for column in _signed_components(rows, metric)]
     return {
         "name": name,
         "answered": rates.fraction_of(is_answered, rows),

@@ -74,8 +74,9 @@ class ParameterSample:
 @in_page_style
 def draws_figure(title: str, samples: Sequence[ParameterSample]) -> Figure:
     """Draw the marginal distributions of at least one parameter, and below them all pairs of parameters that vary."""
-    varying = [sample for sample in samples if len(set(sample.numbers(sample.values).tolist())) > 1][:MAX_PAIRED]
-    pairs_side = len(varying) * _CELL_SIDE_IN if len(varying) > 1 else 0.0
+    pair_samples = [sample for sample in samples if len(set(sample.numbers(sample.values).tolist())) > 1]
+    pair_samples = pair_samples[:MAX_PAIRED]
+    pairs_side = len(pair_samples) * _CELL_SIDE_IN if len(pair_samples) > 1 else 0.0
     width = max(min(len(samples), _MIN_PER_ROW) * _WIDTH_IN, pairs_side, 2.0 * _WIDTH_IN)
     n_columns = min(len(samples), int(width / _WIDTH_IN))
     n_rows = math.ceil(len(samples) / n_columns)
@@ -95,7 +96,7 @@ def draws_figure(title: str, samples: Sequence[ParameterSample]) -> Figure:
     if pairs_side:
         _write_heading(figure, lower_height, "Pairs. Lower left: values; upper right: Spearman's rank correlation")
         left = _MARGIN_IN + 0.5 * (width - pairs_side)
-        _draw_pairs(_add_axes(figure, (left, 0.5 * _MARGIN_IN), (pairs_side, pairs_side)), varying)
+        _draw_pairs(_add_axes(figure, (left, 0.5 * _MARGIN_IN), (pairs_side, pairs_side)), pair_samples)
     return figure
 
 

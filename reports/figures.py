@@ -256,10 +256,10 @@ def outcome_bars(frame: pd.DataFrame) -> Figure | None:
     counts = outcome_counts(frame)
     if not counts:
         return None
-    answered = answered_outcomes(frame)
+    outcomes_with_answer = answered_outcomes(frame)
     figure, axes = new_axes(6.4, 0.75 + 0.36 * len(counts))
     for row, (name, count) in enumerate(counts):
-        style = "crossed" if name in ENGINE_FAILURES else "full" if name in answered else "hatched"
+        style = "crossed" if name in ENGINE_FAILURES else "full" if name in outcomes_with_answer else "hatched"
         axes.barh(row, count, height=0.66, **BARS[style])
         _annotate(axes, f"{count:,}", (count, row), (4, 0), va="center")
     axes.set_yticks(range(len(counts)), [name for name, _ in counts])

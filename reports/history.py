@@ -296,10 +296,11 @@ def format_night_page(
         end = f"ended {night.finished_utc}"
     lines = [f"# Night {night.night}: {headline}", ""]
     lines.append(f"Started {night.started_utc}, {end}; commit {night.git_commit or 'not known'}.")
-    unfinished = list(takewhile(lambda earlier_night: earlier_night.state != FINISHED, earlier))
-    lines += [""] * bool(unfinished)
+    unfinished_nights = list(takewhile(lambda earlier_night: earlier_night.state != FINISHED, earlier))
+    lines += [""] * bool(unfinished_nights)
     lines += [
-        f"Night {previous.night}, started {previous.started_utc}, was {previous.state}." for previous in unfinished
+        f"Night {previous.night}, started {previous.started_utc}, was {previous.state}."
+        for previous in unfinished_nights
     ]
     lines += ["", "| Campaign | Verdict | |", "|---|---|---|"]
     lines += [f"| {_escape(run.name)} | {_escape(run.verdict)} | {_escape(run.sentence)} |" for run in campaigns]

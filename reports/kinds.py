@@ -110,8 +110,8 @@ def flag_rate(name: str, *conditions: str, value: bool = True) -> RateFunction:
     def compute_rate(frame: Rows) -> CaseFraction:
         all_rows = np.ones(len(frame), dtype=np.bool_)
         masks = (rates.flag_mask(frame, condition) for condition in conditions)
-        selected = frame[np.logical_and.reduce([all_rows, *masks])]
-        return rates.fraction_of(rates.flag_mask(selected, name) == value, selected)
+        selected_rows = frame[np.logical_and.reduce([all_rows, *masks])]
+        return rates.fraction_of(rates.flag_mask(selected_rows, name) == value, selected_rows)
 
     return compute_rate
 

@@ -138,7 +138,9 @@ def check_shape(value: object, *shape: int | None) -> Float[np.ndarray, "..."] |
     values = numeric_product(value)
     if values is None or values.ndim != len(shape):
         return None
-    is_valid = all(expected in (None, length) for expected, length in zip(shape, values.shape, strict=True))
+    is_valid = all(
+        required_length in (None, length) for required_length, length in zip(shape, values.shape, strict=True)
+    )
     return values if is_valid else None
 
 

@@ -23,11 +23,11 @@ def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 
 
     Missing values and unfinished cases are no successes. A metric may be a sum of columns, joined by " + ".
     """
-    finished = ~engine_failed(frame)
+    is_finished = ~engine_failed(frame)
     if math.isnan(bound):
-        return np.asarray(flag_mask(frame, metric) & finished, dtype=np.bool_)
+        return np.asarray(flag_mask(frame, metric) & is_finished, dtype=np.bool_)
     values = sum((numbers(frame, part) for part in metric.split(" + ")), np.zeros(len(frame)))
-    return np.asarray((np.abs(scale * values) <= bound) & finished, dtype=np.bool_)
+    return np.asarray((np.abs(scale * values) <= bound) & is_finished, dtype=np.bool_)
 
 
 def population_mask(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
@@ -42,7 +42,7 @@ def population_and_unknown_masks(
     frame: pd.DataFrame, parts: Sequence[str]
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Create the masks of the intersection of populations, and of its cases with a missing flag."""
-    is_member, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
+    is_member, is_unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
     for population in parts:
         if population == "completed":
             is_member &= ~engine_failed(frame)
@@ -50,10 +50,10 @@ def population_and_unknown_masks(
             column = "answered" if population == "valid" else population
             if not is_flag(frame, column):
                 raise ValueError(f"the rows have no column '{column}' of true and false, which defines a population")
-            missing = frame[column].isna().to_numpy(dtype=np.bool_)
-            is_member &= flag_mask(frame, column) | missing
-            unknown |= missing
-    return is_member, is_member & unknown
+            is_missing = frame[column].isna().to_numpy(dtype=np.bool_)
+            is_member &= flag_mask(frame, column) | is_missing
+            is_unknown |= is_missing
+    return is_member, is_member & is_unknown
 
 
 def is_flag(frame: pd.DataFrame, column: str) -> bool:

@@ -66,11 +66,11 @@ class StoredRun:
     @property
     def command(self) -> tuple[str, tuple[str, ...]] | None:
         """Working folder and words of the command that ran the campaign; None if unknown."""
-        stored = table(self.record.get("command"))
-        words = stored.get("words")
+        stored_command = table(self.record.get("command"))
+        words = stored_command.get("words")
         if not isinstance(words, list) or not words:
             return None
-        return str(stored.get("folder") or ""), tuple(str(word) for word in words)
+        return str(stored_command.get("folder") or ""), tuple(str(word) for word in words)
 
     def recorded(self, key: str) -> Any:
         """Return the value of a key in the record or in its configuration; None if missing."""

@@ -77,8 +77,10 @@ def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
         return []
     counts = frame["outcome"].astype("object").fillna("(none)").astype(str).value_counts()
     pairs = [(str(name), int(count)) for name, count in counts.items()]
-    answered = answered_outcomes(frame)
-    return sorted(pairs, key=lambda pair: (pair[0] in ENGINE_FAILURES, pair[0] not in answered, -pair[1], pair[0]))
+    outcomes_with_answer = answered_outcomes(frame)
+    return sorted(
+        pairs, key=lambda pair: (pair[0] in ENGINE_FAILURES, pair[0] not in outcomes_with_answer, -pair[1], pair[0])
+    )
 
 
 def answered_outcomes(frame: pd.DataFrame) -> set[str]:

@@ -248,8 +248,8 @@ def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks:
     upper = proportions.proportion_upper(n - failures, n, levels[1])
     verdict = replace(verdict, lower=lower, upper=upper, plain_lower=lower, plain_upper=upper)
     if groups is None or int(groups.max()) + 1 == n:
-        needed = _cases_needed(first_n, n, failures, probability, confidence, looks)
-        return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), needed - n
+        needed_cases = _cases_needed(first_n, n, failures, probability, confidence, looks)
+        return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), needed_cases - n
     evidence = clustered_evidence(success, groups, confidence)
     in_first_look = np.ones(n, dtype=np.bool_) if looks.in_first_look is None else looks.in_first_look
     if np.unique(groups[in_first_look]).size != first_n:
@@ -265,10 +265,10 @@ def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks:
     else:
         weight = evidence.effective_n / n
         size, n_failed = math.floor(evidence.effective_n), math.ceil(failures * weight)
-    needed = _cases_needed(first_n, size, n_failed, probability, confidence, looks)
+    needed_cases = _cases_needed(first_n, size, n_failed, probability, confidence, looks)
     verdict = replace(verdict, lower=evidence.lower, upper=evidence.upper, clustered=evidence)
     # convert effective cases to cases
-    additional = math.ceil((needed - size) / weight)
+    additional = math.ceil((needed_cases - size) / weight)
     return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), additional
 
 
@@ -351,9 +351,9 @@ def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: Sam
         text = str(error)
         return replace(verdict, reason=f"{text[:1].upper()}{text[1:]}.")
     if population.empty:
-        needed = LaterLook(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
+        needed_cases = LaterLook(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
-        return replace(verdict, reason=reason, further_cases=needed if sampling.independent else None)
+        return replace(verdict, reason=reason, further_cases=needed_cases if sampling.independent else None)
     verdicts = (_decide(verdict, cases, sampling, frame) for cases in (population, population_and_unfinished))
     return _withhold_if_uncertain(*verdicts)
 
@@ -366,18 +366,21 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
     """
     if verdict.status in (Status.FAIL, Status.INSUFFICIENT, with_unfinished.status):
         return verdict
-    unfinished = with_unfinished.n - verdict.n
+    n_unfinished = with_unfinished.n - verdict.n
     reason = (
-        f"{count(unfinished, 'case')} did not finish and {'belongs' if unfinished == 1 else 'belong'} to no population "
-        f"of answers. If they are counted as failures, the verdict is not {verdict.status}. It is therefore withheld."
+        f"{count(n_unfinished, 'case')} did not finish and {'belongs' if n_unfinished == 1 else 'belong'} to no "
+        f"population of answers. If they are counted as failures, the verdict is not {verdict.status}. It is therefore "
+        "withheld."
     )
     return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
 
 
 def _decide(verdict: Verdict, population: pd.DataFrame, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:
     """Decide the verdict from the cases of its population (at least one) and from all cases (`frame`)."""
-    _, unknown = rates.population_and_unknown_masks(population, verdict.population.split(" and "))
-    success = np.asarray(rates.success_mask(population, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
+    _, has_unknown_flag = rates.population_and_unknown_masks(population, verdict.population.split(" and "))
+    success = np.asarray(
+        rates.success_mask(population, verdict.metric, verdict.bound, verdict.scale) & ~has_unknown_flag
+    )
     n, failures, groups = success.size, int((~success).sum()), rates.terrain_groups(population)
     rate, decides_by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
     terrains = None if groups is None else int(population["terrain"].nunique())

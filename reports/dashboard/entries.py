@@ -268,7 +268,8 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
 
 def sparkline(verdicts: Sequence[RequirementVerdict]) -> Sparkline | None:
     """Create the line of observed rates over time and of the required rate; None for fewer than two campaigns."""
-    finite = [v for v in verdicts if math.isfinite(v.estimate) and math.isfinite(v.probability)][-_MAX_POINTS:]
+    finite = [verdict for verdict in verdicts if all(map(math.isfinite, (verdict.estimate, verdict.probability)))]
+    finite = finite[-_MAX_POINTS:]
     if len(finite) < 2:
         return None
     rates = [verdict.estimate for verdict in finite]
@@ -281,7 +282,7 @@ def sparkline(verdicts: Sequence[RequirementVerdict]) -> Sparkline | None:
     def compute_y(rate: float) -> float:
         return round(3.0 + (_HEIGHT_PX - 6.0) * (1.0 - rate) / (1.0 - low), 2)
 
-    points = [(round(4.0 + step_px * k, 2), compute_y(rate)) for k, rate in enumerate(rates)]
+    points = [(round(4.0 + step_px * index, 2), compute_y(rate)) for index, rate in enumerate(rates)]
     text = f"{len(finite)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
     return Sparkline(" ".join(f"{x},{y}" for x, y in points), points[-1], compute_y(finite[-1].probability), text)
 
@@ -292,8 +293,8 @@ def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     ordered = dict.fromkeys(("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS", *statuses))
     present_statuses = [status for status in ordered if status in statuses]
     counts = [(status, statuses.count(status)) for status in present_statuses]
-    missing = sum(row.latest is None for row in rows)
-    return [*counts, ("NO CAMPAIGN", missing)] if missing else counts
+    n_missing = sum(row.latest is None for row in rows)
+    return [*counts, ("NO CAMPAIGN", n_missing)] if n_missing else counts
 
 
 def evidence_text(verdict: RequirementVerdict) -> str:

@@ -122,11 +122,11 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
         ("roughness (m)", maps.roughness_m, truth.roughness_m * coverage, float(limits[1])),
         ("slope (deg)", degrees, np.degrees(truth.slope_rad) * coverage, float(np.degrees(limits[0]))),
     )
-    for upper, lower, (name, estimated, true_values, limit) in zip(map_row, truth_row, maps_by_name, strict=False):
+    for upper, lower, (name, map_values, true_values, limit) in zip(map_row, truth_row, maps_by_name, strict=False):
         colour_scale = {"vmin": -max_deviation_m, "vmax": max_deviation_m, "cmap": ELEVATION_COLOURS}
         if limit is not None:
             colour_scale = {"vmin": 0.0, "vmax": 2.0 * limit, "cmap": HAZARD_COLOURS}
-        image = upper.imshow(estimated, interpolation="nearest", **colour_scale)
+        image = upper.imshow(map_values, interpolation="nearest", **colour_scale)
         lower.pcolormesh(cells[..., 1], cells[..., 0], true_values, shading="nearest", rasterized=True, **colour_scale)
         colour_bar = figure.colorbar(
             image, ax=[upper, lower], orientation="horizontal", shrink=0.9, pad=0.02, aspect=30
@@ -296,7 +296,9 @@ def _draw_terrain(
     sides = maps.cell_m * np.array([columns, rows])
     height_range_m = float(np.nanmax(heights) - np.nanmin(heights))
     # exaggerate heights so that the relief of flat ground is visible
-    exaggeration = next((k for k in (1.0, 2.0, 5.0) if k * height_range_m >= _MIN_RELIEF * sides.max()), 10.0)
+    exaggeration = next(
+        (factor for factor in (1.0, 2.0, 5.0) if factor * height_range_m >= _MIN_RELIEF * sides.max()), 10.0
+    )
     style: dict[str, Any] = {"vert_exag": exaggeration, "dx": maps.cell_m, "dy": maps.cell_m, "blend_mode": "soft"}
     shaded = LightSource(315.0, 45.0).shade_rgb(np.asarray(colours), np.nan_to_num(heights), **style)
     subset = np.s_[::step, ::step]

@@ -236,16 +236,16 @@ def tracking_curves(frame: pd.DataFrame) -> list[TrackingCurve]:
     is_unchanged = is_complete & ~is_changed.any(axis=0)
     result = []
     for change, size, has_change in zip(changes, sizes, is_changed, strict=True):
-        selected = is_complete & (has_change | is_unchanged)
+        is_selected = is_complete & (has_change | is_unchanged)
         rounded = np.where(has_change, np.round(size, 1), 0.0)
-        if np.unique(rounded[selected]).size >= _MIN_SIZES:
+        if np.unique(rounded[is_selected]).size >= _MIN_SIZES:
             points = []
-            for value in np.unique(rounded[selected]):
-                flights = frame[selected & (rounded == value)]
+            for value in np.unique(rounded[is_selected]):
+                flights = frame[is_selected & (rounded == value)]
                 # a flight without tracks counts as zero of its visible features
-                tracked = pooled_rate(flights, "tracks_correct", "features_in_view")
+                tracked_rate = pooled_rate(flights, "tracks_correct", "features_in_view")
                 points.append(
-                    SizeResult(float(value), tracked, len(flights), int(flag_mask(flights, "tracked_well").sum()))
+                    SizeResult(float(value), tracked_rate, len(flights), int(flag_mask(flights, "tracked_well").sum()))
                 )
             result.append(TrackingCurve(change, points, find_knee(points, 1.0), find_knee(points, -1.0)))
     return result

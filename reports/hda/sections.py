@@ -343,9 +343,9 @@ def create_outcome_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> ki
 
 def hazard_distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
     """Collect the distances of reported sites and of touchdowns to the nearest true hazard, metres."""
-    reported = frame[rates.flag_mask(frame, "site_reported")]
+    rows_with_site = frame[rates.flag_mask(frame, "site_reported")]
     return {
-        "reported site": rates.finite_values(reported, "site_hazard_distance_m"),
+        "reported site": rates.finite_values(rows_with_site, "site_hazard_distance_m"),
         "touchdown": rates.finite_values(frame, "touchdown_hazard_distance_m"),
     }
 

@@ -90,7 +90,10 @@ def difference_p_value(first: Sample, second: Sample, permutations: int = 10_000
         cases = int(min(counts))
         pairs = [(first.terrain_means(cases), second.terrain_means(cases))]
     else:
-        pairs = [(first.values[first.terrains == k], second.values[second.terrains == k]) for k in common_terrains]
+        pairs = [
+            (first.values[first.terrains == terrain], second.values[second.terrains == terrain])
+            for terrain in common_terrains
+        ]
     are_rates = all(np.isin(values, (0.0, 1.0)).all() for pair in pairs for values in pair)
     return _test_rates(pairs) if are_rates else _test_ranks(pairs, permutations)
 
@@ -106,7 +109,7 @@ def _test_rates(pairs: Pairs) -> float:
     tables = [table for table in tables if 0 < table[2] < table[3]]
     if not tables:
         return 1.0
-    observed = sum(table[0] for table in tables)
+    observed_sum = sum(table[0] for table in tables)
     if sum(min(size, successes) for _, size, successes, _ in tables) > _MAX_EXACT:
         _, first_sizes, success_counts, case_counts = np.array(tables, dtype=np.float64).T
         # mean and variance of the hypergeometric distribution; continuity correction of 0.5
@@ -119,14 +122,14 @@ def _test_rates(pairs: Pairs) -> float:
                 / (case_counts**2 * (case_counts - 1.0))
             ).sum()
         )
-        excess = max(0.0, abs(observed - float((first_sizes * success_counts / case_counts).sum())) - 0.5)
+        excess = max(0.0, abs(observed_sum - float((first_sizes * success_counts / case_counts).sum())) - 0.5)
         return float(2.0 * stats.norm.sf(excess / math.sqrt(variance)))
     distribution, minimum = np.ones(1), 0
     for _, size, successes, cases in tables:
         low, high = max(0, size + successes - cases), min(size, successes)
         distribution = np.convolve(distribution, stats.hypergeom.pmf(np.arange(low, high + 1), cases, successes, size))
         minimum += low
-    index = observed - minimum
+    index = observed_sum - minimum
     return float(min(1.0, 2.0 * min(distribution[: index + 1].sum(), distribution[index:].sum())))
 
 

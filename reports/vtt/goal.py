@@ -64,20 +64,21 @@ def summarize_cameras(runs: Rows) -> list[dict[str, Any]]:
     rows = []
     for camera, camera_rows in _group_by_camera(runs):
         is_completed = np.isfinite(numbers(camera_rows, "position_error_m"))
-        completed = camera_rows[is_completed]
-        error, drift = rates.finite_values(completed, "position_error_m"), rates.finite_values(completed, "drift_px")
+        completed_runs = camera_rows[is_completed]
+        error, drift = (rates.finite_values(completed_runs, name) for name in ("position_error_m", "drift_px"))
+        _, bound = quantile_bounds(error, QUANTILE, CONFIDENCE, rates.terrain_groups(completed_runs))
         rows.append(
             {
                 "camera": camera,
                 "completed": rates.fraction_of(is_completed, camera_rows),
                 "tracked": rates.flag_fraction(camera_rows, "tracked"),
-                "within": rates.fraction_of(error <= MAX_ERROR_M, completed),
+                "within": rates.fraction_of(error <= MAX_ERROR_M, completed_runs),
                 "false_tracks": rates.flag_fraction(camera_rows, "true_track", value=False),
                 "median_m": rates.quantile(error, 0.5),
                 "quantile_m": rates.quantile(error, QUANTILE),
-                "quantile_bound_m": quantile_bounds(error, QUANTILE, CONFIDENCE, rates.terrain_groups(completed))[1],
-                "range_rms_m": rates.rms(rates.finite_values(completed, "range_error_m")),
-                "cross_rms_m": rates.rms(rates.finite_values(completed, "cross_error_m")),
+                "quantile_bound_m": bound,
+                "range_rms_m": rates.rms(rates.finite_values(completed_runs, "range_error_m")),
+                "cross_rms_m": rates.rms(rates.finite_values(completed_runs, "cross_error_m")),
                 "drift_median_px": rates.quantile(drift, 0.5),
                 "drift_quantile_px": rates.quantile(drift, QUANTILE),
             }

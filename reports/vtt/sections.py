@@ -42,8 +42,10 @@ def table_1_section(subject: Subject) -> Section | None:
     accuracy = measured_accuracy(subject.frame)
     if not accuracy:
         return None
-    computed = {row.name: row for row in table_1()}
-    pairs = [(source, row[name]) for name in PRINTED for source, row in (("paper", PRINTED), ("computed", computed))]
+    computed_rows = {row.name: row for row in table_1()}
+    pairs = [
+        (source, row[name]) for name in PRINTED for source, row in (("paper", PRINTED), ("computed", computed_rows))
+    ]
     grid = build_grid(
         pairs,
         {
@@ -60,7 +62,7 @@ def table_1_section(subject: Subject) -> Section | None:
         Block(heading="Measured", grid=_measured_grid(accuracy), note=measured_note),
     ]
     data = {
-        "computed": {name: asdict(row) for name, row in computed.items()},
+        "computed": {name: asdict(row) for name, row in computed_rows.items()},
         "printed": {name: asdict(row) for name, row in PRINTED.items()},
         "measured": accuracy,
     }
@@ -79,11 +81,13 @@ def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
         return []
     distances = {"range_start_m": START_M, "range_end_m": GOAL_M}
     is_near = [np.abs(numbers(frame, name) / value - 1.0) < _MAX_DEVIATION for name, value in distances.items()]
-    completed = selectable_targets(frame[is_near[0] & is_near[1] & np.isfinite(numbers(frame, "position_error_m"))])
+    completed_runs = selectable_targets(
+        frame[is_near[0] & is_near[1] & np.isfinite(numbers(frame, "position_error_m"))]
+    )
     # factor 300: 3 sigma in centimetres
     rows = []
-    for camera in sorted(completed["camera"].unique()):
-        runs = completed[completed["camera"].eq(camera)]
+    for camera in sorted(completed_runs["camera"].unique()):
+        runs = completed_runs[completed_runs["camera"].eq(camera)]
         designation, pose = numbers(runs, "designation_error_m"), numbers(runs, "pose_error_m")
         rows.append(
             {
@@ -115,8 +119,8 @@ def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
         )
         paper = [NOTHING] * 3
         if printed_row is not None:
-            tracked = tracked_approach_error_m(printed_row.stereo_cm, printed_row.drift_cm_px * row["drift_px"])
-            paper = [f"{printed_row.designation_cm:g}", f"{printed_row.untracked_cm:.1f}", f"{tracked:.1f}"]
+            tracked_cm = tracked_approach_error_m(printed_row.stereo_cm, printed_row.drift_cm_px * row["drift_px"])
+            paper = [f"{printed_row.designation_cm:g}", f"{printed_row.untracked_cm:.1f}", f"{tracked_cm:.1f}"]
         first_texts = [row["camera"], f"{row['runs']:,}", f"{row['designation_cm']:.1f}", paper[0]]
         second_texts = [number(row["disparity_px"]), f"{row['untracked_cm']:.1f}", paper[1]]
         rows.append([*first_texts, *second_texts, f"{row['tracked_cm']:.1f}", paper[2], f"{row['drift_px']:.1f}"])
@@ -149,8 +153,10 @@ def table_4_grid(frame: Rows, legs: Sequence[Mapping[str, Any]]) -> Grid:
         is_reached = is_in_mode.any(axis=1)
         end = np.where(is_in_mode, update_minutes, -np.inf).max(axis=1)
         counts, minutes = is_in_mode.sum(axis=1).astype(np.float64), (end - previous_end)[is_reached]
-        simulated = (rates.median_text(counts[is_reached], 0), rates.median_text(minutes, 1))
-        rows.append([mode["name"], f"{mode['updates']}", simulated[0], f"{mode['minutes']:g}", simulated[1]])
+        simulated_texts = (rates.median_text(counts[is_reached], 0), rates.median_text(minutes, 1))
+        rows.append(
+            [mode["name"], f"{mode['updates']}", simulated_texts[0], f"{mode['minutes']:g}", simulated_texts[1]]
+        )
         previous_end = np.where(is_reached, end, previous_end)
     return Grid(["Mode", "Updates, paper", "Updates, ours", "Minutes, paper", "Minutes, ours"], rows)
 
@@ -209,8 +215,8 @@ def updates_section(subject: Subject) -> Section | None:
                     else NOTHING
                     for update_number in values
                 ]
-                simulated = [rates.median_text(np.abs(update[suffix]), digits) for update in values.values()]
-                comparison_rows += [[heading, "paper", *paper], ["", "ours", *simulated]]
+                simulated_texts = [rates.median_text(np.abs(update[suffix]), digits) for update in values.values()]
+                comparison_rows += [[heading, "paper", *paper], ["", "ours", *simulated_texts]]
         table_3 = Grid(
             ["Parameter", "Rover position", *(str(update_number) for update_number in values)], comparison_rows
         )
@@ -358,13 +364,13 @@ def terrains_section(subject: Subject) -> Section | None:
         row = printed_rows.get(name)
         paper = [NOTHING] * 2 if row is None else [f"{row['failures']} of {row['trials']}", row["reason"]]
         causes = "; ".join(f"{cause}: {n}" for cause, n in cause_counts.items()) or "none"
-        simulated = [
+        simulated_texts = [
             rates.fraction_text(failure_fraction),
             rates.interval_text(failure_fraction),
             causes,
             rates.fraction_text(failure_fraction_all),
         ]
-        rows.append([name, *paper, *simulated, percent(slip)])
+        rows.append([name, *paper, *simulated_texts, percent(slip)])
         fractions = {"failed": asdict(failure_fraction), "failed_all": asdict(failure_fraction_all)}
         data.append({"name": name, **fractions, "causes": cause_counts, "slip_max": slip})
     head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{format_fraction(CONFIDENCE)} interval"]

@@ -133,12 +133,12 @@ class EstimatorSuite(Suite):
 
     def _check_restart(self) -> str:
         measurements = self.protocol.measurements()
-        expected = fingerprint(self._answer(measurements))
+        expected_fingerprint = fingerprint(self._answer(measurements))
         estimator = self.make()
         estimator.stream.start()
         for frame in copy_inputs(inputs.make_noisy(measurements)).frames()[:2]:
             estimator.stream.picture(frame)
-        if fingerprint(estimator.estimate(copy_inputs(measurements))) != expected:
+        if fingerprint(estimator.estimate(copy_inputs(measurements))) != expected_fingerprint:
             raise BreachError("after a restart in the middle of a descent, its answer differs")
         return ""
 

@@ -120,7 +120,7 @@ def landing() -> LandingMeasurements:
     attitudes = [Rotation.from_euler("ZYX", angles, degrees=True) for angles in ((10, 3, -2), (10.2, 2.8, -1.9))]
     times = [0.0, 2.0]
     first, second = _take_images(preset("xc-55"), _LANDING_POSITIONS_M, attitudes, times, step_m=0.03)
-    poses = [PoseMeasurement(rigid(attitudes[k], _LANDING_POSITIONS_M[k]), times[k]) for k in (0, 1)]
+    poses = [PoseMeasurement(rigid(attitudes[index], _LANDING_POSITIONS_M[index]), times[index]) for index in (0, 1)]
     axis = attitudes[0].apply(first.camera.a.copy())
     slant_range_m = -_LANDING_POSITIONS_M[0, 2] / axis[2]
     return LandingMeasurements(
