@@ -119,13 +119,15 @@ def compare_with_baseline(
 ) -> PairedComparison:
     """Compare another algorithm with the first, from rows of the same cases in the same order."""
     first_error, other_error = (np.abs(numbers(frame, metric)) for frame in (first, other))
-    have_errors, groups = np.isfinite(first_error) & np.isfinite(other_error), rates.terrain_groups(first)
+    both_answered, groups = np.isfinite(first_error) & np.isfinite(other_error), rates.terrain_groups(first)
     success: tuple[int | None, int | None, float] = (None, None, math.nan)
     if bound is not None:
         success = compare_successes(first_error <= bound, other_error <= bound, groups)
-    answered_groups = None if groups is None else groups[have_errors]
-    mean, lower, upper, p_value = compare_errors((other_error - first_error)[have_errors], answered_groups, CONFIDENCE)
-    return PairedComparison(name, *success, int(have_errors.sum()), mean, lower, upper, p_value)
+    answered_groups = None if groups is None else groups[both_answered]
+    mean, lower, upper, p_value = compare_errors(
+        (other_error - first_error)[both_answered], answered_groups, CONFIDENCE
+    )
+    return PairedComparison(name, *success, int(both_answered.sum()), mean, lower, upper, p_value)
 
 
 def compare_algorithms(
@@ -195,23 +197,12 @@ def comparison_grids(
         },
     )
     tested_name = results[0].name if results else ""
-    rows = [
-        [
-            *(
-                difference.name,
-                *(
-                    NOTHING if cases is None else f"{cases:,}"
-                    for cases in (difference.only_first, difference.only_other)
-                ),
-            ),
-            *(p_text(difference.success_p), f"{difference.pairs:,}"),
-            f"{number(difference.mean)} ({number(difference.lower)} to {number(difference.upper)})"
-            if difference.pairs
-            else NOTHING,
-            p_text(difference.error_p),
-        ]
-        for difference in differences
-    ]
+    rows = []
+    for difference in differences:
+        successes = [NOTHING if n is None else f"{n:,}" for n in (difference.only_first, difference.only_other)]
+        mean_text = f"{number(difference.mean)} ({number(difference.lower)} to {number(difference.upper)})"
+        texts = [difference.name, *successes, p_text(difference.success_p), f"{difference.pairs:,}"]
+        rows.append([*texts, mean_text if difference.pairs else NOTHING, p_text(difference.error_p)])
     head = ["Algorithm", f"Success only: {tested_name}", "Success only: other", "p (success)", "Cases answered by both"]
     return first, Grid([*head, f"Difference{unit}", "p (error)"], rows)
 

@@ -80,10 +80,8 @@ def draws_figure(title: str, samples: Sequence[ParameterSample]) -> Figure:
     width = max(min(len(samples), _MIN_PER_ROW) * _WIDTH_IN, pairs_side, 2.0 * _WIDTH_IN)
     n_columns = min(len(samples), int(width / _WIDTH_IN))
     n_rows = math.ceil(len(samples) / n_columns)
-    upper_height, lower_height = (
-        n_rows * _HEIGHT_IN + _HEADING_HEIGHT_IN,
-        pairs_side + _HEADING_HEIGHT_IN if pairs_side else 0.0,
-    )
+    upper_height = n_rows * _HEIGHT_IN + _HEADING_HEIGHT_IN
+    lower_height = pairs_side + _HEADING_HEIGHT_IN if pairs_side else 0.0
     figure = Figure(figsize=(width + 2.0 * _MARGIN_IN, upper_height + lower_height))
     cases = count(len(samples[0].values), "case")
     heading = f"{title}: {cases} as sampled. Line: expected from the distribution"

@@ -149,12 +149,9 @@ def _evaluate_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVer
     if not result:
         return OverallVerdict(Status.INSUFFICIENT, crashed, "The study is not finished.")
     if study.get("kind") == "search":
-        violations_text = (
-            f"{count(int(result.get('violations') or 0), 'violation')} of {study.get('requirement')} found"
-        )
-        return OverallVerdict(
-            Status.FAIL if result.get("violations") else None, crashed, f"{violations_text}. See the section."
-        )
+        violations, status = int(result.get("violations") or 0), Status.FAIL if result.get("violations") else None
+        sentence = f"{count(violations, 'violation')} of {study.get('requirement')} found. See the section."
+        return OverallVerdict(status, crashed, sentence)
     statement = f"a violation of {study.get('requirement')} has a probability of at most {study.get('max_probability')}"
     return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {statement}.")
 
@@ -227,7 +224,7 @@ def next_look(verdicts: Sequence[Verdict], sampling: SamplingDesign, cases: int)
             continue
         confidence = confidence_at(verdict.confidence, risk_fraction)
         successes, n = verdict.n - verdict.failures, verdict.n + remaining
-        # bounds for independent cases; bounds for shared terrains are at most as tight
+        # bounds for independent cases; bounds for shared terrains are not tighter
         can_pass = proportion_lower(successes + remaining, n, confidence) >= verdict.probability
         if can_pass or proportion_upper(successes, n, confidence) < verdict.probability:
             return next(look.cases for look in planned_looks(sampling.max_cases) if look.cases > cases)

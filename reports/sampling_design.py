@@ -48,9 +48,9 @@ class TerrainSupply:
         if not self.key.endswith(".bank"):
             return f"{text} Widen the range of {self.key}, and the bank, and run the campaign again."
         # 1.1 n random draws from 10 n terrains give 10 n (1 - exp(-0.11)) = 1.04 n different terrains on average
-        bank, cases = (
-            (min_terrains, min_terrains) if self.in_turn else (10 * min_terrains, math.ceil(1.1 * min_terrains))
-        )
+        bank, cases = 10 * min_terrains, math.ceil(1.1 * min_terrains)
+        if self.in_turn:
+            bank = cases = min_terrains
         remedy = f"{bank:,} stored terrains and {cases:,} cases: --set {self.key}={bank} -n {cases}."
         return f"{text} Run the campaign again with {remedy}"
 

@@ -295,10 +295,8 @@ def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
         rates.flag_mask(frame, name) for name in ("site_reported", "no_safe_site_exists", "wide_site_exists", "landed")
     )
     is_refused, is_safe = rates.flag_mask(frame, "no_site_reported"), rates.flag_mask(frame, "site_safe")
-    has_narrow_site, is_correct = (
-        rates.flag_mask(frame, "safe_site_exists") & ~has_wide_site,
-        is_refused | (is_reported & is_safe),
-    )
+    has_narrow_site = rates.flag_mask(frame, "safe_site_exists") & ~has_wide_site
+    is_correct = is_refused | (is_reported & is_safe)
     fractions = {
         "chosen sites that are truly safe": rates.fraction_of(is_safe[is_reported], frame[is_reported]),
         "answer 'no safe site' if none exists": rates.fraction_of(

@@ -79,10 +79,8 @@ def difference_p_value(first: Sample, second: Sample, permutations: int = 10_000
     if min(first.values.size, second.values.size) == 0:
         return math.nan
     common_terrains = np.intersect1d(first.terrains, second.terrains)
-    if (
-        min(float(np.isin(sample.terrains, common_terrains).mean()) for sample in (first, second))
-        < _MIN_COMMON_FRACTION
-    ):
+    common_fractions = [float(np.isin(sample.terrains, common_terrains).mean()) for sample in (first, second)]
+    if min(common_fractions) < _MIN_COMMON_FRACTION:
         # the same number of cases on each terrain, since the variance of a mean depends on this number
         counts = (
             np.quantile(sample.cases_on_terrains(), 1.0 - _FULL_FRACTION, method="lower") for sample in (first, second)

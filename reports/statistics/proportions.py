@@ -244,13 +244,13 @@ class LaterLook:
     def log_threshold(self) -> float:
         """Logarithm of the likelihood ratio that supports the verdict at a later look."""
         events = np.arange(self.first + 1, dtype=np.float64)
-        decided_events = events[stats.binom.cdf(events, self.first, self.rate) <= self.risk]
-        log_probability = stats.binom.logpmf(decided_events, self.first, self.rate)
+        deciding_events = events[stats.binom.cdf(events, self.first, self.rate) <= self.risk]
+        log_probability = stats.binom.logpmf(deciding_events, self.first, self.rate)
         spent_risk = float(np.exp(log_probability).sum())
-        # the likelihood ratio has the mean 1; part of the mean from results that do not decide at the first look
-        log_ratio = _log_likelihood_ratio(decided_events, self.first, self.rate)
-        remaining = 1.0 - float(np.exp(log_probability + log_ratio).sum())
-        return math.log(max(_MIN_RISK, remaining) / max(_MIN_RISK, self.risk - spent_risk))
+        # mean of the likelihood ratio over the results that do not decide at the first look; the mean over all is 1
+        log_ratio = _log_likelihood_ratio(deciding_events, self.first, self.rate)
+        undecided_mean = 1.0 - float(np.exp(log_probability + log_ratio).sum())
+        return math.log(max(_MIN_RISK, undecided_mean) / max(_MIN_RISK, self.risk - spent_risk))
 
     def risk_of_bound(self, n: float | int) -> float:
         """Compute the risk at which the one-sided Clopper-Pearson bound of n cases supports the verdict."""
@@ -263,8 +263,8 @@ class LaterLook:
         min_events, max_events = 0.0, float(n)
         while max_events - min_events > 1e-9 * max(1.0, n):
             events = 0.5 * (min_events + max_events)
-            is_enough = _log_likelihood_ratio(events, n, self.rate) >= self.log_threshold
-            min_events, max_events = (events, max_events) if is_enough else (min_events, events)
+            is_supported = _log_likelihood_ratio(events, n, self.rate) >= self.log_threshold
+            min_events, max_events = (events, max_events) if is_supported else (min_events, events)
         return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - min_events, min_events + 1.0))))
 
     def cases_needed(self, n: int, events: int) -> int:
@@ -288,7 +288,8 @@ def _log_likelihood_ratio(
     increases with every case without an event.
     """
     events = np.asarray(events, dtype=np.float64)
-    likelihood = special.betaln(events + 0.5, n - events + 0.5) - special.betaln(0.5, 0.5)
+    # marginal likelihood of the prior without truncation, and the factor of the truncation
+    log_marginal = special.betaln(events + 0.5, n - events + 0.5) - special.betaln(0.5, 0.5)
     with np.errstate(divide="ignore"):
-        weight = np.log(special.betainc(events + 0.5, n - events + 0.5, rate) / special.betainc(0.5, 0.5, rate))
-    return np.asarray(likelihood + weight - events * math.log(rate) - (n - events) * math.log1p(-rate))
+        log_weight = np.log(special.betainc(events + 0.5, n - events + 0.5, rate) / special.betainc(0.5, 0.5, rate))
+    return np.asarray(log_marginal + log_weight - events * math.log(rate) - (n - events) * math.log1p(-rate))

@@ -94,6 +94,7 @@ def _standard_error(residuals: Float[np.ndarray, " terrains"], n: int) -> float:
 
 
 def _unite_intervals(first: Interval, second: Interval) -> Interval:
+    """Return the smallest interval that contains both; NaN bounds are ignored."""
     return float(np.fmin(first[0], second[0])), float(np.fmax(first[1], second[1]))
 
 
