@@ -2,8 +2,8 @@
 
 A shard is a tar file with all images of its cases. The files of an image have a common key: 16-bit image (`image.png`),
 range (`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; for landings `hazard.png`: 0 safe,
-1 hazard, 255 unknown), camera model (`cahvor`) and metadata (`json`). Shards of the same campaign are identical byte by
-byte. Existing shards are complete and are not written again, so that an interrupted command can be repeated.
+1 hazard, 255 unknown), camera model (`cahvor`) and metadata (`json`). Two runs of the same campaign write
+byte-identical shards. Existing shards are complete and are not written again; an interrupted command can be repeated.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def write_dataset(
 ) -> list[Path]:
     """Write the shards that do not exist; return the paths of all shards.
 
-    `bits_per_pixel`: compress images with loss to this size; None: no compression with loss.
+    `bits_per_pixel`: size of the images after lossy compression; None for no lossy compression.
     Raises CampaignError if the scenario provides no samples, or the folder is read-only or contains another data set.
     """
     if not isinstance(campaign.scenario, ProvidesSamples):
@@ -50,21 +50,23 @@ def write_dataset(
     shards = {
         path: range(start, min(start + cases_per_shard, total)) for path, start in zip(paths, starts, strict=True)
     }
-    missing = [(path, cases) for path, cases in shards.items() if not path.exists()]
-    if missing:
+    missing_shards = [(path, cases) for path, cases in shards.items() if not path.exists()]
+    if missing_shards:
         from joblib import Parallel, delayed
 
         # build terrains once here; otherwise each worker process would build them
-        _prepare_terrains(campaign, itertools.chain.from_iterable(cases for _, cases in missing))
-        Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases, bits_per_pixel) for path, cases in missing)
+        _prepare_terrains(campaign, itertools.chain.from_iterable(cases for _, cases in missing_shards))
+        Parallel(n_jobs=jobs)(
+            delayed(_write_shard)(campaign, path, cases, bits_per_pixel) for path, cases in missing_shards
+        )
     return paths
 
 
 def _prepare_terrains(campaign: Campaign, cases: Iterable[int]) -> None:
     """Build the terrains (shared inputs) of the cases that are not in the cache."""
-    base = campaign.base_parameters()
+    parameters = campaign.base_parameters()
     for number in plan_inputs(campaign, cases).to_prepare:
-        campaign.scenario.prepare(base, number)
+        campaign.scenario.prepare(parameters, number)
 
 
 def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int, bits_per_pixel: float | None) -> None:
@@ -104,6 +106,7 @@ def _write_shard(campaign: Campaign, path: Path, cases: range, bits_per_pixel: f
 
 
 def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -> Iterator[tuple[str, bytes]]:
+    """Yield the name and the contents of each file of a case."""
     scenario = campaign.scenario
     assert isinstance(scenario, ProvidesSamples)  # noqa: S101  (checked by `write_dataset`)
     draws = campaign.draws(case)
@@ -111,6 +114,7 @@ def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -
         key = f"{case:07d}-{number}"
         metadata = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": draws}
         image = sample.image if bits_per_pixel is None else compress(sample.image, bits_per_pixel, 2**sample.bits - 1)
+        # scale the counts to the full range of 16 bits
         yield f"{key}.image.png", _encode(image * np.uint16(2 ** (16 - sample.bits)))
         yield f"{key}.range.npy", _encode(sample.range_m)
         yield f"{key}.normal.npy", _encode(sample.normal)
@@ -124,13 +128,14 @@ def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -
 
 
 def _encode(values: np.ndarray[Any, Any]) -> bytes:
+    """Encode integers as PNG, and other numbers as NPY."""
     if not np.issubdtype(values.dtype, np.integer):
         buffer = io.BytesIO()
         np.save(buffer, values, allow_pickle=False)
         return buffer.getvalue()
     import cv2
 
-    is_encoded, encoded = cv2.imencode(".png", values)
+    is_encoded, png = cv2.imencode(".png", values)
     if not is_encoded:
         raise ValueError("an image could not be encoded as PNG")
-    return encoded.tobytes()
+    return png.tobytes()

@@ -53,7 +53,7 @@ PROBE_TIMEOUT_S = 30.0
 
 
 class Verdict(Enum):
-    """Verdict of a check, with its colour on the terminal; only FAIL prevents a campaign from running."""
+    """Verdict of a check; its value is the colour on the terminal. Only FAIL prevents a campaign from running."""
 
     OK = "green"
     WARN = "yellow"
@@ -73,7 +73,7 @@ class Check:
 def run(console: Console, *, as_json: bool = False) -> int:
     """Print all checks as a table or JSON; return 0 if a campaign can run on this machine, else 1."""
     checks, version = list(run_checks()), importlib.metadata.version("marsyard")
-    failed = [check.name for check in checks if check.verdict is Verdict.FAIL]
+    failed_checks = [check.name for check in checks if check.verdict is Verdict.FAIL]
     table = Table(title=f"Marsyard {version} in {ROOT}", title_justify="left")
     for heading in ("check", "finding", "verdict"):
         table.add_column(heading, overflow="fold")
@@ -83,15 +83,15 @@ def run(console: Console, *, as_json: bool = False) -> int:
         rows.append({"check": check.name, "finding": check.finding, "verdict": verdict, "remedy": check.remedy})
         table.add_row(Text(check.name), Text(check.finding), Text(verdict, check.verdict.value))
     if as_json:
-        summary = {"version": version, "root": str(ROOT), "can_run": not failed, "checks": rows}
+        summary = {"version": version, "root": str(ROOT), "can_run": not failed_checks, "checks": rows}
         console.print(json.dumps(summary, indent=2), markup=False, highlight=False, soft_wrap=True)
-        return 1 if failed else 0
+        return 1 if failed_checks else 0
     console.print(table)
     for check in checks:
         if check.remedy:
             console.print(Text(f"{check.name}: {check.remedy}"), soft_wrap=True)
-    if failed:
-        console.print(Text(f"A campaign cannot run here: {', '.join(failed)}.", "red"), soft_wrap=True)
+    if failed_checks:
+        console.print(Text(f"A campaign cannot run here: {', '.join(failed_checks)}.", "red"), soft_wrap=True)
         return 1
     console.print("A campaign can run here.")
     return 0
@@ -159,7 +159,7 @@ def check_shadowing() -> Iterator[Check]:
 def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
     """Check the versions against pyproject.toml and constraints.txt; `failures` are those of `find_import_failures`."""
     pins = _read_pins()
-    valid, unpinned = 0, []
+    n_valid, pin_deviations = 0, []
     for requirement in _list_requirements():
         name = canonicalize_name(requirement.name)
         version = _find_version(name)
@@ -170,12 +170,12 @@ def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
         elif (error := failures.get(_import_name(name))) is not None:
             yield Check(name, f"{version} cannot be imported: {error}", Verdict.FAIL, REINSTALL)
         else:
-            valid += 1
+            n_valid += 1
             if pins.get(name, version) != version:
-                unpinned.append(f"{name} {version} (pinned {pins[name]})")
-    yield Check("dependencies", f"{valid} distributions have supported versions and can be imported")
-    if unpinned:
-        yield Check("pinned versions", ", ".join(unpinned), Verdict.WARN, REINSTALL)
+                pin_deviations.append(f"{name} {version} (pinned {pins[name]})")
+    yield Check("dependencies", f"{n_valid} distributions have supported versions and can be imported")
+    if pin_deviations:
+        yield Check("pinned versions", ", ".join(pin_deviations), Verdict.WARN, REINSTALL)
 
 
 def find_import_failures(modules: Iterable[str]) -> dict[str, str]:
@@ -192,6 +192,7 @@ def find_import_failures(modules: Iterable[str]) -> dict[str, str]:
     return failures
 
 
+#: Program that imports the modules in its arguments; it prints name and error message of each module as JSON.
 _IMPORT_SCRIPT = """
 import importlib, json, sys
 for name in sys.argv[1:]:
@@ -360,6 +361,7 @@ def _count_cores() -> int:
 
 
 def _is_writable(folder: Path) -> bool:
+    """Whether a file can be created in a folder; a missing folder is created."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -369,6 +371,7 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python with these arguments in a separate process; status -1 after a timeout."""
     command = [sys.executable, *arguments]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False)  # noqa: S603
@@ -378,5 +381,6 @@ def _run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def _failure_reason(process: subprocess.CompletedProcess[str]) -> str:
+    """Return the last line of the standard error, or the exit status without output."""
     lines = [line.strip() for line in process.stderr.splitlines() if line.strip()]
     return lines[-1] if lines else f"the process ended with status {process.returncode}"

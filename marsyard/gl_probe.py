@@ -36,6 +36,7 @@ def probe(backend: str) -> dict[str, Any]:
         # PyOpenGL detects a missing library only when it looks up one of its functions
         raise SystemExit(f"cannot load the OpenGL libraries ({error})") from None
 
+    # corners of the planes
     x, y = (axis.ravel() for axis in np.meshgrid([-400.0, 400.0], [-400.0, 400.0]))
     # coordinates (right, down) of the pixel centres relative to the image centre, pixels
     # pyrender puts the centre of the first pixel at (0.5, 0.5); the y axis of the camera points up
@@ -51,20 +52,20 @@ def probe(backend: str) -> dict[str, Any]:
             scene.add(pyrender.Mesh.from_trimesh(plane, smooth=False))
             scene.add(camera, pose=np.eye(4))
             colour, depth = renderer.render(scene)
-            # pixel coordinate at which the depth was sampled, from the plane's equation
+            # a ray with pixel coordinate s meets the plane at depth DISTANCE_M / (1 + TILT s / FOCAL_PX); solved for s
             sample_positions = (DISTANCE_M / depth - 1.0) * FOCAL_PX / TILT
-            offset = float(np.mean(sample_positions - pixels))
-            offsets_px.append(offset)
-            errors_m.append(float(np.abs(depth - DISTANCE_M / (1.0 + TILT * (pixels + offset) / FOCAL_PX)).max()))
+            offset_px = float(np.mean(sample_positions - pixels))
+            offsets_px.append(offset_px)
+            errors_m.append(float(np.abs(depth - DISTANCE_M / (1.0 + TILT * (pixels + offset_px) / FOCAL_PX)).max()))
             has_colour = has_colour and bool(colour.any())
-        strings = {name: GL.glGetString(getattr(GL, f"GL_{name}")).decode() for name in ("RENDERER", "VERSION")}
+        gl_strings = {name: GL.glGetString(getattr(GL, f"GL_{name}")).decode() for name in ("RENDERER", "VERSION")}
     finally:
         renderer.delete()
     return {
-        "renderer": strings["RENDERER"],
-        "version": strings["VERSION"],
+        "renderer": gl_strings["RENDERER"],
+        "version": gl_strings["VERSION"],
         "depth_error_m": max(errors_m),
-        "offset_px": [offsets_px[0], -offsets_px[1]],
+        "offset_px": [offsets_px[0], -offsets_px[1]],  # right, down
         "has_colour": has_colour,
     }
 

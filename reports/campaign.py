@@ -40,10 +40,10 @@ COMMON_SECTIONS: tuple[SectionMaker, ...] = (
 #: Sections of a study (`marsyard rare`, `marsyard search`, `marsyard budget`).
 STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section, budget_section)
 
-#: Maximum number of sites and algorithms in `report.json`.
-_MAX_LISTED = 24
+#: Maximum number of names of sites, and of algorithms, in `report.json`.
+_MAX_NAMES = 24
 
-#: Version of the layout of `report.json`, increased if a field is removed or changes its meaning, and its JSON Schema.
+#: Version of the layout of `report.json` and its JSON Schema. A removed field, or a new meaning, increases the version.
 SCHEMA = 5
 SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
 #: Properties of a verdict that `report.json` contains next to its fields.
@@ -71,12 +71,13 @@ def write_evaluation(evaluation: Evaluation) -> Path:
     exclude_nominal = evaluation.sampling.exclude_nominal_case
     random_run = replace(run, frame=exclude_nominal(run.frame), all_cases=exclude_nominal(run.all_cases))
     is_study = bool(run.recorded("study"))
-    # the cases of a study are no random sample, so that statistics of their errors have no meaning
+    # the cases of a study are not a random sample; statistics of their errors would be meaningless
     metric = None if is_study else primary_metric(random_run.frame, run.requirements)
-    bound = next((v.bound / v.scale for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
+    metric_verdicts = [verdict for verdict in verdicts if verdict.metric == metric and math.isfinite(verdict.bound)]
+    bound = metric_verdicts[0].bound / metric_verdicts[0].scale if metric_verdicts else None
     subject = Subject(random_run, metric, bound)
     makers = STUDY_SECTIONS if is_study else section_makers()
-    extra_sections = [section for make in makers if (section := make(subject)) is not None]
+    extra_sections = [section for maker in makers if (section := maker(subject)) is not None]
     report_data = build_report_data(evaluation, subject, extra_sections)
     algorithms = read_algorithms(run.record)
     write_atomic(directory / REPORT_JSON, json.dumps(report_data, indent=2, allow_nan=False) + "\n")
@@ -93,8 +94,9 @@ def write_evaluation(evaluation: Evaluation) -> Path:
 def section_makers() -> list[SectionMaker]:
     """List the functions that create the sections of all campaigns and of all systems, in the order of the page."""
     systems = presentations()
-    first = [make for system in systems for make in system.first]
-    return [*first, *COMMON_SECTIONS, *(make for system in systems for make in system.sections), conditions_section]
+    first_makers = [maker for system in systems for maker in system.first]
+    system_makers = [maker for system in systems for maker in system.sections]
+    return [*first_makers, *COMMON_SECTIONS, *system_makers, conditions_section]
 
 
 def page_context(
@@ -157,25 +159,25 @@ def page_context(
 def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     """List warnings about the sampling: a design that is not random, plots of a part of the cases, a nominal case."""
     sampling = read_sampling_design(run.configuration)
-    texts = []
+    cautions = []
     if not sampling.independent and not run.recorded("study"):
-        texts.append(
+        cautions.append(
             f"The cases are not independent random samples: {sampling.text}. Statistics describe these cases; "
             "intervals, bounds and probabilities on this page assume independent samples and do not apply to them."
         )
     if run.is_truncated:
-        texts.append(
+        cautions.append(
             f"Verdicts, outcomes, answers, statistics and convergence use all {len(run.all_cases):,} cases. Scatter "
             f"plots, conditions and drivers use the first {len(run.frame):,} cases"
             f"{', which are also a random sample' if sampling.independent else ''}."
         )
-    nominal = run.frame[run.frame["case"] == 0] if sampling.nominal and "case" in run.frame else run.frame[:0]
-    if len(nominal):
-        nominal_text = str(nominal["outcome"].iloc[0]) if "outcome" in nominal else "stored"
+    nominal_rows = run.frame[run.frame["case"] == 0] if sampling.nominal and "case" in run.frame else run.frame[:0]
+    if len(nominal_rows):
+        nominal_text = str(nominal_rows["outcome"].iloc[0]) if "outcome" in nominal_rows else "stored"
         if metric is not None:
-            nominal_text += f", {label(metric)} {number(float(numbers(nominal, metric)[0]))}"
-        texts.append(f"Case 0 is the nominal case ({nominal_text}). It is excluded from verdicts and statistics.")
-    return texts
+            nominal_text += f", {label(metric)} {number(float(numbers(nominal_rows, metric)[0]))}"
+        cautions.append(f"Case 0 is the nominal case ({nominal_text}). It is excluded from verdicts and statistics.")
+    return cautions
 
 
 def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> dict[str, Any]:
@@ -201,7 +203,10 @@ def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: 
         "verdict": overall_verdict.word,
         "sentence": overall_verdict.sentence,
         "exit_code": evaluation.exit_code,
-        "verdicts": [asdict(v) | {name: getattr(v, name) for name in _VERDICT_PROPERTIES} for v in evaluation.verdicts],
+        "verdicts": [
+            asdict(verdict) | {name: getattr(verdict, name) for name in _VERDICT_PROPERTIES}
+            for verdict in evaluation.verdicts
+        ],
         "outcomes": dict(outcome_counts(run.all_cases)),
         "metric": metric,
         "statistics": {name: asdict(values) for name, values in summaries},
@@ -213,7 +218,7 @@ def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: 
 
 
 def _unique_values(frame: pd.DataFrame, column: str) -> list[str]:
-    return [] if column not in frame else [str(value) for value in frame[column].dropna().unique()[:_MAX_LISTED]]
+    return [] if column not in frame else [str(value) for value in frame[column].dropna().unique()[:_MAX_NAMES]]
 
 
 def page_environment() -> Environment:
@@ -228,6 +233,7 @@ def page_environment() -> Environment:
 
 
 def _to_json_types(value: Any) -> Any:
+    """Convert a value to types of JSON; NaN and infinities become None."""
     if isinstance(value, Mapping):
         return {str(name): _to_json_types(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -239,7 +245,7 @@ def _to_json_types(value: Any) -> Any:
 
 def write_atomic(path: Path, text: str) -> None:
     """Write a text file atomically: write a temporary file, then rename it."""
-    partial = path.with_suffix(path.suffix + ".partial")
+    partial_path = path.with_suffix(path.suffix + ".partial")
     # JSON can contain lone surrogates, which cannot be encoded as UTF-8
-    partial.write_text(text, encoding="utf-8", errors="replace")
-    partial.replace(path)
+    partial_path.write_text(text, encoding="utf-8", errors="replace")
+    partial_path.replace(path)

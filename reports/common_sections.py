@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from scipy import stats
 
 from marsyard.reports import rates
-from marsyard.reports.comparison import compared_names, select_algorithm
+from marsyard.reports.comparison import list_compared_algorithms, select_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
@@ -85,16 +85,20 @@ def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
     frame = subject.all_cases
     if not rates.is_flag(frame, "answered") or frame.empty:
         return {}
-    answered = rates.population_mask(frame, "valid")
-    fractions = {"answered (of all cases)": rates.fraction_of(answered, frame)}
+    is_answered = rates.population_mask(frame, "valid")
+    fractions = {"answered (of all cases)": rates.fraction_of(is_answered, frame)}
     if rates.is_flag(frame, FEASIBLE_OVERLAP):
-        overlap, completed = rates.population_mask(frame, FEASIBLE_OVERLAP), rates.population_mask(frame, "completed")
-        fractions["answered, of cases with feasible overlap"] = rates.fraction_of(answered[overlap], frame[overlap])
-        fractions["no feasible overlap (of completed cases)"] = rates.fraction_of(~overlap[completed], frame[completed])
+        is_feasible, is_completed = (rates.population_mask(frame, name) for name in (FEASIBLE_OVERLAP, "completed"))
+        fractions["answered, of cases with feasible overlap"] = rates.fraction_of(
+            is_answered[is_feasible], frame[is_feasible]
+        )
+        fractions["no feasible overlap (of completed cases)"] = rates.fraction_of(
+            ~is_feasible[is_completed], frame[is_completed]
+        )
     if subject.metric is not None and subject.bound is not None:
-        wrong = ~rates.success_mask(frame[answered], subject.metric, subject.bound)
+        is_wrong = ~rates.success_mask(frame[is_answered], subject.metric, subject.bound)
         name = f"wrong answers: error above {subject.bound:g} {split_unit(subject.metric)[1]} (of answers)"
-        fractions[name] = rates.fraction_of(wrong, frame[answered])
+        fractions[name] = rates.fraction_of(is_wrong, frame[is_answered])
     return fractions
 
 
@@ -107,17 +111,17 @@ def scatter_section(subject: Subject) -> Section | None:
     metric = subject.metric
     if metric is None:
         return None
-    parts = axis_columns(metric, [str(name) for name in subject.all_cases.columns])[:2]
-    if len(parts) < 2:
+    components = axis_columns(metric, [str(name) for name in subject.all_cases.columns])[:2]
+    if len(components) < 2:
         return None
-    errors = np.column_stack([numbers(subject.all_cases, part) for part in parts])
+    errors = np.column_stack([numbers(subject.all_cases, component) for component in components])
     ellipse = error_ellipse(errors, ELLIPSE)
     if ellipse is None:
         return None
     groups = rates.terrain_groups(subject.all_cases)
     circles = [circular_error(errors, probability, CONFIDENCE, groups) for probability in PROBABILITIES]
     unit = split_unit(metric)[1]
-    first, second = (label(part).removesuffix(f" ({unit})") for part in parts)
+    first, second = (label(component).removesuffix(f" ({unit})") for component in components)
     x, y = (number(value) for value in ellipse.centre)
     text = (
         f"{format_fraction(ELLIPSE)} ellipse, assuming normally distributed errors: centre {x}, {y} {unit}, semi-axes "
@@ -125,7 +129,10 @@ def scatter_section(subject: Subject) -> Section | None:
         f"{number(ellipse.angle_deg)} deg from the {first} towards the {second}. "
         f"{percent(ellipse.inside)} of these errors lie inside."
     )
-    rows = [[format_fraction(c.probability), number(c.estimate), interval(c.lower, c.upper)] for c in circles]
+    rows = [
+        [format_fraction(circle.probability), number(circle.estimate), interval(circle.lower, circle.upper)]
+        for circle in circles
+    ]
     grid = Grid(
         ["Fraction of errors", f"Radius ({unit})", f"Lower and upper bound ({format_fraction(CONFIDENCE)} each)"], rows
     )
@@ -140,7 +147,7 @@ MAX_CONDITIONS, MAX_CASES = 12, 20_000
 
 
 def drivers_section(subject: Subject) -> Section | None:
-    """Rank conditions by the explained variance of errors and of failures; None if no condition can be ranked."""
+    """Create the section that ranks conditions by explained variance of errors and of failures; None without ranks."""
     metric = subject.metric
     if metric is None:
         return None
@@ -148,24 +155,25 @@ def drivers_section(subject: Subject) -> Section | None:
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
         responses["failures"] = (~rates.success_mask(frame, metric, subject.bound)).astype(np.float64)
-    drivers_by_response = {name: rank_drivers(frame, metric, response) for name, response in responses.items()}
-    ranked = {name: drivers for name, drivers in drivers_by_response.items() if drivers}
-    if not ranked:
+    ranked_drivers = {
+        name: drivers for name, response in responses.items() if (drivers := rank_drivers(frame, metric, response))
+    }
+    if not ranked_drivers:
         return None
     note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
     headings = ["Condition", "Cases", "Rank correlation", "Interval of the correlation"]
     headings += ["Fraction of variance", "Interval of the fraction", "p"]
     blocks = []
-    for name, drivers in ranked.items():
+    for name, drivers in ranked_drivers.items():
         rows = []
-        for column, result, p in drivers:
-            ranks = [coefficient(result.correlation), f"{coefficient(result.lower)} to {coefficient(result.upper)}"]
-            fractions = [percent(result.share), rates.range_text(result.share_lower, result.share_upper)]
-            rows.append([label(column), f"{result.n:,}", *ranks, *fractions, p_text(p)])
+        for column, driver, p_value in drivers:
+            ranks = [coefficient(driver.correlation), f"{coefficient(driver.lower)} to {coefficient(driver.upper)}"]
+            fractions = [percent(driver.share), rates.range_text(driver.share_lower, driver.share_upper)]
+            rows.append([label(column), f"{driver.n:,}", *ranks, *fractions, p_text(p_value)])
         blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(headings, rows)))
     data = {
-        name: [{"condition": column, **asdict(result), "corrected_p": p} for column, result, p in drivers]
-        for name, drivers in ranked.items()
+        name: [{"condition": column, **asdict(driver), "corrected_p": p_value} for column, driver, p_value in drivers]
+        for name, drivers in ranked_drivers.items()
     }
     title = "Influence of conditions on errors and failures"
     return Section("explained", "Influences", title, [*blocks, Block(note=note)], data)
@@ -178,11 +186,11 @@ def rank_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray, "
     """Rank conditions by the explained variance of a response, with corrected p-values; largest first."""
     groups = rates.terrain_groups(frame)
     drivers: Mapping[str, Driver] = {
-        column: result
+        column: driver
         for column in driver_columns(frame, metric, MAX_CONDITIONS)
-        if (result := estimate_driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
+        if (driver := estimate_driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
     }
-    p_values = dict(zip(drivers, correct_holm([result.p_value for result in drivers.values()]), strict=True))
+    p_values = dict(zip(drivers, correct_holm([driver.p_value for driver in drivers.values()]), strict=True))
     order = sorted(drivers, key=lambda column: (-drivers[column].share, column))
     return [(column, drivers[column], p_values[column]) for column in order]
 
@@ -205,14 +213,16 @@ class Point:
 
 
 def convergence_section(subject: Subject) -> Section | None:
-    """Plot success rates, mean and 95 % quantile of the errors against the number of cases; None for fewer than 16."""
+    """Plot success rates, mean and 95 % quantile of the errors against the number of cases; None below 16 cases."""
     frame = subject.all_cases
     if len(frame) < 2 * MIN_CASES:
         return None
     curves = success_rate_curves(subject)
     svg_figures = [
-        svg_figure(curve_figure(points, "success rate", rate), f"converge{k}", f"{name}: success rate and its bounds.")
-        for k, (name, rate, points) in enumerate(curves)
+        svg_figure(
+            curve_figure(points, "success rate", rate), f"converge{index}", f"{name}: success rate and its bounds."
+        )
+        for index, (name, rate, points) in enumerate(curves)
     ]
     data = {name: [asdict(point) for point in points] for name, _, points in curves}
     for key, (name, axis, points) in error_curves(frame, subject.metric).items():
@@ -280,12 +290,13 @@ def error_curves(frame: pd.DataFrame, metric: str | None) -> dict[str, tuple[str
 def curve_figure(points: Sequence[Point], name: str, required: float | None) -> Figure:
     """Draw an estimate and its bounds against the number of cases."""
     figure, axes = new_axes(4.2, 2.8)
-    cases, estimates, lower, upper = np.array([(p.cases, p.estimate, p.lower, p.upper) for p in points]).T
-    finite = np.concatenate([estimates, lower, upper, [math.nan if required is None else required]])
-    finite = finite[np.isfinite(finite)]
-    if finite.size:
-        margin = 0.06 * float(np.ptp(finite)) or 0.06
-        bottom, top = float(finite.min()) - margin, float(finite.max()) + margin
+    cases, estimates, lower, upper = np.array([astuple(point) for point in points]).T
+    values = np.concatenate([estimates, lower, upper, [math.nan if required is None else required]])
+    values = values[np.isfinite(values)]
+    if values.size:
+        # margin of 6 % of the range; infinite bounds extend to the edges of the axes
+        margin = 0.06 * float(np.ptp(values)) or 0.06
+        bottom, top = float(values.min()) - margin, float(values.max()) + margin
         axes.set_ylim(bottom, top)
         axes.fill_between(
             cases, np.where(np.isfinite(lower), lower, bottom), np.where(np.isfinite(upper), upper, top),
@@ -304,7 +315,7 @@ def curve_figure(points: Sequence[Point], name: str, required: float | None) -> 
 
 #: Column of the normalised estimation error squared, and its degrees of freedom.
 NEES, NEES_DIMENSION = "velocity_nees", 2
-#: Probability of the band of the mean NEES, and of the ellipse inside which errors are counted.
+#: Probability of the band of the mean NEES, and of the error ellipse.
 BAND_PROBABILITY = 0.95
 
 
@@ -316,25 +327,26 @@ def evaluate_consistency(nees: Float[np.ndarray, " n"], dimension: int = NEES_DI
     """
     n, mean = nees.size, float(nees.mean())
     tail = 0.5 * (1.0 - BAND_PROBABILITY)
-    lower, upper = (float(stats.chi2.ppf(q, dimension * n)) / n for q in (tail, 1.0 - tail))
+    # for correct covariances, the sum of n NEES has a chi-square distribution with n * dimension degrees of freedom
+    lower, upper = (float(stats.chi2.ppf(probability, dimension * n)) / n for probability in (tail, 1.0 - tail))
     inside = int((nees <= stats.chi2.ppf(BAND_PROBABILITY, dimension)).sum())
     low, high = proportion_interval(inside, n, CONFIDENCE)
-    verdict = "too sure" if mean > upper else "too cautious" if mean < lower else "consistent"
+    word = "too sure" if mean > upper else "too cautious" if mean < lower else "consistent"
     band = {"n": n, "mean": mean, "lower": lower, "upper": upper}
-    return band | {"inside": inside / n, "inside_lower": low, "inside_upper": high, "word": verdict}
+    return band | {"inside": inside / n, "inside_lower": low, "inside_upper": high, "word": word}
 
 
 def evaluate_consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Evaluate the consistency of all algorithms with covariances in the rows, by name."""
-    tested = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "tested"
-    frames = {tested: frame, **{name: select_algorithm(frame, name) for name in compared_names(frame)}}
+    tested_name = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "tested"
+    frames = {tested_name: frame, **{name: select_algorithm(frame, name) for name in list_compared_algorithms(frame)}}
     by_name = {name: numbers(rows, NEES) for name, rows in frames.items() if NEES in rows}
     finite = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
     return {name: evaluate_consistency(nees) for name, nees in finite.items() if nees.size}
 
 
 def consistency_section(subject: Subject) -> Section | None:
-    """Compare reported covariances with the errors; None if no algorithm reports covariances."""
+    """Create the section that compares reported covariances with errors; None without covariances."""
     results = evaluate_consistencies(subject.frame)
     if not results:
         return None
@@ -350,9 +362,9 @@ def consistency_section(subject: Subject) -> Section | None:
 
 def _classify_answers(rows: Rows, subject: Subject) -> dict[str, Bool[np.ndarray, " n"]]:
     """Create masks of valid, missing and wrong answers."""
-    answered = rates.population_mask(rows, "valid")
+    is_answered = rates.population_mask(rows, "valid")
     is_correct = rates.success_mask(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
-    return {"valid": answered & is_correct, "invalid": ~answered, "wrong": answered & ~is_correct}
+    return {"valid": is_answered & is_correct, "invalid": ~is_answered, "wrong": is_answered & ~is_correct}
 
 
 def find_frequent_refusal(rows: Rows) -> str:

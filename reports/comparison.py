@@ -65,7 +65,7 @@ class AlgorithmResult:
 class PairedComparison:
     """Another algorithm compared with the tested one on the same cases; p-values are corrected by Holm's method.
 
-    - only_first, only_other: cases within the bound only for the tested or only for the other algorithm; may be None
+    - only_first, only_other: cases within the bound only for the tested or the other algorithm; None without bound
     - success_p, error_p: two-sided p-values of successes (`compare_successes`) and of errors (`compare_errors`)
     - pairs: number of cases that both algorithms answered
     - mean, lower, upper: mean of the other algorithm's error minus the tested one's (magnitudes), with its interval
@@ -82,7 +82,7 @@ class PairedComparison:
     error_p: float
 
 
-def compared_names(frame: pd.DataFrame) -> list[str]:
+def list_compared_algorithms(frame: pd.DataFrame) -> list[str]:
     """List the names of the compared algorithms in the rows."""
     names = [str(column).removesuffix(".answered") for column in frame.columns if str(column).endswith(".answered")]
     return [name for name in names if rates.is_flag(frame, f"{name}.answered")]
@@ -91,8 +91,8 @@ def compared_names(frame: pd.DataFrame) -> list[str]:
 def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     """Return the rows with the results of a compared algorithm instead of the algorithm under test."""
     prefix = f"{name}."
-    names = [str(column) for column in frame.columns if str(column).startswith(prefix)]
-    new_names = {name: name.removeprefix(prefix) for name in names}
+    columns = [str(column) for column in frame.columns if str(column).startswith(prefix)]
+    new_names = {name: name.removeprefix(prefix) for name in columns}
     return frame.drop(columns=[name for name in new_names.values() if name in frame]).rename(columns=new_names)
 
 
@@ -119,37 +119,44 @@ def compare_with_baseline(
 ) -> PairedComparison:
     """Compare another algorithm with the first, from rows of the same cases in the same order."""
     first_error, other_error = (np.abs(numbers(frame, metric)) for frame in (first, other))
-    answered, groups = np.isfinite(first_error) & np.isfinite(other_error), rates.terrain_groups(first)
+    both_answered, groups = np.isfinite(first_error) & np.isfinite(other_error), rates.terrain_groups(first)
     success: tuple[int | None, int | None, float] = (None, None, math.nan)
     if bound is not None:
         success = compare_successes(first_error <= bound, other_error <= bound, groups)
-    answered_groups = None if groups is None else groups[answered]
-    mean, lower, upper, p = compare_errors((other_error - first_error)[answered], answered_groups, CONFIDENCE)
-    return PairedComparison(name, *success, int(answered.sum()), mean, lower, upper, p)
+    answered_groups = None if groups is None else groups[both_answered]
+    mean, lower, upper, p_value = compare_errors(
+        (other_error - first_error)[both_answered], answered_groups, CONFIDENCE
+    )
+    return PairedComparison(name, *success, int(both_answered.sum()), mean, lower, upper, p_value)
 
 
 def compare_algorithms(
     frame: pd.DataFrame, metric: str | None, bound: float | None
 ) -> tuple[list[AlgorithmResult], list[PairedComparison]]:
     """Summarize all algorithms, the one under test first, and compare the others with it; empty for a single one."""
-    names = compared_names(frame)
+    names = list_compared_algorithms(frame)
     # cases that ended before any algorithm ran have no answers to compare
     frame = frame[np.logical_and.reduce([frame[f"{name}.answered"].notna() for name in names])] if names else frame
     if not names or frame.empty:
         return [], []
-    tested = str(frame["algorithm"].iloc[0]) if "algorithm" in frame else "tested"
+    tested_name = str(frame["algorithm"].iloc[0]) if "algorithm" in frame else "tested"
     frames = {name: select_algorithm(frame, name) for name in names}
-    results = [summarize_algorithm(frame, tested, metric, bound)]
+    results = [summarize_algorithm(frame, tested_name, metric, bound)]
     results += [summarize_algorithm(rows, name, metric, bound) for name, rows in frames.items()]
     if metric is None:
         return results, []
-    differences = [compare_with_baseline(frame, rows, n, metric, bound) for n, rows in frames.items() if metric in rows]
+    differences = [
+        compare_with_baseline(frame, rows, name, metric, bound) for name, rows in frames.items() if metric in rows
+    ]
     success_p, error_p = (
-        correct_holm([d.success_p for d in differences]),
-        correct_holm([d.error_p for d in differences]),
+        correct_holm([difference.success_p for difference in differences]),
+        correct_holm([difference.error_p for difference in differences]),
     )
-    corrected = zip(differences, success_p, error_p, strict=True)
-    return results, [replace(difference, success_p=p, error_p=q) for difference, p, q in corrected]
+    corrected_p_values = zip(differences, success_p, error_p, strict=True)
+    return results, [
+        replace(difference, success_p=success_p_value, error_p=error_p_value)
+        for difference, success_p_value, error_p_value in corrected_p_values
+    ]
 
 
 def comparison_section(subject: Subject) -> Section | None:
@@ -158,14 +165,14 @@ def comparison_section(subject: Subject) -> Section | None:
     if not results:
         return None
     grids = comparison_grids(results, differences, subject.metric)
-    tested = results[0].name
-    note = note_text("common.comparison", tested=tested, confidence=format_fraction(CONFIDENCE))
+    tested_name = results[0].name
+    note = note_text("common.comparison", tested=tested_name, confidence=format_fraction(CONFIDENCE))
     blocks = [Block(grid=grids[0])]
     if differences:
-        blocks.append(Block(heading=f"Against {tested}", grid=grids[1], note=note))
+        blocks.append(Block(heading=f"Against {tested_name}", grid=grids[1], note=note))
     data = {
         "algorithms": [asdict(result) for result in results],
-        "against": tested,
+        "against": tested_name,
         "differences": [asdict(difference) for difference in differences],
     }
     return Section("algorithms", "Algorithms", "Algorithms on the same cases", blocks, data)
@@ -182,24 +189,21 @@ def comparison_grids(
             "Algorithm": lambda result: result.name,
             "Answered": lambda result: percent(result.answered / result.cases),
             "Failed": lambda result: f"{result.failed:,}",
-            "Within the bound (of all cases)": lambda r: (
-                NOTHING if r.succeeded is None else percent(r.succeeded / r.cases)
+            "Within the bound (of all cases)": lambda result: (
+                NOTHING if result.succeeded is None else percent(result.succeeded / result.cases)
             ),
             f"Median{unit}": lambda result: number(result.median),
             f"95th percentile{unit}": lambda result: number(result.p95),
         },
     )
-    tested = results[0].name if results else ""
-    rows = [
-        [
-            *(d.name, *(NOTHING if cases is None else f"{cases:,}" for cases in (d.only_first, d.only_other))),
-            *(p_text(d.success_p), f"{d.pairs:,}"),
-            f"{number(d.mean)} ({number(d.lower)} to {number(d.upper)})" if d.pairs else NOTHING,
-            p_text(d.error_p),
-        ]
-        for d in differences
-    ]
-    head = ["Algorithm", f"Success only: {tested}", "Success only: other", "p (success)", "Cases answered by both"]
+    tested_name = results[0].name if results else ""
+    rows = []
+    for difference in differences:
+        successes = [NOTHING if n is None else f"{n:,}" for n in (difference.only_first, difference.only_other)]
+        mean_text = f"{number(difference.mean)} ({number(difference.lower)} to {number(difference.upper)})"
+        texts = [difference.name, *successes, p_text(difference.success_p), f"{difference.pairs:,}"]
+        rows.append([*texts, mean_text if difference.pairs else NOTHING, p_text(difference.error_p)])
+    head = ["Algorithm", f"Success only: {tested_name}", "Success only: other", "p (success)", "Cases answered by both"]
     return first, Grid([*head, f"Difference{unit}", "p (error)"], rows)
 
 
@@ -250,7 +254,7 @@ class MetricComparison:
 
 
 def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
-    """Return the rows without the nominal case, and metrics: successes by requirement, answers, completion, errors."""
+    """Return the rows without the nominal case, and metrics: successes by requirement, errors, answers, completion."""
     frame = read_sampling_design(run.configuration).exclude_nominal_case(run.frame)
     metrics: dict[str, Metric] = {}
     error_columns = dict.fromkeys([primary_metric(frame, run.requirements)])
@@ -265,7 +269,7 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
         except ValueError:
             continue
         values = (bound, requirement.get("scale", 1))
-        limit, scale = (float(x) if isinstance(x, int | float) else math.nan for x in values)
+        limit, scale = (float(value) if isinstance(value, int | float) else math.nan for value in values)
         success = success_mask(frame, metric, limit, scale)
         metrics[name] = Metric(name, True, np.where(population, success.astype(np.float64), np.nan))
         if is_bounded:
@@ -275,22 +279,27 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
         metrics[column] = Metric(label(column), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
     if rates.is_flag(frame, "answered"):
         metrics["answered"] = Metric("answered", True, rates.population_mask(frame, "valid").astype(np.float64))
-    completed = rates.population_mask(frame, "completed").astype(np.float64)
-    metrics["came to an end"] = Metric("came to an end", True, completed)
+    completion = rates.population_mask(frame, "completed").astype(np.float64)
+    metrics["came to an end"] = Metric("came to an end", True, completion)
     return frame, list(metrics.values())
 
 
 def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[MetricComparison]]:
     """Return whether the campaigns' cases are paired, and the comparisons of the metrics of both campaigns."""
     frames, metrics = zip(*(list_metrics(run) for run in (first, second)), strict=True)
-    paired = have_same_draws(first, second)
+    are_paired = have_same_draws(first, second)
     second_metrics = {metric.name: metric for metric in metrics[1]}
     metric_pairs = [(metric, second_metrics[metric.name]) for metric in metrics[0] if metric.name in second_metrics]
     compute_p_value = (
-        _paired_p_value if paired else partial(_unpaired_p_value, common=have_same_terrains(first, second))
+        _paired_p_value if are_paired else partial(_unpaired_p_value, share_terrains=have_same_terrains(first, second))
     )
-    p_values = correct_holm([compute_p_value(frames[0], a, frames[1], b) for a, b in metric_pairs])
-    return paired, [MetricComparison(a.name, a, b, p) for (a, b), p in zip(metric_pairs, p_values, strict=True)]
+    p_values = correct_holm(
+        [compute_p_value(frames[0], metric, frames[1], other_metric) for metric, other_metric in metric_pairs]
+    )
+    comparisons = [
+        MetricComparison(pair[0].name, *pair, p_value) for pair, p_value in zip(metric_pairs, p_values, strict=True)
+    ]
+    return are_paired, comparisons
 
 
 def have_same_draws(first: StoredRun, second: StoredRun) -> bool:
@@ -335,16 +344,16 @@ def build_sample(frame: pd.DataFrame, metric: Metric) -> Sample:
     if groups is None:
         return Sample(metric.values, np.zeros(metric.values.size, dtype=np.int64))
     terrains = pd.to_numeric(frame["terrain"], errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-    # each case of unknown or non-numeric terrain has its own negative number
+    # negative numbers: one for each case of unknown terrain, and one for each terrain without a number
     is_unknown = ~np.isfinite(terrains)
     return Sample(metric.values, np.where(is_unknown, -1.0 - groups, np.nan_to_num(terrains)).astype(np.int64))
 
 
 def _unpaired_p_value(
-    first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric, *, common: bool
+    first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric, *, share_terrains: bool
 ) -> float:
     first_sample, second_sample = build_sample(first, first_metric), build_sample(second, second_metric)
-    if not common:  # equal numbers mean different terrains: shift the second campaign's numbers above the first's
+    if not share_terrains:  # equal numbers are different terrains: shift the second numbers above the first
         if not first_sample.terrains.size or not second_sample.terrains.size:
             return math.nan
         renumbered = second_sample.terrains + (1 + int(first_sample.terrains.max()) - int(second_sample.terrains.min()))
@@ -354,12 +363,12 @@ def _unpaired_p_value(
 
 def _paired_p_value(first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric) -> float:
     _, first_index, second_index = np.intersect1d(first["case"], second["case"], return_indices=True)
-    a, b = first_metric.values[first_index], second_metric.values[second_index]
-    finite = np.isfinite(a) & np.isfinite(b)
+    first_values, second_values = first_metric.values[first_index], second_metric.values[second_index]
+    finite = np.isfinite(first_values) & np.isfinite(second_values)
     if not finite.any():
         return math.nan
     groups = rates.terrain_groups(first)
     finite_groups = None if groups is None else groups[first_index][finite]
-    if first_metric.larger_is_better:
-        return compare_successes(a[finite] > 0.5, b[finite] > 0.5, finite_groups)[2]
-    return compare_errors(b[finite] - a[finite], finite_groups, CONFIDENCE)[3]
+    if first_metric.larger_is_better:  # a rate has the values 0 and 1
+        return compare_successes(first_values[finite] > 0.5, second_values[finite] > 0.5, finite_groups)[2]
+    return compare_errors(second_values[finite] - first_values[finite], finite_groups, CONFIDENCE)[3]

@@ -1,4 +1,4 @@
-"""Errors and answers by condition: a table for each condition with bins of equally many cases."""
+"""Errors and answers by condition: a table for each condition, whose bins have equal numbers of cases."""
 
 from __future__ import annotations
 
@@ -50,7 +50,11 @@ def conditions_section(subject: Subject) -> Section | None:
         column: [_summarize_bin(frame[mask], metric, name) for name, mask in bins]
         for column, bins in bin_conditions(frame)
     }
-    terrain_rows = [row for part in _signed_parts(frame, metric) if (row := terrain_variance(frame, part)) is not None]
+    terrain_rows = [
+        row
+        for component in _signed_components(frame, metric)
+        if (row := terrain_variance(frame, component)) is not None
+    ]
     if not tables and not terrain_rows:
         return None
     blocks = [Block(heading=f"By {label(name)}", grid=_bin_grid(frame, metric, bins)) for name, bins in tables.items()]
@@ -82,13 +86,13 @@ def bin_conditions(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, B
                 masks = [frame[column].eq(value).fillna(False).to_numpy(dtype=np.bool_) for value in values]
                 yield column, list(zip(map(plain_value, values), masks, strict=True))
             elif n_values > 2 and pd.api.types.is_numeric_dtype(frame[column].dtype):
-                x = numbers(frame, column)
-                finite = x[np.isfinite(x)]
+                condition_values = numbers(frame, column)
+                finite = condition_values[np.isfinite(condition_values)]
                 bins = int(np.clip(finite.size // CASES_PER_BIN, 2, MAX_BINS))
                 edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, bins + 1)))
-                positions = np.where(np.isfinite(x), np.digitize(x, edges[1:-1]), -1)
+                positions = np.where(np.isfinite(condition_values), np.digitize(condition_values, edges[1:-1]), -1)
                 names = [f"{number(low)} to {number(high)}" for low, high in pairwise(edges.tolist())]
-                yield column, [(name, positions == k) for k, name in enumerate(names)]
+                yield column, [(name, positions == index) for index, name in enumerate(names)]
 
 
 _TERRAINS_NOTE = note_text("common.terrains")
@@ -111,36 +115,36 @@ def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
     if terrains < 2 or cases == terrains:
         return None
     means = np.bincount(index, weights=errors) / sizes
+    # mean squares; the expectation of `between` is `within` + effective_size * (variance between terrains)
     within = float(((errors - means[index]) ** 2).sum()) / (cases - terrains)
     between = float((sizes * (means - errors.mean()) ** 2).sum()) / (terrains - 1)
-    # effective number of cases per terrain for terrains of unequal size
+    # effective number of cases per terrain, for terrains with unequal numbers of cases
     effective_size = (cases - float((sizes**2).sum()) / cases) / (terrains - 1)
-    variance = max(between - within, 0.0) / effective_size
+    variance_between = max(between - within, 0.0) / effective_size
     p_value = float(stats.f.sf(between / within, terrains - 1, cases - terrains)) if within > 0.0 else float("nan")
     return {
         "part": part,
         "terrains": terrains,
         "within_sd": float(np.sqrt(within)),
-        "between_sd": float(np.sqrt(variance)),
-        "share": variance / (variance + within) if variance + within > 0.0 else 0.0,
+        "between_sd": float(np.sqrt(variance_between)),
+        "share": variance_between / (variance_between + within) if variance_between + within > 0.0 else 0.0,
         "p_value": p_value,
     }
 
 
 def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
     """Summarize a bin: answers, mean and standard deviation of the signed errors, bound of the 99 % quantile."""
-    answered = rates.population_mask(rows, "valid")
-    valid = rows[answered]
-    magnitude, groups = np.abs(numbers(valid, metric)), rates.terrain_groups(valid)
+    is_answered = rates.population_mask(rows, "valid")
+    answered_rows = rows[is_answered]
+    magnitude, groups = np.abs(numbers(answered_rows, metric)), rates.terrain_groups(answered_rows)
     finite = np.isfinite(magnitude)
     magnitude, finite_groups = magnitude[finite], None if groups is None else groups[finite]
-    parts = [numbers(valid, part) for part in _signed_parts(rows, metric)]
-    parts = [part[np.isfinite(part)] for part in parts]
+    components = [rates.finite_values(answered_rows, column) for column in _signed_components(rows, metric)]
     return {
         "name": name,
-        "answered": rates.fraction_of(answered, rows),
-        "means": [float(part.mean()) if part.size else float("nan") for part in parts],
-        "sds": [float(part.std(ddof=1)) if part.size > 1 else float("nan") for part in parts],
+        "answered": rates.fraction_of(is_answered, rows),
+        "means": [float(component.mean()) if component.size else float("nan") for component in components],
+        "sds": [float(component.std(ddof=1)) if component.size > 1 else float("nan") for component in components],
         "quantile_bound": quantile_bounds(magnitude, QUANTILE, CONFIDENCE, finite_groups)[1],
         "largest": float(magnitude.max()) if magnitude.size else float("nan"),
     }
@@ -151,11 +155,11 @@ _AXIS_NAMES = {"x": "east", "y": "north", "z": "up"}
 
 
 def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -> Grid:
-    columns = _signed_parts(frame, metric)
+    columns = _signed_components(frame, metric)
     axes = (
         [""]
         if columns == [metric]
-        else [f", {_AXIS_NAMES[split_unit(part)[0].rsplit('_', 1)[-1]]}" for part in columns]
+        else [f", {_AXIS_NAMES[split_unit(component)[0].rsplit('_', 1)[-1]]}" for component in columns]
     )
     unit = split_unit(metric)[1]
     head = ["", "Cases", "Answered", f"{format_fraction(CONFIDENCE)} interval"]
@@ -163,14 +167,14 @@ def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]
     head += [f"Bound of the {format_fraction(QUANTILE)} quantile ({unit})", f"Maximum ({unit})"]
     rows = []
     for row in bins:
-        part_texts = [number(value) for pair in zip(row["means"], row["sds"], strict=True) for value in pair]
+        component_texts = [number(value) for pair in zip(row["means"], row["sds"], strict=True) for value in pair]
         answered, bound = row["answered"], row["quantile_bound"]
         last_texts = [number(bound) if np.isfinite(bound) else "too few cases", number(row["largest"])]
         interval = rates.range_text(*answered.clustered_interval)
-        rows.append([row["name"], f"{answered.n:,}", percent(answered.share), interval, *part_texts, *last_texts])
+        rows.append([row["name"], f"{answered.n:,}", percent(answered.share), interval, *component_texts, *last_texts])
     return Grid(head, rows)
 
 
-def _signed_parts(frame: pd.DataFrame, metric: str) -> list[str]:
-    """Return the columns of the metric's signed parts (x, y), or the metric itself if it has no parts."""
+def _signed_components(frame: pd.DataFrame, metric: str) -> list[str]:
+    """Return the columns of the metric's signed components (x, y), or the metric itself if it has none."""
     return axis_columns(metric, [str(name) for name in frame.columns]) or [metric]

@@ -74,24 +74,27 @@ class ParameterSample:
 @in_page_style
 def draws_figure(title: str, samples: Sequence[ParameterSample]) -> Figure:
     """Draw the marginal distributions of at least one parameter, and below them all pairs of parameters that vary."""
-    varying = [sample for sample in samples if len(set(sample.numbers(sample.values).tolist())) > 1][:MAX_PAIRED]
-    side = len(varying) * _CELL_SIDE_IN if len(varying) > 1 else 0.0
-    width = max(min(len(samples), _MIN_PER_ROW) * _WIDTH_IN, side, 2.0 * _WIDTH_IN)
-    per_row = min(len(samples), int(width / _WIDTH_IN))
-    rows = math.ceil(len(samples) / per_row)
-    upper_height, lower_height = rows * _HEIGHT_IN + _HEADING_HEIGHT_IN, side + _HEADING_HEIGHT_IN if side else 0.0
+    pair_samples = [sample for sample in samples if len(set(sample.numbers(sample.values).tolist())) > 1]
+    pair_samples = pair_samples[:MAX_PAIRED]
+    pairs_side = len(pair_samples) * _CELL_SIDE_IN if len(pair_samples) > 1 else 0.0
+    width = max(min(len(samples), _MIN_PER_ROW) * _WIDTH_IN, pairs_side, 2.0 * _WIDTH_IN)
+    n_columns = min(len(samples), int(width / _WIDTH_IN))
+    n_rows = math.ceil(len(samples) / n_columns)
+    upper_height = n_rows * _HEIGHT_IN + _HEADING_HEIGHT_IN
+    lower_height = pairs_side + _HEADING_HEIGHT_IN if pairs_side else 0.0
     figure = Figure(figsize=(width + 2.0 * _MARGIN_IN, upper_height + lower_height))
     cases = count(len(samples[0].values), "case")
     heading = f"{title}: {cases} as sampled. Line: expected from the distribution"
     _write_heading(figure, upper_height + lower_height, heading)
     for index, sample in enumerate(samples):
-        row, column = divmod(index, per_row)
-        box = (_MARGIN_IN + column * width / per_row + 0.3, lower_height + (rows - 1 - row) * _HEIGHT_IN + 0.45)
-        _draw_marginal(_add_axes(figure, box, (width / per_row - 0.55, _HEIGHT_IN - 0.85)), sample)
-    if side:
+        row, column = divmod(index, n_columns)
+        # the margins around the axes contain the title and the tick labels
+        corner = (_MARGIN_IN + column * width / n_columns + 0.3, lower_height + (n_rows - 1 - row) * _HEIGHT_IN + 0.45)
+        _draw_marginal(_add_axes(figure, corner, (width / n_columns - 0.55, _HEIGHT_IN - 0.85)), sample)
+    if pairs_side:
         _write_heading(figure, lower_height, "Pairs. Lower left: values; upper right: Spearman's rank correlation")
-        left = _MARGIN_IN + 0.5 * (width - side)
-        _draw_pairs(_add_axes(figure, (left, 0.5 * _MARGIN_IN), (side, side)), varying)
+        left = _MARGIN_IN + 0.5 * (width - pairs_side)
+        _draw_pairs(_add_axes(figure, (left, 0.5 * _MARGIN_IN), (pairs_side, pairs_side)), pair_samples)
     return figure
 
 
@@ -116,6 +119,7 @@ def _draw_marginal(axes: Axes, sample: ParameterSample) -> None:
     expected = None if sample.expected is None else sample.numbers(sample.expected)
     all_values = values if expected is None else np.concatenate([values, expected])
     levels = np.unique(all_values)
+    # categories and few round numbers as bars, other numbers as a histogram with about 1.5 sqrt(n) bins
     if categories is not None or (levels.size <= 12 and np.all(levels == np.round(levels, 9))):
         positions = np.arange(levels.size)
         axes.bar(positions, [(values == level).sum() for level in levels], width=0.7, color=SERIES[0])
@@ -141,11 +145,11 @@ def _draw_marginal(axes: Axes, sample: ParameterSample) -> None:
 
 def _draw_pairs(axes: Axes, samples: Sequence[ParameterSample]) -> None:
     """Draw pairs of parameters: scatter in the lower left, rank correlations in the upper right."""
-    size = len(samples)
+    n = len(samples)
     numbers = [sample.numbers(sample.values) for sample in samples]
     # each value is scaled to its cell of side 1, with margins of 0.08
     scaled = [0.08 + 0.84 * (values - values.min()) / np.ptp(values) for values in numbers]
-    pairs = [(row, column) for row in range(size) for column in range(row)]
+    pairs = [(row, column) for row in range(n) for column in range(row)]
     x = np.concatenate([column + scaled[column] for row, column in pairs])
     y = np.concatenate([row + 1.0 - scaled[row] for row, column in pairs])
     marker_style: dict[str, Any] = {"s": 4.0, "color": SERIES[0], "alpha": 0.7, "linewidths": 0.0}
@@ -164,7 +168,7 @@ def _draw_pairs(axes: Axes, samples: Sequence[ParameterSample]) -> None:
         weight, color = ("bold", SERIES[1]) if is_significant else ("normal", MUTED)
         style = _CENTERED_TEXT | {"fontweight": weight, "color": color}
         axes.text(row + 0.5, column + 0.5, text, fontsize=8, **style)
-    axes.set(xlim=(0, size), ylim=(size, 0))
+    axes.set(xlim=(0, n), ylim=(n, 0))
     axes.set_axis_off()
 
 

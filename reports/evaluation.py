@@ -54,13 +54,13 @@ def combine_verdicts(
     order = (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE)
     worst = next((status for status in order if status in statuses), Status.PASS)
     if not sampling.independent:
-        by_rate = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
-        met_text = f"{by_rate.count(Status.MET_BY_RATE)} of {count(len(by_rate), 'requirement')}"
-        rate_text = f"{met_text} met by the rate of these cases. " if by_rate else ""
+        rate_statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
+        met_text = f"{rate_statuses.count(Status.MET_BY_RATE)} of {count(len(rate_statuses), 'requirement')}"
+        rate_text = f"{met_text} met by the rate of these cases. " if rate_statuses else ""
         return OverallVerdict(worst, crashed, rate_text + sampling.no_probability + crash_text)
-    withheld = sum(verdict.withheld_status is not None for verdict in verdicts)
-    if withheld and worst is Status.INSUFFICIENT:
-        would_be_met = f"{withheld} of {count(len(statuses), 'requirement')} would be met."
+    n_withheld = sum(verdict.withheld_status is not None for verdict in verdicts)
+    if n_withheld and worst is Status.INSUFFICIENT:
+        would_be_met = f"{n_withheld} of {count(len(statuses), 'requirement')} would be met."
         reason = "" if evidence is None else f" {evidence.text}"
         return OverallVerdict(worst, crashed, f"{would_be_met}{reason}{crash_text}")
     worst_count, total = statuses.count(worst), count(len(statuses), "requirement")
@@ -68,8 +68,8 @@ def combine_verdicts(
     subject = (
         "the requirement" if len(statuses) == 1 else f"any of the {total}" if worst_count == len(statuses) else fraction
     )
-    undecided = statuses.count(Status.INSUFFICIENT)
-    undecided_text = f", {undecided} undecided" if undecided else ""
+    n_undecided = statuses.count(Status.INSUFFICIENT)
+    undecided_text = f", {n_undecided} undecided" if n_undecided else ""
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",
@@ -92,13 +92,13 @@ def compute_exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
 
 def _remedy_text(verdicts: Sequence[Verdict]) -> str:
     """Describe how many additional cases would decide all requirements, or why more cases cannot; may be empty."""
-    limited = next((verdict for verdict in verdicts if verdict.advice), None)
-    if limited is not None:
-        return f" {limited.advice}"
-    needed = [verdict for verdict in verdicts if verdict.further_cases is not None]
-    if not needed:
+    verdict_with_advice = next((verdict for verdict in verdicts if verdict.advice), None)
+    if verdict_with_advice is not None:
+        return f" {verdict_with_advice.advice}"
+    undecided_verdicts = [verdict for verdict in verdicts if verdict.further_cases is not None]
+    if not undecided_verdicts:
         return ""
-    largest = max(needed, key=lambda verdict: verdict.further_cases or 0)
+    largest = max(undecided_verdicts, key=lambda verdict: verdict.further_cases or 0)
     counts_terrains = largest.clustered is not None and largest.clustered.method is ClusterMethod.TERRAIN_COUNT
     terrain_text = ", each on a new terrain" if counts_terrains else ""
     cases = count(largest.further_cases or 0, "additional case")
@@ -130,8 +130,8 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     sampling = read_sampling_design(run.configuration)
     study = table(run.record.get("study"))
     if study:
-        return Evaluation(run, sampling, read_evidence(run.record), (), _judge_study(study, run.all_cases))
-    evidence = read_evidence(run.record, own_requirements=requirements is None)
+        return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(study, run.all_cases))
+    evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
     columns = _shipped_columns(str(run.configuration.get("scenario") or ""))
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
     verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling, from_truth, configured)
@@ -142,17 +142,18 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     return Evaluation(run, sampling, evidence, verdicts, overall)
 
 
-def _judge_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdict:
+def _evaluate_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdict:
     """Return the verdict of a study; its cases are not random samples, so no requirement is evaluated by rates."""
     crashed = int(engine_failed(frame).sum())
     result = table(study.get("result"))
     if not result:
         return OverallVerdict(Status.INSUFFICIENT, crashed, "The study is not finished.")
     if study.get("kind") == "search":
-        found = f"{count(int(result.get('violations') or 0), 'violation')} of {study.get('requirement')} found"
-        return OverallVerdict(Status.FAIL if result.get("violations") else None, crashed, f"{found}. See the section.")
-    limit = f"a violation of {study.get('requirement')} has a probability of at most {study.get('max_probability')}"
-    return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {limit}.")
+        violations, status = int(result.get("violations") or 0), Status.FAIL if result.get("violations") else None
+        sentence = f"{count(violations, 'violation')} of {study.get('requirement')} found. See the section."
+        return OverallVerdict(status, crashed, sentence)
+    statement = f"a violation of {study.get('requirement')} has a probability of at most {study.get('max_probability')}"
+    return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {statement}.")
 
 
 def _shipped_columns(scenario: str) -> RowColumns | None:
@@ -163,24 +164,24 @@ def _shipped_columns(scenario: str) -> RowColumns | None:
         return None
 
 
-def read_evidence(record: Mapping[str, Any], *, own_requirements: bool = True) -> Evidence:
+def read_evidence(record: Mapping[str, Any], *, uses_campaign_requirements: bool = True) -> Evidence:
     """Read the kind of evidence of a run from its record.
 
-    A confirmation is void if the program changed during the run. With requirements other than the campaign's own, which
-    were frozen, its results are not a confirmation either.
+    A run is not a confirmation if the program changed during the run, or if other requirements than the frozen ones of
+    the campaign are evaluated.
     """
     evidence = Evidence.read(record.get("evidence"))
     if evidence.kind is not EvidenceKind.CONFIRMATION:
         return evidence
     stored_changes = record.get("changes")
     changes = [str(text) for change in stored_changes or () for text in change.get("in") or ()]
-    if not own_requirements:
+    if not uses_campaign_requirements:
         changes.append("requirements other than those of the campaign")
     return replace(evidence, kind=EvidenceKind.CHANGED, changes=tuple(changes)) if changes else evidence
 
 
 def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
-    """Replace PASS and MET BY RATE by INSUFFICIENT if the algorithm was not frozen before its cases were seen."""
+    """Replace PASS and MET BY RATE by INSUFFICIENT for evidence that allows no PASS (`Evidence.withheld`)."""
     if not evidence.withheld or verdict.status not in (Status.PASS, Status.MET_BY_RATE):
         return verdict
     reason = f"The verdict would be {verdict.status}. {evidence.text}"
@@ -193,15 +194,15 @@ def _add_joint_verdicts(
     verdicts: Sequence[Verdict], run: StoredRun, sampling: SamplingDesign, confirmations: int
 ) -> list[Verdict]:
     """Add the verdicts at the confidence of all confirmations of an algorithm together (Bonferroni)."""
-    stricter = [
-        {**item, "confidence": 1.0 - (1.0 - verdict.confidence) / confirmations}
-        for item, verdict in zip(run.requirements, verdicts, strict=True)
+    strict_requirements = [
+        {**requirement, "confidence": 1.0 - (1.0 - verdict.confidence) / confirmations}
+        for requirement, verdict in zip(run.requirements, verdicts, strict=True)
     ]
-    joint = evaluate_requirements(run.all_cases, stricter, sampling)
+    joint_verdicts = evaluate_requirements(run.all_cases, strict_requirements, sampling)
     texts = [
         f"At {format_fraction(verdict.confidence)} confidence for all {confirmations} confirmations together (each at "
-        f"{percent(other.confidence)}): {other.status}."
-        for verdict, other in zip(verdicts, joint, strict=True)
+        f"{percent(joint_verdict.confidence)}): {joint_verdict.status}."
+        for verdict, joint_verdict in zip(verdicts, joint_verdicts, strict=True)
     ]
     return [replace(verdict, joint_text=text) for verdict, text in zip(verdicts, texts, strict=True)]
 
@@ -222,9 +223,9 @@ def next_look(verdicts: Sequence[Verdict], sampling: SamplingDesign, cases: int)
         if not 0.0 < verdict.probability < 1.0 or not 0.0 < verdict.confidence < 1.0:
             continue
         confidence = confidence_at(verdict.confidence, risk_fraction)
-        succeeded, n = verdict.n - verdict.failures, verdict.n + remaining
-        # bounds for independent cases; bounds for shared terrains are never tighter
-        can_pass = proportion_lower(succeeded + remaining, n, confidence) >= verdict.probability
-        if can_pass or proportion_upper(succeeded, n, confidence) < verdict.probability:
+        successes, n = verdict.n - verdict.failures, verdict.n + remaining
+        # bounds for independent cases; bounds for shared terrains are not tighter
+        can_pass = proportion_lower(successes + remaining, n, confidence) >= verdict.probability
+        if can_pass or proportion_upper(successes, n, confidence) < verdict.probability:
             return next(look.cases for look in planned_looks(sampling.max_cases) if look.cases > cases)
     return None

@@ -38,7 +38,7 @@ ELLIPSE = 0.95
 _MAX_EDGE_RATIO = 3.0
 #: If all errors are below this fraction of the bound, an axis does not include the bound.
 _MIN_BOUND_FRACTION = 0.6
-#: If more than this fraction of the errors lies beyond that axis, the axis ends at this quantile of the errors instead.
+#: If more than this fraction of the errors exceeds that limit, the axis ends at this quantile of the errors instead.
 _MAX_FRACTION_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
 #: Number of cases per point of the curves of median and 95 % quantile; minimum and maximum number of points.
 _CASES_PER_POINT, _MIN_POINTS, _MAX_POINTS = 25, 4, 16
@@ -68,7 +68,7 @@ def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Ca
         names, masks = [name for name, mask in pairs if mask.any()], [mask for _, mask in pairs if mask.any()]
     else:
         names, masks = ["cases"], [np.ones(len(frame), dtype=np.bool_)]
-    return [Category(name, masks[k], SERIES[k], MARKERS[k]) for k, name in enumerate(names)]
+    return [Category(name, masks[index], SERIES[index], MARKERS[index]) for index, name in enumerate(names)]
 
 
 @in_page_style
@@ -77,29 +77,32 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, enla
 
     enlarged: fit the axes to the errors, even if the circle lies outside the axes
     """
-    parts = axis_columns(metric, [str(column) for column in frame.columns])[:2]
-    if len(parts) < 2:
+    components = axis_columns(metric, [str(column) for column in frame.columns])[:2]
+    if len(components) < 2:
         return None
-    points = np.column_stack([numbers(frame, part) for part in parts])
+    points = np.column_stack([numbers(frame, component) for component in components])
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         return None
     ellipse = error_ellipse(points, ELLIPSE)
     limit = 1.08 * float(np.abs(points[finite]).max()) or 1.0
     if not enlarged and bound is not None and bound > 0.0:
+        # the axes include the circle and end at `axis_edge`
         inner_limit = 1.05 * axis_edge(np.abs(points[finite]).max(axis=1), bound)
         limit = min(limit, inner_limit) if limit > 1.15 * bound else 1.15 * bound
     if enlarged and ellipse is not None:
         limit = max(limit, ellipse.half_extent)
     figure, axes = new_axes(5.0, 4.9)
-    inside = (np.abs(points) <= limit).all(axis=1)
+    is_inside = (np.abs(points) <= limit).all(axis=1)
     for category in categories(frame, metric, bound):
-        x, y = points[category.mask & finite & inside].T
+        x, y = points[category.mask & finite & is_inside].T
         _draw_points(axes, x, y, category)
-        x, y = np.clip(points[category.mask & finite & ~inside], -limit, limit).T
+        x, y = np.clip(points[category.mask & finite & ~is_inside], -limit, limit).T
         _draw_points(axes, x, y, category, hollow=True)
-    if (finite & ~inside).any():
-        axes.plot([], [], "o", markerfacecolor="none", color=INK, label=f"{(finite & ~inside).sum():,} beyond the axes")
+    if (finite & ~is_inside).any():
+        axes.plot(
+            [], [], "o", markerfacecolor="none", color=INK, label=f"{(finite & ~is_inside).sum():,} beyond the axes"
+        )
     if bound is not None:
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
         if bound <= limit * math.sqrt(2.0):  # else the circle lies outside the axes
@@ -112,7 +115,7 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, enla
     axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1)
     axes.axvline(0.0, color=MUTED, linewidth=0.8, zorder=1)
     axes.set(xlim=(-limit * 1.04, limit * 1.04), ylim=(-limit * 1.04, limit * 1.04), aspect="equal")
-    axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
+    axes.set(xlabel=label(components[0]), ylabel=label(components[1]))
     axes.legend(bbox_to_anchor=(0.5, -0.14), **_LEGEND_BELOW)
     return figure
 
@@ -150,12 +153,12 @@ def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Fi
     largest = float(on_axis.max()) if on_axis.size else edge
     bins = np.linspace(0.0, largest or 1.0, 1 + int(np.clip(2 * math.sqrt(magnitude.size), 6, 60)))
     axes.hist(on_axis, bins=list(bins), color=SERIES[0], alpha=0.85)
-    beyond = magnitude.size - on_axis.size
+    n_beyond = magnitude.size - on_axis.size
     axes.set(xlabel=magnitude_label(metric), ylabel="cases", xlim=(0.0, edge * 1.02))
-    if beyond:  # a hatched bar beyond the axis
-        axes.bar(1.11 * edge, beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
+    if n_beyond:  # a hatched bar beyond the axis
+        axes.bar(1.11 * edge, n_beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
         axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
-        text, position = f"{beyond:,}\n> {edge:.3g}", (1.11 * edge, beyond)
+        text, position = f"{n_beyond:,}\n> {edge:.3g}", (1.11 * edge, n_beyond)
         _annotate(axes, text, position, (0, 2), ha="center", va="bottom", fontsize=8)
         axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= edge])
         axes.set_xlim(0.0, 1.18 * edge)
@@ -185,10 +188,10 @@ def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) ->
     return figure
 
 
-def note_beyond(axes: Axes, beyond: int) -> None:
+def note_beyond(axes: Axes, n_beyond: int) -> None:
     """Write the number of cases beyond the axis at the right edge of a cumulative curve, if there are any."""
-    if beyond:
-        text = f"{count_text(beyond, 'case')} beyond →"
+    if n_beyond:
+        text = f"{count_text(n_beyond, 'case')} beyond →"
         axes.annotate(text, (0.985, 0.04), xycoords="axes fraction", ha="right", va="bottom", color=INK, fontsize=9)
 
 
@@ -205,7 +208,7 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
         return None
     figure, axes = new_axes(4.2, 3.2)
     edge = _scatter_edge(magnitude[finite], bound)
-    top = 1.12 * edge
+    top = 1.12 * edge  # ticks of cases without an error; hollow markers are at 1.06 * edge
     groups = categories(frame, metric, bound)
     for group in groups:
         on_axis, beyond_axis = (group.mask & finite & on_scale for on_scale in (magnitude <= edge, magnitude > edge))
@@ -215,12 +218,12 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
         # otherwise the scatter figure has the legend
         axes.legend(bbox_to_anchor=(0.5, -0.18), **_LEGEND_BELOW)
     bins = min(int(finite.sum()) // _CASES_PER_POINT, _MAX_POINTS)
-    if bins >= _MIN_POINTS:  # median (solid) and 95 % quantile (dotted) of bins of equally many cases
-        finite_x, limited = x[finite], np.minimum(magnitude[finite], 1.06 * edge)
-        parts = np.array_split(np.argsort(finite_x, kind="stable"), bins)
-        centres = [float(np.median(finite_x[part])) for part in parts]
+    if bins >= _MIN_POINTS:  # median (solid) and 95 % quantile (dotted) of bins with equal numbers of cases
+        finite_x, limited_magnitude = x[finite], np.minimum(magnitude[finite], 1.06 * edge)
+        bin_indices = np.array_split(np.argsort(finite_x, kind="stable"), bins)
+        centres = [float(np.median(finite_x[indices])) for indices in bin_indices]
         for quantile, line in ((0.5, "-"), (0.95, ":")):
-            values = [float(np.quantile(limited[part], quantile)) for part in parts]
+            values = [float(np.quantile(limited_magnitude[indices], quantile)) for indices in bin_indices]
             axes.plot(centres, values, line, color=INK, zorder=4)
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
@@ -253,10 +256,10 @@ def outcome_bars(frame: pd.DataFrame) -> Figure | None:
     counts = outcome_counts(frame)
     if not counts:
         return None
-    answered = answered_outcomes(frame)
+    outcomes_with_answer = answered_outcomes(frame)
     figure, axes = new_axes(6.4, 0.75 + 0.36 * len(counts))
     for row, (name, count) in enumerate(counts):
-        style = "crossed" if name in ENGINE_FAILURES else "full" if name in answered else "hatched"
+        style = "crossed" if name in ENGINE_FAILURES else "full" if name in outcomes_with_answer else "hatched"
         axes.barh(row, count, height=0.66, **BARS[style])
         _annotate(axes, f"{count:,}", (count, row), (4, 0), va="center")
     axes.set_yticks(range(len(counts)), [name for name, _ in counts])
@@ -284,11 +287,12 @@ def _finite_magnitudes(
 def _draw_points(
     axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], category: Category, *, hollow: bool = False
 ) -> None:
-    dense = x.size > section.MAX_VECTOR_POINTS
+    is_dense = x.size > section.MAX_VECTOR_POINTS
     axes.plot(
-        x, y, linestyle="", marker=category.marker, markersize=3.0 if dense else 5.5, alpha=0.55 if dense else 0.85,
-        markeredgewidth=1.0 if hollow else 0.0, markerfacecolor="none" if hollow else category.colour,
-        color=category.colour, label="_beyond" if hollow else category.name, rasterized=dense, zorder=2,
+        x, y, linestyle="", marker=category.marker, markersize=3.0 if is_dense else 5.5,
+        alpha=0.55 if is_dense else 0.85, markeredgewidth=1.0 if hollow else 0.0,
+        markerfacecolor="none" if hollow else category.colour, color=category.colour,
+        label="_beyond" if hollow else category.name, rasterized=is_dense, zorder=2,
     )  # fmt: skip
 
 
@@ -298,9 +302,9 @@ def _draw_bound(axes: Axes, metric: str, bound: float | None, height: float) -> 
         return
     axes.axvline(bound, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3)
     # the text is left of the line unless the line is too close to the y axis
-    left = bound > 0.3 * axes.get_xlim()[1]
-    text, side = f"requirement {bound:g} {split_unit(metric)[1]}", "right" if left else "left"
-    shift = (-5 if left else 5, 0)
+    is_left = bound > 0.3 * axes.get_xlim()[1]
+    text, side = f"requirement {bound:g} {split_unit(metric)[1]}", "right" if is_left else "left"
+    shift = (-5 if is_left else 5, 0)
     _annotate(axes, text, (bound, height), shift, xycoords=("data", "axes fraction"), ha=side, va="top")
 
 
@@ -335,8 +339,8 @@ def cumulative_figure(
             y = 1.0 - fraction if complementary else fraction
             axes.plot(x, y, drawstyle="steps-post", color=colour, linestyle=line, label=name)
     for name, positions in (limits or {}).items():
-        for number, position in enumerate(positions):
-            label = name if number == 0 else None
+        for index, position in enumerate(positions):
+            label = name if index == 0 else None
             axes.axvline(position, color=REQUIREMENT, linewidth=0.9, linestyle="-.", label=label)
     axes.set(xlabel=labels[0], ylabel=labels[1], ylim=(0.0, 1.03))
     axes.set_xlim(left=0.0)
@@ -412,7 +416,7 @@ Points = tuple[Sequence[float] | Values, Sequence[float] | Values]
 @in_page_style
 def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, logarithmic: bool = False) -> Figure:
     """Draw panels with cases and medians of bins, by x and y labels: a row for each y, a column for each x."""
-    columns, rows = (list(dict.fromkeys(pair[k] for pair in panels)) for k in (0, 1))
+    columns, rows = (list(dict.fromkeys(pair[index] for pair in panels)) for index in (0, 1))
     size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(rows))
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col", sharey="row")

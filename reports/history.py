@@ -232,16 +232,17 @@ class Comparison:
 
 
 def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
-    """Find the changed metrics of a night, with at most `MAX_FALSE_ALARM_PROBABILITY` of any false alarm."""
-    pooled: list[Sample | None] = []
+    """Find the changed metrics of a night; a false alarm has at most the probability `MAX_FALSE_ALARM_PROBABILITY`."""
+    earlier_samples: list[Sample | None] = []
     for comparison in comparisons:
-        parts = ([getattr(sample, part) for sample in comparison.before] for part in ("values", "terrains"))
-        pooled.append(Sample(*map(np.concatenate, parts)) if comparison.before else None)
+        columns = ([getattr(sample, field) for sample in comparison.before] for field in ("values", "terrains"))
+        earlier_samples.append(Sample(*map(np.concatenate, columns)) if comparison.before else None)
+    # Holm's method compares the smallest p-value with the significance level divided by the number of metrics
     permutations = math.ceil(_MIN_EXCEEDANCES * len(comparisons) / _SIGNIFICANCE)
     p_values = correct_holm(
         [
-            math.nan if earlier is None else difference_p_value(comparison.metric.sample, earlier, permutations)
-            for comparison, earlier in zip(comparisons, pooled, strict=True)
+            math.nan if sample is None else difference_p_value(comparison.metric.sample, sample, permutations)
+            for comparison, sample in zip(comparisons, earlier_samples, strict=True)
         ]
     )
     return [
@@ -249,13 +250,13 @@ def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
             campaign=comparison.campaign,
             metric=comparison.metric.name,
             is_rate=comparison.metric.is_rate,
-            before=compute_summary(earlier, comparison.metric.is_rate),
+            before=compute_summary(sample, comparison.metric.is_rate),
             now=compute_summary(comparison.metric.sample, comparison.metric.is_rate),
-            p_value=p,
+            p_value=p_value,
             nights=len(comparison.before),
         )
-        for comparison, earlier, p in zip(comparisons, pooled, p_values, strict=True)
-        if earlier is not None and p <= _SIGNIFICANCE
+        for comparison, sample, p_value in zip(comparisons, earlier_samples, p_values, strict=True)
+        if sample is not None and p_value <= _SIGNIFICANCE
     ]
 
 
@@ -294,16 +295,19 @@ def format_night_page(
         headline = verdicts + (f", {count(len(regressions), 'regression')}" if regressions else "")
         end = f"ended {night.finished_utc}"
     lines = [f"# Night {night.night}: {headline}", ""]
-    lines.append(f"Begun {night.started_utc}, {end}; commit {night.git_commit or 'not known'}.")
-    unfinished = list(takewhile(lambda earlier_night: earlier_night.state != FINISHED, earlier))
-    lines += [""] * bool(unfinished)
-    lines += [f"Night {previous.night}, begun {previous.started_utc}, was {previous.state}." for previous in unfinished]
+    lines.append(f"Started {night.started_utc}, {end}; commit {night.git_commit or 'not known'}.")
+    unfinished_nights = list(takewhile(lambda earlier_night: earlier_night.state != FINISHED, earlier))
+    lines += [""] * bool(unfinished_nights)
+    lines += [
+        f"Night {previous.night}, started {previous.started_utc}, was {previous.state}."
+        for previous in unfinished_nights
+    ]
     lines += ["", "| Campaign | Verdict | |", "|---|---|---|"]
     lines += [f"| {_escape(run.name)} | {_escape(run.verdict)} | {_escape(run.sentence)} |" for run in campaigns]
-    for title, group in (("Regressions", regressions), ("Improvements", improvements)):
-        if group:
+    for title, group_changes in (("Regressions", regressions), ("Improvements", improvements)):
+        if group_changes:
             lines += ["", f"## {title}", ""]
-        for change in group:
+        for change in group_changes:
             before, now = ((percent if change.is_rate else number)(value) for value in (change.before, change.now))
             values = f"{before} in {count(change.nights, 'earlier night')}, {now} now (p = {change.p_value:.1g})"
             lines.append(f"- **{_escape(change.campaign)}: {_escape(change.metric)}**: {values}")
@@ -317,5 +321,5 @@ def format_night_page(
 
 def _escape(text: str) -> str:
     """Escape characters with a meaning in Markdown or HTML."""
-    marks = {letter: f"&#{ord(letter)};" for letter in "&<>|"} | {letter: f"\\{letter}" for letter in "\\`*_[]#"}
-    return "".join(marks.get(letter, letter) for letter in " ".join(text.split()))
+    escapes = {letter: f"&#{ord(letter)};" for letter in "&<>|"} | {letter: f"\\{letter}" for letter in "\\`*_[]#"}
+    return "".join(escapes.get(letter, letter) for letter in " ".join(text.split()))

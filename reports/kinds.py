@@ -27,8 +27,8 @@ Rows = pd.DataFrame
 BlocksAndData = tuple[Sequence[Block], Mapping[str, Any]]
 #: Function that computes a rate of rows.
 RateFunction = Callable[[Rows], CaseFraction | PooledRate]
-#: Maximum number of bins of a condition (bins contain equally many cases), and minimum number of cases of a bin.
-_N_BINS, _MIN_IN_BIN = 5, 4
+#: Maximum number of bins of a condition (bins have equal numbers of cases), and minimum number of cases of a bin.
+_MAX_BINS, _MIN_CASES_IN_BIN = 5, 4
 #: Maximum number of values of a condition with a row each.
 _MAX_VALUES = 24
 
@@ -104,14 +104,14 @@ class Quantity:
         return np.asarray(self.scale * numbers(frame, self.column))
 
 
-def flag_rate(name: str, *given: str, value: bool = True) -> RateFunction:
-    """Return a function that computes how often the flag `name` equals `value`, among rows with all flags `given`."""
+def flag_rate(name: str, *conditions: str, value: bool = True) -> RateFunction:
+    """Return a function that computes how often flag `name` equals `value`, in the rows with all flags `conditions`."""
 
     def compute_rate(frame: Rows) -> CaseFraction:
         all_rows = np.ones(len(frame), dtype=np.bool_)
-        masks = (rates.flag_mask(frame, condition) for condition in given)
-        selected = frame[np.logical_and.reduce([all_rows, *masks])]
-        return rates.fraction_of(rates.flag_mask(selected, name) == value, selected)
+        masks = (rates.flag_mask(frame, condition) for condition in conditions)
+        selected_rows = frame[np.logical_and.reduce([all_rows, *masks])]
+        return rates.fraction_of(rates.flag_mask(selected_rows, name) == value, selected_rows)
 
     return compute_rate
 
@@ -149,7 +149,9 @@ class RateTable:
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
         """Create a table of the rates that have cases."""
-        rates_by_name = self.rates(frame) if callable(self.rates) else {r.name: r.compute(frame) for r in self.rates}
+        rates_by_name = (
+            self.rates(frame) if callable(self.rates) else {rate.name: rate.compute(frame) for rate in self.rates}
+        )
         rows = []
         for name, rate in rates_by_name.items():
             if isinstance(rate, CaseFraction) and rate.n:
@@ -166,7 +168,7 @@ class RateTable:
 class RateByCondition:
     """Rates against a condition, as a table and as curves.
 
-    - by: the condition; each value has a row, or each bin of equally many cases if there are many values
+    - by: the condition; each value has a row, or each bin with an equal number of cases if there are many values
     - cases, ylabel: heading of the number of cases in the table, and label of the figure's vertical axis
     - limit: name of a vertical line, and function that returns its position for a campaign
     - data: key of the list in `report.json`
@@ -206,7 +208,10 @@ class RateByCondition:
         grid = Grid([self.by.title, self.cases, *(rate.name for rate in self.rates)], rows)
         bins = [({self.by.column: x, "n": n}, bin_rates) for x, n, bin_rates in records]
         data: dict[str, Any] = {
-            self.data: [head | {k: asdict(r) for k, r in bin_rates.items()} for head, bin_rates in bins]
+            self.data: [
+                head | {rate_key: asdict(bin_rate) for rate_key, bin_rate in bin_rates.items()}
+                for head, bin_rates in bins
+            ]
         }
         if limit is not None:
             data["limit"] = limit[1]
@@ -214,17 +219,17 @@ class RateByCondition:
         return [block, Block(grid=grid, note=self.note)], data
 
 
-def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _N_BINS) -> list[Bool[np.ndarray, " n"]]:
-    """Create a mask for each value, or for bins of equally many cases if there are many values; NaN is in no mask."""
+def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _MAX_BINS) -> list[Bool[np.ndarray, " n"]]:
+    """Create a mask for each value, or for bins with equal numbers of cases if there are many values, without NaN."""
     finite = np.isfinite(values)
     distinct = np.unique(values[finite])
     if distinct.size <= max_values:
         return [values == value for value in distinct]
-    bins = max(1, min(_N_BINS, int(finite.sum()) // _MIN_IN_BIN))
+    bins = max(1, min(_MAX_BINS, int(finite.sum()) // _MIN_CASES_IN_BIN))
     ranks = np.argsort(np.argsort(values[finite], kind="stable"), kind="stable")
     bin_numbers = np.full(values.size, -1)
     bin_numbers[finite] = ranks * bins // int(finite.sum())
-    return [bin_numbers == k for k in range(bins)]
+    return [bin_numbers == index for index in range(bins)]
 
 
 @dataclass(frozen=True)
@@ -403,11 +408,11 @@ class Scatter:
             )
             for effect in effects
         }
-        texts: dict[str, list[str]] = {}
+        texts_by_condition: dict[str, list[str]] = {}
         for effect in effects:
-            texts.setdefault(effect["driver"], []).append(correlation_text(effect))
+            texts_by_condition.setdefault(effect["driver"], []).append(correlation_text(effect))
         head = ["Rank correlation", *(response.title for response in self.y)]
-        grid = Grid(head, [[name, *cells] for name, cells in texts.items()])
+        grid = Grid(head, [[name, *cells] for name, cells in texts_by_condition.items()])
         figure = scatter_panels(panels, logarithmic=self.logarithmic)
         confidence_text = f"The intervals are at {format_fraction(CONFIDENCE)} confidence."
         note = f"{confidence_text} A dash means that there are fewer than {MIN_CASES} cases or only one value."

@@ -67,9 +67,9 @@ class Presentation:
     """Report sections and case figures of a system.
 
     - cases: kinds of case; the first kind that matches the products is used
-    - first: functions that create the sections in front of those of every campaign
-    - sections: functions that create the sections after those of every campaign
-    - outcomes: enumerations of the outcomes; the values describe the outcomes
+    - first: functions that create sections before the sections common to all campaigns
+    - sections: functions that create sections after the common sections
+    - outcomes: enumerations of outcomes; each value describes its outcome
     """
 
     cases: Sequence[CaseKind] = ()
@@ -81,7 +81,7 @@ class Presentation:
 @cache
 def presentations() -> tuple[Presentation, ...]:
     """Import the presentations of all systems in the order of the registry; omit an invalid one with a warning."""
-    selected: list[Presentation] = []
+    valid_presentations: list[Presentation] = []
     for system in systems():
         if not system.report:
             continue
@@ -92,11 +92,11 @@ def presentations() -> tuple[Presentation, ...]:
             _warn(f"{description} cannot be imported: {error}")
             continue
         if isinstance(presentation, Presentation):
-            selected.append(presentation)
+            valid_presentations.append(presentation)
         else:
             type_name = type(presentation).__name__
             _warn(f"{description} is a {type_name}; allowed: a marsyard.reports.presentation.Presentation")
-    return tuple(selected)
+    return tuple(valid_presentations)
 
 
 def _warn(reason: str) -> None:
@@ -138,7 +138,9 @@ def check_shape(value: object, *shape: int | None) -> Float[np.ndarray, "..."] |
     values = numeric_product(value)
     if values is None or values.ndim != len(shape):
         return None
-    is_valid = all(expected in (None, length) for expected, length in zip(shape, values.shape, strict=True))
+    is_valid = all(
+        required_length in (None, length) for required_length, length in zip(shape, values.shape, strict=True)
+    )
     return values if is_valid else None
 
 
@@ -147,8 +149,8 @@ def read_arrays(
 ) -> list[Float[np.ndarray, "..."]] | None:
     """Read products by name and shape; None if a product is missing, invalid, or not finite if `finite` is set."""
     arrays = [check_shape(products.get(name), *shape) for name, shape in shapes.items()]
-    valid = [array for array in arrays if array is not None and (not finite or np.isfinite(array).all())]
-    return valid if len(valid) == len(shapes) else None
+    valid_arrays = [array for array in arrays if array is not None and (not finite or np.isfinite(array).all())]
+    return valid_arrays if len(valid_arrays) == len(shapes) else None
 
 
 #: Number of cases of each kind (largest errors, no answer, random); the images of a case need half a megabyte.
@@ -205,10 +207,10 @@ def _sort_by_error(rows: pd.DataFrame, metric: str) -> tuple[list[int], list[int
 
 def _select_cases(first: list[int], *kinds: list[int]) -> list[int]:
     """List the first cases, then up to `CASES_PER_KIND` further cases of each kind."""
-    selected = list(first)
+    cases = list(first)
     for kind in kinds:
-        selected += [case for case in dict.fromkeys(kind) if case not in selected][:CASES_PER_KIND]
-    return selected
+        cases += [case for case in dict.fromkeys(kind) if case not in cases][:CASES_PER_KIND]
+    return cases
 
 
 def showcase_view(run: StoredRun, case: int) -> ShowcaseView | None:

@@ -25,12 +25,12 @@ from marsyard.reports.section import (
 from marsyard.reports.stored import read_run, table
 from marsyard.reports.wording import count, percent
 
-#: Replicates drawn in the figure.
-_MAX_DRAWN = 8
+#: Maximum number of replicates in the figure.
+_MAX_REPLICATES = 8
 
 
 def read_result(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the settings of a rare study with its `result`; empty for another folder or an unfinished study."""
+    """Return the settings of a study of rare violations with its `result`; empty for another or an unfinished study."""
     study = table(record.get("study"))
     return study if study.get("kind") == "rare" and table(study.get("result")) else {}
 
@@ -67,7 +67,7 @@ def result_sentences(study: Mapping[str, Any]) -> list[str]:
     if isinstance(counting, int | float) and counting > cases:
         cost += f" Counting would need about {counting:,.0f} independent cases for an interval of the same width."
     sentences.append(cost)
-    if not all(item["reached"] for item in result["replicates"]):
+    if not all(replicate["reached"] for replicate in result["replicates"]):
         sentences.append(
             "Some replicates reached no violation before their levels became less likely than a hundredth of the "
             "limit. The probability of their last level is an upper limit, and the lower bound is 0."
@@ -94,17 +94,17 @@ def rare_section(subject: Subject) -> Section | None:
     rows = [
         [
             str(index + 1),
-            probability_text(item["probability"]),
-            str(len(item["thresholds"])),
-            "yes" if item["reached"] else "no",
+            probability_text(replicate["probability"]),
+            str(len(replicate["thresholds"])),
+            "yes" if replicate["reached"] else "no",
         ]
-        for index, item in enumerate(replicates)
+        for index, replicate in enumerate(replicates)
     ]
     grid = Grid(["Replicate", "Probability", "Levels", "Violation reached"], rows)
     note = (
-        "Each replicate is an independent subset simulation. Each level contains a tenth of the previous one's cases. "
-        "The interval comes from the spread of the replicates, since the error that one replicate estimates for itself "
-        "is too small."
+        "Each replicate is an independent subset simulation. Each level contains a tenth of the cases of the "
+        "previous level. The interval comes from the spread of the replicates, since the error that one replicate "
+        "estimates for itself is too small."
     )
     figure = svg_figure(
         _draw_levels(replicates, float(study["max_probability"])),
@@ -125,11 +125,12 @@ def rare_section(subject: Subject) -> Section | None:
 @in_page_style
 def _draw_levels(replicates: list[Mapping[str, Any]], max_probability: float) -> Figure:
     figure, axes = new_axes(6.0, 3.4)
-    for index, item in enumerate(replicates[:_MAX_DRAWN]):
-        thresholds = [value for value in item["thresholds"] if value is not None]
+    for index, replicate in enumerate(replicates[:_MAX_REPLICATES]):
+        thresholds = [value for value in replicate["thresholds"] if value is not None]
+        # each level contains this fraction of the cases of the previous level
         probabilities = [LEVEL_FRACTION ** (level + 1) for level in range(len(thresholds))]
-        margins = [*thresholds, 0.0] if item["reached"] else thresholds
-        probabilities = [*probabilities, item["probability"]] if item["reached"] else probabilities
+        margins = [*thresholds, 0.0] if replicate["reached"] else thresholds
+        probabilities = [*probabilities, replicate["probability"]] if replicate["reached"] else probabilities
         style: dict[str, Any] = {"color": SERIES[index % len(SERIES)], "marker": MARKERS[index % len(MARKERS)]}
         axes.plot(margins, probabilities, markersize=4, linewidth=1.0, **style)
     axes.axhline(max_probability, color=REQUIREMENT, linestyle="--", linewidth=1.0)

@@ -23,11 +23,11 @@ def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 
 
     Missing values and unfinished cases are no successes. A metric may be a sum of columns, joined by " + ".
     """
-    finished = ~engine_failed(frame)
+    is_finished = ~engine_failed(frame)
     if math.isnan(bound):
-        return np.asarray(flag_mask(frame, metric) & finished, dtype=np.bool_)
+        return np.asarray(flag_mask(frame, metric) & is_finished, dtype=np.bool_)
     values = sum((numbers(frame, part) for part in metric.split(" + ")), np.zeros(len(frame)))
-    return np.asarray((np.abs(scale * values) <= bound) & finished, dtype=np.bool_)
+    return np.asarray((np.abs(scale * values) <= bound) & is_finished, dtype=np.bool_)
 
 
 def population_mask(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
@@ -42,7 +42,7 @@ def population_and_unknown_masks(
     frame: pd.DataFrame, parts: Sequence[str]
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Create the masks of the intersection of populations, and of its cases with a missing flag."""
-    is_member, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
+    is_member, is_unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
     for population in parts:
         if population == "completed":
             is_member &= ~engine_failed(frame)
@@ -50,10 +50,10 @@ def population_and_unknown_masks(
             column = "answered" if population == "valid" else population
             if not is_flag(frame, column):
                 raise ValueError(f"the rows have no column '{column}' of true and false, which defines a population")
-            missing = frame[column].isna().to_numpy(dtype=np.bool_)
-            is_member &= flag_mask(frame, column) | missing
-            unknown |= missing
-    return is_member, is_member & unknown
+            is_missing = frame[column].isna().to_numpy(dtype=np.bool_)
+            is_member &= flag_mask(frame, column) | is_missing
+            is_unknown |= is_missing
+    return is_member, is_member & is_unknown
 
 
 def is_flag(frame: pd.DataFrame, column: str) -> bool:
@@ -119,21 +119,22 @@ class CaseFraction:
         return self.shared_lower, self.shared_upper
 
 
-def fraction_of(hit: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> CaseFraction:
-    """Return the fraction of the cases of `frame` that `hit` marks."""
-    n, hits = hit.size, int(hit.sum())
+def fraction_of(mask: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> CaseFraction:
+    """Compute the fraction of the cases of `frame` that a mask selects."""
+    n, hits = mask.size, int(mask.sum())
     if n == 0:
         return CaseFraction(0, 0, math.nan, 0.0, 1.0)
     groups, clustered = terrain_groups(frame), None
     if groups is not None and int(groups.max()) + 1 < n:
-        evidence = clustered_evidence(hit, groups, 0.5 * (1.0 + CONFIDENCE))
+        # a two-sided interval consists of two one-sided bounds at this confidence
+        evidence = clustered_evidence(mask, groups, 0.5 * (1.0 + CONFIDENCE))
         clustered = evidence.lower, evidence.upper
     return CaseFraction(n, hits, hits / n, *proportion_interval(hits, n, CONFIDENCE), *(clustered or (None, None)))
 
 
-def flag_fraction(frame: pd.DataFrame, name: str, *, wanted: bool = True) -> CaseFraction:
-    """Return the fraction of rows whose flag equals `wanted`."""
-    return fraction_of(frame[name].eq(wanted).fillna(False).to_numpy(dtype=np.bool_), frame)
+def flag_fraction(frame: pd.DataFrame, name: str, *, value: bool = True) -> CaseFraction:
+    """Compute the fraction of rows whose flag equals `value`."""
+    return fraction_of(frame[name].eq(value).fillna(False).to_numpy(dtype=np.bool_), frame)
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ class PooledRate:
 
 
 def pooled_rate(frame: pd.DataFrame, hits: str, of: str) -> PooledRate:
-    """Pool the fraction of two columns of counts over the cases; missing hits count as 0."""
+    """Divide the sums of two columns of counts over the cases; missing counts are 0."""
     hit_counts, item_counts = (np.nan_to_num(numbers(frame, name)) for name in (hits, of))
     has_items = item_counts > 0
     cases, cases_hit = int(has_items.sum()), int((has_items & (hit_counts > 0)).sum())
@@ -165,6 +166,7 @@ def pooled_rate(frame: pd.DataFrame, hits: str, of: str) -> PooledRate:
     lower = upper = math.nan
     if cases_hit and cases > 1:
         groups = terrain_groups(frame[has_items])
+        # resample terrains, or cases if there is at most one terrain
         clusters = np.arange(cases) if groups is None or int(groups.max()) < 1 else groups
         weights = bootstrap_weights(clusters, np.random.default_rng(_SEED))[1:]
         sums = weights @ item_counts[has_items]
@@ -260,5 +262,7 @@ def median_text(values: Float[np.ndarray, " n"], digits: int | None = None) -> s
     if values.size == 0:
         return NOTHING
     low, median, high = (float(value) for value in (values.min(), np.median(values), values.max()))
-    texts = [number(x) if digits is None else f"{x:.{digits}f}".replace("-", "−") for x in (median, low, high)]
+    texts = [
+        number(value) if digits is None else f"{value:.{digits}f}".replace("-", "−") for value in (median, low, high)
+    ]
     return texts[0] if texts[1] == texts[2] else f"{texts[0]} ({texts[1]} to {texts[2]})"

@@ -32,21 +32,25 @@ class TerrainSupply:
     key: str
     in_turn: bool = False
 
-    def advice(self, needed: int, probability: float, confidence: float) -> str:
+    def advice(self, min_terrains: int, probability: float, confidence: float) -> str:
         """Explain that the campaign needs more terrains (`needed`), not more cases, and how to configure them."""
         requirement = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
-        stored = f"{count(self.terrains, 'stored terrain')} ({self.key} = {self.terrains})"
-        shortage = f"The campaign has only {stored}."
-        if self.terrains >= needed:
-            shortage = f"Terrains are drawn at random and can repeat, so the {stored} are unlikely to give as many."
+        supply_text = f"{count(self.terrains, 'stored terrain')} ({self.key} = {self.terrains})"
+        shortage = f"The campaign has only {supply_text}."
+        if self.terrains >= min_terrains:
+            shortage = (
+                f"Terrains are drawn at random and can repeat, so the {supply_text} are unlikely to give as many."
+            )
         text = (
-            f"To show a success rate of {requirement}, the cases must include at least {needed:,} different terrains. "
-            f"{shortage}"
+            f"To show a success rate of {requirement}, the cases must include at least {min_terrains:,} different "
+            f"terrains. {shortage}"
         )
         if not self.key.endswith(".bank"):
             return f"{text} Widen the range of {self.key}, and the bank, and run the campaign again."
-        # random draws from ten times as many terrains rarely repeat a terrain, so 1.1 cases per terrain are sufficient
-        bank, cases = (needed, needed) if self.in_turn else (10 * needed, math.ceil(1.1 * needed))
+        # 1.1 n random draws from 10 n terrains give 10 n (1 - exp(-0.11)) = 1.04 n different terrains on average
+        bank, cases = 10 * min_terrains, math.ceil(1.1 * min_terrains)
+        if self.in_turn:
+            bank = cases = min_terrains
         remedy = f"{bank:,} stored terrains and {cases:,} cases: --set {self.key}={bank} -n {cases}."
         return f"{text} Run the campaign again with {remedy}"
 
@@ -96,13 +100,13 @@ class SamplingDesign:
         """Fraction of the risk of a wrong verdict (1 - confidence) that a look at `cases` cases may use."""
         return 1.0 if self.max_cases is None else spent_fraction(planned_looks(self.max_cases), cases)
 
-    def mask_first_look(self, frame: pd.DataFrame, selected: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
-        """Create the mask of the rows of `selected` that were used in an earlier first look; None at the first look."""
+    def mask_first_look(self, frame: pd.DataFrame, population: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
+        """Create the mask of the rows of a population that an earlier first look used; None at the first look."""
         if self.first_look is None or self.max_cases is not None or "case" not in frame:
             return None
         if not bool((frame["case"] >= self.first_look).any()):
             return None
-        return np.asarray(selected["case"] < self.first_look, dtype=np.bool_)
+        return np.asarray(population["case"] < self.first_look, dtype=np.bool_)
 
     def exclude_nominal_case(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Return the rows without the nominal case."""
@@ -132,7 +136,7 @@ def read_sampling_design(configuration: Mapping[str, Any]) -> SamplingDesign:
 
 
 def read_terrain_supply(configuration: Mapping[str, Any]) -> TerrainSupply | None:
-    """Read the available terrains from a configuration; None if unknown."""
+    """Read the number of available terrains from a configuration; None if unknown."""
     parameters, dispersions = table(configuration.get("parameters")), table(configuration.get("dispersions"))
     for name in ("location", "world"):
         bank = table(parameters.get(name)).get("bank")
@@ -143,8 +147,8 @@ def read_terrain_supply(configuration: Mapping[str, Any]) -> TerrainSupply | Non
         if not dispersion:
             return TerrainSupply(1, path)
         in_turn = dispersion.get("distribution") == "in-turn"
-        first, last = dispersion.get("low"), dispersion.get("high")
-        if isinstance(first, int) and isinstance(last, int) and last - first + 1 < bank:
-            return TerrainSupply(last - first + 1, f'dispersions."{path}"', in_turn)
+        low, high = dispersion.get("low"), dispersion.get("high")
+        if isinstance(low, int) and isinstance(high, int) and high - low + 1 < bank:
+            return TerrainSupply(high - low + 1, f'dispersions."{path}"', in_turn)
         return TerrainSupply(bank, f"{name}.bank", in_turn)
     return None

@@ -24,16 +24,16 @@ def search_sentences(study: Mapping[str, Any]) -> list[str]:
     if not study:
         return []
     result = table(study.get("result"))
-    searched = count(int(result["searched"]), "case")
-    total = f"{count(int(result['cases']), 'case')} in all"
+    searched_text = count(int(result["searched"]), "case")
+    total_text = f"{count(int(result['cases']), 'case')} in all"
     if not result["violations"]:
         margin = number(float(result["min_margin"])) if result.get("min_margin") is not None else NOTHING
-        sentences = [f"{study['requirement']}: no violation in {searched}; the smallest margin is {margin}."]
+        sentences = [f"{study['requirement']}: no violation in {searched_text}; the smallest margin is {margin}."]
     else:
-        violations, causes = count(int(result["violations"]), "violation"), len(result["failures"])
+        violations, n_reduced = count(int(result["violations"]), "violation"), len(result["failures"])
         sentences = [
-            f"{study['requirement']}: {violations} in {searched}, the first after {result['first_violation']}; "
-            f"{count(causes, 'reduced violation')} after {total}."
+            f"{study['requirement']}: {violations} in {searched_text}, the first after {result['first_violation']}; "
+            f"{count(n_reduced, 'reduced violation')} after {total_text}."
         ]
     sentences += [failure_sentence(index, failure) for index, failure in enumerate(result["failures"], start=1)]
     return [*sentences, *([str(result["reason"])] if result.get("reason") else []), str(result["margin_text"])]

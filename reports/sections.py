@@ -81,11 +81,13 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
     else:
         lowest = min(verdict.lower, verdict.probability)
         # the scale starts below the lower bound and the required rate, and ends at 100 %
-        start = max(0.0, lowest - 0.25 * (1.0 - lowest))
+        scale_start = max(0.0, lowest - 0.25 * (1.0 - lowest))
         rates = {"estimate": verdict.estimate, "required": verdict.probability}
         rates |= {"lower": verdict.lower, "upper": verdict.upper}
-        scale = 100.0 / max(1.0 - start, 1e-12)
-        strip = {"left": f"{100.0 * start:.3g} %"} | {name: scale * (rate - start) for name, rate in rates.items()}
+        scale = 100.0 / max(1.0 - scale_start, 1e-12)
+        strip = {"left": f"{100.0 * scale_start:.3g} %"} | {
+            name: scale * (rate - scale_start) for name, rate in rates.items()
+        }
     return {
         "verdict": verdict,
         "requirement": requirement_text(verdict),
@@ -101,8 +103,8 @@ def outcome_grid(frame: pd.DataFrame) -> Grid:
     """Count the cases by outcome, with the meaning of each outcome."""
     kinds: list[type[Enum]] = [Fault, *(kind for presentation in presentations() for kind in presentation.outcomes)]
     meanings = {member.name: str(member.value) for kind in kinds for member in kind}
-    n, counts = len(frame), outcome_counts(frame)
-    rows = [[name, f"{cases:,}", percent(cases / n), meanings.get(name, NOTHING)] for name, cases in counts]
+    n_cases, counts = len(frame), outcome_counts(frame)
+    rows = [[name, f"{cases:,}", percent(cases / n_cases), meanings.get(name, NOTHING)] for name, cases in counts]
     return Grid(["Outcome", "Cases", "Fraction", "Meaning"], rows)
 
 
@@ -145,26 +147,26 @@ def _case_table(
 
 
 #: Keys of a dispersion that are not parameters of its distribution.
-_NOT_PARAMETERS = ("distribution", "source", "unit", "description")
+_NON_PARAMETER_KEYS = ("distribution", "source", "unit", "description")
 
 
 def dispersion_grid(run: StoredRun) -> Grid:
     """Create a table of the dispersions, with the values in the rows."""
     rows, model = [], _parameters_type(run)
     for path, entry in table(run.recorded("dispersions")).items():
-        dispersion, parts = table(entry), str(path).split(".")
+        dispersion, path_parts = table(entry), str(path).split(".")
         # the column name is the path of the parameter or the end of the path
-        names = [str(path), *("_".join(parts[start:]) for start in range(len(parts)))]
+        names = [str(path), *("_".join(path_parts[start:]) for start in range(len(path_parts)))]
         column = next((name for name in names if name in run.frame), None)
         statistics = [NOTHING] * 3
         if column is not None:
             values = pd.to_numeric(run.frame[column], errors="coerce").dropna()
             statistics[1] = f"{run.frame[column].nunique()} values"
             if len(values) and not pd.api.types.is_bool_dtype(run.frame[column].dtype):
-                statistics = [_format_value(float(x)) for x in (values.min(), values.mean(), values.max())]
+                statistics = [_format_value(float(value)) for value in (values.min(), values.mean(), values.max())]
         # defaults, which follow a semicolon, do not apply to dispersed parameters
         meaning = str(dispersion.get("description") or (model and description_at(model, str(path))) or NOTHING)
-        meaning, unit = meaning.split(";")[0], split_unit(parts[-1])[1]
+        meaning, unit = meaning.split(";")[0], split_unit(path_parts[-1])[1]
         meaning += f" ({unit})" if unit and not meaning.endswith(f", {unit}") else ""
         source = str(dispersion.get("source") or NOTHING)
         rows.append([meaning, str(path), _distribution_text(dispersion), *statistics, source])
@@ -174,12 +176,12 @@ def dispersion_grid(run: StoredRun) -> Grid:
 def _distribution_text(dispersion: Mapping[str, Any]) -> str:
     """Describe a recorded distribution: ``uniform, 0.6 to 1.2``."""
     name = str(dispersion.get("distribution", "?"))
-    items = {key: x for key, x in dispersion.items() if key not in _NOT_PARAMETERS and x is not None}
+    items = {key: value for key, value in dispersion.items() if key not in _NON_PARAMETER_KEYS and value is not None}
     if name == "choice" and set(items) == {"values"}:
         return f"one of {', '.join(str(value) for value in items['values'])}"
     texts = [f"{items.pop('low')} to {items.pop('high')}"] if {"low", "high"} <= set(items) else []
     limits = items.pop("truncate", None)
-    texts += [f"{'SD' if key == 'sd' else key.replace('_', ' ')} {x}" for key, x in items.items()]
+    texts += [f"{'SD' if key == 'sd' else key.replace('_', ' ')} {value}" for key, value in items.items()]
     if limits is not None:
         texts.append(f"from {limits[0]} to {limits[1]}")
     return ", ".join((name, *texts))
@@ -246,14 +248,14 @@ def rerun_commands(run: StoredRun) -> list[str]:
                 words += [option, str(run.recorded(key))]
         return [shlex.join(words)]
     folder, words = run.command[0], list(run.command[1])
-    blocks = run.configuration.get("appended")
-    # a sequential campaign appends its blocks without a command
-    appended = [] if run.recorded("max_cases") or not isinstance(blocks, list | tuple) else blocks
+    stored_blocks = run.configuration.get("appended")
+    # a sequential campaign appends blocks of cases without a command
+    block_sizes = [] if run.recorded("max_cases") or not isinstance(stored_blocks, list | tuple) else stored_blocks
     target = f"runs/{run.name}-again"
-    if appended:
+    if block_sizes:
         words += ["--out", target]
-    appends = [shlex.join(["marsyard", "append", target, str(cases)]) for cases in appended]
-    return [*([shlex.join(["cd", folder])] if folder else []), shlex.join(words), *appends]
+    append_commands = [shlex.join(["marsyard", "append", target, str(cases)]) for cases in block_sizes]
+    return [*([shlex.join(["cd", folder])] if folder else []), shlex.join(words), *append_commands]
 
 
 def _cell_text(frame: pd.DataFrame, column: str, index: int) -> str:
@@ -292,20 +294,20 @@ def error_figures(frame: pd.DataFrame, all_cases: pd.DataFrame, metric: str, bou
 def driver_figures(frame: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
     """Draw a metric against the conditions that may affect it, with rank correlations."""
     entries, magnitude, groups = [], np.abs(numbers(frame, metric)), terrain_groups(frame)
-    for k, column in enumerate(driver_columns(frame, metric)):
-        result = estimate_driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
-        caption = f"{label(column)}." if result is None else f"{label(column)}: rank correlation {rank_text(result)}."
+    for index, column in enumerate(driver_columns(frame, metric)):
+        driver = estimate_driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
+        caption = f"{label(column)}." if driver is None else f"{label(column)}: rank correlation {rank_text(driver)}."
         n_beyond = figures.count_beyond_axis(frame, metric, column, bound)
         if n_beyond:
             caption = f"{caption} Hollow marks at the upper edge: {count(n_beyond, 'error')} beyond the axis."
-        entries.append((f"driver{k}", figures.error_scatter_against(frame, metric, column, bound), caption))
+        entries.append((f"driver{index}", figures.error_scatter_against(frame, metric, column, bound), caption))
     return _svg_figures(entries)
 
 
-def rank_text(result: Driver) -> str:
+def rank_text(driver: Driver) -> str:
     """Format a rank correlation with its interval: ``0.310 (0.120 to 0.480 at 90 % confidence)``."""
-    lower, upper = coefficient(result.lower), coefficient(result.upper)
-    return f"{coefficient(result.correlation)} ({lower} to {upper} at {format_fraction(CONFIDENCE)} confidence)"
+    lower, upper = coefficient(driver.lower), coefficient(driver.upper)
+    return f"{coefficient(driver.correlation)} ({lower} to {upper} at {format_fraction(CONFIDENCE)} confidence)"
 
 
 def outcome_figures(frame: pd.DataFrame) -> list[SvgFigure]:
@@ -329,19 +331,24 @@ _SCRIPT = Path(__file__).parent / "templates" / "explorer.js"
 def explorer_data(run: StoredRun, metric: str, bound: float | None, with_images: Collection[str]) -> dict[str, Any]:
     """Create the data of the explorer: columns of the points with labels, initial axes, and the bound."""
     frame = run.frame
-    parts = axis_columns(metric, [str(name) for name in frame.columns])[:2]
+    components = axis_columns(metric, [str(name) for name in frame.columns])[:2]
     drivers = driver_columns(frame, metric)
-    names = list(dict.fromkeys([*parts, *drivers, metric]))
+    names = list(dict.fromkeys([*components, *drivers, metric]))
     points = frame.iloc[choose_points(frame, metric)]
     outcomes = points["outcome"].astype(str) if "outcome" in points else pd.Series("", index=points.index)
     distinct_outcomes = list(dict.fromkeys(outcomes))
     cases = points["case"].tolist() if "case" in points else points.index.tolist()
     return {
         "labels": [label(name) for name in names],
-        "columns": [[float(f"{x:.4g}") if math.isfinite(x) else None for x in numbers(points, name)] for name in names],
+        "columns": [
+            [float(f"{value:.4g}") if math.isfinite(value) else None for value in numbers(points, name)]
+            for name in names
+        ],
         "metric": names.index(metric),
-        "parts": [names.index(part) for part in parts] if len(parts) == 2 else [],
-        "axes": [names.index(name) for name in (parts if len(parts) == 2 else [(drivers or [metric])[0], metric])],
+        "parts": [names.index(component) for component in components] if len(components) == 2 else [],
+        "axes": [
+            names.index(name) for name in (components if len(components) == 2 else [(drivers or [metric])[0], metric])
+        ],
         "bound": bound,
         "cases": [int(case) for case in cases],
         "outcomes": [str(outcome) for outcome in distinct_outcomes],
@@ -359,9 +366,11 @@ def choose_points(frame: pd.DataFrame, metric: str) -> Int[np.ndarray, " n"]:
         return np.arange(len(frame))
     magnitude = np.abs(numbers(frame, metric))
     finite = np.isfinite(magnitude)
-    crashed = engine_failed(frame)
+    is_crashed = engine_failed(frame)
     worst = np.argsort(-np.where(finite, magnitude, -1.0), kind="stable")
-    notable = [group[:MAX_NOTABLE] for group in (worst, np.flatnonzero(~finite & ~crashed), np.flatnonzero(crashed))]
+    notable = [
+        group[:MAX_NOTABLE] for group in (worst, np.flatnonzero(~finite & ~is_crashed), np.flatnonzero(is_crashed))
+    ]
     return np.sort(pd.unique(np.concatenate([*notable, np.arange(len(frame))]))[:MAX_POINTS])
 
 

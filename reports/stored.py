@@ -66,11 +66,11 @@ class StoredRun:
     @property
     def command(self) -> tuple[str, tuple[str, ...]] | None:
         """Working folder and words of the command that ran the campaign; None if unknown."""
-        stored = table(self.record.get("command"))
-        words = stored.get("words")
+        stored_command = table(self.record.get("command"))
+        words = stored_command.get("words")
         if not isinstance(words, list) or not words:
             return None
-        return str(stored.get("folder") or ""), tuple(str(word) for word in words)
+        return str(stored_command.get("folder") or ""), tuple(str(word) for word in words)
 
     def recorded(self, key: str) -> Any:
         """Return the value of a key in the record or in its configuration; None if missing."""
@@ -129,17 +129,23 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
     if file.metadata.num_rows <= MAX_FULL_CASES:
         frame = _sort_columns(pd.read_parquet(path).rename(columns=new_names))
         return frame, frame
-    first = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas().rename(columns=new_names)
+    first_rows = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas().rename(columns=new_names)
     requirement_list, names = record.get("requirements"), [new_names.get(name, name) for name in stored_names]
-    requirements = [r for r in requirement_list if isinstance(r, Mapping)] if isinstance(requirement_list, list) else []
+    requirements = (
+        [requirement for requirement in requirement_list if isinstance(requirement, Mapping)]
+        if isinstance(requirement_list, list)
+        else []
+    )
     columns = {"case", "outcome", "answered", "terrain", "feasible_overlap", "error", "traceback"}
-    for r in requirements:
-        columns.update(str(r.get("metric", "")).split(" + "), str(r.get("population", "")).split(" and "))
-    metric = primary_metric(first, requirements)
+    for requirement in requirements:
+        columns.update(
+            str(requirement.get("metric", "")).split(" + "), str(requirement.get("population", "")).split(" and ")
+        )
+    metric = primary_metric(first_rows, requirements)
     if metric is not None:
-        columns.update([metric, *axis_columns(metric, names), *driver_columns(first, metric, max_columns=3)])
+        columns.update([metric, *axis_columns(metric, names), *driver_columns(first_rows, metric, max_columns=3)])
     all_cases = pd.read_parquet(path, columns=[name for name in stored_names if new_names.get(name, name) in columns])
-    return _sort_columns(first), _sort_columns(all_cases.rename(columns=new_names))
+    return _sort_columns(first_rows), _sort_columns(all_cases.rename(columns=new_names))
 
 
 def _sort_columns(frame: pd.DataFrame) -> pd.DataFrame:

@@ -77,8 +77,10 @@ def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
         return []
     counts = frame["outcome"].astype("object").fillna("(none)").astype(str).value_counts()
     pairs = [(str(name), int(count)) for name, count in counts.items()]
-    answered = answered_outcomes(frame)
-    return sorted(pairs, key=lambda pair: (pair[0] in ENGINE_FAILURES, pair[0] not in answered, -pair[1], pair[0]))
+    outcomes_with_answer = answered_outcomes(frame)
+    return sorted(
+        pairs, key=lambda pair: (pair[0] in ENGINE_FAILURES, pair[0] not in outcomes_with_answer, -pair[1], pair[0])
+    )
 
 
 def answered_outcomes(frame: pd.DataFrame) -> set[str]:
@@ -89,14 +91,14 @@ def answered_outcomes(frame: pd.DataFrame) -> set[str]:
 
 
 def error_summaries(frame: pd.DataFrame, metric: str) -> list[tuple[str, ErrorSummary]]:
-    """Compute statistics of a metric and of its signed parts (x, y), with labels, over all cases with a value."""
-    parts = [metric, *axis_columns(metric, [str(column) for column in frame.columns])]
+    """Compute statistics of a metric and of its signed components (x, y), with labels, over all cases with a value."""
+    columns = [metric, *axis_columns(metric, [str(column) for column in frame.columns])]
     groups = terrain_groups(frame)
-    return [(label(part), summarize(numbers(frame, part), groups=groups)) for part in parts]
+    return [(label(column), summarize(numbers(frame, column), groups=groups)) for column in columns]
 
 
 def statistics_grid(frame: pd.DataFrame, metric: str) -> Grid:
-    """Create a table of statistics with a column for the metric and for each of its parts."""
+    """Create a table of statistics with a column for the metric and for each of its components."""
     summaries = error_summaries(frame, metric)
     return Grid(["", *(name for name, _ in summaries)], statistics_rows([summary for _, summary in summaries]))
 
@@ -107,20 +109,25 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
         return []
     confidence = format_fraction(summaries[0].confidence)
     rows = [
-        ["cases", *(str(s.n) for s in summaries)],
-        ["mean", *(number(s.mean) for s in summaries)],
-        [f"mean, {confidence} interval", *(interval(s.mean_lower, s.mean_upper) for s in summaries)],
-        ["standard deviation", *(number(s.sd) for s in summaries)],
-        [f"standard deviation, {confidence} interval", *(interval(s.sd_lower, s.sd_upper) for s in summaries)],
-        ["robust standard deviation", *(number(s.robust_sd) for s in summaries)],
-        ["root mean square", *(number(s.rms) for s in summaries)],
+        ["cases", *(str(summary.n) for summary in summaries)],
+        ["mean", *(number(summary.mean) for summary in summaries)],
+        [f"mean, {confidence} interval", *(interval(summary.mean_lower, summary.mean_upper) for summary in summaries)],
+        ["standard deviation", *(number(summary.sd) for summary in summaries)],
+        [
+            f"standard deviation, {confidence} interval",
+            *(interval(summary.sd_lower, summary.sd_upper) for summary in summaries),
+        ],
+        ["robust standard deviation", *(number(summary.robust_sd) for summary in summaries)],
+        ["root mean square", *(number(summary.rms) for summary in summaries)],
     ]
     for index, quantile in enumerate(summaries[0].quantiles):
         name = "median" if quantile.probability == 0.5 else f"{format_fraction(quantile.probability)} quantile"
         quantiles = [summary.quantiles[index] for summary in summaries]
-        rows.append([name, *(number(q.estimate) for q in quantiles)])
-        rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in quantiles)])
-    return [*rows, ["maximum magnitude", *(number(s.largest) for s in summaries)]]
+        rows.append([name, *(number(quantile.estimate) for quantile in quantiles)])
+        rows.append(
+            [f"{name}, {confidence} bounds", *(interval(quantile.lower, quantile.upper) for quantile in quantiles)]
+        )
+    return [*rows, ["maximum magnitude", *(number(summary.largest) for summary in summaries)]]
 
 
 def confirmations_table(entries: Sequence[Confirmation]) -> Table:

@@ -74,13 +74,13 @@ def format_tested_algorithms(algorithms: Sequence[Algorithm]) -> str:
 
 def _algorithms_from_parameters(parameters: Mapping[str, Any]) -> list[Algorithm]:
     """Read the algorithms from the first table of parameters, at any depth, that has the key `algorithm`."""
-    tested = parameters.get("algorithm")
-    if isinstance(tested, str) and tested:
-        compared = parameters.get("compared")
-        names = compared if isinstance(compared, list) else []
-        return [Algorithm(tested), *(Algorithm(str(name), tested=False) for name in names)]
-    nested = (_algorithms_from_parameters(value) for value in parameters.values() if isinstance(value, Mapping))
-    return next((algorithms for algorithms in nested if algorithms), [])
+    tested_name = parameters.get("algorithm")
+    if isinstance(tested_name, str) and tested_name:
+        compared_names = parameters.get("compared")
+        names = compared_names if isinstance(compared_names, list) else []
+        return [Algorithm(tested_name), *(Algorithm(str(name), tested=False) for name in names)]
+    nested_lists = (_algorithms_from_parameters(value) for value in parameters.values() if isinstance(value, Mapping))
+    return next((algorithms for algorithms in nested_lists if algorithms), [])
 
 
 #: Verdicts of requirements that are neither met nor failed at their confidence; JUnit tests with them are skipped.
@@ -91,12 +91,12 @@ _INVALID_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff
 
 def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
     """Create the columns that identify the algorithms under test; several algorithms are joined by "; "."""
-    tested = [algorithm for algorithm in algorithms if algorithm.tested]
+    tested_algorithms = [algorithm for algorithm in algorithms if algorithm.tested]
     cells = {
-        "algorithm": [algorithm.name for algorithm in tested],
-        "algorithm_version": [algorithm.version for algorithm in tested],
-        "algorithm_options": [algorithm.options_text for algorithm in tested],
-        "algorithm_source": [algorithm.source_hash for algorithm in tested],
+        "algorithm": [algorithm.name for algorithm in tested_algorithms],
+        "algorithm_version": [algorithm.version for algorithm in tested_algorithms],
+        "algorithm_options": [algorithm.options_text for algorithm in tested_algorithms],
+        "algorithm_source": [algorithm.source_hash for algorithm in tested_algorithms],
     }
     return {column: "; ".join(value for value in values if value) for column, values in cells.items()}
 
@@ -169,8 +169,8 @@ def junit_xml(
         properties = Xml.SubElement(suite, "properties")
         for name, value in cells.items():
             Xml.SubElement(properties, "property", name=name, value=_clean_xml(value))
-    tested = format_tested_algorithms(algorithms)
-    tested_text = f"Under test: {tested}. " if tested else ""
+    tested_names = format_tested_algorithms(algorithms)
+    tested_text = f"Under test: {tested_names}. " if tested_names else ""
     for verdict in verdicts:
         test_case = Xml.SubElement(
             suite, "testcase", classname=_clean_xml(campaign), name=_clean_xml(verdict.requirement_id)

@@ -147,10 +147,10 @@ class Verdict:
         """Probability of this result or a better one if the true rate equals the required rate; NaN without bounds."""
         if math.isnan(self.lower):
             return math.nan
-        shared = self.clustered
-        if shared is None:
+        evidence = self.clustered
+        if evidence is None:
             return proportions.consumer_risk(self.n - self.failures, self.n, self.probability)
-        return proportions.consumer_risk(shared.effective_successes, shared.effective_n, self.probability)
+        return proportions.consumer_risk(evidence.effective_successes, evidence.effective_n, self.probability)
 
     @property
     def design_effect(self) -> float:
@@ -189,8 +189,8 @@ class Verdict:
         evidence = self.clustered
         if evidence is None:
             return ""
-        is_assumed = math.isnan(evidence.design_effect)
-        effect = self.n / evidence.effective_n if is_assumed else evidence.design_effect
+        is_effect_unknown = math.isnan(evidence.design_effect)
+        effect = self.n / evidence.effective_n if is_effect_unknown else evidence.design_effect
         reason = "Cases on one terrain are correlated"
         if evidence.method is ClusterMethod.TERRAIN_COUNT:
             reason = "With too few failures to estimate their correlation, each terrain counts as one case"
@@ -248,27 +248,27 @@ def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks:
     upper = proportions.proportion_upper(n - failures, n, levels[1])
     verdict = replace(verdict, lower=lower, upper=upper, plain_lower=lower, plain_upper=upper)
     if groups is None or int(groups.max()) + 1 == n:
-        needed = _cases_needed(first_n, n, failures, probability, confidence, looks)
-        return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), needed - n
+        needed_cases = _cases_needed(first_n, n, failures, probability, confidence, looks)
+        return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), needed_cases - n
     evidence = clustered_evidence(success, groups, confidence)
     in_first_look = np.ones(n, dtype=np.bool_) if looks.in_first_look is None else looks.in_first_look
     if np.unique(groups[in_first_look]).size != first_n:
         # effective number of independent cases at the first look
         first_n = math.floor(clustered_evidence(success[in_first_look], groups[in_first_look], confidence).effective_n)
     levels = _confidences(first_n, evidence.effective_n, probability, confidence, looks)
-    by_level = [clustered_evidence(success, groups, level) for level in levels]
-    evidence = replace(by_level[0], upper=by_level[1].upper)
+    evidence_by_level = [clustered_evidence(success, groups, level) for level in levels]
+    evidence = replace(evidence_by_level[0], upper=evidence_by_level[1].upper)
     if evidence.method is ClusterMethod.TERRAIN_COUNT:
         # the tolerance prevents a rounding error from increasing an integer by 1
         size, weight = evidence.terrains, 1.0
-        failed = math.ceil(evidence.terrains - evidence.effective_successes - 1e-9)
+        n_failed = math.ceil(evidence.terrains - evidence.effective_successes - 1e-9)
     else:
         weight = evidence.effective_n / n
-        size, failed = math.floor(evidence.effective_n), math.ceil(failures * weight)
-    needed = _cases_needed(first_n, size, failed, probability, confidence, looks)
+        size, n_failed = math.floor(evidence.effective_n), math.ceil(failures * weight)
+    needed_cases = _cases_needed(first_n, size, n_failed, probability, confidence, looks)
     verdict = replace(verdict, lower=evidence.lower, upper=evidence.upper, clustered=evidence)
     # convert effective cases to cases
-    additional = math.ceil((needed - size) / weight)
+    additional = math.ceil((needed_cases - size) / weight)
     return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), additional
 
 
@@ -279,8 +279,8 @@ def _confidences(
     if looks.in_first_look is None:
         level = confidence_at(confidence, looks.risk_fraction)
         return level, level
-    passing, failing = (LaterLook(p, 1.0 - confidence, first_n) for p in (1.0 - probability, probability))
-    return 1.0 - passing.risk_of_bound(n), 1.0 - failing.risk_of_bound(n)
+    pass_look, fail_look = (LaterLook(limit, 1.0 - confidence, first_n) for limit in (1.0 - probability, probability))
+    return 1.0 - pass_look.risk_of_bound(n), 1.0 - fail_look.risk_of_bound(n)
 
 
 def _cases_needed(first_n: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:
@@ -323,7 +323,7 @@ def evaluate_requirements(
 def _evaluate_all_cases(
     frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign, configured: Sequence[str]
 ) -> AllCases | None:
-    """Evaluate a requirement on all cases with its configuration; None if that is its population, or has no case."""
+    """Evaluate a requirement on all cases of its configuration; None if its population is the same, or has no case."""
     population = str(requirement.get("population", "all"))
     remaining_conditions = tuple(
         name for name in population.split(" and ") if any(fnmatchcase(name, flag) for flag in configured)
@@ -351,9 +351,9 @@ def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: Sam
         text = str(error)
         return replace(verdict, reason=f"{text[:1].upper()}{text[1:]}.")
     if population.empty:
-        needed = LaterLook(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
+        needed_cases = LaterLook(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
-        return replace(verdict, reason=reason, further_cases=needed if sampling.independent else None)
+        return replace(verdict, reason=reason, further_cases=needed_cases if sampling.independent else None)
     verdicts = (_decide(verdict, cases, sampling, frame) for cases in (population, population_and_unfinished))
     return _withhold_if_uncertain(*verdicts)
 
@@ -366,44 +366,49 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
     """
     if verdict.status in (Status.FAIL, Status.INSUFFICIENT, with_unfinished.status):
         return verdict
-    unfinished = with_unfinished.n - verdict.n
+    n_unfinished = with_unfinished.n - verdict.n
     reason = (
-        f"{count(unfinished, 'case')} did not finish and {'belongs' if unfinished == 1 else 'belong'} to no population "
-        f"of answers. If they are counted as failures, the verdict is not {verdict.status}. It is therefore withheld."
+        f"{count(n_unfinished, 'case')} did not finish and {'belongs' if n_unfinished == 1 else 'belong'} to no "
+        f"population of answers. If they are counted as failures, the verdict is not {verdict.status}. It is therefore "
+        "withheld."
     )
     return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
 
 
 def _decide(verdict: Verdict, population: pd.DataFrame, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:
     """Decide the verdict from the cases of its population (at least one) and from all cases (`frame`)."""
-    _, unknown = rates.population_and_unknown_masks(population, verdict.population.split(" and "))
-    success = np.asarray(rates.success_mask(population, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
+    _, has_unknown_flag = rates.population_and_unknown_masks(population, verdict.population.split(" and "))
+    success = np.asarray(
+        rates.success_mask(population, verdict.metric, verdict.bound, verdict.scale) & ~has_unknown_flag
+    )
     n, failures, groups = success.size, int((~success).sum()), rates.terrain_groups(population)
-    rate, by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
+    rate, decides_by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
     terrains = None if groups is None else int(population["terrain"].nunique())
     with_counts = replace(verdict, n=n, failures=failures, estimate=rate, terrains=terrains)
     if not sampling.independent:
-        reason = f"{'Decided by the rate of these cases. ' if by_rate else ''}{sampling.no_probability}"
-        status = _status_by_rate(rate, n, verdict.probability) if by_rate else verdict.status
+        reason = f"{'Decided by the rate of these cases. ' if decides_by_rate else ''}{sampling.no_probability}"
+        status = _status_by_rate(rate, n, verdict.probability) if decides_by_rate else verdict.status
         return replace(with_counts, status=status, reason=reason)
     looks = Looks(sampling.mask_first_look(frame, population), sampling.risk_fraction_at(len(frame)))
-    evaluated, additional = add_bounds(with_counts, success, groups, looks)
-    status = evaluated.confident_status
-    by_rate = by_rate and status is not Status.PASS
-    if by_rate:
+    verdict_with_bounds, additional = add_bounds(with_counts, success, groups, looks)
+    status = verdict_with_bounds.confident_status
+    decides_by_rate = decides_by_rate and status is not Status.PASS
+    if decides_by_rate:
         status = _status_by_rate(rate, n, verdict.probability)
-    evaluated = replace(evaluated, status=status)
+    verdict_with_bounds = replace(verdict_with_bounds, status=status)
     if status is not Status.INSUFFICIENT:
-        return evaluated
-    if by_rate:
-        return replace(evaluated, further_cases=min_cases_for_rate(verdict.probability) - n)
+        return verdict_with_bounds
+    if decides_by_rate:
+        return replace(verdict_with_bounds, further_cases=min_cases_for_rate(verdict.probability) - n)
     # number of additional cases, or advice if the campaign has too few terrains for them
-    evidence, terrain_supply = evaluated.clustered, sampling.terrains
+    evidence, terrain_supply = verdict_with_bounds.clustered, sampling.terrains
     counts_terrains = evidence is not None and evidence.method is ClusterMethod.TERRAIN_COUNT
     if not counts_terrains or terrain_supply is None or (terrains or 0) + additional <= terrain_supply.terrains:
-        return replace(evaluated, further_cases=additional)
+        return replace(verdict_with_bounds, further_cases=additional)
     needed_terrains = proportions.minimum_sample_size(verdict.probability, verdict.confidence)
-    return replace(evaluated, advice=terrain_supply.advice(needed_terrains, verdict.probability, verdict.confidence))
+    return replace(
+        verdict_with_bounds, advice=terrain_supply.advice(needed_terrains, verdict.probability, verdict.confidence)
+    )
 
 
 def _status_by_rate(rate: float, n: int, probability: float) -> Status:
@@ -431,9 +436,9 @@ def _describe_problem(frame: pd.DataFrame, verdict: Verdict) -> str:
         value = getattr(verdict, name)
         if not 0.0 < value < 1.0:
             return f"The requirement's {name} is {value}; it must lie between 0 and 1, both excluded."
-    missing = next((part for part in verdict.metric.split(" + ") if part not in frame), None)
-    if missing is not None:
-        return f"The rows have no column '{missing}', which is the requirement's metric."
+    missing_column = next((part for part in verdict.metric.split(" + ") if part not in frame), None)
+    if missing_column is not None:
+        return f"The rows have no column '{missing_column}', which is the requirement's metric."
     if not math.isfinite(verdict.bound) and not rates.is_flag(frame, verdict.metric):
         return "The requirement has no bound, and its metric is not a column of true and false."
     return ""

@@ -29,9 +29,9 @@ def requirement_text(requirement: Any) -> str:
     metric, (name, unit) = requirement.metric, split_unit(requirement.metric)
     condition = _read_notes()["metrics"].get(metric, _to_words(metric if requirement.bound is None else name))
     if requirement.bound is not None and not math.isnan(requirement.bound):
-        scaled = "" if requirement.scale == 1.0 else f"{requirement.scale:g} × "
+        factor_text = "" if requirement.scale == 1.0 else f"{requirement.scale:g} × "
         magnitude = condition if unit == "s" else f"|{condition}|"
-        condition = f"{scaled}{magnitude} ≤ {requirement.bound:g} {unit}".rstrip()
+        condition = f"{factor_text}{magnitude} ≤ {requirement.bound:g} {unit}".rstrip()
     confidence = f"{format_fraction(requirement.confidence)} confidence"
     by_rate = requirement.decide_by == "estimate"
     decision = f"evaluated by observed rate; bounds at {confidence}" if by_rate else f"at {confidence}"
@@ -182,18 +182,18 @@ def magnitude_label(column: str) -> str:
 
 
 def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
-    """List the signed parts of a metric among the columns: ``velocity_error_x_m_s`` for ``velocity_error_m_s``."""
+    """List the signed components of a metric among the columns: ``velocity_error_x_m_s`` for ``velocity_error_m_s``."""
     name, _ = split_unit(metric)
     ending = metric[len(name) :]
     return [part for axis in _AXES if (part := f"{name}_{axis}{ending}") in columns]
 
 
 def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the page's metric: the first numeric metric of a requirement, or the first error column; may be None."""
-    required = [str(requirement.get("metric", "")) for requirement in requirements]
+    """Return the page's metric: the first numeric metric of a requirement, else the first error column, else None."""
+    requirement_metrics = [str(requirement.get("metric", "")) for requirement in requirements]
     error_columns = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
     # rows of earlier versions have an empty column for a sum
-    names = [name for name in [*required, *error_columns] if " + " not in name]
+    names = [name for name in [*requirement_metrics, *error_columns] if " + " not in name]
     return next((name for name in names if name in frame and _is_number(frame, name)), None)
 
 
@@ -208,22 +208,22 @@ def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
 def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6) -> list[str]:
     """Select conditions that may affect a metric: `_PREFERRED_DRIVERS` first, then by rank correlation."""
     names = [str(name) for name in frame.columns]
-    excluded = {metric, *axis_columns(metric, names), "terrain"}
+    excluded_names = {metric, *axis_columns(metric, names), "terrain"}
     candidates = [
         name
         for name in names
-        if name not in excluded
+        if name not in excluded_names
         and not _EXCLUDED_COLUMNS.search(name)
         and _is_number(frame, name)
         and frame[name].nunique() > 1
     ]
-    preferred = [name for prefix in _PREFERRED_DRIVERS for name in candidates if name.startswith(prefix)]
+    preferred_names = [name for prefix in _PREFERRED_DRIVERS for name in candidates if name.startswith(prefix)]
     magnitude = np.abs(numbers(frame, metric))
     others = sorted(
-        (name for name in candidates if name not in preferred),
+        (name for name in candidates if name not in preferred_names),
         key=lambda name: -abs(np.nan_to_num(rank_correlation(numbers(frame, name), magnitude))),
     )
-    return [*preferred, *others][:max_columns]
+    return [*preferred_names, *others][:max_columns]
 
 
 def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:

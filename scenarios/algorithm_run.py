@@ -1,4 +1,4 @@
-"""Run the algorithms of a case separately: one algorithm's failure or changed inputs do not affect the others.
+"""Run the algorithms of a case separately: a failure or changed inputs of one algorithm do not affect the others.
 
 The first algorithm of a campaign is under test: its columns have no prefix. The columns of the compared algorithms have
 their label as a prefix (`homography.velocity_error_m_s`), with separate `outcome`, `answered` and `error`.
@@ -70,12 +70,13 @@ def copy_inputs(original: Inputs, *, writable: bool = False) -> Inputs:
 
     Rotations and transforms are immutable and not copied: a copy would be normalised again, with different last digits.
     """
+    # `deepcopy` does not copy the objects of its memo
     immutable = {id(part): part for part in _walk_values(original) if isinstance(part, Rotation | RigidTransform)}
-    copied = copy.deepcopy(original, dict(immutable))
-    for part in _walk_values(copied):
+    duplicate = copy.deepcopy(original, dict(immutable))
+    for part in _walk_values(duplicate):
         if isinstance(part, np.ndarray):
             part.flags.writeable = writable
-    return copied
+    return duplicate
 
 
 def hash_inputs(value: Any, excluded: tuple[str, ...] = ()) -> str:
@@ -155,9 +156,9 @@ def case_result(
     """Record the conditions, score each algorithm (the first is under test) with `evaluate`, and combine the rows."""
     record_conditions(conditions)
     names = labels(algorithms)
-    first, *compared = [evaluate(spec) for spec in algorithms]
+    first, *compared_results = [evaluate(spec) for spec in algorithms]
     row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}
-    for name, result in zip(names[1:], compared, strict=True):
+    for name, result in zip(names[1:], compared_results, strict=True):
         columns: dict[str, Scalar] = {"outcome": result.outcome, "answered": result.answered, **result.row}
         columns["error"] = "" if result.failure is None else result.failure.error
         row |= {f"{name}.{column}": value for column, value in columns.items()}

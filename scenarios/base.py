@@ -30,8 +30,8 @@ class BaseScenario(Generic[ParametersType]):
     def check_parameters(self, parameters: BaseModel) -> ParametersType:
         """Return the parameters with their type. Raises TypeError for parameters of another scenario."""
         if not isinstance(parameters, self.parameters_type):
-            expected, actual = self.parameters_type.__name__, type(parameters).__name__
-            raise TypeError(f"the scenario {self.name} needs {expected}, not {actual}")
+            expected_name, actual_name = self.parameters_type.__name__, type(parameters).__name__
+            raise TypeError(f"the scenario {self.name} needs {expected_name}, not {actual_name}")
         return parameters
 
 

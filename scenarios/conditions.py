@@ -57,6 +57,7 @@ def contrast_columns(image: UInt16[np.ndarray, "rows columns"], detector: Detect
 
 def off_nadir_deg(state: State) -> float:
     """Return the angle between the body's camera axis and nadir."""
+    # the camera looks along -z of the body; the element is the cosine of the angle between the z axes of body and world
     return float(np.degrees(np.arccos(np.clip(state.attitude.as_matrix()[2, 2], -1.0, 1.0))))
 
 
@@ -99,7 +100,7 @@ class SizedFaults(Parameters):
         return {"fault": name, "fault_size": size}
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
-        """Return the changed parameters of the detector by its tables; empty tables change nothing."""
+        """Return the changed parameters of the detector by table; an empty table changes nothing."""
         return {
             "optics": {"dust_discs": self.dust_discs} if self.dust_discs else {},
             "defects": {"dead_fraction": self.bad_pixels, "hot_fraction": self.bad_pixels} if self.bad_pixels else {},
@@ -123,12 +124,12 @@ def corrupt_images(images: Images, repeated: int, black: int, lost_rows: float =
     - black: number, from 1, of the image that is replaced by a black image; 0: none
     - lost_rows: fraction of the second image's rows that is lost, counted from the bottom
     """
-    corrupted = [image.copy() for image in images]
+    copies = [image.copy() for image in images]
     if repeated > 1:
-        corrupted[repeated - 1] = corrupted[repeated - 2].copy()
+        copies[repeated - 1] = copies[repeated - 2].copy()
     if black:
-        corrupted[black - 1][:] = 0
-    lost_count = round(lost_rows * len(corrupted[1])) if lost_rows else 0
-    if lost_count:
-        corrupted[1][-lost_count:] = 0
-    return corrupted
+        copies[black - 1][:] = 0
+    n_lost_rows = round(lost_rows * len(copies[1])) if lost_rows else 0
+    if n_lost_rows:
+        copies[1][-n_lost_rows:] = 0
+    return copies

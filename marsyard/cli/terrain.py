@@ -111,7 +111,7 @@ def stats(
 
 
 def _print_statistics(
-    name: str,
+    site: str,
     parameters: TerrainParameters,
     seed: int,
     statistics: TerrainStatistics,
@@ -123,7 +123,7 @@ def _print_statistics(
     from marsyard.sim.terrain.sites import PAPER
     from marsyard.sim.terrain.surface import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
 
-    side, paper = parameters.samples * parameters.spacing_m, PAPER.get(name)
+    side_m, paper = parameters.samples * parameters.spacing_m, PAPER.get(site)
     albedo, slope, relief, contrast = "", "", "", ""
     if paper is not None:
         albedo, slope, contrast = _format_range(paper.albedo, 1), _format_range(paper.mean_slope_deg, 0), paper.contrast
@@ -137,16 +137,16 @@ def _print_statistics(
         table.add_row(f"mean slope over {length_m} m, deg", "-" if math.isnan(value) else f"{value:.2f}", slope)
     table.add_row("relief, m", f"{statistics.relief_m:.{1 if statistics.relief_m >= 10.0 else 2}f}", relief)
     table.add_row("image contrast, RMS / mean", f"{statistics.contrast:.3f}", contrast)
-    out = console()
-    out.print(f"{name}: {side:g} m x {side:g} m, sample spacing {parameters.spacing_m:g} m, seed {seed}")
-    out.print(table)
-    out.print(
+    terminal = console()
+    terminal.print(f"{site}: {side_m:g} m x {side_m:g} m, sample spacing {parameters.spacing_m:g} m, seed {seed}")
+    terminal.print(table)
+    terminal.print(
         "Slopes are measured along lines to the east and to the north (bidirectional). Contrast is computed for a "
         f"nadir image with pixels of about {CONTRAST_PIXEL_M:g} m, Lunar-Lambert reflection, sun in the west at "
         f"{CONTRAST_SUN_ELEVATION_DEG:g} deg elevation, without shadows and without detector."
     )
     if extent is not None:
-        out.print(
+        terminal.print(
             f"The DTM covers east {extent.west_m:g} to {extent.east_m:g} m and north {extent.south_m:g} to "
             f"{extent.north_m:g} m with posts every {extent.posting_m:g} m; the terrain around it is synthetic. The "
             f"statistics use the DTM without its holes. Filled: {extent.holes} posts without height "
@@ -155,7 +155,7 @@ def _print_statistics(
     if grid_north is not None:
         direction, sign = ("east", "-") if grid_north >= 0.0 else ("west", "+")
         angle = f"{abs(grid_north):.2f} deg"
-        out.print(
+        terminal.print(
             f"Grid north (the y axis) points {angle} {direction} of true north at the centre of the file. All azimuths "
             "are relative to grid north, including that of the sun: azimuth from grid north = azimuth from true north "
             f"{sign} {angle}."
@@ -183,7 +183,9 @@ def write_terrain_image(path: Path, surface: Surface, dtm: EmbeddedDtm | None) -
         raise ValueError(f"--picture {path}: exists; choose another name")
     side = len(surface.levels[0])
     level = max(int(np.ceil(np.log2(side / MAX_PIXELS))), 0)
+    # light from the north-west, as usual for shaded relief
     shaded = nadir_picture(surface, level, np.radians(315.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
+    # scale the brightness; the brightest 0.2 % of the pixels are saturated
     grey = np.clip(255.0 * shaded / np.percentile(shaded, 99.8), 0.0, 255.0).astype(np.uint8)
     image = np.repeat(grey[..., None], 3, axis=2)
     if dtm is not None:
@@ -251,7 +253,7 @@ def render(arguments: RenderOptions) -> None:
         for image in render_images(request, detector=arguments.detector):
             if image.filled is not None and image.filled.any():
                 fraction = f"{image.filled.mean():.1%} of the pixels{image.suffix and f' ({image.suffix[1:]})'}"
-                typer.echo(f"note: {fraction} see filled holes of the DTM (`filled` in the .npz)", err=True)
+                typer.echo(f"note: {fraction} show filled holes of the DTM (`filled` in the .npz)", err=True)
             typer.echo(", ".join(str(path) for path in write_image(image, request, arguments.out)))
 
 

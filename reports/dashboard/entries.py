@@ -94,6 +94,7 @@ def find_campaigns(directories: Sequence[Path]) -> list[Path]:
 
 
 def _find_below(directory: Path, depth: int) -> Iterator[Path]:
+    """Find campaigns in a folder and up to `depth` levels below; folders inside a campaign are not searched."""
     if (directory / RECORD_FILE).is_file() and (directory / TABLE_FILE).is_file():
         yield directory
     elif depth and directory.is_dir():
@@ -190,6 +191,7 @@ def _find_text(parameters: Mapping[str, Any], key: str) -> str:
 
 
 def _to_float(value: Any) -> float:
+    """Convert a number to float; NaN for other values."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
 
@@ -248,11 +250,13 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
     rows = []
     for name, unsorted_cells in cells.items():
         sorted_cells = sorted(unsorted_cells, key=lambda cell: not cell.entry.finished)
-        by_campaign: dict[str, Cell] = {}
+        latest_by_campaign: dict[str, Cell] = {}
         for cell in sorted_cells:
-            by_campaign.setdefault(cell.entry.name, cell)
-        latest = list(by_campaign.values())
-        history = [c.verdict for c in sorted_cells if c.entry.name == latest[0].entry.name and c.entry.finished]
+            latest_by_campaign.setdefault(cell.entry.name, cell)
+        latest = list(latest_by_campaign.values())
+        history = [
+            cell.verdict for cell in sorted_cells if cell.entry.name == latest[0].entry.name and cell.entry.finished
+        ]
         requirement, kind, source = shared.get(name), "", ""
         statement = latest[0].verdict.statement if latest else ""
         if requirement:
@@ -264,11 +268,13 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
 
 def sparkline(verdicts: Sequence[RequirementVerdict]) -> Sparkline | None:
     """Create the line of observed rates over time and of the required rate; None for fewer than two campaigns."""
-    finite = [v for v in verdicts if math.isfinite(v.estimate) and math.isfinite(v.probability)][-_MAX_POINTS:]
+    finite = [verdict for verdict in verdicts if all(map(math.isfinite, (verdict.estimate, verdict.probability)))]
+    finite = finite[-_MAX_POINTS:]
     if len(finite) < 2:
         return None
     rates = [verdict.estimate for verdict in finite]
     low = min(*rates, *(verdict.probability for verdict in finite))
+    # margin below the lowest rate: 15 % of its distance from 100 %; positive also if all rates are 100 %
     low -= 0.15 * (1.0 - low) + 1e-9
     # margins of 4 pixels on the left and right, of 3 pixels at the top and bottom
     step_px = (_WIDTH_PX - 8.0) / (len(finite) - 1)
@@ -276,7 +282,7 @@ def sparkline(verdicts: Sequence[RequirementVerdict]) -> Sparkline | None:
     def compute_y(rate: float) -> float:
         return round(3.0 + (_HEIGHT_PX - 6.0) * (1.0 - rate) / (1.0 - low), 2)
 
-    points = [(round(4.0 + step_px * k, 2), compute_y(rate)) for k, rate in enumerate(rates)]
+    points = [(round(4.0 + step_px * index, 2), compute_y(rate)) for index, rate in enumerate(rates)]
     text = f"{len(finite)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
     return Sparkline(" ".join(f"{x},{y}" for x, y in points), points[-1], compute_y(finite[-1].probability), text)
 
@@ -285,10 +291,10 @@ def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     """Count the requirements per latest verdict; requirements without a campaign come last."""
     statuses = [row.latest.verdict.status for row in rows if row.latest is not None]
     ordered = dict.fromkeys(("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS", *statuses))
-    present = [status for status in ordered if status in statuses]
-    counts = [(status, statuses.count(status)) for status in present]
-    missing = sum(row.latest is None for row in rows)
-    return [*counts, ("NO CAMPAIGN", missing)] if missing else counts
+    present_statuses = [status for status in ordered if status in statuses]
+    counts = [(status, statuses.count(status)) for status in present_statuses]
+    n_missing = sum(row.latest is None for row in rows)
+    return [*counts, ("NO CAMPAIGN", n_missing)] if n_missing else counts
 
 
 def evidence_text(verdict: RequirementVerdict) -> str:

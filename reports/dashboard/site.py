@@ -1,7 +1,7 @@
 """Static site of the dashboard: an index of requirements and campaigns, and a page for each campaign and stored case.
 
 All pages are in the site's folder and need no other files; the reports of campaigns are linked or copied into it.
-Pages of unchanged campaigns are not written again, so an update only costs time for new campaigns.
+Pages of unchanged campaigns are not written again; an update takes time only for new campaigns.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from marsyard.reports.traceability import algorithm_cells, verification_csv
 from marsyard.reports.wording import percent
 
 INDEX = "index.html"
-#: Maximum number of cases of a campaign with a page.
+#: Maximum number of cases with a page for each campaign.
 _MAX_CASES = 24
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 #: Functions that the templates call to format numbers and verdicts.
@@ -84,14 +84,14 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
         return
     folder.mkdir(parents=True, exist_ok=True)
     if report.is_file():
-        # a hard link, or a copy where the disk does not allow links
-        partial = folder / f"{PAGE_FILE}.partial"
-        partial.unlink(missing_ok=True)
+        # a hard link, or a copy if the file system does not allow links
+        partial_path = folder / f"{PAGE_FILE}.partial"
+        partial_path.unlink(missing_ok=True)
         try:
-            os.link(report, partial)
+            os.link(report, partial_path)
         except OSError:
-            shutil.copyfile(report, partial)
-        partial.replace(folder / PAGE_FILE)
+            shutil.copyfile(report, partial_path)
+        partial_path.replace(folder / PAGE_FILE)
     cases = _write_cases(folder, entry)
     write_atomic(page, _render("dashboard_campaign.html.j2", entry=entry, cases=cases, **_FORMATTERS))
 
@@ -150,18 +150,18 @@ def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
 
 def _create_traceability_csv(rows: Sequence[RequirementRow]) -> str:
     """Create the traceability matrix as CSV: the latest verdicts, and requirements without a campaign."""
-    exported: list[dict[str, Any]] = []
+    csv_rows: list[dict[str, Any]] = []
     fields = {"verdict": "status", "decided_by": "decide_by", "cases": "n", "rate": "estimate", "lower_bound": "lower"}
     fields |= {name: name for name in ("probability", "confidence", "failures", "note")}
     for row in rows:
         head = {"requirement": row.requirement, "statement": row.statement, "kind": row.kind, "source": row.source}
         if not row.cells:
-            exported.append({**head, "verdict": "NO CAMPAIGN"})
+            csv_rows.append({**head, "verdict": "NO CAMPAIGN"})
         for cell in row.cells:
             verdict = {column: getattr(cell.verdict, name) for column, name in fields.items()}
             cells = {"campaign": cell.entry.name, "evidence": cell.entry.evidence}
-            exported.append({**head, **cells, **algorithm_cells(cell.entry.tested), **verdict})
-    return verification_csv(exported)
+            csv_rows.append({**head, **cells, **algorithm_cells(cell.entry.tested), **verdict})
+    return verification_csv(csv_rows)
 
 
 def _render(template: str, **context: Any) -> str:

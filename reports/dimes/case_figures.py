@@ -23,12 +23,13 @@ from marsyard.reports.presentation import numeric_product, save_figures, to_matr
 from marsyard.reports.section import INK, draw_images, in_page_style, show_subframe
 
 Image = Float[np.ndarray, "_ _"]
+#: Colours of templates, matches and search windows.
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
 #: Side of a template's square on a delivered image if the products do not contain the side, pixels.
 _DEFAULT_SIDE_PX = 15.0
 _PAIRS = (0, 1)
 _MAX_TRACKS = 2
-#: Relative heights of the rows of a pair's figure, and inches per unit of relative height.
+#: Relative heights of the rows of a pair's figure, and inches per unit: a figure with all rows is 8.3 in high.
 _ROW_HEIGHTS = {"rectified": 1.95, "templates": 1.0, "delivered": 1.95}
 _IN_PER_UNIT = 8.3 / 4.9
 #: Side of a rectified image as drawn, pixels.
@@ -85,7 +86,7 @@ def read_tracks(products: Mapping[str, Any]) -> list[Track]:
 @in_page_style
 def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
     """Draw both image pairs of a case, side by side; raises ValueError without the three images."""
-    figure = Figure(figsize=(12.0, max(_height_in(products, pair) for pair in _PAIRS)), layout="constrained")
+    figure = Figure(figsize=(12.0, max(_figure_height_in(products, pair) for pair in _PAIRS)), layout="constrained")
     columns = figure.add_gridspec(1, 2)
     for pair in _PAIRS:
         _draw_pair(figure.add_subfigure(columns[pair]), products, pair)
@@ -95,7 +96,7 @@ def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
 @in_page_style
 def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
     """Draw one image pair of a case, 0 or 1; raises ValueError without its images."""
-    figure = Figure(figsize=(6.0, _height_in(products, pair)), layout="constrained")
+    figure = Figure(figsize=(6.0, _figure_height_in(products, pair)), layout="constrained")
     _draw_pair(figure, products, pair)
     return figure
 
@@ -115,14 +116,16 @@ def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> list[Pa
 def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:
     """Return the relative heights of the non-empty rows of a pair's figure, from top to bottom."""
     has_content = {
-        "rectified": any(numeric_product(products.get(f"rectified_{pair}_{side}")) is not None for side in (0, 1)),
+        "rectified": any(
+            numeric_product(products.get(f"rectified_{pair}_{image_index}")) is not None for image_index in (0, 1)
+        ),
         "templates": any(track.pair == pair and track.patch is not None for track in read_tracks(products)),
         "delivered": True,
     }
     return {name: _ROW_HEIGHTS[name] for name, is_drawn in has_content.items() if is_drawn}
 
 
-def _height_in(products: Mapping[str, Any], pair: int) -> float:
+def _figure_height_in(products: Mapping[str, Any], pair: int) -> float:
     return _IN_PER_UNIT * sum(_row_heights(products, pair).values())
 
 
@@ -134,31 +137,35 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
     grid = {name: cells[index] for index, name in enumerate(heights)}
     if "rectified" in grid:
         rectified_cells = grid["rectified"].subgridspec(1, 2)
-        for side, image in enumerate(images):
-            _draw_rectified(figure.add_subplot(rectified_cells[side]), products, image, pair_tracks, pair, side)
+        for image_index, image in enumerate(images):
+            _draw_rectified(
+                figure.add_subplot(rectified_cells[image_index]), products, image, pair_tracks, pair, image_index
+            )
     if "templates" in grid:
         template_cells = grid["templates"].subgridspec(1, 2 * _MAX_TRACKS)
         for index in range(_MAX_TRACKS):
-            panels = [figure.add_subplot(template_cells[2 * index + k]) for k in (0, 1)]
+            panels = [figure.add_subplot(template_cells[2 * index + column]) for column in (0, 1)]
             if index < len(pair_tracks):
                 _draw_template_window(panels, pair_tracks[index])
             else:
                 for axes in panels:
                     axes.set_axis_off()
     delivered_cells = grid["delivered"].subgridspec(1, 2)
-    for side, (image, prefix, colour) in enumerate(zip(images, ("template", "match"), (TEMPLATE, MATCH), strict=True)):
-        axes = figure.add_subplot(delivered_cells[side])
+    for image_index, (image, prefix, colour) in enumerate(
+        zip(images, ("template", "match"), (TEMPLATE, MATCH), strict=True)
+    ):
+        axes = figure.add_subplot(delivered_cells[image_index])
         show_subframe(axes, image)
         axes.set_facecolor(INK)
         _mark_tracks(axes, pair_tracks, prefix, colour)
-        _outline_overlap(axes, products, pair, side)
-        axes.set_title(f"Image {pair + side + 1}: {'templates' if side == 0 else 'tracked'}", fontsize=9)
+        _outline_overlap(axes, products, pair, image_index)
+        axes.set_title(f"Image {pair + image_index + 1}: {'templates' if image_index == 0 else 'tracked'}", fontsize=9)
 
 
 def _draw_rectified(
-    axes: Axes, products: Mapping[str, Any], image: Image, pair_tracks: Sequence[Track], pair: int, side: int
+    axes: Axes, products: Mapping[str, Any], image: Image, pair_tracks: Sequence[Track], pair: int, image_index: int
 ) -> None:
-    lattice = numeric_product(products.get(f"rectified_{pair}_{side}"))
+    lattice = numeric_product(products.get(f"rectified_{pair}_{image_index}"))
     frame, gsd = numeric_product(products.get(f"rectified_frame_{pair}")), numeric_product(products.get(f"gsd_{pair}"))
     if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
         axes.set_axis_off()
@@ -166,35 +173,35 @@ def _draw_rectified(
     rectified = _rectify(image, lattice)
     show_subframe(axes, rectified)
     axes.set_facecolor(INK)
-    west, north, lattice_spacing = (float(value) for value in frame.ravel())
-    step = lattice_spacing * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
+    west, north, lattice_spacing_m = (float(value) for value in frame.ravel())
+    step_m = lattice_spacing_m * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
     spacing_m = float(gsd[0]) if gsd is not None and gsd.size == 1 else np.nan
 
-    def draw_square(ground: Float[np.ndarray, "2"], side_px: int, colour: str, valid: bool) -> None:
-        centre = ((ground[0] - west) / step, (north - ground[1]) / step)
-        _draw_square(axes, centre, side_px * spacing_m / step, colour, valid)
+    def draw_ground_square(ground: Float[np.ndarray, "2"], side_px: int, colour: str, is_valid: bool) -> None:
+        centre = ((ground[0] - west) / step_m, (north - ground[1]) / step_m)
+        _draw_square(axes, centre, side_px * spacing_m / step_m, colour, is_valid)
 
     for track in pair_tracks:
         ground = np.array([track.values.get(f"ground_{axis}_m", np.nan) for axis in ("east", "north")])
         if track.patch is None or track.window is None:
             continue
-        if side == 0:
-            draw_square(ground, len(track.patch), TEMPLATE, track.valid)
+        if image_index == 0:
+            draw_ground_square(ground, len(track.patch), TEMPLATE, track.valid)
         else:
-            draw_square(ground, len(track.window), WINDOW, True)
+            draw_ground_square(ground, len(track.window), WINDOW, True)
             if track.position is not None:
                 # the window is centred on `ground`
                 centre = 0.5 * (len(track.window) - 1)
                 offset = np.array([track.position[1] - centre, centre - track.position[0]])
-                draw_square(ground + spacing_m * offset, len(track.patch), MATCH, track.valid)
-    axes.set_title(f"Image {pair + side + 1} rectified{'' if side == 0 else ': windows'}", fontsize=9)
+                draw_ground_square(ground + spacing_m * offset, len(track.patch), MATCH, track.valid)
+    axes.set_title(f"Image {pair + image_index + 1} rectified{'' if image_index == 0 else ': windows'}", fontsize=9)
 
 
 def _rectify(image: Image, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
-    """Resample the image at the interpolated pixels of a lattice; NaN outside the image."""
+    """Rectify an image by a lattice of ground points with their pixels (u, v); NaN outside the image."""
     indices = np.linspace(0.0, lattice.shape[0] - 1.0, _RECTIFIED_PX)
     v, u = np.meshgrid(indices, indices, indexing="ij")
-    pixels = [ndimage.map_coordinates(lattice[..., k], [v, u], order=1, mode="nearest") for k in (1, 0)]
+    pixels = [ndimage.map_coordinates(lattice[..., component], [v, u], order=1, mode="nearest") for component in (1, 0)]
     rows, columns = image.shape
     is_inside = (pixels[0] >= -0.5) & (pixels[0] <= rows - 0.5) & (pixels[1] >= -0.5) & (pixels[1] <= columns - 0.5)
     values = ndimage.map_coordinates(image, np.nan_to_num(pixels, nan=-1.0), order=1, mode="nearest")
@@ -220,30 +227,30 @@ def _mark_tracks(axes: Axes, pair_tracks: Sequence[Track], prefix: str, colour: 
     box = {"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0}
     for track in pair_tracks:
         u, v = track.values.get(f"{prefix}_u", np.nan), track.values.get(f"{prefix}_v", np.nan)
-        side = track.values.get("template_side_px", _DEFAULT_SIDE_PX)
+        side_px = track.values.get("template_side_px", _DEFAULT_SIDE_PX)
         if np.isfinite((u, v)).all():
-            _draw_square(axes, (u, v), side, colour, track.valid)
+            _draw_square(axes, (u, v), side_px, colour, track.valid)
             axes.annotate(
-                str(track.template + 1), (u, v - side / 2), xytext=(0, 3), textcoords="offset points", ha="center",
+                str(track.template + 1), (u, v - side_px / 2), xytext=(0, 3), textcoords="offset points", ha="center",
                 va="bottom", color=colour, fontsize=9, fontweight="bold", annotation_clip=True, bbox=box,
             )  # fmt: skip
 
 
-def _outline_overlap(axes: Axes, products: Mapping[str, Any], pair: int, side: int) -> None:
-    """Outline the overlap in the first image, and mark the zero-phase point."""
+def _outline_overlap(axes: Axes, products: Mapping[str, Any], pair: int, image_index: int) -> None:
+    """Outline the overlap in the first image, and mark the zero-phase point (direction opposite to the sun)."""
     polygon, zero_phase = to_matrix(products.get(f"overlap_{pair}")), to_matrix(products.get(f"zero_phase_{pair}"))
-    if side == 0 and polygon is not None and polygon.shape[1] == 2:
+    if image_index == 0 and polygon is not None and polygon.shape[1] == 2:
         axes.add_patch(Polygon(polygon, fill=False, edgecolor="#f2e35a", linewidth=0.9, linestyle=":"))
-    if zero_phase is not None and zero_phase.shape == (2, 2) and np.isfinite(zero_phase[side]).all():
-        u, v = (float(value) for value in zero_phase[side])
+    if zero_phase is not None and zero_phase.shape == (2, 2) and np.isfinite(zero_phase[image_index]).all():
+        u, v = (float(value) for value in zero_phase[image_index])
         rows, columns = axes.get_images()[0].get_size()
         if 0 <= u < columns and 0 <= v < rows:
             axes.plot([u], [v], marker="x", color="#f2e35a", markersize=7)
 
 
-def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: str, valid: bool) -> None:
+def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: str, is_valid: bool) -> None:
     if np.isfinite([*centre, side]).all():
-        corner, line = (centre[0] - side / 2, centre[1] - side / 2), "-" if valid else _DASHED
+        corner, line = (centre[0] - side / 2, centre[1] - side / 2), "-" if is_valid else _DASHED
         axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=colour, linewidth=1.8, linestyle=line))
 
 

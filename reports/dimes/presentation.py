@@ -26,26 +26,28 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     if "tracks" not in products:
         images = figures.draw_delivered_images(products)
         figure = svg_figure(images, f"{key}pictures", "The three images that the algorithm received.", wide=True)
-        return CaseView(_velocities(products), [figure], [], [], note_text("dimes.plain_legend"))
+        return CaseView(_format_velocities(products), [figure], [], [], note_text("dimes.plain_legend"))
     pairs = enumerate(("first and second image", "second and third image"))
     svg_figures = []
-    for k, name in pairs:
-        svg_figures.append(svg_figure(figures.draw_dimes_pair(products, k), f"{key}pair{k}", f"Pair {k + 1}: {name}."))
+    for index, name in pairs:
+        svg_figures.append(
+            svg_figure(figures.draw_dimes_pair(products, index), f"{key}pair{index}", f"Pair {index + 1}: {name}.")
+        )
     tracks = figures.read_tracks(products)
     names = dict.fromkeys(name for track in tracks for name in track.values)
     quantities = [name for name in names if name not in _HIDDEN_COLUMNS and not name.startswith("failed_")]
     head = ["Pair", "Template", "Failed checks", *(label(name) for name in quantities)]
     rows = []
     for track in tracks:
-        failed = [name for name, value in track.values.items() if name.startswith("failed_") and value == 1.0]
-        checks = ", ".join(name.removeprefix("failed_").replace("_", " ") for name in failed)
+        failed_columns = [name for name, value in track.values.items() if name.startswith("failed_") and value == 1.0]
+        checks = ", ".join(name.removeprefix("failed_").replace("_", " ") for name in failed_columns)
         texts = [str(track.pair + 1), str(track.template + 1), checks or ("none" if track.valid else "unknown")]
         texts += [number(track.values.get(name, np.nan)) for name in quantities]
         rows.append(TableRow(texts, track.valid))
-    return CaseView(_velocities(products), svg_figures, head, rows)
+    return CaseView(_format_velocities(products), svg_figures, head, rows)
 
 
-def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _format_velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Format the estimated and the true velocity, if the products contain them."""
     facts = []
     for key, name in (
@@ -76,16 +78,18 @@ def _read_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"] | None
 def is_stream_case(products: Mapping[str, Any]) -> bool:
     """Whether products contain the answers of a velocity stream after each of its images."""
     table = _read_stream(products)
-    return table is not None and all(to_matrix(products.get(f"image_{k + 1}")) is not None for k in range(len(table)))
+    return table is not None and all(
+        to_matrix(products.get(f"image_{index + 1}")) is not None for index in range(len(table))
+    )
 
 
 def view_stream(products: Mapping[str, Any], key: str) -> CaseView:
     """Create the view of a velocity stream: its images, and the estimate after each image."""
     rows = []
     for image_number, row in enumerate(_require_stream(products), start=1):
-        answered = bool(np.isfinite(row[2]))
+        is_answered = bool(np.isfinite(row[2]))
         values = [number(float(value)) for value in (*row, np.hypot(row[2] - row[4], row[3] - row[5]))]
-        rows.append(TableRow([str(image_number), *(values if answered else ["" for _ in values])], answered))
+        rows.append(TableRow([str(image_number), *(values if is_answered else ["" for _ in values])], is_answered))
     head = ["After image", "From (s)", "To (s)", "East (m/s)", "North (m/s)"]
     head += ["True east", "True north", "Error (m/s)"]
     caption = "Images of the stream, and the estimated velocity after each image."
@@ -93,6 +97,7 @@ def view_stream(products: Mapping[str, Any], key: str) -> CaseView:
 
 
 def _require_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"]:
+    """Read the velocity stream as in `_read_stream`. Raises ValueError if it is missing."""
     table = _read_stream(products)
     if table is None:
         raise ValueError("the products contain no velocity stream")
@@ -112,20 +117,20 @@ def draw_stream_case(products: Mapping[str, Any]) -> Figure:
         axes.set_axis_off()
         image = to_matrix(products.get(f"image_{index + 1}"))
         if image is not None and index < len(table):
-            low, high = np.quantile(image, (0.01, 0.99))
+            low, high = np.quantile(image, (0.01, 0.99))  # contrast stretch
             axes.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1.0), aspect="auto")
             axes.set_box_aspect(1.0)
             axes.set_title(str(index + 1), fontsize=9)
-    answered = table[np.isfinite(table[:, 2])]
-    start, end = answered[:, 0], answered[:, 1]
+    answered_rows = table[np.isfinite(table[:, 2])]
+    start, end = answered_rows[:, 0], answered_rows[:, 1]
     centres = 0.5 * (start + end)
     for component, (name, axes) in enumerate(zip(("east", "north"), lower.subplots(1, 2), strict=True)):
-        estimated, true = answered[:, 2 + component], answered[:, 4 + component]
-        axes.hlines(true, start, np.maximum(end, start), color=INK, linewidth=1.0)
-        axes.plot(centres, true, color=INK, linewidth=1.0, label="true")
+        estimates, truth = answered_rows[:, 2 + component], answered_rows[:, 4 + component]
+        axes.hlines(truth, start, np.maximum(end, start), color=INK, linewidth=1.0)
+        axes.plot(centres, truth, color=INK, linewidth=1.0, label="true")
         style: dict[str, Any] = {"fmt": MARKERS[component], "color": SERIES[component], "ecolor": MUTED}
-        axes.errorbar(centres, estimated, xerr=0.5 * (end - start), label="answered", **style)
-        if len(answered):
+        axes.errorbar(centres, estimates, xerr=0.5 * (end - start), label="answered", **style)
+        if len(answered_rows):
             axes.legend()
         axes.set(xlabel="Time tag (s)", ylabel=f"Velocity {name} (m/s)")
     return figure

@@ -220,26 +220,28 @@ SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
 
 def _landing_rows(subject: Subject) -> pd.DataFrame | None:
     speeds = np.column_stack([numbers(subject.frame, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)])
-    landed = subject.frame[np.isfinite(speeds).all(axis=1)]
-    return landed if len(landed) else None
+    landings = subject.frame[np.isfinite(speeds).all(axis=1)]
+    return landings if len(landings) else None
 
 
-def landing_fractions(landed: kinds.Rows) -> dict[str, rates.CaseFraction]:
+def landing_fractions(landings: kinds.Rows) -> dict[str, rates.CaseFraction]:
     """Compute fractions of landings with a lower and a higher speed, and of answers available before ignition."""
-    change = numbers(landed, SPEED_CORRECTED) - numbers(landed, SPEED_UNCORRECTED)
+    change = numbers(landings, SPEED_CORRECTED) - numbers(landings, SPEED_UNCORRECTED)
     fractions = {
-        f"slower by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(change < -MIN_SPEED_CHANGE_M_S, landed),
-        f"faster by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(change > MIN_SPEED_CHANGE_M_S, landed),
+        f"slower by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(
+            change < -MIN_SPEED_CHANGE_M_S, landings
+        ),
+        f"faster by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(change > MIN_SPEED_CHANGE_M_S, landings),
     }
-    if rates.is_flag(landed, "in_time_assumed"):
+    if rates.is_flag(landings, "in_time_assumed"):
         name = "computation finished before ignition (of all landings)"
-        fractions[name] = rates.fraction_of(rates.flag_mask(landed, "in_time_assumed"), landed)
+        fractions[name] = rates.fraction_of(rates.flag_mask(landings, "in_time_assumed"), landings)
     return fractions
 
 
-def _draw_speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.BlocksAndData:
-    columns = [numbers(landed, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
-    groups = rates.terrain_groups(landed)
+def _create_speed_blocks(landings: kinds.Rows, subject: Subject, key: str) -> kinds.BlocksAndData:
+    columns = [numbers(landings, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
+    groups = rates.terrain_groups(landings)
     change = columns[0] - columns[1]
     rows = [["mean (m/s)", *(number(float(values.mean())) for values in columns)]]
     for probability in (0.5, 0.95, 0.99):
@@ -253,9 +255,9 @@ def _draw_speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Blocks
         [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
         for speed in SPEEDS_M_S
     ]
-    improved, degraded, *_ = landing_fractions(landed).values()
+    improved, degraded, *_ = landing_fractions(landings).values()
     data = {
-        "landings": len(landed),
+        "landings": len(landings),
         "helped": improved.share,
         "harmed": degraded.share,
         "mean_with_m_s": float(columns[0].mean()),
@@ -283,7 +285,7 @@ LANDING = kinds.SectionDeclaration(
             complementary=True,
         ),
         kinds.RateTable(landing_fractions, cases="Landings", heading="Improved and degraded landings", data="shares"),
-        kinds.CustomBlocks(_draw_speeds),
+        kinds.CustomBlocks(_create_speed_blocks),
     ),
 )
 
@@ -327,9 +329,12 @@ def sensitivity_section(subject: Subject) -> Section | None:
     effect_svg = svg_figure(effect_figure(effects, unit), "sensitivity", caption)
     note = note_text("dimes.sensitivity", metric=magnitude_label(metric), confidence=format_fraction(CONFIDENCE))
     rows = [
-        [label(e.column), f"{number(e.low)} to {number(e.high)}"]
-        + ["{} ({} to {})".format(*map(number, value)) for value in (e.rank_correlation, e.coefficient, e.effect)]
-        for e in effects
+        [label(effect.column), f"{number(effect.low)} to {number(effect.high)}"]
+        + [
+            "{} ({} to {})".format(*map(number, value))
+            for value in (effect.rank_correlation, effect.coefficient, effect.effect)
+        ]
+        for effect in effects
     ]
     head = ["", "5 % to 95 %", "Rank correlation", "Standardised coefficient", f"Effect ({unit})"]
     data = {"drivers": [asdict(effect) for effect in effects]}
@@ -357,32 +362,35 @@ def estimate_effects(subject: Subject, metric: str) -> list[ConditionEffect]:
     # the first row is the sample, the other rows are the resamples
     statistics = [ranks, slopes / y.std(), slopes / x.std(axis=0) * (high - low)]
     effects = []
-    for k, name in enumerate(columns):
-        intervals = [(float(statistic[0, k]), *rates.percentile_interval(statistic[1:, k])) for statistic in statistics]
-        effects.append(ConditionEffect(name, float(low[k]), float(high[k]), *intervals))
+    for index, name in enumerate(columns):
+        intervals = [
+            (float(statistic[0, index]), *rates.percentile_interval(statistic[1:, index])) for statistic in statistics
+        ]
+        effects.append(ConditionEffect(name, float(low[index]), float(high[index]), *intervals))
     return effects
 
 
 def regress_weighted(
     x: Float[np.ndarray, "n k"], y: Float[np.ndarray, " n"], weights: Float[np.ndarray, "b n"]
 ) -> Float[np.ndarray, "b k"]:
-    """Fit y to all columns of x and a constant by weighted least squares; returns slopes for each row of weights."""
+    """Fit y to all columns of x and a constant by weighted least squares; return the slopes for each row of weights."""
     design = np.column_stack([np.ones(y.size), x - x.mean(axis=0)])
-    normal = np.einsum("bn,ni,nj->bij", weights, design, design, optimize=True)
-    right = np.einsum("bn,ni->bi", weights, design * y[:, None])
-    # a condition can be constant in a resample of few terrains; the pseudo-inverse then results in slope 0
-    return np.asarray(np.einsum("bij,bj->bi", np.linalg.pinv(normal, hermitian=True), right)[:, 1:])
+    normal_matrices = np.einsum("bn,ni,nj->bij", weights, design, design, optimize=True)
+    right_sides = np.einsum("bn,ni->bi", weights, design * y[:, None])
+    # a condition can be constant in a resample of few terrains; its slope from the pseudo-inverse is then 0
+    return np.asarray(np.einsum("bij,bj->bi", np.linalg.pinv(normal_matrices, hermitian=True), right_sides)[:, 1:])
 
 
 def correlate_weighted(
     x: Float[np.ndarray, "n k"], y: Float[np.ndarray, " n"], weights: Float[np.ndarray, "b n"]
 ) -> Float[np.ndarray, "b k"]:
     """Correlate y with each column of x for each row of weights; inputs are ranks in the original sample."""
-    w = weights / weights.sum(axis=1, keepdims=True)
+    normalized = weights / weights.sum(axis=1, keepdims=True)
     x, y = x - x.mean(axis=0), y - y.mean()
-    mean_x, mean_y = w @ x, (w @ y)[:, None]
-    covariance = w @ (x * y[:, None]) - mean_x * mean_y
-    variances = (w @ (x * x) - mean_x**2) * ((w @ (y * y))[:, None] - mean_y**2)
+    mean_x, mean_y = normalized @ x, (normalized @ y)[:, None]
+    covariance = normalized @ (x * y[:, None]) - mean_x * mean_y
+    variances = (normalized @ (x * x) - mean_x**2) * ((normalized @ (y * y))[:, None] - mean_y**2)
+    # `tiny` avoids a division by zero for a constant
     return np.asarray(covariance / np.sqrt(np.maximum(variances, np.finfo(np.float64).tiny)))
 
 

@@ -23,13 +23,13 @@ from marsyard.reports.hda import products as stages
 from marsyard.reports.presentation import save_figures
 from marsyard.reports.section import MUTED, in_page_style, show_image
 
-Part = TypeVar("Part")
+Product = TypeVar("Product")
 
 #: Green, yellow and red that readers with any colour vision can distinguish (after Okabe & Ito).
 GREEN, YELLOW, RED = "#009e73", "#f0e442", "#c83a12"
 BLUE, PURPLE, BLACK, WHITE = "#3da5ff", "#8f1fb0", "#000000", "#ffffff"
 TRACKED_COLOUR, LOST_COLOUR = "#f0a202", "#c9d1d9"
-#: Green in the lower half of the limit, yellow up to the limit, red above; the scale ends at twice the limit.
+#: Green in the lower half of the limit, yellow up to the limit, red above. The scale ends at twice the limit (1.0).
 HAZARD_COLOURS = LinearSegmentedColormap.from_list(
     "hazard", [(0.0, GREEN), (0.2, GREEN), (0.42, YELLOW), (0.5, YELLOW), (0.5, RED), (1.0, "#7d1f06")]
 ).with_extremes(bad="#8a929b")
@@ -52,7 +52,7 @@ def draw_tracks(products: Mapping[str, Any]) -> Figure:
     tracks = _require(stages.read_tracked_features(products), "tracks")
     _draw_features(left, tracks.first, tracks)
     _draw_segments(right, tracks.first[tracks.accepted], tracks.second[tracks.accepted], TRACKED_COLOUR, alpha=0.9)
-    _draw_features(right, tracks.second, tracks, lost=False)
+    _draw_features(right, tracks.second, tracks, show_lost=False)
     left.set_title(f"First image: {len(tracks.first)} features", fontsize=9)
     right.set_title(f"Second image: {int(tracks.accepted.sum())} tracks", fontsize=9)
     left.legend(loc="lower left", labelcolor=WHITE, frameon=True, facecolor=BLACK, framealpha=0.5, fontsize=8)
@@ -63,12 +63,12 @@ def draw_tracks(products: Mapping[str, Any]) -> Figure:
 def draw_motion(products: Mapping[str, Any]) -> Figure:
     """Draw Fig. 2: three orthographic views of motion and structure."""
     motion, maps = _require(stages.read_motion(products), "motion"), stages.read_landing_maps(products)
-    # without a map the vertical is unknown, so the first camera's optical axis replaces it
-    upright = np.diag([1.0, -1.0, -1.0]) if maps is None else maps.surface_from_camera
+    # without a map the vertical is unknown; the first camera's optical axis replaces it
+    upright_from_camera = np.diag([1.0, -1.0, -1.0]) if maps is None else maps.surface_from_camera
     figure = Figure(figsize=(9.0, 3.6), layout="constrained", facecolor="none")
     views = (("from above", 0, 1), ("along y", 0, 2), ("along x", 1, 2))
-    for axes, (name, *pair) in zip(figure.subplots(1, 3), views, strict=True):
-        _draw_motion_view(axes, motion, upright, pair)
+    for axes, (name, *axis_pair) in zip(figure.subplots(1, 3), views, strict=True):
+        _draw_motion_view(axes, motion, upright_from_camera, axis_pair)
         axes.set_title(f"View {name}", fontsize=9)
     figure.axes[0].legend(loc="upper left", fontsize=7, labelcolor=WHITE)
     return figure
@@ -81,7 +81,7 @@ def draw_epipolar(products: Mapping[str, Any]) -> Figure:
     matches = _require(stages.read_matches(products), "matches")
     # draw every `step`-th row and column of the grid, so that at most `_MAX_MATCHES` are drawn
     step, indices = 1, np.arange(len(matches.grid))
-    v, u = (np.unique(matches.grid[:, k], return_inverse=True)[1] for k in (1, 0))
+    v, u = (np.unique(matches.grid[:, index], return_inverse=True)[1] for index in (1, 0))
     while len(indices) > _MAX_MATCHES:
         step += 1
         indices = np.flatnonzero((v % step == step // 2) & (u % step == step // 2))
@@ -116,21 +116,23 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
     median = np.nanmedian(maps.elevation_m)
     max_deviation_m = float(np.nanquantile(np.abs(maps.elevation_m - median), 0.99)) or 1.0
     cells = maps.world_to_cell(truth.offset_from_nadir_m)
-    covered = np.where(truth.covered, 1.0, np.nan)
+    coverage = np.where(truth.covered, 1.0, np.nan)
     maps_by_name = (
         ("elevation (m)", maps.elevation_m - median, truth.elevation_m - median, None),
-        ("roughness (m)", maps.roughness_m, truth.roughness_m * covered, float(limits[1])),
-        ("slope (deg)", degrees, np.degrees(truth.slope_rad) * covered, float(np.degrees(limits[0]))),
+        ("roughness (m)", maps.roughness_m, truth.roughness_m * coverage, float(limits[1])),
+        ("slope (deg)", degrees, np.degrees(truth.slope_rad) * coverage, float(np.degrees(limits[0]))),
     )
-    for upper, lower, (name, estimated, true_values, limit) in zip(map_row, truth_row, maps_by_name, strict=False):
-        scale = {"vmin": -max_deviation_m, "vmax": max_deviation_m, "cmap": ELEVATION_COLOURS}
+    for upper, lower, (name, map_values, true_values, limit) in zip(map_row, truth_row, maps_by_name, strict=False):
+        colour_scale = {"vmin": -max_deviation_m, "vmax": max_deviation_m, "cmap": ELEVATION_COLOURS}
         if limit is not None:
-            scale = {"vmin": 0.0, "vmax": 2.0 * limit, "cmap": HAZARD_COLOURS}
-        image = upper.imshow(estimated, interpolation="nearest", **scale)
-        lower.pcolormesh(cells[..., 1], cells[..., 0], true_values, shading="nearest", rasterized=True, **scale)
-        bar = figure.colorbar(image, ax=[upper, lower], orientation="horizontal", shrink=0.9, pad=0.02, aspect=30)
-        bar.outline.set_visible(False)
-        bar.ax.tick_params(labelsize=7)
+            colour_scale = {"vmin": 0.0, "vmax": 2.0 * limit, "cmap": HAZARD_COLOURS}
+        image = upper.imshow(map_values, interpolation="nearest", **colour_scale)
+        lower.pcolormesh(cells[..., 1], cells[..., 0], true_values, shading="nearest", rasterized=True, **colour_scale)
+        colour_bar = figure.colorbar(
+            image, ax=[upper, lower], orientation="horizontal", shrink=0.9, pad=0.02, aspect=30
+        )
+        colour_bar.outline.set_visible(False)
+        colour_bar.ax.tick_params(labelsize=7)
         upper.set_title(f"Map: {name}", fontsize=9)
         lower.set_title("Truth of footprints" if limit is not None else "Truth", fontsize=9)
     _draw_safety(map_row[3], truth_row[3], maps, truth)
@@ -146,13 +148,13 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
 
 
 def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, truth: stages.GroundTruth) -> None:
-    scale: dict[str, Any] = {"vmin": 0, "vmax": 2, "cmap": SAFETY_COLOURS}
-    map_axes.imshow(maps.safety, interpolation="nearest", **scale)
+    colour_scale: dict[str, Any] = {"vmin": 0, "vmax": 2, "cmap": SAFETY_COLOURS}
+    map_axes.imshow(maps.safety, interpolation="nearest", **colour_scale)
     if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
         map_axes.contourf(maps.safety, levels=[1.5, 2.5], colors="none", hatches=["////"])
     cells = maps.world_to_cell(truth.offset_from_nadir_m)
     safety = np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
-    truth_axes.pcolormesh(cells[..., 1], cells[..., 0], safety, shading="nearest", rasterized=True, **scale)
+    truth_axes.pcolormesh(cells[..., 1], cells[..., 0], safety, shading="nearest", rasterized=True, **colour_scale)
     map_axes.set_title("Safe landing map", fontsize=9)
     truth_axes.set_title("Truth of footprints", fontsize=9)
     for name, colour in (("safe", GREEN), ("unknown", YELLOW), ("hazard", RED)):
@@ -173,9 +175,9 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
         show_image(axes, images[0])
     limits = {"xlim": overlay_axes.get_xlim(), "ylim": overlay_axes.get_ylim()}
     if np.isfinite(maps.pixels).all():
-        finite = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
+        known_safety = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
         overlay_axes.pcolormesh(
-            maps.pixels[..., 0], maps.pixels[..., 1], finite, shading="nearest", alpha=0.38,
+            maps.pixels[..., 0], maps.pixels[..., 1], known_safety, shading="nearest", alpha=0.38,
             vmin=0, vmax=2, cmap=SAFETY_COLOURS, rasterized=True, linewidth=0.0,
         )  # fmt: skip
     overlay_axes.set(**limits)
@@ -215,16 +217,18 @@ def write_hda_figures(directory: Path, products: Mapping[str, Any]) -> list[Path
     return save_figures(directory, {name: FIGURES[name](products) for name in available_figures(products)}, dpi=130)
 
 
-def _require(part: Part | None, name: str) -> Part:
-    if part is None:
+def _require(product: Product | None, name: str) -> Product:
+    if product is None:
         raise ValueError(f"the products contain no {name}")
-    return part
+    return product
 
 
-def _draw_features(axes: Axes, pixels: stages.Pixels, tracks: stages.TrackedFeatures, *, lost: bool = True) -> None:
+def _draw_features(
+    axes: Axes, pixels: stages.Pixels, tracks: stages.TrackedFeatures, *, show_lost: bool = True
+) -> None:
     style: dict[str, Any] = {"markersize": 5.5, "markerfacecolor": "none", "markeredgewidth": 1.3}
     axes.plot(*pixels[tracks.accepted].T, "s", color=TRACKED_COLOUR, label="tracked", **style)
-    if lost and not tracks.accepted.all():
+    if show_lost and not tracks.accepted.all():
         untracked = pixels[~tracks.accepted]
         axes.plot(*untracked.T, "x", markersize=5.0, color=LOST_COLOUR, markeredgewidth=1.2, label="not tracked")
 
@@ -247,13 +251,13 @@ def _draw_image_pair(products: Mapping[str, Any]) -> tuple[Figure, Axes, Axes]:
 
 
 def _draw_motion_view(
-    axes: Axes, motion: stages.EstimatedMotion, upright: Float[np.ndarray, "3 3"], pair: list[int]
+    axes: Axes, motion: stages.EstimatedMotion, upright_from_camera: Float[np.ndarray, "3 3"], axis_pair: list[int]
 ) -> None:
     """Draw an orthographic view onto two axes of an upright frame at the first camera."""
     depth = float(np.median(motion.points[:, 2]))
 
     def project(points: np.ndarray) -> np.ndarray:
-        return np.asarray((points @ upright.T)[..., pair])
+        return np.asarray((points @ upright_from_camera.T)[..., axis_pair])
 
     axes.plot(*project(motion.points).T, "o", color=WHITE, markersize=2.2, label="features")
     poses = (
@@ -269,14 +273,15 @@ def _draw_motion_view(
         if line == "-":
             for corner in footprint:
                 axes.plot(*project(np.array([centre, corner])).T, color=colour, linewidth=0.5, alpha=0.5)
-            for axis in 0.12 * depth * rotation:
-                axes.plot(*project(np.array([centre, centre + axis])).T, color=colour, linewidth=1.8)
+            # axes of the camera, with 12 % of the depth as length
+            for axis_vector in 0.12 * depth * rotation:
+                axes.plot(*project(np.array([centre, centre + axis_vector])).T, color=colour, linewidth=1.8)
     axes.set_facecolor(_BACKGROUND)
     axes.grid(visible=False)
     axes.set_aspect("equal", adjustable="datalim")
     axes.tick_params(labelsize=7)
-    axes.set_xlabel(f"{'xyz'[pair[0]]} (m)", fontsize=8)
-    axes.set_ylabel(f"{'xyz'[pair[1]]} (m)", fontsize=8)
+    axes.set_xlabel(f"{'xyz'[axis_pair[0]]} (m)", fontsize=8)
+    axes.set_ylabel(f"{'xyz'[axis_pair[1]]} (m)", fontsize=8)
 
 
 def _draw_terrain(
@@ -291,24 +296,28 @@ def _draw_terrain(
     sides = maps.cell_m * np.array([columns, rows])
     height_range_m = float(np.nanmax(heights) - np.nanmin(heights))
     # exaggerate heights so that the relief of flat ground is visible
-    scale = next((k for k in (1.0, 2.0, 5.0) if k * height_range_m >= _MIN_RELIEF * sides.max()), 10.0)
-    style: dict[str, Any] = {"vert_exag": scale, "dx": maps.cell_m, "dy": maps.cell_m, "blend_mode": "soft"}
+    exaggeration = next(
+        (factor for factor in (1.0, 2.0, 5.0) if factor * height_range_m >= _MIN_RELIEF * sides.max()), 10.0
+    )
+    style: dict[str, Any] = {"vert_exag": exaggeration, "dx": maps.cell_m, "dy": maps.cell_m, "blend_mode": "soft"}
     shaded = LightSource(315.0, 45.0).shade_rgb(np.asarray(colours), np.nan_to_num(heights), **style)
-    part = np.s_[::step, ::step]
+    subset = np.s_[::step, ::step]
     axes.plot_surface(
-        *(grid[part] for grid in np.meshgrid(x, y)), heights[part], facecolors=shaded[part], rcount=200, ccount=200,
-        shade=False, antialiased=False, linewidth=0.0, rasterized=True, zorder=1,
+        *(grid[subset] for grid in np.meshgrid(x, y)), heights[subset], facecolors=shaded[subset], rcount=200,
+        ccount=200, shade=False, antialiased=False, linewidth=0.0, rasterized=True, zorder=1,
     )  # fmt: skip
-    offset_m = 0.02 * float(sides.max()) / scale
+    offset_m = 0.02 * float(sides.max()) / exaggeration
     for name, cell in (("apriori", maps.apriori), ("site", maps.site)):
         height = _value_at_cell(heights[..., None], cell)
         if height is not None and np.isfinite(height).all():
             position = maps.corner_m + maps.cell_m * cell[::-1] * np.array([1.0, -1.0])
             axes.plot([position[0]], [position[1]], [float(height[0]) + offset_m], **_SITE_MARKERS[name], zorder=5)
-    axes.set_box_aspect((sides[0], sides[1], max(scale * height_range_m, 0.05 * sides.max())), zoom=1.3)
+    axes.set_box_aspect((sides[0], sides[1], max(exaggeration * height_range_m, 0.05 * sides.max())), zoom=1.3)
     axes.view_init(elev=38.0, azim=azimuth_deg)
     axes.set(xlabel="x (m)", ylabel="y (m)")
-    axes.set_title("Heights in m" if scale == 1.0 else f"Heights in m, exaggerated {scale:g} times", fontsize=9)
+    axes.set_title(
+        "Heights in m" if exaggeration == 1.0 else f"Heights in m, exaggerated {exaggeration:g} times", fontsize=9
+    )
     axes.tick_params(labelsize=6, pad=-2, colors=MUTED)
     for name, axis, bins in (("x", axes.xaxis, 4), ("y", axes.yaxis, 4), ("z", axes.zaxis, 3)):
         axes.locator_params(axis=name, nbins=bins)

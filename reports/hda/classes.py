@@ -31,7 +31,7 @@ class HazardClass:
 
     - kind: `roughness` (the height of the hazard) or `slope`
     - low, high: bounds of the class divided by the lander's limit
-    - called_safe: fraction of footprints that are classified as safe in the map
+    - called_safe: fraction of footprints that the map classifies as safe
     - unflagged: fraction of footprints without a detected hazard before hazard growth
     """
 
@@ -73,20 +73,20 @@ RATES: Mapping[str, tuple[str, str]] = {
 def count_hazard_classes(frame: Rows) -> list[HazardClass]:
     """Count missed hazards by size; empty if the rows do not contain the counts."""
     edges = (0.0, *CLASS_BOUNDS, math.inf)
-    rows = []
+    classes = []
     for kind in ("roughness", "slope"):
-        for name, low, high in zip(CLASS_NAMES, edges[:-1], edges[1:], strict=True):
-            column = f"footprints_{kind}_{name}"
+        for class_name, low, high in zip(CLASS_NAMES, edges[:-1], edges[1:], strict=True):
+            column = f"footprints_{kind}_{class_name}"
             if column in frame:
                 called_safe, unflagged = (
-                    pooled_rate(frame, f"{column}_{part}", column) for part in ("safe", "unflagged")
+                    pooled_rate(frame, f"{column}_{ending}", column) for ending in ("safe", "unflagged")
                 )
-                rows.append(HazardClass(kind, low, high, called_safe, unflagged))
-    return rows
+                classes.append(HazardClass(kind, low, high, called_safe, unflagged))
+    return classes
 
 
-def draw_classes(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
-    """Draw missed hazards by size, and rates of footprints; nothing if the rows do not contain the counts."""
+def create_class_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+    """Create figure and tables of missed hazards by size, and of rates of footprints; nothing without the counts."""
     classes = count_hazard_classes(frame)
     if not classes:
         return [], {}
@@ -178,6 +178,7 @@ class TrackingCurve:
     @property
     def min_fraction_within_limit(self) -> float:
         """Minimum fraction of tracked features over all sizes up to the paper's limit."""
+        # the tolerance of 0.1 % allows for rounding of the sizes
         fractions = [point.tracked.share for point in self.points if abs(point.size) <= 1.001 * self.change["paper"]]
         return float(np.nanmin(fractions)) if fractions and not np.all(np.isnan(fractions)) else math.nan
 
@@ -235,30 +236,30 @@ def tracking_curves(frame: pd.DataFrame) -> list[TrackingCurve]:
     is_unchanged = is_complete & ~is_changed.any(axis=0)
     result = []
     for change, size, has_change in zip(changes, sizes, is_changed, strict=True):
-        selected = is_complete & (has_change | is_unchanged)
+        is_selected = is_complete & (has_change | is_unchanged)
         rounded = np.where(has_change, np.round(size, 1), 0.0)
-        if np.unique(rounded[selected]).size >= _MIN_SIZES:
+        if np.unique(rounded[is_selected]).size >= _MIN_SIZES:
             points = []
-            for value in np.unique(rounded[selected]):
-                flights = frame[selected & (rounded == value)]
-                # a flight without tracks has tracked none of the visible features
-                tracked = pooled_rate(flights, "tracks_correct", "features_in_view")
+            for value in np.unique(rounded[is_selected]):
+                flights = frame[is_selected & (rounded == value)]
+                # a flight without tracks counts as zero of its visible features
+                tracked_rate = pooled_rate(flights, "tracks_correct", "features_in_view")
                 points.append(
-                    SizeResult(float(value), tracked, len(flights), int(flag_mask(flights, "tracked_well").sum()))
+                    SizeResult(float(value), tracked_rate, len(flights), int(flag_mask(flights, "tracked_well").sum()))
                 )
             result.append(TrackingCurve(change, points, find_knee(points, 1.0), find_knee(points, -1.0)))
     return result
 
 
-def find_knee(points: Sequence[SizeResult], sign: float) -> float:
+def find_knee(results: Sequence[SizeResult], sign: float) -> float:
     """Find the first change with a fraction below `GOOD_FRACTION`, for positive (1) or negative (-1) changes."""
-    values = sorted((sign * point.size, point.tracked.share) for point in points if sign * point.size >= 0.0)
-    values = [value for value in values if not math.isnan(value[1])]
-    if len(values) < 2:
+    points_by_change = sorted((sign * point.size, point.tracked.share) for point in results if sign * point.size >= 0.0)
+    points_by_change = [point for point in points_by_change if not math.isnan(point[1])]
+    if len(points_by_change) < 2:
         return math.nan
-    if values[0][1] < GOOD_FRACTION:
-        return values[0][0]
-    for (size, fraction), (next_size, next_fraction) in pairwise(values):
+    if points_by_change[0][1] < GOOD_FRACTION:
+        return points_by_change[0][0]
+    for (size, fraction), (next_size, next_fraction) in pairwise(points_by_change):
         if next_fraction < GOOD_FRACTION:
             return size + (next_size - size) * (fraction - GOOD_FRACTION) / (fraction - next_fraction)
     return math.inf

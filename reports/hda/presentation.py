@@ -14,7 +14,7 @@ from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, write_hda_figures
-from marsyard.reports.hda.classes import draw_classes, limits_section
+from marsyard.reports.hda.classes import create_class_blocks, limits_section
 from marsyard.reports.kinds import CustomBlocks, Distribution, RateTable, SectionDeclaration
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import draw_images, svg_figure
@@ -53,11 +53,12 @@ def _stage_rows(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]
     if tracks is not None:
         results["Features and tracks"] = f"{tracks.accepted.sum()} of {len(tracks.first)} tracked"
     if motion is not None:
+        # rotation by an angle has the trace 1 + 2 cos(angle)
         rotation_error = motion.rotation @ motion.true_rotation.T
-        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(rotation_error) - 1.0), -1.0, 1.0)))
+        angle_deg = np.degrees(np.arccos(np.clip(0.5 * (np.trace(rotation_error) - 1.0), -1.0, 1.0)))
         error_m = float(np.linalg.norm(motion.translation - motion.true_translation))
         baseline = f"baseline {number(float(np.linalg.norm(motion.true_translation)))} m, error {number(error_m)} m"
-        results["Motion"] = f"{baseline}; rotation error {number(float(angle))} deg"
+        results["Motion"] = f"{baseline}; rotation error {number(float(angle_deg))} deg"
     if matches is not None:
         results["Structure"] = f"{matches.accepted.sum():,} of {len(matches.grid):,} matched"
     if maps is not None:
@@ -74,7 +75,7 @@ SITES = SectionDeclaration(
     rows=sections.landing_rows,
     parts=(
         RateTable(sections.site_fractions, cases="Flights", heading="Sites", data="shares", shared=False),
-        CustomBlocks(sections.draw_outcomes),
+        CustomBlocks(sections.create_outcome_blocks),
         Distribution(
             sections.hazard_distances,
             ("distance to the nearest unsafe position (m)", "fraction above this distance"),
@@ -84,7 +85,7 @@ SITES = SectionDeclaration(
             table=sections.distance_grid,
             note=note_text("hda.distances"),
         ),
-        CustomBlocks(draw_classes),
+        CustomBlocks(create_class_blocks),
     ),
 )
 _SECTIONS = (sections.THRESHOLD, sections.FAULTS, limits_section, sections.MAP_ERRORS, sections.TOUCHDOWN, SITES)

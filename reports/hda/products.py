@@ -78,6 +78,7 @@ class LandingMaps:
 
     def world_to_cell(self, offset_from_nadir_m: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Convert offsets (x, y) from the camera's nadir point along the world's axes to fractional (row, column)."""
+        # row vectors times the rotation: offset in the surface frame; y increases towards row 0
         offset_m = offset_from_nadir_m @ self.world_from_surface[:2, :2]
         return np.asarray(((offset_m - self.corner_m) / self.cell_m * np.array([1.0, -1.0]))[..., ::-1])
 
@@ -149,12 +150,12 @@ def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
     pixels, cell_m = check_shape(products.get("map_pixels"), *maps[0].shape, 2), _read_positive(products, "cell")
     if frames is None or pixels is None or cell_m is None or not np.all(frames[-1] > 0.0):
         return None
-    observed = np.isfinite(pixels).all(axis=-1)
-    if not observed.all() and observed.sum() >= 3:
+    is_known = np.isfinite(pixels).all(axis=-1)
+    if not is_known.all() and is_known.sum() >= 3:
         # extrapolate unknown pixels by an affine map fitted to the known pixels; exact for level ground
-        cells = np.concatenate([np.moveaxis(np.indices(observed.shape), 0, -1), np.ones((*observed.shape, 1))], axis=-1)
-        affine = np.linalg.lstsq(cells[observed], pixels[observed], rcond=None)[0]
-        pixels = np.where(observed[..., None], pixels, cells @ affine)
+        cells = np.concatenate([np.moveaxis(np.indices(is_known.shape), 0, -1), np.ones((*is_known.shape, 1))], axis=-1)
+        affine = np.linalg.lstsq(cells[is_known], pixels[is_known], rcond=None)[0]
+        pixels = np.where(is_known[..., None], pixels, cells @ affine)
     (site,) = read_arrays(products, {"site": (2,)}, finite=True) or [np.full(2, np.nan)]
     names = ("elevation_m", "roughness_m", "slope_rad", "safety", "corner_m", "apriori", "surface_from_camera")
     arrays = dict(zip((*names, "world_from_surface", "limits"), (*maps, *frames), strict=True))

@@ -39,8 +39,8 @@ def _threshold_rows(subject: Subject) -> pd.DataFrame | None:
     frame = landing_rows(subject)
     if frame is None:
         return None
-    unsafe = numbers(frame, "footprints") - numbers(frame, "footprints_truly_safe")
-    return frame.assign(footprints_not_safe=unsafe)
+    n_unsafe = numbers(frame, "footprints") - numbers(frame, "footprints_truly_safe")
+    return frame.assign(footprints_not_safe=n_unsafe)
 
 
 def _lander_limit_m(subject: Subject) -> float:
@@ -103,16 +103,16 @@ def _describe_fault(fault: str, size: float) -> tuple[str, str]:
 
 def classify_answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
     """Create a mask for each outcome of the search; each row has exactly one outcome."""
-    reported, safe, refused = (
+    is_reported, is_safe, is_refused = (
         rates.flag_mask(frame, name) for name in ("site_reported", "site_safe", "no_site_reported")
     )
-    finished = frame["site_reported"].notna().to_numpy(dtype=np.bool_)
+    is_finished = frame["site_reported"].notna().to_numpy(dtype=np.bool_)
     return {
-        "safe": reported & safe,
-        "wrong": reported & ~safe,
-        "refused": refused,
-        "unconverged": finished & ~reported & ~refused,
-        "unfinished": ~finished,
+        "safe": is_reported & is_safe,
+        "wrong": is_reported & ~is_safe,
+        "refused": is_refused,
+        "unconverged": is_finished & ~is_reported & ~is_refused,
+        "unfinished": ~is_finished,
     }
 
 
@@ -178,7 +178,7 @@ MAP_EFFECTS = kinds.Scatter(
     ),
     y=_MAP_ERRORS,
     heading="Dependence on conditions",
-    caption="Points are cases, lines are medians of bins with equally many cases. The error axes are logarithmic.",
+    caption="Points are cases, lines are medians of bins with equal numbers of cases. The error axes are logarithmic.",
     logarithmic=True,
 )
 MAP_ERRORS = kinds.SectionDeclaration(
@@ -212,7 +212,7 @@ def _landed_rows(subject: Subject) -> pd.DataFrame | None:
     return None if frame is None else frame[rates.flag_mask(frame, "landed")]
 
 
-def _draw_table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
+def _create_table_2_blocks(landings: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
     """Create Table II: the paper's runs and their mean, and the campaign's landings by each measure."""
     runs: Sequence[Mapping[str, float]] = PAPER["landings"]
     columns = ("error_m", "north_m", "east_m", "run_time_s")
@@ -222,27 +222,27 @@ def _draw_table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.Blo
         [f"paper, {name}", str(n), f"{error:.2f}", NOTHING, f"{north:.2f}", f"{east:.2f}", f"{run_time_s:.1f} s"]
         for name, (n, (error, north, east, run_time_s)) in paper.items()
     ]
-    deviations = {name: rates.finite_values(landed, name) for name in _DEVIATIONS}
-    run_times_s = rates.finite_values(landed, "estimation_time_s")
-    groups, means, intervals = rates.terrain_groups(landed), {}, {}
+    deviations = {name: rates.finite_values(landings, name) for name in _DEVIATIONS}
+    run_times_s = rates.finite_values(landings, "estimation_time_s")
+    groups, means, intervals = rates.terrain_groups(landings), {}, {}
     for measure in TOUCHDOWN_ERRORS:
-        values = measure.values(landed)
+        values = measure.values(landings)
         finite = np.isfinite(values)
         if finite.any():
-            low, high = mean_interval(values[finite], CONFIDENCE, None if groups is None else groups[finite])
-            means[measure.column], intervals[measure.column] = float(values[finite].mean()), (low, high)
-            text = f"mean {number(means[measure.column])} ({number(low)} to {number(high)})"
+            lower, upper = mean_interval(values[finite], CONFIDENCE, None if groups is None else groups[finite])
+            means[measure.column], intervals[measure.column] = float(values[finite].mean()), (lower, upper)
+            text = f"mean {number(means[measure.column])} ({number(lower)} to {number(upper)})"
             range_text = " to ".join(number(float(quantile)) for quantile in np.quantile(values[finite], (0.05, 0.95)))
             run_time = f"{1e3 * float(np.median(run_times_s)):.0f} ms (this host)" if run_times_s.size else NOTHING
-            means_m = [f"{x.mean():.2f}" if x.size else NOTHING for x in deviations.values()]
+            means_m = [f"{values.mean():.2f}" if values.size else NOTHING for values in deviations.values()]
             rows.append(
                 [f"this campaign, {measure.title}", f"{int(finite.sum()):,}", text, range_text, *means_m, run_time]
             )
     head = ["", "Landings", "Position error (m)", "5 % to 95 % quantiles (m)", "GPS SD north (m)", "GPS SD east (m)"]
     note, column = note_text("hda.touchdown", confidence=format_fraction(CONFIDENCE)), "touchdown_safe"
-    safe_fraction = rates.flag_fraction(landed, column).share if column in landed else math.nan
+    safe_fraction = rates.flag_fraction(landings, column).share if column in landings else math.nan
     data = {
-        "landings": len(landed),
+        "landings": len(landings),
         "mean_m": means,
         "mean_interval_m": intervals,
         "deviations_m": {name: float(values.mean()) for name, values in deviations.items() if values.size},
@@ -265,7 +265,7 @@ TOUCHDOWN = kinds.SectionDeclaration(
             "Cumulative distribution of the distance from touchdown to site. Vertical lines: runs of the paper.",
             limits={"paper, runs 1, 3 and 4": [run["error_m"] for run in PAPER["landings"]]},
         ),
-        kinds.CustomBlocks(_draw_table_2),
+        kinds.CustomBlocks(_create_table_2_blocks),
         kinds.RateTable(
             (
                 kinds.Rate("touchdown", "touchdown on safe ground", kinds.flag_rate("touchdown_safe")),
@@ -291,39 +291,46 @@ ANSWERS = ("truly safe site", "unsafe site", "'no safe site'", "not converged", 
 
 def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
     """Compute fractions of correct answers by class of the true ground; classes without cases are omitted."""
-    reported, no_site, wide_site, landed = (
+    is_reported, has_no_safe_site, has_wide_site, has_landed = (
         rates.flag_mask(frame, name) for name in ("site_reported", "no_safe_site_exists", "wide_site_exists", "landed")
     )
-    refused, safe = rates.flag_mask(frame, "no_site_reported"), rates.flag_mask(frame, "site_safe")
-    narrow, correct = rates.flag_mask(frame, "safe_site_exists") & ~wide_site, refused | (reported & safe)
+    is_refused, is_safe = rates.flag_mask(frame, "no_site_reported"), rates.flag_mask(frame, "site_safe")
+    has_narrow_site = rates.flag_mask(frame, "safe_site_exists") & ~has_wide_site
+    is_correct = is_refused | (is_reported & is_safe)
     fractions = {
-        "chosen sites that are truly safe": rates.fraction_of(safe[reported], frame[reported]),
-        "answer 'no safe site' if none exists": rates.fraction_of(refused[no_site], frame[no_site]),
-        "site reported although none is safe": rates.fraction_of(reported[no_site], frame[no_site]),
-        "site reported if a wide safe site exists": rates.fraction_of(reported[wide_site], frame[wide_site]),
+        "chosen sites that are truly safe": rates.fraction_of(is_safe[is_reported], frame[is_reported]),
+        "answer 'no safe site' if none exists": rates.fraction_of(
+            is_refused[has_no_safe_site], frame[has_no_safe_site]
+        ),
+        "site reported although none is safe": rates.fraction_of(
+            is_reported[has_no_safe_site], frame[has_no_safe_site]
+        ),
+        "site reported if a wide safe site exists": rates.fraction_of(is_reported[has_wide_site], frame[has_wide_site]),
         "truly safe site or 'no safe site' if all safe sites are narrow": rates.fraction_of(
-            correct[narrow], frame[narrow]
+            is_correct[has_narrow_site], frame[has_narrow_site]
         ),
         "converged (of all flights)": rates.fraction_of(rates.flag_mask(frame, "converged"), frame),
-        "landings on safe ground": rates.fraction_of(rates.flag_mask(frame, "touchdown_safe")[landed], frame[landed]),
+        "landings on safe ground": rates.fraction_of(
+            rates.flag_mask(frame, "touchdown_safe")[has_landed], frame[has_landed]
+        ),
     }
     return {name: fraction for name, fraction in fractions.items() if fraction.n}
 
 
 def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
     """Count flights by true ground (`GROUNDS`) and outcome (`ANSWERS`)."""
-    wide_site, safe_site, no_site = (
+    has_wide_site, has_safe_site, has_no_safe_site = (
         rates.flag_mask(frame, name) for name in ("wide_site_exists", "safe_site_exists", "no_safe_site_exists")
     )
     answer_masks = dict(zip(ANSWERS, classify_answers(frame).values(), strict=True))
-    ground_masks = dict(zip(GROUNDS, (wide_site, safe_site & ~wide_site, no_site), strict=True))
+    ground_masks = dict(zip(GROUNDS, (has_wide_site, has_safe_site & ~has_wide_site, has_no_safe_site), strict=True))
     return {
         ground: {answer: int((ground_mask & mask).sum()) for answer, mask in answer_masks.items()}
         for ground, ground_mask in ground_masks.items()
     }
 
 
-def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
+def create_outcome_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
     """Create the table of the outcomes of the search by class of the true ground."""
     counts = outcome_counts(frame)
     rows = [[ground, *(f"{answer_counts[name]:,}" for name in ANSWERS)] for ground, answer_counts in counts.items()]
@@ -334,9 +341,9 @@ def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.Bloc
 
 def hazard_distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
     """Collect the distances of reported sites and of touchdowns to the nearest true hazard, metres."""
-    reported = frame[rates.flag_mask(frame, "site_reported")]
+    rows_with_site = frame[rates.flag_mask(frame, "site_reported")]
     return {
-        "reported site": rates.finite_values(reported, "site_hazard_distance_m"),
+        "reported site": rates.finite_values(rows_with_site, "site_hazard_distance_m"),
         "touchdown": rates.finite_values(frame, "touchdown_hazard_distance_m"),
     }
 
@@ -368,14 +375,15 @@ def run_times_section(subject: Subject) -> Section | None:
     if frame is None:
         return None
     durations = np.column_stack([numbers(frame, stage["column"]) for stage in stages])
-    complete = np.isfinite(durations).all(axis=1)
-    durations, rows_with_times, cases = durations[complete], frame[complete], int(complete.sum())
+    is_complete = np.isfinite(durations).all(axis=1)
+    durations, rows_with_times, cases = durations[is_complete], frame[is_complete], int(is_complete.sum())
     if not cases or not durations.sum() > 0.0:
         return None
-    median, p95 = np.median(durations, axis=0), np.quantile(durations, 0.95, axis=0)
-    paper_total_s, total_s = sum(stage["seconds"] for stage in stages), float(median.sum())
+    medians_s, percentiles_95_s = np.median(durations, axis=0), np.quantile(durations, 0.95, axis=0)
+    paper_total_s, total_s = sum(stage["seconds"] for stage in stages), float(medians_s.sum())
+    # scales the total run time to that of the paper
     factor, rows, data = paper_total_s / total_s, [], []
-    for stage, median_s, p95_s in zip(stages, median.tolist(), p95.tolist(), strict=True):
+    for stage, median_s, p95_s in zip(stages, medians_s.tolist(), percentiles_95_s.tolist(), strict=True):
         sizes = [rates.quantile(rates.finite_values(rows_with_times, name), 0.5) for name in stage["ours"]]
         text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
         seconds = {"paper_s": stage["seconds"], "median_s": median_s, "late_s": p95_s, "scaled_s": factor * median_s}
@@ -386,6 +394,6 @@ def run_times_section(subject: Subject) -> Section | None:
     rows.append(["Total", *times, NOTHING, NOTHING])
     head = ["Stage", "Paper (s)", "Median (ms)", "95 % quantile (ms)", "Scaled (s)", "Paper's parameters", "Parameters"]
     note = note_text("hda.run_times", cases=count(cases, "case"), factor=number(factor))
-    block, data_of_section = Block(grid=Grid(head, rows), note=note), {"factor": factor, "cases": cases, "stages": data}
+    block, section_data = Block(grid=Grid(head, rows), note=note), {"factor": factor, "cases": cases, "stages": data}
     title = "Run time by stage, compared with Table I of the paper"
-    return Section("run-times", "Run time", title, [block], data_of_section)
+    return Section("run-times", "Run time", title, [block], section_data)

@@ -45,18 +45,18 @@ _COLUMNS = (
     "inertial_difference_m_s", "pair_discrepancy_m_s", "rotation_pose_difference_deg", "direction_pose_difference_deg",
     "baseline_pose_difference_fraction",
 )  # fmt: skip
-_TEXT = (
+_AGREEMENT_TEXT = (
     "Images and poses must agree, even if the true velocity is unknown. Features are matched between consecutive "
     "images. According to the poses, a match lies on a curve of the later image (at a point, if the camera only "
     "rotated); the residual is its distance from this curve. It contains the errors of poses, lens and matching. "
     "Matching alone causes a few tenths of a pixel; larger residuals are caused by the poses or the camera."
 )
-_INERTIAL = (
+_INERTIAL_NOTE = (
     "Differences from the inertial velocity contain its constant error. The discrepancy of pairs does not: it compares "
     "the change of velocity from the first pair of images to the second with the inertial change. Without measured "
     "positions, the residual uses the answer's velocity instead of the constant part of the inertial velocity. "
 )
-_NOT_RANDOM = "Measured cases are not random samples, so these numbers are not probabilities."
+_SAMPLING_NOTE = "Measured cases are not random samples, so these numbers are not probabilities."
 
 
 def agreement_section(subject: Subject) -> Section | None:
@@ -72,14 +72,17 @@ def agreement_section(subject: Subject) -> Section | None:
     rows = []
     for index, row in enumerate(frame.head(_MAX_ROWS).to_dict("records")):
         values = [float(numbers(frame, name)[index]) for name in names]
-        texts = [NOTHING if not isfinite(x) else f"{x:.0f}" if x.is_integer() else number(x) for x in values]
+        texts = [
+            NOTHING if not isfinite(value) else f"{value:.0f}" if value.is_integer() else number(value)
+            for value in values
+        ]
         rows.append([str(row.get("case", index)), str(row["measured_case"]), str(row["outcome"]), *texts])
     svg_figures = []
     if np.count_nonzero(np.isfinite(medians)) >= _MIN_CASES:
         svg_figures.append(
             svg_figure(residual_figure(frame), "agreement", "Residuals of each case, in the order of their median.")
         )
-    note = (_INERTIAL if "inertial_difference_m_s" in names else "") + _NOT_RANDOM
+    note = (_INERTIAL_NOTE if "inertial_difference_m_s" in names else "") + _SAMPLING_NOTE
     grid = Grid(head, rows, max(0, len(frame) - _MAX_ROWS))
     data = {
         "cases": len(frame),
@@ -87,7 +90,7 @@ def agreement_section(subject: Subject) -> Section | None:
         "median_of_medians_px": float(np.nanmedian(medians)) if np.isfinite(medians).any() else None,
         "apart": {name: float(np.nanmedian(numbers(frame, name))) for name in names if name in differences},
     }
-    blocks = [Block(text=_TEXT, figures=svg_figures, grid=grid, note=note)]
+    blocks = [Block(text=_AGREEMENT_TEXT, figures=svg_figures, grid=grid, note=note)]
     return Section("agreement", "Agreement", "Images compared with measured poses", blocks, data)
 
 
@@ -99,8 +102,8 @@ def residual_figure(frame: pd.DataFrame) -> Figure:
     order = finite[np.argsort(medians[finite], kind="stable")]
     x = np.arange(1, order.size + 1)
     figure, axes = new_axes(6.2, 3.2)
-    for values, name, k in ((percentile_90, "90 %", 1), (medians, "median", 0)):
-        axes.plot(x, values[order], MARKERS[k], color=SERIES[k], markersize=5.0, label=name)
+    for values, name, index in ((percentile_90, "90 %", 1), (medians, "median", 0)):
+        axes.plot(x, values[order], MARKERS[index], color=SERIES[index], markersize=5.0, label=name)
     axes.set(xlabel="case, in order of the median", ylabel="residual (px)", ylim=(0.0, None))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlim(0.5, order.size + 0.5)
@@ -144,7 +147,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     for pair in pairs:
         residuals, offsets = pair.residuals_px, pair.offsets[pair.inlier]
         head_cells = [f"{pair.number} and {pair.number + 1}", f"{residuals.size:,}", f"{int((~pair.inlier).sum()):,}"]
-        texts = 4 * ["–"]
+        texts = 4 * [NOTHING]
         if residuals.size:
             percentile_90 = np.quantile(residuals, 0.9, method="higher")
             values = [np.median(residuals), percentile_90, *np.nanmedian(offsets, axis=0)]
@@ -213,13 +216,13 @@ class MatchedPair:
 def read_matched_pairs(products: Mapping[str, Any]) -> list[MatchedPair]:
     """Read the valid pairs of a case's products (`marsyard.scenarios.measured.consistency.agreement_products`)."""
     pairs = []
-    for k in _IMAGE_NUMBERS:
-        table = numeric_product(products.get(f"matches_{k}"))
-        first, second = (to_matrix(products.get(f"image_{number}")) for number in (k, k + 1))
+    for image_number in _IMAGE_NUMBERS:
+        table = numeric_product(products.get(f"matches_{image_number}"))
+        first, second = (to_matrix(products.get(f"image_{image_number + offset}")) for offset in (0, 1))
         # columns of the table: (u, v) in both images, offset (u, v), and 1 for inliers
         if table is not None and table.ndim == 2 and table.shape[1] == 7 and first is not None and second is not None:
-            pixels, inlier = table[:, :4].reshape(-1, 2, 2), table[:, 6] > 0.0
-            pairs.append(MatchedPair(k, (first, second), pixels, table[:, 4:6], inlier))
+            pixels, is_inlier = table[:, :4].reshape(-1, 2, 2), table[:, 6] > 0.0
+            pairs.append(MatchedPair(image_number, (first, second), pixels, table[:, 4:6], is_inlier))
     return pairs
 
 
@@ -231,13 +234,15 @@ def draw_pair(pair: MatchedPair) -> Figure:
     offsets = pair.offsets[pair.inlier]
     lengths = np.hypot(*offsets.T)
     style: dict[str, Any] = {"c": lengths, "s": 12.0, "cmap": _COLOURS, "vmin": 0.0, "vmax": _MAX_COLOUR_PX}
-    for side, axes in enumerate((left, right)):
-        show_image(axes, pair.images[side])
-        axes.plot(*pair.pixels[~pair.inlier, side].T, "x", markersize=4.0, color=_OUTLIER_COLOUR, markeredgewidth=0.8)
-        points = axes.scatter(*pair.pixels[pair.inlier, side].T, linewidths=0.0, **style)
-        axes.set_title(f"Image {pair.number + side}", fontsize=9)
-    bar: dict[str, Any] = {"location": "bottom", "shrink": 0.5, "aspect": 40, "extend": "max"}
-    figure.colorbar(points, ax=[left, right], label="residual (px)", **bar)
+    for image_index, axes in enumerate((left, right)):
+        show_image(axes, pair.images[image_index])
+        axes.plot(
+            *pair.pixels[~pair.inlier, image_index].T, "x", markersize=4.0, color=_OUTLIER_COLOUR, markeredgewidth=0.8
+        )
+        points = axes.scatter(*pair.pixels[pair.inlier, image_index].T, linewidths=0.0, **style)
+        axes.set_title(f"Image {pair.number + image_index}", fontsize=9)
+    colour_bar_style: dict[str, Any] = {"location": "bottom", "shrink": 0.5, "aspect": 40, "extend": "max"}
+    figure.colorbar(points, ax=[left, right], label="residual (px)", **colour_bar_style)
     finite = lengths[np.isfinite(lengths)]
     axis_limit = max(_MAX_COLOUR_PX, 1.5 * float(np.quantile(finite, 0.9))) if finite.size else _MAX_COLOUR_PX
     scatter.scatter(*offsets.T, linewidths=0.0, **style)

@@ -3,7 +3,8 @@
 Unpaired cases: cases on one terrain are correlated. If both sets have cases on the same terrains, they are compared
 within each terrain, where cases are independent. Rates are compared by the exact distribution of Mantel and Haenszel's
 sum of hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int.
-Statist. 37, 1960). If they have few terrains in common, each terrain is one unit with the mean of equally many cases.
+Statist. 37, 1960). If they have few terrains in common, each terrain is one unit: the mean of the same number of
+cases.
 
 Small p-values of ranks are computed by permutation. With many ties (rates of a few cases per terrain, for example), the
 rank sum is skewed. At 0.001 the p-value of its normal approximation is then too small by a factor of two to three.
@@ -33,9 +34,9 @@ _MIN_COMMON_FRACTION = 0.5
 _MIN_RANKED = 8
 #: Maximum size of an exact distribution; for larger ones the normal approximation is sufficiently accurate.
 _MAX_EXACT = 20_000
-#: Minimum fraction of each set's terrains that have enough cases for the terrain means of a comparison.
+#: Minimum fraction of the terrains of each set that have enough cases for a terrain mean.
 _FULL_FRACTION = 0.8
-#: p-value of the normal approximation below which permutations are used.
+#: Permutations replace a p-value of the normal approximation below this value.
 _PERMUTATION_LIMIT = 0.05
 #: Permutations per batch; number of exceedances at which sampling stops; maximum number of permuted values.
 _BATCH, _MAX_EXCEEDANCES, _MAX_PERMUTED = 500, 50, 2_000_000_000
@@ -63,8 +64,8 @@ class Sample:
         """Compute the mean of the first `cases` cases on each terrain with at least as many cases."""
         order = np.argsort(self.terrains, kind="stable")
         counts = self.cases_on_terrains()
-        first = np.cumsum(counts) - counts
-        indices = first[counts >= cases, None] + np.arange(cases)
+        first_indices = np.cumsum(counts) - counts
+        indices = first_indices[counts >= cases, None] + np.arange(cases)
         return np.asarray(self.values[order][indices].mean(axis=1))
 
 
@@ -77,14 +78,20 @@ def difference_p_value(first: Sample, second: Sample, permutations: int = 10_000
     first, second = first.finite_cases(), second.finite_cases()
     if min(first.values.size, second.values.size) == 0:
         return math.nan
-    common = np.intersect1d(first.terrains, second.terrains)
-    if min(float(np.isin(s.terrains, common).mean()) for s in (first, second)) < _MIN_COMMON_FRACTION:
-        # equally many cases on each terrain, since the variance of a mean depends on their number
-        counts = (np.quantile(s.cases_on_terrains(), 1.0 - _FULL_FRACTION, method="lower") for s in (first, second))
+    common_terrains = np.intersect1d(first.terrains, second.terrains)
+    common_fractions = [float(np.isin(sample.terrains, common_terrains).mean()) for sample in (first, second)]
+    if min(common_fractions) < _MIN_COMMON_FRACTION:
+        # the same number of cases on each terrain, since the variance of a mean depends on this number
+        counts = (
+            np.quantile(sample.cases_on_terrains(), 1.0 - _FULL_FRACTION, method="lower") for sample in (first, second)
+        )
         cases = int(min(counts))
         pairs = [(first.terrain_means(cases), second.terrain_means(cases))]
     else:
-        pairs = [(first.values[first.terrains == k], second.values[second.terrains == k]) for k in common]
+        pairs = [
+            (first.values[first.terrains == terrain], second.values[second.terrains == terrain])
+            for terrain in common_terrains
+        ]
     are_rates = all(np.isin(values, (0.0, 1.0)).all() for pair in pairs for values in pair)
     return _test_rates(pairs) if are_rates else _test_ranks(pairs, permutations)
 
@@ -94,68 +101,81 @@ Pairs = Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]
 
 
 def _test_rates(pairs: Pairs) -> float:
-    """Compute the exact two-sided p-value for values of 0 and 1, given the sum of each pair: twice the smaller tail."""
-    # per pair: successes and cases of the first set, successes and cases of both sets
+    """Compute the exact two-sided p-value of rates, given the successes of each pair: twice the smaller tail."""
+    # for each pair: successes and cases of the first set, successes and cases of both sets
     tables = [(int(a.sum()), a.size, int(a.sum() + b.sum()), a.size + b.size) for a, b in pairs]
     tables = [table for table in tables if 0 < table[2] < table[3]]
     if not tables:
         return 1.0
-    observed = sum(table[0] for table in tables)
-    if sum(min(n, ones) for _, n, ones, _ in tables) > _MAX_EXACT:
-        _, n, ones, total = np.array(tables, dtype=np.float64).T
-        variance = float((n * ones * (total - ones) * (total - n) / (total**2 * (total - 1.0))).sum())
-        excess = max(0.0, abs(observed - float((n * ones / total).sum())) - 0.5)
+    observed_sum = sum(table[0] for table in tables)
+    if sum(min(size, successes) for _, size, successes, _ in tables) > _MAX_EXACT:
+        _, first_sizes, success_counts, case_counts = np.array(tables, dtype=np.float64).T
+        # mean and variance of the hypergeometric distribution; continuity correction of 0.5
+        variance = float(
+            (
+                first_sizes
+                * success_counts
+                * (case_counts - success_counts)
+                * (case_counts - first_sizes)
+                / (case_counts**2 * (case_counts - 1.0))
+            ).sum()
+        )
+        excess = max(0.0, abs(observed_sum - float((first_sizes * success_counts / case_counts).sum())) - 0.5)
         return float(2.0 * stats.norm.sf(excess / math.sqrt(variance)))
     distribution, minimum = np.ones(1), 0
     for _, size, successes, cases in tables:
         low, high = max(0, size + successes - cases), min(size, successes)
         distribution = np.convolve(distribution, stats.hypergeom.pmf(np.arange(low, high + 1), cases, successes, size))
         minimum += low
-    index = observed - minimum
+    index = observed_sum - minimum
     return float(min(1.0, 2.0 * min(distribution[: index + 1].sum(), distribution[index:].sum())))
 
 
 def _test_ranks(pairs: Pairs, permutations: int) -> float:
-    """Van Elteren's test with ties; NaN for fewer than eight values of one set.
+    """Compute the two-sided p-value of van Elteren's test with ties; NaN for fewer than eight values of one set.
 
     Small p-values are the fraction of permutations within strata with at least the same excess; sampling stops early if
     that fraction is clearly large (Besag & Clifford, "Sequential Monte Carlo p-values", Biometrika 78, 1991).
     """
     if min(sum(a.size for a, _ in pairs), sum(b.size for _, b in pairs)) < _MIN_RANKED:
         return math.nan
-    # scores of the values of both sets, of mean zero, and the size of the first set
+    # scores of the values of both sets, and the size of the first set: ranks minus their mean, divided by the number of
+    # values plus 1 (the weight of van Elteren's test)
     ranked_pairs = [(stats.rankdata(np.concatenate([a, b])), a.size) for a, b in pairs if a.size and b.size]
-    strata = [((ranks - ranks.mean()) / (ranks.size + 1.0), n) for ranks, n in ranked_pairs]
-    excess = abs(sum(float(scores[:n].sum()) for scores, n in strata))
+    strata = [((ranks - ranks.mean()) / (ranks.size + 1.0), first_size) for ranks, first_size in ranked_pairs]
+    excess = abs(sum(float(scores[:first_size].sum()) for scores, first_size in strata))
+    # variance of a sum of scores that are drawn without replacement
     variance = sum(
-        n * (scores.size - n) / (scores.size * (scores.size - 1.0)) * float((scores**2).sum()) for scores, n in strata
+        first_size * (scores.size - first_size) / (scores.size * (scores.size - 1.0)) * float((scores**2).sum())
+        for scores, first_size in strata
     )
     if variance == 0.0:
         return 1.0
-    p = float(2.0 * stats.norm.sf(excess / math.sqrt(variance)))
-    if p >= _PERMUTATION_LIMIT or permutations * sum(scores.size for scores, _ in strata) > _MAX_PERMUTED:
-        return p
+    p_value = float(2.0 * stats.norm.sf(excess / math.sqrt(variance)))
+    if p_value >= _PERMUTATION_LIMIT or permutations * sum(scores.size for scores, _ in strata) > _MAX_PERMUTED:
+        return p_value
     rng = np.random.default_rng(_SEED)
     exceedances = n_permutations = 0
     while n_permutations < permutations and exceedances < _MAX_EXCEEDANCES:
         sums = np.zeros(_BATCH)
-        for scores, n in strata:
+        for scores, first_size in strata:
             shuffled = rng.permuted(np.broadcast_to(scores, (_BATCH, scores.size)), axis=1)
-            sums += shuffled[:, :n].sum(axis=1)
+            sums += shuffled[:, :first_size].sum(axis=1)
         # the tolerance makes sums of the same scores in another order equal
         exceedances += int((np.abs(sums) >= excess - 1e-9).sum())
         n_permutations += _BATCH
+    # the observed order counts as one of the permutations
     return (exceedances + 1.0) / (n_permutations + 1.0)
 
 
 def correct_holm(p_values: Sequence[float]) -> list[float]:
     """Correct p-values for multiple tests (Holm 1979), which limits the family-wise error rate; NaN remains NaN."""
     sorted_p = sorted((p, index) for index, p in enumerate(p_values) if not math.isnan(p))
-    corrected, largest = [math.nan] * len(p_values), 0.0
+    corrected_p, max_p = [math.nan] * len(p_values), 0.0
     for rank, (p, index) in enumerate(sorted_p):
-        largest = max(largest, min(1.0, p * (len(sorted_p) - rank)))
-        corrected[index] = largest
-    return corrected
+        max_p = max(max_p, min(1.0, p * (len(sorted_p) - rank)))
+        corrected_p[index] = max_p
+    return corrected_p
 
 
 def compare_successes(
@@ -166,8 +186,8 @@ def compare_successes(
     if groups is not None and is_shared(groups):
         return only_first, only_other, _test_signed_ranks(_sum_groups(other.astype(np.float64) - first, groups))
     total = only_first + only_other
-    p = 1.0 if total == 0 else float(stats.binomtest(only_first, total, 0.5).pvalue)
-    return only_first, only_other, p
+    p_value = 1.0 if total == 0 else float(stats.binomtest(only_first, total, 0.5).pvalue)
+    return only_first, only_other, p_value
 
 
 def compare_errors(
@@ -185,9 +205,11 @@ def compare_errors(
 
 
 def _sum_groups(differences: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, " terrains"]:
+    """Sum the differences on each terrain."""
     return np.bincount(number_terrains(groups), weights=differences)
 
 
 def _test_signed_ranks(differences: Float[np.ndarray, " n"]) -> float:
+    """Compute the p-value of Wilcoxon's signed-rank test without the zero differences; 1 if all are zero."""
     nonzero = differences[differences != 0.0]
     return 1.0 if nonzero.size == 0 else float(stats.wilcoxon(nonzero).pvalue)

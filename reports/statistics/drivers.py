@@ -55,7 +55,7 @@ def estimate_driver(
     - confidence: confidence of the two-sided intervals
 
     Correlation: Fisher's z with Bonett & Wright's variance (Psychometrika 65, 2000). Fraction of variance: ranks of the
-    response in bins of equally many cases (the "given data" estimate of the first-order index: Plischke, Borgonovo &
+    response in bins with equal numbers of cases ("given data" estimate of the first-order index: Plischke, Borgonovo &
     Smith, Eur. J. Oper. Res. 226, 2013), corrected for bias as Kelley's epsilon squared (Proc. Nat. Acad. Sci. 21,
     1935), with the interval of the noncentral F distribution.
     """
@@ -68,10 +68,12 @@ def estimate_driver(
     if groups is not None:
         index = np.unique(groups[finite], return_inverse=True)[1]
         sizes = np.bincount(index).astype(np.float64)
+        # mean number of cases on the terrain of a case
         size = float((sizes**2).sum() / sizes.sum())
         r_x, r_y = (_estimate_intraclass_correlation(values, index, sizes) for values in (x, y))
         effective_n = n / max(1.0, 1.0 + (size - 1.0) * r_x * r_y)
     correlation = float(np.corrcoef(x, y)[0, 1])
+    # Fisher's z has the variance (1 + r^2 / 2) / (n - 3)
     half_width = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
     half_width *= math.sqrt((1.0 + 0.5 * correlation**2) / max(effective_n - 3.0, 1.0))
     centre = math.atanh(float(np.clip(correlation, -1.0 + 1e-12, 1.0 - 1e-12)))
@@ -84,54 +86,61 @@ def estimate_driver(
 def _estimate_explained_fraction(
     x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], effective_n: float, confidence: float
 ) -> tuple[float, float, float, float]:
-    """Estimate the fraction of variance between bins, its interval, and the p-value of the F-test."""
+    """Estimate the fraction of the variance of y between bins of x, its interval, and the p-value of the F-test."""
     n = x.size
     max_bins = int(np.clip(n // _CASES_PER_BIN, 2, _MAX_BINS))
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, max_bins + 1)))[1:-1]
     # intervals closed on the left, so that each value of a condition with two values has its own bin
-    index = np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
-    if index.max() == 0:
-        index = np.unique(x, return_inverse=True)[1] if np.unique(x).size <= max_bins else (x > x.min()).astype(int)
-    bins = int(index.max()) + 1
-    means = np.bincount(index, weights=y) / np.bincount(index)
+    bin_index = np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
+    if bin_index.max() == 0:
+        bin_index = np.unique(x, return_inverse=True)[1] if np.unique(x).size <= max_bins else (x > x.min()).astype(int)
+    bins = int(bin_index.max()) + 1
+    means = np.bincount(bin_index, weights=y) / np.bincount(bin_index)
     total = float(((y - y.mean()) ** 2).sum())
-    between = float((np.bincount(index) * (means - y.mean()) ** 2).sum())
+    between = float((np.bincount(bin_index) * (means - y.mean()) ** 2).sum())
     if between >= (1.0 - 1e-9) * total:
         return 1.0, 1.0, 1.0, 0.0
-    degrees = max(effective_n - bins, 1.0)  # degrees of freedom within bins
+    within_degrees = max(effective_n - bins, 1.0)  # degrees of freedom within bins
     within = total - between
-    ratio = between / (bins - 1.0) / (within / degrees)
-    fraction = max(0.0, (between - (bins - 1.0) * within / degrees) / total)
+    f_ratio = between / (bins - 1.0) / (within / within_degrees)
+    # epsilon squared: the chance part of the sum of squares between bins is subtracted
+    fraction = max(0.0, (between - (bins - 1.0) * within / within_degrees) / total)
 
     def cdf_minus_level(value: float, level: float) -> float:
         """Return the distribution function of the F ratio at a noncentrality `value`, minus a level."""
-        cdf = stats.ncf.cdf(ratio, bins - 1.0, degrees, value) if value else stats.f.cdf(ratio, bins - 1.0, degrees)
+        cdf = (
+            stats.ncf.cdf(f_ratio, bins - 1.0, within_degrees, value)
+            if value
+            else stats.f.cdf(f_ratio, bins - 1.0, within_degrees)
+        )
         return float(cdf) - level
 
     bounds: list[float] = []
     tail = 0.5 * (1.0 - confidence)
     for level in (1.0 - tail, tail):
-        high = max(1.0, ratio * (bins - 1.0))
+        high = max(1.0, f_ratio * (bins - 1.0))
         while cdf_minus_level(high, level) > 0.0:
             high *= 2.0
-        noncentrality = 0.0
+        # the noncentrality divided by n is the variance between bins divided by the variance within
+        ratio_of_variances = 0.0
         if cdf_minus_level(0.0, level) > 0.0:
             root = float(optimize.brentq(cdf_minus_level, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4))
-            noncentrality = root / effective_n
-        bounds.append(noncentrality / (1.0 + noncentrality))
-    return fraction, bounds[0], bounds[1], float(stats.f.sf(ratio, bins - 1.0, degrees))
+            ratio_of_variances = root / effective_n
+        bounds.append(ratio_of_variances / (1.0 + ratio_of_variances))
+    return fraction, bounds[0], bounds[1], float(stats.f.sf(f_ratio, bins - 1.0, within_degrees))
 
 
 def _estimate_intraclass_correlation(
     values: Float[np.ndarray, " n"], index: Int[np.ndarray, " n"], sizes: Float[np.ndarray, " groups"]
 ) -> float:
     """Estimate the intraclass correlation (0 to 1) by analysis of variance; 0 if no group has two values."""
-    n, groups = values.size, sizes.size
-    if groups < 2 or groups == n:
+    n, n_groups = values.size, sizes.size
+    if n_groups < 2 or n_groups == n:
         return 0.0
     means = np.bincount(index, weights=values) / sizes
-    within = float(((values - means[index]) ** 2).sum()) / (n - groups)
-    between = float((sizes * (means - values.mean()) ** 2).sum()) / (groups - 1)
-    size = (n - float((sizes**2).sum()) / n) / (groups - 1)
-    variance = between - within
-    return float(np.clip(variance / (variance + size * within), 0.0, 1.0)) if variance > 0.0 else 0.0
+    within = float(((values - means[index]) ** 2).sum()) / (n - n_groups)
+    between = float((sizes * (means - values.mean()) ** 2).sum()) / (n_groups - 1)
+    # the expectation of `between` is `within` + effective_size * (variance between groups)
+    effective_size = (n - float((sizes**2).sum()) / n) / (n_groups - 1)
+    excess = between - within
+    return float(np.clip(excess / (excess + effective_size * within), 0.0, 1.0)) if excess > 0.0 else 0.0

@@ -99,7 +99,7 @@ def consumer_risk(successes: float | int, n: float | int, rate: float) -> float:
     return 1.0 if successes <= 0 else float(stats.beta.cdf(rate, successes, n - successes + 1.0))
 
 
-#: Minimum number of terrains, and of terrains with a failure (and with a success), to estimate the design effect.
+#: Minimum number of terrains, and of terrains with a failure and with a success, to estimate the design effect.
 #: Chosen by simulation (`tests/reports/statistics/test_clusters.py`) so that the bounds keep their confidence.
 _MIN_TERRAINS = 50
 _MIN_MIXED_TERRAINS = 10
@@ -144,9 +144,9 @@ def clustered_evidence(
     index = number_terrains(terrain)
     sizes = np.bincount(index).astype(np.float64)
     successes = np.bincount(index, weights=success.astype(np.float64))
-    failed, succeeded = int((successes < sizes).sum()), int((successes > 0).sum())
+    n_failed, n_succeeded = int((successes < sizes).sum()), int((successes > 0).sum())
     n, terrains = float(sizes.sum()), sizes.size
-    if terrains >= _MIN_TERRAINS and min(failed, succeeded) >= _MIN_MIXED_TERRAINS:
+    if terrains >= _MIN_TERRAINS and min(n_failed, n_succeeded) >= _MIN_MIXED_TERRAINS:
         method, design_effect = ClusterMethod.KORN_GRAUBARD, _estimate_design_effect(successes, sizes)
         # The second factor accounts for the estimation of the variance from few terrains.
         correction = (stats.t.ppf(confidence, n - 1) / stats.t.ppf(confidence, terrains - 1)) ** 2
@@ -158,11 +158,11 @@ def clustered_evidence(
         # unequal numbers (fewer answers on difficult terrains), the rate of the cases can be the more conservative one.
         method, design_effect, effective_n = ClusterMethod.TERRAIN_COUNT, float("nan"), float(terrains)
         scaled_successes = terrains * float(successes.sum() / n)
-        min_successes = min(float(terrains - failed), scaled_successes)
-        max_successes = max(float(succeeded), scaled_successes)
+        min_successes = min(float(terrains - n_failed), scaled_successes)
+        max_successes = max(float(n_succeeded), scaled_successes)
     lower = proportion_lower(min_successes, effective_n, confidence)
     upper = proportion_upper(max_successes, effective_n, confidence)
-    return ClusteredEvidence(terrains, failed, method, design_effect, effective_n, min_successes, lower, upper)
+    return ClusteredEvidence(terrains, n_failed, method, design_effect, effective_n, min_successes, lower, upper)
 
 
 def _estimate_design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
@@ -175,12 +175,12 @@ def _estimate_design_effect(successes: Float[np.ndarray, " terrains"], sizes: Fl
 
 
 def number_terrains(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Number the terrains consecutively from 0, in the order of their given numbers."""
-    first, last = int(terrain.min()), int(terrain.max())
-    if last - first > 4 * terrain.size:
+    """Number the terrains consecutively from 0, in the order of their original numbers."""
+    lowest, highest = int(terrain.min()), int(terrain.max())
+    if highest - lowest > 4 * terrain.size:
         return np.unique(terrain, return_inverse=True)[1]
-    # without sorting, which is slow for a million cases
-    shifted = terrain - first
+    # for dense numbers: count instead of sorting, which is slow for a million cases
+    shifted = terrain - lowest
     return np.asarray((np.cumsum(np.bincount(shifted) > 0) - 1)[shifted])
 
 
@@ -209,7 +209,7 @@ def planned_looks(cases: int) -> tuple[Look, ...]:
 
 
 def spent_fraction(looks: tuple[Look, ...], cases: int) -> float:
-    """Return the fraction of the risk for a number of cases: that of the first look with at least as many cases.
+    """Return the fraction of the risk at a number of cases: that of the first look with at least as many cases.
 
     For more cases than at the last look, return the fraction of the last look.
     """
@@ -225,11 +225,11 @@ def confidence_at(confidence: float, risk_fraction: float) -> float:
 class LaterLook:
     """Test for one verdict (PASS or FAIL) on a requirement of a campaign that was evaluated with fewer cases before.
 
-    Events are failures for PASS, successes for FAIL: few events support the verdict. If the probability of an event is
-    `rate`, the likelihood ratio (`_log_likelihood_ratio`) is a martingale; if it is higher, a supermartingale. Ville's
-    inequality holds for any stopping rule: the probability that the ratio ever reaches a threshold c is at most its
-    value at the first look divided by c. The first look uses the Clopper-Pearson bound. The threshold c is chosen so
-    that the probabilities of a false verdict at the first and at all later looks add up to `risk`.
+    Events are failures for PASS and successes for FAIL: few events support the verdict. If the probability of an event
+    is `rate`, the likelihood ratio (`_log_likelihood_ratio`) is a martingale; if it is higher, a supermartingale.
+    Ville's inequality holds for any stopping rule: the probability that the ratio ever reaches a threshold c is at most
+    its value at the first look divided by c. The first look uses the Clopper-Pearson bound. The threshold c is chosen
+    so that the probabilities of a false verdict at the first look and at all later looks sum to `risk`.
 
     - rate: probability of an event at the limit of the requirement: 1 - probability for PASS, probability for FAIL
     - risk: probability of a false verdict at all looks together: 1 - confidence
@@ -244,25 +244,27 @@ class LaterLook:
     def log_threshold(self) -> float:
         """Logarithm of the likelihood ratio that supports the verdict at a later look."""
         events = np.arange(self.first + 1, dtype=np.float64)
-        decided_events = events[stats.binom.cdf(events, self.first, self.rate) <= self.risk]
-        log_probability = stats.binom.logpmf(decided_events, self.first, self.rate)
+        deciding_events = events[stats.binom.cdf(events, self.first, self.rate) <= self.risk]
+        log_probability = stats.binom.logpmf(deciding_events, self.first, self.rate)
         spent_risk = float(np.exp(log_probability).sum())
-        # part of the martingale's mean of 1 that remains if the first look does not decide
-        log_ratio = _log_likelihood_ratio(decided_events, self.first, self.rate)
-        remaining = 1.0 - float(np.exp(log_probability + log_ratio).sum())
-        return math.log(max(_MIN_RISK, remaining) / max(_MIN_RISK, self.risk - spent_risk))
+        # mean of the likelihood ratio over the results that do not decide at the first look; the mean over all is 1
+        log_ratio = _log_likelihood_ratio(deciding_events, self.first, self.rate)
+        undecided_mean = 1.0 - float(np.exp(log_probability + log_ratio).sum())
+        return math.log(max(_MIN_RISK, undecided_mean) / max(_MIN_RISK, self.risk - spent_risk))
 
     def risk_of_bound(self, n: float | int) -> float:
         """Compute the risk at which the one-sided Clopper-Pearson bound of n cases supports the verdict."""
         log_ratio = float(_log_likelihood_ratio(0.0, n, self.rate))
+        # n cases are too few even without events: the risk (1 - rate)^n of no event, times ratio / threshold
         if log_ratio < self.log_threshold:
-            level = n * math.log1p(-self.rate) + log_ratio - self.log_threshold
-            return max(_MIN_RISK, min(self.risk, math.exp(level)))
+            log_risk = n * math.log1p(-self.rate) + log_ratio - self.log_threshold
+            return max(_MIN_RISK, min(self.risk, math.exp(log_risk)))
+        # bisection for the largest number of events that supports the verdict
         min_events, max_events = 0.0, float(n)
         while max_events - min_events > 1e-9 * max(1.0, n):
             events = 0.5 * (min_events + max_events)
-            is_enough = _log_likelihood_ratio(events, n, self.rate) >= self.log_threshold
-            min_events, max_events = (events, max_events) if is_enough else (min_events, events)
+            is_supported = _log_likelihood_ratio(events, n, self.rate) >= self.log_threshold
+            min_events, max_events = (events, max_events) if is_supported else (min_events, events)
         return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - min_events, min_events + 1.0))))
 
     def cases_needed(self, n: int, events: int) -> int:
@@ -286,7 +288,8 @@ def _log_likelihood_ratio(
     increases with every case without an event.
     """
     events = np.asarray(events, dtype=np.float64)
-    likelihood = special.betaln(events + 0.5, n - events + 0.5) - special.betaln(0.5, 0.5)
+    # marginal likelihood of the prior without truncation, and the factor of the truncation
+    log_marginal = special.betaln(events + 0.5, n - events + 0.5) - special.betaln(0.5, 0.5)
     with np.errstate(divide="ignore"):
-        weight = np.log(special.betainc(events + 0.5, n - events + 0.5, rate) / special.betainc(0.5, 0.5, rate))
-    return np.asarray(likelihood + weight - events * math.log(rate) - (n - events) * math.log1p(-rate))
+        log_weight = np.log(special.betainc(events + 0.5, n - events + 0.5, rate) / special.betainc(0.5, 0.5, rate))
+    return np.asarray(log_marginal + log_weight - events * math.log(rate) - (n - events) * math.log1p(-rate))

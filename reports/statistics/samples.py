@@ -94,6 +94,7 @@ def _standard_error(residuals: Float[np.ndarray, " terrains"], n: int) -> float:
 
 
 def _unite_intervals(first: Interval, second: Interval) -> Interval:
+    """Return the smallest interval that contains both; NaN bounds are ignored."""
     return float(np.fmin(first[0], second[0])), float(np.fmax(first[1], second[1]))
 
 
@@ -180,13 +181,14 @@ def _bonett_interval(values: Float[np.ndarray, " n"], confidence: float) -> Inte
     """Bonett 2006, equation 8, with Student's t instead of the normal quantile."""
     n = values.size
     quantile = _student_quantile(confidence, n)
-    trimmed = float(stats.trim_mean(values, min(0.49, 0.5 / math.sqrt(n - 4.0))))
+    # Bonett's trimmed mean and correction n / (n - z); the logarithm of the variance is less skewed
+    trimmed_mean = float(stats.trim_mean(values, min(0.49, 0.5 / math.sqrt(n - 4.0))))
     squares = float(((values - values.mean()) ** 2).sum())
-    kurtosis = n * float(((values - trimmed) ** 4).sum()) / squares**2
+    kurtosis = n * float(((values - trimmed_mean) ** 4).sum()) / squares**2
     correction = n / (n - quantile)
-    error = correction * math.sqrt(max((kurtosis - (n - 3.0) / n) / (n - 1.0), 0.0))
+    standard_error = correction * math.sqrt(max((kurtosis - (n - 3.0) / n) / (n - 1.0), 0.0))
     centre = math.log(correction * squares / (n - 1.0))
-    return math.exp(0.5 * (centre - quantile * error)), math.exp(0.5 * (centre + quantile * error))
+    return math.exp(0.5 * (centre - quantile * standard_error)), math.exp(0.5 * (centre + quantile * standard_error))
 
 
 def quantile_bounds(
@@ -216,16 +218,16 @@ def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: f
         # `ppf` gives the smallest k with P(Bin <= k) >= confidence; the value of 1-based rank k + 1 is the bound
         rank = int(stats.binom.ppf(confidence, n, quantile))
         return float(ordered[rank]) if rank < n else math.inf
-    below = values <= ordered[min(n - 1, max(0, math.ceil(quantile * n) - 1))]
-    evidence = clustered_evidence(below, groups, confidence)
+    is_below = values <= ordered[min(n - 1, max(0, math.ceil(quantile * n) - 1))]
+    evidence = clustered_evidence(is_below, groups, confidence)
     weight = evidence.effective_n / n
     if evidence.method is ClusterMethod.TERRAIN_COUNT:
-        # an upper bound of the terrains' maxima is also an upper bound of the values, so each terrain counts once
+        # an upper bound of the maxima of the terrains is also an upper bound of the values; each terrain counts once
         index = number_terrains(groups)
         ordered = np.full(int(index.max()) + 1, -math.inf)
         np.maximum.at(ordered, index, values)
         ordered, weight = np.sort(ordered), 1.0
-    # first rank above the quantile; each value counts as `weight` independent values
+    # first rank above the quantile; each value is `weight` independent values
     ranks = range(1, ordered.size + 1)
     total = ordered.size * weight
     rank = bisect.bisect_left(ranks, True, key=lambda k: proportion_lower(k * weight, total, confidence) >= quantile)
@@ -350,14 +352,15 @@ def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> Error
     if n < _MIN_FOR_ELLIPSE:
         return None
     centre = finite.mean(axis=0)
-    values, axes = np.linalg.eigh(np.cov(finite.T))
-    if values[1] <= 0.0:
+    eigenvalues, axes = np.linalg.eigh(np.cov(finite.T))
+    if eigenvalues[1] <= 0.0:
         return None
     factor = 2.0 * (n - 1.0) * (n + 1.0) / (n * (n - 2.0)) * float(stats.f.ppf(probability, 2, n - 2))
-    variances = np.maximum(values, 0.0)
+    variances = np.maximum(eigenvalues, 0.0)
     principal = (finite - centre) @ axes
     with np.errstate(divide="ignore", invalid="ignore"):
-        distances = np.where(variances > 0.0, principal**2 / variances, 0.0).sum(axis=1)
+        squared_distances = np.where(variances > 0.0, principal**2 / variances, 0.0).sum(axis=1)
+    # `eigh` sorts the eigenvalues in ascending order; the second axis is the major axis
     angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
     return ErrorEllipse(
         centre=(float(centre[0]), float(centre[1])),
@@ -365,7 +368,7 @@ def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> Error
         semi_minor=math.sqrt(factor * variances[0]),
         angle_deg=angle - 180.0 * math.ceil((angle - 90.0) / 180.0),
         probability=probability,
-        inside=float((distances <= factor).mean()),
+        inside=float((squared_distances <= factor).mean()),
     )
 
 

@@ -129,7 +129,7 @@ def read_stops(products: Mapping[str, Any]) -> list[StopImages]:
                 state=str(state).replace("_", " ").lower(),
                 left=left,
                 right=to_matrix(products.get(f"stop_{number}_right")),
-                quantities={name: float(a[number - 1]) for name, a in arrays.items() if number <= a.size},
+                quantities={name: float(array[number - 1]) for name, array in arrays.items() if number <= array.size},
                 **dict(zip(("corners", "window", "matches", "point"), pixels, strict=True)),
             )
         )
@@ -165,9 +165,11 @@ def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Fig
     """Draw the subframes of all stops, or of `max_stops` evenly spaced stops including the first and the last."""
     stops = read_stops(products)
     if max_stops is not None and len(stops) > max_stops:
-        stops = [stops[k] for k in np.unique(np.rint(np.linspace(0, len(stops) - 1, max_stops)).astype(np.int64))]
-    side = read_template_px(products)
-    if not stops or side is None:
+        stops = [
+            stops[index] for index in np.unique(np.rint(np.linspace(0, len(stops) - 1, max_stops)).astype(np.int64))
+        ]
+    side_px = read_template_px(products)
+    if not stops or side_px is None:
         raise ValueError("the products contain no image of a stop")
     columns = min(_MAX_COLUMNS, len(stops))
     rows = -(-len(stops) // columns)
@@ -175,20 +177,20 @@ def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Fig
     figure = Figure(figsize=(_CELL_SIZE_IN[0] * columns, _CELL_SIZE_IN[1] * rows), layout=layout)
     grid = figure.add_gridspec(rows, columns)
     for index, stop in enumerate(stops):
-        _draw_stop(figure, grid[index // columns, index % columns], stop, side)
+        _draw_stop(figure, grid[index // columns, index % columns], stop, side_px)
     return figure
 
 
 @in_page_style
 def draw_path(products: Mapping[str, Any]) -> Figure:
     """Draw the top view of the path, and the target's estimates; raises ValueError if the path is missing."""
-    run = read_rover_path(products)
-    if run is None:
+    rover_path = read_rover_path(products)
+    if rover_path is None:
         raise ValueError("the products contain no path of a rover")
     figure = Figure(figsize=(10.5, 5.0), layout="constrained")
     path_axes, estimate_axes = figure.subplots(1, 2)
-    _draw_path_axes(path_axes, run)
-    _draw_estimates(estimate_axes, run)
+    _draw_path_axes(path_axes, rover_path)
+    _draw_estimates(estimate_axes, rover_path)
     figure.legend(loc="outside lower center", ncols=3)
     return figure
 
@@ -201,7 +203,7 @@ def write_vtt_figures(directory: Path, products: Mapping[str, Any]) -> list[Path
     return save_figures(directory, figures)
 
 
-def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side: float) -> None:
+def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side_px: float) -> None:
     cells = cell.subgridspec(2, 2, width_ratios=(2.0, 1.0))
     left = figure.add_subplot(cells[:, 0])
     show_subframe(left, stop.left, _CONTRAST_QUANTILES)
@@ -213,11 +215,11 @@ def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side: float)
         style: dict[str, Any] = {"color": TRUTH, "markersize": 5.5, "markeredgewidth": 0.9, "path_effects": _OUTLINE}
         left.plot(*point[:, None], "+", **style)
     if stop.is_matched:
-        _draw_target(left, stop.matches[0] - corner, side)
+        _draw_target(left, stop.matches[0] - corner, side_px)
     left.set_title("\n".join(_title_lines(stop)), fontsize=7.5, fontweight="normal", loc="left", linespacing=1.25)
     enlarged = figure.add_subplot(cells[0, 1])
     if stop.is_matched:
-        steps = (np.arange(_ENLARGED_PX) + 0.5) / _ENLARGED_PX * side - 0.5 * side
+        steps = (np.arange(_ENLARGED_PX) + 0.5) / _ENLARGED_PX * side_px - 0.5 * side_px
         u, v = (stop.matches[0] - corner)[:, None] + steps
         pixels = np.meshgrid(v, u, indexing="ij")
         show_subframe(
@@ -233,7 +235,7 @@ def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side: float)
         return
     show_subframe(right, stop.right, _CONTRAST_QUANTILES)
     if np.isfinite(stop.matches[1]).all():
-        _draw_target(right, stop.matches[1] - stop.corners[1], side)
+        _draw_target(right, stop.matches[1] - stop.corners[1], side_px)
 
 
 def _title_lines(stop: StopImages) -> list[str]:
@@ -243,8 +245,11 @@ def _title_lines(stop: StopImages) -> list[str]:
         "magnification": "× {:.3f}", "roll_change_deg": "roll {:+.1f}°", "match_score": "NCC {:.2f}",
         "stereo_score": "stereo {:.2f}", "error_px": "error {:.1f} px",
     }  # fmt: skip
-    values = {name: 0.0 if abs(stop.quantity(name)) < 0.05 else stop.quantity(name) for name in formats}  # no -0.0
-    texts = {name: formats[name].format(x).replace("-", "−") for name, x in values.items() if np.isfinite(x)}
+    # values that would be printed as -0.0 become 0
+    values = {name: 0.0 if abs(stop.quantity(name)) < 0.05 else stop.quantity(name) for name in formats}
+    texts = {
+        name: formats[name].format(value).replace("-", "−") for name, value in values.items() if np.isfinite(value)
+    }
     lines = (
         ("range_m", "azimuth_deg"),
         ("elevation_deg", "magnification", "roll_change_deg"),
@@ -255,8 +260,8 @@ def _title_lines(stop: StopImages) -> list[str]:
     return [f"{stop.number}{state}: {line_texts[0]}", *(line or " " for line in line_texts[1:])]
 
 
-def _draw_target(axes: Axes, centre: Float[np.ndarray, "2"], side: float) -> None:
-    _draw_rectangle(axes, centre - 0.5 * side, np.full(2, side), TARGET, "-")
+def _draw_target(axes: Axes, centre: Float[np.ndarray, "2"], side_px: float) -> None:
+    _draw_rectangle(axes, centre - 0.5 * side_px, np.full(2, side_px), TARGET, "-")
 
 
 def _draw_rectangle(axes: Axes, corner: Point, size: Point, colour: str, line: Any) -> None:
@@ -264,31 +269,40 @@ def _draw_rectangle(axes: Axes, corner: Point, size: Point, colour: str, line: A
     axes.add_patch(Rectangle((x, y), width, height, fill=False, edgecolor=colour, linewidth=1.3, linestyle=line))
 
 
-def _draw_path_axes(axes: Axes, run: RoverPath) -> None:
+def _draw_path_axes(axes: Axes, rover_path: RoverPath) -> None:
     """Draw the top view of the path; north is up."""
-    for number, (east, north, diameter) in enumerate(run.rocks):
+    for number, (east, north, diameter) in enumerate(rover_path.rocks):
         rock = Circle((east, north), 0.5 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8)
         rock.set_hatch("" if number == 0 else "////")
         axes.add_patch(rock)
-    axes.plot(*run.path.T, "-", color=SERIES[0], linewidth=1.6, label="path driven")
-    axes.plot(*run.stops.T, "o", color=SERIES[0], markersize=5, label="stops")
-    axes.plot(*run.estimated.T, "x", color=SERIES[1], markersize=5.5, markeredgewidth=1.3, label="estimated stops")
-    axes.plot(*run.target, "*", color=INK, markersize=12, label="designated target")
+    axes.plot(*rover_path.path.T, "-", color=SERIES[0], linewidth=1.6, label="path driven")
+    axes.plot(*rover_path.stops.T, "o", color=SERIES[0], markersize=5, label="stops")
+    axes.plot(
+        *rover_path.estimated.T, "x", color=SERIES[1], markersize=5.5, markeredgewidth=1.3, label="estimated stops"
+    )
+    axes.plot(*rover_path.target, "*", color=INK, markersize=12, label="designated target")
     axes.set(xlabel="east (m)", ylabel="north (m)", title="Top view of the path")
-    width = _set_limits(axes, np.vstack([run.path, run.stops, run.estimated, run.target[None]]), 0.5, _MIN_ASPECT)
-    directions = np.column_stack([np.sin(run.heading), np.cos(run.heading)])
-    for position, direction in zip(run.stops, 0.045 * width * directions, strict=True):
+    width = _set_limits(
+        axes,
+        np.vstack([rover_path.path, rover_path.stops, rover_path.estimated, rover_path.target[None]]),
+        0.5,
+        _MIN_ASPECT,
+    )
+    # lines of 4.5 % of the width show the heading
+    directions = np.column_stack([np.sin(rover_path.heading), np.cos(rover_path.heading)])
+    for position, direction in zip(rover_path.stops, 0.045 * width * directions, strict=True):
         axes.plot(*np.column_stack([position, position + direction]), "-", color=MUTED, linewidth=1.1, zorder=1)
-    for number in _choose_labelled(run.stops, width):
-        _annotate_number(axes, run.stops[number], number + 1)
+    for number in _choose_numbered_points(rover_path.stops, width):
+        _annotate_number(axes, rover_path.stops[number], number + 1)
 
 
-def _draw_estimates(axes: Axes, run: RoverPath) -> None:
+def _draw_estimates(axes: Axes, rover_path: RoverPath) -> None:
     """Draw the estimates of the target relative to the designated point, joined in the order of the stops."""
-    offsets = 100.0 * (run.estimates - run.target)
+    # centimetres
+    offsets = 100.0 * (rover_path.estimates - rover_path.target)
     finite = np.flatnonzero(np.isfinite(offsets).all(axis=1))
-    for east, north, diameter in run.rocks[:1]:
-        centre = 100.0 * (np.array([east, north]) - run.target)
+    for east, north, diameter in rover_path.rocks[:1]:
+        centre = 100.0 * (np.array([east, north]) - rover_path.target)
         axes.add_patch(Circle((centre[0], centre[1]), 50.0 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8))
     change_cm = float(np.linalg.norm(offsets[finite[-1]] - offsets[finite[0]])) if finite.size else 0.0
     axes.plot(*offsets[finite].T, "-", color=SERIES[1], linewidth=1.0)
@@ -298,11 +312,11 @@ def _draw_estimates(axes: Axes, run: RoverPath) -> None:
     axes.set(xlabel="east of the target (cm)", ylabel="north of the target (cm)")
     axes.set_title("Estimated target positions")
     width = _set_limits(axes, np.vstack([offsets[finite], np.zeros((1, 2))]), 2.0)
-    for index in _choose_labelled(offsets[finite], width):
+    for index in _choose_numbered_points(offsets[finite], width):
         _annotate_number(axes, offsets[finite[index]], int(finite[index]) + 1)
 
 
-def _choose_labelled(points: Float[np.ndarray, "n 2"], width: float) -> list[int]:
+def _choose_numbered_points(points: Float[np.ndarray, "n 2"], width: float) -> list[int]:
     """Choose the points that get a number: the first, the last, and points far enough from other numbered points."""
     indices = [0, len(points) - 1] if len(points) > 1 else list(range(len(points)))
     for index in range(1, len(points) - 1):

@@ -54,6 +54,7 @@ def goal_rows(subject: Subject) -> Rows | None:
 
 
 def _group_by_camera(runs: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield the name of each camera and its rows."""
     for name in sorted(runs["camera"].dropna().unique()):
         yield str(name), runs[runs["camera"].eq(name)]
 
@@ -63,20 +64,21 @@ def summarize_cameras(runs: Rows) -> list[dict[str, Any]]:
     rows = []
     for camera, camera_rows in _group_by_camera(runs):
         is_completed = np.isfinite(numbers(camera_rows, "position_error_m"))
-        completed = camera_rows[is_completed]
-        error, drift = rates.finite_values(completed, "position_error_m"), rates.finite_values(completed, "drift_px")
+        completed_runs = camera_rows[is_completed]
+        error, drift = (rates.finite_values(completed_runs, name) for name in ("position_error_m", "drift_px"))
+        _, bound = quantile_bounds(error, QUANTILE, CONFIDENCE, rates.terrain_groups(completed_runs))
         rows.append(
             {
                 "camera": camera,
                 "completed": rates.fraction_of(is_completed, camera_rows),
                 "tracked": rates.flag_fraction(camera_rows, "tracked"),
-                "within": rates.fraction_of(error <= MAX_ERROR_M, completed),
-                "false_tracks": rates.flag_fraction(camera_rows, "true_track", wanted=False),
+                "within": rates.fraction_of(error <= MAX_ERROR_M, completed_runs),
+                "false_tracks": rates.flag_fraction(camera_rows, "true_track", value=False),
                 "median_m": rates.quantile(error, 0.5),
                 "quantile_m": rates.quantile(error, QUANTILE),
-                "quantile_bound_m": quantile_bounds(error, QUANTILE, CONFIDENCE, rates.terrain_groups(completed))[1],
-                "range_rms_m": rates.rms(rates.finite_values(completed, "range_error_m")),
-                "cross_rms_m": rates.rms(rates.finite_values(completed, "cross_error_m")),
+                "quantile_bound_m": bound,
+                "range_rms_m": rates.rms(rates.finite_values(completed_runs, "range_error_m")),
+                "cross_rms_m": rates.rms(rates.finite_values(completed_runs, "cross_error_m")),
                 "drift_median_px": rates.quantile(drift, 0.5),
                 "drift_quantile_px": rates.quantile(drift, QUANTILE),
             }
@@ -89,7 +91,8 @@ def _format_mm(name: str) -> Any:
     return lambda row: number(1000.0 * row[name]) if np.isfinite(row[name]) else "too few cases"
 
 
-def _draw_cameras(runs: Rows, subject: Subject, key: str) -> BlocksAndData:
+def _create_camera_blocks(runs: Rows, subject: Subject, key: str) -> BlocksAndData:
+    """Create the tables of rates and errors of each camera, and of the runs that lost the target."""
     cameras = summarize_cameras(runs)
     rows = [
         [row["camera"], name, rates.fraction_text(row[rate]), rates.interval_text(row[rate])]
@@ -130,6 +133,7 @@ def _expected_errors() -> str:
         stereo = stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m)
         drift = drift_error_m(GOAL_M, design.focal_px, 1.0)
         errors.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
+    # 230 runs: ln(1 - CONFIDENCE) / ln(QUANTILE), rounded up
     return (
         f"By Eqs. 1 and 4, one pixel of disparity error at {GOAL_M:g} m corresponds to an error along the line of "
         f"sight, and one pixel of drift to an error across it; for the paper's cameras: {'; '.join(errors)}. The "
@@ -140,14 +144,14 @@ def _expected_errors() -> str:
 
 def losses_grid(frame: Rows) -> Grid:
     """Count runs that ended without a tracked target, by outcome and loss criteria."""
-    failed = frame[~rates.flag_mask(frame, "tracked")]
+    failed_runs = frame[~rates.flag_mask(frame, "tracked")]
     rows = []
-    for (outcome, losses), runs in failed.groupby([failed["outcome"], failed["losses"].fillna(NOTHING)]):
+    for (outcome, losses), runs in failed_runs.groupby([failed_runs["outcome"], failed_runs["losses"].fillna(NOTHING)]):
         azimuth = rates.finite_values(runs, "azimuth_change_max_deg")
         distance = rates.finite_values(runs, "lost_range_m")
         azimuth_text = f"{azimuth.max():.1f}" if azimuth.size else NOTHING
         distance_text = f"{distance.min():.1f} to {distance.max():.1f}" if distance.size else NOTHING
-        n_cloudy = rates.flag_fraction(runs, "clear_sky", wanted=False).hits if "clear_sky" in runs else 0
+        n_cloudy = rates.flag_fraction(runs, "clear_sky", value=False).hits if "clear_sky" in runs else 0
         loss_text = str(losses).replace("_", " ").lower()
         rows.append([str(outcome), loss_text, f"{len(runs):,}", distance_text, azimuth_text, f"{n_cloudy:,}"])
     rows.sort(key=lambda row: -int(row[2].replace(",", "")))
@@ -171,6 +175,6 @@ GOAL = SectionDeclaration(
             "Fraction of completed runs with a smaller error at the goal. Dashed line: the requirement.",
             bound=100.0 * MAX_ERROR_M,
         ),
-        CustomBlocks(_draw_cameras),
+        CustomBlocks(_create_camera_blocks),
     ),
 )

@@ -33,8 +33,8 @@ _QUANTITIES = (
 def view(products: Mapping[str, Any], key: str) -> CaseView:
     """Create the view of a tracking case."""
     stops = read_stops(products)
-    is_selection = len(stops) > _MAX_STOPS
-    caption = f"{_MAX_STOPS} of the {len(stops)} stops." if is_selection else "All stops."
+    shows_selection = len(stops) > _MAX_STOPS
+    caption = f"{_MAX_STOPS} of the {len(stops)} stops." if shows_selection else "All stops."
     svg_figures = [svg_figure(draw_stops(products, _MAX_STOPS), f"{key}stops", caption, wide=True)]
     if read_rover_path(products) is not None:
         text = "Left: top view of the rover's path. Right: estimated target positions."

@@ -42,8 +42,10 @@ def table_1_section(subject: Subject) -> Section | None:
     accuracy = measured_accuracy(subject.frame)
     if not accuracy:
         return None
-    computed = {row.name: row for row in table_1()}
-    pairs = [(source, row[name]) for name in PRINTED for source, row in (("paper", PRINTED), ("computed", computed))]
+    computed_rows = {row.name: row for row in table_1()}
+    pairs = [
+        (source, row[name]) for name in PRINTED for source, row in (("paper", PRINTED), ("computed", computed_rows))
+    ]
     grid = build_grid(
         pairs,
         {
@@ -60,7 +62,7 @@ def table_1_section(subject: Subject) -> Section | None:
         Block(heading="Measured", grid=_measured_grid(accuracy), note=measured_note),
     ]
     data = {
-        "computed": {name: asdict(row) for name, row in computed.items()},
+        "computed": {name: asdict(row) for name, row in computed_rows.items()},
         "printed": {name: asdict(row) for name, row in PRINTED.items()},
         "measured": accuracy,
     }
@@ -79,10 +81,13 @@ def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
         return []
     distances = {"range_start_m": START_M, "range_end_m": GOAL_M}
     is_near = [np.abs(numbers(frame, name) / value - 1.0) < _MAX_DEVIATION for name, value in distances.items()]
-    completed = selectable_targets(frame[is_near[0] & is_near[1] & np.isfinite(numbers(frame, "position_error_m"))])
+    completed_runs = selectable_targets(
+        frame[is_near[0] & is_near[1] & np.isfinite(numbers(frame, "position_error_m"))]
+    )
+    # factor 300: 3 sigma in centimetres
     rows = []
-    for camera in sorted(completed["camera"].unique()):
-        runs = completed[completed["camera"].eq(camera)]
+    for camera in sorted(completed_runs["camera"].unique()):
+        runs = completed_runs[completed_runs["camera"].eq(camera)]
         designation, pose = numbers(runs, "designation_error_m"), numbers(runs, "pose_error_m")
         rows.append(
             {
@@ -109,11 +114,13 @@ def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
     head += ["Without tracking (cm)", "Paper (cm)", "With tracking (cm)", "Paper's formula (cm)"]
     rows = []
     for row in accuracy:
-        printed = next((p for name, p in PRINTED.items() if row["camera"].endswith(name.lower())), None)
+        printed_row = next(
+            (row_of_paper for name, row_of_paper in PRINTED.items() if row["camera"].endswith(name.lower())), None
+        )
         paper = [NOTHING] * 3
-        if printed is not None:
-            tracked = tracked_approach_error_m(printed.stereo_cm, printed.drift_cm_px * row["drift_px"])
-            paper = [f"{printed.designation_cm:g}", f"{printed.untracked_cm:.1f}", f"{tracked:.1f}"]
+        if printed_row is not None:
+            tracked_cm = tracked_approach_error_m(printed_row.stereo_cm, printed_row.drift_cm_px * row["drift_px"])
+            paper = [f"{printed_row.designation_cm:g}", f"{printed_row.untracked_cm:.1f}", f"{tracked_cm:.1f}"]
         first_texts = [row["camera"], f"{row['runs']:,}", f"{row['designation_cm']:.1f}", paper[0]]
         second_texts = [number(row["disparity_px"]), f"{row['untracked_cm']:.1f}", paper[1]]
         rows.append([*first_texts, *second_texts, f"{row['tracked_cm']:.1f}", paper[2], f"{row['drift_px']:.1f}"])
@@ -130,25 +137,31 @@ def read_legs(subject: Subject) -> list[Mapping[str, Any]]:
 def table_4_grid(frame: Rows, legs: Sequence[Mapping[str, Any]]) -> Grid:
     """Create Table IV: tracking updates and minutes of each operational mode; `legs` are the legs of the drive."""
     updates = [int(str(name).split("_")[1]) for name in frame.columns if re.match(r"^update_\d+_leg$", str(name))]
-    update_legs = np.column_stack([numbers(frame, f"update_{n}_leg") for n in updates])
-    update_minutes = np.column_stack([numbers(frame, f"update_{n}_time_s") for n in updates]) / 60.0
+    update_legs = np.column_stack([numbers(frame, f"update_{update_number}_leg") for update_number in updates])
+    update_minutes = (
+        np.column_stack([numbers(frame, f"update_{update_number}_time_s") for update_number in updates]) / 60.0
+    )
     leg_modes = [(str(leg.get("motion", "approach")), bool(leg.get("autonav"))) for leg in legs]
     leg_modes = [(motion, motion == "approach" and autonav) for motion, autonav in leg_modes]
     rows, previous_end = [], np.zeros(len(frame))
     for mode in PAPER["table_4"]:
-        mode_legs = [k for k, leg in enumerate(leg_modes) if leg == (mode["motion"], mode.get("autonav", False))]
-        # the first update, at the start, has the leg -1
+        mode_legs = [
+            index for index, leg in enumerate(leg_modes) if leg == (mode["motion"], mode.get("autonav", False))
+        ]
+        # the first update is at the start, before any leg; its leg is -1
         is_in_mode = np.isin(update_legs, [-1, *mode_legs] if mode.get("start") else mode_legs)
         is_reached = is_in_mode.any(axis=1)
         end = np.where(is_in_mode, update_minutes, -np.inf).max(axis=1)
         counts, minutes = is_in_mode.sum(axis=1).astype(np.float64), (end - previous_end)[is_reached]
-        simulated = (rates.median_text(counts[is_reached], 0), rates.median_text(minutes, 1))
-        rows.append([mode["name"], f"{mode['updates']}", simulated[0], f"{mode['minutes']:g}", simulated[1]])
+        simulated_texts = (rates.median_text(counts[is_reached], 0), rates.median_text(minutes, 1))
+        rows.append(
+            [mode["name"], f"{mode['updates']}", simulated_texts[0], f"{mode['minutes']:g}", simulated_texts[1]]
+        )
         previous_end = np.where(is_reached, end, previous_end)
     return Grid(["Mode", "Updates, paper", "Updates, ours", "Minutes, paper", "Minutes, ours"], rows)
 
 
-def _draw_modes(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+def _create_mode_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
     if "update_1_leg" not in frame:
         return [], {}
     grid = table_4_grid(frame, read_legs(subject))
@@ -156,7 +169,7 @@ def _draw_modes(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
 
 
 #: Comparison of the paper's single runs with the campaigns that repeat them.
-SINGLE_RUNS = PaperFacts(_PAPER_FILE, extra_parts={CHECKOUT_3: CustomBlocks(_draw_modes)})
+SINGLE_RUNS = PaperFacts(_PAPER_FILE, extra_parts={CHECKOUT_3: CustomBlocks(_create_mode_blocks)})
 
 #: Quantities of an update in the table: heading, suffix of the column, digits.
 QUANTITIES: tuple[tuple[str, str, int], ...] = (
@@ -169,15 +182,22 @@ QUANTITIES: tuple[tuple[str, str, int], ...] = (
 def updates_section(subject: Subject) -> Section | None:
     """Create the section on the updates, with Table III for the first checkout; None if rows contain no updates."""
     frame = subject.frame
-    matched = (re.match(r"^update_(\d+)_range_m$", str(name)) for name in frame.columns)
-    updates = sorted(int(match[1]) for match in matched if match)
+    matches = (re.match(r"^update_(\d+)_range_m$", str(name)) for name in frame.columns)
+    updates = sorted(int(match[1]) for match in matches if match)
     if not is_tracking(frame) or not updates:
         return None
     endings = [suffix for _, suffix, _ in QUANTITIES]
-    values = {n: {name: rates.finite_values(frame, f"update_{n}_{name}") for name in endings} for n in updates}
+    values = {
+        update_number: {name: rates.finite_values(frame, f"update_{update_number}_{name}") for name in endings}
+        for update_number in updates
+    }
     rows = [
-        [str(n), f"{update['range_m'].size:,}", *(rates.median_text(update[name], d) for _, name, d in QUANTITIES)]
-        for n, update in values.items()
+        [
+            str(update_number),
+            f"{update['range_m'].size:,}",
+            *(rates.median_text(update[name], digits) for _, name, digits in QUANTITIES),
+        ]
+        for update_number, update in values.items()
         if update["range_m"].size
     ]
     grid = Grid(["Update", "Cases", *(heading for heading, _, _ in QUANTITIES)], rows)
@@ -187,17 +207,27 @@ def updates_section(subject: Subject) -> Section | None:
         title = "Updates of the first checkout (Table III of the paper)"
         comparison_rows = []
         for heading, suffix, digits in QUANTITIES:
-            printed = PAPER["table_3"].get(suffix)
-            if printed is not None:
-                paper = [f"{printed[str(n)]:.{digits}f}" if str(n) in printed else NOTHING for n in values]
-                simulated = [rates.median_text(np.abs(update[suffix]), digits) for update in values.values()]
-                comparison_rows += [[heading, "paper", *paper], ["", "ours", *simulated]]
-        table_3 = Grid(["Parameter", "Rover position", *(str(n) for n in values)], comparison_rows)
+            printed_values = PAPER["table_3"].get(suffix)
+            if printed_values is not None:
+                paper = [
+                    f"{printed_values[str(update_number)]:.{digits}f}"
+                    if str(update_number) in printed_values
+                    else NOTHING
+                    for update_number in values
+                ]
+                simulated_texts = [rates.median_text(np.abs(update[suffix]), digits) for update in values.values()]
+                comparison_rows += [[heading, "paper", *paper], ["", "ours", *simulated_texts]]
+        table_3 = Grid(
+            ["Parameter", "Rover position", *(str(update_number) for update_number in values)], comparison_rows
+        )
         blocks = [
             Block(heading="Comparison with the paper", grid=table_3, note=note_text("vtt.table_3")),
             Block(heading="All updates of Marsyard", grid=grid, note=note),
         ]
-    data = {str(n): {name: x.tolist() for name, x in update.items()} for n, update in values.items()}
+    data = {
+        str(update_number): {name: values_of_update.tolist() for name, values_of_update in update.items()}
+        for update_number, update in values.items()
+    }
     return Section("updates", "Updates", title, blocks, {"updates": data})
 
 
@@ -272,8 +302,10 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
                     "step": step,
                     "good": rates.flag_fraction(good_rows, "tracked"),
                     "all_targets": rates.flag_fraction(step_rows, "tracked"),
-                    "false_tracks": rates.flag_fraction(good_rows, "true_track", wanted=False),
-                    "paper_percent": next((p for size, p in paper.items() if abs(step - float(size)) < 0.5), None),
+                    "false_tracks": rates.flag_fraction(good_rows, "true_track", value=False),
+                    "paper_percent": next(
+                        (percentage for size, percentage in paper.items() if abs(step - float(size)) < 0.5), None
+                    ),
                 }
             )
     return cells
@@ -302,7 +334,7 @@ def _obliquity_grid(frame: Rows) -> Grid | None:
         class_rows = visible[visible["obliquity_max_deg"].between(low, high, inclusive="left")]
         if len(class_rows):
             fractions = [rates.flag_fraction(class_rows[class_rows["step"].eq(step)], "tracked") for step in steps]
-            rows.append([f"{low:g} to {high:g}", *(f"{x.hits:,} of {x.n:,}" for x in fractions)])
+            rows.append([f"{low:g} to {high:g}", *(f"{fraction.hits:,} of {fraction.n:,}" for fraction in fractions)])
     return Grid(["Maximum obliquity (deg)", *(f"{step:g} deg" for step in steps)], rows) if rows else None
 
 
@@ -314,25 +346,32 @@ MAX_SMALL_ROCK_M = 0.1
 
 def terrains_section(subject: Subject) -> Section | None:
     """Create the section on Table II; None unless the campaign is that of the paper's terrains."""
-    frame, printed = subject.frame, PAPER["table_2"]
+    frame, printed_rows = subject.frame, PAPER["table_2"]
     if subject.run.name != TERRAINS or not is_closed_loop(frame) or "incline" not in frame:
         return None
     names = [str(name) for name in frame["incline"].dropna().unique()]
-    ordered_names = [name for name in printed if name in names] + sorted(set(names) - set(printed))
+    ordered_names = [name for name in printed_rows if name in names] + sorted(set(names) - set(printed_rows))
     rows, data = [], []
     for name in ordered_names:
         runs = frame[frame["incline"].eq(name)]
         good_runs, slips = selectable_targets(runs), rates.finite_values(runs, "slip_max")
         lost_runs = good_runs[~rates.flag_mask(good_runs, "tracked")]
         cause_counts = dict(Counter(failure_cause(row) for _, row in lost_runs.iterrows()).most_common())
-        failed, failed_all = (rates.flag_fraction(group, "tracked", wanted=False) for group in (good_runs, runs))
+        failure_fraction, failure_fraction_all = (
+            rates.flag_fraction(group, "tracked", value=False) for group in (good_runs, runs)
+        )
         slip = float(slips.max()) if slips.size else float("nan")
-        row = printed.get(name)
+        row = printed_rows.get(name)
         paper = [NOTHING] * 2 if row is None else [f"{row['failures']} of {row['trials']}", row["reason"]]
         causes = "; ".join(f"{cause}: {n}" for cause, n in cause_counts.items()) or "none"
-        simulated = [rates.fraction_text(failed), rates.interval_text(failed), causes, rates.fraction_text(failed_all)]
-        rows.append([name, *paper, *simulated, percent(slip)])
-        fractions = {"failed": asdict(failed), "failed_all": asdict(failed_all)}
+        simulated_texts = [
+            rates.fraction_text(failure_fraction),
+            rates.interval_text(failure_fraction),
+            causes,
+            rates.fraction_text(failure_fraction_all),
+        ]
+        rows.append([name, *paper, *simulated_texts, percent(slip)])
+        fractions = {"failed": asdict(failure_fraction), "failed_all": asdict(failure_fraction_all)}
         data.append({"name": name, **fractions, "causes": cause_counts, "slip_max": slip})
     head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{format_fraction(CONFIDENCE)} interval"]
     head += ["Cause, ours", "Failures, all targets", "Maximum slip"]
@@ -361,12 +400,12 @@ def regression_section(subject: Subject) -> Section | None:
     map_source = frame["map_by"] if "map_by" in frame else pd.Series("none", index=frame.index)
     driving_text = np.where(frame["visual_odometry"].astype(bool), "visual odometry", "blind")
     autonav_text = ("Autonav by " + map_source.astype(str) + " cameras").to_numpy()
-    labelled = frame.assign(
+    rows_with_labels = frame.assign(
         driving=np.where(frame["autonav"].astype(bool), autonav_text, driving_text),
         rock=np.where(numbers(frame, "rock_height_m") <= MAX_SMALL_ROCK_M, "small", "large"),
     )
     grid = build_grid(
-        list(labelled.groupby(["driving", "rock", "incline"], sort=True)),
+        list(rows_with_labels.groupby(["driving", "rock", "incline"], sort=True)),
         {
             "Driving": lambda group: str(group[0][0]),
             "Rock": lambda group: str(group[0][1]),
@@ -374,9 +413,11 @@ def regression_section(subject: Subject) -> Section | None:
             "Runs": lambda group: f"{len(group[1]):,}",
             "Tracked to the goal": lambda group: rates.fraction_text(rates.flag_fraction(group[1], "tracked")),
             "Outcomes": lambda group: ", ".join(sorted(str(outcome) for outcome in group[1]["outcome"].unique())),
-            "Position error (cm)": lambda g: rates.median_text(rates.finite_values(g[1], "position_error_m", 100.0), 2),
-            "Drift (px)": lambda g: rates.median_text(rates.finite_values(g[1], "drift_px"), 1),
-            "Navigation updates": lambda g: rates.median_text(rates.finite_values(g[1], "autonav_updates"), 0),
+            "Position error (cm)": lambda group: rates.median_text(
+                rates.finite_values(group[1], "position_error_m", 100.0), 2
+            ),
+            "Drift (px)": lambda group: rates.median_text(rates.finite_values(group[1], "drift_px"), 1),
+            "Navigation updates": lambda group: rates.median_text(rates.finite_values(group[1], "autonav_updates"), 0),
         },
     )
     note = "According to the paper, all 14 runs were successful. Small rocks are at most 10 cm high."

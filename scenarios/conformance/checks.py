@@ -98,8 +98,8 @@ class Suite(ABC):
         "use numpy.random.default_rng(a fixed seed), created in estimate; keep no state between cases"
     )
     time_verb = "answers"
-    #: Problem of an answer that differs after other cases.
-    dependence = "its answer depends on earlier cases"
+    #: Message about an answer that differs after other cases.
+    dependence_problem = "its answer depends on earlier cases"
     #: Whether imports of modules with ground truth are forbidden.
     forbids_truth = True
     #: Whether the arrays of inputs are writable in all checks.
@@ -144,10 +144,10 @@ class Suite(ABC):
 
     def _check_inputs(self) -> str:
         for case in self.cases():
-            copy = copy_inputs(case, writable=True)
-            original_hash = hash_inputs(copy)
-            self._call(self.make(), copy, 1)
-            if hash_inputs(copy) != original_hash:
+            input_copy = copy_inputs(case, writable=True)
+            original_hash = hash_inputs(input_copy)
+            self._call(self.make(), input_copy, 1)
+            if hash_inputs(input_copy) != original_hash:
                 raise BreachError(f"it changed its input, a {type(case).__name__}")
         return ""
 
@@ -165,7 +165,7 @@ class Suite(ABC):
                 self._call(reused_instance, copy_inputs(other_case, writable=self.writable_inputs), 2)
             answer = self._call(reused_instance, copy_inputs(case, writable=self.writable_inputs), 1)
             if fingerprint(self._check_answer(answer, case)) != fingerprints[0]:
-                raise BreachError(self.dependence)
+                raise BreachError(self.dependence_problem)
         return ""
 
     def _check_time(self) -> str:
@@ -181,22 +181,22 @@ class Suite(ABC):
         return measure_time_s(lambda: self._answer(case))
 
     def _check_imports(self) -> str:
-        forbidden, allowed = [], tuple(f"{module}." for module in ALLOWED_MODULES)
+        violations, allowed_prefixes = [], tuple(f"{module}." for module in ALLOWED_MODULES)
         for name, path in algorithm_sources(self.spec):
             try:
                 nodes = list(ast.walk(ast.parse(path.read_bytes())))
             except (SyntaxError, ValueError):
                 continue
             statements = [node for node in nodes if isinstance(node, ast.Import)]
-            imports = [(node.lineno, part.name) for node in statements for part in node.names]
+            imports = [(node.lineno, alias.name) for node in statements for alias in node.names]
             for node in nodes:
                 if isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
-                    imports += [(node.lineno, f"{node.module}.{part.name}") for part in node.names]
+                    imports += [(node.lineno, f"{node.module}.{alias.name}") for alias in node.names]
             for line, module in imports:
-                if module.partition(".")[0] == "marsyard" and not f"{module}.".startswith(allowed):
-                    forbidden.append(f"{name}, line {line}: {module}")
-        if forbidden:
-            raise BreachError(f"it imports modules with access to the truth: {'; '.join(forbidden[:5])}")
+                if module.partition(".")[0] == "marsyard" and not f"{module}.".startswith(allowed_prefixes):
+                    violations.append(f"{name}, line {line}: {module}")
+        if violations:
+            raise BreachError(f"it imports modules with access to the truth: {'; '.join(violations[:5])}")
         return ""
 
 

@@ -82,11 +82,11 @@ class EstimatorSuite(Suite):
             rule = f"returns a failure if images are {name}"
             yield Check(name, rule, advice, partial(self._check_blank_images, name, blank))
         rule = "returns a well-formed answer to images of noise"
-        yield Check("noise", rule, advice, lambda: self._outcome(inputs.make_noisy(protocol.measurements())))
+        yield Check("noise", rule, advice, lambda: self._describe_outcome(inputs.make_noisy(protocol.measurements())))
         if protocol is LANDING:
             rule = "returns a well-formed answer without a range"
             no_range = replace(inputs.landing(), slant_range_m=float("nan"))
-            yield Check("no-range", rule, advice, lambda: self._outcome(no_range))
+            yield Check("no-range", rule, advice, lambda: self._describe_outcome(no_range))
         yield from self.common_checks()
         if protocol is STREAM:
             advice = f"return one of the failures from finish: {VELOCITY.failures}"
@@ -94,7 +94,9 @@ class EstimatorSuite(Suite):
             rule = f"returns a well-formed answer to {', '.join(map(str, _SHORT_LENGTHS))} and {_LONG_LENGTH} images"
             advice = "accept any number: see VelocityStream in algorithms/interface.py"
             streams = (*map(_select_first_images, _SHORT_LENGTHS), inputs.descent(_LONG_LENGTH))
-            yield Check("number", rule, advice, lambda: "; ".join(describe_velocity(self._answer(s)) for s in streams))
+            yield Check(
+                "number", rule, advice, lambda: "; ".join(describe_velocity(self._answer(stream)) for stream in streams)
+            )
             rule, advice = "resets its state after an interrupted descent", "reset the whole state in start"
             yield Check("start", rule, advice, self._check_restart)
 
@@ -111,7 +113,7 @@ class EstimatorSuite(Suite):
     def _check_answer(self, answer: Any, case: Any) -> Any:
         return self.protocol.check(answer)
 
-    def _outcome(self, measurements: Any) -> str:
+    def _describe_outcome(self, measurements: Any) -> str:
         return str(self._answer(measurements).outcome.name)
 
     def _check_blank_images(self, name: str, blank: inputs.Blank) -> str:
@@ -131,12 +133,12 @@ class EstimatorSuite(Suite):
 
     def _check_restart(self) -> str:
         measurements = self.protocol.measurements()
-        expected = fingerprint(self._answer(measurements))
-        reused = self.make()
-        reused.stream.start()
+        expected_fingerprint = fingerprint(self._answer(measurements))
+        estimator = self.make()
+        estimator.stream.start()
         for frame in copy_inputs(inputs.make_noisy(measurements)).frames()[:2]:
-            reused.stream.picture(frame)
-        if fingerprint(reused.estimate(copy_inputs(measurements))) != expected:
+            estimator.stream.picture(frame)
+        if fingerprint(estimator.estimate(copy_inputs(measurements))) != expected_fingerprint:
             raise BreachError("after a restart in the middle of a descent, its answer differs")
         return ""
 

@@ -40,7 +40,7 @@ _TEXTURE_SIZE, _TEXTURE_CONTRAST = 1024, 0.2
 DESCENT_VELOCITY_M_S = np.array([12.0, -7.0, -75.0])
 #: Maximum time between images, and from the first to the last image, s.
 _INTERVAL_S, _DURATION_S = 3.75, 7.5
-#: Attitudes of the images, periodic: about z, y and x, degrees.
+#: Attitudes of the images about z, y and x, degrees; further images repeat them.
 _ATTITUDES_DEG = ((40, 4, -3), (44, 2, 3), (41, -3, 5))
 _START_POSITION_M = np.array([0.0, 0.0, 1900.0])
 #: Positions of the two landing images, metres.
@@ -83,10 +83,11 @@ class TexturedPlane:
 
 @cache
 def texture() -> Float32[np.ndarray, "rows columns"]:
-    """Create periodic noise of mean 1; its amplitudes decrease with frequency, as on natural surfaces."""
+    """Create periodic noise with the mean 1; its amplitudes decrease with frequency, as on natural surfaces."""
     rng = np.random.default_rng(20040103)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(_TEXTURE_SIZE), fft.rfftfreq(_TEXTURE_SIZE), indexing="ij"))
     frequency[0, 0] = np.inf
+    # amplitudes from 4 cycles per side of the texture to 0.3 cycles per sample
     amplitude = np.where(frequency < 0.3, frequency**-1.2, 0.0) * (frequency > 4.0 / _TEXTURE_SIZE)
     shape = (_TEXTURE_SIZE, _TEXTURE_SIZE)
     values = fft.irfft2(amplitude * fft.rfft2(rng.standard_normal(shape)), shape)
@@ -119,15 +120,15 @@ def landing() -> LandingMeasurements:
     attitudes = [Rotation.from_euler("ZYX", angles, degrees=True) for angles in ((10, 3, -2), (10.2, 2.8, -1.9))]
     times = [0.0, 2.0]
     first, second = _take_images(preset("xc-55"), _LANDING_POSITIONS_M, attitudes, times, step_m=0.03)
-    poses = [PoseMeasurement(rigid(attitudes[k], _LANDING_POSITIONS_M[k]), times[k]) for k in (0, 1)]
+    poses = [PoseMeasurement(rigid(attitudes[index], _LANDING_POSITIONS_M[index]), times[index]) for index in (0, 1)]
     axis = attitudes[0].apply(first.camera.a.copy())
-    slant = -_LANDING_POSITIONS_M[0, 2] / axis[2]
+    slant_range_m = -_LANDING_POSITIONS_M[0, 2] / axis[2]
     return LandingMeasurements(
         images=(first, second),
         poses=(poses[0], poses[1]),
-        slant_range_m=float(slant),
+        slant_range_m=float(slant_range_m),
         up_body=np.asarray(attitudes[0].inv().apply([0.0, 0.0, 1.0])),
-        apriori_site_world=np.asarray(_LANDING_POSITIONS_M[0] + slant * axis),
+        apriori_site_world=np.asarray(_LANDING_POSITIONS_M[0] + slant_range_m * axis),
     )
 
 
@@ -156,10 +157,10 @@ def make_noisy(measurements: Measurements) -> Measurements:
     """Return the measurements with images of pure noise."""
     rng = np.random.default_rng(2)
 
-    def draw(image: DetectorImage) -> np.ndarray:
+    def draw_noise(image: DetectorImage) -> np.ndarray:
         return rng.integers(0, image.calibration.full_scale_dn, image.counts.shape, np.uint16, endpoint=True)
 
-    return _replace_counts(measurements, draw)
+    return _replace_counts(measurements, draw_noise)
 
 
 def _replace_counts(measurements: Measurements, counts: Callable[[DetectorImage], np.ndarray]) -> Measurements:

@@ -47,8 +47,8 @@ def determine_kind(spec: str) -> str | None:
         return None
     if isinstance(part, type):
         return next((kind.name for kind in (DYNAMICS, INSTRUMENT) if hasattr(part, kind.members[0])), None)
-    accepted = scores.accepted_cases(part) if callable(part) else scores.SCORED
-    return SCORE.name if accepted and accepted != scores.SCORED else None
+    accepted_cases = scores.accepted_cases(part) if callable(part) else scores.SCORED
+    return SCORE.name if accepted_cases and accepted_cases != scores.SCORED else None
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ class PartSuite(Suite):
         """See `Suite`."""
         if self.kind is not SCORE:
             return motion_cases() if self.kind is DYNAMICS else instrument_cases()
-        accepted = scores.accepted_cases(scores.load_score(self.spec))
-        return [case for case in scored_cases() if isinstance(case, accepted)]
+        accepted_types = scores.accepted_cases(scores.load_score(self.spec))
+        return [case for case in scored_cases() if isinstance(case, accepted_types)]
 
     def _call(self, algorithm: Any, case: Any, seed: int) -> Any:
         rng = np.random.default_rng(seed)
@@ -142,7 +142,7 @@ def _ground_height(x: float, y: float) -> float:
 def _nearest_ground(
     apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_width_rad: float, max_range_m: float
 ) -> float:
-    """Compute the distance from the apex of a cone to the suite's plane within the cone; infinite beyond the range."""
+    """Compute the shortest distance from the apex of a cone to the plane inside the cone; infinite beyond the range."""
     angle = max(float(np.arccos(np.clip(-axis @ _NORMAL, -1.0, 1.0))) - half_width_rad, 0.0)
     distance = float(apex @ _NORMAL) / np.cos(angle) if angle < 0.5 * np.pi else np.inf
     return float(distance) if distance <= max_range_m else np.inf
@@ -190,29 +190,29 @@ def scored_cases() -> tuple[scores.ScoredCase, ...]:
     poses = rigid(states[0].attitude, states[0].position_m), rigid(states[1].attitude, states[1].position_m)
     cases: list[scores.ScoredCase] = []
     for answer in velocities:
-        answered: dict[str, Any] = {"measurements": inputs.descent(), "answer": answer}
-        with_truth: dict[str, Any] = answered | {"true_velocity_m_s": inputs.DESCENT_VELOCITY_M_S[:2].copy()}
+        without_truth: dict[str, Any] = {"measurements": inputs.descent(), "answer": answer}
+        with_truth: dict[str, Any] = without_truth | {"true_velocity_m_s": inputs.DESCENT_VELOCITY_M_S[:2].copy()}
         with_motion: dict[str, Any] = with_truth | {"states": states, "motion": swinging_fall()}
         touchdown: dict[str, Any] = {"at_firing": swinging_fall().state(20.0), "touchdown_m_s": np.array([3.0, -1.0])}
         cases += [scores.ScoredDescent(**with_motion, **touchdown), scores.ScoredFlight(**with_motion)]
-        cases += [scores.ScoredVelocity(**with_truth), scores.ScoredVelocity(**answered, true_velocity_m_s=None)]
+        cases += [scores.ScoredVelocity(**with_truth), scores.ScoredVelocity(**without_truth, true_velocity_m_s=None)]
     for site in sites:
-        answered = {"measurements": inputs.landing(), "answer": site}
-        with_truth = answered | {"true_poses": poses}
+        without_truth = {"measurements": inputs.landing(), "answer": site}
+        with_truth = without_truth | {"true_poses": poses}
         landing = scores.ScoredLanding(**with_truth, states=states[:2], ground=_make_ground_truth())
-        cases += [landing, scores.ScoredSite(**with_truth), scores.ScoredSite(**answered, true_poses=None)]
+        cases += [landing, scores.ScoredSite(**with_truth), scores.ScoredSite(**without_truth, true_poses=None)]
     return (*cases, _make_scored_run(TrackingState.NORMAL), _make_scored_run(TrackingState.FAILURE))
 
 
 def _make_ground_truth() -> GroundTruth:
     """Create level ground of 20 m x 20 m with one unsafe position."""
-    line = np.linspace(-4.0, 4.0, 9)
-    positions_m = np.stack(np.meshgrid(line, line), axis=-1)
+    coordinates_m = np.linspace(-4.0, 4.0, 9)
+    positions_m = np.stack(np.meshgrid(coordinates_m, coordinates_m), axis=-1)
     zeros = np.zeros(positions_m.shape[:2])
-    safe = np.ones(zeros.shape, dtype=bool)
-    safe[0, 0] = False
+    is_safe = np.ones(zeros.shape, dtype=bool)
+    is_safe[0, 0] = False
     relief = Relief(np.zeros((200, 200)), -10.0, -10.0, 0.1)
-    footprints = Footprints(zeros, zeros, zeros, safe)
+    footprints = Footprints(zeros, zeros, zeros, is_safe)
     return GroundTruth(relief, Limits(2.0, 0.26, 0.2), positions_m, footprints, np.ones(zeros.shape, dtype=bool), 1.0)
 
 

@@ -77,7 +77,7 @@ class TrackerSuite(Suite):
 
     deterministic_advice = "use numpy.random.default_rng(a fixed seed); reset the whole state in clear and designate"
     time_verb = "updates"
-    dependence = "after clear and a second designation of the target, its answer differs"
+    dependence_problem = "after clear and a second designation of the target, its answer differs"
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""

@@ -170,11 +170,11 @@ class HeatShield:
         distance = ((centre - origin) @ normal) / np.where(np.abs(cosines) > 1e-9, cosines, 1e-9)
         centre_distance = np.linalg.norm(origin + distance[:, None] * directions - centre, axis=1)
         is_hit = (distance > 0.0) & (centre_distance < 0.5 * SHIELD_DIAMETER_M)
-        # the visible side faces the camera
+        # the camera sees the outside if the normal points towards it, otherwise the inside
         sun_cosine = np.maximum(-np.sign(cosines) * float(normal @ sun.direction), 0.0)
         reflected = np.where(cosines < 0.0, SHIELD_OUTSIDE_ALBEDO, SHIELD_INSIDE_ALBEDO) * sun_cosine
-        combined = np.where(is_hit, reflected, radiance.reshape(-1))
-        return combined.astype(np.float32).reshape(radiance.shape)
+        painted = np.where(is_hit, reflected, radiance.reshape(-1))
+        return painted.astype(np.float32).reshape(radiance.shape)
 
 
 def camera_optics(parameters: CameraParameters) -> Optics:
@@ -205,7 +205,8 @@ def _create_camera(p: CameraParameters, focal_factor: float, shift_px: tuple[flo
         right=np.array([1.0, 0.0, 0.0]),
         image_centre=(centre[0] + shift_px[0], centre[1] + shift_px[1]),
     )
-    # CAHVOR moves a point at angle a from the axis outwards by the fraction R0 + R1 tan(a)^2 + ... of its distance
+    # CAHVOR moves a point at angle a from the axis outwards by the fraction R0 + R1 tan(a)^2 + ... of its distance;
+    # at a corner, tan(a) = radius_px / focal_px
     radius_px = float(np.hypot(*centre))
     radial_1 = p.radial_1 + corner_px / radius_px / (radius_px / focal_px) ** 2
     return Cahvor.from_cahv(pinhole, r=np.array([p.radial_0, radial_1, p.radial_2]))

@@ -86,11 +86,12 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
         row = {"flight_file": p.flight.file, "flight_first_picture_s": p.flight.start_s}
     positions = motion.motion(np.array(times)).positions_m
     heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
-    invalid = np.flatnonzero(heights <= 0.0)
-    if invalid.size:
+    invalid_indices = np.flatnonzero(heights <= 0.0)
+    if invalid_indices.size:
+        index = invalid_indices[0]
         raise TrajectoryFileError(
-            f"{p.flight.motion if isinstance(p.flight, CustomMotion) else p.flight.file}: at image {invalid[0] + 1} "
-            f"the camera is {-heights[invalid[0]]:.1f} m below the ground; allowed: above it"
+            f"{p.flight.motion if isinstance(p.flight, CustomMotion) else p.flight.file}: at image {index + 1} "
+            f"the camera is {-heights[index]:.1f} m below the ground; allowed: above it"
         )
     return DescentFlight(motion, p.flight.lead_s, _find_firing_time(p, motion, surface), row)
 
@@ -103,7 +104,7 @@ def _find_firing_time(p: DescentScenarioParameters, motion: Trajectory, surface:
     indices = np.flatnonzero(heights <= p.descent.thruster_firing_m)
     if not indices.size or indices[0] == 0:
         return float(times[0 if indices.size else -1])
-    # the height decreases; `np.interp` needs increasing values
+    # the height decreases; its sign changes because `np.interp` needs increasing values
     crossing = slice(indices[0] - 1, indices[0] + 1)
     return float(np.interp(-p.descent.thruster_firing_m, -heights[crossing], times[crossing]))
 

@@ -65,7 +65,7 @@ class Instruments:
         imu = approach.calibrate(uncalibrated_imu, streams.generator("inertial unit's calibration"))
         clock = Clock.draw(p.clock, streams.generator("image clock"))
         surface, motion = world.surface, flight.motion
-        # readings and result columns of the custom instruments, by parameter table
+        # readings and result columns of the custom instruments, by name of the parameter table
         custom: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
         tags = clock.tags(np.array(p.image_times_s), streams.generator("image time tags"))
         for table, times in (("altimeter", np.array(p.image_times_s)), ("attitude_source", tags)):

@@ -90,7 +90,7 @@ def test_killed_run_is_shown_and_not_compared(
     assert (tmp_path / "out" / "nightly.md").read_text().startswith("# Night 1: RUNNING")
     _, report = nightly()
     assert report.startswith("# Night 2:")
-    assert "Night 1, begun" in report
+    assert "Night 1, started" in report
     assert "was interrupted" in report
     assert "No metric has a history" in report
 

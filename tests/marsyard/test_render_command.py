@@ -144,7 +144,7 @@ def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path) -> 
     assert "25.0% of its posts have no height; allowed: up to 5.0%" in message
     status, message = marsyard(*command, "--max-holes", 0.3)
     assert status == 0, message
-    assert "see filled holes of the DTM" in message
+    assert "show filled holes of the DTM" in message
     with np.load(f"{prefix}.npz") as truth:
         filled, points = truth["filled"], truth["point_m"]
         assert filled.any()

@@ -174,7 +174,7 @@ def test_page_lists_regressions_and_interrupted_runs(tmp_path: Path) -> None:
     assert text.startswith("# Night 2: 1 FAIL, 1 regression\n")
     assert "- **first: DIMES-VEL**: 95.00 % in 7 earlier nights, 70.00 % now (p = 2e-06)" in text
     assert text.index("## Regressions") < text.index("DIMES-VEL") < text.index("## Improvements")
-    assert "Night 1, begun" in text
+    assert "Night 1, started" in text
     assert "<script>" not in text
     assert "| a&#124;b \\# &#60;script&#62;\\`\\* | FAIL |" in text
     unchanged_text = format_night_page(later, [], [_make_campaign()], [], 6)
