@@ -71,7 +71,9 @@ class FlightFile(UserFile, RecordedAxes):
     def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
         """Transform the flight to world axes with time 0 at the first image; `ground_m` is the ground below it."""
         poses = read_poses(self.file)
-        world_from_file = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.world
+        world_from_file = (
+            Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.enu_from_axes
+        )
         attitudes = world_from_file * Rotation.from_quat(poses.quaternions)
         positions = world_from_file.apply(poses.positions_m) + self.lever_arms(attitudes)
         if self.origin == "place":

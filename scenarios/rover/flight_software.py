@@ -105,7 +105,7 @@ def plan_drive(position: Float64[np.ndarray, "2"], max_length_m: float) -> Itera
         yield DriveCommand(turn_left_rad=angle)
         yield DriveCommand(forward_m=min(chord, max_length_m))
         return
-    # an arc that starts straight ahead turns by twice the angle of its chord
+    # an arc that starts straight ahead turns by twice the angle of its chord; its length is chord * angle / sin(angle)
     arc = chord / float(np.sinc(angle / np.pi))
     length = min(arc, max_length_m)
     yield DriveCommand(forward_m=length, turn_left_rad=2.0 * angle * length / arc)
