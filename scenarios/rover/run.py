@@ -99,7 +99,7 @@ class Run(Setup):
     navigator: Navigator = field(default_factory=Navigator)
     odometry_pair: tuple[Stance, StereoMeasurement] | None = None  #: last pair of visual odometry, and its stance
     time_s: float = 0.0  #: time since the start
-    pending: list[Drive] = field(default_factory=list)  #: drives since the last stop
+    drives_since_stop: list[Drive] = field(default_factory=list)
 
     @classmethod
     def from_setup(cls, setup: Setup, target: DesignatedTarget) -> Run:
@@ -284,8 +284,8 @@ def visit_stop(p: RoverScenarioParameters, run: Run, guide: Guide, leg: int) -> 
         shadow = build_shadow_caster(vehicle.rover, stance, geometry, rig.state.true_rad, target, radius_m, sun)
     cameras, boxes, brightness = (rig.left, rig.right), (aim.left, aim.right), world.brightness(time_s)
     images = run.camera.take(world.scene(time_s), shadow, world_from_head, cameras, boxes, brightness, time_s)
-    angles, drives = rig.state.readings_rad, tuple(run.pending)
-    run.pending = []
+    angles, drives = rig.state.readings_rad, tuple(run.drives_since_stop)
+    run.drives_since_stop = []
     view = View(leg, time_s, vehicle.stance, vehicle.estimated_pose, angles, world_from_head, images, drives)
     return guide.observe(run, view)
 
@@ -308,7 +308,7 @@ def drive_step(
             part_count = max(1, int(np.ceil(parts - 1e-9)))
             run.visual_odometry_updates += part_count
             run.time_s += part_count * p.timing.visual_odometry_s
-        run.pending += [drive_part(p, run, leg, command.part(1.0 / part_count)) for _ in range(part_count)]
+        run.drives_since_stop += [drive_part(p, run, leg, command.part(1.0 / part_count)) for _ in range(part_count)]
         run.time_s += p.timing.drive_s
     return None
 
