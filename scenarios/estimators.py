@@ -281,6 +281,7 @@ def labels(specs: Sequence[str]) -> tuple[str, ...]:
         program = re.match(r"(?:(?:exec|serve)(?:-stream)?|answers|export):\s*(\S+)", spec)
         basename = Path(program[1]).stem if program else spec.rpartition(":")[2]
         label = re.sub(r"\W", "_", basename, flags=re.ASCII)
+        # names of columns must begin with a letter
         label = label if label[:1].isalpha() else f"a_{label}"
         candidates = itertools.chain([label], (f"{label}_{number}" for number in itertools.count(2)))
         unique_labels.append(next(name for name in candidates if name not in unique_labels))

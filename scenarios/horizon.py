@@ -32,12 +32,16 @@ def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objec
     the mean height of the terrain, `albedo` that of the plain.
     """
     azimuth = np.linspace(-np.pi, np.pi, _AZIMUTHS, endpoint=False)
-    nearest, farthest = (min(h.distance_m - h.depth_m for h in hills), max(h.distance_m + h.depth_m for h in hills))
+    nearest, farthest = (
+        min(hill.distance_m - hill.depth_m for hill in hills),
+        max(hill.distance_m + hill.depth_m for hill in hills),
+    )
     distance = np.geomspace(max(nearest, 1.0), farthest, _DISTANCES)[:, None]
     height = np.zeros((_DISTANCES, _AZIMUTHS))
     for hill in hills:
         angle = azimuth - np.radians(hill.azimuth_deg)
         along, across = distance * np.cos(angle) - hill.distance_m, distance * np.sin(angle)
+        # a Gaussian of standard deviation depth / 4 and width / 4
         dome = np.exp(-2.0 * ((2.0 * along / hill.depth_m) ** 2 + (2.0 * across / hill.width_m) ** 2))
         height += hill.height_m * np.where(np.cos(angle) > 0.0, dome, 0.0)
     rng = np.random.default_rng(0)
@@ -45,16 +49,17 @@ def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objec
         noise = gaussian_filter(rng.standard_normal(height.shape), (size / 3.0, size), mode=("nearest", "wrap"))
         height *= np.maximum(1.0 + _RIDGE_HEIGHT * size / _RIDGE_SIZES[0] * noise / noise.std(), 0.0)
     x, y = distance * np.sin(azimuth), distance * np.cos(azimuth)
-    above_plain = height - distance**2 / (2.0 * _MARS_RADIUS_M)
-    vertices = np.stack([x, y, ground_m + above_plain], axis=-1)
-    by_azimuth = np.roll(vertices, -1, axis=1) - np.roll(vertices, 1, axis=1)
-    normals = np.cross(by_azimuth, np.gradient(vertices, axis=0))
+    # the plain curves away from its tangent plane by distance^2 / (2 radius)
+    height_above_plain = height - distance**2 / (2.0 * _MARS_RADIUS_M)
+    vertices = np.stack([x, y, ground_m + height_above_plain], axis=-1)
+    azimuth_tangents = np.roll(vertices, -1, axis=1) - np.roll(vertices, 1, axis=1)
+    normals = np.cross(azimuth_tangents, np.gradient(vertices, axis=0))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    corner = np.arange(height.size, dtype=np.int32).reshape(height.shape)
-    right = np.roll(corner, -1, axis=1)
-    quads = np.stack([corner[:-1], right[:-1], right[1:], corner[1:]], axis=-1)
+    indices = np.arange(height.size, dtype=np.int32).reshape(height.shape)
+    right = np.roll(indices, -1, axis=1)
+    quads = np.stack([indices[:-1], right[:-1], right[1:], indices[1:]], axis=-1)
     # omit faces below `_MIN_FACE_HEIGHT_M`: they would intersect the terrain; bodies are sectors of azimuth
-    row, column = np.nonzero(np.all(above_plain.reshape(-1)[quads] > _MIN_FACE_HEIGHT_M, axis=-1))
+    row, column = np.nonzero(np.all(height_above_plain.reshape(-1)[quads] > _MIN_FACE_HEIGHT_M, axis=-1))
     order = np.argsort(column // _LINES_PER_BODY, kind="stable")
     quad, body = quads[row, column][order], (column // _LINES_PER_BODY)[order]
     faces = np.stack([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
@@ -68,22 +73,26 @@ def add_unresolved_rocks(
 ) -> Frame:
     """Blend the mean radiance of the rendered rocks into ground pixels that rocks below the resolution occlude.
 
-    Rocks with diameters below ``smallest_rad x range`` are not drawn. At grazing view they hide the ground. The visible
-    fraction of the ground is ``exp(-A / t)`` with ``t**2 = tan(e)**2 + rms_slope**2``. Here A is the frontal area of
-    these rocks per square metre, and e is the angle between the line of sight and level ground. Range and normals are
-    not changed.
+    Rocks with diameters below ``smallest_rad x range`` are not rendered. At grazing view they hide the ground. The
+    visible fraction of the ground is ``exp(-A / t)`` with ``t**2 = tan(e)**2 + rms_slope**2``. Here A is the frontal
+    area of these rocks per square metre, and e is the angle between the line of sight and level ground. Range and
+    normals are not changed.
     """
-    # the bodies -1 (ground) and -2 (sky) index the two appended negative names
+    # bodies -1 (ground) and -2 (sky) select the two appended names, which are negative like all names except rocks
     is_rock = np.append(scene.objects.names, [-2, -1])[frame.body] >= 0
     if rocks is None or len(rocks) == 0 or not np.any(is_rock):
         return frame
     order = np.argsort(rocks.diameter_m)
     areas = _SILHOUETTE_FRACTION * (rocks.diameter_m * rocks.height_m)[order] / rocks.period_m**2
     area_below = np.concatenate([[0.0], np.cumsum(areas)])
-    smaller = np.searchsorted(rocks.diameter_m[order], smallest_rad * np.where(frame.body == -1, frame.range_m, 0.0))
+    unresolved_counts = np.searchsorted(
+        rocks.diameter_m[order], smallest_rad * np.where(frame.body == -1, frame.range_m, 0.0)
+    )
     up = frame.rays.directions.reshape(*frame.range_m.shape, 3) @ frame.world_from_body.rotation.as_matrix()[2]
-    tangent = np.maximum(-up, 1e-4) / np.sqrt(np.maximum(1.0 - up**2, 1e-8))
-    occluded_fraction = -np.expm1(-area_below[smaller] / np.hypot(tangent, rms_slope)).astype(np.float32)
-    rock = frame.radiance[is_rock].mean()
-    blended = frame.radiance + occluded_fraction * (rock - frame.radiance)
+    tan_elevation = np.maximum(-up, 1e-4) / np.sqrt(np.maximum(1.0 - up**2, 1e-8))
+    occluded_fraction = -np.expm1(-area_below[unresolved_counts] / np.hypot(tan_elevation, rms_slope)).astype(
+        np.float32
+    )
+    rock_radiance = frame.radiance[is_rock].mean()
+    blended = frame.radiance + occluded_fraction * (rock_radiance - frame.radiance)
     return replace(frame, radiance=np.where(frame.body == -1, blended, frame.radiance))

@@ -90,8 +90,8 @@ class MeshParameters(UserFile):
             lengths = np.linalg.norm(normals, axis=1, keepdims=True)
             normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0).repeat(3, axis=0)
         faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-        numbers = np.full(len(faces), FIRST_MESH_NUMBER, dtype=np.int32)
-        return Objects.of_mesh(corners, normals, faces, numbers, self.albedo or _ALBEDO[self.kind])
+        body_numbers = np.full(len(faces), FIRST_MESH_NUMBER, dtype=np.int32)
+        return Objects.of_mesh(corners, normals, faces, body_numbers, self.albedo or _ALBEDO[self.kind])
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +111,8 @@ def add_meshes(scene: Scene, meshes: Sequence[MeshParameters], point: tuple[floa
     """Add meshes to a scene, each at its periodic position nearest to a point (x, y)."""
     if not meshes:
         return scene
-    placed = Objects.join([mesh.place_on_ground(scene.surface, point) for mesh in meshes])
-    return scene.with_objects(Objects.join([scene.objects, placed]))
+    mesh_objects = Objects.join([mesh.place_on_ground(scene.surface, point) for mesh in meshes])
+    return scene.with_objects(Objects.join([scene.objects, mesh_objects]))
 
 
 def read_mesh(path: str) -> Mesh:
@@ -127,8 +127,8 @@ def read_mesh(path: str) -> Mesh:
 
 
 @lru_cache(maxsize=16)
-def _read(path: str, _changed_ns: int) -> Mesh:
-    """Read a mesh; the time of the last change is part of the cache's key."""
+def _read(path: str, _modified_ns: int) -> Mesh:
+    """Read a mesh; the modification time is part of the cache's key."""
     import trimesh
 
     kind = Path(path).suffix.lower().lstrip(".")
@@ -147,13 +147,13 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     if size > MAX_BYTES:
         raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MAX_BYTES >> 20} MiB")
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
+        mesh = trimesh.load(path, force="mesh", process=False)
         digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except Exception as error:  # each reader raises different exceptions
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MeshFileError(f"{path}: cannot be read as a mesh ({reason})") from error
     # the arrays of trimesh are read-only, which rotations do not accept
-    triangles = np.array(getattr(loaded, "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
+    triangles = np.array(getattr(mesh, "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
     if len(triangles) == 0:
         raise MeshFileError(f"{path}: contains no triangle")
     if len(triangles) > MAX_FACES:
@@ -163,9 +163,9 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     if not np.ptp(triangles.reshape(-1, 3), axis=0).all():
         raise MeshFileError(f"{path}: is flat; allowed: bodies that extend along all axes")
     # equal corners become one vertex, so that normals are smooth even over unconnected triangles
-    vertices, numbers = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
-    merged = trimesh.Trimesh(vertices, numbers.reshape(-1, 3), process=False)
-    return Mesh(digest, triangles, np.array(merged.vertex_normals, dtype=np.float64)[np.array(merged.faces)])
+    vertices, vertex_indices = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    merged_mesh = trimesh.Trimesh(vertices, vertex_indices.reshape(-1, 3), process=False)
+    return Mesh(digest, triangles, np.array(merged_mesh.vertex_normals, dtype=np.float64)[np.array(merged_mesh.faces)])
 
 
 def _accessor_bytes(contents: bytes, kind: str) -> int:

@@ -69,6 +69,7 @@ class AnswerFormat(Generic[Answer]):
 
 
 def _create_velocity(outcome: Enum, numbers: Mapping[str, float]) -> VelocityEstimate:
+    """Create a velocity estimate; the columns of the covariance are its elements (0, 0), (0, 1) and (1, 1)."""
     groups = (VELOCITY_FORMAT.required, *VELOCITY_FORMAT.optional)
     velocity, covariance, span = ([numbers[name] for name in group if name in numbers] for group in groups)
     estimate = VelocityEstimate(
@@ -81,6 +82,7 @@ def _create_velocity(outcome: Enum, numbers: Mapping[str, float]) -> VelocityEst
 
 
 def _create_site(outcome: Enum, numbers: Mapping[str, float]) -> SiteEstimate:
+    """Create a site estimate; outcomes without convergence need no position."""
     position = [numbers[name] for name in SITE_FORMAT.required if name in numbers]
     estimate = SiteEstimate(SiteOutcome(outcome), np.array(position) if position else None)
     return check_site(estimate) if position or estimate.outcome.converged else estimate
@@ -144,29 +146,31 @@ class CaseExporter:
         if self.bits_per_pixel is not None:
             bits, images = self.bits_per_pixel, measurements.images
             counts = [compress(image.counts, bits, image.calibration.full_scale_dn) for image in images]
-            lossy = tuple(replace(image, counts=values) for image, values in zip(images, counts, strict=True))
-            measurements = replace(measurements, images=lossy)
-        unfinished = self.folder.with_name(f"{self.folder.name}.part{os.getpid()}")
-        shutil.rmtree(unfinished, ignore_errors=True)
-        unfinished.mkdir(parents=True)
-        write_case(unfinished, measurements, image_format="png")
+            compressed_images = tuple(
+                replace(image, counts=values) for image, values in zip(images, counts, strict=True)
+            )
+            measurements = replace(measurements, images=compressed_images)
+        temporary_folder = self.folder.with_name(f"{self.folder.name}.part{os.getpid()}")
+        shutil.rmtree(temporary_folder, ignore_errors=True)
+        temporary_folder.mkdir(parents=True)
+        write_case(temporary_folder, measurements, image_format="png")
         shutil.rmtree(self.folder, ignore_errors=True)
-        unfinished.rename(self.folder)
+        temporary_folder.rename(self.folder)
         return self.answer_format.create_empty(measurements)
 
 
 @dataclass(frozen=True)
 class RecordedAnswer(Generic[Answer]):
-    """Replaces an algorithm: returns the answer of a table; `missing` is the error message without an answer."""
+    """Replaces an algorithm: returns the answer of a table; `error_message` is that of a missing answer."""
 
     answer: Answer | None
-    missing: str
+    error_message: str
     answer_format: AnswerFormat[Answer]
 
     def estimate(self, measurements: Any) -> Answer:
         """Return the answer. Raises AlgorithmError if the table has none."""
         if self.answer is None:
-            raise AlgorithmError(Fault.BAD_ANSWER, self.missing)
+            raise AlgorithmError(Fault.BAD_ANSWER, self.error_message)
         return self.answer_format.add_inputs(self.answer, measurements)
 
 
@@ -180,8 +184,8 @@ def read_answers(file: Path, answer_format: AnswerFormat[Answer]) -> Mapping[int
 
 
 @lru_cache(maxsize=4)
-def _read(file: Path, answer_format: AnswerFormat[Any], _time: int, _size: int) -> Mapping[int, Any]:
-    """Read a table; time and size are part of the cache's key, so that a changed file is read again."""
+def _read(file: Path, answer_format: AnswerFormat[Any], _modified_ns: int, _size: int) -> Mapping[int, Any]:
+    """Read a table; the cache's key includes modification time and size, so that a changed file is read again."""
     first_lines: dict[int, int] = {}
 
     def parse(line: int, cells: Mapping[str, str]) -> tuple[int, Any]:
@@ -192,14 +196,15 @@ def _read(file: Path, answer_format: AnswerFormat[Any], _time: int, _size: int) 
         return case, answer
 
     hint = f"allowed: {', '.join(answer_format.columns)}; the suffix of a name is its unit"
-    needed = ("case", *answer_format.required)
-    answers, problems = parse_table(file, MAX_ROWS, needed, answer_format.columns, hint, parse)
+    required = ("case", *answer_format.required)
+    answers, problems = parse_table(file, MAX_ROWS, required, answer_format.columns, hint, parse)
     if problems:
         raise ValueError(format_problems(file, problems))
     return dict(answers)
 
 
 def _parse_answer(cells: Mapping[str, str], answer_format: AnswerFormat[Any]) -> tuple[int, Any]:
+    """Convert the cells of a row to a case number and its answer. Raises ValueError for an invalid value."""
     if not cells["case"].isdecimal():
         raise ValueError(f"case is '{cells['case']}'; allowed: a whole number from 0")
     numbers = {}

@@ -179,14 +179,14 @@ class Registry:
 @cache
 def registry() -> Registry:
     """Read the systems of this installation, once per process."""
-    loaded = list(BUILT_IN)
+    loaded_systems = list(BUILT_IN)
     problems: list[str] = []
     for point in sorted(entry_points(group=GROUP), key=lambda item: (item.name, item.value)):
         try:
-            loaded.append(_load(point, loaded))
+            loaded_systems.append(_load(point, loaded_systems))
         except ValueError as error:
             problems.append(f"system '{point.name}' ({point.value}) is omitted: {error}")
-    return Registry(tuple(loaded), tuple(problems))
+    return Registry(tuple(loaded_systems), tuple(problems))
 
 
 def systems() -> tuple[System, ...]:
@@ -279,12 +279,12 @@ def row_columns(scenario: str) -> RowColumns | None:
         columns = tomllib.loads(system.columns.read_text(encoding="utf-8")).get(scenario)
         if columns is None:
             return None
-        truth = columns.get("from_truth", {})
+        from_truth = columns.get("from_truth", {})
         return RowColumns(
             tuple(columns["flags"]),
             tuple(columns["numbers"]),
             columns.get("named_flags", ""),
-            dict(truth) if isinstance(truth, Mapping) else dict.fromkeys(truth, ""),
+            dict(from_truth) if isinstance(from_truth, Mapping) else dict.fromkeys(from_truth, ""),
             tuple(columns.get("configured", ())),
         )
     except (OSError, ValueError, LookupError, TypeError) as error:

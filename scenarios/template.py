@@ -97,8 +97,10 @@ VELOCITY = CampaignTemplate(
     scale="descent",
     site="gusev",
     bound=5.0,
-    bound_text="horizontal velocity within this many m/s (5 of the DIMES requirement)",
-    values=lambda c: {"binned_size": binned_size_for(*read_camera(c.camera).size)} if c.camera else {},
+    bound_text="maximum error of the horizontal velocity, m/s (DIMES requirement: 5)",
+    values=lambda choices: (
+        {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}
+    ),
 )
 LANDING = CampaignTemplate(
     file=SCENARIOS_FOLDER / "landing" / "new.toml.j2",
@@ -114,6 +116,6 @@ TRACKING = CampaignTemplate(
     scale="ground",
     site="mars-yard",
     bound=0.03,
-    bound_text="position of the target within this many metres at the goal",
+    bound_text="maximum error of the target's position at the goal, m",
     refused={"camera": _REFUSED_CAMERA, "detector": _REFUSED_CAMERA, "flight": _REFUSED_FLIGHT.format("tracking")},
 )

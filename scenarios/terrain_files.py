@@ -35,6 +35,7 @@ _ARRAYS = {"dem": 2, "dem_gsd": 0, "ortho": 2, "ortho_gsd": 0, "ortho_valid": 2}
 
 
 def _check_terrain(terrain: TerrainParameters) -> TerrainParameters:
+    """Check the files of a terrain from a model. Raises TerrainFileError."""
     if terrain.source is not None:
         check_source(terrain.source)
     return terrain
@@ -59,7 +60,7 @@ def site_validator(user: str, scale: str) -> AfterValidator:
 def check_source(source: RealTerrain) -> None:
     """Raise TerrainFileError for invalid files; the message contains the file and the problem."""
     paths = [path for path in (source.dtm, source.ortho) if path is not None]
-    _check_files(source, tuple(_check_present(path).st_mtime_ns for path in paths))
+    _check_files(source, tuple(_require_file(path).st_mtime_ns for path in paths))
 
 
 @lru_cache(maxsize=16)
@@ -67,11 +68,11 @@ def _check_files(source: RealTerrain, _modified_ns: tuple[int, ...]) -> None:
     """Check the files; the modification times are a key of the cache, so that changed files are checked again."""
     dtm = source.dtm
     if dtm.suffix == ".npz":
-        _raise_first(dtm, _npz_problems(source))
+        _raise_first_problem(dtm, _npz_problems(source))
         _check_values(dtm, read_rasters(source)[0].values, source, "mark posts without height with NaN")
         dtm_crs = None
     else:
-        dtm_crs = _check_geotiff(dtm, _MAX_POSTS, heights_of=source)
+        dtm_crs = _check_geotiff(dtm, _MAX_POSTS, dtm_source=source)
     if source.ortho is None:
         return
     ortho_crs = _check_geotiff(source.ortho, _MAX_PIXELS)
@@ -82,7 +83,8 @@ def _check_files(source: RealTerrain, _modified_ns: tuple[int, ...]) -> None:
         )
 
 
-def _check_present(path: Path) -> os.stat_result:
+def _require_file(path: Path) -> os.stat_result:
+    """Return the status of a file. Raises TerrainFileError if it is missing, not a regular file, or empty."""
     try:
         status = check_regular(path)
     except FileNotFoundError:
@@ -122,7 +124,7 @@ def _npz_problems(source: RealTerrain) -> Iterator[str]:
                 yield f"{name} is {posting}; allowed: metres between posts, above 0"
 
 
-def _geotiff_problems(file: Any, max_side: int, are_heights: bool) -> Iterator[str]:
+def _geotiff_problems(file: Any, max_side: int, is_dtm: bool) -> Iterator[str]:
     """Yield problems of a GeoTIFF's size, cells and projection and, for heights, of their unit and type."""
     if min(file.width, file.height) < 4:
         yield f"has {file.width} x {file.height} values; allowed: at least 4 x 4"
@@ -149,7 +151,7 @@ def _geotiff_problems(file: Any, max_side: int, are_heights: bool) -> Iterator[s
             f"its projection stretches lengths by {scale.min_ratio:.3f} to {scale.max_ratio:.3f}, depending on their "
             f"direction; allowed: within {_MAX_STRETCH:g} of 1: project it about its centre with rio warp --dst-crs"
         )
-    if not are_heights:
+    if not is_dtm:
         return
     if file.dtypes[0] == "uint8":
         yield "contains 8-bit values, as in an image; allowed: heights in metres"
@@ -159,31 +161,31 @@ def _geotiff_problems(file: Any, max_side: int, are_heights: bool) -> Iterator[s
         yield f"has scale {file.scales[0]:g} and offset {file.offsets[0]:g}; apply them with rio calc"
 
 
-def _raise_first(path: Path, problems: Iterator[str]) -> None:
+def _raise_first_problem(path: Path, problems: Iterator[str]) -> None:
     """Raise TerrainFileError for the first problem only: later checks assume that earlier checks passed."""
     problem = next(problems, None)
     if problem is not None:
         raise TerrainFileError(f"{path}: {problem}")
 
 
-def _check_geotiff(path: Path, max_side: int, *, heights_of: RealTerrain | None = None) -> Any:
+def _check_geotiff(path: Path, max_side: int, *, dtm_source: RealTerrain | None = None) -> Any:
     """Check the header and, for a DTM, the heights; return the projection."""
     with _open(path) as file:
-        _raise_first(path, _geotiff_problems(file, max_side, heights_of is not None))
-        if heights_of is None:
+        _raise_first_problem(path, _geotiff_problems(file, max_side, dtm_source is not None))
+        if dtm_source is None:
             return file.crs
         values = file.read(1, masked=True)
         if values.dtype.kind not in "iuf":
             raise TerrainFileError(f"{path}: contains values of type {values.dtype}; allowed: heights in metres")
         nodata = "has no nodata value" if file.nodata is None else f"has the nodata value {file.nodata:g}"
         advice = f"it {nodata}; set the value for missing data with rio edit-info --nodata"
-        _check_values(path, values.astype(np.float64).filled(np.nan), heights_of, advice)
+        _check_values(path, values.astype(np.float64).filled(np.nan), dtm_source, advice)
         return file.crs
 
 
 def _open(path: Path) -> Any:
     """Open a GeoTIFF. Raises TerrainFileError."""
-    _check_present(path)
+    _require_file(path)
     try:
         import rasterio
     except ImportError as error:
@@ -211,8 +213,8 @@ def grid_north_deg(path: Path) -> float | None:
 def _check_values(path: Path, values: np.ndarray, source: RealTerrain, advice: str) -> None:
     """Check the number of missing heights (NaN) and the range of the valid heights."""
     check_holes(source, values)
-    valid = values[np.isfinite(values)]
-    low, high = float(valid.min()), float(valid.max())
+    valid_heights = values[np.isfinite(values)]
+    low, high = float(valid_heights.min()), float(valid_heights.max())
     if not (HEIGHTS_M[0] <= low and high <= HEIGHTS_M[1]):
         extreme = low if low < HEIGHTS_M[0] else high
         raise TerrainFileError(
@@ -258,21 +260,21 @@ def map_scale(file: Any) -> MapScale | None:
         positions = np.array(transform(file.crs, body_fixed, xs, ys, [0.0] * 4), dtype=np.float64).T
     except (RasterioError, ValueError):
         return None
-    # ground lengths divided by map lengths along x and y
+    # derivatives of the ground position with respect to the map's x and y
     length = 2.0 * step * unit_m
-    east, north = (positions[1] - positions[0]) / length, (positions[3] - positions[2]) / length
+    tangent_x, tangent_y = (positions[1] - positions[0]) / length, (positions[3] - positions[2]) / length
     # the eigenvalues of the Gram matrix are the squared extreme ratios
-    gram = np.array([[east @ east, east @ north], [east @ north, north @ north]])
+    gram = np.array([[tangent_x @ tangent_x, tangent_x @ tangent_y], [tangent_x @ tangent_y, tangent_y @ tangent_y]])
     if not np.all(np.isfinite(gram)) or np.linalg.det(gram) <= 0.0:
         return None
     ground_ratios = np.sqrt(np.linalg.eigvalsh(gram))
     azimuth_deg = None
     if float(np.hypot(*positions.mean(axis=0)[:2])) >= _POLE_CELLS * abs(cell.a) * unit_m:
-        normal = np.cross(east, north)
+        normal = np.cross(tangent_x, tangent_y)
         normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
         true_east = np.cross([0.0, 0.0, 1.0], normal)
         true_north = np.cross(normal, true_east)
-        azimuth_deg = float(np.degrees(np.arctan2(north @ true_east, north @ true_north)))
+        azimuth_deg = float(np.degrees(np.arctan2(tangent_y @ true_east, tangent_y @ true_north)))
     return MapScale(1.0 / float(ground_ratios[1]), 1.0 / float(ground_ratios[0]), azimuth_deg)
 
 

@@ -98,6 +98,7 @@ def input_files(parameters: Any) -> tuple[str, ...]:
 
 
 def _find_files(value: Any) -> Iterator[str]:
+    """Yield the input files of a value and of the values that it contains."""
     if isinstance(value, HasInputFiles):
         yield from value.input_files()
     if isinstance(value, BaseModel):
@@ -176,6 +177,7 @@ def parse_table(
 
 
 def _read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Read the header and the rows with their line numbers, without empty rows. Raises ValueError."""
     try:
         check_regular(path)
         with path.open(newline="", encoding="utf-8-sig") as text:
@@ -197,6 +199,7 @@ def _read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, l
 def _header_problems(
     header: Sequence[str], required: Sequence[str], allowed: Sequence[str], hint: str
 ) -> Iterator[str]:
+    """Yield the missing, unknown and duplicate columns of a header."""
     if not header:
         yield "it is empty"
         return
@@ -226,10 +229,10 @@ def finite_number(name: str, text: str, hint: str = "") -> float:
 def check_column_groups(groups: Iterable[Sequence[str]], values: Mapping[str, float]) -> None:
     """Raise ValueError if a row contains only some values of a group of columns."""
     for names in groups:
-        filled = [name for name in names if name in values]
+        names_with_value = [name for name in names if name in values]
         missing = [name for name in names if name not in values]
-        if filled and missing:
-            raise ValueError(f"{filled[0]} is given, but {missing[0]} is not")
+        if names_with_value and missing:
+            raise ValueError(f"{names_with_value[0]} is given, but {missing[0]} is not")
 
 
 #: Rotations from a file's world axes to east, north, up.
@@ -261,7 +264,7 @@ class RecordedAxes(Parameters):
         return self
 
     @property
-    def world(self) -> Rotation:
+    def enu_from_axes(self) -> Rotation:
         """Rotation from the file's world axes to east, north, up."""
         return _ENU_FROM_AXES[self.axes]
 

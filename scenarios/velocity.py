@@ -25,7 +25,9 @@ _FIRST_TRIPLE: ImageTriple = (0, 1, 2)
 
 
 def run_estimator(
-    make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: ImageTriple | None = _FIRST_TRIPLE
+    create_estimator: Callable[[], VelocityEstimator],
+    measurements: DescentMeasurements,
+    triple: ImageTriple | None = _FIRST_TRIPLE,
 ) -> AlgorithmRun[VelocityEstimate]:
     """Run an estimator on a descent; the answer contains its span.
 
@@ -35,14 +37,14 @@ def run_estimator(
 
     def estimate(inputs: DescentMeasurements) -> object:
         nonlocal tags
-        estimator = make()
+        estimator = create_estimator()
         if isinstance(estimator, StreamedEstimator | CaseExporter | RecordedAnswer):
             return estimator.estimate(inputs)
         if triple is None:
             raise ValueError(f"it needs three images, but the descent has {len(measurements.images)}")
-        selected = inputs if len(measurements.images) == len(triple) else inputs.select(triple)
-        tags = selected.tags_s
-        return estimator.estimate(selected)
+        triple_inputs = inputs if len(measurements.images) == len(triple) else inputs.select(triple)
+        tags = triple_inputs.tags_s
+        return estimator.estimate(triple_inputs)
 
     return run_algorithm_on_copy(estimate, lambda answer: check_and_set_span(answer, tags), measurements)
 
@@ -62,9 +64,9 @@ def _answers_after_images(
     estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]
 ) -> list[tuple[Span, Horizontal, Horizontal]]:
     """Return a stream's span, velocity and truth after each image, NaN without a velocity; empty without a stream."""
-    missing = ((np.nan, np.nan), np.full(2, np.nan), np.full(2, np.nan))
+    no_answer = ((np.nan, np.nan), np.full(2, np.nan), np.full(2, np.nan))
     return [
-        missing
+        no_answer
         if answer is None or answer.velocity_m_s is None or answer.span_s is None
         else (answer.span_s, answer.velocity_m_s, truth(answer.span_s))
         for answer in (estimate.after_pictures if estimate is not None else ())
@@ -84,17 +86,17 @@ def stream_row(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizo
     return row | {f"velocity_error_after_{number}_m_s": error for number, error in enumerate(errors, start=1)}
 
 
-def velocity_row(name: str, estimated: Horizontal | None, true: Horizontal) -> dict[str, Scalar]:
+def velocity_row(name: str, estimate: Horizontal | None, truth: Horizontal) -> dict[str, Scalar]:
     """Return a velocity's error with the estimated and true velocity; NaN without an estimate."""
-    reported = np.full(2, np.nan) if estimated is None else estimated
-    error = reported - true
+    estimate_or_nan = np.full(2, np.nan) if estimate is None else estimate
+    error = estimate_or_nan - truth
     row: dict[str, Scalar] = {f"{name}_error_m_s": float(np.hypot(*error))}
-    for kind, values in (("error", error), ("estimated", reported), ("true", true)):
+    for kind, values in (("error", error), ("estimated", estimate_or_nan), ("true", truth)):
         row |= {f"{name}_{kind}_{axis}_m_s": float(value) for axis, value in zip("xy", values, strict=True)}
     return row
 
 
-def consistency_row(estimate: VelocityEstimate | None, true: Horizontal) -> dict[str, Scalar]:
+def consistency_row(estimate: VelocityEstimate | None, truth: Horizontal) -> dict[str, Scalar]:
     """Return the error relative to the reported covariance; empty without a covariance.
 
     `velocity_nees` is the squared error normalised by the covariance P, e' P^-1 e: for a consistent estimator with a
@@ -104,26 +106,26 @@ def consistency_row(estimate: VelocityEstimate | None, true: Horizontal) -> dict
     """
     if estimate is None or estimate.velocity_m_s is None or estimate.covariance_m2_s2 is None:
         return {}
-    error, covariance = estimate.velocity_m_s - true, estimate.covariance_m2_s2
-    sd = np.sqrt(np.diag(covariance))
+    error, covariance = estimate.velocity_m_s - truth, estimate.covariance_m2_s2
+    deviations = np.sqrt(np.diag(covariance))
     return {
-        "velocity_sd_x_m_s": float(sd[0]),
-        "velocity_sd_y_m_s": float(sd[1]),
-        "velocity_correlation": float(covariance[0, 1] / (sd[0] * sd[1])),
-        "velocity_normalised_x": float(error[0] / sd[0]),
-        "velocity_normalised_y": float(error[1] / sd[1]),
+        "velocity_sd_x_m_s": float(deviations[0]),
+        "velocity_sd_y_m_s": float(deviations[1]),
+        "velocity_correlation": float(covariance[0, 1] / (deviations[0] * deviations[1])),
+        "velocity_normalised_x": float(error[0] / deviations[0]),
+        "velocity_normalised_y": float(error[1] / deviations[1]),
         "velocity_nees": float(error @ np.linalg.solve(covariance, error)),
     }
 
 
 def velocity_products(
-    images: Sequence[UInt16[np.ndarray, "rows columns"]], estimate: VelocityEstimate | None, true: Horizontal
+    images: Sequence[UInt16[np.ndarray, "rows columns"]], estimate: VelocityEstimate | None, truth: Horizontal
 ) -> dict[str, object]:
     """Return the arrays for a case's figures."""
     arrays: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(images, start=1)}
     if estimate is not None and isinstance(estimate.details, DimesDetails):
         arrays.update(dimes_products(estimate.details))
-    arrays["velocity_true_m_s"] = true
+    arrays["velocity_true_m_s"] = truth
     if estimate is not None and estimate.velocity_m_s is not None:
         arrays["velocity_estimated_m_s"] = estimate.velocity_m_s
     return arrays

@@ -137,6 +137,7 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
     finest_m = max(_MESH_FINEST * eye.height_m, 0.8 * spacing_m)
     horizon_m = float(np.sqrt(2.0 * _MARS_RADIUS_M * eye.height_m))
     reach_m = max(_MESH_REACH_HEIGHTS * eye.height_m, _MESH_REACH_M, min(horizon_m, eye.reach_m))
+    # line k of the mesh is at finest_m * sinh(k growth) / sinh(growth)
     half_lines = int(np.ceil(np.arcsinh(reach_m / finest_m * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
     objects = select_rocks(ground, eye, reach_m)
     if ground.site.hills and np.isinf(eye.reach_m) and eye.height_m < _MAX_AMONG_ROCKS_M:
@@ -188,11 +189,11 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
         # horizontal part of the maximum distance of this size class
         horizontal = np.sqrt(max((min_diameter_m * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - eye.height_m**2, 0.0))
         radius = float(min(horizontal, reach))
-        selected = members[_find_near_rocks(field, members, eye, radius)]
-        if selected.size:
-            subset = replace(field, names={}, **{name: getattr(field, name)[selected] for name in ROCK_ARRAYS})
+        rock_indices = members[_find_near_rocks(field, members, eye, radius)]
+        if rock_indices.size:
+            subset = replace(field, names={}, **{name: getattr(field, name)[rock_indices] for name in ROCK_ARRAYS})
             mesh = subset.near(eye.east_m, eye.north_m, radius, above_m=eye.height_m, pixel_rad=pixel_rad)
-            meshes.append(replace(mesh, rock_of_face=selected[mesh.rock_of_face].astype(np.int32)))
+            meshes.append(replace(mesh, rock_of_face=rock_indices[mesh.rock_of_face].astype(np.int32)))
     if not meshes:
         return Objects.none()
     # keep only triangles in the eye's sector or near the eye; offsets number vertices and bodies of the joined meshes
@@ -283,7 +284,7 @@ def mast_pose(
 ) -> RigidTransform:
     """Return the pose of a mast's frame (x forward, y left, z up); azimuth clockwise from north."""
     rotation = Rotation.from_euler("ZY", [90.0 - azimuth_deg, -elevation_deg], degrees=True)
-    return rigid(rotation, _above(surface, east_m, north_m, height_m))
+    return rigid(rotation, _position_above_ground(surface, east_m, north_m, height_m))
 
 
 def nadir_pose(
@@ -294,10 +295,12 @@ def nadir_pose(
     The azimuth, clockwise from north, is that of the image's upper edge.
     """
     rotation = Rotation.from_euler("ZX", [-azimuth_deg, tilt_deg], degrees=True)
-    return rigid(rotation, _above(surface, east_m, north_m, altitude_m))
+    return rigid(rotation, _position_above_ground(surface, east_m, north_m, altitude_m))
 
 
-def _above(surface: Surface, east_m: float, north_m: float, height_m: float) -> Float64[np.ndarray, "3"]:
+def _position_above_ground(
+    surface: Surface, east_m: float, north_m: float, height_m: float
+) -> Float64[np.ndarray, "3"]:
     return np.array([east_m, north_m, float(surface.height(east_m, north_m)) + height_m])
 
 
@@ -308,21 +311,21 @@ def _find_near_rocks(
 
     All rocks with triangles of `_find_visible_triangles` are among them.
     """
-    period, selected = field.period_m, np.zeros(members.size, dtype=np.bool_)
+    period, is_selected = field.period_m, np.zeros(members.size, dtype=np.bool_)
     # larger than any shape on the steepest ground
     extent = field.diameter_m[members] + field.height_m[members]
     near_m = max(_NEAR_HEIGHTS * eye.height_m, _NEAR_M)
     eye_m = np.array([eye.east_m, eye.north_m])
-    base_offsets = field.position_m[members, :2] + np.floor(eye_m / period) * period - eye_m
+    reference_offsets = field.position_m[members, :2] + np.floor(eye_m / period) * period - eye_m
     repetitions = range(-int(np.ceil(radius_m / period)), int(np.ceil(radius_m / period)) + 1)
     for column, row in product(repetitions, repetitions):
-        offsets = base_offsets + np.array([column, row]) * period
+        offsets = reference_offsets + np.array([column, row]) * period
         distance = np.hypot(*offsets.T)
         bearing = np.abs((np.arctan2(offsets[:, 0], offsets[:, 1]) - eye.azimuth_rad + np.pi) % (2.0 * np.pi) - np.pi)
         widening = np.arcsin(np.minimum(extent / np.maximum(distance, 1e-9), 1.0))
         is_relevant = (bearing <= eye.half_width_rad + widening) | (distance <= near_m + extent)
-        selected |= is_relevant & (distance <= radius_m)
-    return selected
+        is_selected |= is_relevant & (distance <= radius_m)
+    return is_selected
 
 
 def _find_visible_triangles(mesh: RockMesh, eye: Eye) -> Bool[np.ndarray, "triangles"]:

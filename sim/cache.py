@@ -18,7 +18,7 @@ import numpy as np
 FREE_FRACTION, LIMIT_GB = 0.4, 10.0
 GIGA = 10**9
 #: Suffix of files that are being written, and the age after which such a file belongs to an interrupted process.
-UNFINISHED, ABANDONED_S = ".part", 86400.0
+UNFINISHED, MAX_UNFINISHED_AGE_S = ".part", 86400.0
 _CHECKSUM_BYTES = 4  #: Bytes of the checksum after an array.
 #: Files that this process has verified, with their state at that time: device, inode, modification time and size.
 _VERIFIED: dict[Path, tuple[int, int, int, int]] = {}
@@ -42,15 +42,15 @@ def limit_bytes(folder: Path, stored_bytes: int) -> int:
     ``MARSYARD_CACHE_GB`` if it is set; otherwise 40 % of the space that is free without the cached files, at most
     10 GB. Raises ValueError if the variable is not a positive number.
     """
-    configured = os.environ.get("MARSYARD_CACHE_GB")
-    if not configured:
+    setting = os.environ.get("MARSYARD_CACHE_GB")
+    if not setting:
         return int(min(FREE_FRACTION * (shutil.disk_usage(folder).free + stored_bytes), LIMIT_GB * GIGA))
     try:
-        gigabytes = float(configured)
+        gigabytes = float(setting)
     except ValueError:
         gigabytes = 0.0
     if not 0.0 < gigabytes < float("inf"):
-        raise ValueError(f"MARSYARD_CACHE_GB is '{configured}'; a number of gigabytes above 0 is needed")
+        raise ValueError(f"MARSYARD_CACHE_GB is '{setting}'; a number of gigabytes above 0 is needed")
     return int(gigabytes * GIGA)
 
 
@@ -76,7 +76,7 @@ def evict_files(folder: Path, new_file_bytes: int, in_use: Collection[Path] = ()
             if path.suffix != UNFINISHED:
                 entries.append((status.st_atime, path, status.st_size))
                 stored_bytes += status.st_size
-            elif time.time() - status.st_mtime > ABANDONED_S:
+            elif time.time() - status.st_mtime > MAX_UNFINISHED_AGE_S:
                 path.unlink()
     limit = limit_bytes(folder, stored_bytes)
     for _, path, size in sorted(entries):
@@ -105,7 +105,7 @@ def save_array(path: Path, array: np.ndarray) -> np.ndarray:
             part.write(_compute_checksum(array))
             part.flush()
             os.fsync(part.fileno())
-            mapped: np.ndarray = np.load(part.name, mmap_mode="r").view(np.ndarray)
+            mapped_array: np.ndarray = np.load(part.name, mmap_mode="r").view(np.ndarray)
             state = _read_file_state(Path(part.name))
             Path(part.name).replace(path)
         except BaseException:
@@ -116,7 +116,7 @@ def save_array(path: Path, array: np.ndarray) -> np.ndarray:
         stack.callback(os.close, descriptor)
         os.fsync(descriptor)
     _VERIFIED[path] = state
-    return mapped
+    return mapped_array
 
 
 def load_array(path: Path) -> np.ndarray | None:
@@ -127,12 +127,12 @@ def load_array(path: Path) -> np.ndarray | None:
     """
     try:
         state = _read_file_state(path)
-        mapped: np.ndarray = np.load(path, mmap_mode="r").view(np.ndarray)
+        mapped_array: np.ndarray = np.load(path, mmap_mode="r").view(np.ndarray)
         if _VERIFIED.get(path) != state:
             with path.open("rb") as file:
                 file.seek(-_CHECKSUM_BYTES, os.SEEK_END)
-                stored = file.read()
-            if stored != _compute_checksum(mapped):
+                stored_checksum = file.read()
+            if stored_checksum != _compute_checksum(mapped_array):
                 raise ValueError("its checksum does not match its content")
     except FileNotFoundError:
         return None
@@ -140,13 +140,15 @@ def load_array(path: Path) -> np.ndarray | None:
         warnings.warn(f"the cached file {path} is damaged and will be rebuilt: {error}", CacheWarning, stacklevel=2)
         return None
     _VERIFIED[path] = state
-    return mapped
+    return mapped_array
 
 
 def _read_file_state(path: Path) -> tuple[int, int, int, int]:
+    """Return device, inode, modification time (ns) and size of a file."""
     status = path.stat()
     return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def _compute_checksum(array: np.ndarray) -> bytes:
+    """Compute the CRC-32 of an array's elements."""
     return zlib.crc32(np.ascontiguousarray(array).data).to_bytes(_CHECKSUM_BYTES, "little")

@@ -106,7 +106,9 @@ def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]
             AltitudeMeasurement(faults.shield_range_m + SHIELD_FALL_M_S * (altitude.time_s - first_s), altitude.time_s)
             for altitude in altitudes
         ]
-    errors = [faults.altitude_error + faults.altitude_error_once * (n == FAULTY_IMAGE) for n in range(len(altitudes))]
+    errors = [
+        faults.altitude_error + faults.altitude_error_once * (index == FAULTY_IMAGE) for index in range(len(altitudes))
+    ]
     return [
         AltitudeMeasurement(altitude.altitude_m * (1.0 + error), altitude.time_s)
         for altitude, error in zip(altitudes, errors, strict=True)
@@ -118,13 +120,14 @@ def add_attitude_faults(
 ) -> list[AttitudeMeasurement]:
     """Tilt attitudes about two drawn horizontal axes: the first for all attitudes, the second for `FAULTY_IMAGE`."""
     axes = [np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) for azimuth in rng.uniform(-np.pi, np.pi, 2)]
-    common = Rotation.from_rotvec(np.radians(faults.attitude_error_deg) * axes[0])
-    single = Rotation.from_rotvec(np.radians(faults.attitude_error_once_deg) * axes[1])
+    common_tilt = Rotation.from_rotvec(np.radians(faults.attitude_error_deg) * axes[0])
+    single_tilt = Rotation.from_rotvec(np.radians(faults.attitude_error_once_deg) * axes[1])
     return [
         AttitudeMeasurement(
-            (single if n == FAULTY_IMAGE else Rotation.identity()) * common * attitude.world_from_body, attitude.time_s
+            (single_tilt if index == FAULTY_IMAGE else Rotation.identity()) * common_tilt * attitude.world_from_body,
+            attitude.time_s,
         )
-        for n, attitude in enumerate(attitudes)
+        for index, attitude in enumerate(attitudes)
     ]
 
 
@@ -275,6 +278,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     @model_validator(mode="before")
     @classmethod
     def _complete_terrain(cls, settings: Any) -> Any:
+        """Merge the table `terrain` into the terrain of the site."""
         name = settings.get("site") if isinstance(settings, Mapping) else None
         if not isinstance(name, str) or getattr(sites().get(name), "descent", None) is None:
             return settings
@@ -336,16 +340,17 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         return None if self.site is None else site(self.site).with_dust(self.dust_opacity)
 
 
-def check_binning(binned: tuple[int, int], delivered: tuple[int, int]) -> None:
+def check_binning(binned_size: tuple[int, int], delivered_size: tuple[int, int]) -> None:
     """Raise ValueError if DIMES cannot bin a delivered image to this size; both are (columns, rows)."""
-    if delivered[0] % binned[0] or delivered[1] % binned[1]:
+    if delivered_size[0] % binned_size[0] or delivered_size[1] % binned_size[1]:
         raise ValueError(
-            f"dimes.binned_size {list(binned)} does not divide the delivered image of {delivered[0]} x "
-            f"{delivered[1]} pixels; allowed: sizes that do, such as {list(binned_size_for(*delivered))}"
+            f"dimes.binned_size {list(binned_size)} does not divide the delivered image of {delivered_size[0]} x "
+            f"{delivered_size[1]} pixels; allowed: sizes that do, such as {list(binned_size_for(*delivered_size))}"
         )
 
 
 def binned_size_for(columns: int, rows: int) -> tuple[int, int]:
     """Return a binned size for DIMES: square bins, and the smallest possible width of at least 256 columns."""
-    factors = [f for f in range(1, max(columns // 256, 1) + 1) if columns % f == 0 and rows % f == 0]
+    candidates = range(1, max(columns // 256, 1) + 1)
+    factors = [factor for factor in candidates if columns % factor == 0 and rows % factor == 0]
     return columns // factors[-1], rows // factors[-1]

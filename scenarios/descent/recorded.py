@@ -48,19 +48,20 @@ class FlightFile(UserFile, RecordedAxes):
             return self.first_picture_s
         return float(read_poses(self.file).times_s[0]) + self.lead_s
 
-    def check(self, pictures_s: Sequence[float]) -> None:
+    def check(self, image_times_s: Sequence[float]) -> None:
         """Raise ValueError if the flight does not cover the images, or its camera looks up or is below the ground."""
         motion = self.motion(np.zeros(3), 0.0)
         first, last = motion.span_s
-        if first > -self.lead_s + 1e-9 or last < max(pictures_s) + END_MARGIN_S:
+        # tolerance of 1e-9 s for rounding
+        if first > -self.lead_s + 1e-9 or last < max(image_times_s) + END_MARGIN_S:
             begin, end = read_poses(self.file).times_s[[0, -1]]
             raise TrajectoryFileError(
                 f"{self.file}: covers {begin:.3f} to {end:.3f} s; images from {self.start_s:.3f} to "
-                f"{self.start_s + max(pictures_s):.3f} s, lead_s {self.lead_s:g} s before and {END_MARGIN_S:g} s after "
-                "them are needed"
+                f"{self.start_s + max(image_times_s):.3f} s, lead_s {self.lead_s:g} s before and {END_MARGIN_S:g} s "
+                "after them are needed"
             )
-        check_looks_down(self.file, motion, pictures_s)
-        for number, position in enumerate(motion.motion(np.array(pictures_s)).positions_m, start=1):
+        check_looks_down(self.file, motion, image_times_s)
+        for number, position in enumerate(motion.motion(np.array(image_times_s)).positions_m, start=1):
             if self.origin == "place" and position[2] <= 0.0:
                 raise TrajectoryFileError(
                     f"{self.file}: at image {number} the camera is {-position[2]:.1f} m below the ground at the "
@@ -70,17 +71,19 @@ class FlightFile(UserFile, RecordedAxes):
     def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
         """Transform the flight to world axes with time 0 at the first image; `ground_m` is the ground below it."""
         poses = read_poses(self.file)
-        world = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.world
-        recorded = world * Rotation.from_quat(poses.quaternions)
-        positions = world.apply(poses.positions_m) + self.lever_arms(recorded)
+        world_from_file = (
+            Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.enu_from_axes
+        )
+        attitudes = world_from_file * Rotation.from_quat(poses.quaternions)
+        positions = world_from_file.apply(poses.positions_m) + self.lever_arms(attitudes)
         if self.origin == "place":
             positions = positions + ground_m
-        return RecordedMotion(poses.times_s - self.start_s, positions, self.body_attitudes(recorded), gravity_m_s2)
+        return RecordedMotion(poses.times_s - self.start_s, positions, self.body_attitudes(attitudes), gravity_m_s2)
 
 
-def check_looks_down(name: str, motion: RecordedMotion, pictures_s: Sequence[float]) -> None:
+def check_looks_down(name: str, motion: RecordedMotion, image_times_s: Sequence[float]) -> None:
     """Raise TrajectoryFileError if the camera of the flight looks up at an image; `name` is used in the message."""
-    for number, attitude in enumerate(motion.motion(np.array(pictures_s)).attitudes, start=1):
+    for number, attitude in enumerate(motion.motion(np.array(image_times_s)).attitudes, start=1):
         axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
         if axis[2] >= 0.0:
             elevation = np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0)))

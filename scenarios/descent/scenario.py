@@ -179,6 +179,7 @@ class Descent:
 
 
 def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scalar]) -> CaseResult:
+    """Run an algorithm on a descent and compute its columns and products."""
     p, state_at_firing, measurements = descent.p, descent.at_firing, descent.measurements
     create_estimator = partial(VELOCITY.make, algorithm, p.dimes, p.executable, descent.streams.case)
     algorithm_run = run_estimator(create_estimator, measurements, p.triple_indices)

@@ -178,12 +178,12 @@ def feasible_overlap_row(
         model, centre = place_camera(camera.bin(columns, rows), state.attitude, altitude_m)
         views.append(View(blank, blank, model, centre, state.time_s, calibration, calibration.rows_summed * rows))
     sun = world.sun.direction
-    first, second = (
+    first_count, second_count = (
         len(template_candidates(view, later, search_geometry(view, later, options), sun, options).pixels)
         for view, later in pairwise(views)
     )
     return {
-        "feasible_overlap": min(first, second) > 0,
-        "feasible_overlap_first_pair": first,
-        "feasible_overlap_second_pair": second,
+        "feasible_overlap": min(first_count, second_count) > 0,
+        "feasible_overlap_first_pair": first_count,
+        "feasible_overlap_second_pair": second_count,
     }

@@ -129,7 +129,7 @@ class TripleParameters(Parameters):
 
 
 class FieldTestParameters(AlgorithmSelection, CustomScores):
-    """A field test: its runs and their common settings. Case i is a triple of one of the runs."""
+    """A field test: its runs and their common settings. Each case is a triple of one run."""
 
     task = VELOCITY
     scored = ScoredFlight
@@ -155,9 +155,9 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
     @model_validator(mode="after")
     def _check_run_names(self) -> FieldTestParameters:
         names = [run.name for run in self.runs]
-        repeated = sorted({name for name in names if names.count(name) > 1})
-        if repeated:
-            raise ValueError(f"several runs have the same name: {', '.join(repeated)}")
+        duplicates = sorted({name for name in names if names.count(name) > 1})
+        if duplicates:
+            raise ValueError(f"several runs have the same name: {', '.join(duplicates)}")
         return self
 
     @property

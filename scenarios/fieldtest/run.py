@@ -44,8 +44,8 @@ _MARGIN_POSTS = 2
 _TARGET_EDGE_RAYS = 4
 #: Minimum number of sightings of a pass: two directions determine an attitude, one more checks it.
 _MIN_SIGHTINGS = 3
-#: Spacing of the mesh below the targets, in posts of the terrain.
-_MESH_POSTS = 0.67
+#: Spacing of the mesh below the targets, in samples of the terrain.
+_MESH_SAMPLES = 0.67
 
 
 class Category(StrEnum):
@@ -179,7 +179,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     clouds = None
     if run.clouds is not None:
         clouds = CloudLayer.draw(run.clouds, generator("clouds"), ground_m=float(flight.origin_m[2]))
-    flown = FlownRun(key, clouds, flight)
+    flown_run = FlownRun(key, clouds, flight)
     interval = p.pictures.interval_s
     pass_times = [np.arange(leg.start_s + 0.5 * interval, leg.end_s, interval) for leg in flight.passes]
     times = np.concatenate(pass_times)
@@ -187,7 +187,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     clock = Clock.draw(p.pictures.clock, generator("camera clock"))
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
     position = gps.measure(flight, times, generator("gps noise")).values
-    solution = _estimate_attitudes(flown, ground, clock, gps)
+    solution = _estimate_attitudes(flown_run, ground, clock, gps)
     attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
     elevation_model = simulate_elevation_model(p.elevation, surface, horizontal, generator("elevation model"))
@@ -253,10 +253,10 @@ def render_and_detect_targets(
     p, key = run.key.field_test, run.key
     scene = build_start_scene(run, ground, p.helicopter.fly_over_m)
     objects = Objects.join([scene.objects, targets.panels(p.targets.albedo)])
-    # more rays at edges than for rocks, because a side of a target is 2 pixels; mesh lines at most one post apart,
-    # because coarser ground would hide some of the targets
+    # more rays at edges than for rocks, because a side of a target is 2 pixels; mesh lines at most one
+    # terrain sample apart, because coarser ground would hide some of the targets
     scene = replace(
-        scene, objects=objects, edge_rays=_TARGET_EDGE_RAYS, mesh_finest_m=_MESH_POSTS * ground.surface.spacing_m
+        scene, objects=objects, edge_rays=_TARGET_EDGE_RAYS, mesh_finest_m=_MESH_SAMPLES * ground.surface.spacing_m
     )
     camera, detector, noise = key.calibrated_camera(), key.detector(), key.generator(f"targets at {times_s[0]:.0f} s")
     prior_error = np.radians(p.targets.prior_deg) * key.generator("platform alignment").standard_normal(3)

@@ -130,15 +130,18 @@ def _find_triple(p: FieldTestParameters, case: int) -> tuple[int, int]:
 
 
 def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
-    """Return the run and triple of each case; the first n cases contain all runs and categories in proportion."""
-    # triple k of n in its category has the rank (k + 0.5) / n; the cases are sorted by rank
-    ranked = []
+    """Return the run and triple of each case.
+
+    Triple k of the n triples of a category has the rank (k + 0.5) / n. Sorting by rank mixes all runs and categories in
+    proportion, so that any number of first cases is representative.
+    """
+    ranks = []
     for number, run in enumerate(p.runs):
         start = 0
         for count in (run.short_time, run.same_direction, run.opposite_direction):
-            ranked += [((index + 0.5) / count, number, start + index) for index in range(count)]
+            ranks += [((index + 0.5) / count, number, start + index) for index in range(count)]
             start += count
-    return [(number, index) for _, number, index in sorted(ranked)]
+    return [(number, index) for _, number, index in sorted(ranks)]
 
 
 def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, "2 3"]:
@@ -161,14 +164,14 @@ def measure(
 ) -> DescentMeasurements:
     """Create an estimator's inputs: time tags at the virtual interval, and the calibrated camera (paper, III.D)."""
     tags = [number * p.triples.virtual_interval_s for number in range(len(images))]
-    tagged_indices = list(zip(case.triple.image_indices, tags, strict=True))
+    indices_and_tags = list(zip(case.triple.image_indices, tags, strict=True))
     altitudes = case.run.images.altitude_m
     return DescentMeasurements(
         images=tuple(
             DetectorImage(counts, tag, camera, detector.calibration) for counts, tag in zip(images, tags, strict=True)
         ),
-        attitudes=tuple(AttitudeMeasurement(case.run.attitudes[k], tag) for k, tag in tagged_indices),
-        altitudes=tuple(AltitudeMeasurement(float(altitudes[k]), tag) for k, tag in tagged_indices),
+        attitudes=tuple(AttitudeMeasurement(case.run.attitudes[index], tag) for index, tag in indices_and_tags),
+        altitudes=tuple(AltitudeMeasurement(float(altitudes[index]), tag) for index, tag in indices_and_tags),
         interval_velocities_m_s=truth_velocities(p, case),
         sun_direction=case.run.sun(case.states[1].time_s),
     )
@@ -177,6 +180,7 @@ def measure(
 def _conditions(
     p: FieldTestParameters, case: Case, measurements: DescentMeasurements, surface: Surface
 ) -> dict[str, Scalar]:
+    """Compute the columns of a case's conditions and measurement errors."""
     run, indices = case.run, list(case.triple.image_indices)
     true_altitudes = height_above_ground(surface, np.stack([state.position_m for state in case.states]))
     row: dict[str, Scalar] = {

@@ -54,7 +54,7 @@ class Targets:
     def draw(
         cls, p: TargetParameters, surface: Surface, centre_m: Float64[np.ndarray, "2"], rng: np.random.Generator
     ) -> Targets:
-        """Draw panels on the ground around a position; the first `used` of them are used."""
+        """Draw `placed` panels on the ground around a position; return the first `used` of them."""
         points = centre_m + rng.uniform(-p.within_m, p.within_m, (p.placed, 2))[: p.used]
         error = p.survey_m * rng.standard_normal((p.used, 3))
         # corners of squares of any azimuth, counterclockwise
@@ -106,10 +106,10 @@ class Sightings:
         """Compute the directions from the centroids in each image (columns, rows); NaN for targets not detected."""
         parts = []
         for tag, position, centroids in zip(tags_s, gps_m, centroids_px, strict=True):
-            measured = np.isfinite(centroids).all(axis=1)
-            directions = camera.rays(centroids[measured])[1]
-            surveyed = targets.surveyed_m[measured] - position
-            parts.append((np.full(len(surveyed), tag), _normalize(directions), _normalize(surveyed)))
+            is_measured = np.isfinite(centroids).all(axis=1)
+            directions = camera.rays(centroids[is_measured])[1]
+            offsets = targets.surveyed_m[is_measured] - position
+            parts.append((np.full(len(offsets), tag), _normalize(directions), _normalize(offsets)))
         times, camera_vectors, world_vectors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         return cls(times, camera_vectors, world_vectors)
 
@@ -167,18 +167,18 @@ def detect_targets(
     predicted = camera.project(prior.inv().apply(offsets))[0] / px_per_m
     # search within four standard deviations of the prior
     displacement = _find_displacement(tree, predicted, 4.0 * prior_sd_rad * height)
-    attitude, limit_m = prior, _MAX_VOTE_DISTANCE_M
+    attitude, max_distance_m = prior, _MAX_VOTE_DISTANCE_M
     predicted = predicted + displacement
     for _ in range(_ITERATIONS):
         distances, nearest = tree.query(predicted)
-        matched = np.flatnonzero(distances < limit_m)
-        if len(matched) < _MIN_TARGETS:
+        matches = np.flatnonzero(distances < max_distance_m)
+        if len(matches) < _MIN_TARGETS:
             return no_centroids
-        measured_directions = camera.rays(candidates[np.asarray(nearest)[matched]])[1]
-        attitude = Rotation.align_vectors(_normalize(offsets[matched]), _normalize(measured_directions))[0]
-        predicted, limit_m = camera.project(attitude.inv().apply(offsets))[0] / px_per_m, _MAX_FIT_DISTANCE_M
+        measured_directions = camera.rays(candidates[np.asarray(nearest)[matches]])[1]
+        attitude = Rotation.align_vectors(_normalize(offsets[matches]), _normalize(measured_directions))[0]
+        predicted, max_distance_m = camera.project(attitude.inv().apply(offsets))[0] / px_per_m, _MAX_FIT_DISTANCE_M
     distances, nearest = tree.query(predicted)
-    is_target = (distances < limit_m) & _is_inside(predicted * px_per_m, camera)
+    is_target = (distances < max_distance_m) & _is_inside(predicted * px_per_m, camera)
     if is_target.sum() < _MIN_TARGETS:
         return no_centroids
     return np.where(is_target[:, None], candidates[nearest], np.nan)
@@ -193,6 +193,7 @@ def find_bright_spots(
     """
     size = 2 * np.ceil(0.5 * np.maximum(_TOP_HAT_SIDES * side_px, _MIN_TOP_HAT_PX)).astype(int) + 1
     top_hat = ndimage.white_tophat(image.astype(np.float32), size=(int(size[1]), int(size[0])))
+    # 84.13 % of a normal distribution are below its mean plus one standard deviation
     median, high = np.percentile(top_hat, (50.0, 84.13))
     labels, count = ndimage.label(top_hat > median + _THRESHOLD_SD * (high - median), np.ones((3, 3)))
     peaks = np.array(ndimage.maximum_position(top_hat, labels, np.arange(1, count + 1)), dtype=np.int64).reshape(-1, 2)

@@ -57,12 +57,13 @@ class Flight:
         ground = float(surface.height(p.location.east_m, p.location.north_m))
         height = helicopter.transit.height_m
         start_m = np.array([p.location.east_m, p.location.north_m, ground + height])
+        # azimuths are clockwise from north, angles counterclockwise from east; `heading` is that of the image's right
         heading = -np.radians(p.flown.heading_deg)
         course = np.pi / 2 - np.radians(p.flown.heading_deg + p.flown.course_deg)
         gravity = p.preset.environment.gravity_m_s2
         transit = Transit.fly(helicopter, start_m, float(course), float(heading), gravity, streams)
         received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
-        # laser ranges to the ground, without rocks, at all images
+        # laser ranges to the ground, without rocks, at all images; no echo beyond five times the height
         transit_states = [transit.state(number) for number in range(transit.times_s.size)]
         laser = RangingUnit.draw(p.laser, streams.generator("laser"))
         axes = [np.asarray(state.attitude.apply(laser.axis)) for state in transit_states]
@@ -73,7 +74,9 @@ class Flight:
         readings = laser.readings(transit.times_s, np.array(true_ranges), streams.generator("laser noise, transit"))
         ranges = add_range_faults(p.faults, readings.values, height)[received_indices]
         calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
-        choice = choose_pair([transit.pose(int(n)) for n in received_indices], ranges, calibrated, p.pair, height)
+        choice = choose_pair(
+            [transit.pose(int(index)) for index in received_indices], ranges, calibrated, p.pair, height
+        )
         first, second = int(received_indices[choice.first]), int(received_indices[choice.second])
         poses = (transit.pose(first), transit.pose(second))
         return cls((transit_states[first], transit_states[second]), poses, transit.up_body(first), transit)
@@ -88,9 +91,11 @@ def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams
     """Compute the body's states at the two images from `PassParameters`."""
     pair = p.flown
     first = nadir_pose(surface, p.location.east_m, p.location.north_m, pair.height_m, pair.heading_deg)
-    towards = np.radians(pair.tilt_towards_deg)
+    tilt_azimuth = np.radians(pair.tilt_towards_deg)
     # a rotation about the horizontal axis to the right of the azimuth tilts the optical axis towards the azimuth
-    tilt = Rotation.from_rotvec(np.radians(pair.tilt_deg) * np.array([np.cos(towards), -np.sin(towards), 0.0]))
+    tilt = Rotation.from_rotvec(
+        np.radians(pair.tilt_deg) * np.array([np.cos(tilt_azimuth), -np.sin(tilt_azimuth), 0.0])
+    )
     attitude = tilt * first.rotation
     # body axes: x towards the image's right, y towards its upper edge, z opposite to the optical axis
     rotation = Rotation.from_rotvec(np.radians([pair.pitch_deg, pair.yaw_deg, pair.roll_deg]))
@@ -111,14 +116,17 @@ def measure_poses(
     p: LandingScenarioParameters, states: tuple[State, State], streams: Streams
 ) -> tuple[PoseMeasurement, PoseMeasurement]:
     """Draw the filter's poses with an error common to both poses, and an error of the motion between them."""
-    sd, rng = p.navigation, streams.generator("navigation")
-    position = sd.position_m * rng.standard_normal(3)
-    motion = sd.motion_m * rng.standard_normal(3)
-    tilt, azimuth = np.radians(sd.tilt_deg) * rng.standard_normal(2), np.radians(sd.azimuth_deg) * rng.standard_normal()
-    rotation_error = np.radians(sd.turn_deg) * rng.standard_normal(3)
-    common = Rotation.from_rotvec(np.array([tilt[0], tilt[1], azimuth]))
+    deviations, rng = p.navigation, streams.generator("navigation")
+    position = deviations.position_m * rng.standard_normal(3)
+    motion = deviations.motion_m * rng.standard_normal(3)
+    tilt, azimuth = (
+        np.radians(deviations.tilt_deg) * rng.standard_normal(2),
+        np.radians(deviations.azimuth_deg) * rng.standard_normal(),
+    )
+    rotation_error = np.radians(deviations.turn_deg) * rng.standard_normal(3)
+    common_rotation = Rotation.from_rotvec(np.array([tilt[0], tilt[1], azimuth]))
     positions = (position, position + motion)
-    rotations = (common, Rotation.from_rotvec(rotation_error) * common)
+    rotations = (common_rotation, Rotation.from_rotvec(rotation_error) * common_rotation)
     first, second = (
         PoseMeasurement(rigid(rotation * state.attitude, state.position_m + offset), state.time_s)
         for state, offset, rotation in zip(states, positions, rotations, strict=True)
@@ -156,14 +164,14 @@ def choose_pair(
     views = [_ImageView.from_pose(camera, pose) for pose in poses]
     best, best_score = None, (False, -np.inf)
     max_shift_px = np.inf if parameters.max_shift_px is None else parameters.max_shift_px
-    for i, first in enumerate(views[:-1]):
-        distance = float(ranges_m[i]) if np.isfinite(ranges_m[i]) else height_m
-        level = float(first.centre_m[2] + distance * first.axis[2])
-        first_footprint = first.footprint(level, first.centre_m)
-        for j, second in enumerate(views[i + 1 :], start=i + 1):
+    for first_index, first in enumerate(views[:-1]):
+        distance = float(ranges_m[first_index]) if np.isfinite(ranges_m[first_index]) else height_m
+        ground_m = float(first.centre_m[2] + distance * first.axis[2])
+        first_footprint = first.footprint(ground_m, first.centre_m)
+        for second_index, second in enumerate(views[first_index + 1 :], start=first_index + 1):
             step = second.centre_m - first.centre_m
             baseline = float(np.linalg.norm(step - (step @ first.axis) * first.axis))
-            second_footprint = second.footprint(level, first.centre_m)
+            second_footprint = second.footprint(ground_m, first.centre_m)
             overlap, shift_px = 0.0, np.inf
             if first_footprint is not None and second_footprint is not None:
                 shared_area = cv2.intersectConvexConvex(first_footprint, second_footprint)[0]
@@ -174,7 +182,7 @@ def choose_pair(
             score = overlap * min(baseline / (parameters.max_baseline_fraction * distance), 1.0)
             if (is_usable, score) > best_score:
                 best_score = (is_usable, score)
-                best = PairChoice(i, j, baseline, overlap)
+                best = PairChoice(first_index, second_index, baseline, overlap)
     if best is None:
         raise ValueError("no pair of images has finite poses")
     return best

@@ -42,7 +42,7 @@ from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters,
 from marsyard.sim.streams import Streams
 
 #: Maximum number of iterations of a landing, and maximum change of the path at convergence, metres.
-MAX_ITERATIONS, CONVERGED_M = 8, 1e-3
+MAX_ITERATIONS, MAX_PATH_CHANGE_M = 8, 1e-3
 
 
 class HelicopterParameters(Parameters):
@@ -68,7 +68,7 @@ class HelicopterParameters(Parameters):
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """Time span from the flight's start to its latest possible end."""
+        """Time span from the flight's start to its latest possible end, with 1 s of margin."""
         end = self.transit.pictures_s + self.guidance.wait_s + self.guidance.max_duration_s + self.guidance.rest_s
         return -self.transit.lead_s, end + 1.0
 
@@ -121,17 +121,17 @@ class NavigatedLeg:
         initial: FilterState | None = None,
     ) -> NavigatedLeg:
         """Simulate instruments and filter on one leg; `leg` selects its random streams."""
-        fixes = instruments.receiver.sampling.within(start_s, end_s)
+        fix_times = instruments.receiver.sampling.within(start_s, end_s)
         increments = instruments.imu.increments(
             trajectory, start_s, end_s, streams.generator(f"inertial unit's noise, {leg}")
         )
-        solutions = instruments.receiver.measure(trajectory, fixes, streams.generator(f"receiver's noise, {leg}"))
+        solutions = instruments.receiver.measure(trajectory, fix_times, streams.generator(f"receiver's noise, {leg}"))
         readings = instruments.compass.measure(
             trajectory, instruments.compass.sampling.within(start_s, end_s), streams.generator(f"compass' noise, {leg}")
         )
         start = instruments.navigation.initialize(solutions, readings) if initial is None else initial
         solution = instruments.navigation.run(start, increments, solutions, readings)
-        return cls(solution, instruments.imu.boundaries(start_s, end_s), solutions, readings, fixes)
+        return cls(solution, instruments.imu.boundaries(start_s, end_s), solutions, readings, fix_times)
 
     def errors(self, trajectory: Trajectory) -> Float64[np.ndarray, "m 9"]:
         """Compute estimated minus true position, velocity and angles (yaw, pitch, roll) at the boundaries."""
@@ -153,7 +153,7 @@ class Transit:
     instruments: Instruments
     air: Air
     flight: RotorcraftFlight  #: true flight
-    navigated: NavigatedLeg
+    navigation_leg: NavigatedLeg
     times_s: Float64[np.ndarray, "images"]  #: true mid-exposure times
     tags_s: Float64[np.ndarray, "images"]  #: time tags of the images
 
@@ -178,11 +178,11 @@ class Transit:
             p.craft, p.transit, start_m, course_rad, heading_rad, gravity_m_s2, air, streams.generator("vibration")
         )
         instruments = Instruments.draw(p, gravity_m_s2, streams)
-        navigated = NavigatedLeg.simulate(flight.path, *flight.path.span_s, instruments, streams, "transit")
+        navigation_leg = NavigatedLeg.simulate(flight.path, *flight.path.span_s, instruments, streams, "transit")
         times = np.linspace(0.0, p.transit.pictures_s, p.transit.pictures)
         clock_stream = streams.generator("picture clock")
         tags = Clock.draw(p.picture_clock, clock_stream).tags(times, clock_stream)
-        return cls(p, instruments, air, flight, navigated, times, tags)
+        return cls(p, instruments, air, flight, navigation_leg, times, tags)
 
     def state(self, number: int) -> State:
         """Return the true state at an image."""
@@ -191,11 +191,11 @@ class Transit:
     def pose(self, number: int) -> PoseMeasurement:
         """Return the filter's pose at an image's time tag."""
         tag = float(self.tags_s[number])
-        return PoseMeasurement(self.navigated.solution.pose(tag), tag)
+        return PoseMeasurement(self.navigation_leg.solution.pose(tag), tag)
 
     def up_body(self, number: int) -> Float64[np.ndarray, "3"]:
         """Return the up vector in body axes from the inclinometers' last reading before an image."""
-        readings = self.navigated.readings
+        readings = self.navigation_leg.readings
         last = int(np.searchsorted(readings.times_s, self.tags_s[number], side="right")) - 1
         up: Float64[np.ndarray, "3"] = readings.up_body[max(last, 0)]
         return up
@@ -206,7 +206,7 @@ class Touchdown:
     """True and estimated state at the touchdown of a landing."""
 
     flight: RotorcraftFlight  #: true flight from its start to rest on the ground
-    navigated: NavigatedLeg  #: navigation from the end of the transit
+    navigation_leg: NavigatedLeg  #: navigation from the end of the transit
     time_s: float  #: time of first skid contact
     state: State  #: true state at touchdown
     estimated_m: Float64[np.ndarray, "3"]  #: position estimated by the filter at touchdown
@@ -239,16 +239,18 @@ def land(
     noise = np.hypot(laser.parameters.noise_m, laser.parameters.noise * p.guidance.flare_range_m)
     errors_m = noise * streams.generator("laser noise, landing").standard_normal(len(transit.air.gusts_m_s))
     altimeter = AltimeterErrors(laser.scale, errors_m, laser_stuck_m)
-    start = float(transit.navigated.boundaries_s[-1])
-    transit_errors = _interpolate_at_knots(path, transit.navigated.boundaries_s, transit.navigated.errors(path))
+    start = float(transit.navigation_leg.boundaries_s[-1])
+    transit_errors = _interpolate_at_knots(
+        path, transit.navigation_leg.boundaries_s, transit.navigation_leg.errors(path)
+    )
     errors, previous, end = transit_errors, None, None
-    iterations, path_change_m, initial = 0, np.inf, transit.navigated.solution.end
-    while iterations < MAX_ITERATIONS and path_change_m > CONVERGED_M:
+    iterations, path_change_m, initial = 0, np.inf, transit.navigation_leg.solution.end
+    while iterations < MAX_ITERATIONS and path_change_m > MAX_PATH_CHANGE_M:
         flight = simulate_landing(transit.flight, p.guidance, site_m[:2], errors, transit.air, ground, altimeter, end)
         path = flight.path
         end = path.span_s[1] if end is None else end  # all iterations have the duration of the first one
-        navigated = NavigatedLeg.simulate(path, start, end, transit.instruments, streams, "landing", initial)
-        leg_errors = _interpolate_at_knots(path, navigated.boundaries_s, navigated.errors(path))
+        navigation_leg = NavigatedLeg.simulate(path, start, end, transit.instruments, streams, "landing", initial)
+        leg_errors = _interpolate_at_knots(path, navigation_leg.boundaries_s, navigation_leg.errors(path))
         errors = np.concatenate([transit_errors, leg_errors[len(transit_errors) :]])
         path_change_m = np.inf if previous is None else float(np.abs(path.rows[:, :3] - previous.rows[:, :3]).max())
         previous, iterations = path, iterations + 1
@@ -264,13 +266,13 @@ def land(
     is_valid = np.isfinite(solutions.positions_m[:, 0])
     count = int(np.count_nonzero(is_valid))
     missing = np.full(3, np.nan)
-    index = int(np.searchsorted(navigated.boundaries_s, time, side="right")) - 1
+    index = int(np.searchsorted(navigation_leg.boundaries_s, time, side="right")) - 1
     return Touchdown(
         flight=flight,
-        navigated=navigated,
+        navigation_leg=navigation_leg,
         time_s=time,
         state=path.state(time),
-        estimated_m=navigated.solution.positions_m[index],
+        estimated_m=navigation_leg.solution.positions_m[index],
         gps_m=solutions.positions_m[is_valid].mean(axis=0) if count else missing,
         gps_deviation_m=solutions.reported_m[is_valid].mean(axis=0) if count else missing,
         gps_solutions=count,

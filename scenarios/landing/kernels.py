@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-#: Deviations below this limit, m, contribute their square (Huber loss): the cost function is differentiable.
-SQUARED_BELOW_M = 1e-4
+#: Limit of the Huber loss, m: quadratic below, linear above, so that the cost function is differentiable.
+HUBER_LIMIT_M = 1e-4
 #: Maximum change of the plane at convergence, m, and maximum number of iterations.
-CONVERGED_M, MAX_ITERATIONS = 1e-5, 60
+MAX_PLANE_CHANGE_M, MAX_ITERATIONS = 1e-5, 60
 
 
 @njit(cache=True)
@@ -51,16 +51,17 @@ def raise_by_triangles(heights: Array, west: float, south: float, spacing: float
 @njit(cache=True)
 def _fit_weighted_plane(x: Array, y: Array, z: Array, weights: Array, plane: Array) -> None:
     """Fit a plane by weighted least squares; write its value at the origin and its slopes to `plane`."""
-    total, mx, my, mz = 0.0, 0.0, 0.0, 0.0
+    total, mean_x, mean_y, mean_z = 0.0, 0.0, 0.0, 0.0
     for i in range(x.size):
         total += weights[i]
-        mx += weights[i] * x[i]
-        my += weights[i] * y[i]
-        mz += weights[i] * z[i]
-    mx, my, mz = mx / total, my / total, mz / total
+        mean_x += weights[i] * x[i]
+        mean_y += weights[i] * y[i]
+        mean_z += weights[i] * z[i]
+    mean_x, mean_y, mean_z = mean_x / total, mean_y / total, mean_z / total
+    # second moments about the weighted means
     xx, yy, xy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(x.size):
-        dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
+        dx, dy, dz = x[i] - mean_x, y[i] - mean_y, z[i] - mean_z
         xx += weights[i] * dx * dx
         yy += weights[i] * dy * dy
         xy += weights[i] * dx * dy
@@ -69,7 +70,7 @@ def _fit_weighted_plane(x: Array, y: Array, z: Array, weights: Array, plane: Arr
     determinant = xx * yy - xy * xy
     plane[1] = (xz * yy - yz * xy) / determinant
     plane[2] = (yz * xx - xz * xy) / determinant
-    plane[0] = mz - plane[1] * mx - plane[2] * my
+    plane[0] = mean_z - plane[1] * mean_x - plane[2] * mean_y
 
 
 @njit(cache=True)
@@ -82,10 +83,10 @@ def _fit_least_absolute_plane(x: Array, y: Array, z: Array, weights: Array) -> A
     for _ in range(MAX_ITERATIONS):
         previous[:] = plane
         for i in range(x.size):
-            weights[i] = 1.0 / max(abs(z[i] - plane[0] - plane[1] * x[i] - plane[2] * y[i]), SQUARED_BELOW_M)
+            weights[i] = 1.0 / max(abs(z[i] - plane[0] - plane[1] * x[i] - plane[2] * y[i]), HUBER_LIMIT_M)
         _fit_weighted_plane(x, y, z, weights, plane)
         change = abs(plane[0] - previous[0]) + extent * (abs(plane[1] - previous[1]) + abs(plane[2] - previous[2]))
-        if change < CONVERGED_M:
+        if change < MAX_PLANE_CHANGE_M:
             break
     return plane
 
@@ -94,7 +95,7 @@ class Disc(NamedTuple):
     """Points of a disc relative to its centre (rows, columns): all points, and those used to fit planes."""
 
     offsets: NDArray[np.int64]
-    fitted: NDArray[np.int64]
+    fit_offsets: NDArray[np.int64]
 
 
 @njit(cache=True)
@@ -106,16 +107,16 @@ def measure_footprints(
     The area contains the points farther than `limit` (m) from the plane. `centres` are grid points (row, column);
     footprints must lie within the grid.
     """
-    offsets, fitted = disc.offsets, disc.fitted
+    offsets, fit_offsets = disc.offsets, disc.fit_offsets
     slopes, roughness, areas = np.empty(len(centres)), np.empty(len(centres)), np.empty(len(centres))
-    n = fitted.shape[0]
+    n = fit_offsets.shape[0]
     x, y, z, weights = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     for m in range(n):
-        y[m], x[m] = fitted[m, 0] * spacing, fitted[m, 1] * spacing
+        y[m], x[m] = fit_offsets[m, 0] * spacing, fit_offsets[m, 1] * spacing
     for k in range(len(centres)):
         row, column = centres[k, 0], centres[k, 1]
         for m in range(n):
-            z[m] = heights[row + fitted[m, 0], column + fitted[m, 1]]
+            z[m] = heights[row + fit_offsets[m, 0], column + fit_offsets[m, 1]]
         plane = _fit_least_absolute_plane(x, y, z, weights)
         max_distance, count = 0.0, 0
         for m in range(offsets.shape[0]):

@@ -87,8 +87,8 @@ def add_receiver_outage(faults: Faults, helicopter: HelicopterParameters) -> Hel
 
 def draw_received_images(faults: Faults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
     """Draw the images of a flight that arrive, at least two; return their sorted indices."""
-    received = max(2, count - round(faults.lost_pictures * count))
-    return np.sort(rng.permutation(count)[:received]).astype(np.int64)
+    received_count = max(2, count - round(faults.lost_pictures * count))
+    return np.sort(rng.permutation(count)[:received_count]).astype(np.int64)
 
 
 def add_range_faults(faults: Faults, ranges_m: Float64[np.ndarray, "n"], height_m: float) -> Float64[np.ndarray, "n"]:
@@ -218,12 +218,17 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     @model_validator(mode="before")
     @classmethod
     def _complete_terrain(cls, settings: Any) -> Any:
+        """Merge the table `terrain` into the site's terrain at the selected scale."""
         if not isinstance(settings, Mapping):
             return settings
         name, scale = settings.get("site", "heli-hazardous"), settings.get("scale", "ground")
         changes = settings.get("terrain", {})
-        values = sites().get(name) if isinstance(name, str) else None
-        if "terrain_of" in settings or getattr(values, str(scale), None) is None or not isinstance(changes, Mapping):
+        site_preset = sites().get(name) if isinstance(name, str) else None
+        if (
+            "terrain_of" in settings
+            or getattr(site_preset, str(scale), None) is None
+            or not isinstance(changes, Mapping)
+        ):
             return settings
         return {**settings, "terrain_of": name, "terrain": site(name).terrain(scale).with_changes(changes).model_dump()}
 

@@ -96,16 +96,17 @@ def take_images(p: LandingScenarioParameters, world: World, flight: Flight, opti
     scene = add_meshes(site_scene(world.ground, eye, world.sun), world.meshes, (eye.east_m, eye.north_m))
     scene = replace(scene, caster_diameter_m=shadow_disc_m)
     noise = streams.generator("detector noise")
-    rendered = [render_state(p.render.backend, scene, optics, state) for state in flight.states]
-    frames, motions = zip(*rendered, strict=True)
+    frames_and_motions = [render_state(p.render.backend, scene, optics, state) for state in flight.states]
+    frames, motions = zip(*frames_and_motions, strict=True)
     radiances = [frame.radiance * np.float32(world.brightness) for frame in frames]
     detector = auto_expose(detector, radiances[0], p.exposure, streams.generator("test pictures")).detector
     counts = [detector.expose(radiance, noise, motion) for radiance, motion in zip(radiances, motions, strict=True)]
-    delivered = corrupt_images(counts, 2 * p.faults.repeated_picture, p.faults.black_picture, p.faults.lost_rows)
+    # the fault `repeated_picture` = 1 replaces image 2
+    delivered_images = corrupt_images(counts, 2 * p.faults.repeated_picture, p.faults.black_picture, p.faults.lost_rows)
     camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
     first, second = (
         DetectorImage(image, state.time_s, camera, detector.calibration)
-        for image, state in zip(delivered, flight.states, strict=True)
+        for image, state in zip(delivered_images, flight.states, strict=True)
     )
     return Pair((first, second), (frames[0], frames[1]))
 
@@ -159,6 +160,7 @@ class GroundTruth:
         right = flight.states[0].attitude.apply(np.array([1.0, 0.0, 0.0]))[:2]
         right = right / np.hypot(*right)
         axes = np.array([right, [-right[1], right[0]]])
+        # outline of the ground in the image; every eighth pixel suffices
         ground_points = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
         hull = cv2.convexHull(ground_points[np.all(np.isfinite(ground_points), axis=1)].astype(np.float32))
         outline = (hull[:, 0].astype(np.float64) - centre[:2]) @ axes.T
@@ -340,7 +342,7 @@ def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: Groun
     error = ground.elevation.elevation_m - exact
     is_finite = np.isfinite(error)
     values = error[is_finite]
-    if values.size < 4:
+    if values.size < 4:  # the fitted plane has three parameters
         return {}
     design = np.column_stack([local[is_finite], np.ones(values.size)])
     is_inlier = np.abs(values - np.median(values)) <= 5.0 * _robust_deviation(values)
@@ -360,5 +362,8 @@ def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: Groun
 
 
 def _robust_deviation(values: Float[np.ndarray, "n"]) -> float:
-    """Compute a robust standard deviation (1.4826 times the median absolute deviation), at least 1e-12."""
+    """Compute a robust standard deviation of at least 1e-12.
+
+    It is 1.4826 times the median absolute deviation: the ratio of the two for a normal distribution.
+    """
     return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-12)

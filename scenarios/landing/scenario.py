@@ -99,15 +99,15 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 **algorithm_run.row,
             }
             if answer is not None:
-                scored = ScoredLanding(
+                scored_case = ScoredLanding(
                     measurements=measurements,
                     answer=answer,
                     true_poses=(flight.states[0].world_from_body, flight.states[1].world_from_body),
                     states=flight.states,
                     ground=truth,
                 )
-                row |= compute_scores(p.scores, scored, {*row, *shared})
-            converged = answer is not None and estimate.outcome.converged
-            return algorithm_result(algorithm_run, converged, row, products(case, estimate))
+                row |= compute_scores(p.scores, scored_case, {*row, *shared})
+            is_converged = answer is not None and estimate.outcome.converged
+            return algorithm_result(algorithm_run, is_converged, row, products(case, estimate))
 
         return case_result(p.algorithms, evaluate, shared)

@@ -301,6 +301,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
 
 
 def _navigation_errors(flight: Flight, measurements: LandingMeasurements) -> dict[str, Scalar]:
+    """Compute the columns of the errors of inclinometers and poses."""
     states, poses = flight.states, flight.poses
     first, second = (
         (pose.world_from_body.rotation * state.attitude.inv()).as_rotvec()

@@ -186,14 +186,17 @@ def epipolar_offsets_px(
     normals = np.cross(baselines, directions)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
-    projected = later_directions - np.sum(later_directions * normals, axis=1, keepdims=True) * normals
-    from_first, from_direction = np.cross(projected, baselines), np.cross(projected, directions)
-    scale = np.sum(from_direction * from_direction, axis=1)
+    projected_directions = later_directions - np.sum(later_directions * normals, axis=1, keepdims=True) * normals
+    baseline_cross, direction_cross = (
+        np.cross(projected_directions, baselines),
+        np.cross(projected_directions, directions),
+    )
+    scale = np.sum(direction_cross * direction_cross, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        distances = -np.sum(from_first * from_direction, axis=1) / scale
-    is_in_front = np.sum((baselines + distances[:, None] * directions) * projected, axis=1) > 0.0
+        distances = -np.sum(baseline_cross * direction_cross, axis=1) / scale
+    is_in_front = np.sum((baselines + distances[:, None] * directions) * projected_directions, axis=1) > 0.0
     is_inside_arc = np.isfinite(distances) & (distances > 0.0) & is_in_front & (lengths[:, 0] > 0.0)
-    # outside the arc, use the end at infinity: no ground is in front of the first camera's lens
+    # outside the arc, use its end at infinity; the other end is the first camera, where no ground is visible
     distances = np.where(is_inside_arc, np.minimum(distances, _INFINITY_M), _INFINITY_M)
     predicted, _ = second.project(origins + distances[:, None] * directions)
     return np.asarray(later_pixels - predicted)

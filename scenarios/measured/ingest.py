@@ -58,29 +58,29 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
     Raises ValueError if the folder is invalid: the message contains the file, and the line or key. Raises OSError if
     the cases cannot be written.
     """
-    path, stored = ingest(source, target)
-    rows_summed, note, binned_size = stored.detector.rows_summed, "", None
+    path, stored_cases = ingest(source, target)
+    rows_summed, note, binned_size = stored_cases.detector.rows_summed, "", None
     if rows_summed > 1 and read_ingest_file(source).detector.rows_summed is None:
         note = (
             f"rows_summed = {rows_summed}: computed from the camera, whose pixels are longer than wide by "
             f"that factor; rows_summed under [detector] of {INGEST_FILE} overrides it"
         )
-    if stored.task == VELOCITY:
+    if stored_cases.task == VELOCITY:
         # DIMES bins delivered images, whose rows are already summed; without square bins, a bin is one pixel
-        columns, rows = stored.cases[0].pictures[0].size
+        columns, rows = stored_cases.cases[0].pictures[0].size
         binned_size = binned_size_for(columns, rows * rows_summed)
         binned_size = binned_size if rows % binned_size[1] == 0 else (columns, rows)
     template = toml_environment(Path(__file__).parent).get_template("campaign.toml.j2")
     text = template.render(
-        **stored.model_dump(include={"folder", "name", "task"}),
-        description=stored.description or _DESCRIPTIONS[stored.task],
-        cases=len(stored.cases),
+        **stored_cases.model_dump(include={"folder", "name", "task"}),
+        description=stored_cases.description or _DESCRIPTIONS[stored_cases.task],
+        cases=len(stored_cases.cases),
         file=str(final / path.name),
         binned_size=binned_size,
-        numbers=list(range(len(stored.cases))),
-        velocity_is_known=any(case.truth.velocity_m_s is not None for case in stored.cases),
+        numbers=list(range(len(stored_cases.cases))),
+        velocity_is_known=any(case.truth.velocity_m_s is not None for case in stored_cases.cases),
     )
-    return Ingested(text, len(stored.cases), sum(len(case.pictures) for case in stored.cases), note)
+    return Ingested(text, len(stored_cases.cases), sum(len(case.pictures) for case in stored_cases.cases), note)
 
 
 def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
@@ -101,7 +101,7 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
     if problems:
         raise IngestError(format_problems(table, problems))
     detector, first_camera = file.detector, next(iter(reader.cameras))
-    stored = store.StoredCases(
+    stored_cases = store.StoredCases(
         schema_version=store.SCHEMA,
         name=file.name,
         description=file.description,
@@ -114,7 +114,7 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
         ),
         cases=tuple(cases),
     )
-    return store.write_cases(target, stored), stored
+    return store.write_cases(target, stored_cases), stored_cases
 
 
 def infer_summed_rows(camera: CameraModel) -> int:
@@ -156,7 +156,9 @@ class _FolderReader:
         for earlier, later in itertools.pairwise(images):
             if later.time_s <= earlier.time_s:
                 raise later.row.error(f"time goes from {earlier.time_s:g} to {later.time_s:g} s; it must increase")
-        stored = [self._store_image(f"{number:06d}-{index}", item) for index, item in enumerate(images, start=1)]
+        stored_images = [
+            self._store_image(f"{number:06d}-{index}", image) for index, image in enumerate(images, start=1)
+        ]
         measurements: dict[str, Any] = {}
         truth = self._read_truth(images)
         if self.file.task == VELOCITY:
@@ -175,7 +177,7 @@ class _FolderReader:
             measurements["site_m"] = self._apriori_site(images[0], measurements["slant_range_m"])
         elif len({image.position_m is None for image in images}) > 1:
             raise rows[0].error(f"case '{name}': some images have a position and some have none")
-        return store.StoredCase(name=name, pictures=tuple(stored), truth=truth, **measurements)
+        return store.StoredCase(name=name, pictures=tuple(stored_images), truth=truth, **measurements)
 
     def _read_image(self, row: ImageRow) -> _RecordedImage:
         """Read a row's image and its camera in the body frame; a PDS3 label supplies missing values of the row."""
@@ -220,20 +222,25 @@ class _FolderReader:
     def _body_pose(
         self, row: ImageRow, rotation: Rotation, position: Float64[np.ndarray, "n"] | None
     ) -> tuple[Rotation, Float64[np.ndarray, "3"] | None]:
+        """Compute the body's attitude and position in world axes; the position is None if none was recorded."""
         poses = self.file.poses
         if poses is None:
             raise row.error(f"quaternions require the table [poses] in {INGEST_FILE}, which defines their axes")
-        vehicle = poses.world * rotation
+        vehicle = poses.enu_from_axes * rotation
         if position is None:
             return poses.body_attitudes(vehicle), None
-        return poses.body_attitudes(vehicle), np.asarray(poses.world.apply(position) + poses.lever_arms(vehicle))
+        return poses.body_attitudes(vehicle), np.asarray(
+            poses.enu_from_axes.apply(position) + poses.lever_arms(vehicle)
+        )
 
     def _to_world(self, row: ImageRow, vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+        """Rotate a vector from the recorded axes to world axes."""
         if self.file.poses is None:
             raise row.error(f"vectors need [poses] in {INGEST_FILE}, which defines their axes")
-        return np.asarray(self.file.poses.world.apply(vector))
+        return np.asarray(self.file.poses.enu_from_axes.apply(vector))
 
     def _store_image(self, name: str, image: _RecordedImage) -> store.StoredImage:
+        """Write an image with its camera and flat field, and return its record."""
         row, camera, counts = image.row, image.camera, image.counts
         if camera not in self.cameras:
             self.cameras[camera] = store.write_camera(self.target, len(self.cameras), camera)

@@ -213,11 +213,11 @@ def read_table(path: Path, task: str) -> dict[str, list[ImageRow]]:
     required = [column.name for column in COLUMNS if task in column.tasks and column.required == "every"]
     hint = f"allowed for {task}: {', '.join(allowed)}"
     try:
-        parsed, problems = parse_table(path, _MAX_ROWS, required, allowed, hint, _parse_row)
+        image_rows, problems = parse_table(path, _MAX_ROWS, required, allowed, hint, _parse_row)
     except ValueError as error:
         raise IngestError(str(error)) from error
     cases: dict[str, list[ImageRow]] = {}
-    for row in parsed:
+    for row in image_rows:
         cases.setdefault(row.texts["case"], []).append(row)
     if not problems:
         low, high = IMAGE_COUNTS[task]
@@ -247,14 +247,15 @@ def read_table(path: Path, task: str) -> dict[str, list[ImageRow]]:
 
 
 def _parse_row(line: int, cells: Mapping[str, str]) -> ImageRow:
-    filled = {name: cell for name, cell in cells.items() if cell}
-    numbers = {name: finite_number(name, cell) for name, cell in filled.items() if name not in _TEXT_COLUMNS}
-    row = ImageRow(line, {name: filled[name] for name in _TEXT_COLUMNS if name in filled}, numbers)
+    """Convert the cells of a row. Raises ValueError for an invalid or a missing value."""
+    cell_texts = {name: cell for name, cell in cells.items() if cell}
+    numbers = {name: finite_number(name, cell) for name, cell in cell_texts.items() if name not in _TEXT_COLUMNS}
+    row = ImageRow(line, {name: cell_texts[name] for name in _TEXT_COLUMNS if name in cell_texts}, numbers)
     for name in _POSITIVE_COLUMNS:
         if numbers.get(name, 1.0) <= 0.0:
-            raise ValueError(f"{name} is {filled[name]}; allowed: above 0")
+            raise ValueError(f"{name} is {cell_texts[name]}; allowed: above 0")
     for name in ("case", "file"):
-        if name not in filled:
+        if name not in cell_texts:
             raise ValueError(f"{name} is empty")
     check_column_groups(_COLUMN_GROUPS, numbers)
     for prefix in ("", "true_"):
@@ -303,7 +304,7 @@ def read_counts(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "rows c
 def read_image_size(path: Path) -> tuple[int, int]:
     """Read (columns, rows) from the header. Raises IngestError for other formats."""
     head = read_header(path)
-    if head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) >= 24:
+    if head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) >= 24:  # width and height in the IHDR chunk
         return struct.unpack(">II", head[16:24])
     pgm = _PGM.match(head)
     if pgm is not None:
@@ -333,9 +334,9 @@ def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
     try:
         if head.startswith(b"\x93NUMPY"):
             with path.open("rb") as file:
-                shape, kind = read_npy_header(file)
-            if len(shape) != 2 or max(shape) > _MAX_SIDE or kind.kind not in "iuf":
-                raise ValueError(f"contains an array of shape {shape} and type {kind}")
+                shape, dtype = read_npy_header(file)
+            if len(shape) != 2 or max(shape) > _MAX_SIDE or dtype.kind not in "iuf":
+                raise ValueError(f"contains an array of shape {shape} and type {dtype}")
             response = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
         else:
             counts = read_counts(path, read_image_size(path))

@@ -173,13 +173,13 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
             pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
             details = None if run.answer is None else run.answer.details
             velocity_pair = details.chosen if isinstance(details, DimesDetails) else None
-            reported = np.full(2, np.nan) if velocity is None else velocity
+            estimate_m_s = np.full(2, np.nan) if velocity is None else velocity
             row: dict[str, Scalar] = {
-                "velocity_estimated_x_m_s": float(reported[0]),
-                "velocity_estimated_y_m_s": float(reported[1]),
+                "velocity_estimated_x_m_s": float(estimate_m_s[0]),
+                "velocity_estimated_y_m_s": float(estimate_m_s[1]),
                 # this difference includes the unknown error of the inertial velocity
                 "inertial_difference_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
-                # this difference excludes it: velocity change between the intervals minus the inertial velocity change
+                # the discrepancy excludes it: estimated minus inertial velocity change between the intervals
                 "pair_discrepancy_m_s": NAN if velocity_pair is None else velocity_pair.discrepancy_m_s,
             }
             if true_velocity is not None:
@@ -239,8 +239,8 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
                 case = ScoredSite(measurements=measurements, answer=run.answer, true_poses=true_poses)
                 row |= compute_scores(p.scores, case, {*row, *conditions})
             products = hda_products(details) if isinstance(details, HdaDetails) else {}
-            converged = run.answer is not None and run.answer.outcome.converged
-            return algorithm_result(run, converged, row, {**products, **agreement_products(images, pairs)})
+            is_converged = run.answer is not None and run.answer.outcome.converged
+            return algorithm_result(run, is_converged, row, {**products, **agreement_products(images, pairs)})
 
         return case_result(p.algorithms, evaluate, conditions)
 
@@ -248,6 +248,8 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
 def _run_algorithms(
     p: AlgorithmSelection, options: Any, measurements: Any, check: Callable[[object], Answer], case: int
 ) -> Mapping[str, AlgorithmRun[Answer]]:
+    """Run all algorithms on copies of the measurements."""
+
     def estimate(spec: str, inputs: Any) -> Any:
         return p.task.make(spec, options, p.executable, case).estimate(inputs)
 
@@ -284,7 +286,7 @@ def _get_site(estimate: SiteEstimate | None) -> Float[np.ndarray, "3"] | None:
 
 
 def _descent_poses(
-    case: store.StoredCase, measurements: DescentMeasurements, estimated: Float64[np.ndarray, "2"] | None
+    case: store.StoredCase, measurements: DescentMeasurements, velocity_m_s: Float64[np.ndarray, "2"] | None
 ) -> list[RigidTransform]:
     """Return the body's poses from measured positions or, without these, from the inertial unit's velocities.
 
@@ -293,8 +295,8 @@ def _descent_poses(
     change. The agreement of images and poses then depends on the estimate as well.
     """
     velocities = measurements.interval_velocities_m_s.copy()
-    if estimated is not None:
-        velocities[:, :2] += estimated - velocities[1, :2]
+    if velocity_m_s is not None:
+        velocities[:, :2] += velocity_m_s - velocities[1, :2]
     times = np.array([image.time_s for image in measurements.images])
     positions = np.concatenate([np.zeros((1, 3)), np.cumsum(velocities * np.diff(times)[:, None], axis=0)])
     positions_m = [image.position_m for image in case.pictures]

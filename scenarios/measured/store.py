@@ -133,8 +133,8 @@ def _load(file: str) -> tuple[StoredCases, str]:
 
 
 @lru_cache(maxsize=4)
-def _read(file: str, _changed_ns: int, _size: int) -> tuple[StoredCases, str]:
-    """Read and check `cases.json`; time and size are part of the cache's key, so that a changed file is read again."""
+def _read(file: str, _modified_ns: int, _size: int) -> tuple[StoredCases, str]:
+    """Read and check `cases.json`; modification time and size are cache keys, so that a changed file is read again."""
     try:
         contents = Path(file).read_bytes()
         stored = StoredCases.model_validate_json(contents)

@@ -77,6 +77,8 @@ class InstrumentReadings:
 
 
 class _CustomInstrument(CustomPart):
+    """A user-defined instrument; subclasses define the measured quantity."""
+
     kind = INSTRUMENT
     name_key = "instrument"
     quantity: ClassVar[str]

@@ -90,10 +90,10 @@ class CustomMotion(CustomPart, RecordedAxes):
     ) -> tuple[RecordedMotion, dict[str, Scalar]]:
         """Compute the motion of a case in world axes, and its columns. Raises ValueError for invalid poses."""
         poses = check_poses(self.spec, self.create().fly(place, rng), place)
-        recorded = self.world * Rotation.from_quat(poses.quaternions_xyzw)
-        positions = self.world.apply(poses.positions_m) + self.lever_arms(recorded) + ground_m
+        attitudes = self.enu_from_axes * Rotation.from_quat(poses.quaternions_xyzw)
+        positions = self.enu_from_axes.apply(poses.positions_m) + self.lever_arms(attitudes) + ground_m
         try:
-            motion = RecordedMotion(poses.times_s, positions, self.body_attitudes(recorded), place.gravity_m_s2)
+            motion = RecordedMotion(poses.times_s, positions, self.body_attitudes(attitudes), place.gravity_m_s2)
         except ValueError as error:
             raise ValueError(f"the motion of '{self.spec}' {error}") from error
         return motion, self.columns("flight", poses.columns)

@@ -124,6 +124,7 @@ class CustomPart(Parameters):
     @model_validator(mode="before")
     @classmethod
     def _complete_options(cls, table: Any) -> Any:
+        """Add the default values of missing options."""
         if not isinstance(table, Mapping) or not isinstance(table.get(cls.name_key), str):
             return table
         options = table.get("options", {})
@@ -137,14 +138,14 @@ class CustomPart(Parameters):
         self.create()
         return self
 
-    def columns(self, prefix: str, reported: Mapping[str, Scalar]) -> dict[str, Scalar]:
+    def columns(self, prefix: str, reported_columns: Mapping[str, Scalar]) -> dict[str, Scalar]:
         """Return the result columns of a part: its name, its scalar options, and the columns that it reports.
 
         Raises ValueError for a reported column with an invalid name or value, or with the name of an option.
         """
         options = {name: value for name, value in self.options.items() if isinstance(value, bool | int | float | str)}
         row: dict[str, Scalar] = {f"{prefix}_{self.name_key}": self.spec}
-        for name, value in (*options.items(), *check_columns(self.spec, reported).items()):
+        for name, value in (*options.items(), *check_columns(self.spec, reported_columns).items()):
             if f"{prefix}_{name}" in row:
                 raise ValueError(f"'{self.spec}' reports the column {name}, which is also the name of an option")
             row[f"{prefix}_{name}"] = value
@@ -164,16 +165,16 @@ def default_or_custom(default: type[BaseModel], custom: type[CustomPart]) -> Dis
     return Discriminator(select_tag)
 
 
-def check_columns(spec: str, reported: object, *, texts: bool = True) -> dict[str, Scalar]:
+def check_columns(spec: str, reported_columns: object, *, texts: bool = True) -> dict[str, Scalar]:
     """Check and return the columns reported by a part: numbers as floats, booleans and texts unchanged.
 
-    Raises ValueError if `reported` is not a mapping, a name is not an ASCII identifier, or a value is not a number, a
-    boolean or a text; texts are allowed only if `texts` is true.
+    Raises ValueError if `reported_columns` is not a mapping, a name is not an ASCII identifier, or a value is not a
+    number, a boolean or a text; texts are allowed only if `texts` is true.
     """
-    if not isinstance(reported, Mapping):
-        raise ValueError(f"'{spec}' returns columns of type {type(reported).__name__}; allowed: a mapping")
+    if not isinstance(reported_columns, Mapping):
+        raise ValueError(f"'{spec}' returns columns of type {type(reported_columns).__name__}; allowed: a mapping")
     row: dict[str, Scalar] = {}
-    for name, value in reported.items():
+    for name, value in reported_columns.items():
         if not (isinstance(name, str) and name.isidentifier() and name.isascii()):
             raise ValueError(f"'{spec}' returns the invalid column name {name!r}; allowed: letters, digits and _")
         scalar = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value

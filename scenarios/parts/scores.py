@@ -125,9 +125,9 @@ SCORED: tuple[type[Any], ...] = (ScoredVelocity, ScoredFlight, ScoredDescent, Sc
 def accepted_cases(score: Any) -> tuple[type[Any], ...]:
     """Return the kinds of cases that a score's annotation accepts, with subclasses; all kinds without an annotation."""
     annotations = inspect.get_annotations(score if inspect.isroutine(score) else type(score).__call__)
-    annotated = [str(kind) for name, kind in annotations.items() if name != "return"]
-    classes = tuple(item for item in SCORED if any(item.__name__ in kind for kind in annotated))
-    return tuple(item for item in SCORED if issubclass(item, classes)) if annotated else SCORED
+    annotation_names = [str(kind) for name, kind in annotations.items() if name != "return"]
+    classes = tuple(item for item in SCORED if any(item.__name__ in kind for kind in annotation_names))
+    return tuple(item for item in SCORED if issubclass(item, classes)) if annotation_names else SCORED
 
 
 def load_score(spec: str, kind: type[Any] | None = None) -> Any:
@@ -140,9 +140,9 @@ def load_score(spec: str, kind: type[Any] | None = None) -> Any:
         inspect.signature(score).bind(None)
     except (TypeError, ValueError) as error:
         raise ValueError(f"'{spec}' is not a valid score: it must accept one argument, the case ({error})") from error
-    accepted = accepted_cases(score)
-    if kind is not None and kind not in accepted:
-        names = ", ".join(item.__name__ for item in accepted) or "no case"
+    case_types = accepted_cases(score)
+    if kind is not None and kind not in case_types:
+        names = ", ".join(item.__name__ for item in case_types) or "no case"
         raise ValueError(f"'{spec}' accepts {names}; allowed here: {kind.__name__}")
     return score
 
@@ -164,13 +164,13 @@ class CustomScores(Parameters):
         return specs
 
 
-def compute_scores(specs: Sequence[str], case: ScoredCase, existing: Collection[str]) -> dict[str, Scalar]:
+def compute_scores(specs: Sequence[str], case: ScoredCase, existing_columns: Collection[str]) -> dict[str, Scalar]:
     """Return the columns of all scores of a case. Raises ValueError for an invalid or an existing column."""
     row: dict[str, Scalar] = {}
     for spec, label in zip(specs, labels(specs), strict=True):
         for name, value in check_columns(spec, load_score(spec)(case), texts=False).items():
             column = f"{label}_{name}"
-            if column in row or column in existing:
+            if column in row or column in existing_columns:
                 raise ValueError(f"'{spec}' returns the column {column}, which the row already contains")
             row[column] = value
     return row

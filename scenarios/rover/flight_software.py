@@ -105,7 +105,7 @@ def plan_drive(position: Float64[np.ndarray, "2"], max_length_m: float) -> Itera
         yield DriveCommand(turn_left_rad=angle)
         yield DriveCommand(forward_m=min(chord, max_length_m))
         return
-    # an arc that starts straight ahead turns by twice the angle of its chord
+    # an arc that starts straight ahead turns by twice the angle of its chord; its length is chord * angle / sin(angle)
     arc = chord / float(np.sinc(angle / np.pi))
     length = min(arc, max_length_m)
     yield DriveCommand(forward_m=length, turn_left_rad=2.0 * angle * length / arc)
@@ -138,13 +138,13 @@ class Navigator:
     def map_points(self, points: Float64[np.ndarray, "n 3"]) -> None:
         """Add points in the estimated world frame. Raises ValueError before `map_start`."""
         if self.terrain is None:
-            raise ValueError("the map has no start")
+            raise ValueError("the map is empty; call `map_start` first")
         self.terrain = self.terrain.add_points(points)
 
     def plan(self, leg: LegParameters, target: TargetEstimate, world_from_rover: RigidTransform) -> NavigationPlan:
         """Plan the next step of a leg around the hazards of the map. Raises ValueError before `map_start`."""
         if self.terrain is None:
-            raise ValueError("the map has no start")
+            raise ValueError("the map is empty; call `map_start` first")
         axes, origin = world_from_rover.rotation.as_matrix(), world_from_rover.translation
         goal = origin + axes @ np.array([*goal_position(leg, target), 0.0])
         terrain = self.terrain

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.interface import PixelBox
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.points import cast_rover_shadow
+from marsyard.scenarios.rover.points import build_shadow_caster
 from marsyard.scenarios.rover.stops import StereoCamera
 from marsyard.scenarios.rover.world import Rig, RunWorld, Vehicle
 from marsyard.scenarios.views import STANCES
@@ -49,14 +49,14 @@ class _StereoPair:
     def draw(cls, p: RoverScenarioParameters, name: str, head: StereoHead, streams: Streams) -> _StereoPair:
         """Draw the detectors of a pair with these true and calibrated cameras."""
         factor = 1.0 / p.navigation.binning
-        binned = [(mast.left.scale(factor), mast.right.scale(factor)) for mast in (head.true, head.calibrated)]
+        binned_cameras = [(mast.left.scale(factor), mast.right.scale(factor)) for mast in (head.true, head.calibrated)]
         settings, rng = preset(name).detector.bin(p.navigation.binning), streams.generator(f"{name} response")
-        left, right = (Detector.draw(natural_fall_off(camera), settings, rng) for camera in binned[0])
+        left, right = (Detector.draw(natural_fall_off(camera), settings, rng) for camera in binned_cameras[0])
         # the exposure is metered in the binned image, which is the whole subframe
         exposure = p.exposure.model_copy(update={"of": "subframe"})
         parameters = p.model_copy(update={"exposure": exposure})
         camera = StereoCamera(parameters, (left, right), streams.generator(f"{name} noise"))
-        return cls(camera, binned[0], binned[1])
+        return cls(camera, binned_cameras[0], binned_cameras[1])
 
     def take(
         self,
@@ -75,7 +75,7 @@ class _StereoPair:
         geometry, sun = rig.calibrated.geometry, scene.sun.direction
         shadow = None
         if self.camera.parameters.rover_shadow:
-            shadow = cast_rover_shadow(
+            shadow = build_shadow_caster(
                 vehicle.rover, vehicle.stance, geometry, rig.state.true_rad, ahead, _SHADOW_RADIUS_M, sun
             )
         boxes = tuple(PixelBox((0, 0), camera.size) for camera in self.true)

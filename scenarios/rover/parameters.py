@@ -183,12 +183,17 @@ class SunParameters(Parameters):
 
     def direction(self, time_s: float) -> Float64[np.ndarray, "3"]:
         """Compute the unit vector to the sun, world axes; the sun rotates westwards about the pole."""
-        first = direction(np.radians(self.azimuth_deg), np.radians(self.elevation_deg))
+        start_direction = direction(np.radians(self.azimuth_deg), np.radians(self.elevation_deg))
         pole = direction(0.0, np.radians(self.latitude_deg))
         angle = -np.radians(self.hour_angle_deg_min * time_s / 60.0)
         cosine, sine = np.cos(angle), np.sin(angle)
-        rotated = cosine * first + sine * np.cross(pole, first) + (1.0 - cosine) * (pole @ first) * pole
-        return np.asarray(rotated / np.linalg.norm(rotated))
+        # Rodrigues' rotation formula
+        direction_at_time = (
+            cosine * start_direction
+            + sine * np.cross(pole, start_direction)
+            + (1.0 - cosine) * (pole @ start_direction) * pole
+        )
+        return np.asarray(direction_at_time / np.linalg.norm(direction_at_time))
 
     def sun_in_interval(self, index: int, angular_radius_rad: float) -> Sun:
         """Return the sun of all images in an interval of `held_s`: the sun at the centre of the interval."""

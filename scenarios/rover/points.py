@@ -118,9 +118,9 @@ class RockOutline:
         across, up = view[:, 1] / view[:, 0], view[:, 2] / view[:, 0]
         rows = []
         for low, high in pairwise(np.linspace(up.min(), up.max(), _OUTLINE_ROWS + 1)):
-            row = across[(up >= low) & (up <= high)]
-            if row.size:
-                rows.append((0.5 * (low + high), row.min(), row.max()))
+            row_tangents = across[(up >= low) & (up <= high)]
+            if row_tangents.size:
+                rows.append((0.5 * (low + high), row_tangents.min(), row_tangents.max()))
         return cls(triangles, eye, axes, np.array(rows))
 
     def point(self, across: float, up: float) -> Vector:
@@ -149,6 +149,7 @@ def find_self_occlusion(triangles: Triangles, points: Points, eye: Vector) -> Bo
 
 def find_self_shadow(triangles: Triangles, points: Points, sun_direction: Vector) -> Bool[np.ndarray, "points"]:
     """Return for each point of a rock whether the rock shadows it."""
+    # an offset towards the sun avoids intersections with a point's own triangle
     origins = points + 2.0 * _MIN_GAP_M * sun_direction
     distances = [ray_distances(triangles, origin, sun_direction[None])[0] for origin in origins]
     return np.array([np.isfinite(distance) for distance in distances], dtype=bool)
@@ -166,7 +167,7 @@ def sample_template(eye: Vector, point: Vector, half_angle_rad: float) -> Points
     return np.vstack([point, *(point + fraction * ring for fraction in _RING_RADII)])
 
 
-def cast_rover_shadow(
+def build_shadow_caster(
     rover: RoverParameters,
     stance: Stance,
     mast: MastGeometry,
@@ -175,7 +176,7 @@ def cast_rover_shadow(
     radius_m: float,
     sun_direction: Vector,
 ) -> Objects | None:
-    """Return the rover's mesh, with its mast at these angles, if its shadow may fall on the given sphere, else None."""
+    """Build the rover's mesh, with its mast at these angles, if its shadow may fall on a sphere, else return None."""
     # the mesh is built only if the rover's bounding sphere may cast a shadow on the sphere
     if not may_cast_shadow(rover_sphere(rover, stance, mast), sun_direction, centre_m, radius_m):
         return None
@@ -194,7 +195,7 @@ def rover_shades_patch(
     """Return whether the rover, with its mast at these angles, shadows a point of a patch; world axes."""
     centre = patch_m.mean(axis=0)
     radius = float(np.linalg.norm(patch_m - centre, axis=1).max())
-    body = cast_rover_shadow(rover, stance, mast, angles_rad, centre, radius, sun_direction)
+    body = build_shadow_caster(rover, stance, mast, angles_rad, centre, radius, sun_direction)
     if body is None:
         return False
     return any(np.isfinite(ray_distances(body.triangles, point, sun_direction[None])[0]) for point in patch_m)

@@ -37,7 +37,7 @@ from marsyard.scenarios.rover.flight_software import (
 )
 from marsyard.scenarios.rover.navigation_cameras import ODOMETRY_EDGE_RAYS, NavigationCameras, oracle_heights
 from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
-from marsyard.scenarios.rover.points import cast_rover_shadow
+from marsyard.scenarios.rover.points import build_shadow_caster
 from marsyard.scenarios.rover.stops import (
     DesignatedTarget,
     RunOutcome,
@@ -99,7 +99,7 @@ class Run(Setup):
     navigator: Navigator = field(default_factory=Navigator)
     odometry_pair: tuple[Stance, StereoMeasurement] | None = None  #: last pair of visual odometry, and its stance
     time_s: float = 0.0  #: time since the start
-    pending: list[Drive] = field(default_factory=list)  #: drives since the last stop
+    drives_since_stop: list[Drive] = field(default_factory=list)
 
     @classmethod
     def from_setup(cls, setup: Setup, target: DesignatedTarget) -> Run:
@@ -115,18 +115,18 @@ class Run(Setup):
 class TrackerGuide:
     """The tracker under test as guide: it receives copies of its inputs, and its answers are checked."""
 
-    def __init__(self, p: RoverScenarioParameters, run: Run, estimated: RigidTransform) -> None:
-        """Create the tracker and designate the run's target; `estimated` is the rover's estimated world pose."""
+    def __init__(self, p: RoverScenarioParameters, run: Run, estimated_pose: RigidTransform) -> None:
+        """Create the tracker and designate the run's target; `estimated_pose` is the rover's estimated world pose."""
         self._tracker: TargetTracker = TRACKING.make(p.algorithm, p.vtt, p.executable)
         self._mast = InputCopy[MastCalibration](run.rig.calibrated)
-        self._tracker.designate(InputCopy(run.target.designation).inputs, estimated)
+        self._tracker.designate(InputCopy(run.target.designation).inputs, estimated_pose)
 
     def aim(self, run: Run) -> MastAim | None:
         """Return the tracker's mast angles and subframe boxes; None if the mast or cameras cannot show the target.
 
         Raises AlgorithmError for an invalid answer, and the tracker's own errors.
         """
-        answer = self._tracker.aim(run.vehicle.estimated, self._mast.inputs)
+        answer = self._tracker.aim(run.vehicle.estimated_pose, self._mast.inputs)
         self._mast.check()
         return check_aim(answer, run.rig.calibrated)
 
@@ -136,7 +136,7 @@ class TrackerGuide:
         Raises the same exceptions as `aim`.
         """
         input_copy = InputCopy((view.images.left, view.images.right))
-        measurements = RoverMeasurements(*input_copy.inputs, self._mast.inputs, *view.angles_rad, view.estimated)
+        measurements = RoverMeasurements(*input_copy.inputs, self._mast.inputs, *view.angles_rad, view.estimated_pose)
         start_s = time.process_time()
         answer = self._tracker.update(measurements)
         elapsed_s = time.process_time() - start_s
@@ -154,7 +154,7 @@ class TrackerGuide:
         stop = run.stops[-1]
         if stop.update.position_rover is None:
             raise ValueError("the tracker has not reported a target position yet")
-        current_from_stop = compose(run.vehicle.estimated.inv(), stop.estimated)
+        current_from_stop = compose(run.vehicle.estimated_pose.inv(), stop.estimated_pose)
         return run.create_target_estimate(current_from_stop.apply(np.array(stop.update.position_rover)))
 
 
@@ -201,7 +201,7 @@ class DesignationGuide:
         if self.position_world is None:
             true_pose = run.vehicle.stance.world_from_rover
             return run.create_target_estimate(true_pose.inv().apply(run.target.point_world.copy()))
-        return run.create_target_estimate(run.vehicle.estimated.inv().apply(self.position_world.copy()))
+        return run.create_target_estimate(run.vehicle.estimated_pose.inv().apply(self.position_world.copy()))
 
     @classmethod
     def designate(cls, run: Run, margin_px: float, oracle: bool) -> DesignationGuide:
@@ -218,7 +218,7 @@ class DesignationGuide:
             raise ValueError("the mast cannot point at the target's rock from the start of this drive")
         rig.point(*angles)
         position = triangulate_point(rig, stance, point)
-        return cls(margin_px, np.asarray(run.vehicle.estimated.apply(position)))
+        return cls(margin_px, np.asarray(run.vehicle.estimated_pose.apply(position)))
 
 
 Guide = TrackerGuide | DesignationGuide
@@ -237,18 +237,18 @@ def prepare_run(p: RoverScenarioParameters, streams: Streams, load_ground: LoadG
 
 def track_target(p: RoverScenarioParameters, run: Run) -> Run:
     """Drive a prepared run to its end, guided by the tracker of the parameters."""
-    guide, last = TrackerGuide(p, run, run.vehicle.estimated), p.legs[-1]
+    guide, last_leg = TrackerGuide(p, run, run.vehicle.estimated_pose), p.legs[-1]
     failure = drive_legs(p, run, guide)
     if failure is not None:
         run.outcome = failure
     elif not run.stops[-1].update.found:
         run.outcome = RunOutcome.LOST
     else:
-        has_goal = not last.ends_with_steps and last.motion in ("approach", "back-off")
-        is_complete = not has_goal or is_finished(last, 0, guide.target(run))
+        has_goal = not last_leg.ends_with_steps and last_leg.motion in ("approach", "back-off")
+        is_complete = not has_goal or is_finished(last_leg, 0, guide.target(run))
         run.outcome = RunOutcome.COMPLETED if is_complete else RunOutcome.STUCK
-    if run.outcome is RunOutcome.COMPLETED and last.motion == "approach":
-        goal = GoalCriterion(last.goal_m, 2.0 * GOAL_TOLERANCE_M)
+    if run.outcome is RunOutcome.COMPLETED and last_leg.motion == "approach":
+        goal = GoalCriterion(last_leg.goal_m, 2.0 * GOAL_TOLERANCE_M)
         result = hand_off(run.stops[-1].update, goal, run.rig.calibrated)
         run.handed_over = result.outcome is HandOffOutcome.HANDED_OVER
     return run
@@ -258,12 +258,12 @@ def drive_legs(p: RoverScenarioParameters, run: Run, guide: Guide) -> RunOutcome
     """Drive all legs; return the outcome if the run ends early, else None."""
     failure = visit_stop(p, run, guide, -1)
     for number, leg in enumerate(p.legs):
-        count = 0
+        step_count = 0
         if leg.maps_first and failure is None:
             map_terrain(p, run, leg, guide.target(run))
-        while failure is None and not is_finished(leg, count, guide.target(run)):
-            failure = drive_step(p, run, leg, count, guide.target(run)) or visit_stop(p, run, guide, number)
-            count += 1
+        while failure is None and not is_finished(leg, step_count, guide.target(run)):
+            failure = drive_step(p, run, leg, step_count, guide.target(run)) or visit_stop(p, run, guide, number)
+            step_count += 1
     return failure
 
 
@@ -281,12 +281,12 @@ def visit_stop(p: RoverScenarioParameters, run: Run, guide: Guide, leg: int) -> 
         target, stance = run.target.point_world, vehicle.stance
         radius_m = SUBFRAME_RADIUS_FRACTION * float(np.linalg.norm(target - stance.world_from_rover.translation))
         geometry, sun = rig.calibrated.geometry, world.scene(time_s).sun.direction
-        shadow = cast_rover_shadow(vehicle.rover, stance, geometry, rig.state.true_rad, target, radius_m, sun)
+        shadow = build_shadow_caster(vehicle.rover, stance, geometry, rig.state.true_rad, target, radius_m, sun)
     cameras, boxes, brightness = (rig.left, rig.right), (aim.left, aim.right), world.brightness(time_s)
     images = run.camera.take(world.scene(time_s), shadow, world_from_head, cameras, boxes, brightness, time_s)
-    angles, drives = rig.state.readings_rad, tuple(run.pending)
-    run.pending = []
-    view = View(leg, time_s, vehicle.stance, vehicle.estimated, angles, world_from_head, images, drives)
+    angles, drives = rig.state.readings_rad, tuple(run.drives_since_stop)
+    run.drives_since_stop = []
+    view = View(leg, time_s, vehicle.stance, vehicle.estimated_pose, angles, world_from_head, images, drives)
     return guide.observe(run, view)
 
 
@@ -297,18 +297,18 @@ def drive_step(
     commands: Iterable[DriveCommand] = plan_step(leg, step_count, target)
     if leg.autonav:
         map_terrain(p, run, leg, target)
-        plan = run.navigator.plan(leg, target, run.vehicle.estimated)
+        plan = run.navigator.plan(leg, target, run.vehicle.estimated_pose)
         if plan.outcome not in (NavigationOutcome.PATH, NavigationOutcome.AT_GOAL):
             return RunOutcome.NO_PATH
         commands = plan.commands
     for command in commands:
-        count = 1
+        part_count = 1
         if leg.visual_odometry:
             parts = max(command.length_m / leg.visual_odometry_step_m, abs(command.turn_left_rad) / VISUAL_TURN_RAD)
-            count = max(1, int(np.ceil(parts - 1e-9)))
-            run.visual_odometry_updates += count
-            run.time_s += count * p.timing.visual_odometry_s
-        run.pending += [drive_part(p, run, leg, command.part(1.0 / count)) for _ in range(count)]
+            part_count = max(1, int(np.ceil(parts - 1e-9)))
+            run.visual_odometry_updates += part_count
+            run.time_s += part_count * p.timing.visual_odometry_s
+        run.drives_since_stop += [drive_part(p, run, leg, command.part(1.0 / part_count)) for _ in range(part_count)]
         run.time_s += p.timing.drive_s
     return None
 
@@ -320,10 +320,10 @@ def drive_part(p: RoverScenarioParameters, run: Run, leg: LegParameters, command
         drive = vehicle.drive(command, leg.visual_odometry)
         run.visual_odometry_failures += vehicle.estimate.visual_failed
         return drive
-    first, before = take_odometry_pair(p, run), vehicle.estimated
+    first, before = take_odometry_pair(p, run), vehicle.estimated_pose
     drive = vehicle.drive(command, False)
     second = take_odometry_pair(p, run)
-    result: VisualOdometry = estimate_motion(first, second, compose(before.inv(), vehicle.estimated))
+    result: VisualOdometry = estimate_motion(first, second, compose(before.inv(), vehicle.estimated_pose))
     if result.first_from_second is None:
         run.visual_odometry_failures += 1
     else:
@@ -349,19 +349,21 @@ def map_terrain(p: RoverScenarioParameters, run: Run, leg: LegParameters, target
     run.autonav_updates += 1
     run.time_s += p.timing.autonav_s
     vehicle, cameras, time_s = run.vehicle, run.navigation_cameras, run.time_s
-    estimated = vehicle.estimated
-    run.navigator.map_start(estimated, vehicle.rover.enclosing_radius_m)
+    estimated_pose = vehicle.estimated_pose
+    run.navigator.map_start(estimated_pose, vehicle.rover.enclosing_radius_m)
     ahead = goal_position(leg, target)
     azimuth = -float(np.arctan2(ahead[1], ahead[0]))
     azimuths = [azimuth + (number - 0.5 * (leg.wedges - 1)) * MAST_SPACING_RAD for number in range(leg.wedges)]
     if p.navigation.terrain == "oracle-heights":
         ranges_m, azimuths = (BODY_RANGES_M, [0.0]) if leg.map_by == "body" else (MAST_RANGES_M, azimuths)
         points = [oracle_heights(run.world, vehicle, azimuth, ranges_m, leg.map_by == "body") for azimuth in azimuths]
-        estimated_from_true = estimated * vehicle.stance.world_from_rover.inv()
+        estimated_from_true = estimated_pose * vehicle.stance.world_from_rover.inv()
         run.navigator.map_points(np.asarray(estimated_from_true.apply(np.concatenate(points))))
     elif leg.map_by == "body":
-        run.navigator.map_pair(cameras.take_body_pair(run.world, run.rig, vehicle, time_s), estimated, BODY_RANGES_M)
+        run.navigator.map_pair(
+            cameras.take_body_pair(run.world, run.rig, vehicle, time_s), estimated_pose, BODY_RANGES_M
+        )
     else:
         for azimuth in azimuths:
             pair = cameras.take_mast_pair(p, run.world, run.rig, vehicle, azimuth, time_s)
-            run.navigator.map_pair(pair, estimated, MAST_RANGES_M)
+            run.navigator.map_pair(pair, estimated_pose, MAST_RANGES_M)

@@ -97,7 +97,7 @@ class SharedDriveParameters(Parameters):
     margin_px: Annotated[float, Field(gt=0.0, description="margin around the rock in the images")] = 110.0
     steering: Annotated[
         Literal["estimate", "oracle-target"],
-        Field(description="position that guides the drive: designated and carried by odometry, or the true one"),
+        Field(description="position that guides the drive: designated and propagated by odometry, or the true one"),
     ] = "estimate"
     bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps")] = ()
     face_deg: float | None = Field(default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`")
@@ -172,6 +172,7 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
     sine, cosine = np.sin(half_circle_rad), np.cos(half_circle_rad)
 
     def compute_eye(world_from_head: RigidTransform) -> Float64[np.ndarray, "3"]:
+        # rotate the left camera about the rock, clockwise from above
         rock = world.rocks.position_m[world.target_number]
         east, north, up = rig.eyes(world_from_head)[0] - rock
         return np.asarray(rock + np.array([cosine * east + sine * north, cosine * north - sine * east, up]))
@@ -198,7 +199,7 @@ def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | N
     """Run a tracker over the drive's images for one of the targets; default: the tracker under test."""
     run = prepare_shared_run(p, drive)
     parameters = p.drive.model_copy(update={"algorithm": algorithm or p.drive.algorithm})
-    guide = TrackerGuide(parameters, run, drive.views[0].estimated)
+    guide = TrackerGuide(parameters, run, drive.views[0].estimated_pose)
     for view in drive.views[:: p.skip + 1]:
         guide.observe(run, view)
         if run.stops[-1].update.state is TrackingState.FAILURE:

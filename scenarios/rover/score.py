@@ -82,15 +82,15 @@ def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "drift_px": drift,
         "drift_u_px": float(last_error_px[0]),
         "drift_v_px": float(last_error_px[1]),
-        "worst_error_px": _max(error_sizes_px),
-        "track_margin_px": p.score.tracked_px - _max(error_sizes_px),
+        "worst_error_px": _finite_max(error_sizes_px),
+        "track_margin_px": p.score.tracked_px - _finite_max(error_sizes_px),
         "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
         "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.found), NAN),
         "handed_over": run.handed_over,
     }
 
 
-def _max(values: Float64[np.ndarray, "n"]) -> float:
+def _finite_max(values: Float64[np.ndarray, "n"]) -> float:
     """Return the maximum; NaN without finite values."""
     return float(np.nanmax(values)) if np.any(np.isfinite(values)) else NAN
 
@@ -103,7 +103,7 @@ def tracking_row(run: Run) -> dict[str, Scalar]:
     if tracked_stops:
         first_stop, last_stop = tracked_stops[0], tracked_stops[-1]
         first_m, last_m = (
-            stop.estimated.apply(np.asarray(stop.update.position_rover).copy()) for stop in (first_stop, last_stop)
+            stop.estimated_pose.apply(np.asarray(stop.update.position_rover).copy()) for stop in (first_stop, last_stop)
         )
         drift_m = float(np.linalg.norm(last_m - first_m))
         designation_error = float(np.linalg.norm(first_stop.error_m()))
@@ -218,7 +218,7 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     ranges, times, pose_error = (NAN, NAN), (0.0, 0.0), NAN
     if stops:
         ranges, times = (stops[0].range_m, stops[-1].range_m), (stops[0].time_s, stops[-1].time_s)
-        position_error = stops[-1].estimated.translation - stops[-1].stance.world_from_rover.translation
+        position_error = stops[-1].estimated_pose.translation - stops[-1].stance.world_from_rover.translation
         pose_error = float(np.linalg.norm(position_error))
     sun = [world.sun.direction(time_s) for time_s in times]
     exposures = np.array([stop.images.exposure_s for stop in stops], dtype=np.float64)
@@ -228,17 +228,17 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "no_rover_shadow_on_target": not is_shadowed,
         "range_start_m": ranges[0],
         "range_end_m": ranges[1],
-        "tilt_max_deg": float(np.degrees(_max(np.array([stop.stance.tilt_rad for stop in stops])))),
+        "tilt_max_deg": float(np.degrees(_finite_max(np.array([stop.stance.tilt_rad for stop in stops])))),
         "distance_driven_m": distance,
         "slip_mean": float(np.sum(slips * lengths[is_moving]) / distance) if distance > 0.0 else 0.0,
-        "slip_max": _max(slips) if np.any(is_moving) else 0.0,
+        "slip_max": _finite_max(slips) if np.any(is_moving) else 0.0,
         "pose_error_m": pose_error,
         "pose_error_fraction": pose_error / distance if distance > 0.0 else NAN,
         "duration_min": times[1] / 60.0,
         **sun_columns(sun[0]),
         "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
-        "exposure_min_s": -_max(-exposures),
-        "exposure_max_s": _max(exposures),
+        "exposure_min_s": -_finite_max(-exposures),
+        "exposure_max_s": _finite_max(exposures),
     }
 
 
@@ -263,7 +263,7 @@ def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
         sun = run.world.sun.direction(stop.time_s)
         if p.rover_shadow and rover_shades_patch(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
             return True
-        if not error <= p.score.tracked_px:
+        if not error <= p.score.tracked_px:  # also for NaN: the target was not found
             return False
     return False
 
@@ -307,8 +307,10 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
             "point": stop.point_px,
         }
         arrays |= {f"stop_{number}_{name}": values for name, values in stop_arrays.items()}
-    estimated = [
-        np.full(3, np.nan) if stop.reported_rover is None else stop.estimated.apply(stop.reported_rover.copy())
+    estimated_targets = [
+        np.full(3, np.nan)
+        if stop.reported_position_rover is None
+        else stop.estimated_pose.apply(stop.reported_position_rover.copy())
         for stop in stops
     ]
     stances = [stance for stop in stops for drive in stop.drives for stance in drive.stances]
@@ -318,10 +320,10 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
         "figures": update_quantities(run),
         "states": [stop.update.state.name for stop in stops],
         "rover_true_m": np.array([stop.stance.world_from_rover.translation for stop in stops]).reshape(-1, 3),
-        "rover_believed_m": np.array([stop.estimated.translation for stop in stops]).reshape(-1, 3),
+        "rover_believed_m": np.array([stop.estimated_pose.translation for stop in stops]).reshape(-1, 3),
         "heading_deg": np.degrees(np.array([stop.stance.azimuth_rad for stop in stops])),
         "target_m": run.target.point_world,
-        "target_believed_m": np.array(estimated).reshape(-1, 3),
+        "target_believed_m": np.array(estimated_targets).reshape(-1, 3),
         "path_true_m": np.array(path).reshape(-1, 2),
         "rocks_m": np.column_stack([rocks.position_m[rock_indices, :2], rocks.diameter_m[rock_indices]]),
     }
@@ -337,7 +339,7 @@ def create_scored_run(run: Run) -> ScoredRun:
         world_from_rover=tuple(stop.stance.world_from_rover for stop in run.stops),
         point_px=np.array([stop.point_px for stop in run.stops]).reshape(-1, 2),
         measurements=tuple(
-            RoverMeasurements(stop.images.left, stop.images.right, mast, *stop.angles_rad, stop.estimated)
+            RoverMeasurements(stop.images.left, stop.images.right, mast, *stop.angles_rad, stop.estimated_pose)
             for stop in run.stops
         ),
         answers=tuple(stop.update for stop in run.stops),

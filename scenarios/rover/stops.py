@@ -119,8 +119,8 @@ class StereoCamera:
                 response = np.resize(detector.response[:rows, :columns], (rows, columns))
                 detector = replace(detector, response=response, hot_e_s=None)
             if p.exposure.of != "fixed":
-                exposed = auto_expose(detector, metering_radiance, p.exposure.auto, self.noise)
-                exposure_s = exposed.detector.parameters.exposure_s
+                auto_exposure = auto_expose(detector, metering_radiance, p.exposure.auto, self.noise)
+                exposure_s = auto_exposure.detector.parameters.exposure_s
             counts = [
                 window.with_exposure(exposure_s).expose(radiance, self.noise)
                 for window, radiance in zip(windows, radiances, strict=True)
@@ -151,7 +151,7 @@ class View:
     leg: int  #: index of the leg that ended at this stop; -1 for the start
     time_s: float  #: time since the start of the run
     stance: Stance  #: true stance
-    estimated: RigidTransform  #: estimated world pose of the rover
+    estimated_pose: RigidTransform  #: estimated world pose of the rover
     angles_rad: tuple[float, float]  #: azimuth and elevation read by the mast's encoders
     world_from_head: RigidTransform  #: true pose of the mast's head
     images: StereoImages
@@ -164,7 +164,7 @@ class Stop(View):
 
     update: TargetUpdate  #: the tracker's answer
     details: VttDetails | None  #: details of the answer; None for a custom tracker
-    reported_rover: Float64[np.ndarray, "3"] | None  #: reported position, rover frame; None if not found
+    reported_position_rover: Float64[np.ndarray, "3"] | None  #: reported position, rover frame; None if not found
     track_time_s: float  #: processor time of the update
     point_px: Float64[np.ndarray, "2"]  #: true full-frame (u, v) of the target in the left image; NaN outside
     point_rover: Float64[np.ndarray, "3"]  #: the designated point in the rover's true frame, metres
@@ -180,7 +180,7 @@ class Stop(View):
             **{item.name: getattr(view, item.name) for item in fields(View)},
             update=update,
             details=update.details if isinstance(update.details, VttDetails) else None,
-            reported_rover=update.position_rover if update.found else None,
+            reported_position_rover=update.position_rover if update.found else None,
             track_time_s=track_time_s,
             point_px=np.asarray(left.project(in_head)[0]),
             point_rover=np.asarray(view.stance.world_from_rover.inv().apply(point_m.copy())),
@@ -192,16 +192,20 @@ class Stop(View):
 
         Without details of the match the reported position is projected through the calibrated camera.
         """
-        if self.reported_rover is None:
+        if self.reported_position_rover is None:
             return np.full(2, np.nan)
         if self.details is not None and self.details.match is not None:
             return np.asarray(self.details.match.pixel, dtype=np.float64)
         camera = mast.left.transform(mast.geometry.rover_from_head(*self.angles_rad))
-        return np.asarray(camera.project(self.reported_rover)[0], dtype=np.float64)
+        return np.asarray(camera.project(self.reported_position_rover)[0], dtype=np.float64)
 
     def error_m(self) -> Float64[np.ndarray, "3"]:
         """Compute the reported minus the true position in the rover frame; NaN if no position was reported."""
-        return np.full(3, np.nan) if self.reported_rover is None else np.asarray(self.reported_rover - self.point_rover)
+        return (
+            np.full(3, np.nan)
+            if self.reported_position_rover is None
+            else np.asarray(self.reported_position_rover - self.point_rover)
+        )
 
 
 #: Number of directions around a point. The point is on an edge if one direction shows ground far behind the rock.

@@ -154,7 +154,10 @@ class RunWorld:
 
 
 def _mesh_lines(reach_m: float) -> int:
-    """Return the number of lines of a ground mesh with a half width of `reach_m`."""
+    """Return the number of lines of a ground mesh with a half width of `reach_m`.
+
+    The lines are at `MESH_FINEST_M * sinh(MESH_GROWTH * i) / sinh(MESH_GROWTH)`, with i = 0 at the centre.
+    """
     return 2 * int(np.ceil(np.arcsinh(reach_m / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1
 
 
@@ -183,6 +186,7 @@ def place_rocks(p: RoverScenarioParameters, base: SiteGround, rng: np.random.Gen
 
 
 def _distances(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "rocks"]:
+    """Compute the horizontal distances of rocks from a position on the periodic terrain."""
     offsets = rocks.position_m[:, :2] - position
     offsets -= rocks.period_m * np.round(offsets / rocks.period_m)
     return np.asarray(np.hypot(offsets[:, 0], offsets[:, 1]))
@@ -198,7 +202,7 @@ class Rig:
     right: CameraModel  #: true right camera in the head's frame
     mast: Mast
     state: MastState  #: current angles: true, and read by the encoders
-    motors: np.random.Generator  #: random stream of the motors' stopping errors
+    motor_stream: np.random.Generator  #: random stream of the motors' stopping errors
 
     @classmethod
     def draw(cls, p: RoverScenarioParameters, streams: Streams) -> Rig:
@@ -206,8 +210,8 @@ class Rig:
         design = p.camera.mast()
         head = StereoHead.draw(design, p.stereo, streams.generator("stereo calibration"))
         mast = Mast.draw(p.pointing, design.geometry, streams.generator("mast zeros"))
-        left, right, motors = head.true.left, head.true.right, streams.generator("mast motors")
-        return cls(head, head.calibrated, left, right, mast, mast.rest, motors)
+        left, right, motor_stream = head.true.left, head.true.right, streams.generator("mast motors")
+        return cls(head, head.calibrated, left, right, mast, mast.rest, motor_stream)
 
     @property
     def pixel_rad(self) -> float:
@@ -227,7 +231,7 @@ class Rig:
     def point(self, azimuth_rad: float, elevation_rad: float) -> None:
         """Point the mast; it does not move if its encoders already read these angles."""
         if self.state.readings_rad != (azimuth_rad, elevation_rad):
-            self.state = self.mast.point(self.state, azimuth_rad, elevation_rad, self.motors)
+            self.state = self.mast.point(self.state, azimuth_rad, elevation_rad, self.motor_stream)
 
     def range_m(self, position_rover: Float64[np.ndarray, "3"]) -> float:
         """Compute the estimated distance of a position from the left camera."""
@@ -272,13 +276,13 @@ class Vehicle:
         return cls(rover, ground, soil, stance, odometer, odometer.initial_estimate, *generators)
 
     @property
-    def estimated(self) -> RigidTransform:
+    def estimated_pose(self) -> RigidTransform:
         """World pose of the rover as estimated on board."""
         return self.estimate.world_from_rover
 
     def correct_position(self, position_m: Float64[np.ndarray, "3"]) -> None:
         """Replace the estimated position by that of visual odometry, world; the attitude remains that of the IMU."""
-        pose = rigid(self.estimated.rotation, position_m)
+        pose = rigid(self.estimated_pose.rotation, position_m)
         self.estimate = replace(self.estimate, world_from_rover=pose)
 
     def drive(self, command: DriveCommand, visual: bool) -> Drive:

@@ -144,8 +144,8 @@ class CameraModel(ABC):
         if not new_from_old.single:
             raise ValueError("a camera is transformed by a single transform, not by an array of transforms")
         matrix = new_from_old.as_matrix()
-        rotated = {name: matrix[:3, :3] @ getattr(self, name) for name in ("a", "h", "v", "o") if hasattr(self, name)}
-        return self._with(c=matrix[:3, :3] @ self.c + matrix[:3, 3], **rotated)
+        vectors = {name: matrix[:3, :3] @ getattr(self, name) for name in ("a", "h", "v", "o") if hasattr(self, name)}
+        return self._with(c=matrix[:3, :3] @ self.c + matrix[:3, 3], **vectors)
 
     def bin(self: M, columns: int, rows: int) -> M:
         """Return the camera of the binned image: each block of `columns` x `rows` pixels becomes one pixel.
@@ -192,6 +192,7 @@ class CameraModel(ABC):
         return self._with(h=scale[0] * self.h + shift[0] * self.a, v=scale[1] * self.v + shift[1] * self.a, size=size)
 
     def _with(self: M, **changes: Any) -> M:
+        """Return a copy with changed fields."""
         return cast(M, replace(cast(Any, self), **changes))
 
     @property
@@ -290,8 +291,8 @@ class CameraModel(ABC):
 
     def _compute_linear_directions(self, u: Vector, v: Vector) -> Gradient:
         """Compute the directions of pixels of the camera without distortion."""
-        m = self._direction_from_pixel
-        x, y, z = (m[i, 0] * u + m[i, 1] * v + m[i, 2] for i in range(3))
+        matrix = self._direction_from_pixel
+        x, y, z = (matrix[i, 0] * u + matrix[i, 1] * v + matrix[i, 2] for i in range(3))
         return x, y, z
 
 

@@ -278,11 +278,11 @@ def from_opencv(
             f"finite, not {distortion}"
         )
     coefficients = np.concatenate([distortion, np.zeros(8 - len(distortion))])
-    linear, pixels, distorted = _create_linear_camera(matrix, size, camera_from_world)
+    linear, pixels, distorted_points = _create_linear_camera(matrix, size, camera_from_world)
     perpendicular = np.cross(linear.a, np.eye(3)[np.argmin(np.abs(linear.a))])
     perpendicular /= np.linalg.norm(perpendicular)
     tilt_axes = np.stack([perpendicular, np.cross(linear.a, perpendicular)])
-    points = _invert_pinhole_distortion(distorted, coefficients)
+    points = _invert_pinhole_distortion(distorted_points, coefficients)
     directions = _rotate_to_world(np.concatenate([points, np.ones((len(points), 1))], axis=1), camera_from_world)
     start = Cahvor.from_cahv(linear, r=(0.0, coefficients[0], coefficients[1]))
 
@@ -317,11 +317,12 @@ def from_opencv_fisheye(
     """
     if len(distortion) != 4 or not np.all(np.isfinite(distortion)):
         raise ValueError(f"distortion of a fisheye must be (k1, k2, k3, k4), finite, not {distortion}")
-    linear, pixels, distorted = _create_linear_camera(matrix, size, camera_from_world)
-    directions = _rotate_to_world(_invert_fisheye(distorted, distortion), camera_from_world)
+    linear, pixels, distorted_points = _create_linear_camera(matrix, size, camera_from_world)
+    directions = _rotate_to_world(_invert_fisheye(distorted_points, distortion), camera_from_world)
     start = Cahvore.from_cahv(linear, r=(0.0, distortion[0], distortion[1]), linearity=0.0)
 
     def modify_camera(change: Array) -> Cahvore:
+        """Scale the focal lengths, and change rho1, rho2 and the linearity."""
         (hc, vc), a, scale = start.image_centre, start.a, float(change[0])
         h, v = start.h + scale * (start.h - hc * a), start.v + scale * (start.v - vc * a)
         return replace(start, h=h, v=v, r=start.r + np.array([0.0, *change[1:3]]), linearity=float(change[3]))
@@ -376,9 +377,10 @@ def _invert_fisheye(points: Array, coefficients: Array) -> Array:
         if np.max(np.abs(step)) < 1e-14:
             break
     angles = np.linspace(0.0, float(theta.max()), 1000)
-    recomputed = theta * _compute_fisheye_gain(theta, coefficients)[0]
+    recomputed_distance = theta * _compute_fisheye_gain(theta, coefficients)[0]
     if not (
-        np.max(np.abs(recomputed - distance)) < 1e-9 and np.all(_compute_fisheye_gain(angles, coefficients)[1] > 0)
+        np.max(np.abs(recomputed_distance - distance)) < 1e-9
+        and np.all(_compute_fisheye_gain(angles, coefficients)[1] > 0)
     ):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
     scale = np.divide(np.sin(theta), distance, out=np.ones_like(theta), where=distance > 0)
@@ -394,17 +396,17 @@ def _project_directions(camera: CameraModel, directions: Array) -> Array:
     return camera.project(camera.c + directions)[0]
 
 
-def _invert_pinhole_distortion(distorted: Array, coefficients: Array) -> Array:
+def _invert_pinhole_distortion(distorted_points: Array, coefficients: Array) -> Array:
     """Invert the pinhole distortion by Newton's method in two dimensions."""
-    points = distorted.copy()
+    points = distorted_points.copy()
     for _ in range(50):
         image, slope = _apply_pinhole_distortion(points, coefficients)
-        step = np.linalg.solve(slope, (image - distorted)[..., np.newaxis])[..., 0]
+        step = np.linalg.solve(slope, (image - distorted_points)[..., np.newaxis])[..., 0]
         points -= step
         if np.max(np.abs(step)) < 1e-14:
             break
     image, slope = _apply_pinhole_distortion(points, coefficients)
-    if not (np.max(np.abs(image - distorted)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
+    if not (np.max(np.abs(image - distorted_points)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
     return points
 
@@ -418,13 +420,13 @@ def _apply_pinhole_distortion(points: Array, coefficients: Array) -> tuple[Array
     denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     gain = numerator / denominator
     slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - gain * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
-    mixed = 2 * (x * y * slope + p1 * x + p2 * y)
-    distorted = np.stack(
+    mixed_derivative = 2 * (x * y * slope + p1 * x + p2 * y)
+    distorted_points = np.stack(
         [x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * gain + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], axis=-1
     )
-    by_x = np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=-1)
-    by_y = np.stack([mixed, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1)
-    return distorted, np.stack([by_x, by_y], axis=-2)
+    derivative_x = np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed_derivative], axis=-1)
+    derivative_y = np.stack([mixed_derivative, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1)
+    return distorted_points, np.stack([derivative_x, derivative_y], axis=-2)
 
 
 def _compute_fisheye_gain(theta: Array, coefficients: Array) -> tuple[Array, Array]:
@@ -436,6 +438,7 @@ def _compute_fisheye_gain(theta: Array, coefficients: Array) -> tuple[Array, Arr
 
 
 def _compute_residual(differences: Array) -> Residual:
+    """Compute RMS and maximum of the lengths of pixel differences, shape (n, 2)."""
     squares = np.sum(differences * differences, axis=-1)
     return Residual(rms_px=float(np.sqrt(np.mean(squares))), max_px=float(np.sqrt(np.max(squares))))
 

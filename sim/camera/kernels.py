@@ -133,12 +133,12 @@ def compute_ray_directions(
     - axis: O, normalised
     - polynomial, limits: as in `compute_undistortion_ratios`
     """
-    m = direction_from_pixel
+    matrix = direction_from_pixel
     direction_x, direction_y, direction_z = np.empty(u.size), np.empty(u.size), np.empty(u.size)
     for n in range(u.size):
-        x = m[0, 0] * u[n] + m[0, 1] * v[n] + m[0, 2]
-        y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 2]
-        z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 2]
+        x = matrix[0, 0] * u[n] + matrix[0, 1] * v[n] + matrix[0, 2]
+        y = matrix[1, 0] * u[n] + matrix[1, 1] * v[n] + matrix[1, 2]
+        z = matrix[2, 0] * u[n] + matrix[2, 1] * v[n] + matrix[2, 2]
         axial = _dot(axis, x, y, z)
         x, y, z = x - axial * axis[0], y - axial * axis[1], z - axial * axis[2]
         tau = (x * x + y * y + z * z) / (axial * axial) if axial > 0.0 else math.nan

@@ -342,12 +342,14 @@ class Cahvore(RadialModel):
         return min(float(self._theta_from_chi(np.array([chi]))[0]), np.pi)
 
     def _chi_from_theta(self, theta: Vector) -> Vector:
+        """Compute the radial coordinate of rays at an angle from O."""
         linearity = self.linearity
         if linearity > _ZERO_LINEARITY:
             return np.tan(linearity * theta) / linearity
         return np.sin(linearity * theta) / linearity if linearity < -_ZERO_LINEARITY else theta
 
     def _theta_from_chi(self, chi: Vector) -> Vector:
+        """Compute the angle from O of rays with a radial coordinate."""
         linearity = self.linearity
         if linearity > _ZERO_LINEARITY:
             return np.arctan(linearity * chi) / linearity
@@ -391,6 +393,7 @@ class Cahvore(RadialModel):
         return u, v, depth > 0
 
     def _compute_kappa(self, chi: Vector, axial: Vector, radius: Vector) -> Vector:
+        """Compute kappa = f(chi) / radius, with its limit (1 + rho0) / axial on the axis."""
         (k1, k3, k5), tau = self._polynomial, chi * chi
         gain = k1 + tau * (k3 + tau * k5)
         return gain * np.where(radius > 0, chi / radius, 1 / axial)
@@ -404,7 +407,8 @@ class Cahvore(RadialModel):
         cosine = np.cos(self.linearity * theta)
         chi_slope = 1 / (cosine * cosine) if self.linearity > _ZERO_LINEARITY else cosine
         slope = (k1 + tau * (3 * k3 + tau * 5 * k5)) * chi_slope
-        # kappa = f(chi) / radius. On the axis lambda is zero, and the gradient of kappa has no effect
+        # kappa = f(chi) / radius, and d theta = (cos theta d radius - sin theta d axial) / upsilon
+        # on the axis lambda is zero, and the gradient of kappa has no effect
         inverse = np.where(radius > 0, 1 / radius, 0.0)
         kappa_by_radius = (slope * np.cos(theta) / upsilon - kappa) * inverse
         kappa_by_axial = -slope * np.sin(theta) / upsilon * inverse
@@ -415,9 +419,9 @@ class Cahvore(RadialModel):
 
     def _compute_rays(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
         axial, lateral, radius = self._split_at_axis(*self._compute_linear_directions(u, v))
-        distorted = radius / np.where(axial > 0, axial, np.nan)
-        ratio = kernels.compute_undistortion_ratios(self._polynomial, self._limits, distorted * distorted)
-        theta = self._theta_from_chi(distorted * ratio)
+        distorted_chi = radius / np.where(axial > 0, axial, np.nan)
+        ratio = kernels.compute_undistortion_ratios(self._polynomial, self._limits, distorted_chi * distorted_chi)
+        theta = self._theta_from_chi(distorted_chi * ratio)
         theta = np.where(theta < self._theta_limit, theta, np.nan)
         sine, cosine = np.sin(theta), np.cos(theta)
         lateral_scale = np.where(radius > 0, sine / radius, 0.0)

@@ -125,6 +125,7 @@ def read_pds3_product(path: str | Path) -> Pds3Product:
     label = _parse_blocks(text, ("IMAGE", *_POSE_GROUPS), source)
     size = _read_size(label, source)
     counts = _read_counts(text, label["IMAGE"], size, source)
+    # middle of the exposure: mean of the start and stop counts
     times = [float(match[2]) for match in _CLOCK.finditer(text)]
     time_s = float(np.mean(times)) if times else None
     name = next((name for name in _POSE_GROUPS if name in label), None)
@@ -150,6 +151,7 @@ def is_pds3(head: bytes) -> bool:
 
 
 def _read_label(source: Source) -> str:
+    """Read the label up to its END line. Raises CameraFileError."""
     for count in (_FIRST_BYTES, MAX_BYTES):
         head = source.read_head(count)
         if not is_pds3(head):
@@ -187,6 +189,7 @@ def _parse_blocks(text: str, names: Sequence[str], source: Source) -> Any:
 
 
 def _read_size(label: Any, source: Source) -> tuple[int, int]:
+    """Read (columns, rows) of the label's IMAGE object. Raises CameraFileError."""
     if "IMAGE" not in label or not isinstance(label["IMAGE"], Mapping):
         raise source.error("IMAGE", "missing", "an object with LINES and LINE_SAMPLES")
     image = label["IMAGE"]
@@ -248,6 +251,7 @@ def _describe_fault(value: Any) -> str:
 
 
 def _read_counts(text: str, image: Any, size: tuple[int, int], source: Source) -> UInt16[np.ndarray, "rows columns"]:
+    """Read the image's samples at the label's pointer ^IMAGE. Raises CameraFileError."""
     pointer = _POINTER.search(text)
     if pointer is None:
         raise source.error("^IMAGE", "missing or not readable", 'a record, bytes, or ("FILE", record)')
@@ -320,11 +324,11 @@ def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
         raise source.error("Array_2D_Image", "missing", "an image array of lines and samples")
     extents = {}
     for axis in (element for element in arrays[0] if _local_name(element) == "Axis_Array"):
-        axis_name, count = _text(_find_child(axis, "axis_name")), _find_child(axis, "elements")
+        axis_name, count = _element_text(_find_child(axis, "axis_name")), _find_child(axis, "elements")
         if axis_name in ("Line", "Sample") and count is not None:
-            if not (_text(count).isdecimal() and int(_text(count)) > 0):
-                raise source.error("Axis_Array.elements", f"{_text(count)!r}", "a positive integer")
-            extents[axis_name] = int(_text(count))
+            if not (_element_text(count).isdecimal() and int(_element_text(count)) > 0):
+                raise source.error("Axis_Array.elements", f"{_element_text(count)!r}", "a positive integer")
+            extents[axis_name] = int(_element_text(count))
     if set(extents) != {"Line", "Sample"}:
         raise source.error("Axis_Array", f"names {sorted(extents)}", "the axes Line and Sample")
     size = extents["Sample"], extents["Line"]
@@ -333,9 +337,9 @@ def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
         part for part in parts if _local_name(part) in ("Subframe", "Downsampling") and not subframe_folded_in
     ):
         for field in _find_elements(part, "first_line", "first_sample", "height_pixels", "width_pixels"):
-            if _text(field) not in ("", "1"):
+            if _element_text(field) not in ("", "1"):
                 name = f"{_local_name(part)}.{_local_name(field)}"
-                raise source.error(name, f"{_text(field)}: {_SUBFRAME}", "1, or subframe_folded_in = true")
+                raise source.error(name, f"{_element_text(field)}: {_SUBFRAME}", "1, or subframe_folded_in = true")
     return tuple(_create_pds4_camera(element, size, source) for element in models)
 
 
@@ -352,12 +356,13 @@ def _find_child(element: ElementTree.Element, name: str) -> ElementTree.Element 
     return next((child for child in element if _local_name(child) == name), None)
 
 
-def _text(element: ElementTree.Element | None) -> str:
+def _element_text(element: ElementTree.Element | None) -> str:
     return "" if element is None else (element.text or "").strip()
 
 
 def _create_pds4_camera(element: ElementTree.Element, size: tuple[int, int], source: Source) -> CameraModel:
-    name = _text(_find_child(element, "model_type"))
+    """Create the camera of a class `Camera_Model_Parameters`. Raises CameraFileError."""
+    name = _element_text(_find_child(element, "model_type"))
     if name not in MODELS:
         raise source.error(f"{_PARAMETERS}.model_type", f"{name!r}", ", ".join(MODELS))
     class_name = f"{name}_Model"
@@ -393,6 +398,6 @@ def _parse_number(element: ElementTree.Element, name: str, field: str, source: S
     if child is None:
         return None
     try:
-        return float(_text(child))
+        return float(_element_text(child))
     except ValueError:
-        raise source.error(field, f"{_text(child)!r} is not a number", "a finite number") from None
+        raise source.error(field, f"{_element_text(child)!r} is not a number", "a finite number") from None

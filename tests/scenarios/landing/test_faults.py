@@ -31,8 +31,8 @@ def test_receiver_outage_covers_images_and_landing() -> None:
             transit = Transit.fly(flight, np.array([0.0, 0.0, 10.0]), 0.5, 0.5, 9.8, Streams(7, "outage", case))
             estimate = np.array(transit.pose(0).world_from_body.translation)
             errors.append(float(np.hypot(*(estimate - transit.state(0).position_m)[:2])))
-            has_solution = np.isfinite(transit.navigated.solutions.positions_m[:, 0])
-            fix_times_s = transit.navigated.fix_times_s
+            has_solution = np.isfinite(transit.navigation_leg.solutions.positions_m[:, 0])
+            fix_times_s = transit.navigation_leg.fix_times_s
             assert has_solution.all() if not outage_s else not has_solution[fix_times_s >= -outage_s].any()
             assert has_solution[fix_times_s < -outage_s].all()
     assert np.median(position_errors_m[40.0]) > 10.0 * np.median(position_errors_m[0.0])

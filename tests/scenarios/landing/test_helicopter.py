@@ -82,7 +82,7 @@ def test_acceleration_causes_inclinometer_errors() -> None:
 def test_equal_streams_give_equal_flights() -> None:
     first, second = (_fly_transit(3)[0] for _ in range(2))
     np.testing.assert_array_equal(first.flight.path.rows, second.flight.path.rows)
-    np.testing.assert_array_equal(first.navigated.solution.positions_m, second.navigated.solution.positions_m)
+    np.testing.assert_array_equal(first.navigation_leg.solution.positions_m, second.navigation_leg.solution.positions_m)
 
 
 def test_landing_iteration_converges_to_a_consistent_flight() -> None:
@@ -91,9 +91,9 @@ def test_landing_iteration_converges_to_a_consistent_flight() -> None:
         transit, touchdown = _fly_landing(case)
         assert touchdown.iterations < 8
         assert touchdown.path_change_m < 1e-3
-        path, navigated = touchdown.flight.path, touchdown.navigated
+        path, navigated = touchdown.flight.path, touchdown.navigation_leg
         errors = np.zeros((len(path.rows), 9))
-        transit_navigation = transit.navigated
+        transit_navigation = transit.navigation_leg
         for column in range(9):
             times = np.concatenate([transit_navigation.boundaries_s, navigated.boundaries_s[1:]])
             values = np.concatenate([transit_navigation.errors(transit.flight.path), navigated.errors(path)[1:]])

@@ -28,7 +28,7 @@ def run_slipping_rover(**changes: Any) -> Run:
 
 def _position_error_m(run: Run) -> float:
     vehicle = run.vehicle
-    return float(np.linalg.norm((vehicle.estimated.translation - vehicle.stance.world_from_rover.translation)[:2]))
+    return float(np.linalg.norm((vehicle.estimated_pose.translation - vehicle.stance.world_from_rover.translation)[:2]))
 
 
 def test_visual_odometry_measures_slip_and_wheel_odometry_does_not() -> None:
