@@ -222,7 +222,7 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
 
 @njit(cache=True, inline="always")
 def _is_outside_beam(triangles: Array, n: int, sides: tuple[Plane, ...]) -> bool:
-    """Return whether a triangle is entirely outside one of the first four sides of a frustum; the fifth is the far side."""
+    """Return whether a triangle is entirely outside one of a frustum's first four sides; the fifth is the far side."""
     for nx, ny, nz, offset, _ix, _iy, _iz in sides[:4]:
         is_outside = True
         for corner in range(3):
