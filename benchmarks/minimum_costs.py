@@ -19,7 +19,7 @@ from benchmarks.images import descent_scene
 from benchmarks.stages import Stages, profile_stages
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.sim.render.kernels.ground import height_range
-from marsyard.sim.render.kernels.strips import STRIP, FetchedCells, allocate_cells, fetch_cells, spline
+from marsyard.sim.render.kernels.strips import STRIP, CellBuffers, allocate_cells, fetch_cells, spline
 from marsyard.sim.terrain.kernels import Array, Level
 
 #: Images of a case, and their side in pixels.
@@ -60,7 +60,7 @@ def _prepare_splines() -> Callable[[], object]:
 @njit(cache=True)
 def _sum_fields(field: Level, scale: float, x: Array, y: Array) -> float:
     """Sum of heights, slopes and albedos at positions."""
-    cells: FetchedCells = allocate_cells()
+    cells: CellBuffers = allocate_cells()
     lanes = np.arange(STRIP)
     total = 0.0
     for first in range(0, x.size, STRIP):
@@ -70,7 +70,7 @@ def _sum_fields(field: Level, scale: float, x: Array, y: Array) -> float:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _sum_strip(cells: FetchedCells) -> float:
+def _sum_strip(cells: CellBuffers) -> float:
     total = 0.0
     for k in range(STRIP):
         height, slope_x, slope_y, albedo = spline(cells[0], cells[1], k)

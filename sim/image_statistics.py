@@ -69,7 +69,7 @@ def spectral_slope(image: Float[np.ndarray, "side side"]) -> float:
     relative = image / image.mean() - 1.0
     power = np.abs(np.fft.fft2(relative * window[:, None] * window)) ** 2
     frequency = np.fft.fftfreq(side, 1.0 / side)
-    ring = np.hypot(frequency[:, None], frequency).astype(int).ravel()
-    radial_mean = np.bincount(ring, power.ravel()) / np.bincount(ring)
-    k = np.arange(MIN_FREQUENCY, MAX_FREQUENCY + 1)
-    return float(np.polyfit(np.log(k), np.log(radial_mean[k]), 1)[0])
+    ring_number = np.hypot(frequency[:, None], frequency).astype(int).ravel()
+    radial_mean = np.bincount(ring_number, power.ravel()) / np.bincount(ring_number)
+    fit_range = np.arange(MIN_FREQUENCY, MAX_FREQUENCY + 1)
+    return float(np.polyfit(np.log(fit_range), np.log(radial_mean[fit_range]), 1)[0])

@@ -19,8 +19,8 @@ class DeprecatedNameWarning(FutureWarning):
 
 
 @cache
-def _read_renamed(section: str) -> Mapping[str, str]:
-    """Read the current names by deprecated name: keys, columns, options, values or streams."""
+def _read_names(section: str) -> Mapping[str, str]:
+    """Read the current names by deprecated name from a section: keys, columns, options, values or streams."""
     with Path(__file__).with_name("renamed.toml").open("rb") as file:
         names: dict[str, str] = tomllib.load(file)[section]
     return names
@@ -28,7 +28,7 @@ def _read_renamed(section: str) -> Mapping[str, str]:
 
 def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[str] = ()) -> str:
     """Return the current name of a key; the name itself if it is valid, or if the input contains both names."""
-    current = _read_renamed("keys").get(name)
+    current = _read_names("keys").get(name)
     if current is None or name in valid_keys or current not in valid_keys or current in input_keys:
         return name
     return _warn_deprecated(name, current)
@@ -37,17 +37,17 @@ def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[s
 def current_column(name: str, exists: Callable[[str], bool]) -> str:
     """Return the current name of a column; the name may have the prefix "<algorithm>." of a comparison."""
     algorithm, dot, column = name.rpartition(".")
-    for deprecated, current in _read_renamed("columns").items():
+    for deprecated, current in _read_names("columns").items():
         match = re.fullmatch(deprecated.replace("*", r"(\d+)"), column)
-        renamed = current.replace("*", match[1]) if match and match.groups() else current
-        if match and exists(renamed):
-            return algorithm + dot + _warn_deprecated(column, renamed)
+        current_name = current.replace("*", match[1]) if match and match.groups() else current
+        if match and exists(current_name):
+            return algorithm + dot + _warn_deprecated(column, current_name)
     return name
 
 
 def current_options(arguments: Sequence[str]) -> list[str]:
     """Replace deprecated names of options in the arguments of a command line."""
-    return [_warn_deprecated(argument, _read_renamed("options").get(argument, argument)) for argument in arguments]
+    return [_warn_deprecated(argument, _read_names("options").get(argument, argument)) for argument in arguments]
 
 
 class Choice(Enum):
@@ -55,13 +55,13 @@ class Choice(Enum):
 
     @classmethod
     def _missing_(cls, value: object) -> Choice | None:
-        current = _read_renamed("values").get(str(value))
+        current = _read_names("values").get(str(value))
         return None if current is None else cls(_warn_deprecated(str(value), current))
 
 
 def stream_name(path: str) -> str:
     """Return the random stream name of a dispersed parameter; a renamed parameter uses the stream of its old name."""
-    return _read_renamed("streams").get(path, path)
+    return _read_names("streams").get(path, path)
 
 
 def _warn_deprecated(name: str, current: str) -> str:
@@ -98,10 +98,10 @@ class Parameters(BaseModel):
 
 def merge_settings(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Merge changes into nested settings: tables are merged, other values replaced."""
-    merged = dict(base)
+    settings = dict(base)
     for key, value in changes.items():
-        current = merged.get(key)
+        current = settings.get(key)
         if isinstance(current, Mapping) and isinstance(value, Mapping):
             value = merge_settings(current, value)
-        merged[key] = value
-    return merged
+        settings[key] = value
+    return settings

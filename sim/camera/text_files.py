@@ -23,13 +23,14 @@ from marsyard.sim.camera.calibrations import Source, create_camera, is_calibrati
 from marsyard.sim.camera.models import Cahvore
 from marsyard.sim.camera.pds import is_pds3, is_xml, read_pds3, read_pds4
 
-#: Number of bytes that identify a format.
+#: Number of leading bytes that identify a format.
 _FORMAT_BYTES = 4096
 
 #: Descriptions of the frames of reference, written into the files.
 BODY_FRAME = "body (metres); the file next to this one contains the body's pose in the world if it is known"
 HEAD_FRAME = "head of the mast (metres: x forward, y left, z up at azimuth and elevation zero)"
 
+#: Value of the line Model, by the name of the class or by the linearity of a CAHVORE camera.
 _TYPE_NAMES = {
     "CAHV": "CAHV = perspective, linear",
     "CAHVOR": "CAHVOR = perspective, distortion",
@@ -80,39 +81,39 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
     """
     source = Source(str(path))
     lines: dict[str, tuple[str, int]] = {}
-    for number, line in enumerate(source.read_text().splitlines(), start=1):
+    for line_number, line in enumerate(source.read_text().splitlines(), start=1):
         match = _ASSIGNMENT.match(line.partition("#")[0])
         if match is not None and match["name"] in lines:
             name = match["name"]
-            raise source.error(name, f"defined twice, in lines {lines[name][1]} and {number}", "once")
+            raise source.error(name, f"defined twice, in lines {lines[name][1]} and {line_number}", "once")
         if match is not None:
-            lines[match["name"]] = match["value"], number
+            lines[match["name"]] = match["value"], line_number
 
     def find_line(name: str) -> tuple[str, int]:
         if name not in lines:
             raise source.error(name, "missing", f"a line '{name} = ...'")
         return lines[name]
 
-    value, number = find_line("Model")
+    value, line_number = find_line("Model")
     model = _MODEL.match(value)
     if model is None:
         allowed = "CAHV, CAHVOR, CAHVORE1, CAHVORE2 or CAHVORE3,<linearity>"
-        raise source.error("Model", f"{value!r} in line {number}", allowed)
+        raise source.error("Model", f"{value!r} in line {line_number}", allowed)
     name = "CAHVORE" if model["name"].startswith("CAHVORE") else model["name"]
-    kind = None if model["type"] is None else int(model["type"])
+    cahvore_type = None if model["type"] is None else int(model["type"])
     linearity = None
     if name == "CAHVORE":
         linearity_text = model["parameter"]
-        parameter = None if linearity_text is None else _parse_number("Model", linearity_text, number, source)
-        linearity = linearity_of_type(kind, parameter, "Model", source)
+        parameter = None if linearity_text is None else _parse_number("Model", linearity_text, line_number, source)
+        linearity = linearity_of_type(cahvore_type, parameter, "Model", source)
     size = _read_size(lines.get("Dimensions"), size, source)
     vectors = {}
     for letter in name:
-        value, number = find_line(letter)
+        value, line_number = find_line(letter)
         words = value.split()
         if len(words) != 3:
-            raise source.error(letter, f"{len(words)} words in line {number}", "three finite numbers")
-        vectors[letter] = [_parse_number(letter, word, number, source) for word in words]
+            raise source.error(letter, f"{len(words)} words in line {line_number}", "three finite numbers")
+        vectors[letter] = [_parse_number(letter, word, line_number, source) for word in words]
     return create_camera(name, vectors, size, linearity, source)
 
 

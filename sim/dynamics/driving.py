@@ -1,7 +1,7 @@
 """Rover driving with slip: each command is executed in short steps on the terrain.
 
 In each step the rover moves in the body's x-y plane by the command reduced by slip, and is then settled on the ground.
-`SlipParameters` defines the slip along the path, across it and in heading, with random factors of run and command.
+`SlipParameters` defines the slip along the path, across it and in heading, with random factors per run and command.
 
 The default slip on dry sand is 20 % on a slope of 10 deg, 50 % on 15 deg and 100 % on 20 deg. Sources: the tracking
 paper reports up to 100 % on 15 to 20 deg (section 5.5), as do MER's tests on loose sand (Lindemann & Voorhees 2005).
@@ -65,8 +65,8 @@ class SlipParameters(Parameters):
 
     def slip_fraction(self, slope_rad: float) -> float:
         """Return the slip s of a slope, without soil factor and command factor."""
-        relative = abs(np.degrees(slope_rad)) / self.full_slope_deg
-        return float(min(self.flat + (1.0 - self.flat) * relative**self.exponent, 1.0))
+        slope_ratio = abs(np.degrees(slope_rad)) / self.full_slope_deg
+        return float(min(self.flat + (1.0 - self.flat) * slope_ratio**self.exponent, 1.0))
 
     def excess_slip(self, slope_rad: float) -> float:
         """Return the slip of a slope minus the slip on level ground."""
@@ -88,7 +88,7 @@ class Soil:
 
 @dataclass(frozen=True)
 class DriveStep:
-    """One step of a drive: the command of the wheels, which an odometer integrates, and the stances around it."""
+    """One step of a drive: the wheels' command, which an odometer integrates, and the stances before and after it."""
 
     command: DriveCommand
     before: Stance
@@ -112,12 +112,13 @@ class DriveStep:
     @property
     def progress_m(self) -> float:
         """True path in the commanded direction; 0 for a turn in place."""
-        commanded = np.array([self.command.forward_m, self.command.left_m])
-        if (length := float(np.hypot(*commanded))) < _MIN_PATH_M:
+        path = np.array([self.command.forward_m, self.command.left_m])
+        if (length := float(np.hypot(*path))) < _MIN_PATH_M:
             return 0.0
-        angle = float(np.arctan2(commanded[1], commanded[0])) + 0.5 * self.command.turn_left_rad
+        # the chord of an arc is rotated by half of the turn
+        chord_rad = float(np.arctan2(path[1], path[0])) + 0.5 * self.command.turn_left_rad
         arc_over_chord = length / max(float(np.hypot(*self.command.displacement_m)), _MIN_PATH_M)
-        return arc_over_chord * float(self.motion.translation[:2] @ np.array([np.cos(angle), np.sin(angle)]))
+        return arc_over_chord * float(self.motion.translation[:2] @ np.array([np.cos(chord_rad), np.sin(chord_rad)]))
 
 
 @dataclass(frozen=True)
@@ -171,6 +172,7 @@ def drive(
     command_draw, wander_draw = rng.standard_normal(2)
     factor = soil.factor * float(np.exp(p.step_spread * command_draw))
     wander_rad = np.radians(p.wander_deg_m) * np.sqrt(command.length_m) * float(wander_draw)
+    # 1e-9: tolerance for rounding errors
     count = max(1, int(np.ceil(max(command.length_m / STEP_M, abs(command.turn_left_rad) / STEP_RAD) - 1e-9)))
     step_command = command.part(1.0 / count)
     parts: list[DriveStep] = []
@@ -195,14 +197,14 @@ def _apply_slip(
     p: SlipParameters, factor: float, rotation: Float64[np.ndarray, "3 3"], command: DriveCommand
 ) -> Float64[np.ndarray, "2"]:
     """Reduce a commanded path by slip; return the true path along the body's x and y axes, metres."""
-    commanded = np.array([command.forward_m, command.left_m])
-    length = float(np.hypot(*commanded))
+    path = np.array([command.forward_m, command.left_m])
+    length = float(np.hypot(*path))
     if length < _MIN_PATH_M:
-        return commanded
-    forward = commanded / length
+        return path
+    forward = path / length
     left = np.array([-forward[1], forward[0]])
     # slopes along and across the motion: angles of these axes from the horizontal
     climb, cross_slope = (float(np.arcsin(np.clip(rotation[2, :2] @ axis, -1.0, 1.0))) for axis in (forward, left))
-    lost = factor * (p.flat + (1.0 if climb >= 0.0 else -p.downhill) * p.excess_slip(climb))
-    slide = -np.sign(cross_slope) * factor * p.across * p.excess_slip(cross_slope)
-    return np.asarray(length * (max(1.0 - lost, 0.0) * forward + max(-1.0, min(slide, 1.0)) * left))
+    lost_fraction = factor * (p.flat + (1.0 if climb >= 0.0 else -p.downhill) * p.excess_slip(climb))
+    side_fraction = -np.sign(cross_slope) * factor * p.across * p.excess_slip(cross_slope)
+    return np.asarray(length * (max(1.0 - lost_fraction, 0.0) * forward + max(-1.0, min(side_fraction, 1.0)) * left))

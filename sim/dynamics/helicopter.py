@@ -30,14 +30,16 @@ Vector = Float64[np.ndarray, "3"]
 Angle = Annotated[float, Field(ge=0.0, le=45.0)]
 
 #: Number of points within a pass at which the speed is drawn.
-_SPEED_CHANGES = 4
+_SPEED_POINTS = 4
+#: Time between the points at which distance from the line, pointing and swing are drawn.
+_POINT_SPACING_S = 15.0
 
 
 class HelicopterParameters(Parameters):
     """Parameters of a flight. Values are from the field test paper (III.C, III.D) unless marked as assumed.
 
     With a climb of 1 m/s, passes of 100 s and turns of 60 s, ten passes climb from 1000 m to 2000 m in 27 min. The
-    paper: a climb of 1 to 2 m/s, about 30 min of images, and about 40 min between the passes over the targets.
+    paper reports a climb of 1 to 2 m/s, about 30 min of images, and about 40 min between the passes over the targets.
     """
 
     passes: Annotated[int, bounded_field(1, 100, "passes along the line")] = 10
@@ -66,7 +68,7 @@ class HelicopterParameters(Parameters):
     fly_over_s: Annotated[Positive, Field(le=120.0, description="duration of a pass over the targets")] = 90.0
     between_s: Annotated[Positive, Field(description="time between the passes over the targets")] = 2400.0
     approach_s: Annotated[Positive, Field(description="time from the targets to the first pass (assumed)")] = 350.0
-    vibration: Annotated[VibrationParameters, Field(description="at the blades' rate, on the platform (assumed)")] = (
+    vibration: Annotated[VibrationParameters, Field(description="platform vibration at the blades' rate (assumed)")] = (
         VibrationParameters(rate_hz=13.0, acceleration_m_s2=1.0, angle_deg=0.005)
     )
 
@@ -173,19 +175,19 @@ def draw_helicopter_flight(
 ) -> HelicopterFlight:
     """Draw a flight along a line whose middle is above `origin_m`, a point of the ground."""
     half_s = 0.5 * p.fly_over_s
-    first_s = half_s + p.approach_s
-    starts = [first_s + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
+    first_pass_s = half_s + p.approach_s
+    starts = [first_pass_s + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
     passes = tuple(FlightPass(k, start, start + p.pass_s, 1 - 2 * (k % 2)) for k, start in enumerate(starts))
     fly_overs = ((-half_s, half_s), (p.between_s - half_s, p.between_s + half_s))
-    times = np.arange(fly_overs[0][0], fly_overs[1][1] + 15.0, 15.0)
+    times = np.arange(fly_overs[0][0], fly_overs[1][1] + _POINT_SPACING_S, _POINT_SPACING_S)
     # points of the curves: (time, value, rate) or (time, value). Height and platform angle are constant over the
     # targets. A platform that rotates with the helicopter rotates by 180 deg after each pass, forward and back
-    half_m, rate = half_s * p.fly_over_m_s, p.fly_over_m_s
-    positions = [point for start, end in fly_overs for point in ((start, -half_m, rate), (end, half_m, rate))]
+    half_m, speed = half_s * p.fly_over_m_s, p.fly_over_m_s
+    positions = [point for start, end in fly_overs for point in ((start, -half_m, speed), (end, half_m, speed))]
     heights = [(time, p.fly_over_m, 0.0) for times_s in fly_overs for time in times_s]
     angles = [(time, 0.0) for times_s in fly_overs for time in times_s]
     climb_m = p.climb_m_s * p.pass_s
-    fraction = np.linspace(0.0, 1.0, _SPEED_CHANGES + 2)
+    fraction = np.linspace(0.0, 1.0, _SPEED_POINTS + 2)
     for flight_pass in passes:
         changes = p.speed_change_m_s * rng.standard_normal(fraction.size)
         changes[[0, -1]] = 0.0
@@ -201,10 +203,10 @@ def draw_helicopter_flight(
     return HelicopterFlight(
         origin_m=origin_m,
         azimuth_rad=azimuth_rad,
-        along=_fit_moving(sorted(positions)),
-        across=_fit_stationary(times, p.wander_m * rng.standard_normal(times.size)),
-        up=_fit_moving(sorted(heights)),
-        platform=_fit_stationary(*np.array(sorted(angles)).T),
+        along=_fit_rates(sorted(positions)),
+        across=_fit_zero_rates(times, p.wander_m * rng.standard_normal(times.size)),
+        up=_fit_rates(sorted(heights)),
+        platform=_fit_zero_rates(*np.array(sorted(angles)).T),
         tilt_along=tilt_along,
         tilt_across=tilt_across,
         passes=passes,
@@ -219,7 +221,7 @@ def _draw_tilts(
 ) -> tuple[Tilt, Tilt]:
     """Draw the gimbal's angles over time: pointing and swing on the passes; elsewhere only residual motion.
 
-    Pointing that would exceed the maximum angle off nadir together with the swing is reduced to it.
+    The pointing is reduced where pointing and swing together would exceed the maximum angle off nadir.
     """
     on_pass = np.any([(times > flight_pass.start_s) & (times < flight_pass.end_s) for flight_pass in passes], axis=0)
     swing_rad_s = 2.0 * np.pi * p.swing_hz
@@ -237,18 +239,18 @@ def _draw_tilts(
     pointing *= np.minimum(1.0, limit / np.maximum(np.linalg.norm(pointing, axis=0), 1e-9))
     pointing += np.radians(p.platform_deg) * rng.standard_normal((2, times.size))
     along, across = (
-        Tilt(_fit_stationary(times, angles), _fit_stationary(times, swing), swing_rad_s)
+        Tilt(_fit_zero_rates(times, angles), _fit_zero_rates(times, swing), swing_rad_s)
         for angles, swing in zip(pointing, amplitudes, strict=True)
     )
     return along, across
 
 
-def _fit_moving(points: Sequence[tuple[float, float, float]]) -> BPoly:
+def _fit_rates(points: Sequence[tuple[float, float, float]]) -> BPoly:
     """Fit a curve through points (time, value, rate), with zero acceleration at each point."""
     return BPoly.from_derivatives([time for time, _, _ in points], [[value, rate, 0.0] for _, value, rate in points])
 
 
-def _fit_stationary(times_s: Float64[np.ndarray, "n"], values: Float64[np.ndarray, "n"]) -> BPoly:
+def _fit_zero_rates(times_s: Float64[np.ndarray, "n"], values: Float64[np.ndarray, "n"]) -> BPoly:
     """Fit a curve through values, with zero rate and zero acceleration at each of them."""
     zero = np.zeros_like(values)
     return BPoly.from_derivatives(times_s, np.stack([values, zero, zero], axis=-1))

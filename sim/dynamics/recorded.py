@@ -47,8 +47,9 @@ MIN_POSES = 4
 MAX_ROTATION_DEG = 90.0
 #: Tolerance on times outside the span, for rounding errors in sums of times.
 ROUNDING_S = 1e-9
+#: Columns of a table: time, position, and quaternion with the scalar part last.
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-#: Tolerance on a quaternion's length: the rounding error of components with three digits.
+#: Tolerance on a quaternion's length; components rounded to three decimals change it by at most 0.001.
 UNIT_TOLERANCE = 5e-3
 #: Maximum size of a file: ten hours at 100 Hz are 400 MB of text.
 MAX_BYTES = 1 << 29
@@ -190,12 +191,12 @@ def _read_file(path: str, _modified_ns: int, size: int) -> RecordedPoses:
 
 def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     """Read time, position and quaternion (x, y, z, w) of each row; the first bytes determine the format."""
-    first = head.decode("utf-8", errors="replace").lstrip("\ufeff").split("\n", 1)[0].strip()
+    first_line = head.decode("utf-8", errors="replace").lstrip("\ufeff").split("\n", 1)[0].strip()
     if head.startswith(b"PAR1"):
         return _read_parquet(path)
     import pandas as pd  # imported here: slow, and few campaigns use such a file
 
-    if first.startswith("#timestamp") and "," in first:
+    if first_line.startswith("#timestamp") and "," in first_line:
         frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
         values = frame.to_numpy(dtype=np.float64)
         # nanoseconds since 1970 exceed the precision of a float, therefore integers are subtracted first
@@ -204,7 +205,7 @@ def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
         return np.asarray(values[:, [0, 1, 2, 3, 5, 6, 7, 4]])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # empty files are reported below; cells without a column name are ignored
-        if "," in first and not first.startswith("#"):
+        if "," in first_line and not first_line.startswith("#"):
             frame = pd.read_csv(
                 path,
                 usecols=lambda name: name.strip() in COLUMNS,
@@ -258,10 +259,10 @@ def _column_indices(path: str, names: Sequence[str]) -> list[int]:
 def _check_poses(path: str, digest: str, values: Float64[np.ndarray, "n 8"]) -> RecordedPoses:
     if len(values) < MIN_POSES:
         raise TrajectoryFileError(f"{path}: has {len(values)} poses; allowed: at least {MIN_POSES}")
-    faulty = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
-    if faulty.size:
-        names = [COLUMNS[column] for column in np.flatnonzero(~np.isfinite(values[faulty[0]]))]
-        raise TrajectoryFileError(f"{path}: pose {faulty[0] + 1}: {', '.join(names)} is not finite; allowed: numbers")
+    invalid = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
+    if invalid.size:
+        names = [COLUMNS[column] for column in np.flatnonzero(~np.isfinite(values[invalid[0]]))]
+        raise TrajectoryFileError(f"{path}: pose {invalid[0] + 1}: {', '.join(names)} is not finite; allowed: numbers")
     not_increasing = np.flatnonzero(np.diff(values[:, 0]) <= 0.0)
     if not_increasing.size:
         first = not_increasing[0]

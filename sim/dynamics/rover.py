@@ -38,12 +38,12 @@ WheelPoints = Float64[np.ndarray, "6 3"]
 #: Names of the wheels, in the order of all arrays.
 WHEELS = ("left front", "left middle", "left rear", "right front", "right middle", "right rear")
 #: Signs of the wheels' y coordinates.
-_SIDE = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
+_SIDE_SIGNS = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
 #: Sample points of a tread: angles about the axle from straight below, and lateral positions in widths of the tread.
 _TREAD_RAD = np.radians(np.linspace(-72.0, 72.0, 25))
-_TREAD_LINES = np.array([-0.5, 0.0, 0.5])
-#: Steps of finite differences, metres and radians.
-_DIFFERENCE = 1e-6
+_TREAD_OFFSETS = np.array([-0.5, 0.0, 0.5])
+#: Step of finite differences, metres or radians.
+_DIFFERENCE_STEP = 1e-6
 #: Iterations of Newton's method, and the gap below which a wheel touches the ground.
 _NEWTON_STEPS, _GAP_TOLERANCE_M = 12, 1e-10
 
@@ -147,7 +147,7 @@ class RoverParameters(Parameters):
     def wheel_centres_m(self) -> WheelPoints:
         """Centres of the wheels on level ground, rover frame, in the order of `WHEELS`."""
         x = np.tile([self.front_m, 0.0, -self.rear_m], 2)
-        y = _SIDE * np.tile([self.half_track_m, self.middle_half_track_m, self.half_track_m], 2)
+        y = _SIDE_SIGNS * np.tile([self.half_track_m, self.middle_half_track_m, self.half_track_m], 2)
         return np.stack([x, y, np.full(6, self.wheel_radius_m)], axis=1)
 
     @property
@@ -206,9 +206,9 @@ class Stance:
 
     @cached_property
     def _yaw_pitch_roll(self) -> tuple[float, float, float]:
-        m = rotation_matrix(self.world_from_rover)
-        pitch = np.arctan2(-m[2, 0], np.hypot(m[2, 1], m[2, 2]))
-        return float(np.arctan2(m[1, 0], m[0, 0])), float(pitch), float(np.arctan2(m[2, 1], m[2, 2]))
+        axes = rotation_matrix(self.world_from_rover)
+        pitch = np.arctan2(-axes[2, 0], np.hypot(axes[2, 1], axes[2, 2]))
+        return (float(np.arctan2(axes[1, 0], axes[0, 0])), float(pitch), float(np.arctan2(axes[2, 1], axes[2, 2])))
 
     @property
     def azimuth_rad(self) -> float:
@@ -310,9 +310,9 @@ class _StanceEquations:
 
     def _compute_jacobian(self, unknowns: Vector6, points: WheelPoints) -> Float64[np.ndarray, "6 6"]:
         """Compute the derivatives of the gaps by finite differences, at the lowest point of each tread only."""
-        step = _DIFFERENCE * np.eye(6)
+        step = _DIFFERENCE_STEP * np.eye(6)
         heights = self._compute_heights(np.concatenate([unknowns - step, unknowns + step]), points[:, None])[..., 0]
-        return np.asarray(((heights[6:] - heights[:6]) / (2.0 * _DIFFERENCE)).T)
+        return np.asarray(((heights[6:] - heights[:6]) / (2.0 * _DIFFERENCE_STEP)).T)
 
     def _find_lowest_points(self, unknowns: Vector6) -> tuple[Vector6, WheelPoints]:
         """Find each tread's smallest height above the ground, and the point there, relative to the wheel's centre."""
@@ -326,7 +326,7 @@ class _StanceEquations:
 
     @cached_property
     def _tread(self) -> Float64[np.ndarray, "points 3"]:
-        angle, line = np.meshgrid(_TREAD_RAD, _TREAD_LINES)
+        angle, line = np.meshgrid(_TREAD_RAD, _TREAD_OFFSETS)
         radius, width = self.rover.wheel_radius_m, self.rover.wheel_width_m
         return np.stack([radius * np.sin(angle), width * line, -radius * np.cos(angle)], axis=-1).reshape(-1, 3)
 

@@ -58,7 +58,7 @@ from marsyard.sim.parameters import bounded_field
 Vector = Float64[np.ndarray, "3"]
 StateVector = Float64[np.ndarray, "22"]
 Constants = tuple[kernels.Array, kernels.Array]
-Phase = Annotated[float, Field(ge=-360.0, le=720.0)]
+Degrees = Annotated[float, Field(ge=-360.0, le=720.0)]
 Gyration = Annotated[float, Field(ge=0.05, le=5.0)]
 
 #: Distance of the camera below the thrusters' firing height at which the integration ends: more than a second later.
@@ -69,6 +69,7 @@ MAX_LEAD_S = 30.0
 TOLERANCE = 1e-9
 #: Maximum ratio of the coning lander's tilt to the line's for which the linear theory defines an initial state.
 MAX_LANDER_TILT_RATIO = 1.5
+#: Unit vector downwards, world axes.
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -84,7 +85,7 @@ class SwingParameters(WindParameters):
     descent_rate_m_s: Annotated[
         float, bounded_field(20.0, 200.0, "descent rate of the parachute at the first image")
     ] = 75.0
-    density_scale_height_m: Annotated[float, bounded_field(5000.0, 20000.0, "of the atmosphere: CO2 at 220 K")] = (
+    density_scale_height_m: Annotated[float, bounded_field(5000.0, 20000.0, "density scale height: CO2 at 220 K")] = (
         11200.0
     )
     cone_angle_deg: Annotated[float, bounded_field(0.0, 45.0, "largest angle between the lander's axis and nadir")] = (
@@ -93,8 +94,8 @@ class SwingParameters(WindParameters):
     cone_minor_fraction: Annotated[
         float, bounded_field(-1.0, 1.0, "minor / major axis of the coning; sign: sense of rotation")
     ] = 0.5
-    cone_direction_deg: Annotated[Phase, Field(description="azimuth of the major axis of the coning")] = 0.0
-    cone_phase_deg: Annotated[Phase, Field(description="phase of the coning at the first image")] = 0.0
+    cone_direction_deg: Annotated[Degrees, Field(description="azimuth of the major axis of the coning")] = 0.0
+    cone_phase_deg: Annotated[Degrees, Field(description="phase of the coning at the first image")] = 0.0
     cone_damping_ratio: Annotated[float, bounded_field(-0.05, 0.2, "damping of small coning / critical (assumed)")] = (
         0.01
     )
@@ -102,24 +103,24 @@ class SwingParameters(WindParameters):
         float, bounded_field(0.0, 120.0, "largest rate of the nodding: fast swing of the lander on its bridle")
     ] = 20.0
     nod_direction_deg: Annotated[
-        Phase, Field(description="azimuth of the nodding, relative to the coning's major axis")
+        Degrees, Field(description="azimuth of the nodding, relative to the coning's major axis")
     ] = 0.0
-    nod_phase_deg: Annotated[Phase, Field(description="phase of the nodding at the first image")] = 0.0
-    nod_damping_ratio: Annotated[float, bounded_field(0.0, 0.5, "damping of small nodding by the bridle (assumed)")] = (
+    nod_phase_deg: Annotated[Degrees, Field(description="phase of the nodding at the first image")] = 0.0
+    nod_damping_ratio: Annotated[float, bounded_field(0.0, 0.5, "damping of small nodding / critical (assumed)")] = (
         0.002
     )
-    heading_deg: Annotated[Phase, Field(description="rotation about the lander's axis at the first image")] = 0.0
+    heading_deg: Annotated[Degrees, Field(description="rotation about the lander's axis at the first image")] = 0.0
     spin_rate_deg_s: Annotated[
         float, bounded_field(-30.0, 30.0, "spin rate about the lander's axis at the first image")
     ] = 0.0
     line_length_m: Annotated[float, bounded_field(10.0, 200.0, "canopy to hinge; bridle 20 m, rest assumed")] = 47.0
     bridle_length_m: Annotated[float, bounded_field(1.0, 100.0, "from the backshell to the hinge")] = 20.0
-    canopy_mass_kg: Annotated[float, bounded_field(1.0, 1000.0, "with lines and entrained air (assumed)")] = 30.0
+    canopy_mass_kg: Annotated[float, bounded_field(1.0, 1000.0, "canopy, lines and entrained air (assumed)")] = 30.0
     backshell_mass_kg: Annotated[float, bounded_field(0.0, 5000.0, "backshell without canopy")] = 179.0
     lander_mass_kg: Annotated[float, bounded_field(1.0, 5000.0, "lander with rover")] = 533.0
     mass_centre_m: Annotated[float, bounded_field(0.1, 10.0, "hinge to the lander's centre of mass (assumed)")] = 1.5
-    gyration_transverse_m: Annotated[Gyration, Field(description="gyration radius across its axis (assumed)")] = 0.5
-    gyration_axial_m: Annotated[Gyration, Field(description="gyration radius about its axis (assumed)")] = 0.5
+    gyration_transverse_m: Annotated[Gyration, Field(description="radius of gyration across the axis (assumed)")] = 0.5
+    gyration_axial_m: Annotated[Gyration, Field(description="radius of gyration about the axis (assumed)")] = 0.5
     arm_length_m: Annotated[float, bounded_field(0.0, 10.0, "from the hinge to the camera (assumed)")] = 1.5
     thruster_firing_m: Annotated[float, bounded_field(0.0, 1000.0, "height above ground of the thrusters' firing")] = (
         100.0
@@ -299,7 +300,7 @@ class SwingDescent(Trajectory):
     The origin of the body frame is the camera, and the IMU is at the same point. At time 0, the time of the first
     image, the camera is at `start_m`, coning and nodding have the phases of the parameters, and the canopy drifts with
     the mean wind. The equations of motion with gusts are integrated from this state backward and forward. Amplitudes
-    and rates match the parameters for coning alone or nodding alone in still air; large ones together interact.
+    and rates match the parameters for coning or nodding alone in still air; large coning and nodding interact.
 
     - parameters, start_m: parameters of the descent, and the camera's position at time 0, world axes, metres
     - wind: mean wind and gusts as functions of height
@@ -341,6 +342,7 @@ class SwingDescent(Trajectory):
             )
         wind = Wind.draw(p, ground_height_m, rng)
         modes = Modes.of(p, gravity_m_s2)
+        # with this rate at the lowest point the lander would reach the upright position
         loop_deg_s = float(np.degrees(2.0 * modes.nod_rad_s))
         if p.nod_rate_deg_s >= loop_deg_s:
             raise ValueError(f"nod_rate_deg_s is {p.nod_rate_deg_s:.6g}; allowed: below {loop_deg_s:.6g}, a full loop")
@@ -370,17 +372,17 @@ class SwingDescent(Trajectory):
         """Return the time at which the camera passes an altitude above the ground; ValueError if it does not."""
         first, last = self.span_s
 
-        def excess(time_s: float) -> float:
+        def height_above(time_s: float) -> float:
             return (
                 _compute_camera_height(self.path.at(np.array([time_s]))[0], self.chain)
                 - self.ground_height_m
                 - altitude_m
             )
 
-        if not excess(last) <= 0.0 <= excess(first):
-            highest, lowest = altitude_m + excess(first), altitude_m + excess(last)
+        if not height_above(last) <= 0.0 <= height_above(first):
+            highest, lowest = altitude_m + height_above(first), altitude_m + height_above(last)
             raise ValueError(f"altitude {altitude_m:.6g} m is not passed; allowed: {lowest:.6g} to {highest:.6g} m")
-        return float(brentq(excess, first, last, xtol=1e-9))
+        return float(brentq(height_above, first, last, xtol=1e-9))
 
     @cached_property
     def thruster_firing_s(self) -> float:
@@ -396,7 +398,8 @@ def _compute_initial_state(p: SwingParameters, modes: Modes, wind: Wind, start_m
     """Compute the state at the first image: coning and nodding of a canopy that drifts with the mean wind."""
     line, line_rate = _compute_cone_direction(p, modes, 1.0)
     axis, axis_rate = _compute_cone_direction(p, modes, modes.lander_tilt_ratio)
-    # pendulum of any amplitude about an axis that moves with the cone: sin(angle / 2) and the rate are in quadrature
+    # nodding about an axis that moves with the cone; the energy of a pendulum of any amplitude is constant:
+    # rate^2 + (2 nod_rad_s sin(nod / 2))^2 = largest_rate^2
     phase, largest_rate = np.radians(p.nod_phase_deg), np.radians(p.nod_rate_deg_s)
     nod = 2.0 * np.arcsin(largest_rate / (2.0 * modes.nod_rad_s) * np.sin(phase))
     nod_rate = largest_rate * np.cos(phase)

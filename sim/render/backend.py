@@ -51,26 +51,26 @@ def default_backend() -> Backend:
 #: OpenGL's camera looks along -z with y up.
 _VIEW_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
-#: Passes the triangle's number from its vertices to its fragments.
+#: Shaders that write the triangle's number as the colour of its fragments.
 _VERTEX_SHADER = """#version 330 core
 layout(location = 0) in vec3 position;
 layout(location = 1) in vec4 number;
 uniform mat4 view;
 uniform mat4 projection;
-flat out vec4 encoded;
+flat out vec4 number_colour;
 void main()
 {
     // mat4() prevents the compiler from reordering the products, which would change the rounding
     gl_Position = mat4(projection * view) * vec4(position, 1.0);
-    encoded = number;
+    number_colour = number;
 }
 """
 _FRAGMENT_SHADER = """#version 330 core
-flat in vec4 encoded;
+flat in vec4 number_colour;
 out vec4 colour;
 void main()
 {
-    colour = encoded;
+    colour = number_colour;
 }
 """
 _POSITION, _NUMBER = 0, 1
@@ -92,7 +92,7 @@ class DepthRenderer:
         if "OpenGL" in sys.modules and current != backend:
             raise RenderingError(
                 f"this process already uses OpenGL through {current}; a process can use one backend: "
-                f"start another for {backend}"
+                f"start another process for {backend}"
             )
         os.environ["PYOPENGL_PLATFORM"] = backend
         self.side_px = side_px
@@ -185,9 +185,9 @@ class DepthRenderer:
             (gl.GL_ELEMENT_ARRAY_BUFFER, self._faces, faces.astype(np.uint32)),
         ]
         if len(triangles) or self._object_vertex_count:
-            encoded = np.repeat((numbers + 1).astype(np.uint32) | np.uint32(_OPAQUE), 3)
+            colours = np.repeat((numbers + 1).astype(np.uint32) | np.uint32(_OPAQUE), 3)
             uploads.append((gl.GL_ARRAY_BUFFER, self._triangles, triangles.astype(np.float32)))
-            uploads.append((gl.GL_ARRAY_BUFFER, self._numbers, encoded))
+            uploads.append((gl.GL_ARRAY_BUFFER, self._numbers, colours))
         for kind, buffer, values in uploads:
             gl.glBindBuffer(kind, buffer)
             gl.glBufferData(kind, values.nbytes, np.ascontiguousarray(values), gl.GL_STREAM_DRAW)

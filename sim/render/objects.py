@@ -45,7 +45,7 @@ class Objects:
         albedo: float | Float64[np.ndarray, "names"],
         body_of_face: Int32[np.ndarray, "triangles"] | None = None,
     ) -> Objects:
-        """Build bodies from a mesh: contiguous faces of one name, or of one `body_of_face`, are one body.
+        """Build bodies from a mesh: contiguous faces of one name, or of one number in `body_of_face`, are one body.
 
         `albedo` is common to all bodies, or has one value for each name. Raises ValueError for more than
         `MAX_TRIANGLES` triangles.
@@ -79,7 +79,7 @@ class Objects:
         names: Int64[np.ndarray, "bodies"],
         spheres: Float64[np.ndarray, "bodies 4"] | None = None,
     ) -> Objects:
-        """Create bodies with `counts` triangles each; known bounding `spheres` save their computation."""
+        """Create bodies with `counts` triangles each; without `spheres`, bounding spheres are computed when needed."""
         if len(triangles) > MAX_TRIANGLES:
             raise ValueError(f"{len(triangles)} triangles; at most {MAX_TRIANGLES} can be drawn at once")
         body_of_triangle = np.repeat(np.arange(counts.size, dtype=np.int32), counts)
@@ -110,7 +110,7 @@ class Objects:
         is_selected = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
         return np.asarray(select_facing(self.triangles, self._triangles_of(is_selected), *apex))
 
-    def only(self, is_selected: Bool[np.ndarray, "bodies"]) -> Objects:
+    def select(self, is_selected: Bool[np.ndarray, "bodies"]) -> Objects:
         """Return the selected bodies, renumbered."""
         triangles = self._triangles_of(is_selected)
         return self._of_bodies(
@@ -148,7 +148,7 @@ def spheres_in_cone(
 
 #: Albedo of all rover parts, assumed: dusty bright metal and glass.
 ALBEDO = 0.25
-#: Name of the rover's body: rocks have numbers from 0, and truth layers use -1 for ground and -2 for sky.
+#: Number in `names` of the rover's body: rocks have numbers from 0; truth layers use -1 for ground and -2 for sky.
 ROVER_NAME = -3
 #: Dimensions that affect shadows only, assumed: width of the legs, radius of the mast and thickness of the deck, m;
 #: length and width of the body as fractions of those of the deck.
@@ -240,7 +240,7 @@ def may_cast_shadow(
     position_m: Float64[np.ndarray, "3"],
     radius_m: float,
 ) -> bool:
-    """Whether bodies in spheres may hide the sun from a point within a radius of a position; False is certain."""
+    """Return False if bodies in these spheres cannot hide the sun from any point within a radius of a position."""
     offset = spheres[:, :3] - position_m
     along_sun = offset @ sun_direction
     max_distance = spheres[:, 3] + radius_m
@@ -249,6 +249,7 @@ def may_cast_shadow(
 
 
 def _length(*parts: float | Float64[np.ndarray, "3"]) -> float:
+    """Compute the length of a vector with these components."""
     return float(np.linalg.norm(np.hstack(parts)))
 
 

@@ -153,7 +153,7 @@ def _spherical_albedo(lunar_fraction: float, surge_amplitude: float, surge_width
     tan_half = np.sqrt(np.clip(1.0 - cos_g, 0.0, None) / (1.0 + cos_g))
     surge = 1.0 + surge_amplitude / (1.0 + tan_half / surge_width)
     radiance = surge * (2.0 * lunar_fraction * cos_i / (cos_i + cos_e) + (1.0 - lunar_fraction) * cos_i)
-    # both halves of the azimuth
+    # the factor 2: both halves of the azimuth
     flux = 2.0 * np.einsum("ijk,j,k->i", radiance * cos_e, mu_weights, phi_weights) / np.pi
     return float(2.0 * np.sum(flux * mu_weights))
 
@@ -225,17 +225,17 @@ class CloudLayer:
         noise = np.fft.rfft2(rng.standard_normal((CELLS, CELLS)))
         if parameters.cover == 0.0:
             return cls(parameters, ground_m + parameters.base_m, _read_only(np.zeros((CELLS, CELLS))))
-        # squared wave numbers of the real transform's terms, rad2/m2
+        # squared wavenumbers of the real transform's terms, rad2/m2
         spacing = parameters.size_m * PERIOD_SIZES / CELLS
         y, x = 2.0 * np.pi * np.fft.fftfreq(CELLS, spacing), 2.0 * np.pi * np.fft.rfftfreq(CELLS, spacing)
-        wave2 = y[:, None] ** 2 + x**2
+        squared_k = y[:, None] ** 2 + x**2
         threshold = float(ndtri(1.0 - parameters.cover))
         total_variance = sum(variance for _, variance in OCTAVES)
         mean_square_slope = sum(variance / (2.0 * scale**2) for scale, variance in OCTAVES) / total_variance
         length = parameters.size_m * np.sqrt(mean_square_slope) * np.exp(-0.5 * threshold**2)
         length /= 2.0 * np.pi * parameters.cover
         power = sum(
-            variance * (scale * length) ** 2 * np.exp(-wave2 * (scale * length) ** 2) for scale, variance in OCTAVES
+            variance * (scale * length) ** 2 * np.exp(-squared_k * (scale * length) ** 2) for scale, variance in OCTAVES
         )
         field = np.fft.irfft2(noise * np.sqrt(power), s=(CELLS, CELLS))
         excess = field - np.quantile(field, 1.0 - parameters.cover)
@@ -243,7 +243,7 @@ class CloudLayer:
         slope = np.hypot(*(0.5 * (np.roll(excess, -1, k) - np.roll(excess, 1, k)) for k in (0, 1)))
         cloud_fraction = np.clip(0.5 + excess / np.maximum(slope, 1e-12), 0.0, 1.0)
         smoothed = np.fft.irfft2(
-            np.fft.rfft2(cloud_fraction) * np.exp(-0.5 * wave2 * parameters.edge_m**2), s=(CELLS, CELLS)
+            np.fft.rfft2(cloud_fraction) * np.exp(-0.5 * squared_k * parameters.edge_m**2), s=(CELLS, CELLS)
         )
         return cls(parameters, ground_m + parameters.base_m, _read_only(np.clip(smoothed, 0.0, 1.0)))
 

@@ -56,7 +56,7 @@ _MMAP_THRESHOLD_BYTES = 32 << 20
 _TRIM_THRESHOLD_BYTES = 1 << 30
 #: Number of scenes between returns of freed memory; a return after each scene takes 10 % of a rover case's time.
 _TRIM_INTERVAL_SCENES = 16
-#: Rays along each side of an image that determine the visible ground.
+#: Number of rays along each side of an image (probe rays) that determine the visible ground.
 _PROBES = 9
 
 

@@ -20,7 +20,7 @@ from marsyard.sim.render.objects import Objects, spheres_in_cone
 from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture, no_cover
 from marsyard.sim.terrain import Surface
 
-#: Rounding of a mean of heights in single precision, metres, at a few km.
+#: Rounding error of a mean of heights of a few km in single precision, metres.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
 _NO_COVER = np.ones((1, 1), dtype=np.float32)
@@ -32,7 +32,7 @@ Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]
 Spheres = Float64[np.ndarray, "bodies 4"]
 #: Largest number of cells along a side of a footprint.
 MAX_CELLS = 512
-#: Footprint of objects that may shade all ground.
+#: Region for objects that may shade all ground.
 ALL_GROUND = Footprint(np.ones((1, 1), dtype=np.bool_), 0.0, 0.0, 0.0)
 #: Maximum number of samples along a side of the grid on which the ground's shadow is computed.
 SHADOW_SIDE = 4096
@@ -111,7 +111,7 @@ class Scene:
         is_visible = np.zeros(len(self.objects), dtype=np.bool_)
         for cone in cones:
             is_visible |= potentially_visible(self.objects.spheres, sun, min_height, cone)
-        scene = replace(self, objects=self.objects.only(is_visible), visible_m=ground_in_cones(cones, min_height))
+        scene = replace(self, objects=self.objects.select(is_visible), visible_m=ground_in_cones(cones, min_height))
         return self._keep_results(scene, "mesh_offsets", "height_range_m", "max_slopes")
 
     @property
@@ -201,7 +201,7 @@ def shadow_footprint(spheres: Spheres, sun: Float64[np.ndarray, "3"], min_height
     lengths = np.maximum(spheres[:, 2] + spheres[:, 3] - min_height_m, 0.0) / sun[2]
     ends = starts - lengths[:, None] * sun[:2]
     low, high = np.minimum(starts, ends).min(axis=0), np.maximum(starts, ends).max(axis=0)
-    # a cell contains a body's radius and half a step
+    # a cell is longer than a body's radius and half a step together: the dilation by one cell covers both
     cell = float(max((high - low).max() / MAX_CELLS, 2.0 * spheres[:, 3].max(), 1e-3))
     steps = int(np.ceil(2.0 * float(np.linalg.norm(ends - starts, axis=1).max()) / cell)) + 2
     fraction = np.linspace(0.0, 1.0, steps)[:, None, None]
@@ -283,7 +283,7 @@ def ground_shadow(
     rows = columns = np.arange(len(field))
     max_rows = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, len(field)))
     if visible_m is not None:
-        # a path towards the sun, and the shadows that are cast on its end
+        # rows of the longest path towards the sun, as many rows for shadows that fall on its end, and 10 % of both
         path_rows = 2.2 * max_rows + _BORDER_SAMPLES
         path = spacing * path_rows * np.array([np.sign(along), shift] if along_x else [shift, np.sign(along)])
         bounds = np.reshape(visible_m, (2, 2)) + np.stack([np.minimum(path, 0.0), np.maximum(path, 0.0)], axis=1)
@@ -295,9 +295,11 @@ def ground_shadow(
             entries = np.arange(count)
             columns, rows = ((start + ((entries - start) & (count - 1))) & (len(field) - 1) for start in first)
     height = heights_in_rows(field, rows, columns, along_x)
-    swept, casters = sweep_shadow(height, float(np.sign(along)), drop, shift, max_rows)
+    shadow_height, caster_distance = sweep_shadow(height, float(np.sign(along)), drop, shift, max_rows)
     row_m, cos_elevation = spacing / abs(along), float(np.hypot(east, north))
-    return GroundShadow(swept, casters, along_x, spacing, level, row_m, cos_elevation, height_range_m[1])
+    return GroundShadow(
+        shadow_height, caster_distance, along_x, spacing, level, row_m, cos_elevation, height_range_m[1]
+    )
 
 
 def ground_in_cones(cones: Sequence[Cone], min_height_m: float) -> Bounds | None:

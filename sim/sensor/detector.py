@@ -28,7 +28,7 @@ from marsyard.sim.sensor.optics import (
     moving_exposure,
 )
 
-CODES = 256
+CODES = 256  #: Number of 8-bit codes.
 _RelativeError = Annotated[float, Field(ge=0.0, le=0.1)]
 Counts = UInt16[np.ndarray, "rows columns"]
 Delivered = UInt16[np.ndarray, "delivered_rows columns"]
@@ -40,10 +40,10 @@ class DefectParameters(Parameters):
     hot_fraction: Annotated[Fraction, Field(description="fraction of hot pixels")] = 0.0
     hot_e_s: Annotated[NonNegative, Field(description="mean dark current of a hot pixel at 0 deg C, e/s")] = 20000.0
     dead_fraction: Annotated[Fraction, Field(description="fraction of pixels without response")] = 0.0
-    listed: Annotated[bool, Field(description="whether the camera has a list of them and interpolates them")] = False
+    listed: Annotated[bool, Field(description="bad pixels are listed and interpolated")] = False
 
 
-#: Amplitude of an interference burst, a third of the image's signal, and its length, two delivered rows.
+#: Amplitude of an interference burst (a third of the image's signal) and its length (two delivered rows).
 BURST_DN, BURST_PX = 300.0, 2048.0
 
 
@@ -167,18 +167,18 @@ class Detector:
         if rows % p.rows_summed:
             raise ValueError(f"{rows} rows cannot be summed by {p.rows_summed}")
         response = fall_off * (1.0 + p.response_spread * rng.standard_normal(fall_off.shape, dtype=np.float32))
-        delivered = _sum_rows(response, p.rows_summed) / p.rows_summed
-        measured_response = delivered * (1.0 + p.calibration_error * rng.standard_normal(delivered.shape))
+        summed_response = _sum_rows(response, p.rows_summed) / p.rows_summed
+        measured_response = summed_response * (1.0 + p.calibration_error * rng.standard_normal(summed_response.shape))
         names = ("exposure_s", "transfer_row_s", "clear_row_s", "rows_summed", "offset_dn", "full_scale_dn")
         settings = {name: getattr(p, name) for name in names}
         calibration = DetectorCalibration(flat_field=measured_response.astype(np.float64), **settings)
-        is_bad, hot = np.zeros(fall_off.shape, dtype=np.bool_), None
+        is_bad, hot_e_s = np.zeros(fall_off.shape, dtype=np.bool_), None
         if p.defects.hot_fraction > 0.0:
             # the dark current of hot pixels is exponentially distributed
             is_hot = rng.random(fall_off.shape, dtype=np.float32) < p.defects.hot_fraction
-            hot = np.zeros(fall_off.shape, dtype=np.float32)
-            hot[is_hot] = p.defects.hot_e_s * rng.standard_exponential(int(is_hot.sum()), dtype=np.float32)
-            is_bad |= hot > 0.0
+            hot_e_s = np.zeros(fall_off.shape, dtype=np.float32)
+            hot_e_s[is_hot] = p.defects.hot_e_s * rng.standard_exponential(int(is_hot.sum()), dtype=np.float32)
+            is_bad |= hot_e_s > 0.0
         if p.defects.dead_fraction > 0.0:
             is_dead = rng.random(fall_off.shape, dtype=np.float32) < p.defects.dead_fraction
             response = np.where(is_dead, np.float32(0.0), response)
@@ -187,7 +187,7 @@ class Detector:
             response = response * dust_transmission(fall_off.shape, p.optics, rng)
         has_list = p.defects.listed and (p.defects.hot_fraction > 0.0 or p.defects.dead_fraction > 0.0)
         listed = _sum_rows(is_bad.astype(np.float32), p.rows_summed) > 0.0 if has_list else None
-        return cls(p, response.astype(np.float32), calibration, hot, listed)
+        return cls(p, response.astype(np.float32), calibration, hot_e_s, listed)
 
     def with_exposure(self, exposure_s: float) -> Detector:
         """Return the same detector with another exposure time; the calibration is updated."""
@@ -214,10 +214,12 @@ class Detector:
             )
         part = np.s_[row : row + size[1], column : column + size[0]]
         summed = np.s_[row // rows_summed : (row + size[1]) // rows_summed, part[1]]
-        hot = None if self.hot_e_s is None else self.hot_e_s[part]
+        hot_e_s = None if self.hot_e_s is None else self.hot_e_s[part]
         listed = None if self.listed is None else self.listed[summed]
         calibration = replace(self.calibration, flat_field=self.calibration.flat_field[summed])
-        return replace(self, response=self.response[part].copy(), calibration=calibration, hot_e_s=hot, listed=listed)
+        return replace(
+            self, response=self.response[part].copy(), calibration=calibration, hot_e_s=hot_e_s, listed=listed
+        )
 
     def expose(self, radiance: Image, rng: np.random.Generator, motion: ImageMotion | None = None) -> Delivered:
         """Simulate the counts of one exposure; `radiance` is the radiance factor of the scene at mid exposure."""
@@ -236,10 +238,10 @@ class Detector:
                 start = int(rng.integers(readout.size))
                 burst = readout[start : start + 1 + int(rng.exponential(p.bursts.length_px))]
                 burst += np.float32(p.bursts.amplitude_dn) * rng.standard_normal(burst.size, dtype=np.float32)
-        delivered: Delivered = np.clip(np.rint(counts), 0, p.full_scale_dn).astype(np.uint16)
+        image: Delivered = np.clip(np.rint(counts), 0, p.full_scale_dn).astype(np.uint16)
         if self.listed is not None:
-            delivered = fill_bad_pixels(delivered, self.listed)
-        return expand(compand(delivered, p.full_scale_dn), p.full_scale_dn) if p.companded else delivered
+            image = fill_bad_pixels(image, self.listed)
+        return expand(compand(image, p.full_scale_dn), p.full_scale_dn) if p.companded else image
 
     def charge(self, radiance: Image, motion: ImageMotion | None = None) -> Image:
         """Compute the mean photo charge in electrons of each physical pixel at the end of the transfer.
@@ -367,9 +369,9 @@ def auto_expose(
     saturation = min(float(p.full_scale_dn), p.full_well_e / p.gain_e_dn + p.offset_dn)
     exposure = float(np.clip(p.exposure_s, parameters.min_exposure_s, parameters.max_exposure_s))
     while True:
-        current = detector.with_exposure(exposure)
+        test_detector = detector.with_exposure(exposure)
         exposures.append(exposure)
-        counts = current.expose(radiance, rng, motion)[region or np.s_[:]]
+        counts = test_detector.expose(radiance, rng, motion)[region or np.s_[:]]
         if counts.size == 0:
             raise ValueError("the auto-exposure region is empty")
         level = float(np.percentile(counts, parameters.percentile))
@@ -379,7 +381,7 @@ def auto_expose(
         converged = abs(factor - 1.0) <= parameters.tolerance
         next_exposure = float(np.clip(exposure * factor, parameters.min_exposure_s, parameters.max_exposure_s))
         if converged or next_exposure == exposure:
-            return AutoExposure(current, tuple(exposures), converged)
+            return AutoExposure(test_detector, tuple(exposures), converged)
         if len(exposures) == parameters.pictures:
             return AutoExposure(detector.with_exposure(next_exposure), tuple(exposures), False)
         exposure = next_exposure

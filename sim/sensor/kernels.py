@@ -32,7 +32,7 @@ class Transfer(NamedTuple):
     - padded, pad: scene with border, and width of the border in pixels
     - response: relative response of each pixel
     - edges: first row of each block of rows, and the number of rows, shape (blocks + 1,)
-    - field, step: image velocity, as in `blur`
+    - velocity, step: image velocity, as in `blur`
     - start_s, row_s: start time of the transfer relative to mid exposure, and time per row
     """
 
@@ -40,23 +40,23 @@ class Transfer(NamedTuple):
     pad: int
     response: Array32
     edges: NDArray[np.int64]
-    field: Array
+    velocity: Array
     step: float
     start_s: float
     row_s: float
 
 
 @njit(cache=True)
-def interpolate_velocity(field: Array, step: float, row: float, column: float) -> tuple[float, float]:
+def interpolate_velocity(velocity: Array, step: float, row: float, column: float) -> tuple[float, float]:
     """Interpolate the velocity bilinearly at a pixel, rows and columns per second; constant beyond the grid."""
-    y = min(max(row / step, 0.0), field.shape[0] - 1.0)
-    x = min(max(column / step, 0.0), field.shape[1] - 1.0)
-    i, j = min(int(y), field.shape[0] - 2), min(int(x), field.shape[1] - 2)
+    y = min(max(row / step, 0.0), velocity.shape[0] - 1.0)
+    x = min(max(column / step, 0.0), velocity.shape[1] - 1.0)
+    i, j = min(int(y), velocity.shape[0] - 2), min(int(x), velocity.shape[1] - 2)
     fy, fx = y - i, x - j
     a, b, c, d = (1.0 - fy) * (1.0 - fx), (1.0 - fy) * fx, fy * (1.0 - fx), fy * fx
     return (
-        a * field[i, j, 0] + b * field[i, j + 1, 0] + c * field[i + 1, j, 0] + d * field[i + 1, j + 1, 0],
-        a * field[i, j, 1] + b * field[i, j + 1, 1] + c * field[i + 1, j, 1] + d * field[i + 1, j + 1, 1],
+        a * velocity[i, j, 0] + b * velocity[i, j + 1, 0] + c * velocity[i + 1, j, 0] + d * velocity[i + 1, j + 1, 0],
+        a * velocity[i, j, 1] + b * velocity[i, j + 1, 1] + c * velocity[i + 1, j, 1] + d * velocity[i + 1, j + 1, 1],
     )
 
 
@@ -108,11 +108,11 @@ def _find_tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
 
 
 @njit(cache=True)
-def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float, out: Array32) -> None:
+def blur(padded: Array32, pad: int, velocity: Array, step: float, exposure_s: float, out: Array32) -> None:
     """Average the moving scene over the exposure.
 
     - padded, pad: scene at mid exposure with border, and width of the border; three more columns on the right
-    - field, step: image velocity at grid nodes (rows and columns per second), and the grid spacing in pixels
+    - velocity, step: image velocity at grid nodes (rows and columns per second), and the grid spacing in pixels
     - out: output, shape of the scene without its border
     """
     rows, columns = out.shape
@@ -124,7 +124,7 @@ def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float
         bottom = min(top + TILE, rows)
         for left in range(0, columns, TILE):
             width = min(TILE, columns - left)
-            v_row, v_column = interpolate_velocity(field, step, 0.5 * (top + bottom - 1), left + 0.5 * (width - 1))
+            v_row, v_column = interpolate_velocity(velocity, step, 0.5 * (top + bottom - 1), left + 0.5 * (width - 1))
             write_path_kernel(v_row * exposure_s, v_column * exposure_s, pad, kernel)
             count = _find_tap_groups(kernel, groups)
             for r in range(top, bottom):
@@ -206,7 +206,7 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
 
     Returns the sum at each edge, shape (blocks + 1, columns).
     """
-    pad, edges, field, step = transfer.pad, transfer.edges, transfer.field, transfer.step
+    pad, edges, velocity, step = transfer.pad, transfer.edges, transfer.velocity, transfer.step
     blocks, columns = response.shape
     line = np.empty(TILE, dtype=np.float32)
     sums = prefix.reshape(-1)
@@ -217,7 +217,7 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
             time = transfer.start_s + (edges[start] - centre) * transfer.row_s
             for left in range(0, columns, TILE):
                 width = min(TILE, columns - left)
-                v_row, v_column = interpolate_velocity(field, step, centre - 0.5, left + 0.5 * (width - 1))
+                v_row, v_column = interpolate_velocity(velocity, step, centre - 0.5, left + 0.5 * (width - 1))
                 y, x = pad - v_row * time, pad + left - v_column * time
                 line[:] = 0.0
                 _add_shifted(sums, prefix.shape, edges[block + 1] + y, x, np.float32(1.0), line, width)
@@ -228,7 +228,7 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
 
 
 @njit(cache=True)
-def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
+def add_smear(transfer: Transfer, edge_sums: Array32, charge: Array32) -> None:
     """Add the charge that each packet collects during the transfer to `charge` (radiance x seconds, in place).
 
     The charge from previous blocks (`gather_blocks`) is interpolated linearly between the edges of a block. The rows of
@@ -247,12 +247,12 @@ def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
         for left in range(0, columns, TILE):
             width = min(TILE, columns - left)
             centre = 0.5 * (first + last - 1)
-            v_row, v_column = interpolate_velocity(transfer.field, transfer.step, centre, left + 0.5 * (width - 1))
+            v_row, v_column = interpolate_velocity(transfer.velocity, transfer.step, centre, left + 0.5 * (width - 1))
             y, x = pad - v_row * time, pad + left - v_column * time
             shifted[:], in_block[:] = 0.0, 0.0
             for k in range(width):
-                edge_charge[k] = gathered[block, left + k]
-                change[k] = gathered[block + 1, left + k] - edge_charge[k]
+                edge_charge[k] = edge_sums[block, left + k]
+                change[k] = edge_sums[block + 1, left + k] - edge_charge[k]
             for r in range(first, last):
                 line = shifted[r - first]
                 _add_shifted(scene, padded.shape, r + y, x, np.float32(1.0), line, width)

@@ -6,7 +6,7 @@ f-number N and transmission T, a pixel of area A on the optical axis collects el
 
 The sun is a black body of 5772 K with its nominal radius (IAU 2015 Resolution B3): 1361 W/m2 at 1 AU. Between 400 and
 1100 nm the difference from the measured spectrum is a few per cent, less than the uncertainty of quantum efficiency and
-lens transmission. The calibrated transmission of the lens absorbs the difference.
+lens transmission. The calibrated transmission of the lens compensates for the difference.
 
 Calibration: the field-test paper (section III.B) reports the signal-to-noise ratio (SNR) on the darkest terrain, and
 the fraction of the noise due to dark current, at -34, 0 and +23 deg C. Two constants are fitted: `LENS_TRANSMISSION`
@@ -37,6 +37,7 @@ from marsyard.sim.sensor.kernels import Transfer, add_smear, average_blocks, blu
 
 #: Planck constant, speed of light and Boltzmann constant, SI units.
 _PLANCK, _SPEED_OF_LIGHT, _BOLTZMANN = 6.62607015e-34, 2.99792458e8, 1.380649e-23
+#: Temperature and radius of the sun, and the astronomical unit.
 _SUN_K, _SUN_RADIUS_M, _AU_M = 5772.0, 6.957e8, 1.495978707e11
 
 #: Calibrated for an SNR of 103 without dark current at `DARKEST_RADIANCE_FACTOR`; includes window and other losses.
@@ -204,8 +205,9 @@ def dust_transmission(shape: tuple[int, int], parameters: OpticsParameters, rng:
     for _ in range(parameters.dust_discs):
         centre = rng.uniform(0.0, 1.0, 2) * shape
         radius = parameters.dust_radius_px * rng.uniform(2.0 / 3.0, 4.0 / 3.0)
-        outer = radius * (1.0 + parameters.dust_softness)
-        first, last = np.maximum(centre - outer, 0.0).astype(int), np.minimum(centre + outer + 1.0, shape).astype(int)
+        outer_px = radius * (1.0 + parameters.dust_softness)
+        first = np.maximum(centre - outer_px, 0.0).astype(int)
+        last = np.minimum(centre + outer_px + 1.0, shape).astype(int)
         row, column = np.ogrid[first[0] : last[0], first[1] : last[1]]
         distance = np.hypot(row - centre[0], column - centre[1]) / radius
         coverage = np.clip((1.0 + parameters.dust_softness - distance) / (2.0 * parameters.dust_softness), 0.0, 1.0)
@@ -311,7 +313,8 @@ def _add_clearing(arrays: _ExposureArrays, motion: ImageMotion, start_s: float, 
     """Add the smear of the clearing, which equals the transfer of the vertically flipped image with reversed time."""
     padded, response, charge = arrays
     rows = len(response)
-    # velocities at the nodes of the flipped image: flip and time reversal cancel for rows; columns change sign
+    # velocities at the nodes of the flipped image: time reversal changes the sign of both components, the flip changes
+    # that of the row component again
     positions = np.clip((rows - 1 - _grid_nodes(rows)) / GRID_STEP_PX, 0.0, len(motion.velocity_px_s) - 1.0)
     node = np.minimum(positions.astype(np.int64), len(motion.velocity_px_s) - 2)
     fraction = (positions - node)[:, None, None]

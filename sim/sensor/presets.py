@@ -374,16 +374,16 @@ class CustomCamera(Parameters):
     @classmethod
     def from_camera(cls, camera: CameraModel, **origin: Any) -> CustomCamera:
         """Create the parameters from a camera with any pose; the camera is mounted to look down."""
-        mounted = mount_looking_down(camera)
-        length = float(np.linalg.norm(mounted.a))  # A in PDS labels is rounded and not exactly a unit vector
+        model = mount_looking_down(camera)
+        length = float(np.linalg.norm(model.a))  # A in PDS labels is rounded and not exactly a unit vector
         vectors: dict[str, Any] = {
-            letter: tuple((getattr(mounted, letter) / (length if letter in "hv" else 1.0)).tolist())
+            letter: tuple((getattr(model, letter) / (length if letter in "hv" else 1.0)).tolist())
             for letter in "hvore"
-            if hasattr(mounted, letter)
+            if hasattr(model, letter)
         }
-        values = {"columns": mounted.size[0], "rows": mounted.size[1], "linearity": getattr(mounted, "linearity", None)}
+        values = {"columns": model.size[0], "rows": model.size[1], "linearity": getattr(model, "linearity", None)}
         # class names equal model names
-        return cls.model_validate({"model": type(mounted).__name__.upper(), **values, **vectors, **origin})
+        return cls.model_validate({"model": type(model).__name__.upper(), **values, **vectors, **origin})
 
 
 def _resolve_camera(settings: object) -> object:

@@ -192,8 +192,8 @@ class RtkReceiver:
         velocities = motion.velocities_m_s + self.velocity_wander.at(times_s)
         velocities = velocities + p.velocity_noise_m_s * white_noise[:, 3:]
         for outage in p.outages:
-            missing = (times_s >= outage.start_s) & (times_s < outage.start_s + outage.duration_s)
-            positions[missing], velocities[missing] = np.nan, np.nan
+            is_outage = (times_s >= outage.start_s) & (times_s < outage.start_s + outage.duration_s)
+            positions[is_outage], velocities[is_outage] = np.nan, np.nan
         reported = self.reported_factor * np.where(floating, p.floating.total_m, p.fixed.total_m)
         return RtkSolutions(tags, positions, velocities, reported, ~floating[:, 0])
 

@@ -89,8 +89,7 @@ class TerrainBank:
     """Numbered terrains of one kind, cached on disk. Wind tails of rocks are part of the surface.
 
     Terrain k is a pure function of the parameters, the seed and k. The file of a terrain is one array: all levels, then
-    the cover.
-    Workers memory-map it and therefore share its pages. The size of the cache is limited (see
+    the cover. Workers memory-map it and therefore share its pages. The size of the cache is limited (see
     `marsyard.sim.cache.evict_files`).
     """
 
@@ -104,13 +103,13 @@ class TerrainBank:
         if flat is not None and flat.size == self._size():
             touch(path)
         else:
-            built = self._build(number)
-            flat = np.concatenate([array.reshape(-1) for array in (*built.levels, built.cover)])
+            surface = self._build(number)
+            flat = np.concatenate([array.reshape(-1) for array in (*surface.levels, surface.cover)])
             try:
                 evict_files(path.parent, 4 * self._size(), set(_IN_USE))
                 flat = save_array(path, flat)
             except OSError as error:
-                warnings.warn(f"terrain {number} is not kept: {path}: {error.strerror}", CacheWarning, stacklevel=2)
+                warnings.warn(f"terrain {number} is not stored: {path}: {error.strerror}", CacheWarning, stacklevel=2)
                 flat.flags.writeable = False
         _IN_USE[path] = flat
         sides, cover_side = self._sides(), self._cover_side()

@@ -282,6 +282,7 @@ def choose_grid(source: RealTerrain) -> tuple[int, float]:
     longest = max(raster.values.shape)
     # the terrain's side is the power of two that is at least 1.5 times that of the DTM
     samples = max(64, 1 << int(np.ceil(np.log2(1.5 * longest))))
+    # the maximum in the message is MAX_SIDE / 1.5
     if samples > MAX_SIDE:
         raise TerrainFileError(f"{source.dtm} has {longest} posts along a side; maximum: 5461")
     return samples, raster.posting_m
@@ -318,12 +319,12 @@ def blend_into_ground(ground: Ground, dtm: EmbeddedDtm, detail: Detail | None) -
     difference[dtm.rows, dtm.columns] = dtm.height - ground.height[dtm.rows, dtm.columns]
     deformation = _extrapolate_smoothly(difference[::step, ::step].astype(np.float64), is_covered[::step, ::step])
     np.add(ground.height, refine(deformation.astype(np.float32), ground.side), out=ground.height)
-    area = ground.height[dtm.rows, dtm.columns]
-    area += dtm.weight * (height - area)
+    region = ground.height[dtm.rows, dtm.columns]
+    region += dtm.weight * (height - region)
     if dtm.log_brightness is not None:
         log_brightness = dtm.log_brightness if detail is None else dtm.log_brightness + detail[1]
-        area = ground.log_albedo[dtm.rows, dtm.columns]
-        area += dtm.weight * (log_brightness - area)
+        region = ground.log_albedo[dtm.rows, dtm.columns]
+        region += dtm.weight * (log_brightness - region)
 
 
 def _extrapolate_smoothly(

@@ -34,7 +34,7 @@ def bspline_weights(t: float) -> WeightsAndDerivatives:
 
 @njit(cache=True, inline="always")
 def sample(field: Level, inverse_spacing: float, x: float, y: float) -> tuple[float, float, float, float]:
-    """Evaluate height, its slopes along x and y, and albedo of one level at one position."""
+    """Evaluate height, its slopes along x and y, and albedo of one periodic level at one position."""
     side = field.shape[0]
     mask = side - 1
     gx = x * inverse_spacing

@@ -12,17 +12,17 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True)
-def _edge_length(first: Array, second: Array) -> float:
-    return math.sqrt((first[0] - second[0]) ** 2 + (first[1] - second[1]) ** 2 + (first[2] - second[2]) ** 2)
+def _edge_length(start: Array, end: Array) -> float:
+    return math.sqrt((start[0] - end[0]) ** 2 + (start[1] - end[1]) ** 2 + (start[2] - end[2]) ** 2)
 
 
 @njit(cache=True)
 def rasterize_heights(
     triangles: Array, corner_x: float, corner_y: float, cell: float, max_spacing: float, top: Array
 ) -> None:
-    """Raise `top` (height of each cell, world, metres) to the highest point of the triangles in each cell.
+    """Update `top`, the maximum height of the triangles in each cell (world, metres).
 
-    Points are sampled on each triangle along both of its sides, at most `max_spacing` apart. The centre of cell
+    Points are sampled on a regular grid of barycentric weights, at most `max_spacing` apart. The centre of cell
     (row, column) is at corner + cell * (column, row). Points outside the grid are ignored.
     """
     rows, columns = top.shape
@@ -32,10 +32,10 @@ def rasterize_heights(
         steps = max(math.ceil(longest / max_spacing), 1)
         for j in range(steps + 1):
             for i in range(steps + 1 - j):
-                second, third = i / steps, j / steps
-                first = 1.0 - second - third
-                column = round((first * a[0] + second * b[0] + third * c[0] - corner_x) / cell)
-                row = round((first * a[1] + second * b[1] + third * c[1] - corner_y) / cell)
+                weight_b, weight_c = i / steps, j / steps
+                weight_a = 1.0 - weight_b - weight_c
+                column = round((weight_a * a[0] + weight_b * b[0] + weight_c * c[0] - corner_x) / cell)
+                row = round((weight_a * a[1] + weight_b * b[1] + weight_c * c[1] - corner_y) / cell)
                 if 0 <= row < rows and 0 <= column < columns:
-                    height = first * a[2] + second * b[2] + third * c[2]
+                    height = weight_a * a[2] + weight_b * b[2] + weight_c * c[2]
                     top[row, column] = max(top[row, column], height)

@@ -23,27 +23,33 @@ def rotate_about_pivot(x: float, z: float, angle: float, pivot: Array) -> tuple[
 
 
 @njit(cache=True)
-def compute_wheel_centres(centres0: Array, rocker_pivot: Array, bogie_pivot: Array, joints: Array) -> Array:
+def compute_wheel_centres(level_centres: Array, rocker_pivot: Array, bogie_pivot: Array, joints: Array) -> Array:
     """Compute the centres of the wheels in the rover frame, metres, shape (6, 3).
 
-    - centres0: the same on level ground (all joint angles zero), in the order of the rover's `WHEELS`
+    - level_centres: centres on level ground (all joint angles zero), in the order of the rover's `WHEELS`
     - rocker_pivot, bogie_pivot: (x, z) of the axes on level ground
     - joints: angles of the differential, the left and the right bogie, radians
     """
     centres = np.empty((2 * WHEELS_PER_SIDE, 3))
     for wheel in range(2 * WHEELS_PER_SIDE):
         side = wheel // WHEELS_PER_SIDE
-        x, z = centres0[wheel, 0], centres0[wheel, 2]
+        x, z = level_centres[wheel, 0], level_centres[wheel, 2]
         if wheel % WHEELS_PER_SIDE > 0:
             x, z = rotate_about_pivot(x, z, joints[1 + side], bogie_pivot)
         x, z = rotate_about_pivot(x, z, joints[0] if side == 0 else -joints[0], rocker_pivot)
-        centres[wheel, 0], centres[wheel, 1], centres[wheel, 2] = x, centres0[wheel, 1], z
+        centres[wheel, 0], centres[wheel, 1], centres[wheel, 2] = x, level_centres[wheel, 1], z
     return centres
 
 
 @njit(cache=True)
 def compute_tread_points(
-    states: Array, yaw: float, position: Array, centres0: Array, rocker_pivot: Array, bogie_pivot: Array, treads: Array
+    states: Array,
+    yaw: float,
+    position: Array,
+    level_centres: Array,
+    rocker_pivot: Array,
+    bogie_pivot: Array,
+    treads: Array,
 ) -> tuple[Array, Array, Array]:
     """Compute world x, y and z of points on the wheels' treads, each of shape (n, 6, points).
 
@@ -59,7 +65,7 @@ def compute_tread_points(
         # rotation by roll about x, then by -pitch about y, then by yaw about z
         sp, cp = math.sin(-states[n, 1]), math.cos(-states[n, 1])
         sr, cr = math.sin(states[n, 2]), math.cos(states[n, 2])
-        centres = compute_wheel_centres(centres0, rocker_pivot, bogie_pivot, states[n, 3:])
+        centres = compute_wheel_centres(level_centres, rocker_pivot, bogie_pivot, states[n, 3:])
         for wheel in range(2 * WHEELS_PER_SIDE):
             tread = treads[wheel % treads.shape[0]]
             for k in range(points_per_tread):

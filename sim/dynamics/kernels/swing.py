@@ -129,10 +129,10 @@ def compute_aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array
 
 @njit(cache=True)
 def state_derivative(_t: float, y: Array, constants: Array, waves: Array) -> Array:
-    """Right-hand side for the integrator, with the arrays of `pack_constants`: numba converts named tuples slowly."""
+    """Right-hand side for the integrator; arguments are arrays, because numba converts named tuples slowly."""
     chain = Chain(*to_fixed_tuple(constants[:CHAIN_SIZE], CHAIN_SIZE))
-    mean = to_fixed_tuple(constants[CHAIN_SIZE:], FIELD_SIZE)
-    rates: Array = compute_derivatives(y, chain, WindField(mean[0], mean[1], mean[2], mean[3], mean[4], waves))
+    wind = to_fixed_tuple(constants[CHAIN_SIZE:], FIELD_SIZE)
+    rates: Array = compute_derivatives(y, chain, WindField(wind[0], wind[1], wind[2], wind[3], wind[4], waves))
     return rates
 
 

@@ -33,7 +33,7 @@ from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_f
 
 Gain = Annotated[float, Field(gt=0.0, le=10.0)]
 
-#: Duration of the flight after the last image, because the camera's clock can be late.
+#: Duration of the flight after the last image; it is needed because the camera's clock can be late.
 TAIL_S = 0.1
 
 
@@ -193,7 +193,7 @@ class FlownPath(Trajectory):
         vibration = [self.vibration.derivative(times_s, order) for order in range(3)]
         attitudes, rates = attitudes_and_body_rates(angles + vibration[0][:, 3:], angle_rates + vibration[1][:, 3:])
         path = self._interpolate(interval, elapsed_s, kernels.POSITION)
-        derivatives = [smooth + sine[:, :3] for smooth, sine in zip(path, vibration, strict=True)]
+        derivatives = [vector + sine[:, :3] for vector, sine in zip(path, vibration, strict=True)]
         return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
     def _interpolate(
@@ -352,7 +352,7 @@ def simulate_transit(
 
 
 def simulate_landing(
-    flown: RotorcraftFlight,
+    transit: RotorcraftFlight,
     guidance: LandingGuidance,
     site_m: Float64[np.ndarray, "2"],
     errors: Float64[np.ndarray, "m 9"],
@@ -361,7 +361,7 @@ def simulate_landing(
     laser: AltimeterErrors,
     end_s: float | None = None,
 ) -> RotorcraftFlight:
-    """Continue a flight to a site and land.
+    """Continue the flight `transit` to a site and land.
 
     The simulation ends at `end_s`; by default `rest_s` after the touchdown, or at the time limit without a touchdown.
     `site_m` is the site's east and north in the coordinates of the navigation. `errors` are the estimated position,
@@ -369,30 +369,30 @@ def simulate_landing(
     also applies to all later knots. Raises ValueError if the gusts or the laser's noise end before the longest possible
     flight.
     """
-    step, before = flown.craft.step_s, len(flown.path.rows)
-    count = before + int(np.ceil((guidance.wait_s + guidance.max_duration_s) / step))
+    step, transit_knots = transit.craft.step_s, len(transit.path.rows)
+    count = transit_knots + int(np.ceil((guidance.wait_s + guidance.max_duration_s) / step))
     air.check_duration(count)
     if len(laser.noise_m) < count:
         raise ValueError(f"there is laser noise for {len(laser.noise_m)} knots; the flight can have {count}")
-    rows = np.concatenate([flown.path.rows, np.zeros((count - before, kernels.SIZE))])
-    phases = np.concatenate([flown.phases, np.full(count - before, Phase.WAIT.value)])
+    rows = np.concatenate([transit.path.rows, np.zeros((count - transit_knots, kernels.SIZE))])
+    phases = np.concatenate([transit.phases, np.full(count - transit_knots, Phase.WAIT.value)])
     padded_errors = np.concatenate([errors, np.repeat(errors[-1:], max(count - len(errors), 0), axis=0)])
-    commands = kernels.Landing(
+    landing = kernels.Landing(
         **guidance.model_dump(include=set(kernels.Landing._fields)),
         site_east_m=float(site_m[0]),
         site_north_m=float(site_m[1]),
-        hover_m=float(rows[before - 1, 2] + padded_errors[before - 1, 2]),
-        wait_until=before - 1 + round((guidance.wait_s - TAIL_S) / step),
+        hover_m=float(rows[transit_knots - 1, 2] + padded_errors[transit_knots - 1, 2]),
+        wait_until=transit_knots - 1 + round((guidance.wait_s - TAIL_S) / step),
         laser_scale=laser.scale,
         laser_stuck_m=np.nan if laser.stuck_m is None else laser.stuck_m,
     )
-    flight = kernels.Flight(rows, flown.autopilot.copy(), flown.heading_rad, air.mean_m_s, air.gusts_m_s, step)
-    craft = flown.craft.to_kernel(flown.path.gravity_m_s2)
-    kernels.land(flight, phases, before - 1, padded_errors, laser.noise_m, ground.as_kernel(), commands, craft)
-    landed = np.flatnonzero(phases == Phase.ON_GROUND.value)
+    flight = kernels.Flight(rows, transit.autopilot.copy(), transit.heading_rad, air.mean_m_s, air.gusts_m_s, step)
+    craft = transit.craft.to_kernel(transit.path.gravity_m_s2)
+    kernels.land(flight, phases, transit_knots - 1, padded_errors, laser.noise_m, ground.as_kernel(), landing, craft)
+    ground_knots = np.flatnonzero(phases == Phase.ON_GROUND.value)
     if end_s is not None:
-        count = min(count, round((end_s - flown.path.start_s) / step) + 1)
-    elif landed.size:
-        count = min(count, int(landed[0]) + int(np.ceil(guidance.rest_s / step)))
-    path = replace(flown.path, rows=rows[:count])
-    return replace(flown, path=path, phases=phases[:count], autopilot=flight.autopilot)
+        count = min(count, round((end_s - transit.path.start_s) / step) + 1)
+    elif ground_knots.size:
+        count = min(count, int(ground_knots[0]) + int(np.ceil(guidance.rest_s / step)))
+    path = replace(transit.path, rows=rows[:count])
+    return replace(transit, path=path, phases=phases[:count], autopilot=flight.autopilot)

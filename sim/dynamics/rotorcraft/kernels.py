@@ -98,7 +98,7 @@ def compute_ground_height(ground: Ground, east: float, north: float) -> float:
 
 @njit(cache=True)
 def compute_laser_range(ground: Ground, row: Array) -> float:
-    """Compute the range along body -z to the ground by four fixed-point iterations; the beam is nearly vertical."""
+    """Compute the range along body -z to the ground; the beam is nearly vertical: four fixed-point steps converge."""
     yaw, pitch, roll = row[ANGLE], row[ANGLE + 1], row[ANGLE + 2]
     cp, sp, cr, sr = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
     forward = cr * sp
@@ -115,16 +115,20 @@ def compute_laser_range(ground: Ground, row: Array) -> float:
 
 @njit(cache=True)
 def _limit_length(east: float, north: float, limit: float) -> tuple[float, float]:
+    """Shorten a horizontal vector to at most `limit`."""
     length = math.hypot(east, north)
     return (east, north) if length <= limit else (limit * east / length, limit * north / length)
 
 
 @njit(cache=True)
 def _command_acceleration(
-    state: Array, autopilot: Array, goal: Array, speed: Array, acceleration: Array, step: float, craft: Craft
+    state: Array, autopilot: Array, goal: Array, velocity: Array, acceleration: Array, step: float, craft: Craft
 ) -> tuple[float, float, float]:
-    """Compute the acceleration that the autopilot commands (east, north, up), and update the autopilot's trim."""
-    error = speed + craft.position_gain * (goal - state[:VELOCITY]) - state[VELOCITY:ACCELERATION]
+    """Compute the acceleration that the autopilot commands (east, north, up), and update the autopilot's trim.
+
+    `goal`, `velocity` and `acceleration` are the desired position, velocity and acceleration.
+    """
+    error = velocity + craft.position_gain * (goal - state[:VELOCITY]) - state[VELOCITY:ACCELERATION]
     autopilot[TRIM:] += craft.trim_gain * error * step
     command = acceleration + craft.speed_gain * error + autopilot[TRIM:]
     limit = craft.gravity_m_s2 * math.tan(craft.max_tilt_rad)
@@ -143,11 +147,17 @@ def _integrate(row: Array, after: Array, step: float) -> None:
 
 
 @njit(cache=True)
-def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float, float, float], craft: Craft) -> None:
-    """Compute the row after row k: angles from the commands; accelerations from thrust (body z), drag and gravity."""
+def _step_flight(
+    flight: Flight, k: int, angle_errors: Array, command: tuple[float, float, float], craft: Craft
+) -> None:
+    """Compute the row after row k: angles from the commands; accelerations from thrust (body z), drag and gravity.
+
+    - angle_errors: estimated minus true yaw, pitch and roll
+    - command: acceleration to the east, north and up
+    """
     row, after, gust = flight.rows[k], flight.rows[k + 1], flight.gusts[k + 1]
     autopilot, step, g = flight.autopilot, flight.step, craft.gravity_m_s2
-    yaw_estimate = row[ANGLE] + tilt_error[0]
+    yaw_estimate = row[ANGLE] + angle_errors[0]
     cy, sy = math.cos(yaw_estimate), math.sin(yaw_estimate)
     pitch_command = math.atan2(cy * command[0] + sy * command[1], g)
     roll_command = -math.atan2((cy * command[1] - sy * command[0]) * math.cos(pitch_command), g)
@@ -159,9 +169,9 @@ def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float
     gust_left = cy * gust[1] - sy * gust[0]
     # the autopilot controls the estimated angles; a gust tilts the rotor along its direction and turns the nose into it
     targets = (
-        flight.heading - tilt_error[0] - craft.gust_yaw_s_m * gust_left,
-        pitch_command - tilt_error[1] + craft.gust_tilt_s_m * gust_forward,
-        roll_command - tilt_error[2] - craft.gust_tilt_s_m * gust_left,
+        flight.heading - angle_errors[0] - craft.gust_yaw_s_m * gust_left,
+        pitch_command - angle_errors[1] + craft.gust_tilt_s_m * gust_forward,
+        roll_command - angle_errors[2] - craft.gust_tilt_s_m * gust_left,
     )
     for i in range(3):
         natural_frequency = craft.heading_rad_s if i == 0 else craft.attitude_rad_s
@@ -188,7 +198,10 @@ def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float
 
 @njit(cache=True)
 def _step_on_ground(row: Array, after: Array, step: float, craft: Craft) -> None:
-    """Compute the next row on the ground: velocity and tilt decay to zero with the time constant `contact_s`."""
+    """Compute the next row on the ground: velocity and yaw rate decay with the time constant `contact_s`.
+
+    Pitch and roll decay to zero, critically damped with the natural frequency 0.5 / `contact_s`.
+    """
     for i in range(3):
         after[ACCELERATION + i] = -(row[VELOCITY + i] + step * row[ACCELERATION + i]) / craft.contact_s
         natural_frequency = 0.5 / craft.contact_s
@@ -230,7 +243,7 @@ def land(
     """
     rows = flight.rows
     goal = np.empty(3)
-    speed = np.zeros(3)
+    velocity = np.zeros(3)
     zero = np.zeros(3)
     phase = WAIT
     for k in range(start, rows.shape[0] - 1):
@@ -253,16 +266,16 @@ def land(
                 phase = FLARE
         # goal: the current position in WAIT and FLARE, otherwise a point towards the site, limited by the speed
         goal[2] = landing.hover_m
-        speed[2] = 0.0
+        velocity[2] = 0.0
         if phase in (WAIT, FLARE):
             goal[0], goal[1] = estimate[0], estimate[1]
         else:
             east, north = _limit_length(to_site_east, to_site_north, landing.approach_m_s / craft.position_gain)
             goal[0], goal[1] = estimate[0] + east, estimate[1] + north
         if phase >= DESCEND:
-            speed[2] = -landing.descent_m_s if phase == DESCEND else -landing.flare_m_s
+            velocity[2] = -landing.descent_m_s if phase == DESCEND else -landing.flare_m_s
             goal[2] = estimate[2]
-        command = _command_acceleration(estimate, flight.autopilot, goal, speed, zero, flight.step, craft)
+        command = _command_acceleration(estimate, flight.autopilot, goal, velocity, zero, flight.step, craft)
         _step_flight(flight, k, errors[k, ACCELERATION:], command, craft)
         after = rows[k + 1]
         if phase != WAIT and after[2] - craft.gear_m <= compute_ground_height(ground, after[0], after[1]):

@@ -25,7 +25,8 @@ Grid = tuple[Array, Longs, Longs, Longs]
 #: the cells; maximum s of each listed triangle.
 BodyGrids = tuple[Array, Longs, Longs, Longs, Array]
 #: Linear functions of each triangle (constant, slope along u, slope along v): the weights of the second and third
-#: corner, and s of its plane; unit vectors u and v perpendicular to the sun's direction, and s along it; grids.
+#: corner, and s of its plane; unit vectors u and v perpendicular to the sun's direction, and s along it; grid over all
+#: bodies, and grids of the bodies.
 Casters = tuple[Array, Array, Grid, BodyGrids]
 #: Minimum u and v, maximum u, v and s; or minimum u and v, cells per metre along u and v, and maximum s.
 BoundsUVS = tuple[float, float, float, float, float]
@@ -55,12 +56,12 @@ def _project_along_sun(triangles: Array, axes: Array) -> tuple[Array, Array]:
         u, v, s = projected[0, 0], projected[1, 0], projected[2, 0]
         u2, v2, s2 = projected[0, 1] - u, projected[1, 1] - v, projected[2, 1] - s
         u3, v3, s3 = projected[0, 2] - u, projected[1, 2] - v, projected[2, 2] - s
-        area = u2 * v3 - u3 * v2
-        if abs(area) < MIN_DOUBLE_AREA_M2:
+        double_area = u2 * v3 - u3 * v2
+        if abs(double_area) < MIN_DOUBLE_AREA_M2:
             linear[n] = math.nan
             continue
-        weight2_u, weight2_v = v3 / area, -u3 / area
-        weight3_u, weight3_v = -v2 / area, u2 / area
+        weight2_u, weight2_v = v3 / double_area, -u3 / double_area
+        weight3_u, weight3_v = -v2 / double_area, u2 / double_area
         slope_u, slope_v = weight2_u * s2 + weight3_u * s3, weight2_v * s2 + weight3_v * s3
         linear[n, 0], linear[n, 1], linear[n, 2] = -(weight2_u * u + weight2_v * v), weight2_u, weight2_v
         linear[n, 3], linear[n, 4], linear[n, 5] = -(weight3_u * u + weight3_v * v), weight3_u, weight3_v
@@ -69,8 +70,8 @@ def _project_along_sun(triangles: Array, axes: Array) -> tuple[Array, Array]:
 
 
 @njit(cache=True)
-def _joint_bounds(bounds: Array, first: int, end: int) -> BoundsUVS:
-    """Joint bounds of the rows from `first` to before `end`."""
+def _enclose_bounds(bounds: Array, first: int, end: int) -> BoundsUVS:
+    """Compute bounds that enclose the rows of bounds from `first` to before `end`."""
     u0, v0, u1, v1, s1 = math.inf, math.inf, -math.inf, -math.inf, -math.inf
     for n in range(first, end):
         u0 = min(u0, bounds[n, 0])
@@ -82,14 +83,14 @@ def _joint_bounds(bounds: Array, first: int, end: int) -> BoundsUVS:
 
 
 @njit(cache=True)
-def _cells_per_side(items: float) -> int:
-    """Number of cells along a side for about one item per cell."""
+def _choose_side(items: float) -> int:
+    """Choose the number of cells along a side for about one item per cell."""
     return min(max(math.ceil(math.sqrt(items)), 1), MAX_CELLS)
 
 
 @njit(cache=True, inline="always")
-def _cell(value: float, low: float, per_metre: float, count: int) -> int:
-    """Cell index of a coordinate; values outside the grid by rounding errors belong to its border cells."""
+def _find_cell(value: float, low: float, per_metre: float, count: int) -> int:
+    """Find the cell of a coordinate; values outside the grid by rounding errors belong to its border cells."""
     return min(max(int((value - low) * per_metre), 0), count - 1)
 
 
@@ -98,10 +99,10 @@ def _add_to_cells(bounds: Array, n: int, grid: Array, side: int, first: int, end
     """Add the n-th row of bounds to the list of each cell of a grid that it overlaps.
 
     `grid` is a row of `grid_rows` of `_list_in_cells`, `first` the grid's first cell. `ends`, the ends of the cells'
-    lists, are updated. With an empty `items` the function only counts.
+    lists, are updated. With an empty `items` the rows are only counted.
     """
-    low, high = _cell(bounds[n, 1], grid[1], grid[3], side), _cell(bounds[n, 3], grid[1], grid[3], side)
-    left, right = _cell(bounds[n, 0], grid[0], grid[2], side), _cell(bounds[n, 2], grid[0], grid[2], side)
+    low, high = _find_cell(bounds[n, 1], grid[1], grid[3], side), _find_cell(bounds[n, 3], grid[1], grid[3], side)
+    left, right = _find_cell(bounds[n, 0], grid[0], grid[2], side), _find_cell(bounds[n, 2], grid[0], grid[2], side)
     for i in range(low, high + 1):
         for j in range(left, right + 1):
             cell = first + i * side + j
@@ -139,8 +140,8 @@ def _list_in_cells(
 
 
 @njit(cache=True)
-def _grid_row(bounds: BoundsUVS, side: int) -> BoundsUVS:
-    """Minimum u and v, cells per metre along u and v, and maximum s of a grid over these bounds."""
+def _create_grid_row(bounds: BoundsUVS, side: int) -> BoundsUVS:
+    """Create the row of a grid over these bounds: minimum u and v, cells per metre along u and v, maximum s."""
     return bounds[0], bounds[1], side / (bounds[2] - bounds[0]), side / (bounds[3] - bounds[1]), bounds[4]
 
 
@@ -155,9 +156,9 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     cells = 0
     for body in range(bodies):
         first, end = first_triangle[body], first_triangle[body + 1]
-        side = _cells_per_side((end - first) / TRIANGLES_PER_CELL)
-        joint = _joint_bounds(bounds, first, end)
-        body_bounds[body], body_grids[body] = joint, _grid_row(joint, side)
+        side = _choose_side((end - first) / TRIANGLES_PER_CELL)
+        enclosing = _enclose_bounds(bounds, first, end)
+        body_bounds[body], body_grids[body] = enclosing, _create_grid_row(enclosing, side)
         layouts[body, 0], layouts[body, 1] = side, cells
         cells += side * side
     starts, items = _list_in_cells(bounds, first_triangle, body_grids, layouts[:, 0].copy(), layouts[:, 1].copy())
@@ -165,14 +166,14 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     for k in range(items.size):
         max_s[k] = bounds[items[k], 4]
     # one grid over all bodies
-    sides = np.array([_cells_per_side(float(bodies))])
-    joint_grid = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
+    sides = np.array([_choose_side(float(bodies))])
+    scene_grid = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
     if bodies > 0:
-        joint_grid[0] = _grid_row(_joint_bounds(body_bounds, 0, bodies), sides[0])
-    first_items, bodies_listed = _list_in_cells(
-        body_bounds, np.array([0, bodies]), joint_grid, sides, np.zeros(1, dtype=np.int64)
+        scene_grid[0] = _create_grid_row(_enclose_bounds(body_bounds, 0, bodies), sides[0])
+    first_items, body_entries = _list_in_cells(
+        body_bounds, np.array([0, bodies]), scene_grid, sides, np.zeros(1, dtype=np.int64)
     )
-    grid: Grid = (joint_grid[0, :4].copy(), sides, first_items, bodies_listed)
+    grid: Grid = (scene_grid[0, :4].copy(), sides, first_items, body_entries)
     return linear, axes, grid, (body_grids, layouts, starts, items, max_s)
 
 
@@ -182,7 +183,7 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
 
     All positions are tested in one call, because passing the arrays takes longer than testing most positions.
     """
-    linear, axes, (grid, sides, starts, items), (body_grids, layouts, first_items, listed, max_s) = casters
+    linear, axes, (grid, sides, starts, bodies), (body_grids, layouts, first_items, listed_triangles, max_s) = casters
     to_axes = unpack_matrix(axes)
     side = sides[0]
     min_u, min_v, per_u, per_v = grid[0], grid[1], grid[2], grid[3]
@@ -197,7 +198,7 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
         cell = int(row) * side + int(column)
         k = starts[cell]
         while k < starts[cell + 1] and not hidden[position]:
-            body = items[k]
+            body = bodies[k]
             k += 1
             if body_grids[body, 4] < s:
                 continue
@@ -210,7 +211,7 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
             for m in range(first_items[body_cell], first_items[body_cell + 1]):
                 if max_s[m] < s:
                     continue
-                n = listed[m]
+                n = listed_triangles[m]
                 weight2 = linear[n, 0] + linear[n, 1] * u + linear[n, 2] * v
                 weight3 = linear[n, 3] + linear[n, 4] * u + linear[n, 5] * v
                 above = linear[n, 6] + linear[n, 7] * u + linear[n, 8] * v > s

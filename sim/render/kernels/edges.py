@@ -42,7 +42,7 @@ BEAM_RADIUS_PX = 0.8
 
 @njit(cache=True, inline="always")
 def _is_range_jump(range0: float, range1: float, range2: float, range3: float) -> bool:
-    """Whether the range jumps between the second and the third of four pixels in a line.
+    """Return whether the range jumps between the second and the third of four pixels in a line.
 
     The inverse range of a plane is linear in the image, so it has no jump.
     """
@@ -69,10 +69,10 @@ def _find_candidates(
 
 
 @njit(cache=True)
-def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: Flags) -> None:
+def mark_edges(radiance: Array32, distance: Array, body: Ints, edge_mask: Flags) -> None:
     """Mark the pixels on both sides of each visible edge of an object, a terrain occlusion or a shadow.
 
-    `marked` is the output; all its values must be False before the call.
+    `edge_mask` is the output; all its values must be False before the call.
     """
     rows, columns = radiance.shape
     is_candidate = np.empty(columns, dtype=np.bool_)
@@ -97,15 +97,15 @@ def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: Flags) ->
                     i3, j3 = min(i2 + below, rows - 1), min(j2 + 1 - below, columns - 1)
                     is_edge = _is_range_jump(distance[i0, j0], distance[i, j], distance[i2, j2], distance[i3, j3])
                 if is_edge:
-                    marked[i, j], marked[i2, j2] = True, True
+                    edge_mask[i, j], edge_mask[i2, j2] = True, True
 
 
 @njit(cache=True)
-def split_rays(rays: Array32, size: tuple[int, int], pixels: Longs, side: int, unit: bool, out: Array32) -> None:
+def split_rays(rays: Array32, size: tuple[int, int], pixels: Longs, side: int, normalize: bool, out: Array32) -> None:
     """Interpolate vectors at side x side positions within each of these pixels, from those at all pixels' centres.
 
     The positions are a rotated square grid: no two positions are in the same row or column, so a horizontal or vertical
-    edge is resolved to 1 / side**2. `size` is rows and columns; `unit` normalises the vectors; `out` is the output.
+    edge is resolved to 1 / side**2. `size` is rows and columns; `normalize` makes unit vectors; `out` is the output.
     """
     rows, columns = size
     number = 0
@@ -116,8 +116,8 @@ def split_rays(rays: Array32, size: tuple[int, int], pixels: Longs, side: int, u
         right = pixel + (1 if j < columns - 1 else 0)
         above = pixel - (columns if i > 0 else 0)
         below = pixel + (columns if i < rows - 1 else 0)
-        across = 1.0 / max(right - left, 1)
-        down = 1.0 / max((below - above) // columns, 1)
+        column_scale = 1.0 / max(right - left, 1)
+        row_scale = 1.0 / max((below - above) // columns, 1)
         for k in range(side):
             for m in range(side):
                 u = (k + (m + 0.5) / side) / side - 0.5
@@ -126,12 +126,12 @@ def split_rays(rays: Array32, size: tuple[int, int], pixels: Longs, side: int, u
                 for axis in range(3):
                     value = (
                         rays[pixel, axis]
-                        + u * across * (rays[right, axis] - rays[left, axis])
-                        + v * down * (rays[below, axis] - rays[above, axis])
+                        + u * column_scale * (rays[right, axis] - rays[left, axis])
+                        + v * row_scale * (rays[below, axis] - rays[above, axis])
                     )
                     out[number, axis] = value
                     square += value * value
-                if unit:
+                if normalize:
                     for axis in range(3):
                         out[number, axis] /= math.sqrt(square)
                 number += 1
@@ -188,12 +188,12 @@ def trace_subpixel_rays(
     rays_per_pixel = rays.directions.shape[0] // max(pixels.size, 1)
     ranges = np.empty(9)
     levels = np.empty(9, dtype=np.int64)
-    listed = np.empty(MAX_LISTED, dtype=np.int64)
+    beam_triangles = np.empty(MAX_LISTED, dtype=np.int64)
     origin, direction = np.empty((1, 3), dtype=np.float32), np.empty((1, 3), dtype=np.float32)
     for k in range(pixels.size):
         pixel = pixels[k]
         count, has_sky, has_objects, farthest = _gather_neighbours(primary, pixel, columns, ranges, levels)
-        listed_count = -1
+        beam_count = -1
         first, last = k * rays_per_pixel, (k + 1) * rays_per_pixel
         if has_objects:
             # the ray through the pixel's centre is the mean of the first and the last subpixel ray
@@ -203,12 +203,12 @@ def trace_subpixel_rays(
             centre_ray = world_ray(pose, Rays(origin, direction, rays.pixel_angles), 0)
             half_angle = BEAM_RADIUS_PX * rays.pixel_angles[first]
             max_range = math.inf if has_sky else SEARCH_END * farthest
-            listed_count = list_in_beam(tree, centre_ray, half_angle, max_range, listed)
+            beam_count = list_in_beam(tree, centre_ray, half_angle, max_range, beam_triangles)
         for n in range(first, last):
             ray = world_ray(pose, rays, n)
             hit = TriangleHit(math.inf, -1, 0.0, 0.0)
-            for m in range(listed_count):
-                hit = nearer_hit(hit, tree[0], listed[m], ray, 0.0)
+            for m in range(beam_count):
+                hit = nearer_hit(hit, tree[0], beam_triangles[m], ray, 0.0)
             t = math.inf
             level = 0
             end = math.inf
@@ -228,7 +228,7 @@ def trace_subpixel_rays(
                 ground_level = GroundLevel(fields[m], ceilings[m], 1.0 / spacing / (1 << m))
                 t = intersect_ground(ground_level, ray, start, min(end, hit.distance))
                 index += 1
-            if listed_count < 0 and has_objects:
+            if beam_count < 0 and has_objects:
                 hit = nearest_hit(tree, ray, t)
             if not hit.distance < t:
                 hit = TriangleHit(t, -1, 0.0, 0.0)

@@ -34,7 +34,7 @@ class Clearance(NamedTuple):
 
 @njit(cache=True, inline="always")
 def clearance_at(field: Level, per_metre: float, ray: Ray, t: float) -> Clearance:
-    """Clearance of a ray above one level of the ground at a distance."""
+    """Compute the clearance of a ray above one level of the ground at a distance."""
     height, slope_x, slope_y, _albedo = sample(field, per_metre, ray.x + t * ray.dx, ray.y + t * ray.dy)
     return Clearance(t, ray.z + t * ray.dz - height, ray.dz - slope_x * ray.dx - slope_y * ray.dy)
 
@@ -134,6 +134,7 @@ def _bracketed_crossing(level: GroundLevel, ray: Ray, above: Clearance, below: C
         candidate = clearance_at(field, per_metre, ray, above_t + (below_t - above_t) * fraction)
         if abs(candidate.height) < 1e-3 * spacing * max(-ray.dz, 1e-3) or below_t - above_t <= 0.01 * spacing:
             break
+        # the Illinois method halves the height of the other end
         if candidate.height < 0.0:
             below_t, below_height, below_rate = candidate.t, candidate.height, candidate.rate
             above_height *= weight

@@ -56,21 +56,24 @@ def nearer_hit(best: TriangleHit, triangles: Array, n: int, ray: Ray, slack: flo
 
 
 @njit(cache=True)
-def body_spheres(triangles: Array, first: Longs) -> Array:
-    """Bounding sphere of each body: centre of its bounding box, and maximum distance of its corners from the centre."""
-    bodies = first.size - 1
+def body_spheres(triangles: Array, first_triangle: Longs) -> Array:
+    """Bounding sphere of each body: centre of its bounding box, and maximum distance of its corners from the centre.
+
+    `first_triangle` contains the first triangle of each body, and the number of triangles at the end.
+    """
+    bodies = first_triangle.size - 1
     spheres = np.empty((bodies, 4))
     for body in range(bodies):
         for axis in range(3):
             low = math.inf
             high = -math.inf
-            for n in range(first[body], first[body + 1]):
+            for n in range(first_triangle[body], first_triangle[body + 1]):
                 for corner in range(3):
                     low = min(low, triangles[n, corner, axis])
                     high = max(high, triangles[n, corner, axis])
             spheres[body, axis] = 0.5 * (low + high)
         farthest = 0.0
-        for n in range(first[body], first[body + 1]):
+        for n in range(first_triangle[body], first_triangle[body + 1]):
             for corner in range(3):
                 x = triangles[n, corner, 0] - spheres[body, 0]
                 y = triangles[n, corner, 1] - spheres[body, 1]
@@ -116,7 +119,7 @@ def _spread_bits(value: int) -> int:
 
 @njit(cache=True)
 def morton_codes(triangles: Array) -> Longs:
-    """Morton code of each triangle's centroid in the cube that contains all centroids."""
+    """Morton code of each triangle's centroid in the cube that contains all centroids, with 20 bits per axis."""
     count = triangles.shape[0]
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
@@ -219,7 +222,7 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
 
 @njit(cache=True, inline="always")
 def _is_outside_beam(triangles: Array, n: int, sides: tuple[Plane, ...]) -> bool:
-    """Whether a triangle is entirely outside one of a frustum's four lateral sides (the fifth is the far side)."""
+    """Return whether a triangle is entirely outside one of a frustum's first four sides; the fifth is the far side."""
     for nx, ny, nz, offset, _ix, _iy, _iz in sides[:4]:
         is_outside = True
         for corner in range(3):
@@ -231,15 +234,15 @@ def _is_outside_beam(triangles: Array, n: int, sides: tuple[Plane, ...]) -> bool
 
 
 @njit(cache=True, inline="always")
-def _plane(ray: Ray, nx: float, ny: float, nz: float, distance: float) -> Plane:
-    """The plane with this normal at a distance from a ray's origin."""
+def _create_plane(ray: Ray, nx: float, ny: float, nz: float, distance: float) -> Plane:
+    """Create the plane with this normal at a distance from a ray's origin."""
     offset = nx * ray.x + ny * ray.y + nz * ray.z + distance
     return nx, ny, nz, offset, 0 if nx > 0.0 else 3, 1 if ny > 0.0 else 4, 2 if nz > 0.0 else 5
 
 
 @njit(cache=True)
-def list_in_beam(tree: Hierarchy, ray: Ray, half_angle: float, farthest: float, listed: Longs) -> int:
-    """List the triangles within an angle of a ray, in `listed`; return their number, or -1 if `listed` is too small."""
+def list_in_beam(tree: Hierarchy, ray: Ray, half_angle: float, farthest: float, numbers: Longs) -> int:
+    """Write the triangles within an angle of a ray to `numbers`; return the count, or -1 if `numbers` is too small."""
     triangles, order, boxes = tree
     if order.size == 0:
         return 0
@@ -252,11 +255,11 @@ def list_in_beam(tree: Hierarchy, ray: Ray, half_angle: float, farthest: float, 
     tangent = math.tan(half_angle)
     sx, sy, sz = tangent * dx, tangent * dy, tangent * dz
     sides = (
-        _plane(ray, rx - sx, ry - sy, rz - sz, 0.0),
-        _plane(ray, -rx - sx, -ry - sy, -rz - sz, 0.0),
-        _plane(ray, ux - sx, uy - sy, uz - sz, 0.0),
-        _plane(ray, -ux - sx, -uy - sy, -uz - sz, 0.0),
-        _plane(ray, dx, dy, dz, farthest),
+        _create_plane(ray, rx - sx, ry - sy, rz - sz, 0.0),
+        _create_plane(ray, -rx - sx, -ry - sy, -rz - sz, 0.0),
+        _create_plane(ray, ux - sx, uy - sy, uz - sz, 0.0),
+        _create_plane(ray, -ux - sx, -uy - sy, -uz - sz, 0.0),
+        _create_plane(ray, dx, dy, dz, farthest),
     )
     first_leaf = boxes.shape[0] // 2
     count = 0
@@ -273,9 +276,9 @@ def list_in_beam(tree: Hierarchy, ray: Ray, half_angle: float, farthest: float, 
             for k in range(start, min(start + LEAF, order.size)):
                 if _is_outside_beam(triangles, order[k], sides):
                     continue
-                if count == listed.size:
+                if count == numbers.size:
                     return -1
-                listed[count] = order[k]
+                numbers[count] = order[k]
                 count += 1
         node = _next_node(node)
         if node == 0:

@@ -11,9 +11,9 @@ from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.terrain.kernels import Array
 
 #: Coefficient of the loss of contrast with (footprint / cell)^2, as in `marsyard.sim.render.kernels.photometry`, for
-#: slopes with a median frequency of 0.61 cycles per cell.
+#: slopes with a median frequency of 0.61 cycles per cell: (0.61 pi)^2 / 12.
 FADING = 0.306
-#: Octaves with smaller cells, in footprints, are not resolved at all.
+#: Minimum cell size, in footprints, of an octave of which a pixel resolves a part.
 MIN_CELLS = math.sqrt(FADING)
 #: Mean squares of `relief_noise` and of its derivative along one axis.
 HEIGHT_VARIANCE, SLOPE_VARIANCE = 0.0464, 0.3886
@@ -73,19 +73,19 @@ def add_relief_slopes(
     """Compute the slopes of the octaves that are resolved by the pixels, for a roughness of 1.
 
     An octave fades with the footprint of the pixel (`FADING`). `resolved` and `unresolved` are the variances of the
-    slope along one axis, of the part that a pixel resolves and of the remainder. Pixels without ground have an infinite
-    footprint.
+    slope along one axis: of the part that a pixel resolves, and of the remainder. Pixels without ground have an
+    infinite footprint.
     """
     finest = math.inf
     for k in range(footprint.size):
         finest = min(finest, footprint[k])
         slope_x[k] = slope_y[k] = resolved[k] = unresolved[k] = 0.0
-    cell, unresolved_octaves = relief.coarsest, 0.0
+    cell, unresolved_variance = relief.coarsest, 0.0
     for octave in range(relief.heights.size):
         gain = relief.heights[octave] / cell
         variance = gain * gain * SLOPE_VARIANCE
         if cell <= MIN_CELLS * finest:
-            unresolved_octaves += variance
+            unresolved_variance += variance
         else:
             for k in range(footprint.size):
                 ratio = footprint[k] / cell
@@ -98,7 +98,7 @@ def add_relief_slopes(
                 unresolved[k] += variance * (1.0 - fade * fade)
         cell *= 0.5
     for k in range(footprint.size):
-        unresolved[k] += unresolved_octaves
+        unresolved[k] += unresolved_variance
 
 
 @njit(cache=True, inline="always", error_model="numpy")

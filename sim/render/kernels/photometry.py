@@ -45,7 +45,8 @@ def sky_brightness(sky: Array, sun_z: float, sun_radius: float, dz: float, cos_g
     brightness += sky[1] * single_scattering(dz, sun_z, cos_g, sky[2], sky[3])
     if cos_g > 0.9:
         disc_fraction = (sun_radius - math.acos(min(cos_g, 1.0))) / pixel_rad + 0.5
-        # the ramp across the edge adds pixel**2 / 12 to the squared radius, on average
+        # the radiance factor of the disc is pi / solid angle, 1 / radius**2; the ramp across the edge adds
+        # pixel**2 / 12 to the squared radius, on average
         brightness += min(max(disc_fraction, 0.0), 1.0) / (sun_radius * sun_radius + pixel_rad * pixel_rad / 12.0)
     return brightness
 
@@ -73,8 +74,9 @@ def scattered_irradiance(sun_z: float, depth: float, asymmetry: float) -> float:
 NOISE_VARIANCE = 0.0732
 #: A pixel averages over its area: a wave of f cycles per footprint keeps the fraction sinc(f) of its amplitude. (The
 #: detector model applies the blur of the optics.) Noise with cells of c footprints has a median frequency of 0.53
-#: cycles per cell; ``(1 - FADING / c^2)^2`` approximates its sinc to 0.02 down to the Nyquist frequency. Waves
-#: above the Nyquist frequency alias, as in a real camera.
+#: cycles per cell; ``(1 - FADING / c^2)^2`` approximates its sinc to 0.02 down to the Nyquist frequency. FADING is
+#: (0.53 pi)^2 / 12, from the series sinc(f) = 1 - (pi f)^2 / 6. Waves above the Nyquist frequency alias, as in a real
+#: camera.
 FADING = 0.231
 #: Cell size, in footprints, at which an octave vanishes.
 MIN_CELLS = math.sqrt(FADING)
@@ -97,14 +99,15 @@ def _hash_point(i: int, j: int, k: int, seed: int) -> np.uint32:
 
 @njit(cache=True)
 def _gradient_product(h: np.uint32, x: float, y: float, z: float) -> float:
-    """Scalar product of an offset and one of Perlin's twelve gradients, four of them twice, by the last bits of a hash.
+    """Scalar product of an offset and one of Perlin's twelve gradients.
 
-    Written without a table, and with selections instead of branches, for vector instructions.
+    The last four bits of a hash select one of 16 entries: four gradients have two entries. Written without a table,
+    and with selections instead of branches, for vector instructions.
     """
-    kind = h & np.uint32(15)
-    first = x if kind < np.uint32(8) else y
-    second = y if kind < np.uint32(4) else (x if kind & np.uint32(13) == np.uint32(12) else z)
-    return (-first if kind & np.uint32(1) else first) + (-second if kind & np.uint32(2) else second)
+    selector = h & np.uint32(15)
+    first = x if selector < np.uint32(8) else y
+    second = y if selector < np.uint32(4) else (x if selector & np.uint32(13) == np.uint32(12) else z)
+    return (-first if selector & np.uint32(1) else first) + (-second if selector & np.uint32(2) else second)
 
 
 @njit(cache=True, inline="always")
@@ -150,9 +153,9 @@ def _add_octave(
     for k in range(x.size):
         ratio = footprint[k] / cell
         fade = max(1.0 - FADING * ratio * ratio, 0.0)
-        faded = strength[k] * amplitude * (fade * fade)
+        gain = strength[k] * amplitude * (fade * fade)
         noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, number)
-        change[k] += faded * noise - 0.5 * NOISE_VARIANCE * faded**2
+        change[k] += gain * noise - 0.5 * NOISE_VARIANCE * gain**2
 
 
 @njit(cache=True)
@@ -162,9 +165,9 @@ def add_texture(
     """Add the logarithm of the relative albedo, averaged over the pixels' footprints, to `change`.
 
     Octave n has lattice cells of ``coarsest / 2**n``. It fades by the average over the pixel (`FADING`), so that detail
-    appears as slowly as in a real camera that approaches a surface. Half of each octave's variance is subtracted, so
-    the mean albedo does not depend on the number of visible octaves. `strength` is a factor of the amplitudes. Pixels
-    with an infinite footprint have no texture.
+    appears gradually as a camera approaches the surface. Half of each octave's variance is subtracted (mean of a
+    log-normal variable): the mean albedo does not depend on the number of visible octaves. `strength` is a factor of
+    the amplitudes. Pixels with an infinite footprint have no texture.
     """
     finest = math.inf
     for k in range(footprint.size):

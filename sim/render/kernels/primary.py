@@ -13,7 +13,7 @@ from marsyard.sim.render.kernels.hierarchy import Hierarchy, TriangleHit, nearer
 from marsyard.sim.render.kernels.strips import (
     ROW,
     STRIP,
-    FetchedCells,
+    CellBuffers,
     Matrix,
     allocate_cells,
     fetch_levels,
@@ -32,7 +32,7 @@ MAX_FINE_FOOTPRINT = 8.0
 MAX_GRAZING_SINE = 0.4
 #: Maximum number of Newton steps, and the maximum relative change of the first guess.
 MAX_STEPS, MAX_CHANGE = 8, 0.05
-#: Relative tolerance at a triangle's edges, so that no ray passes between two triangles.
+#: Tolerance of barycentric weights, so that no ray passes between two neighbouring triangles.
 SLACK = 1e-9
 #: Rows of a strip's buffer: origins and directions in world axes; positions in a view (first in samples, then as
 #: fractions between four samples), and components along the view's axis; the depths at these four samples.
@@ -155,10 +155,10 @@ def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None
 
 
 @njit(cache=True, error_model="numpy")
-def _take_newton_step(fetched: FetchedCells, width: int, work: Array) -> None:
+def _take_newton_step(buffers: CellBuffers, width: int, work: Array) -> None:
     """Take a Newton step for the active rays; `ACTIVE` becomes 0 for rays that have converged or failed."""
     for k in range(min(width, STRIP)):
-        height, slope_x, slope_y, _albedo = spline(fetched[0], fetched[1], k)
+        height, slope_x, slope_y, _albedo = spline(buffers[0], buffers[1], k)
         t, start, scale, dz = work[DISTANCE + k], work[START + k], work[SCALE + k], work[DZ + k]
         clearance = work[Z0 + k] + t * dz - height
         rate = dz - slope_x * scale * work[DX + k] - slope_y * scale * work[DY + k]
@@ -180,12 +180,12 @@ def _refine_on_ground(
     count: int,
     width: int,
     work: Array,
-    fetched: FetchedCells,
+    buffers: CellBuffers,
 ) -> None:
     """Intersect the active rays of a strip with the ground by Newton's method, starting from `DISTANCE`.
 
     If the method fails, the first guess remains. All rays take a step together, so that the loop vectorises. `active`
-    contains the indices of the `count` active rays and is overwritten. `fetched` is a buffer for control values.
+    contains the indices of the `count` active rays and is overwritten. `buffers` are those of `allocate_cells`.
     """
     for k in range(width):
         work[START + k] = work[DISTANCE + k]
@@ -199,8 +199,8 @@ def _refine_on_ground(
         for k in range(min(width, STRIP)):
             work[X + k] = work[X0 + k] + work[DISTANCE + k] * work[DX + k]
             work[Y + k] = work[Y0 + k] + work[DISTANCE + k] * work[DY + k]
-        fetch_levels(levels, inverse_spacing, level_of, active, count, work[X : X + ROW], work[Y : Y + ROW], fetched)
-        _take_newton_step(fetched, width, work)
+        fetch_levels(levels, inverse_spacing, level_of, active, count, work[X : X + ROW], work[Y : Y + ROW], buffers)
+        _take_newton_step(buffers, width, work)
         remaining = 0
         for m in range(count):
             k = active[m]
@@ -297,7 +297,7 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
     centre = (pose.position[0], pose.position[1], pose.position[2])
     origins, directions = rays.origins.reshape(-1), rays.directions.reshape(-1)
     levels, ceilings, top_level, spacing, extent = ground
-    fetched = allocate_cells()
+    buffers = allocate_cells()
     work, pixels = np.empty(ROWS * ROW), rays.directions.shape[0]
     index_buffers = np.empty((4, STRIP), dtype=np.int64)
     level_of, refined = index_buffers[2], index_buffers[3]
@@ -320,5 +320,5 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
             # Newton's method refines the rays without this intersection
             refined[count] = k
             count += work[DISTANCE + k] == work[GUESS + k]
-        _refine_on_ground(levels, 1.0 / spacing, level_of, refined, count, width, work, fetched)
+        _refine_on_ground(levels, 1.0 / spacing, level_of, refined, count, width, work, buffers)
         _write_hits(views, tree, first, width, strip, hits)

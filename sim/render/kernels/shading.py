@@ -15,7 +15,7 @@ from marsyard.sim.render.kernels.primary import MIN_INCIDENCE_SINE
 from marsyard.sim.render.kernels.strips import (
     ROW,
     STRIP,
-    FetchedCells,
+    CellBuffers,
     Matrix,
     allocate_cells,
     fetch_levels,
@@ -141,10 +141,10 @@ def _locate_pixels(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _evaluate_splines(fetched: FetchedCells, width: int, out: Array) -> None:
+def _evaluate_splines(buffers: CellBuffers, width: int, out: Array) -> None:
     """Evaluate height, slopes per sample and albedo of the terrain for a strip; each is a row of `out`."""
     for k in range(min(width, STRIP)):
-        out[k], out[ROW + k], out[2 * ROW + k], out[3 * ROW + k] = spline(fetched[0], fetched[1], k)
+        out[k], out[ROW + k], out[2 * ROW + k], out[3 * ROW + k] = spline(buffers[0], buffers[1], k)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -212,19 +212,19 @@ def _sample_ground(
     n_blended: int,
     width: int,
     strip: _Strip,
-    fetched: FetchedCells,
+    buffers: CellBuffers,
 ) -> None:
     """Sample slopes, albedo and normals of the ground for a strip of pixels."""
     work = strip.work
     if n_ground > 0:
         x, y = work[X : X + ROW], work[Y : Y + ROW]
-        fetch_levels(levels, per_metre, strip.level, strip.ground, n_ground, x, y, fetched)
-        _evaluate_splines(fetched, width, work[HEIGHT : HEIGHT + 4 * ROW])
+        fetch_levels(levels, per_metre, strip.level, strip.ground, n_ground, x, y, buffers)
+        _evaluate_splines(buffers, width, work[HEIGHT : HEIGHT + 4 * ROW])
         if n_blended > 0:
             for m in range(n_blended):
                 strip.level[strip.blended[m]] += 1
-            fetch_levels(levels, per_metre, strip.level, strip.blended, n_blended, x, y, fetched)
-            _evaluate_splines(fetched, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
+            fetch_levels(levels, per_metre, strip.level, strip.blended, n_blended, x, y, buffers)
+            _evaluate_splines(buffers, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
         _blend_levels(width, work)
     for k in range(min(width, STRIP)):
         slope_x, slope_y = work[SLOPE_X + k], work[SLOPE_Y + k]
@@ -300,7 +300,10 @@ def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _shade_roughness(width: int, work: Array) -> None:
-    """Restore the mean radiance after the normals were tilted, and darken by shadows of unresolved relief."""
+    """Restore the mean radiance after the normals were tilted, and darken by shadows of unresolved relief.
+
+    On level ground the mean of n_z, 1 / sqrt(1 + slope**2), is 1 - variance to second order in the slope.
+    """
     for k in range(min(width, STRIP)):
         cosine = min(max(work[COS_I + k], 1e-6), 1.0)
         work[SUN_FRACTION + k] *= (1.0 + work[RESOLVED + k]) * smith_shadowing(cosine, work[UNRESOLVED + k])
@@ -383,7 +386,7 @@ def _cast_shadows(
                 sun_fraction = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
         work[SUN_FRACTION + k] = sun_fraction
         if sun_fraction > 0.0 and has_objects and (on_object or _in_footprint(footprint, x, y)):
-            # an offset along the normal prevents shading by the facet itself because of rounding
+            # an offset along the normal: without it, rounding errors would let a facet shade itself
             offset = 1e-4 + (0.05 * distance[k] * pixel_angles[k] if on_object else 0.0)
             work[OBJECT_X + n_tested] = x + offset * work[NX + k]
             work[OBJECT_Y + n_tested] = y + offset * work[NY + k]
@@ -471,7 +474,7 @@ def shade(
     levels, spacing = ground.levels, ground.spacing
     finest = GroundLevel(levels[0], ground.ceilings[0], 1.0 / spacing)
     terrain = levels[occluders.shadow.level]
-    fetched = allocate_cells()
+    buffers = allocate_cells()
     work = np.empty(ROWS * ROW)
     index_buffers = np.empty((4, STRIP), dtype=np.int64)
     strip = _Strip(
@@ -491,7 +494,7 @@ def shade(
             rotation, centre, origins[start:end], directions[start:end], angles, strip_hits.distance, width, work
         )
         n_ground, n_blended, n_other = _select_levels(spacing, ground.top_level, strip_hits, strip)
-        _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, fetched)
+        _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, buffers)
         n_objects = _sample_objects(materials, strip_hits, angles, n_other, strip, body)
         for k in range(width):
             n = start + 3 * k

@@ -16,7 +16,7 @@ from marsyard.sim.render.kernels.structs import Array32, Longs
 from marsyard.sim.terrain.kernels import Array, Level, bspline_weights
 
 #: Control values around the positions of a strip, the positions' fractions of a cell, and a buffer for indices.
-FetchedCells = tuple[Array32, Array, Longs]
+CellBuffers = tuple[Array32, Array, Longs]
 #: The nine elements of a 3 x 3 matrix, row by row.
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 
@@ -29,7 +29,7 @@ CELLS = 2 * 16 * ROW
 
 
 @njit(cache=True)
-def allocate_cells() -> FetchedCells:
+def allocate_cells() -> CellBuffers:
     """Allocate buffers for the control values around the positions of a strip."""
     return np.empty(CELLS, dtype=np.float32), np.empty(2 * ROW), np.empty(STRIP, dtype=np.int64)
 
@@ -86,10 +86,10 @@ def fetch_levels(
     count: int,
     x: Array,
     y: Array,
-    fetched: FetchedCells,
+    buffers: CellBuffers,
 ) -> None:
-    """Call `fetch_cells` for positions on different terrain levels; the last array of `fetched` is overwritten."""
-    cells, fractions, on_level = fetched
+    """Call `fetch_cells` for positions on different terrain levels; the last of the buffers is overwritten."""
+    cells, fractions, on_level = buffers
     lowest, highest = len(levels) - 1, 0
     for m in range(count):
         lowest = min(lowest, level_of[indices[m]])

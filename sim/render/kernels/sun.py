@@ -72,10 +72,10 @@ def sweep_shadow(height: Array32, row_sign: float, drop: float, shift: float, ma
             caster[j] = max(height[source, j], shadow_row[j])
             caster_rows[j] = 0 if height[source, j] >= shadow_row[j] else shadow_rows[j]
         for j in range(columns):
-            a = (j + whole_columns) & column_mask
-            b = (a + 1) & column_mask
-            shadow_row[j] = weight * caster[a] + fraction * caster[b] - row_drop
-            shadow_rows[j] = max(caster_rows[a], caster_rows[b]) + 1
+            left = (j + whole_columns) & column_mask
+            right = (left + 1) & column_mask
+            shadow_row[j] = weight * caster[left] + fraction * caster[right] - row_drop
+            shadow_rows[j] = max(caster_rows[left], caster_rows[right]) + 1
         if step < rows:
             for j in range(columns):
                 shadow[i, j] = shadow_row[j]

@@ -139,19 +139,20 @@ def build_mesh(
             if end > first:
                 left[line] = min(left[line], first)
                 right[line] = max(right[line], end)
+    # index of the vertex in column 0 of each line, if the line began there
     starts = np.empty(lines, dtype=np.int64)
     count = 0
     for line in range(lines):
         starts[line] = count - left[line]
         count += max(right[line] + 1 - left[line], 0)
-    corners = np.empty((count, 3))
+    vertices = np.empty((count, 3))
     for line in range(lines):
         for column in range(left[line], right[line] + 1):
             level = max(level_of_x[column], level_of_y[line])
             inverse_spacing = 1.0 / (spacing * 2.0**level)
             height, _slope_x, _slope_y, _albedo = sample(levels[level], inverse_spacing, x[column], y[line])
             n = starts[line] + column
-            corners[n, 0], corners[n, 1], corners[n, 2] = x[column], y[line], height
+            vertices[n, 0], vertices[n, 1], vertices[n, 2] = x[column], y[line], height
     faces = np.empty((2 * cells, 3), dtype=np.uint32)
     n = 0
     for strip in range(lines - 1):
@@ -161,4 +162,4 @@ def build_mesh(
             faces[n, 0], faces[n, 1], faces[n, 2] = lower, lower + 1, upper + 1
             faces[n + 1, 0], faces[n + 1, 1], faces[n + 1, 2] = lower, upper + 1, upper
             n += 2
-    return corners, faces
+    return vertices, faces

@@ -126,7 +126,7 @@ class NavigationFilter:
         valid = np.flatnonzero(np.isfinite(solutions.positions_m[:, 0]))
         if valid.size == 0 or readings.times_s.size == 0:
             raise ValueError("the filter needs a receiver solution and a compass reading to start")
-        p, i, c = self.parameters, self.imu, self.compass
+        parameters, imu, compass = self.parameters, self.imu, self.compass
         state = np.zeros(kernels.STATE)
         up = readings.up_body[0]
         pitch, roll = -np.arcsin(np.clip(up[0], -1.0, 1.0)), np.arctan2(up[1], up[2])
@@ -134,22 +134,24 @@ class NavigationFilter:
         state[: kernels.STATE_GYRO_BIAS] = np.concatenate(
             [solutions.positions_m[valid[0]], solutions.velocities_m_s[valid[0]], attitude.as_quat()]
         )
-        gyro_bias = float(np.hypot(i.gyro_bias_deg_h, i.gyro_wander_deg_h) * DEG_H)
+        gyro_bias = float(np.hypot(imu.gyro_bias_deg_h, imu.gyro_wander_deg_h) * DEG_H)
         # scale and misalignment errors act like a bias under gravity: 1 ppm is 1e-3 mg, 1 mrad is 1 mg
-        scale_mg, misalignment_mg = 1e-3 * i.accelerometer_scale_ppm, i.accelerometer_misalignment_mrad
-        biases_mg = [i.accelerometer_bias_mg, i.accelerometer_wander_mg, scale_mg, misalignment_mg]
+        scale_mg, misalignment_mg = 1e-3 * imu.accelerometer_scale_ppm, imu.accelerometer_misalignment_mrad
+        biases_mg = [imu.accelerometer_bias_mg, imu.accelerometer_wander_mg, scale_mg, misalignment_mg]
         accelerometer_bias = float(np.linalg.norm(np.array(biases_mg))) * 1e-3 * STANDARD_GRAVITY_M_S2
-        dip_error_deg = float(c.tilt_bias_deg * np.tan(np.radians(c.dip_deg)))
-        heading_biases_deg = [c.heading_bias_deg, c.hard_iron_deg, c.soft_iron_deg, dip_error_deg]
+        dip_error_deg = float(compass.tilt_bias_deg * np.tan(np.radians(compass.dip_deg)))
+        heading_biases_deg = [compass.heading_bias_deg, compass.hard_iron_deg, compass.soft_iron_deg, dip_error_deg]
         # in the order of the error vector
         deviations = np.concatenate(
             [
-                np.repeat([p.initial_position_sd_m, p.initial_velocity_sd_m_s], 3),
-                np.radians([p.initial_tilt_sd_deg, p.initial_tilt_sd_deg, p.initial_heading_sd_deg]),
+                np.repeat([parameters.initial_position_sd_m, parameters.initial_velocity_sd_m_s], 3),
+                np.radians(
+                    [parameters.initial_tilt_sd_deg, parameters.initial_tilt_sd_deg, parameters.initial_heading_sd_deg]
+                ),
                 np.repeat([gyro_bias, accelerometer_bias, 1.0], 3),
                 self.rtk.velocity_wander_m_s,
                 [float(np.radians(np.linalg.norm(np.array(heading_biases_deg))))],
-                np.full(2, np.radians(c.tilt_bias_deg)),
+                np.full(2, np.radians(compass.tilt_bias_deg)),
             ]
         )
         # no solution yet, acceleration zero, no rejected solutions
@@ -197,52 +199,56 @@ class NavigationFilter:
             end=FilterState(states[-1].copy(), covariance, memory),
         )
 
-    def _convert_solutions(self, s: RtkSolutions) -> Float64[np.ndarray, "n 15"]:
+    def _convert_solutions(self, solutions: RtkSolutions) -> Float64[np.ndarray, "n 15"]:
         """Convert solutions to rows for the kernels; reported deviations are split as in the receiver's parameters."""
         fixed, floating = self.rtk.fixed, self.rtk.floating
         wanders, noises = (
-            np.where(s.fixed[:, None], _error_fraction(fixed, part), _error_fraction(floating, part)) * s.reported_m
+            np.where(solutions.fixed[:, None], _error_fraction(fixed, part), _error_fraction(floating, part))
+            * solutions.reported_m
             for part in ("wander_m", "noise_m")
         )
-        delivery_times = s.times_s + self.rtk.latency_s
-        rows = np.column_stack([s.times_s, delivery_times, s.positions_m, s.velocities_m_s, wanders, noises, s.fixed])
-        rows[_is_stuck(s.positions_m, self.parameters.max_repeated_fixes), kernels.GPS_POSITION] = np.nan
+        times, positions, velocities = solutions.times_s, solutions.positions_m, solutions.velocities_m_s
+        rows = np.column_stack(
+            [times, times + self.rtk.latency_s, positions, velocities, wanders, noises, solutions.fixed]
+        )
+        rows[_is_stuck(positions, self.parameters.max_repeated_fixes), kernels.GPS_POSITION] = np.nan
         return rows
 
-    def _convert_readings(self, r: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
+    def _convert_readings(self, readings: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
         """Convert readings to rows for the kernels; headings become yaw, counterclockwise from east."""
-        rows = np.column_stack([r.times_s, r.up_body, 0.5 * np.pi - r.headings_rad])
-        for column, values in ((kernels.UP, r.up_body), (kernels.YAW, r.headings_rad[:, None])):
+        rows = np.column_stack([readings.times_s, readings.up_body, 0.5 * np.pi - readings.headings_rad])
+        for column, values in ((kernels.UP, readings.up_body), (kernels.YAW, readings.headings_rad[:, None])):
             rows[_is_stuck(values, self.parameters.max_repeated_fixes), column] = np.nan
         return rows
 
     def _create_tuning(self, step_s: float) -> kernels.Tuning:
         """Convert the parameters of filter and instruments to SI units and to factors per step."""
-        i, r, c, p = self.imu, self.rtk, self.compass, self.parameters
-        force_wander = i.accelerometer_wander_mg * MILLI_G
+        imu, rtk, compass, parameters = self.imu, self.rtk, self.compass, self.parameters
+        force_wander = imu.accelerometer_wander_mg * MILLI_G
         return kernels.Tuning(
             gravity_m_s2=self.gravity_m_s2,
-            attitude_density=i.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
-            velocity_density=1e-3 * i.velocity_random_walk_ug_sqrt_hz * MILLI_G,
+            attitude_density=imu.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
+            velocity_density=1e-3 * imu.velocity_random_walk_ug_sqrt_hz * MILLI_G,
             # over times much shorter than its correlation time a Gauss-Markov bias is a random walk of this density
-            gyro_bias_density=i.gyro_wander_deg_h * DEG_H * float(np.sqrt(2.0 / i.gyro_wander_s)),
-            accelerometer_bias_density=force_wander * float(np.sqrt(2.0 / i.accelerometer_wander_s)),
-            fixed_wander_decay=float(np.exp(-step_s / r.fixed.correlation_s)),
-            floating_wander_decay=float(np.exp(-step_s / r.floating.correlation_s)),
-            velocity_wander_m_s=r.velocity_wander_m_s,
-            velocity_decay=float(np.exp(-step_s / r.velocity_correlation_s)),
-            velocity_noise_m_s=r.velocity_noise_m_s,
-            tilt_noise_rad=float(np.radians(c.tilt_noise_deg)),
-            heading_noise_rad=float(np.radians(np.hypot(c.heading_noise_deg, c.count_deg / np.sqrt(12.0)))),
-            tan_dip=float(np.tan(np.radians(c.dip_deg))),
-            lag_s=c.lag_s,
-            disturbance=p.disturbance,
-            unmodelled_acceleration_m_s2=p.unmodelled_acceleration_m_s2,
-            gate=p.gate,
-            max_rejected_fixes=p.max_rejected_fixes,
-            first_position_m=p.initial_position_sd_m,
-            first_velocity_m_s=p.initial_velocity_sd_m_s,
-            first_tilt_rad=float(np.radians(p.initial_tilt_sd_deg)),
+            gyro_bias_density=imu.gyro_wander_deg_h * DEG_H * float(np.sqrt(2.0 / imu.gyro_wander_s)),
+            accelerometer_bias_density=force_wander * float(np.sqrt(2.0 / imu.accelerometer_wander_s)),
+            fixed_wander_decay=float(np.exp(-step_s / rtk.fixed.correlation_s)),
+            floating_wander_decay=float(np.exp(-step_s / rtk.floating.correlation_s)),
+            velocity_wander_m_s=rtk.velocity_wander_m_s,
+            velocity_decay=float(np.exp(-step_s / rtk.velocity_correlation_s)),
+            velocity_noise_m_s=rtk.velocity_noise_m_s,
+            tilt_noise_rad=float(np.radians(compass.tilt_noise_deg)),
+            # rounding to whole counts has the standard deviation count / sqrt(12)
+            heading_noise_rad=float(np.radians(np.hypot(compass.heading_noise_deg, compass.count_deg / np.sqrt(12.0)))),
+            tan_dip=float(np.tan(np.radians(compass.dip_deg))),
+            lag_s=compass.lag_s,
+            disturbance=parameters.disturbance,
+            unmodelled_acceleration_m_s2=parameters.unmodelled_acceleration_m_s2,
+            gate=parameters.gate,
+            max_rejected_fixes=parameters.max_rejected_fixes,
+            first_position_m=parameters.initial_position_sd_m,
+            first_velocity_m_s=parameters.initial_velocity_sd_m_s,
+            first_tilt_rad=float(np.radians(parameters.initial_tilt_sd_deg)),
         )
 
 

@@ -158,20 +158,22 @@ def apply_transition(
 
 
 @njit(cache=True)
-def propagate_covariance(p: Array, matrix: Array, delta_v: Array, decay: float, t: Tuning, step: float) -> None:
-    """Propagate the covariance by a step, in place: P = F P F' + Q."""
+def propagate_covariance(p: Array, matrix: Array, delta_v: Array, decay: float, tuning: Tuning, step: float) -> None:
+    """Propagate the covariance P by a step, in place: P = F P F' + Q, with the transition matrix F and the noise Q."""
     cross = np.zeros((3, 3))
     cross[0, 1], cross[0, 2], cross[1, 2] = delta_v[2], -delta_v[1], delta_v[0]
     cross[1, 0], cross[2, 0], cross[2, 1] = -delta_v[2], delta_v[1], -delta_v[0]
-    apply_transition(p, matrix, cross, decay, t.velocity_decay, step)
-    apply_transition(p.T, matrix, cross, decay, t.velocity_decay, step)
+    apply_transition(p, matrix, cross, decay, tuning.velocity_decay, step)
+    apply_transition(p.T, matrix, cross, decay, tuning.velocity_decay, step)
     for i in range(3):
-        p[VELOCITY + i, VELOCITY + i] += t.velocity_density**2 * step
-        p[ATTITUDE_ERROR + i, ATTITUDE_ERROR + i] += t.attitude_density**2 * step
-        p[GYRO_BIAS + i, GYRO_BIAS + i] += t.gyro_bias_density**2 * step
-        p[ACCELEROMETER_BIAS + i, ACCELEROMETER_BIAS + i] += t.accelerometer_bias_density**2 * step
+        p[VELOCITY + i, VELOCITY + i] += tuning.velocity_density**2 * step
+        p[ATTITUDE_ERROR + i, ATTITUDE_ERROR + i] += tuning.attitude_density**2 * step
+        p[GYRO_BIAS + i, GYRO_BIAS + i] += tuning.gyro_bias_density**2 * step
+        p[ACCELEROMETER_BIAS + i, ACCELEROMETER_BIAS + i] += tuning.accelerometer_bias_density**2 * step
         p[POSITION_WANDER + i, POSITION_WANDER + i] += 1.0 - decay * decay
-        p[VELOCITY_WANDER + i, VELOCITY_WANDER + i] += t.velocity_wander_m_s[i] ** 2 * (1.0 - t.velocity_decay**2)
+        p[VELOCITY_WANDER + i, VELOCITY_WANDER + i] += tuning.velocity_wander_m_s[i] ** 2 * (
+            1.0 - tuning.velocity_decay**2
+        )
 
 
 @njit(cache=True)
@@ -236,18 +238,18 @@ def _reset_errors(p: Array, block: int, deviation: float, old_factor: float) -> 
 
 
 @njit(cache=True)
-def _restart(estimate: Estimate, row: Array, t: Tuning) -> None:
+def _restart(estimate: Estimate, row: Array, tuning: Tuning) -> None:
     """Set position and velocity to a solution; increase the covariance of both and of the attitude."""
     state, p = estimate
     state[POSITION : POSITION + 3] = row[GPS_POSITION : GPS_POSITION + 3]
     state[VELOCITY : VELOCITY + 3] = row[GPS_VELOCITY : GPS_VELOCITY + 3]
-    _reset_errors(p, POSITION, t.first_position_m, 0.0)
-    _reset_errors(p, VELOCITY, t.first_velocity_m_s, 0.0)
-    _reset_errors(p, ATTITUDE_ERROR, t.first_tilt_rad, 1.0)
+    _reset_errors(p, POSITION, tuning.first_position_m, 0.0)
+    _reset_errors(p, VELOCITY, tuning.first_velocity_m_s, 0.0)
+    _reset_errors(p, ATTITUDE_ERROR, tuning.first_tilt_rad, 1.0)
 
 
 @njit(cache=True)
-def update_fix(row: Array, estimate: Estimate, change: Array, time: float, t: Tuning, log: Array) -> None:
+def update_fix(row: Array, estimate: Estimate, change: Array, time: float, tuning: Tuning, log: Array) -> None:
     """Update with a solution and the displacement and velocity `change` since its time tag; write six innovations."""
     state, _ = estimate
     h = np.empty(ERRORS)
@@ -256,17 +258,19 @@ def update_fix(row: Array, estimate: Estimate, change: Array, time: float, t: Tu
         h[POSITION + i], h[VELOCITY + i], h[POSITION_WANDER + i] = 1.0, row[TAG] - time, row[GPS_WANDER + i]
         log[i, 0], log[i, 1], log[i, 2] = time, POSITION_FIX, i
         residual = row[GPS_POSITION + i] + change[i] - state[POSITION + i]
-        update_scalar(estimate, h, residual, row[GPS_NOISE + i], t.gate, log[i])
+        update_scalar(estimate, h, residual, row[GPS_NOISE + i], tuning.gate, log[i])
     for i in range(3):
         h[:] = 0.0
         h[VELOCITY + i], h[VELOCITY_WANDER + i] = 1.0, 1.0
         log[3 + i, 0], log[3 + i, 1], log[3 + i, 2] = time, VELOCITY_FIX, i
         residual = row[GPS_VELOCITY + i] + change[3 + i] - state[VELOCITY + i]
-        update_scalar(estimate, h, residual, t.velocity_noise_m_s[i], t.gate, log[3 + i])
+        update_scalar(estimate, h, residual, tuning.velocity_noise_m_s[i], tuning.gate, log[3 + i])
 
 
 @njit(cache=True)
-def update_tilt(row: Array, estimate: Estimate, disturbance_rad: float, time: float, t: Tuning, log: Array) -> None:
+def update_tilt(
+    row: Array, estimate: Estimate, disturbance_rad: float, time: float, tuning: Tuning, log: Array
+) -> None:
     """Update with the x and y components of the inclinometers' up direction; write two innovations."""
     h, matrix = np.empty(ERRORS), np.empty((3, 3))
     for i in range(2):
@@ -274,12 +278,14 @@ def update_tilt(row: Array, estimate: Estimate, disturbance_rad: float, time: fl
         h[:] = 0.0
         h[ATTITUDE_ERROR], h[ATTITUDE_ERROR + 1], h[TILT_BIAS + i] = matrix[1, i], -matrix[0, i], 1.0
         log[i, 0], log[i, 1], log[i, 2] = time, INCLINOMETER, i
-        noise = math.hypot(t.tilt_noise_rad, disturbance_rad)
-        update_scalar(estimate, h, row[UP + i] - matrix[2, i], noise, t.gate, log[i])
+        noise = math.hypot(tuning.tilt_noise_rad, disturbance_rad)
+        update_scalar(estimate, h, row[UP + i] - matrix[2, i], noise, tuning.gate, log[i])
 
 
 @njit(cache=True)
-def update_heading(row: Array, estimate: Estimate, disturbance_rad: float, time: float, t: Tuning, log: Array) -> None:
+def update_heading(
+    row: Array, estimate: Estimate, disturbance_rad: float, time: float, tuning: Tuning, log: Array
+) -> None:
     """Update with the compass; write one innovation."""
     h, matrix = np.zeros(ERRORS), np.empty((3, 3))
     write_rotation_matrix(estimate.state[QUATERNION:], matrix)
@@ -289,26 +295,28 @@ def update_heading(row: Array, estimate: Estimate, disturbance_rad: float, time:
     h[ATTITUDE_ERROR + 2], h[HEADING_BIAS] = 1.0, 1.0
     log[0, 0], log[0, 1], log[0, 2] = time, COMPASS, 0
     residual = row[YAW] - math.atan2(matrix[1, 0], matrix[0, 0])
-    noise = math.hypot(t.heading_noise_rad, t.tan_dip * disturbance_rad)
-    update_scalar(estimate, h, math.atan2(math.sin(residual), math.cos(residual)), noise, t.gate, log[0])
+    noise = math.hypot(tuning.heading_noise_rad, tuning.tan_dip * disturbance_rad)
+    update_scalar(estimate, h, math.atan2(math.sin(residual), math.cos(residual)), noise, tuning.gate, log[0])
 
 
 @njit(cache=True)
-def _propagate(inputs: Inputs, k: int, states: Array, p: Array, memory: Array, t: Tuning) -> None:
+def _propagate(inputs: Inputs, k: int, states: Array, p: Array, memory: Array, tuning: Tuning) -> None:
     """Propagate state, covariance and filtered acceleration over the sample that ends at boundary k."""
     before, step, matrix = states[k - 1], inputs.step, np.empty((3, 3))
     write_rotation_matrix(before[QUATERNION:], matrix)
-    delta_v = propagate_state(before, states[k], inputs.angles[k - 1], inputs.velocities[k - 1], t.gravity_m_s2, step)
-    decay = t.fixed_wander_decay if memory[LAST_FIX] == 1.0 else t.floating_wander_decay
-    propagate_covariance(p, matrix, delta_v, decay, t, step)
+    delta_v = propagate_state(
+        before, states[k], inputs.angles[k - 1], inputs.velocities[k - 1], tuning.gravity_m_s2, step
+    )
+    decay = tuning.fixed_wander_decay if memory[LAST_FIX] == 1.0 else tuning.floating_wander_decay
+    propagate_covariance(p, matrix, delta_v, decay, tuning, step)
     for i in range(3):
         change = states[k, VELOCITY + i] - before[VELOCITY + i]
         filtered = memory[FILTERED_ACCELERATION + i]
-        memory[FILTERED_ACCELERATION + i] += (change / step - filtered) * min(step / t.lag_s, 1.0)
+        memory[FILTERED_ACCELERATION + i] += (change / step - filtered) * min(step / tuning.lag_s, 1.0)
 
 
 @njit(cache=True)
-def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tuple[Array, Array, Array, Array]:
+def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -> tuple[Array, Array, Array, Array]:
     """Run the filter; return states, stored covariances, deviations at all boundaries, and innovations.
 
     `memory` and the covariance `p` are updated in place. Readings with tags before the first boundary are ignored.
@@ -325,7 +333,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
         state = states[k]
         estimate = Estimate(state, p)
         if k > 0:
-            _propagate(inputs, k, states, p, memory, t)
+            _propagate(inputs, k, states, p, memory, tuning)
             change = state[VELOCITY : VELOCITY + 3] - states[k - 1, VELOCITY : VELOCITY + 3]
             inertial[k, :3] = inertial[k - 1, :3] + (inertial[k - 1, 3:] + 0.5 * change) * inputs.step
             inertial[k, 3:] = inertial[k - 1, 3:] + change
@@ -340,24 +348,24 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
             # displacement since the time of the solution, from the current velocity estimate
             fix_change = inertial[k] - _interpolate(times, inertial, k, row[TAG])
             fix_change[:3] += (state[VELOCITY : VELOCITY + 3] - inertial[k, 3:]) * (times[k] - row[TAG])
-            if memory[REJECTED] >= t.max_rejected_fixes:
-                _restart(estimate, row, t)
-            update_fix(row, estimate, fix_change, times[k], t, log[log_count : log_count + 6])
+            if memory[REJECTED] >= tuning.max_rejected_fixes:
+                _restart(estimate, row, tuning)
+            update_fix(row, estimate, fix_change, times[k], tuning, log[log_count : log_count + 6])
             memory[REJECTED] = 0.0 if log[log_count : log_count + 6, 4].all() else memory[REJECTED] + 1.0
             log_count += 6
         east, north = memory[FILTERED_ACCELERATION], memory[FILTERED_ACCELERATION + 1]
-        acceleration = math.sqrt(east**2 + north**2 + t.unmodelled_acceleration_m_s2**2)
-        disturbance_rad = t.disturbance * acceleration / t.gravity_m_s2
+        acceleration = math.sqrt(east**2 + north**2 + tuning.unmodelled_acceleration_m_s2**2)
+        disturbance_rad = tuning.disturbance * acceleration / tuning.gravity_m_s2
         while next_tilt < tilts.shape[0] and tilts[next_tilt, TAG] <= times[k]:
             row = tilts[next_tilt]
             next_tilt += 1
             if row[TAG] < times[0]:
                 continue
             if not math.isnan(row[UP]):
-                update_tilt(row, estimate, disturbance_rad, times[k], t, log[log_count : log_count + 2])
+                update_tilt(row, estimate, disturbance_rad, times[k], tuning, log[log_count : log_count + 2])
                 log_count += 2
             if not math.isnan(row[YAW]):
-                update_heading(row, estimate, disturbance_rad, times[k], t, log[log_count : log_count + 1])
+                update_heading(row, estimate, disturbance_rad, times[k], tuning, log[log_count : log_count + 1])
                 log_count += 1
         for i in range(ESTIMATED):
             deviations[k, i] = math.sqrt(p[i, i])

@@ -68,8 +68,8 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
     - fraction of the depth that is filled; changes of the logarithm of albedo on the ejecta and on the floor
     - three pairs of cosine and sine terms of the outline with two, three and five lobes; phase of the rays
 
-    `max_r` is the maximum distance of ejecta from the centre, in radii. The rim is lower where the outline is displaced
-    inwards.
+    With the distance r from the centre in radii, the bowl rises with r**2.2. The ejecta blanket falls with r**-3, has
+    rays outside the rim and ends at `max_r`. The rim is lower where the outline is displaced inwards.
     """
     mask = height.shape[0] - 1
     for n in range(craters.shape[0]):
@@ -77,6 +77,7 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
         c2, s2, c3, s3, c5, s5, phase = craters[n, 9:]
         extent = max_r * radius * 1.1
         cos_phase_7, sin_phase_7 = math.cos(phase), math.sin(phase)
+        # the twelve rays have another phase than the seven rays
         cos_phase_12, sin_phase_12 = math.cos(2.3 * phase), math.sin(2.3 * phase)
         # depth of the bowl before its fill
         bottom = depth / (1.0 - fill)
@@ -157,7 +158,7 @@ def scale_roughness(factors: Grid, spacing: float, craters: Array, max_r: float)
 def stamp_streaks(log_albedo: Grid, spacing: float, streaks: Array) -> None:
     """Add wind tails to the logarithm of albedo: rows (x, y, half width, length, cosine and sine downwind, log_albedo).
 
-    A tail begins at (x, y), widens downwind and fades to its end and its sides.
+    A tail begins at (x, y), widens downwind from 0.8 to 1.6 half widths, and fades to its end and its sides.
     """
     mask = log_albedo.shape[0] - 1
     for n in range(streaks.shape[0]):
@@ -186,6 +187,7 @@ def _arctan2(x: float, y: float) -> float:
     abs_x, abs_y = abs(x), abs(y)
     larger = max(abs_x, abs_y, 1e-30)
     ratio = min(abs_x, abs_y) / larger
+    # for ratios above tan(pi / 8) the polynomial approximates the angle minus pi / 4
     is_reduced = ratio > 0.41421356237309503
     a = (ratio - 1.0) / (ratio + 1.0) if is_reduced else ratio
     b = a * a
@@ -383,6 +385,7 @@ def raise_cones(
             if total > 0.0:
                 z = total**0.125
                 height[i, j] += z
+                # the coverage is 1 from 2 % of the first cone's slope times radius
                 coverage[i, j] = min(z / (0.02 * slope * apexes[0, 2]), 1.0)
 
 

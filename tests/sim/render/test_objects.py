@@ -29,14 +29,14 @@ def test_spheres_enclose_their_bodies_tightly() -> None:
 def test_subset_contains_the_selected_bodies() -> None:
     objects = _make_bodies()
     is_selected = np.array([True, False, False, True])
-    subset = objects.only(is_selected)
+    subset = objects.select(is_selected)
     is_expected = is_selected[objects.body_of_triangle]
     np.testing.assert_array_equal(subset.triangles, objects.triangles[is_expected])
     np.testing.assert_array_equal(subset.normals, objects.normals[is_expected])
     assert subset.first_triangle.tolist() == [0, 5, 8]
     assert subset.names.tolist() == [7, 3]
     np.testing.assert_array_equal(subset.spheres, objects.spheres[is_selected])
-    assert len(objects.only(np.zeros(4, dtype=bool))) == 0
+    assert len(objects.select(np.zeros(4, dtype=bool))) == 0
 
 
 def test_cone_selects_facing_triangles_of_bodies_within_it() -> None:
