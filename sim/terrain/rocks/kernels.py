@@ -115,8 +115,10 @@ def stamp_tails(
     `tails` has rows (x, y, half width, distance of the tip, height). `log_albedo` is the natural logarithm of the
     albedo of a ridge divided by that of the ground. The ridge rises from the centre of the rock to its edge. Its width
     and height are largest there, and decrease linearly to its tip. Its cross section at the offset t is
-    ``(1 - (t / half width)**2)**2``; the maximum slope is 1.54 times the height divided by the half width.
+    ``(1 - (t / half width)**2)**2``. The maximum slope is 1.54 times the height divided by the half width: the maximum
+    of ``4 t (1 - t**2)`` at ``t = 1 / sqrt(3)``.
     """
+    # the side is a power of two: `& mask` returns the index in the periodic square
     mask = samples.shape[0] - 1
     for n in range(tails.shape[0]):
         x, y, half_width, tip, height = tails[n]
@@ -173,6 +175,7 @@ def assemble(rocks: Placements, unit_vertices: Array, unit_normals: Array) -> tu
             vertices[row, 0] = position[n, 0] + r00 * x + r01 * y + ux * z
             vertices[row, 1] = position[n, 1] + r01 * x + r11 * y + uy * z
             vertices[row, 2] = position[n, 2] - ux * x - uy * y + uz * z
+            # normals are stretched by the inverse of the scale
             a = unit_normals[unit, v, 0] / sx
             b = unit_normals[unit, v, 1] / sy
             z = unit_normals[unit, v, 2] / sz
