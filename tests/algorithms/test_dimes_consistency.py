@@ -87,13 +87,14 @@ def test_each_pair_needs_one_track() -> None:
 
 def test_discrepancy_at_the_threshold_is_a_mismatch() -> None:
     velocities = np.zeros((2, 3))
-    still, moving = [np.zeros(2)], [np.array([THRESHOLD, 0.0])]
-    assert combine_tracks(still, moving, velocities).outcome is VelocityOutcome.IMU_MISMATCH
-    assert combine_tracks(still, [0.999 * moving[0]], velocities).outcome is VelocityOutcome.VALID
+    zero_velocity, threshold_velocity = [np.zeros(2)], [np.array([THRESHOLD, 0.0])]
+    assert combine_tracks(zero_velocity, threshold_velocity, velocities).outcome is VelocityOutcome.IMU_MISMATCH
+    assert combine_tracks(zero_velocity, [0.999 * threshold_velocity[0]], velocities).outcome is VelocityOutcome.VALID
 
 
 @pytest.mark.parametrize("invalid_pair", [0, 1])
 def test_invalid_tracks_are_ignored(invalid_pair: int) -> None:
+    # In one pair the only valid track is wrong. In the other pair the wrong track is invalid.
     correct, wrong, failed = np.array([5.0, 5.0]), np.array([25.0, 5.0]), (ValidityCheck.PEAK_HEIGHT,)
     pairs = [
         make_pair(make_track(p, 0, wrong, failed), make_track(p, 1, correct if p != invalid_pair else wrong))
@@ -110,9 +111,9 @@ def draw_track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
     """Draw velocity errors of four tracks per case from error formulas, m/s, shape (cases, pair, template, 2).
 
     The tracks of an image have common errors of altitude, 1 % (3 sigma), and attitude, 0.03 deg (0.5 ms at 60 deg/s).
-    The match error is 0.1 m/s per track. Features are within 39 deg of the nadir. A feature at distance r from the
-    nadir of a camera at height H, with relative altitude error e and tilt error (a, b), is displaced by at most
-    e r + H (1 + r^2 / H^2) (a, b).
+    The match error is 0.1 m/s per track. Features are within 39 deg of the nadir, at 0.8 altitudes. A feature at
+    distance r from the nadir of a camera at height H, with relative altitude error e and tilt error (a, b), is
+    displaced by at most e r + H (1 + r^2 / H^2) (a, b).
     """
     heights = np.array([2000.0, 1719.0, 1438.0])
     scale = rng.normal(0.0, 0.01 / 3.0, (cases, 3))

@@ -36,7 +36,7 @@ OPTIONS = HdaOptions(
     max_roughness_m=0.12,
     max_slope_rad=float(np.deg2rad(12.0)),
 )
-#: Boulders in the left half of the image; the ground on the right is clear.
+#: Boulders (x, y, height, standard deviation, metres) in the left half of the image; the right half is clear.
 BOULDERS = ((-1.2, 1.5, 0.35, 0.12), (1.6, 1.6, 0.35, 0.12), (0.3, 0.6, 0.35, 0.12), (-2.0, 0.3, 0.35, 0.12))
 ESTIMATORS: dict[str, Callable[[HdaOptions], SiteEstimator]] = {
     "hda": HdaEstimator,
@@ -149,8 +149,7 @@ def test_too_steep_ground_has_no_safe_site() -> None:
 
 def test_gravity_from_fitted_plane_removes_mean_slope() -> None:
     steep = measure_pass(make_pass((0.3, 0.0), ()))
-    frame = replace(OPTIONS, surface_frame=SurfaceFrame.PLANE)
-    result = HdaEstimator(frame).estimate(steep)
+    result = HdaEstimator(replace(OPTIONS, surface_frame=SurfaceFrame.PLANE)).estimate(steep)
     assert result.outcome is SiteOutcome.SAFE_SITE
     ground = get_ground(result)
     first = get_details(result).views[0]
@@ -159,7 +158,8 @@ def test_gravity_from_fitted_plane_removes_mean_slope() -> None:
     assert np.rad2deg(np.arccos(normal @ np.array([-0.3, 0.0, 1.0]) / np.hypot(0.3, 1.0))) < 0.2
 
 
-def test_gravity_from_inclinometers_or_state(measurements: LandingMeasurements) -> None:
+def test_inclinometer_error_changes_slopes_only_if_inclinometers_are_used(measurements: LandingMeasurements) -> None:
+    # The inclinometers have an error of 0.1 rad.
     tilted = replace(measurements, up_body=Rotation.from_rotvec([0.0, 0.1, 0.0]).apply(measurements.up_body))
     slopes = {}
     for frame in (SurfaceFrame.INCLINOMETER, SurfaceFrame.STATE):
@@ -297,12 +297,12 @@ def test_any_image_returns_an_estimate(name: str, measurements: LandingMeasureme
 
 def test_poses_can_predict_feature_positions(scene: Pass) -> None:
     # A baseline of 1.5 m moves the ground by at least 60 px, beyond the search window without a prediction.
-    wide = Pass(scene.height, (scene.poses[0], make_pose(0.1, -1.5, 10.1, 7.0, 2.0, -1.0)))
-    inputs = measure_pass(wide)
-    seeded = HdaEstimator(replace(OPTIONS, track_seed=TrackSeed.POSE)).estimate(inputs)
-    assert seeded.outcome.converged
-    assert get_motion(seeded).parallax_px > 50.0
-    errors = compute_map_errors(wide, seeded)
+    wide_pass = Pass(scene.height, (scene.poses[0], make_pose(0.1, -1.5, 10.1, 7.0, 2.0, -1.0)))
+    inputs = measure_pass(wide_pass)
+    with_prediction = HdaEstimator(replace(OPTIONS, track_seed=TrackSeed.POSE)).estimate(inputs)
+    assert with_prediction.outcome.converged
+    assert get_motion(with_prediction).parallax_px > 50.0
+    errors = compute_map_errors(wide_pass, with_prediction)
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
     assert not HdaEstimator(OPTIONS).estimate(inputs).outcome.converged
 

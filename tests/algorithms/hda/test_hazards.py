@@ -37,8 +37,8 @@ def make_ground(rows: int = 80, columns: int = 100, slope_x: float = 0.0, slope_
 def add_bump(flat: ElevationMap, row: int, column: int, radius: float, height: float) -> ElevationMap:
     """Add a cylinder; its radius is in cells, its height in metres."""
     rows, columns = np.indices(flat.elevation_m.shape)
-    inside = np.hypot(rows - row, columns - column) <= radius
-    return replace(flat, elevation_m=flat.elevation_m + height * inside)
+    is_inside = np.hypot(rows - row, columns - column) <= radius
+    return replace(flat, elevation_m=flat.elevation_m + height * is_inside)
 
 
 @pytest.mark.parametrize("refine", [False, True])
@@ -269,7 +269,10 @@ SHARP = Resolution(window_m=0.0, noise_m=0.0)
 
 
 def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
-    """The limit uses the mean of the paraboloid 1 - 4 r^2 / D^2 over a centred square window of side w."""
+    """The limit uses the mean of the paraboloid 1 - 4 r^2 / D^2 over a centred square window of side w.
+
+    The base width D is narrowest_hazard x max_roughness_m = 0.4 m, and w is 0.1 m.
+    """
     options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
     x = np.linspace(-0.05, 0.05, 401)
     mean = float(np.mean(1.0 - 4.0 * (x[:, None] ** 2 + x**2) / 0.4**2))
@@ -279,7 +282,7 @@ def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
 
 
 def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
-    """A ridge of 0.3 m height and flanks of 1 m width: no plane over 2 m fits it within 0.1 m."""
+    """A ridge with a slope of 0.3 on both sides: no plane under a footprint on its crest fits within 0.1 m."""
     x = 0.05 * (np.arange(121) - 60)
     ground = ElevationMap(np.tile(-0.3 * np.abs(x), (121, 1)), np.zeros(2), 0.05)
     all_safe = np.full((121, 121), Safety.SAFE, dtype=np.uint8)
@@ -298,8 +301,8 @@ def test_coarse_map_has_no_safe_cells() -> None:
     options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
     coarse = Resolution(window_m=1.0, noise_m=0.0)
     # At the corners most of a footprint is outside the map.
-    inside = (slice(10, 50), slice(10, 50))
-    assert np.all(check_footprints(all_safe, ground, SHARP, options)[inside] == Safety.SAFE)
+    inner = (slice(10, 50), slice(10, 50))
+    assert np.all(check_footprints(all_safe, ground, SHARP, options)[inner] == Safety.SAFE)
     assert np.all(check_footprints(all_safe, ground, coarse, options) == Safety.HAZARD)
 
 
