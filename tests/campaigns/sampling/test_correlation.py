@@ -166,9 +166,9 @@ def test_overridden_parameter_is_removed_from_its_group(campaign_file: CampaignF
     ],
 )
 def test_invalid_correlations_are_rejected(matrices: dict[str, object], message: str) -> None:
-    with pytest.raises(ValidationError) as raised:
+    with pytest.raises(ValidationError) as error:
         Correlation.model_validate({"parameters": ["a", "b"], **matrices})
-    assert message in str(raised.value)
+    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -187,6 +187,6 @@ def test_invalid_correlations_are_rejected(matrices: dict[str, object], message:
     ],
 )
 def test_invalid_groups_are_rejected(campaign_file: CampaignFile, dispersions: str, message: str) -> None:
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         load_campaign(str(campaign_file(dispersions=dispersions)))
-    assert message in str(raised.value)
+    assert message in str(error.value)

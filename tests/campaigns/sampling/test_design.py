@@ -204,6 +204,6 @@ def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
 def test_invalid_designs_are_rejected(
     campaign_file: CampaignFile, kind: str, cases: int, options: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         load_design(campaign_file, kind, cases, **options)  # type: ignore[arg-type]
-    assert message in str(raised.value)
+    assert message in str(error.value)
