@@ -150,8 +150,8 @@ def _slope_deg(heights: Heights, spacing_m: float, baseline_m: float, samples: S
     z, mask = heights[::step, ::step], None if samples is None else samples[::step, ::step]
     if mask is not None:
         # crop to the bounding box of the samples
-        occupied = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
-        box = tuple(slice(int(indices[0]), int(indices[-1]) + 1) if indices.size else slice(0) for indices in occupied)
+        axes = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
+        box = tuple(slice(int(indices[0]), int(indices[-1]) + 1) if indices.size else slice(0) for indices in axes)
         z, mask = z[box], mask[box]
     lag = round(baseline_m / (spacing_m * step))
     if lag < 1 or 2 * lag > min(z.shape):

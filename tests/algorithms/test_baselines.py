@@ -66,8 +66,8 @@ def test_images_of_different_ground_have_no_velocity(estimator: VelocityEstimato
     for _ in range(3):
         flight = draw_flight(rng, max_tilt_deg=10.0)
         first, second = (render(flight, draw_terrain(1), rng), render(flight, draw_terrain(2), rng))
-        mixed = replace(first, images=(first.images[0], second.images[1], first.images[2]))
-        answer = estimator.estimate(mixed)
+        inputs = replace(first, images=(first.images[0], second.images[1], first.images[2]))
+        answer = estimator.estimate(inputs)
         assert answer.outcome in (VelocityOutcome.NO_VALID_TRACK, VelocityOutcome.IMU_MISMATCH)
 
 
@@ -126,10 +126,8 @@ def test_distortion_is_the_largest_relative_length_change() -> None:
     middle, step = np.array([100.0, 50.0]), 1e-4
     angles = np.linspace(0.0, np.pi, 2001)
     changes = [
-        np.hypot(*(apply_homography(middle + step * np.array([np.cos(a), np.sin(a)])) - apply_homography(middle)))
-        / step
-        - 1.0
-        for a in angles
+        np.hypot(*(apply_homography(middle + step * unit_vector) - apply_homography(middle))) / step - 1.0
+        for unit_vector in np.column_stack([np.cos(angles), np.sin(angles)])
     ]
     result = max_length_change(homography, float((homography @ np.array([*middle, 1.0]))[2]), apply_homography(middle))
     assert result == pytest.approx(np.abs(changes).max(), abs=1e-4)

@@ -63,8 +63,10 @@ def test_noise_free_velocity_error_is_within_requirement() -> None:
     rng = np.random.default_rng(2024)
     flights = [draw_flight(rng) for _ in range(12)]
     estimates = [ESTIMATOR.estimate(render(flight)) for flight in flights]
-    assert [e.outcome for e in estimates] == [VelocityOutcome.VALID] * len(flights)
-    errors = np.array([e.velocity_m_s - f.velocities[1, :2] for e, f in zip(estimates, flights, strict=True)])
+    assert [estimate.outcome for estimate in estimates] == [VelocityOutcome.VALID] * len(flights)
+    errors = np.array(
+        [estimate.velocity_m_s - flight.velocities[1, :2] for estimate, flight in zip(estimates, flights, strict=True)]
+    )
     assert compute_rms(errors) < 0.05
     errors_of_tracks = compute_track_errors(flights, estimates)
     assert len(errors_of_tracks) >= 0.9 * 4 * len(flights)
@@ -84,7 +86,7 @@ def test_velocity_is_accurate_with_flight_camera_noise() -> None:
     rng = np.random.default_rng(2025)
     flights = [draw_flight(rng) for _ in range(6)]
     estimates = [ESTIMATOR.estimate(render(flight, noise=rng)) for flight in flights]
-    assert [e.outcome for e in estimates] == [VelocityOutcome.VALID] * len(flights)
+    assert [estimate.outcome for estimate in estimates] == [VelocityOutcome.VALID] * len(flights)
     assert compute_rms(compute_track_errors(flights, estimates)) < 0.06
 
 
@@ -142,8 +144,9 @@ def test_altitude_is_propagated_to_image_time() -> None:
 
 def test_velocity_uses_image_time_tags() -> None:
     inputs = render(steady_flight((12.0, 0.0)))
-    images = tuple(replace(i, time_s=100.0 + 1.25 * (i.time_s - 100.0)) for i in inputs.images)
-    altitudes = tuple(replace(a, time_s=i.time_s) for a, i in zip(inputs.altitudes, images, strict=True))
+    # The first image is at 100 s; all intervals are 1.25 times as long.
+    images = tuple(replace(image, time_s=100.0 + 1.25 * (image.time_s - 100.0)) for image in inputs.images)
+    altitudes = tuple(replace(a, time_s=image.time_s) for a, image in zip(inputs.altitudes, images, strict=True))
     answer = ESTIMATOR.estimate(replace(inputs, images=images, altitudes=altitudes))
     np.testing.assert_allclose(valid_velocity(answer), [12.0 / 1.25, 0.0], atol=0.1)
 
@@ -248,7 +251,7 @@ def test_any_attitude_returns_an_estimate(measurements: DescentMeasurements) -> 
     "times", [(0.0, 0.0, 0.0), (2.0, 1.0, 0.0), (0.0, 1e9, 2e9), (0.0, np.nan, 1.0), (0.0, 60.0, 120.0)]
 )
 def test_any_time_returns_an_estimate(measurements: DescentMeasurements, times: tuple[float, float, float]) -> None:
-    images = tuple(replace(i, time_s=t) for i, t in zip(measurements.images, times, strict=True))
+    images = tuple(replace(image, time_s=t) for image, t in zip(measurements.images, times, strict=True))
     altitudes = tuple(replace(a, time_s=t) for a, t in zip(measurements.altitudes, times, strict=True))
     answer = ESTIMATOR.estimate(replace(measurements, images=images, altitudes=altitudes))
     assert answer.outcome is VelocityOutcome.NO_TEMPLATE_AREA

@@ -77,10 +77,10 @@ def test_ground_and_pixel_projections_are_inverse() -> None:
     view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     pixels = grid_pixels(view.size, 16)
     ground, is_within_limit = ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
-    reprojected, visible = pixels_from_ground(view, ground)
+    projections, visible = pixels_from_ground(view, ground)
     assert is_within_limit.sum() > 200
     assert np.all(visible[is_within_limit])
-    np.testing.assert_allclose(reprojected[is_within_limit], pixels[is_within_limit], atol=1e-6)
+    np.testing.assert_allclose(projections[is_within_limit], pixels[is_within_limit], atol=1e-6)
 
 
 def test_distant_rays_are_clipped_at_the_off_nadir_limit() -> None:
@@ -230,11 +230,11 @@ def test_only_textured_area_is_selected() -> None:
     view = make_blank_view(Rotation.identity(), 2000.0, 0.0, counts)
     pixels = grid_pixels(view.size, OPTIONS.grid_step_px)
     positions = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
-    selected, contrasts_of_selected = select_templates(view, positions, OPTIONS)
-    np.testing.assert_allclose(pixels[selected[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
-    assert contrasts_of_selected[0] > 0.02
-    assert contrasts_of_selected[1] < 0.001
-    assert template_contrasts(view, pixels, OPTIONS.template_px)[selected[0]] == contrasts_of_selected[0]
+    selected_numbers, contrasts = select_templates(view, positions, OPTIONS)
+    np.testing.assert_allclose(pixels[selected_numbers[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
+    assert contrasts[0] > 0.02
+    assert contrasts[1] < 0.001
+    assert template_contrasts(view, pixels, OPTIONS.template_px)[selected_numbers[0]] == contrasts[0]
 
 
 def make_wave_texture() -> Texture:

@@ -73,8 +73,8 @@ class SurfaceUnits(Parameters):
     ) -> Float32[np.ndarray, "cover cover 3"]:
         """Add the albedo of units, dust devil tracks and wind tails of craters; return the cover (see `Surface`)."""
         units = self.kinds
-        expected = np.array([unit.fraction for unit in units])
-        areas = rng.dirichlet(self.concentration * expected / expected.sum())
+        expected_areas = np.array([unit.fraction for unit in units])
+        areas = rng.dirichlet(self.concentration * expected_areas / expected_areas.sum())
         side = ground.side // COVER_STEP
         spacing = ground.period_m / side
         downwind = np.radians(270.0 - self.wind_from_deg - self.wind_spread_deg * rng.standard_normal())

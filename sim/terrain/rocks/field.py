@@ -315,16 +315,17 @@ def _draw_positions(
 ) -> Float64[np.ndarray, "rocks 2"]:
     """Return the positions of placed rocks, and draw positions without overlap for the others by decreasing size."""
     period_m, density = surface.period_m, np.ascontiguousarray(surface.cover[..., ROCKS])
-    placed = np.array([(rock.east_m, rock.north_m) for rock in parameters.placed], dtype=np.float64).reshape(-1, 2)
-    placed %= period_m
-    count = placed.shape[0]
+    coordinates = [(rock.east_m, rock.north_m) for rock in parameters.placed]
+    placed_positions = np.array(coordinates, dtype=np.float64).reshape(-1, 2)
+    placed_positions %= period_m
+    count = placed_positions.shape[0]
     if radius.size == count:
-        return placed
-    occupied = np.column_stack([placed, radius[:count]])
+        return placed_positions
+    occupied = np.column_stack([placed_positions, radius[:count]])
     cell = max(CELL_OVER_DIAMETER * float(diameter[count:].mean()), period_m / 4096)
     random_positions = place_discs(radius[count:], occupied, density, period_m, cell, MAX_TRIES, rng)
-    unplaced = int(np.count_nonzero(np.isnan(random_positions[:, 0])))
-    if unplaced:
+    n_unplaced = int(np.count_nonzero(np.isnan(random_positions[:, 0])))
+    if n_unplaced:
         total = len(random_positions)
-        raise ValueError(f"{unplaced} of {total} rocks have no free position; a smaller rocks.abundance is needed")
-    return np.concatenate([placed, random_positions])
+        raise ValueError(f"{n_unplaced} of {total} rocks have no free position; a smaller rocks.abundance is needed")
+    return np.concatenate([placed_positions, random_positions])

@@ -51,7 +51,7 @@ def place_discs(
     next_entry = np.empty(n_entries, dtype=np.int32)
     disc_of_entry = np.empty(n_entries, dtype=np.int32)
     discs = np.empty((occupied.shape[0] + radii.size, 3), dtype=np.float64)
-    placed = np.full((radii.size, 2), np.nan, dtype=np.float64)
+    positions = np.full((radii.size, 2), np.nan, dtype=np.float64)
     n_listed, n_discs = 0, 0
     for disc in range(occupied.shape[0] + radii.size):
         is_existing = disc < occupied.shape[0]
@@ -91,7 +91,7 @@ def place_discs(
         if not is_free:
             continue
         if not is_existing:
-            placed[disc - occupied.shape[0], 0], placed[disc - occupied.shape[0], 1] = x, y
+            positions[disc - occupied.shape[0], 0], positions[disc - occupied.shape[0], 1] = x, y
         discs[n_discs, 0], discs[n_discs, 1], discs[n_discs, 2] = x, y, radius
         cell_rows = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
         cell_columns = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
@@ -103,7 +103,7 @@ def place_discs(
                 first_entry[i * side + j] = n_listed
                 n_listed += 1
         n_discs += 1
-    return placed
+    return positions
 
 
 @njit(cache=True)

@@ -65,7 +65,7 @@ def test_robust_fit_tolerates_almost_half_outliers() -> None:
     # Close to the breakdown point of 50 %: 45 of 100 points are outliers. The probability that 300 trials contain no
     # inlier triple is 1e-24.
     rng = np.random.default_rng(1)
-    x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(10), np.arange(10)))
+    x, y = (grid.astype(np.float64).ravel() for grid in np.meshgrid(np.arange(10), np.arange(10)))
     z = 3.0 + 0.2 * x - 0.1 * y + rng.normal(0.0, 0.01, 100)
     z[rng.permutation(100)[:45]] += rng.uniform(1.0, 5.0, 45)
     triples = rng.uniform(size=(300, 3))
@@ -81,20 +81,21 @@ def test_robust_fit_tolerates_almost_half_outliers() -> None:
 
 def test_robust_fit_has_least_median_of_tested_triples() -> None:
     rng = np.random.default_rng(2)
-    x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(5), np.arange(5)))
+    x, y = (grid.astype(np.float64).ravel() for grid in np.meshgrid(np.arange(5), np.arange(5)))
     z = rng.normal(size=25)
     triples = rng.uniform(size=(40, 3))
     result = robust_plane(x, y, z, triples, False)
     best = np.inf
     expected = None
-    for u in triples:
-        # Sampling without replacement: the second of 24 indices, then the third of 23.
+    for uniform_numbers in triples:
+        # Sampling without replacement: the first of 25 indices, the second of the other 24, then the third of 23.
         remaining = list(range(25))
-        i, j, k = (remaining.pop(int(u[n] * (25 - n))) for n in range(3))
-        design = np.array([[1.0, x[n], y[n]] for n in (i, j, k)])
+        indices = [remaining.pop(int(number * (25 - n))) for n, number in enumerate(uniform_numbers)]
+        design = np.array([[1.0, x[index], y[index]] for index in indices])
+        # The determinant of whole coordinates is a whole number: 0 if the points are collinear.
         if abs(np.linalg.det(design)) < 0.5:
             continue
-        plane = np.linalg.solve(design, z[[i, j, k]])
+        plane = np.linalg.solve(design, z[indices])
         median = np.sort(np.abs(z - plane[0] - plane[1] * x - plane[2] * y))[25 // 2 + 1]
         if median < best:
             best, expected = median, plane
@@ -104,7 +105,7 @@ def test_robust_fit_has_least_median_of_tested_triples() -> None:
 
 def test_refinement_reduces_noise() -> None:
     rng = np.random.default_rng(3)
-    x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(10), np.arange(10)))
+    x, y = (grid.astype(np.float64).ravel() for grid in np.meshgrid(np.arange(10), np.arange(10)))
     errors = []
     for _ in range(200):
         z = rng.normal(0.0, 1.0, 100)

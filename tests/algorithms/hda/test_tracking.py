@@ -96,8 +96,8 @@ def test_correlation_peak_matches_shared_operators(noise: np.ndarray) -> None:
     template, window = first[40:51, 60:71], second[32:63, 50:77]
     surface = pseudo_normalized_correlation(template, window)
     actual = [
-        [matching.correlation(first, second, 45, 65, 37 + i, 55 + j, 5) for j in range(surface.shape[1])]
-        for i in range(surface.shape[0])
+        [matching.correlation(first, second, 45, 65, 37 + row, 55 + column, 5) for column in range(surface.shape[1])]
+        for row in range(surface.shape[0])
     ]
     np.testing.assert_allclose(actual, surface, atol=1e-6)
     peak = highest_peak(surface)
@@ -106,8 +106,8 @@ def test_correlation_peak_matches_shared_operators(noise: np.ndarray) -> None:
 
 
 def test_biquadratic_peak_is_exact_for_a_quadric() -> None:
-    r, c = np.mgrid[-1.0:2.0, -1.0:2.0]
-    z = 0.9 - 0.3 * (r - 0.2) ** 2 - 0.2 * (c + 0.35) ** 2 - 0.1 * (r - 0.2) * (c + 0.35)
+    row, column = np.mgrid[-1.0:2.0, -1.0:2.0]
+    z = 0.9 - 0.3 * (row - 0.2) ** 2 - 0.2 * (column + 0.35) ** 2 - 0.1 * (row - 0.2) * (column + 0.35)
     np.testing.assert_allclose(matching.fit_biquadratic_peak(z), (0.2, -0.35, 0.9), atol=1e-12)
 
 

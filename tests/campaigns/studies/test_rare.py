@@ -141,8 +141,8 @@ def test_campaign_commands_reject_a_study(campaign_path: Path, tmp_path: Path) -
 
 def test_changed_program_is_rejected(campaign_path: Path, tmp_path: Path) -> None:
     run_study(campaign_path, tmp_path / "run")
-    stored = record.read(tmp_path / "run")
-    record.update(tmp_path / "run", {"identity": {**stored["identity"], "code": "other"}})
+    stored_record = record.read(tmp_path / "run")
+    record.update(tmp_path / "run", {"identity": {**stored_record["identity"], "code": "other"}})
     with pytest.raises(CampaignError, match="another program"):
         continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
 
