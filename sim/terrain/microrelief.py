@@ -21,13 +21,14 @@ def octave_heights(
     """Compute the cell size of the coarsest octave and the amplitude of each octave of height noise, metres.
 
     The ground's power spectral density is ``(k**2 + k0**2)**-(H + 1)`` (`landforms.ground.Spectrum`) with the Hurst
-    exponent H and the wavenumber k0 of the outer scale. Its correlation function is Matérn's. Its variance follows from
-    the slope over the baseline. An octave from k1 = k / sqrt(2) to k2 = k sqrt(2) around the wavenumber k has the
-    fraction ``(1 + (k1 / k0)**2)**-H - (1 + (k2 / k0)**2)**-H`` of this variance.
+    exponent H and the wavenumber k0 of the outer scale. Its correlation function c is Matérn's. Its variance follows
+    from the slope over the baseline L: ``(tan(slope) L)**2 = 2 variance (1 - c(L))``. An octave from k1 = k / sqrt(2)
+    to k2 = k sqrt(2) around the wavenumber k has the fraction ``(1 + (k1 / k0)**2)**-H - (1 + (k2 / k0)**2)**-H`` of
+    this variance.
     """
     k0 = 2.0 * np.pi / outer_scale_m
-    lag = k0 * baseline_m
-    correlation = 2.0 ** (1.0 - hurst) / gamma(hurst) * lag**hurst * kv(hurst, lag)
+    scaled_lag = k0 * baseline_m
+    correlation = 2.0 ** (1.0 - hurst) / gamma(hurst) * scaled_lag**hurst * kv(hurst, scaled_lag)
     variance = (np.tan(slope_rad) * baseline_m) ** 2 / (2.0 * (1.0 - correlation))
     coarsest = WAVES_PER_CELL * 2.0 * spacing_m / _FIRST_FREQUENCY
     octaves = max(int(np.log2(coarsest / FINEST_M)) + 1, 0)

@@ -27,10 +27,8 @@ class TerrainParameters(Parameters):
     outer_scale_m: Annotated[Positive, Field(description="wavelength above which relief stops growing, m")] = 3000.0
     craters_per_km2: Annotated[float, bounded_field(0.0, 2.0e6, "craters above the smallest diameter per km2")] = 60.0
     crater_exponent: Annotated[Positive, Field(description="exponent of the cumulative size-frequency power law")] = 2.0
-    crater_knee_m: Annotated[Positive, Field(description="diameter above which production, not saturation, limits")] = (
-        1e4
-    )
-    crater_steep_exponent: Annotated[Positive, Field(description="exponent above that diameter")] = 3.2
+    crater_knee_m: Annotated[Positive, Field(description="maximum diameter of craters in saturation, m")] = 1e4
+    crater_steep_exponent: Annotated[Positive, Field(description="exponent above crater_knee_m")] = 3.2
     crater_floor_contrast: Annotated[Fraction, Field(description="RMS of log albedo of floors over the ground's")] = 0.0
     crater_diameter_min_m: Annotated[Positive, Field(description="smallest crater diameter, m")] = 12.0
     crater_diameter_max_m: Annotated[Positive, Field(description="largest crater diameter, m")] = 600.0
@@ -47,7 +45,7 @@ class TerrainParameters(Parameters):
     fans: Annotated[Fans | None, Field(description="alluvial fans around a playa")] = None
     lava: Annotated[Lava | None, Field(description="pahoehoe flows and a'a")] = None
     dunes: Annotated[Dunes | None, Field(description="transverse dunes")] = None
-    ripples: Annotated[Dunes | None, Field(description="ripples: dunes of a smaller size")] = None
+    ripples: Annotated[Dunes | None, Field(description="ripples, as small dunes")] = None
     swell: Annotated[Swell | None, Field(description="broad relief")] = None
     ramp: Annotated[Ramp | None, Field(description="an even slope")] = None
     gullies: Annotated[Gullies | None, Field(description="steep-walled gullies")] = None

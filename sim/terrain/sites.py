@@ -42,15 +42,15 @@ class Environment(Parameters):
         ``exp(-tau' / sin elevation)``, where tau' is the optical depth without the forward peak of scattering (delta
         scaling, Joseph et al. 1976).
         """
-        return float(np.exp(-self._delta_scaled()[0] / max(np.sin(sun_elevation_rad), MIN_SUN_SINE)))
+        return float(np.exp(-self._apply_delta_scaling()[0] / max(np.sin(sun_elevation_rad), MIN_SUN_SINE)))
 
     def sky_fraction(self, sun_elevation_rad: float) -> float:
-        """Compute the diffuse irradiance of level ground / that of direct sunlight on a plane facing the sun.
+        """Compute the diffuse irradiance on level ground divided by the direct irradiance on a plane facing the sun.
 
         Delta-Eddington approximation (Joseph, Wiscombe & Weinman 1976) over black ground, without light that the ground
         reflects to the atmosphere. The value is also the radiance factor of a uniform sky with this irradiance.
         """
-        tau, albedo, asymmetry = self._delta_scaled()
+        tau, albedo, asymmetry = self._apply_delta_scaling()
         if tau == 0.0:
             return 0.0
         mu = max(float(np.sin(sun_elevation_rad)), MIN_SUN_SINE)
@@ -75,8 +75,8 @@ class Environment(Parameters):
         height_m = max(height_m, 1.0)
         return float(-self.optical_depth * np.expm1(-height_m / self.scale_height_m) / height_m)
 
-    def _delta_scaled(self) -> tuple[float, float, float]:
-        """Compute optical depth, single-scattering albedo and asymmetry without the forward peak (fraction g**2)."""
+    def _apply_delta_scaling(self) -> tuple[float, float, float]:
+        """Compute optical depth, single-scattering albedo and asymmetry g without the forward peak (fraction g**2)."""
         peak = self.asymmetry**2
         remainder = 1.0 - self.single_scattering_albedo * peak
         albedo = self.single_scattering_albedo * (1.0 - peak) / remainder
@@ -176,19 +176,19 @@ PAPER: dict[str, PaperFigures] = {
 def sites() -> dict[str, Site]:
     """Return all sites in ``sites.toml`` by name."""
     tables = tomllib.loads(Path(__file__).with_name("sites.toml").read_text("utf-8"))
-    loaded = {}
+    sites_by_name = {}
     for name, entry in tables["sites"].items():
         entry["environment"] = _merge_base(tables["environments"][entry["environment"]], tables["environments"])
         for scale in {"descent", "ground"} & set(entry):
             entry[scale] = _merge_base(entry[scale], tables["grounds"])
         for texture, coarsest_m in (("ground_texture", 3.0), ("rock_texture", 0.2)):
-            # octaves down to 1 mm; amplitudes decrease by the factor `decay`
+            # cells from `coarsest_m` down to 1 mm; the amplitude of each octave is multiplied by `decay`
             first_amplitude, decay = entry[texture]["amplitude"], entry[texture]["decay"]
             octaves = range(int(np.log2(coarsest_m / 0.001)) + 1)
             amplitudes = tuple(round(first_amplitude * decay**n, 5) for n in octaves)
             entry[texture] = SiteTexture(coarsest_m=coarsest_m, amplitudes=amplitudes)
-        loaded[name] = Site(name=name, **entry)
-    return loaded
+        sites_by_name[name] = Site(name=name, **entry)
+    return sites_by_name
 
 
 def _merge_base(entry: dict[str, Any], bases: dict[str, dict[str, Any]]) -> dict[str, Any]:

@@ -48,8 +48,8 @@ class Surface:
         """Build the pyramid from level 0; ValueError unless level 0 is a square of 2**k samples per side, k >= 4."""
         side = samples.shape[0]
         if samples.shape[1] != side or side < SMALLEST_LEVEL or side & (side - 1):
-            needed = "a square with a power of two of at least 16 is needed"
-            raise ValueError(f"terrain samples have shape {samples.shape}; {needed}")
+            requirement = "a square with a power of two of at least 16 is needed"
+            raise ValueError(f"terrain samples have shape {samples.shape}; {requirement}")
         levels = [np.ascontiguousarray(samples)]
         while levels[-1].shape[0] > SMALLEST_LEVEL:
             levels.append(reduce_level(levels[-1]))
@@ -142,6 +142,7 @@ def mean_slope_deg(surface: Surface, baseline_m: float, samples: Samples | None 
 
 
 def _slope_deg(heights: Heights, spacing_m: float, baseline_m: float, samples: Samples | None) -> float:
+    """Compute `mean_slope_deg` from the heights at the samples of a terrain."""
     # decimate to a spacing of 1/16 to 1/8 of the baseline
     step = 1
     while spacing_m * 2 * step <= baseline_m / 8.0:
@@ -149,8 +150,8 @@ def _slope_deg(heights: Heights, spacing_m: float, baseline_m: float, samples: S
     z, mask = heights[::step, ::step], None if samples is None else samples[::step, ::step]
     if mask is not None:
         # crop to the bounding box of the samples
-        occupied = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
-        box = tuple(slice(int(indices[0]), int(indices[-1]) + 1) if indices.size else slice(0) for indices in occupied)
+        axes = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
+        box = tuple(slice(int(indices[0]), int(indices[-1]) + 1) if indices.size else slice(0) for indices in axes)
         z, mask = z[box], mask[box]
     lag = round(baseline_m / (spacing_m * step))
     if lag < 1 or 2 * lag > min(z.shape):
@@ -186,9 +187,9 @@ def nadir_picture(
     surface: Surface, level: int, sun_azimuth_rad: float, sun_elevation_rad: float
 ) -> Float64[np.ndarray, "rows columns"]:
     """Compute the radiance factor of one level's samples in nadir view; row 0 is the terrain's southern edge."""
-    field = surface.levels[level].astype(np.float64)
+    channels = surface.levels[level].astype(np.float64)
     spacing = surface.spacing_m * 2.0**level
-    height = field[..., HEIGHT]
+    height = channels[..., HEIGHT]
     slope_x, slope_y = ((np.roll(height, -1, axis) - np.roll(height, 1, axis)) / (2.0 * spacing) for axis in (1, 0))
     # cosines of the emission angle and of the incidence angle
     cos_e = 1.0 / np.sqrt(1.0 + slope_x**2 + slope_y**2)
@@ -196,5 +197,6 @@ def nadir_picture(
     horizontal, up = np.cos(sun_elevation_rad), np.sin(sun_elevation_rad)
     towards_sun = up - slope_x * east * horizontal - slope_y * north * horizontal
     cos_i = np.maximum(towards_sun * cos_e, 0.0)
+    # a uniform sky illuminates a slope with (1 + cos(slope)) / 2 of its irradiance on level ground
     direct = 2.0 * CONTRAST_LUNAR_FRACTION * cos_i / (cos_i + cos_e) + (1.0 - CONTRAST_LUNAR_FRACTION) * cos_i
-    return np.asarray(field[..., ALBEDO] * (direct + CONTRAST_SKY_FRACTION * 0.5 * (1.0 + cos_e)))
+    return np.asarray(channels[..., ALBEDO] * (direct + CONTRAST_SKY_FRACTION * 0.5 * (1.0 + cos_e)))

@@ -39,13 +39,16 @@ INTERVAL_S = 3.75
 
 @dataclass(frozen=True)
 class Texture:
-    """Brightness of the plane, a periodic bilinear surface; `values[i, j]` is at north = -i step, east = j step."""
+    """Brightness of the plane, periodic and bilinear; `values[i, j]` is at north = -i step_m, east = j step_m."""
 
     values: np.ndarray
     step_m: float
 
     def __call__(self, east: np.ndarray, north: np.ndarray, origin: np.ndarray) -> np.ndarray:
-        """Brightness at `origin` plus (east, north), metres. Accuracy: 1e-4 texel in float32, 1/32 texel in remap."""
+        """Interpolate the brightness at `origin` plus (east, north), metres.
+
+        The positions have errors of 1e-4 texels from float32 and of 1/32 texel from remap.
+        """
         size = np.array(self.values.shape, dtype=np.float64)
         row, column = np.mod(np.array([-origin[1], origin[0]]) / self.step_m, size)
         rows = np.float32(row) - east.dtype.type(1.0 / self.step_m) * north
@@ -67,7 +70,7 @@ def draw_terrain(
 
 
 def make_waves(wavelength_m: float, contrast: float = 0.2, size: int = 2048, step_m: float = 1.5) -> Texture:
-    """Repetitive terrain: two crossed waves; the wavelength is rounded to a whole number of waves per period."""
+    """Create a repetitive terrain of two crossed waves, with a whole number of waves per period."""
     phase = 2.0 * np.pi * np.round(size * step_m / wavelength_m) * np.arange(size) / size
     values = 1.0 + contrast * (np.sin(phase)[:, None] + np.sin(phase)[None, :]) / 2.0
     return Texture(values.astype(np.float32), step_m)
@@ -75,19 +78,19 @@ def make_waves(wavelength_m: float, contrast: float = 0.2, size: int = 2048, ste
 
 @cache
 def compute_body_rays() -> np.ndarray:
-    """Directions of all physical pixels' rays in the body frame, shape (3, 1024, 1024)."""
+    """Compute the directions of the rays of all physical pixels in the body frame, shape (3, 1024, 1024)."""
     return np.ascontiguousarray(np.moveaxis(CAMERA.rays(CAMERA.pixel_grid())[1], -1, 0), dtype=np.float32)
 
 
 @cache
 def compute_fall_off() -> np.ndarray:
-    """Relative response of the physical pixels: cosine to the fourth, shape (1024, 1024)."""
+    """Compute the relative response of the physical pixels, cos^4 of the field angle, shape (1024, 1024)."""
     return np.clip(np.tensordot(CAMERA.a, compute_body_rays(), 1), 0.0, 1.0) ** 4
 
 
 @cache
 def compute_binned_fall_off() -> np.ndarray:
-    """Relative response of the delivered rows, shape (256, 1024)."""
+    """Compute the relative response of the delivered rows, shape (256, 1024)."""
     return np.asarray(compute_fall_off().reshape(-1, ROWS_SUMMED, 1024).mean(axis=1))
 
 
@@ -104,7 +107,7 @@ def make_calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) ->
 
 
 def trace_scene(texture: Texture, world_from_body: Rotation, position: np.ndarray) -> np.ndarray:
-    """Radiance of each physical pixel, shape (1024, 1024); the sky is black."""
+    """Compute the radiance of each physical pixel, shape (1024, 1024); the sky is black."""
     rays = np.tensordot(world_from_body.as_matrix().astype(np.float32), compute_body_rays(), 1)
     is_down = rays[2] < -0.05
     slant = np.where(is_down, np.float32(-position[2]) / np.where(is_down, rays[2], np.float32(-1.0)), np.float32(0.0))
@@ -114,9 +117,9 @@ def trace_scene(texture: Texture, world_from_body: Rotation, position: np.ndarra
 def expose_scene(
     radiance: np.ndarray, detector: DetectorCalibration, noise: np.random.Generator | None = None, level: float = 1600.0
 ) -> np.ndarray:
-    """Expose a static scene; return counts. `level`: counts of radiance 1 on the axis.
+    """Expose a static scene; return counts. `level` is the number of counts of radiance 1 on the axis.
 
-    Noise: 50 electrons, and shot noise at 6.9 (11000 / 1600) electrons per count.
+    The noise is 50 electrons, and shot noise at 6.9 (11000 / 1600) electrons per count.
     """
     rate = radiance * compute_fall_off()
     rate_above = np.cumsum(rate, axis=0) - rate  # float64, as the fall-off
@@ -144,7 +147,7 @@ class Flight:
 
 
 def tilt_body(tilt_deg: float, azimuth_deg: float, roll_deg: float) -> Rotation:
-    """Attitude of a body that rolls about its vertical and is then tilted towards `azimuth_deg`."""
+    """Create the attitude of a body that rolls about its vertical and is then tilted towards `azimuth_deg`."""
     tilt = Rotation.from_euler("ZYZ", [azimuth_deg, tilt_deg, -azimuth_deg], degrees=True)
     return tilt * Rotation.from_euler("z", roll_deg, degrees=True)
 
@@ -155,16 +158,16 @@ def draw_flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: 
     - max_wind: maximum horizontal velocity, m/s
     """
     wind = max_wind * np.sqrt(rng.uniform()) * np.array([*_draw_unit_vector(rng), 0.0])
-    change = np.array([*rng.normal(0.0, 1.0, 2), 0.0])
+    wind_change = np.array([*rng.normal(0.0, 1.0, 2), 0.0])
     first = np.array([*rng.uniform(0.0, 3000.0, 2), rng.uniform(1900.0, 2100.0)])
     descent = np.array([0.0, 0.0, -75.0])
-    steps = np.stack([np.zeros(3), wind + descent, 2.0 * (wind + descent) + change])
+    displacements = np.stack([np.zeros(3), wind + descent, 2.0 * (wind + descent) + wind_change])
     mean_tilt_deg = max_tilt_deg * np.sqrt(rng.uniform()) * _draw_unit_vector(rng)
     attitudes = []
     for _ in range(3):
         x, y = mean_tilt_deg + rng.uniform(-5.0, 5.0, 2)
         attitudes.append(tilt_body(np.hypot(x, y), np.degrees(np.arctan2(y, x)), rng.uniform(0.0, 360.0)))
-    return Flight(first + INTERVAL_S * steps, (attitudes[0], attitudes[1], attitudes[2]))
+    return Flight(first + INTERVAL_S * displacements, (attitudes[0], attitudes[1], attitudes[2]))
 
 
 LEVEL_FLIGHT = (Rotation.identity(), Rotation.identity(), Rotation.identity())
@@ -183,30 +186,30 @@ def _draw_unit_vector(rng: np.random.Generator) -> np.ndarray:
     return np.array([np.cos(angle), np.sin(angle)])
 
 
-def make_measurements(path: Flight, counts: list[np.ndarray], detector: DetectorCalibration) -> DescentMeasurements:
+def make_measurements(flight: Flight, counts: list[np.ndarray], detector: DetectorCalibration) -> DescentMeasurements:
     """Create exact measurements of a flight; the inertial velocities have a common error of (40, -25) m/s."""
     camera = CAMERA.bin(1, detector.rows_summed)
     times = [100.0 + INTERVAL_S * i for i in range(3)]
     return DescentMeasurements(
-        images=tuple(DetectorImage(c, t, camera, detector) for c, t in zip(counts, times, strict=True)),
-        attitudes=tuple(AttitudeMeasurement(a, t) for a, t in zip(path.attitudes, times, strict=True)),
-        altitudes=tuple(AltitudeMeasurement(float(p[2]), t) for p, t in zip(path.positions, times, strict=True)),
-        interval_velocities_m_s=path.velocities + np.array([40.0, -25.0, 0.0]),
-        sun_direction=path.sun,
+        images=tuple(DetectorImage(image, t, camera, detector) for image, t in zip(counts, times, strict=True)),
+        attitudes=tuple(AttitudeMeasurement(a, t) for a, t in zip(flight.attitudes, times, strict=True)),
+        altitudes=tuple(AltitudeMeasurement(float(p[2]), t) for p, t in zip(flight.positions, times, strict=True)),
+        interval_velocities_m_s=flight.velocities + np.array([40.0, -25.0, 0.0]),
+        sun_direction=flight.sun,
     )
 
 
 def render(
-    path: Flight, texture: Texture | None = None, noise: np.random.Generator | None = None, level: float = 1600.0
+    flight: Flight, texture: Texture | None = None, noise: np.random.Generator | None = None, level: float = 1600.0
 ) -> DescentMeasurements:
     """Render the images of a flight; return them with exact measurements."""
     detector = make_calibration()
     ground = draw_terrain() if texture is None else texture
     counts = [
         expose_scene(trace_scene(ground, attitude, position), detector, noise, level)
-        for attitude, position in zip(path.attitudes, path.positions, strict=True)
+        for attitude, position in zip(flight.attitudes, flight.positions, strict=True)
     ]
-    return make_measurements(path, counts, detector)
+    return make_measurements(flight, counts, detector)
 
 
 def valid_velocity(estimate: VelocityEstimate) -> np.ndarray:

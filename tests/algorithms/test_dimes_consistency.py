@@ -31,10 +31,10 @@ THRESHOLD = DimesOptions().imu_threshold_m_s
 METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_ratio=0.3, on_border=False)
 
 
-def make_track(pair: int, index: int, velocity: np.ndarray, failed: tuple[ValidityCheck, ...] = ()) -> Track:
+def make_track(pair: int, index: int, velocity: np.ndarray, failures: tuple[ValidityCheck, ...] = ()) -> Track:
     blank = np.zeros((3, 3))
     return Track(
-        pair, index, *(np.zeros(2),) * 3, blank, blank, np.ones(2), blank, METRICS, failed, np.asarray(velocity)
+        pair, index, *(np.zeros(2),) * 3, blank, blank, np.ones(2), blank, METRICS, failures, np.asarray(velocity)
     )
 
 
@@ -54,8 +54,8 @@ def combine_tracks(
     first: list[np.ndarray], second: list[np.ndarray], interval_velocities: np.ndarray
 ) -> VelocityEstimate:
     pairs = [
-        make_pair(*(make_track(p, k, v) for k, v in enumerate(velocities)))
-        for p, velocities in enumerate((first, second))
+        make_pair(*(make_track(pair, index, velocity) for index, velocity in enumerate(velocities)))
+        for pair, velocities in enumerate((first, second))
     ]
     return combine_pairs((pairs[0], pairs[1]), interval_velocities, THRESHOLD)
 
@@ -64,8 +64,8 @@ def test_combinations_are_sorted_by_consistency() -> None:
     velocities = np.array([[40.0, 0.0, -75.0], [41.0, 2.0, -75.0]])
     first = [(0, np.array([5.0, 5.0])), (1, np.array([9.0, 5.0]))]
     result = rank_combinations(first, [(1, np.array([6.0, 7.0]))], velocities)
-    assert [(c.first, c.second) for c in result] == [(0, 1), (1, 1)]
-    assert [c.discrepancy_m_s for c in result] == pytest.approx([0.0, 4.0])
+    assert [(combination.first, combination.second) for combination in result] == [(0, 1), (1, 1)]
+    assert [combination.discrepancy_m_s for combination in result] == pytest.approx([0.0, 4.0])
 
 
 def test_best_combination_reports_second_pair_velocity() -> None:
@@ -87,17 +87,18 @@ def test_each_pair_needs_one_track() -> None:
 
 def test_discrepancy_at_the_threshold_is_a_mismatch() -> None:
     velocities = np.zeros((2, 3))
-    still, moving = [np.zeros(2)], [np.array([THRESHOLD, 0.0])]
-    assert combine_tracks(still, moving, velocities).outcome is VelocityOutcome.IMU_MISMATCH
-    assert combine_tracks(still, [0.999 * moving[0]], velocities).outcome is VelocityOutcome.VALID
+    zero_velocity, threshold_velocity = [np.zeros(2)], [np.array([THRESHOLD, 0.0])]
+    assert combine_tracks(zero_velocity, threshold_velocity, velocities).outcome is VelocityOutcome.IMU_MISMATCH
+    assert combine_tracks(zero_velocity, [0.999 * threshold_velocity[0]], velocities).outcome is VelocityOutcome.VALID
 
 
-@pytest.mark.parametrize("invalid_pair", [0, 1])
-def test_invalid_tracks_are_ignored(invalid_pair: int) -> None:
-    correct, wrong, failed = np.array([5.0, 5.0]), np.array([25.0, 5.0]), (ValidityCheck.PEAK_HEIGHT,)
+@pytest.mark.parametrize("wrong_pair", [0, 1])
+def test_invalid_tracks_are_ignored(wrong_pair: int) -> None:
+    # In one pair the only valid track is wrong. In the other pair the wrong track is invalid.
+    correct, wrong, failures = np.array([5.0, 5.0]), np.array([25.0, 5.0]), (ValidityCheck.PEAK_HEIGHT,)
     pairs = [
-        make_pair(make_track(p, 0, wrong, failed), make_track(p, 1, correct if p != invalid_pair else wrong))
-        for p in range(2)
+        make_pair(make_track(pair, 0, wrong, failures), make_track(pair, 1, wrong if pair == wrong_pair else correct))
+        for pair in range(2)
     ]
     answer = combine_pairs((pairs[0], pairs[1]), np.zeros((2, 3)), THRESHOLD)
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
@@ -110,9 +111,9 @@ def draw_track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
     """Draw velocity errors of four tracks per case from error formulas, m/s, shape (cases, pair, template, 2).
 
     The tracks of an image have common errors of altitude, 1 % (3 sigma), and attitude, 0.03 deg (0.5 ms at 60 deg/s).
-    The match error is 0.1 m/s per track. Features are within 39 deg of the nadir. A feature at distance r from the
-    nadir of a camera at height H, with relative altitude error e and tilt error (a, b), is displaced by at most
-    e r + H (1 + r^2 / H^2) (a, b).
+    The match error is 0.1 m/s per track. Features are within 39 deg of the nadir, at 0.8 altitudes. A feature at
+    distance r from the nadir of a camera at height H, with relative altitude error e and tilt error (a, b), is
+    displaced by at most e r + H (1 + r^2 / H^2) (a, b).
     """
     heights = np.array([2000.0, 1719.0, 1438.0])
     scale = rng.normal(0.0, 0.01 / 3.0, (cases, 3))

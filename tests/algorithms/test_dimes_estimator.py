@@ -45,8 +45,8 @@ def compute_track_errors(
 ) -> np.ndarray:
     return np.array(
         [
-            track.velocity_m_s - truth.velocities[track.pair, :2]
-            for truth, estimate in zip(flights, estimates, strict=True)
+            track.velocity_m_s - flight.velocities[track.pair, :2]
+            for flight, estimate in zip(flights, estimates, strict=True)
             for track in get_details(estimate).tracks
             if track.valid or not valid_only
         ]
@@ -54,17 +54,19 @@ def compute_track_errors(
 
 
 def compute_rms(errors: np.ndarray) -> float:
-    """Root mean square length of vectors."""
+    """Compute the root mean square length of vectors."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
 
 def test_noise_free_velocity_error_is_within_requirement() -> None:
-    # Requirement: at most 0.15 m/s rms over flat terrain. Aliasing in the binned pixels causes 0.02 m/s (0.015 px).
+    # The requirement is 0.15 m/s rms over flat terrain. Aliasing in the binned pixels causes 0.02 m/s (0.015 px).
     rng = np.random.default_rng(2024)
     flights = [draw_flight(rng) for _ in range(12)]
-    estimates = [ESTIMATOR.estimate(render(truth)) for truth in flights]
-    assert [e.outcome for e in estimates] == [VelocityOutcome.VALID] * len(flights)
-    errors = np.array([e.velocity_m_s - f.velocities[1, :2] for e, f in zip(estimates, flights, strict=True)])
+    estimates = [ESTIMATOR.estimate(render(flight)) for flight in flights]
+    assert [estimate.outcome for estimate in estimates] == [VelocityOutcome.VALID] * len(flights)
+    errors = np.array(
+        [estimate.velocity_m_s - flight.velocities[1, :2] for estimate, flight in zip(estimates, flights, strict=True)]
+    )
     assert compute_rms(errors) < 0.05
     errors_of_tracks = compute_track_errors(flights, estimates)
     assert len(errors_of_tracks) >= 0.9 * 4 * len(flights)
@@ -75,7 +77,7 @@ def test_noise_free_velocity_error_is_within_requirement() -> None:
 def test_published_algorithm_has_the_errors_of_its_peak_fit() -> None:
     rng = np.random.default_rng(2024)
     flights = [draw_flight(rng) for _ in range(6)]
-    estimates = [DimesEstimator().estimate(render(truth)) for truth in flights]
+    estimates = [DimesEstimator().estimate(render(flight)) for flight in flights]
     # The fit is biased by up to 0.12 px of 5.6 m in 3.75 s (0.18 m/s) on each axis.
     assert 0.03 < compute_rms(compute_track_errors(flights, estimates)) < 0.18
 
@@ -83,8 +85,8 @@ def test_published_algorithm_has_the_errors_of_its_peak_fit() -> None:
 def test_velocity_is_accurate_with_flight_camera_noise() -> None:
     rng = np.random.default_rng(2025)
     flights = [draw_flight(rng) for _ in range(6)]
-    estimates = [ESTIMATOR.estimate(render(truth, noise=rng)) for truth in flights]
-    assert [e.outcome for e in estimates] == [VelocityOutcome.VALID] * len(flights)
+    estimates = [ESTIMATOR.estimate(render(flight, noise=rng)) for flight in flights]
+    assert [estimate.outcome for estimate in estimates] == [VelocityOutcome.VALID] * len(flights)
     assert compute_rms(compute_track_errors(flights, estimates)) < 0.06
 
 
@@ -96,28 +98,28 @@ def test_east_and_north_velocities_are_not_swapped(velocity: tuple[float, float]
 
 
 def test_template_and_match_show_the_same_ground() -> None:
-    truth = steady_flight(
+    flight = steady_flight(
         (12.0, -7.0), (tilt_body(3.0, 0.0, 40.0), tilt_body(8.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
     )
-    measured = render(truth)
-    tracks = get_details(ESTIMATOR.estimate(measured)).tracks
+    inputs = render(flight)
+    tracks = get_details(ESTIMATOR.estimate(inputs)).tracks
     assert len(tracks) == 4
     for track in tracks:
         ground = []
         for k, pixel in ((track.pair, track.template_pixel), (track.pair + 1, track.match_pixel)):
-            _, rays = measured.images[k].camera.bin(4, 1).rays(pixel[None, :])
-            ray = truth.attitudes[k].apply(rays[0])
-            ground.append(truth.positions[k] - ray * truth.positions[k, 2] / ray[2])
+            _, rays = inputs.images[k].camera.bin(4, 1).rays(pixel[None, :])
+            ray = flight.attitudes[k].apply(rays[0])
+            ground.append(flight.positions[k] - ray * flight.positions[k, 2] / ray[2])
         np.testing.assert_allclose(ground[0], ground[1], atol=0.5)  # less than a tenth of a binned pixel
 
 
 def test_subpixel_refinement_reduces_velocity_error() -> None:
     rng = np.random.default_rng(9)
     flights = [draw_flight(rng) for _ in range(4)]
-    measured = [render(truth) for truth in flights]
+    inputs = [render(flight) for flight in flights]
 
     def rms_error(options: DimesOptions) -> float:
-        estimates = [DimesEstimator(options).estimate(m) for m in measured]
+        estimates = [DimesEstimator(options).estimate(measurements) for measurements in inputs]
         return compute_rms(compute_track_errors(flights, estimates, valid_only=False))
 
     whole_pixel, fitted, aligned = (
@@ -132,31 +134,33 @@ def test_subpixel_refinement_reduces_velocity_error() -> None:
 
 
 def test_altitude_is_propagated_to_image_time() -> None:
-    truth = steady_flight((15.0, 5.0))
-    measured = render(truth)
-    later = tuple(replace(m, altitude_m=m.altitude_m - 75.0 * 0.5, time_s=m.time_s + 0.5) for m in measured.altitudes)
-    answer = ESTIMATOR.estimate(replace(measured, altitudes=later))
+    flight = steady_flight((15.0, 5.0))
+    inputs = render(flight)
+    # The altitudes are measured 0.5 s after the images; the lander descends at 75 m/s.
+    later = tuple(replace(a, altitude_m=a.altitude_m - 75.0 * 0.5, time_s=a.time_s + 0.5) for a in inputs.altitudes)
+    answer = ESTIMATOR.estimate(replace(inputs, altitudes=later))
     np.testing.assert_allclose(valid_velocity(answer), [15.0, 5.0], atol=0.1)
 
 
 def test_velocity_uses_image_time_tags() -> None:
-    measured = render(steady_flight((12.0, 0.0)))
-    images = tuple(replace(i, time_s=100.0 + 1.25 * (i.time_s - 100.0)) for i in measured.images)
-    altitudes = tuple(replace(a, time_s=i.time_s) for a, i in zip(measured.altitudes, images, strict=True))
-    answer = ESTIMATOR.estimate(replace(measured, images=images, altitudes=altitudes))
+    inputs = render(steady_flight((12.0, 0.0)))
+    # The first image is at 100 s; all intervals are 1.25 times as long.
+    images = tuple(replace(image, time_s=100.0 + 1.25 * (image.time_s - 100.0)) for image in inputs.images)
+    altitudes = tuple(replace(a, time_s=image.time_s) for a, image in zip(inputs.altitudes, images, strict=True))
+    answer = ESTIMATOR.estimate(replace(inputs, images=images, altitudes=altitudes))
     np.testing.assert_allclose(valid_velocity(answer), [12.0 / 1.25, 0.0], atol=0.1)
 
 
 def test_different_image_sizes_are_binned_equally() -> None:
-    truth = steady_flight((12.0, -7.0))
+    flight = steady_flight((12.0, -7.0))
     detector = replace(
         make_calibration(), rows_summed=1, flat_field=np.repeat(make_calibration().flat_field, 4, axis=0)
     )
     counts = [
         expose_scene(trace_scene(draw_terrain(), a, p), detector)
-        for a, p in zip(truth.attitudes, truth.positions, strict=True)
+        for a, p in zip(flight.attitudes, flight.positions, strict=True)
     ]
-    answer = ESTIMATOR.estimate(make_measurements(truth, counts, detector))
+    answer = ESTIMATOR.estimate(make_measurements(flight, counts, detector))
     np.testing.assert_allclose(valid_velocity(answer), [12.0, -7.0], atol=0.1)
 
 
@@ -177,21 +181,30 @@ def test_repetitive_terrain_is_rejected_by_second_peak(wavelength_m: float) -> N
 
 
 def test_disagreement_with_imu_rejects_the_velocity() -> None:
-    measured = render(steady_flight((10.0, 5.0)))
-    velocities = measured.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
-    answer = ESTIMATOR.estimate(replace(measured, interval_velocities_m_s=velocities))
+    inputs = render(steady_flight((10.0, 5.0)))
+    velocities = inputs.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
+    answer = ESTIMATOR.estimate(replace(inputs, interval_velocities_m_s=velocities))
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
     assert get_details(answer).chosen is None
     assert get_details(answer).combinations[0].discrepancy_m_s == pytest.approx(10.0, abs=0.2)
 
 
-def _set_counts(measured: DescentMeasurements, change: Callable[[int, np.ndarray], np.ndarray]) -> DescentMeasurements:
-    images = tuple(replace(i, counts=change(k, i.counts.copy())) for k, i in enumerate(measured.images))
-    return replace(measured, images=images)
+#: Function of the number and the counts of an image that returns new counts.
+ChangeCounts = Callable[[int, np.ndarray], np.ndarray]
 
 
-def _draw_random_counts(k: int, counts: np.ndarray) -> np.ndarray:
-    return np.random.default_rng(k).integers(0, 4096, counts.shape, dtype=np.uint16)
+def _change_counts(inputs: DescentMeasurements, change: ChangeCounts) -> DescentMeasurements:
+    images = (replace(image, counts=change(number, image.counts.copy())) for number, image in enumerate(inputs.images))
+    return replace(inputs, images=tuple(images))
+
+
+def _draw_random_counts(number: int, counts: np.ndarray) -> np.ndarray:
+    return np.random.default_rng(number).integers(0, 4096, counts.shape, dtype=np.uint16)
+
+
+def _draw_stripes(_: int, counts: np.ndarray) -> np.ndarray:
+    """Set even columns to 0 and odd columns to 4095."""
+    return np.where(np.arange(counts.shape[1]) % 2 == 0, 0, 4095).astype(np.uint16) + np.zeros_like(counts)
 
 
 @pytest.fixture(scope="module")
@@ -202,19 +215,17 @@ def measurements() -> DescentMeasurements:
 @pytest.mark.parametrize(
     "change",
     [
-        lambda k, c: np.zeros_like(c),
-        lambda k, c: np.full_like(c, 4095),
-        lambda k, c: np.full_like(c, 65535),
+        lambda number, counts: np.zeros_like(counts),
+        lambda number, counts: np.full_like(counts, 4095),
+        lambda number, counts: np.full_like(counts, 65535),
         _draw_random_counts,
-        lambda k, c: c if k else np.zeros_like(c),
-        lambda k, c: np.where(np.arange(c.shape[1]) % 2 == 0, 0, 4095).astype(np.uint16) + np.zeros_like(c),
-        lambda k, c: np.full_like(c, k),
+        lambda number, counts: counts if number else np.zeros_like(counts),
+        _draw_stripes,
+        lambda number, counts: np.full_like(counts, number),
     ],
 )
-def test_any_image_returns_an_estimate(
-    measurements: DescentMeasurements, change: Callable[[int, np.ndarray], np.ndarray]
-) -> None:
-    answer = ESTIMATOR.estimate(_set_counts(measurements, change))
+def test_any_image_returns_an_estimate(measurements: DescentMeasurements, change: ChangeCounts) -> None:
+    answer = ESTIMATOR.estimate(_change_counts(measurements, change))
     assert answer.outcome is not VelocityOutcome.VALID
     assert answer.velocity_m_s is None
     dimes_products(get_details(answer))
@@ -240,7 +251,7 @@ def test_any_attitude_returns_an_estimate(measurements: DescentMeasurements) -> 
     "times", [(0.0, 0.0, 0.0), (2.0, 1.0, 0.0), (0.0, 1e9, 2e9), (0.0, np.nan, 1.0), (0.0, 60.0, 120.0)]
 )
 def test_any_time_returns_an_estimate(measurements: DescentMeasurements, times: tuple[float, float, float]) -> None:
-    images = tuple(replace(i, time_s=t) for i, t in zip(measurements.images, times, strict=True))
+    images = tuple(replace(image, time_s=t) for image, t in zip(measurements.images, times, strict=True))
     altitudes = tuple(replace(a, time_s=t) for a, t in zip(measurements.altitudes, times, strict=True))
     answer = ESTIMATOR.estimate(replace(measurements, images=images, altitudes=altitudes))
     assert answer.outcome is VelocityOutcome.NO_TEMPLATE_AREA
@@ -256,44 +267,47 @@ def test_any_sun_direction_returns_an_estimate(measurements: DescentMeasurements
 
 def test_velocity_is_correct_with_one_corrupted_template_per_pair() -> None:
     rng = np.random.default_rng(12)
-    truth = draw_flight(rng, max_tilt_deg=10.0)
-    measured = render(truth)
-    reference = get_details(ESTIMATOR.estimate(measured))
-    corrupted = {t.pair: t.template_pixel for t in reference.tracks if t.index == 0}
+    flight = draw_flight(rng, max_tilt_deg=10.0)
+    inputs = render(flight)
+    reference = get_details(ESTIMATOR.estimate(inputs))
+    dust_pixels = {t.pair: t.template_pixel for t in reference.tracks if t.index == 0}
 
-    def add_dust(k: int, counts: np.ndarray) -> np.ndarray:
-        # Uncalibrated dust on the best template of the earlier image of each pair.
-        if k in corrupted:
-            u, v = (round(float(x)) for x in corrupted[k])
+    def add_dust(number: int, counts: np.ndarray) -> np.ndarray:
+        # Dust that is not in the flat field covers the best template of the earlier image of each pair.
+        if number in dust_pixels:
+            u, v = (round(float(x)) for x in dust_pixels[number])
             counts[max(v - 9, 0) : v + 10, max(4 * (u - 9), 0) : 4 * (u + 10)] = 3000 if (u + v) % 2 else 4000
         return counts
 
-    answer = ESTIMATOR.estimate(_set_counts(measured, add_dust))
+    answer = ESTIMATOR.estimate(_change_counts(inputs, add_dust))
     assert not all(track.valid for track in get_details(answer).tracks)
     assert answer.outcome is VelocityOutcome.VALID
-    np.testing.assert_allclose(valid_velocity(answer), truth.velocities[1, :2], atol=0.3)
+    np.testing.assert_allclose(valid_velocity(answer), flight.velocities[1, :2], atol=0.3)
 
 
 def test_opposition_surge_does_not_bias_velocity() -> None:
-    """An opposition surge moves with the lander: a Gaussian of 30 % and 3 deg at the anti-solar point."""
+    """An opposition surge moves with the lander.
+
+    It is a Gaussian with an amplitude of 30 % and a standard deviation of 3 deg around the anti-solar point.
+    """
     sun = direction(np.radians(250.0), np.radians(75.0))
     attitudes = (tilt_body(5.0, 0.0, 40.0), tilt_body(8.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
-    truth = replace(steady_flight((25.0, -10.0), attitudes), sun=sun)
+    flight = replace(steady_flight((25.0, -10.0), attitudes), sun=sun)
     low_contrast = draw_terrain(7, 0.02)
     counts = []
-    for attitude, position in zip(truth.attitudes, truth.positions, strict=True):
+    for attitude, position in zip(flight.attitudes, flight.positions, strict=True):
         phase = np.arccos(np.clip(np.tensordot(attitude.inv().apply(-sun), compute_body_rays(), 1), -1.0, 1.0))
         surge = 1.0 + 0.3 * np.exp(-0.5 * (phase / np.radians(3.0)) ** 2)
         counts.append(expose_scene(trace_scene(low_contrast, attitude, position) * surge, make_calibration()))
-    measured = make_measurements(truth, counts, make_calibration())
-    answer = ESTIMATOR.estimate(measured)
+    inputs = make_measurements(flight, counts, make_calibration())
+    answer = ESTIMATOR.estimate(inputs)
     assert answer.outcome is VelocityOutcome.VALID
-    np.testing.assert_allclose(valid_velocity(answer), truth.velocities[1, :2], atol=0.6)
+    np.testing.assert_allclose(valid_velocity(answer), flight.velocities[1, :2], atol=0.6)
     # Without a mask the templates are at the surge, which has the highest contrast. Its distance from the nadir
     # decreases with altitude. The apparent velocity is the descent rate times the cotangent of the sun's elevation.
     apparent_velocity = -75.0 * sun[:2] / sun[2]
-    unmasked = get_details(DimesEstimator(DimesOptions(**IMPROVEMENTS, zero_phase_radius_rad=0.0)).estimate(measured))
-    assert np.hypot(*(apparent_velocity - truth.velocities[1, :2])) > 10.0
+    unmasked = get_details(DimesEstimator(DimesOptions(**IMPROVEMENTS, zero_phase_radius_rad=0.0)).estimate(inputs))
+    assert np.hypot(*(apparent_velocity - flight.velocities[1, :2])) > 10.0
     assert min(np.hypot(*(t.velocity_m_s - apparent_velocity)) for t in unmasked.tracks) < 5.0
 
 
@@ -324,8 +338,8 @@ def test_products_report_failures_and_selection(measurements: DescentMeasurement
     assert details.chosen is not None
     products = dimes_products(details)
     np.testing.assert_array_equal(products["chosen"], [details.chosen.first, details.chosen.second])
-    flat = get_details(ESTIMATOR.estimate(_set_counts(measurements, lambda k, c: np.full_like(c, 1000))))
-    products = dimes_products(flat)
+    uniform = _change_counts(measurements, lambda number, counts: np.full_like(counts, 1000))
+    products = dimes_products(get_details(ESTIMATOR.estimate(uniform)))
     assert products["chosen"].size == 0
     column = products["tracks_columns"].index("failed_contrast")
     np.testing.assert_array_equal(products["tracks"][:, column], 1.0)
@@ -359,20 +373,18 @@ def test_inputs_are_unchanged_and_estimates_are_deterministic(measurements: Desc
 
 def test_altitude_error_causes_predicted_velocity_error() -> None:
     """An altitude error e of the third image displaces a feature at distance r from its nadir by e r / H."""
-    truth = steady_flight((8.0, 3.0), (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 0.0), tilt_body(4.0, 200.0, 0.0)))
-    measured = render(truth)
+    attitudes = (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 0.0), tilt_body(4.0, 200.0, 0.0))
+    flight = steady_flight((8.0, 3.0), attitudes)
+    inputs = render(flight)
     error = 10.0
-    altitudes = (
-        *measured.altitudes[:2],
-        replace(measured.altitudes[2], altitude_m=measured.altitudes[2].altitude_m + error),
-    )
-    tracks = [t for t in get_details(ESTIMATOR.estimate(replace(measured, altitudes=altitudes))).tracks if t.pair == 1]
+    altitudes = (*inputs.altitudes[:2], replace(inputs.altitudes[2], altitude_m=inputs.altitudes[2].altitude_m + error))
+    tracks = [t for t in get_details(ESTIMATOR.estimate(replace(inputs, altitudes=altitudes))).tracks if t.pair == 1]
     assert len(tracks) == 2
     for track in tracks:
-        earlier, later = (truth.positions[k, 2] for k in (1, 2))
-        _, rays = measured.images[2].camera.bin(4, 1).rays(track.match_pixel[None, :])
-        ray = truth.attitudes[2].apply(rays[0])
+        earlier, later = (flight.positions[k, 2] for k in (1, 2))
+        _, rays = inputs.images[2].camera.bin(4, 1).rays(track.match_pixel[None, :])
+        ray = flight.attitudes[2].apply(rays[0])
         position = ray[:2] / -ray[2] * later
         expected = -error / later * position / INTERVAL_S
-        np.testing.assert_allclose(track.velocity_m_s - truth.velocities[1, :2], expected, atol=0.1)
+        np.testing.assert_allclose(track.velocity_m_s - flight.velocities[1, :2], expected, atol=0.1)
         assert earlier > later

@@ -77,10 +77,10 @@ def test_ground_and_pixel_projections_are_inverse() -> None:
     view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     pixels = grid_pixels(view.size, 16)
     ground, is_within_limit = ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
-    reprojected, visible = pixels_from_ground(view, ground)
+    projections, visible = pixels_from_ground(view, ground)
     assert is_within_limit.sum() > 200
     assert np.all(visible[is_within_limit])
-    np.testing.assert_allclose(reprojected[is_within_limit], pixels[is_within_limit], atol=1e-6)
+    np.testing.assert_allclose(projections[is_within_limit], pixels[is_within_limit], atol=1e-6)
 
 
 def test_distant_rays_are_clipped_at_the_off_nadir_limit() -> None:
@@ -117,7 +117,7 @@ def test_pixel_angle_and_search_geometry_match_the_paper() -> None:
     assert geometry.window_px == OPTIONS.template_px + 2 * geometry.search_px
 
 
-def test_square_and_outline_have_the_expected_points() -> None:
+def test_lattice_and_outline_have_the_expected_number_of_points() -> None:
     assert square_lattice(3.0, 4).shape == (16, 2)
     outline = square_outline(3.0, 4)
     assert outline.shape == (12, 2)
@@ -230,15 +230,15 @@ def test_only_textured_area_is_selected() -> None:
     view = make_blank_view(Rotation.identity(), 2000.0, 0.0, counts)
     pixels = grid_pixels(view.size, OPTIONS.grid_step_px)
     positions = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
-    selected, contrasts_of_selected = select_templates(view, positions, OPTIONS)
-    np.testing.assert_allclose(pixels[selected[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
-    assert contrasts_of_selected[0] > 0.02
-    assert contrasts_of_selected[1] < 0.001
-    assert template_contrasts(view, pixels, OPTIONS.template_px)[selected[0]] == contrasts_of_selected[0]
+    selected_numbers, contrasts = select_templates(view, positions, OPTIONS)
+    np.testing.assert_allclose(pixels[selected_numbers[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
+    assert contrasts[0] > 0.02
+    assert contrasts[1] < 0.001
+    assert template_contrasts(view, pixels, OPTIONS.template_px)[selected_numbers[0]] == contrasts[0]
 
 
 def make_wave_texture() -> Texture:
-    """Texture of the plane with the analytic brightness `wave_brightness`: waves of 60 to 200 m."""
+    """Create a texture with the analytic brightness `wave_brightness`: waves of 60 to 200 m."""
     offsets_m = 1.5 * np.arange(2048)
     return Texture(wave_brightness(offsets_m[None, :], -offsets_m[:, None]).astype(np.float32), 1.5)
 
@@ -273,7 +273,7 @@ def test_rectified_patch_shows_its_lattice_positions(attitude: Rotation) -> None
 
 
 def _estimate_shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-    """Mean displacement (east, north) of the patch relative to the expected one, metres, by one least-squares step."""
+    """Estimate the displacement (east, north) of a patch from the expected one, metres, by one least-squares step."""
     east, north = lattice[..., 0], lattice[..., 1]
     slopes = [
         (wave_brightness(east + dx, north + dy) - wave_brightness(east - dx, north - dy)) / 0.2
@@ -287,12 +287,13 @@ def _estimate_shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray
 def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
     view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     lattice = ground_lattice(np.array([-150.0, 200.0]), 31, 5.5)
-    exact, visible = pixels_from_ground(view, lattice)
+    exact_pixels, is_visible_exactly = pixels_from_ground(view, lattice)
     pixels, is_visible = homography_lattice(view, lattice)
-    assert visible.all()
+    assert is_visible_exactly.all()
     assert is_visible.all()
-    np.testing.assert_allclose(pixels[[0, 0, -1, -1], [0, -1, 0, -1]], exact[[0, 0, -1, -1], [0, -1, 0, -1]], atol=1e-4)
-    differences_px = np.hypot(*np.moveaxis(pixels - exact, -1, 0))
+    corners = ([0, 0, -1, -1], [0, -1, 0, -1])
+    np.testing.assert_allclose(pixels[corners], exact_pixels[corners], atol=1e-4)
+    differences_px = np.hypot(*np.moveaxis(pixels - exact_pixels, -1, 0))
     # 31 px span a seventh of the image; the lens shifts its corners by 5 % of a pixel more than its centre.
     assert 1e-4 < differences_px.max() < 0.1
     pinhole = replace(view, camera=Cahv(view.camera.c, view.camera.a, view.camera.h, view.camera.v, view.camera.size))

@@ -22,18 +22,21 @@ from tests.algorithms.synthetic_descent import (
 )
 
 LEVEL = 1600.0  #: Counts of radiance 1.
-#: Times per row of the transfer and of the clearing.
+#: Times per row of the transfer and of the clearing, seconds.
 ROW_TIMES_S = [(5e-6, 2e-6), (5e-6, 0.0), (0.0, 2e-6), (3e-6, 3e-6), (1e-6, 5e-6), (0.0, 0.0)]
 
 
 def simulate_transfer(rates: np.ndarray, exposure_s: float, transfer_row_s: float, clear_row_s: float) -> np.ndarray:
-    """Compute the charge of each physical row: its exposure, and the smear of rows passed in clearing and transfer."""
+    """Compute the charge of each physical row: its exposure, and the smear of the rows that it crosses.
+
+    A row crosses the rows with higher numbers during clearing, and those with lower numbers during transfer.
+    """
     charge = exposure_s * rates
-    for r in range(len(rates)):
-        for passed in range(len(rates) - 1, r, -1):
-            charge[r] += clear_row_s * rates[passed]
-        for passed in range(r - 1, -1, -1):
-            charge[r] += transfer_row_s * rates[passed]
+    for row in range(len(rates)):
+        for higher_row in range(len(rates) - 1, row, -1):
+            charge[row] += clear_row_s * rates[higher_row]
+        for lower_row in range(row - 1, -1, -1):
+            charge[row] += transfer_row_s * rates[lower_row]
     return charge
 
 
@@ -46,9 +49,9 @@ def test_smear_removal_is_exact_for_uniform_summed_rows(row_times_s: tuple[float
     detector = replace(make_calibration(*row_times_s), exposure_s=1e-4, rows_summed=rows_summed)
     charge = simulate_transfer(rates, detector.exposure_s, *row_times_s)
     signal = charge.reshape(16, rows_summed, 3).mean(axis=1)
-    exposed = remove_frame_transfer(signal, detector, rows_summed)
+    corrected_signal = remove_frame_transfer(signal, detector, rows_summed)
     # Only rounding errors remain; the recursion amplifies them by at most a factor of ten per row block.
-    np.testing.assert_allclose(exposed, detector.exposure_s * rates[::rows_summed], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(corrected_signal, detector.exposure_s * rates[::rows_summed], rtol=1e-9, atol=1e-9)
 
 
 def test_exposure_shorter_than_transfer_is_rejected() -> None:
@@ -77,11 +80,11 @@ def render_view(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, 
 def test_static_scene_is_restored_within_tolerance(row_times_s: tuple[float, float]) -> None:
     radiance, view = render_view(*row_times_s)
     irradiance = bin_mean(LEVEL * radiance * compute_fall_off(), 4, 4)
-    restored = remove_frame_transfer(view.signal, view.calibration, view.rows_summed)
+    corrected_signal = remove_frame_transfer(view.signal, view.calibration, view.rows_summed)
     assert np.abs(view.signal - irradiance).max() > (0.1 * 4095 if row_times_s[0] else 0.0)  # the smear is significant
     # Rows within a delivered row differ slightly and counts are rounded: at most 0.2 % of full scale, 0.1 % rms.
-    assert np.abs(restored - irradiance).max() < 0.002 * 4095
-    assert np.sqrt(np.mean((restored - irradiance) ** 2)) < 0.001 * 4095
+    assert np.abs(corrected_signal - irradiance).max() < 0.002 * 4095
+    assert np.sqrt(np.mean((corrected_signal - irradiance) ** 2)) < 0.001 * 4095
 
 
 def test_patch_is_corrected_for_fall_off() -> None:

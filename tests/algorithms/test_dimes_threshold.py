@@ -88,7 +88,7 @@ def test_common_attitude_error_causes_apparent_drift() -> None:
     # A tilt b (rad) at the velocity v causes an apparent velocity b x v. For 75 m/s down and 0.5 deg per axis it is
     # 0.65 m/s per axis. A heading error of 0.5 deg adds at most 0.26 m/s at 30 m/s of drift.
     errors = draw_errors(replace(EXACT, descents=120, common_attitude_sd_deg=0.5))
-    apparent_m_s = np.radians(0.5) * 281.0 / 3.75
+    apparent_m_s = np.radians(0.5) * 281.0 / 3.75  # 281 m of descent in 3.75 s
     assert 0.8 * apparent_m_s < errors.std() < 1.7 * apparent_m_s
     # All tracks have the same error: the IMU check is hardly affected.
     result = discrepancies(errors, 0.0, np.random.default_rng(1))

@@ -33,7 +33,7 @@ TRUE_VELOCITY = np.array([12.0, -7.0])
 
 @pytest.fixture(scope="module")
 def measurements() -> DescentMeasurements:
-    """Images of a nearly level descent with noise; the inertial velocity has an error of (3, -2) m/s."""
+    """Render a nearly level descent with noise; the inertial velocity has an error of (3, -2) m/s."""
     attitudes = (tilt_body(3.0, 20.0, 40.0), tilt_body(4.0, 60.0, 40.0), tilt_body(5.0, 90.0, 40.0))
     steps = np.outer([0.0, 3.75, 7.5], [*TRUE_VELOCITY, -75.0])
     flight = Flight(np.array([1000.0, 1000.0, 2000.0]) + steps, attitudes)
@@ -57,9 +57,9 @@ def run_program(spec: str, measurements: DescentMeasurements, **limits: float) -
 @pytest.mark.parametrize("image_format", ["pgm", "png"])
 def test_case_files_round_trip(measurements: DescentMeasurements, tmp_path: Path, image_format: str) -> None:
     write_case(tmp_path, measurements, image_format)  # type: ignore[arg-type]
-    restored = read_case(tmp_path)
-    assert isinstance(restored, DescentMeasurements)
-    for image, copy in zip(measurements.images, restored.images, strict=True):
+    restored_case = read_case(tmp_path)
+    assert isinstance(restored_case, DescentMeasurements)
+    for image, copy in zip(measurements.images, restored_case.images, strict=True):
         np.testing.assert_array_equal(image.counts, copy.counts)
         np.testing.assert_array_equal(image.calibration.flat_field, copy.calibration.flat_field)
         assert dataclasses.replace(image.calibration, flat_field=np.zeros((1, 1))) == dataclasses.replace(
@@ -67,10 +67,10 @@ def test_case_files_round_trip(measurements: DescentMeasurements, tmp_path: Path
         )
         for letter in "cahvor":
             np.testing.assert_array_equal(getattr(image.camera, letter), getattr(copy.camera, letter))
-    np.testing.assert_array_equal(measurements.interval_velocities_m_s, restored.interval_velocities_m_s)
-    np.testing.assert_array_equal(measurements.sun_direction, restored.sun_direction)
-    assert measurements.altitudes == restored.altitudes
-    for reference, actual in zip(measurements.attitudes, restored.attitudes, strict=True):
+    np.testing.assert_array_equal(measurements.interval_velocities_m_s, restored_case.interval_velocities_m_s)
+    np.testing.assert_array_equal(measurements.sun_direction, restored_case.sun_direction)
+    assert measurements.altitudes == restored_case.altitudes
+    for reference, actual in zip(measurements.attitudes, restored_case.attitudes, strict=True):
         # normalising the quaternion again changes the last digits
         assert (reference.world_from_body.inv() * actual.world_from_body).magnitude() < 1e-14
     assert len(list(tmp_path.glob("*.f64"))) == 1  # one flat field for three images of one camera
@@ -86,11 +86,11 @@ def test_landing_without_range_round_trips(measurements: DescentMeasurements, tm
         apriori_site_world=np.array([3.0, 4.0, 5.0]),
     )
     write_case(tmp_path, landing)
-    restored = read_case(tmp_path)
-    assert isinstance(restored, LandingMeasurements)
-    assert np.isnan(restored.slant_range_m)
-    np.testing.assert_allclose(restored.poses[1].world_from_body.as_matrix(), pose.as_matrix(), atol=1e-15)
-    np.testing.assert_array_equal(restored.apriori_site_world, landing.apriori_site_world)
+    restored_case = read_case(tmp_path)
+    assert isinstance(restored_case, LandingMeasurements)
+    assert np.isnan(restored_case.slant_range_m)
+    np.testing.assert_allclose(restored_case.poses[1].world_from_body.as_matrix(), pose.as_matrix(), atol=1e-15)
+    np.testing.assert_array_equal(restored_case.apriori_site_world, landing.apriori_site_world)
 
 
 def test_case_files_contain_no_truth(measurements: DescentMeasurements, tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_case_files_contain_no_truth(measurements: DescentMeasurements, tmp_path
     names = sorted(path.name for path in tmp_path.iterdir())
     cameras, images = [f"camera_{k}.cahvor" for k in (1, 2, 3)], [f"image_{k}.pgm" for k in (1, 2, 3)]
     assert names == [*cameras, "case.json", "flat_field_1.f64", *images]
-    # Each number in the files is a measurement; the true velocity is absent.
+    # Each number in the files is a measurement or an index; the true velocity is absent.
     case = json.loads((tmp_path / "case.json").read_text())
     numbers = np.array(list(_iterate_numbers(case)))
     inputs = np.array(list(_iterate_numbers(_to_plain_values(measurements))))
@@ -179,18 +179,18 @@ def test_program_errors_are_reported_as_faults(
     measurements: DescentMeasurements, tmp_path: Path, body: str, fault: Fault, message: str
 ) -> None:
     spec = f"exec:{write_program(tmp_path, 'print(chr(33), file=sys.stderr, flush=True)' + chr(10) + body)}"
-    started = time.monotonic()
+    start_s = time.monotonic()
     times_out = fault is Fault.TIMED_OUT
-    with pytest.raises(AlgorithmError, match=message.replace("[", r"\[")) as caught:
+    with pytest.raises(AlgorithmError, match=message.replace("[", r"\[")) as error:
         run_program(
             spec,
             measurements,
             time_s=2.0 if times_out else 60.0,
             memory_gb=0.2 if fault is Fault.OUT_OF_MEMORY else 2.0,
         )
-    assert caught.value.fault is fault
-    assert caught.value.stderr.startswith("!")
-    assert time.monotonic() - started < 59.0  # the test does not wait for child processes
+    assert error.value.fault is fault
+    assert error.value.stderr.startswith("!")
+    assert time.monotonic() - start_s < 59.0  # the test does not wait for child processes
 
 
 SERVER = f"""
@@ -208,9 +208,9 @@ def test_persistent_program_restarts_after_a_crash(measurements: DescentMeasurem
     assert [float(velocity[0]) for velocity in velocities if velocity is not None] == [0.0, 1.0]
     with pytest.raises(AlgorithmError, match="SIGABRT"):
         run_program(spec, measurements)
-    repeated = run_program(spec, measurements).velocity_m_s
-    assert repeated is not None
-    assert repeated[0] == 0.0
+    velocity = run_program(spec, measurements).velocity_m_s
+    assert velocity is not None
+    assert velocity[0] == 0.0
     end_idle_programs()
 
 
@@ -241,13 +241,13 @@ def test_late_second_answer_is_not_used_for_the_next_case(
     first = run_program(spec, measurements).velocity_m_s
     assert first is not None
     time.sleep(0.5)  # the second line is in the pipe
-    with pytest.raises(AlgorithmError, match="before the request; expected one line") as caught:
+    with pytest.raises(AlgorithmError, match="before the request; expected one line") as error:
         run_program(spec, measurements)
-    assert caught.value.fault is Fault.BAD_ANSWER
+    assert error.value.fault is Fault.BAD_ANSWER
     # a new process answers the next case
-    repeated = run_program(spec, measurements).velocity_m_s
-    assert repeated is not None
-    assert repeated[0] == 0.0
+    velocity = run_program(spec, measurements).velocity_m_s
+    assert velocity is not None
+    assert velocity[0] == 0.0
     end_idle_programs()
 
 
@@ -255,9 +255,9 @@ def test_answer_to_another_request_is_rejected(measurements: DescentMeasurements
     # The second line follows the next request: only its id shows that it answers the previous request.
     spec = f"serve:{write_program(tmp_path, format_double_answers(2, pause_s=1.0))}"
     run_program(spec, measurements)
-    with pytest.raises(AlgorithmError, match="the answer's id is 1; allowed: 2") as caught:
+    with pytest.raises(AlgorithmError, match="the answer's id is 1; allowed: 2") as error:
         run_program(spec, measurements)
-    assert caught.value.fault is Fault.BAD_ANSWER
+    assert error.value.fault is Fault.BAD_ANSWER
     end_idle_programs()
 
 
@@ -276,15 +276,15 @@ def test_answer_must_contain_the_request_id(
     body = (
         f"""print('{{"exchange": 2, "ready": true}}', flush=True)\nsys.stdin.readline()\nprint('{reply}', flush=True)"""
     )
-    with pytest.raises(AlgorithmError, match=message) as caught:
+    with pytest.raises(AlgorithmError, match=message) as error:
         run_program(f"serve:{write_program(tmp_path, body)}", measurements)
-    assert caught.value.fault is Fault.BAD_ANSWER
+    assert error.value.fault is Fault.BAD_ANSWER
 
 
 def test_persistent_program_must_report_ready(measurements: DescentMeasurements, tmp_path: Path) -> None:
-    with pytest.raises(AlgorithmError, match="its first line is") as caught:
+    with pytest.raises(AlgorithmError, match="its first line is") as error:
         run_program(f"serve:{write_program(tmp_path, 'print({}, flush=True); time.sleep(60)')}", measurements)
-    assert caught.value.fault is Fault.BAD_ANSWER
+    assert error.value.fault is Fault.BAD_ANSWER
 
 
 @pytest.mark.parametrize(
@@ -312,9 +312,9 @@ def test_python_answers_are_validated() -> None:
         dataclasses.replace(valid, velocity_m_s=np.array([1.0, np.inf])),
         dataclasses.replace(valid, covariance_m2_s2=np.array([[1.0, 0.5], [0.4, 1.0]])),
     ):
-        with pytest.raises(AlgorithmError) as caught:
+        with pytest.raises(AlgorithmError) as error:
             check_velocity(invalid)
-        assert caught.value.fault is Fault.BAD_ANSWER
+        assert error.value.fault is Fault.BAD_ANSWER
     with pytest.raises(AlgorithmError, match="NO_SAFE_SITE"):
         check_site(SiteEstimate(SiteOutcome.NO_SAFE_SITE, np.zeros(3)))
 
@@ -329,7 +329,8 @@ def test_c_example_estimates_velocity(measurements: DescentMeasurements, tmp_pat
     for spec in (f"exec:{executable}", f"serve:{executable} --serve"):
         result = run_program(spec, measurements)
         assert result.velocity_m_s is not None
-        # Whole pixels of 1.6 m (4 rows: 6.5 m) over 3.75 s; the median of 25 has a quarter of that error.
+        # Matches are whole pixels of 1.6 m (4 summed rows: 6.5 m) over 3.75 s. The median of 25 matches has a quarter
+        # of the error of one match.
         assert np.hypot(*(result.velocity_m_s - TRUE_VELOCITY)) < 1.0
         assert isinstance(result.details, ProgramDetails)
         assert "templates found" in result.details.stderr

@@ -112,7 +112,7 @@ def test_program_matches_python_tracker(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("import_path")
-def test_persistent_process_serves_many_runs(tmp_path: Path) -> None:
+def test_only_a_persistent_process_serves_many_runs(tmp_path: Path) -> None:
     command = write_server(tmp_path)
     for prefix, shared in (("serve", True), ("exec", False)):
         processes = []
@@ -142,7 +142,7 @@ def test_example_tracks_the_target() -> None:
 
 READY = 'import json, sys\nprint(json.dumps({"exchange": 1, "ready": True}), flush=True)\n'
 #: A program that prints fixed answers without evaluating the requests.
-ANSWERING = (
+ANSWERING_PROGRAM = (
     READY
     + """
 OK = '{"exchange": 1, "state": "NORMAL"}'
@@ -183,17 +183,18 @@ for answer in ANSWERS:
 )
 def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: str, message: str) -> None:
     fault = Fault.CRASHED if answers == "[]" else Fault.BAD_ANSWER
-    with pytest.raises(AlgorithmError, match=message) as caught:
-        trackers.drive_to_target(make_tracker(f"exec:{write_server(tmp_path, ANSWERING.replace('ANSWERS', answers))}"))
-    assert caught.value.fault is fault
-    assert caught.value.stderr == ("" if fault is Fault.CRASHED else "hm\n")
+    program = write_server(tmp_path, ANSWERING_PROGRAM.replace("ANSWERS", answers))
+    with pytest.raises(AlgorithmError, match=message) as error:
+        trackers.drive_to_target(make_tracker(f"exec:{program}"))
+    assert error.value.fault is fault
+    assert error.value.stderr == ("" if fault is Fault.CRASHED else "hm\n")
 
 
 def test_hanging_program_is_terminated(tmp_path: Path) -> None:
     tracker = make_tracker(f"exec:{write_server(tmp_path, READY + 'import time; time.sleep(60)')}", time_s=1.0)
-    with pytest.raises(AlgorithmError, match="no answer within 1 s") as caught:
+    with pytest.raises(AlgorithmError, match="no answer within 1 s") as error:
         tracker.designate(trackers.designation(), trackers.pose(0.0))
-    assert caught.value.fault is Fault.TIMED_OUT
+    assert error.value.fault is Fault.TIMED_OUT
 
 
 def test_tracker_inputs_round_trip(tmp_path: Path) -> None:
@@ -207,16 +208,16 @@ def test_tracker_inputs_round_trip(tmp_path: Path) -> None:
         assert reference.size == actual.size
     tracker = VisualTargetTracker(VttOptions())
     tracker.designate(trackers.designation(), trackers.pose(0.0))
-    reported = tracker.aim(trackers.pose(0.0), mast)
-    assert reported is not None
-    rotated = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, -0.2, 0.3]))
-    stop = replace(trackers.take_images(reported, trackers.pose(0.0)), world_from_rover=rotated)
+    aim = tracker.aim(trackers.pose(0.0), mast)
+    assert aim is not None
+    rotated_pose = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, -0.2, 0.3]))
+    stop = replace(trackers.take_images(aim, trackers.pose(0.0)), world_from_rover=rotated_pose)
     write_stop(tmp_path, stop)
     restored_stop = read_stop(tmp_path, restored_mast)
     np.testing.assert_array_equal(restored_stop.left.counts, stop.left.counts)
     assert (restored_stop.left.corner, restored_stop.right.corner) == (stop.left.corner, stop.right.corner)
     assert (restored_stop.azimuth_rad, restored_stop.elevation_rad) == (stop.azimuth_rad, stop.elevation_rad)
-    np.testing.assert_allclose(restored_stop.world_from_rover.as_matrix(), rotated.as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(restored_stop.world_from_rover.as_matrix(), rotated_pose.as_matrix(), atol=1e-15)
     assert "true" not in (tmp_path / "stop.json").read_text()
     for path in ("mast.json", "stop.json"):
         (tmp_path / path).write_text("{}")

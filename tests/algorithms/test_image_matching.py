@@ -14,10 +14,11 @@ WARPS: tuple[Warp, ...] = ("shift", "stretch", "bend")
 
 def correlate_directly(template: np.ndarray, window: np.ndarray) -> np.ndarray:
     """Correlate with a loop over all positions."""
-    n, m = template.shape
-    result = np.zeros((window.shape[0] - n + 1, window.shape[1] - m + 1))
-    for i, j in np.ndindex(*result.shape):
-        result[i, j] = np.corrcoef(template.ravel(), window[i : i + n, j : j + m].ravel())[0, 1]
+    rows, columns = template.shape
+    result = np.zeros((window.shape[0] - rows + 1, window.shape[1] - columns + 1))
+    for row, column in np.ndindex(*result.shape):
+        patch = window[row : row + rows, column : column + columns]
+        result[row, column] = np.corrcoef(template.ravel(), patch.ravel())[0, 1]
     return result
 
 
@@ -28,10 +29,13 @@ def draw_natural_image(seed: int, size: int, blur: float = 1.2) -> np.ndarray:
     return np.asarray(1500.0 + 150.0 * image / image.std())
 
 
-@pytest.mark.parametrize(("n", "m", "rows", "columns"), [(5, 5, 12, 12), (7, 9, 30, 21), (21, 21, 50, 61)])
-def test_correlation_equals_its_definition(n: int, m: int, rows: int, columns: int) -> None:
-    rng = np.random.default_rng(n * rows)
-    template, window = 1000.0 + 30.0 * rng.normal(size=(n, m)), 1500.0 + 50.0 * rng.normal(size=(rows, columns))
+@pytest.mark.parametrize(
+    ("template_shape", "window_shape"), [((5, 5), (12, 12)), ((7, 9), (30, 21)), ((21, 21), (50, 61))]
+)
+def test_correlation_equals_its_definition(template_shape: tuple[int, int], window_shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(template_shape[0] * window_shape[0])
+    template = 1000.0 + 30.0 * rng.normal(size=template_shape)
+    window = 1500.0 + 50.0 * rng.normal(size=window_shape)
     # Sums of products are computed in float32: relative errors of 1e-7.
     np.testing.assert_allclose(
         normalized_correlation(template, window), correlate_directly(template, window), atol=1e-5
@@ -139,12 +143,12 @@ def test_stretched_image_biases_match_without_stretch_model() -> None:
 
 
 def test_bent_image_biases_match_without_bend_model() -> None:
-    """A round rock bends the image: 10 px from the centre, at the template border, the shift is half a pixel."""
+    """The image of a round rock is bent: 10 px from the centre, at the template border, the shift is half a pixel."""
     image, offsets = render_blobs(11, pixel_grid(80)), pixel_grid(21) - 10.0
-    bent = offsets + 0.005 * np.stack([np.zeros_like(offsets[..., 0]), (offsets**2).sum(axis=-1)], axis=-1)
+    bent_offsets = offsets + 0.005 * np.stack([np.zeros_like(offsets[..., 0]), (offsets**2).sum(axis=-1)], axis=-1)
     errors: dict[Warp, list[float]] = {"stretch": [], "bend": []}
     for centre in np.random.default_rng(4).uniform(35.0, 45.0, (20, 2)):
-        template = render_blobs(11, centre + bent)
+        template = render_blobs(11, centre + bent_offsets)
         for warp, distances in errors.items():
             match = register_template(template, image, centre[::-1] - 10.0, warp)
             assert match is not None
@@ -162,7 +166,7 @@ def test_registration_rejects_undetermined_shifts() -> None:
     assert register_template(stripes[30:51, 30:51], stripes, np.array([30.0, 30.0]), "shift") is None
     # The match is farther from the start than the limit.
     assert register_template(template, image, np.array([26.0, 27.0]), "shift") is None
-    # The spline needs neighbours.
+    # The template is at the image border, where the spline has no neighbours.
     assert register_template(image[:21, :21], image, np.array([0.0, 0.0]), "shift") is None
     # The image contains only the negative of the template.
     assert register_template(template, -image, np.array([30.0, 30.0]), "shift") is None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -23,23 +25,23 @@ from marsyard.algorithms.image.registration import refine_shift, shifted_patch, 
 
 
 def correlate_directly(template: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """Correlate with a loop over all positions."""
-    n, m = template.shape
+    """Correlate with a loop over all positions: 2 sum(a b) / (sum(a^2) + sum(b^2)), where a and b have the mean 0."""
+    rows, columns = template.shape
     a = template - template.mean()
-    result = np.zeros((window.shape[0] - n + 1, window.shape[1] - m + 1))
-    for i, j in np.ndindex(*result.shape):
-        b = window[i : i + n, j : j + m]
+    result = np.zeros((window.shape[0] - rows + 1, window.shape[1] - columns + 1))
+    for row, column in np.ndindex(*result.shape):
+        b = window[row : row + rows, column : column + columns]
         b = b - b.mean()
-        result[i, j] = 2.0 * np.sum(a * b) / (np.sum(a * a) + np.sum(b * b))
+        result[row, column] = 2.0 * np.sum(a * b) / (np.sum(a * a) + np.sum(b * b))
     return result
 
 
 @pytest.mark.parametrize(
-    ("n", "m", "rows", "columns"), [(5, 5, 12, 12), (7, 9, 30, 21), (31, 31, 71, 71), (5, 5, 5, 5)]
+    ("template_shape", "window_shape"), [((5, 5), (12, 12)), ((7, 9), (30, 21)), ((31, 31), (71, 71)), ((5, 5), (5, 5))]
 )
-def test_correlation_equals_its_definition(n: int, m: int, rows: int, columns: int) -> None:
-    rng = np.random.default_rng(n * rows)
-    template, window = 1000.0 + rng.normal(size=(n, m)), 1500.0 + 3.0 * rng.normal(size=(rows, columns))
+def test_correlation_equals_its_definition(template_shape: tuple[int, int], window_shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(template_shape[0] * window_shape[0])
+    template, window = 1000.0 + rng.normal(size=template_shape), 1500.0 + 3.0 * rng.normal(size=window_shape)
     # The squares of values of 1e3 are rounded to about 1e-16 * 1e6 = 1e-10; the deviations are 1.
     np.testing.assert_allclose(
         pseudo_normalized_correlation(template, window), correlate_directly(template, window), atol=1e-10
@@ -67,9 +69,9 @@ def test_uniform_patches_have_zero_correlation(value: float) -> None:
 
 
 @given(arrays(np.float64, (11, 13), elements=st.floats(-1e6, 1e6)), st.integers(1, 5), st.integers(1, 5))
-def test_correlation_is_bounded_and_finite(window: np.ndarray, n: int, m: int) -> None:
-    surface = pseudo_normalized_correlation(window[:n, :m], window)
-    assert surface.shape == (12 - n, 14 - m)
+def test_correlation_is_bounded_and_finite(window: np.ndarray, rows: int, columns: int) -> None:
+    surface = pseudo_normalized_correlation(window[:rows, :columns], window)
+    assert surface.shape == (12 - rows, 14 - columns)
     assert np.all(np.abs(surface) <= 1.0)
 
 
@@ -87,15 +89,15 @@ def compute_subpixel_errors(align: bool) -> np.ndarray:
     """Compute the errors (row, column) of measured shifts, pixels, for a table of fractions of a pixel."""
     fractions = np.linspace(-0.5, 0.5, 6)
     errors = []
-    for k, (fy, fx) in enumerate((a, b) for a in fractions[::2] for b in fractions):
-        template = render_blobs(k % 2)[12:43, 12:43]
-        window = render_blobs(k % 2, (fy, fx))
+    for number, shift in enumerate(product(fractions[::2], fractions)):
+        template = render_blobs(number % 2)[12:43, 12:43]
+        window = render_blobs(number % 2, shift)
         surface = pseudo_normalized_correlation(template, window)
         peak = highest_peak(surface)
         start = np.array([peak.row, peak.column]) + biquadratic_offset(surface, peak)
         result = refine_shift(template, window, start) if align else start
         assert result is not None
-        errors.append(result - 12.0 - np.array([fy, fx]))
+        errors.append(result - 12.0 - np.array(shift))
     return np.array(errors)
 
 
@@ -132,7 +134,7 @@ def test_shifted_patch_equals_scipys_spline() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 2), (23, 17)])
 def test_cubic_sampling_equals_scipys_spline(shape: tuple[int, int]) -> None:
-    """A part of an image that starts at row 40 and column 30, up to the centres of its outermost pixels."""
+    """The array is a part of an image that starts at row 40 and column 30; all positions are between pixel centres."""
     rng = np.random.default_rng(6)
     image = rng.normal(size=shape)
     ends = np.stack(np.meshgrid([0.0, shape[1] - 1.0], [0.0, shape[0] - 1.0]), axis=-1)
@@ -173,10 +175,11 @@ def make_gaussian(row: float, column: float, widths: tuple[float, float] = (1.5,
 
 
 def test_peak_width_uses_the_widest_direction() -> None:
-    # A Gaussian of width s exceeds 3/4 within s sqrt(2 ln 4/3) = 0.759 s: full width 1.517 s, in whole pixels.
-    for s in (2.0, 4.0, 6.0):
-        surface = make_gaussian(20.0, 20.0, (2.0, s))
-        assert peak_width(surface, highest_peak(surface)) == pytest.approx(1.517 * max(s, 2.0), abs=1.0)
+    # A Gaussian with the standard deviation s exceeds 3/4 within s sqrt(2 ln 4/3) = 0.759 s: its full width is 1.517 s,
+    # in whole pixels.
+    for widest in (2.0, 4.0, 6.0):
+        surface = make_gaussian(20.0, 20.0, (2.0, widest))
+        assert peak_width(surface, highest_peak(surface)) == pytest.approx(1.517 * widest, abs=1.0)
     spike = np.zeros((9, 9))
     spike[4, 4] = 1.0
     assert peak_width(spike, highest_peak(spike)) == pytest.approx(4.0 / np.sqrt(12.0))

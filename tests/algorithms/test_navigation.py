@@ -97,9 +97,9 @@ def test_hazard_is_passed_with_clearance(offset_m: float, yaw_deg: float) -> Non
     goal = rotation @ np.array([7.0, 0.0])
     positions = _drive_to_goal(_map_ground((*rock, 0.25, 0.4)), _make_pose(0.0, 0.0, yaw_deg), goal, 0.5)
     assert positions[-1] == pytest.approx(goal, abs=0.02)
-    closest = np.hypot(*(positions - rock).T).min()
+    min_distance_m = np.hypot(*(positions - rock).T).min()
     # Cells of the rock extend beyond its outline by at most half the diagonal of a cell.
-    assert closest > OPTIONS.half_width_m + 0.25
+    assert min_distance_m > OPTIONS.half_width_m + 0.25
     assert np.hypot(*np.diff(positions, axis=0).T).sum() < 1.25 * 7.0
 
 
@@ -143,9 +143,9 @@ def _map_wedges(apex_east: float, azimuths_deg: tuple[float, ...], *rocks: tuple
 def test_passing_a_hazard_needs_two_pairs() -> None:
     # The cameras are 2.8 m behind the rover; the rock is 1.2 m ahead, where one pair maps 1.7 m to each side.
     rock, goal, pose = (1.2, 0.0, 0.25, 0.4), np.array([6.0, 0.0]), _make_pose(0.0, 0.0)
-    one, two = (_map_wedges(-2.8, azimuths, rock) for azimuths in ((90.0,), (70.0, 110.0)))
-    assert navigate(one, pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
-    assert _drive_to_goal(two, pose, goal, 0.5)[-1] == pytest.approx(goal, abs=0.02)
+    one_pair, two_pairs = (_map_wedges(-2.8, azimuths, rock) for azimuths in ((90.0,), (70.0, 110.0)))
+    assert navigate(one_pair, pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
+    assert _drive_to_goal(two_pairs, pose, goal, 0.5)[-1] == pytest.approx(goal, abs=0.02)
     # Without the rock one pair is wide enough.
     assert navigate(_map_wedges(-2.8, (90.0,)), pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
 

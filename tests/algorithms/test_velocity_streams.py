@@ -82,13 +82,13 @@ def test_selection_averages_velocities_over_omitted_images() -> None:
     images = tuple(
         replace(image, time_s=tag) for image, tag in zip(measurements.images, (0.0, 1.0, 4.0, 6.0, 7.0), strict=True)
     )
-    selected = replace(measurements, images=images, interval_velocities_m_s=velocities).select((0, 2, 3))
-    assert selected.tags_s == (0.0, 4.0, 6.0)
+    selection = replace(measurements, images=images, interval_velocities_m_s=velocities).select((0, 2, 3))
+    assert selection.tags_s == (0.0, 4.0, 6.0)
     # One second at the velocity of the first interval and three at that of the second; the third interval is unchanged.
-    np.testing.assert_allclose(selected.interval_velocities_m_s[0], (velocities[0] + 3.0 * velocities[1]) / 4.0)
-    np.testing.assert_array_equal(selected.interval_velocities_m_s[1], velocities[2])
-    assert selected.attitudes == (measurements.attitudes[0], measurements.attitudes[2], measurements.attitudes[3])
-    np.testing.assert_array_equal(selected.inertial_velocities_m_s, measurements.inertial_velocities_m_s[[0, 2, 3]])  # type: ignore[index]
+    np.testing.assert_allclose(selection.interval_velocities_m_s[0], (velocities[0] + 3.0 * velocities[1]) / 4.0)
+    np.testing.assert_array_equal(selection.interval_velocities_m_s[1], velocities[2])
+    assert selection.attitudes == (measurements.attitudes[0], measurements.attitudes[2], measurements.attitudes[3])
+    np.testing.assert_array_equal(selection.inertial_velocities_m_s, measurements.inertial_velocities_m_s[[0, 2, 3]])  # type: ignore[index]
     assert len(measurements.select(()).frames()) == 0
 
 
@@ -111,9 +111,9 @@ def test_three_image_estimator_rejects_more_images() -> None:
 def test_invalid_spans_are_rejected(span: object, message: str) -> None:
     answer = make_estimate()
     object.__setattr__(answer, "span_s", span)
-    with pytest.raises(AlgorithmError, match=message) as caught:
+    with pytest.raises(AlgorithmError, match=message) as error:
         check_velocity(answer, (0.0, 1.0, 2.0))
-    assert caught.value.fault is Fault.BAD_ANSWER
+    assert error.value.fault is Fault.BAD_ANSWER
 
 
 def test_missing_span_defaults_to_last_interval() -> None:
@@ -140,12 +140,12 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
     write_frame(tmp_path, frame)
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["camera_1.cahvor", "flat_field_1.f64", "frame.json", "image_1.pgm"]
-    restored = read_frame(tmp_path)
-    np.testing.assert_array_equal(restored.image.counts, frame.image.counts)
+    restored_frame = read_frame(tmp_path)
+    np.testing.assert_array_equal(restored_frame.image.counts, frame.image.counts)
     for name in ("sun_direction", "inertial_velocity_m_s", "interval_velocity_m_s"):
-        np.testing.assert_array_equal(getattr(restored, name), getattr(frame, name))
-    assert repr(restored.altitude) == repr(frame.altitude)
-    assert (restored.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
+        np.testing.assert_array_equal(getattr(restored_frame, name), getattr(frame, name))
+    assert repr(restored_frame.altitude) == repr(frame.altitude)
+    assert (restored_frame.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
     path = tmp_path / "frame.json"
     path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 2'))
     with pytest.raises(ValueError, match="is not a valid descent image file: exchange format version 2"):
@@ -156,13 +156,13 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
 def test_cases_of_any_image_count_round_trip(tmp_path: Path, image_count: int) -> None:
     measurements = inputs.descent(5).select(tuple(range(image_count)))
     write_case(tmp_path, measurements)
-    restored = read_case(tmp_path)
-    assert isinstance(restored, DescentMeasurements)
-    assert hash_inputs([image.counts for image in restored.images]) == hash_inputs(
+    restored_case = read_case(tmp_path)
+    assert isinstance(restored_case, DescentMeasurements)
+    assert hash_inputs([image.counts for image in restored_case.images]) == hash_inputs(
         [image.counts for image in measurements.images]
     )
-    np.testing.assert_array_equal(restored.interval_velocities_m_s, measurements.interval_velocities_m_s)
-    np.testing.assert_array_equal(restored.inertial_velocities_m_s, measurements.inertial_velocities_m_s)
+    np.testing.assert_array_equal(restored_case.interval_velocities_m_s, measurements.interval_velocities_m_s)
+    np.testing.assert_array_equal(restored_case.inertial_velocities_m_s, measurements.inertial_velocities_m_s)
 
 
 def make_stream(spec: str, time_s: float = 60.0) -> StreamedEstimator:
@@ -226,13 +226,13 @@ NO_VELOCITY_YET = '{"exchange": 1, "outcome": null}'
 )
 def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: list[str], message: str) -> None:
     (tmp_path / "stream.py").write_text(format_server(answers))
-    with pytest.raises(AlgorithmError, match=message) as caught:
+    with pytest.raises(AlgorithmError, match=message) as error:
         make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.descent())
-    assert caught.value.fault is (Fault.CRASHED if answers == [NO_VELOCITY_YET] * 2 else Fault.BAD_ANSWER)
+    assert error.value.fault is (Fault.CRASHED if answers == [NO_VELOCITY_YET] * 2 else Fault.BAD_ANSWER)
 
 
 def test_program_hanging_at_an_image_is_terminated(tmp_path: Path) -> None:
     (tmp_path / "stream.py").write_text(format_server([NO_VELOCITY_YET, NO_VELOCITY_YET]) + "time.sleep(60)\n")
-    with pytest.raises(AlgorithmError, match="no answer within 3 s") as caught:
+    with pytest.raises(AlgorithmError, match="no answer within 3 s") as error:
         make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}", 3.0).estimate(inputs.descent())
-    assert caught.value.fault is Fault.TIMED_OUT
+    assert error.value.fault is Fault.TIMED_OUT

@@ -22,7 +22,7 @@ HEIGHT_M, BASELINE_M = 1.5, 0.2
 
 
 def _make_camera(left_m: float, toe_in_deg: float = 0.0) -> Cahv:
-    """Create a camera on the mast in the rover frame, 30 deg below the horizon, 45 deg wide, 256 x 256 pixels."""
+    """Create a mast camera, `left_m` to the left of the rover's axis: 30 deg down, 45 deg wide, 256 x 256 pixels."""
     turn = Rotation.from_euler("ZY", [toe_in_deg, 30.0], degrees=True)
     axis, right = turn.apply([1.0, 0.0, 0.0]), turn.apply([0.0, -1.0, 0.0])
     return Cahv.from_axes((305.0, 305.0), (256, 256), axis=axis, right=right, centre=np.array([0.4, left_m, HEIGHT_M]))

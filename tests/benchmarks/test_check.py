@@ -13,12 +13,13 @@ PATHS = ("one", "two", "three", "four", "five", "six")
 
 
 def draw_ratios(rng: np.random.Generator, sd: float, factor: float = 1.0) -> dict[str, list[float]]:
+    """Draw the logarithms of time ratios with the median `factor` for each path."""
     return {name: (np.log(factor) + sd * rng.standard_normal(PAIRS)).tolist() for name in PATHS}
 
 
 @pytest.mark.parametrize("sd", [0.03, 0.2])
 def test_unchanged_paths_raise_few_alarms(sd: float) -> None:
-    """The false alarm rate is at most 1 %: more than 9 alarms in 400 comparisons have a probability below 1 %."""
+    """At a false alarm rate of 1 %, more than 9 alarms in 400 comparisons have a probability below 1 %."""
     rng = np.random.default_rng(1)
     alarms = sum(bool(select_slower(compare(draw_ratios(rng, sd), draw_ratios(rng, sd)))) for _ in range(400))
     assert alarms <= 9
@@ -33,12 +34,12 @@ def test_accepted_growth_raises_few_alarms() -> None:
 @pytest.mark.parametrize(("sd", "factor"), [(0.05, 1.3), (0.2, 1.8)])
 def test_slower_path_is_detected(sd: float, factor: float) -> None:
     rng = np.random.default_rng(3)
-    detected = 0
+    detections = 0
     for _ in range(100):
-        measured = draw_ratios(rng, sd) | {"three": draw_ratios(rng, sd, factor)["three"]}
-        slower = select_slower(compare(measured, draw_ratios(rng, sd)))
-        detected += [comparison.name for comparison in slower] == ["three"]
-    assert detected >= 95
+        ratios = draw_ratios(rng, sd) | {"three": draw_ratios(rng, sd, factor)["three"]}
+        slower = select_slower(compare(ratios, draw_ratios(rng, sd)))
+        detections += [comparison.name for comparison in slower] == ["three"]
+    assert detections >= 95
 
 
 def test_ratio_of_processor_times_is_measured() -> None:

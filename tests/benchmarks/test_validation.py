@@ -41,7 +41,7 @@ def failed_claims(measures: list[Measure]) -> list[str]:
 
 
 def _check_drift_with_lost_targets(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
-    """Every second target is lost; the others do not drift at all."""
+    """Run the check with every second target lost and a drift of 0.1 px of the others."""
     row = {"selectable": True, "sun_motion_deg": 5.0}
     monkeypatch.setattr(
         tracking_checks, "simulate_run", lambda number, camera: row | {"drift_px": NAN if number % 2 else 0.1}
@@ -50,7 +50,7 @@ def _check_drift_with_lost_targets(monkeypatch: pytest.MonkeyPatch) -> list[Meas
 
 
 def _check_stereo_with_lost_targets(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
-    """Every second target is not found; the others have the errors of Eq. 1 of the tracking paper."""
+    """Run the check with every second target lost and the errors of Eq. 1 of the tracking paper for the others."""
     monkeypatch.setattr(
         tracking_checks, "_simulate_designation", lambda number, camera: (NAN if number % 2 else 0.1, 0.1)
     )
@@ -58,7 +58,7 @@ def _check_stereo_with_lost_targets(monkeypatch: pytest.MonkeyPatch) -> list[Mea
 
 
 def _check_landing_with_a_failed_pair(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
-    """Motion estimation fails for one image pair in a hundred; the others are exact."""
+    """Run the check with a failed motion estimate of one image pair and exact estimates of the others."""
 
     def errors(number: int) -> dict[str, dict[str, Any]]:
         value = NAN if number == 3 else 0.0
@@ -80,22 +80,22 @@ def test_checks_with_lost_cases_fail(
 
 
 def test_limits_are_close_to_the_measured_values() -> None:
-    wide = [
+    wide_limits = [
         (row.claim, row.measured, row.limit)
         for row in read_measures()
         if row.limit is not None and row.sense == "at most" and row.measured > 1e-12
         and row.limit > 4.0 * row.measured and not row.claim.startswith(tuple(REASONS_FOR_WIDE_LIMITS))
     ]  # fmt: skip
-    assert wide == []
+    assert wide_limits == []
 
 
 def test_unmet_requirements_keep_their_original_limit() -> None:
     rows = {row.claim: row for row in read_measures()}
-    required = {"deg": landing_checks.ROTATION_LIMIT_DEG, "": 0.95}
+    limit_by_unit = {"deg": landing_checks.ROTATION_LIMIT_DEG, "": 0.95}
     for claim_start in ("rotation error with the paper's features", "nights that detect a regression"):
-        selected = [row for claim, row in rows.items() if claim.startswith(claim_start)]
-        assert selected
-        assert all(row.limit == required[row.unit] for row in selected)
+        claim_rows = [row for claim, row in rows.items() if claim.startswith(claim_start)]
+        assert claim_rows
+        assert all(row.limit == limit_by_unit[row.unit] for row in claim_rows)
 
 
 def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,18 +107,18 @@ def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(dimes_checks, "draw_correct_track_errors", halve_errors, raising=False)
     options = dimes_checks.DimesOptions(imu_threshold_m_s=2.3)
     monkeypatch.setattr(dimes_checks, "DimesOptions", lambda: options)
-    failed = failed_claims(list(dimes_checks.check_imu_threshold(quick=True)))
-    assert "discrepancy of correct tracks: 99.5 % quantile against the threshold" in failed
-    assert "descents with one correct track per pair that pass the IMU check" in failed
+    claims = failed_claims(list(dimes_checks.check_imu_threshold(quick=True)))
+    assert "discrepancy of correct tracks: 99.5 % quantile against the threshold" in claims
+    assert "descents with one correct track per pair that pass the IMU check" in claims
 
 
-def test_reference_implementation_has_the_matching_error_only_without_instrument_errors() -> None:
+def test_reference_has_only_the_matching_error_without_instrument_errors() -> None:
     inputs = ThresholdInputs(
         altitude_sd=0.0, common_attitude_sd_deg=0.0, attitude_sd_deg=0.0, tag_sd_s=0.0, feature_height_sd_m=0.0
     )
     reference = Reference.draw(inputs, 300, np.random.default_rng(1))
     np.testing.assert_allclose(reference.tracks.std(), inputs.match_sd_m_s, rtol=0.1)
-    # The discrepancy of two tracks and the IMU has a Rayleigh distribution; this is its median.
+    # The discrepancy of two tracks and the IMU has a Rayleigh distribution with the median sd sqrt(2 ln 2).
     sd = math.sqrt(2.0 * inputs.match_sd_m_s**2 + inputs.imu_sd_m_s**2)
     assert np.median(reference.single()) == pytest.approx(sd * math.sqrt(2.0 * math.log(2.0)), rel=0.15)
 

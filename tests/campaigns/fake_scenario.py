@@ -64,8 +64,8 @@ class FakeParameters(BaseModel):
         return self
 
 
-def misbehave(parameters: FakeParameters, case: int) -> None:
-    """Loop, print, exit, fork, stop the parent or allocate memory without end, as the parameters select."""
+def inject_faults(parameters: FakeParameters, case: int) -> None:
+    """Loop, print, exit, fork, stop the parent, change the process state or allocate memory, as parameters select."""
     if case in parameters.looping_cases:
         # backtracks 2^64 times in C without releasing the interpreter lock
         re.match("(a+)+$", "a" * 64 + "b")
@@ -105,7 +105,7 @@ class FakeScenario:
             raise ZeroDivisionError(f"case {streams.case} of {object()!r}")
         if streams.case in parameters.aborting_cases:
             os.abort()
-        misbehave(parameters, streams.case)
+        inject_faults(parameters, streams.case)
         has_answer = streams.case not in parameters.unanswered_cases
         # the environment variable imitates a change of the algorithm's code
         scale = parameters.error_scale * float(os.environ.get("FAKE_ERROR_SCALE", "1"))

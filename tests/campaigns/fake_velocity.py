@@ -54,5 +54,6 @@ class FakeVelocityScenario:
                 failure=run_result.failure,
             )
 
+        # the inputs of the cases differ only in their inertial velocities
         input_text = f"{measurements.interval_velocities_m_s.tolist()}"
         return case_result(parameters.algorithms, evaluate, {"image_hash": input_text})

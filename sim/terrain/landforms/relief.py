@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 SAMPLES_ON_SLIP_FACE = 2.1  #: Minimum number of samples along the slope of a slip face.
 CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.
-#: RMS of a cubic B-spline divided by that of its control values, if these are independent: 151/315.
+#: RMS of a two-dimensional cubic B-spline divided by that of its control values, if these are independent. The mean
+#: square has the factor 151/315 along each axis: the integral of the squared basis function.
 SPLINE_OF_NOISE_RMS = 151.0 / 315.0
 EJECTA_EXTENT_RADII = 3.0  #: Maximum distance of ejecta from the centre of a crater, in radii.
 #: Depth from the rim crest to the floor, divided by the diameter: 0.2 for fresh simple craters (Pike 1977; Robbins &
@@ -65,22 +66,24 @@ class Dunes(Parameters):
         """Add the dunes, with the wave vector that is periodic on the terrain and nearest to the parameters."""
         # the wave vector points downwind; azimuth is clockwise from north, x is east
         downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
-        waves = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
-        cycles = np.round(waves)
-        if not cycles.any():
+        waves_per_side = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
+        whole_waves = np.round(waves_per_side)
+        if not whole_waves.any():
             side = f"{ground.period_m:g} m"
             raise ValueError(f"dunes.wavelength_m is {self.wavelength_m:g}; the terrain's side is {side}")
-        wave = 2.0 * np.pi * cycles / ground.period_m
-        crest_scale, wave_scale = (
+        wave_vector = 2.0 * np.pi * whole_waves / ground.period_m
+        # amplitudes of the fields fall to 1/e at the wavenumber 2 / length
+        across_m, along_m = (
             length * self.wavelength_m / np.sqrt(2.0) for length in (self.crest_length, self.regularity)
         )
-        modulation = draw_smooth_fields(ground.period_m, crest_scale, wave_scale, float(downwind), rng)
+        modulation = draw_smooth_fields(ground.period_m, across_m, along_m, float(downwind), rng)
         step = max(modulation.shape[0] // ground.side, 1)
         modulation = np.ascontiguousarray(modulation[::step, ::step])
-        steepest = float(np.tan(np.radians(self.repose_deg)))
-        slip_face_m = self.height_m / steepest
+        max_slope = float(np.tan(np.radians(self.repose_deg)))
+        slip_face_m = self.height_m / max_slope
         part = ground.coarser(min(slip_face_m / SAMPLES_ON_SLIP_FACE, ground.period_m / modulation.shape[0]))
-        bedforms = Bedforms(float(wave[0]), float(wave[1]), self.height_m, steepest, self.albedo_contrast)
+        kx, ky = (float(wavenumber) for wavenumber in wave_vector)
+        bedforms = Bedforms(kx, ky, self.height_m, max_slope, self.albedo_contrast)
         add_dunes(part.height, part.log_albedo, part.spacing_m, modulation, bedforms)
         ground.add(part)
 
@@ -107,11 +110,12 @@ class Lava(Parameters):
         part = ground.coarser(max(self.lobe_length_m / 36.0, self.lobe_thickness_m))
         scale_m = self.lobe_length_m / 12.0
         warp = np.float32(CRENULATION) * draw_smooth_fields(ground.period_m, scale_m, scale_m, 0.0, rng)
-        # log-normal lengths; widths are 1/4 to 1/2 of the lengths; the number of lobes assumes a mean ratio of 0.38
-        spread = 0.5
-        mean_area = np.pi / 4.0 * self.lobe_length_m**2 * np.exp(2.0 * spread**2) * 0.38
+        # log-normal lengths: the mean square is the square of the median times exp(2 SD**2)
+        # widths are 1/4 to 1/2 of the lengths; the number of lobes assumes a mean ratio of 0.38
+        log_length_sd = 0.5
+        mean_area = np.pi / 4.0 * self.lobe_length_m**2 * np.exp(2.0 * log_length_sd**2) * 0.38
         count = int(rng.poisson(self.layers * ground.period_m**2 / mean_area))
-        half_length = 0.5 * self.lobe_length_m * np.exp(spread * rng.standard_normal(count))
+        half_length = 0.5 * self.lobe_length_m * np.exp(log_length_sd * rng.standard_normal(count))
         half_width = half_length / rng.uniform(2.0, 4.0, count)
         thickness = self.lobe_thickness_m * np.exp(0.35 * rng.standard_normal(count))
         heading = np.radians(90.0 - self.flow_to_deg) + 0.45 * rng.standard_normal(count)
@@ -129,8 +133,8 @@ class Lava(Parameters):
         blocks = ground.coarser(self.aa_block_m / 2.0)
         patches = np.zeros((blocks.side, blocks.side), dtype=np.float32)
         for scale, strength in ((1.0, 1.0), (0.35, 0.45), (0.12, 0.2)):
-            size = scale * self.lobe_length_m
-            field = draw_smooth_fields(ground.period_m, size, size, 0.0, rng)[..., 0]
+            length = scale * self.lobe_length_m
+            field = draw_smooth_fields(ground.period_m, length, length, 0.0, rng)[..., 0]
             patches += np.float32(strength) * resample(field, blocks.side)
         threshold = float(np.quantile(patches[::4, ::4], 1.0 - self.aa_fraction))
         coverage = np.clip((patches - np.float32(threshold)) * np.float32(6.0) + np.float32(0.5), 0.0, 1.0)
@@ -179,17 +183,18 @@ class Ramp(Parameters):
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the ramp."""
         period = ground.period_m
-        longest = 0.45 * period
-        if self.length_m > longest:
-            raise ValueError(f"ramp.length_m is {self.length_m:g}; at most {longest:g} fit on this terrain")
+        max_length = 0.45 * period
+        if self.length_m > max_length:
+            raise ValueError(f"ramp.length_m is {self.length_m:g}; at most {max_length:g} fit on this terrain")
         position = np.arange(ground.side) * ground.spacing_m
         bend = 0.1 * self.length_m
         climb, fall = (
             np.clip((0.5 * self.length_m + bend / 2.0 - np.abs(position - centre * period)) / bend, 0.0, 1.0)
             for centre in (0.25, 0.75)
         )
-        rise = climb - fall
-        profile = (np.cumsum(rise) - 0.5 * rise) * ground.spacing_m * np.tan(np.radians(self.slope_deg))
+        relative_slope = climb - fall
+        profile = np.cumsum(relative_slope) - 0.5 * relative_slope
+        profile = profile * ground.spacing_m * np.tan(np.radians(self.slope_deg))
         profile = (profile - profile.mean()).astype(np.float32)
         np.add(ground.height, profile[None, :] if self.uphill == "east" else profile[:, None], out=ground.height)
 
@@ -237,8 +242,8 @@ def draw_channels(
     """Draw winding channels as rows of discs (x, y, half width, depth) with a spacing of a quarter of their width.
 
     The direction of a channel deviates from its heading (radians, counter-clockwise from x) by a first-order
-    Gauss-Markov process with an RMS of `wander` per width and a correlation length of about eight widths. Both ends of
-    a channel are narrow and shallow.
+    Gauss-Markov process. Its correlation length is eight widths, its RMS about four times `wander` (radians): each step
+    adds noise with the standard deviation `wander`. Both ends of a channel are narrow and shallow.
     """
     parts = [np.empty((0, 4))]
     for origin, mean_heading, length_m, width_m, depth_m in zip(start, heading, length, width, depth, strict=True):
@@ -275,7 +280,8 @@ class Gullies(Parameters):
         width = self.width_m * np.exp(0.3 * rng.standard_normal(count))
         length = self.length_m * rng.uniform(0.6, 1.4, count)
         start = rng.uniform(0.0, ground.period_m, (count, 2))
-        trunks = draw_channels(start, heading, length, width, width * self._depth(1.0), 0.15, rng)
+        depth = width * self._compute_depth(1.0)
+        trunks = draw_channels(start, heading, length, width, depth, 0.15, rng)
         # the profile depth (1 - (r / w)**1.5) has its maximum slope at the rim: 1.5 depth / w
         cut_channels(part.log_albedo, part.spacing_m, trunks, 1.5)
         if self.tributaries and trunks.size:
@@ -283,14 +289,15 @@ class Gullies(Parameters):
             heading = np.radians(90.0 - self.downhill_deg) + np.pi + rng.choice([-0.7, 0.7], mouths.size)
             width = trunks[mouths, 2] * 2.0 * rng.uniform(0.35, 0.6, mouths.size)
             length = 6.0 * width + 0.1 * self.length_m
-            branches = draw_channels(trunks[mouths, :2], heading, length, width, width * self._depth(1.0), 0.15, rng)
+            depth = width * self._compute_depth(1.0)
+            branches = draw_channels(trunks[mouths, :2], heading, length, width, depth, 0.15, rng)
             cut_channels(part.log_albedo, part.spacing_m, branches, 1.5)
         part.height[...] = -part.log_albedo
-        part.log_albedo[...] *= np.float32(self.contrast / (0.5 * self._depth(self.width_m)))
+        part.log_albedo[...] *= np.float32(self.contrast / (0.5 * self._compute_depth(self.width_m)))
         np.clip(part.log_albedo, -abs(self.contrast), abs(self.contrast), out=part.log_albedo)
         ground.add(part)
 
-    def _depth(self, width: float) -> float:
+    def _compute_depth(self, width: float) -> float:
         """Compute the depth of a gully from its width and the slope of its walls, m."""
         return float(0.5 * width * np.tan(np.radians(self.wall_slope_deg)) / 1.5)
 
@@ -309,9 +316,9 @@ class Playa(Parameters):
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add fissures to the whole terrain."""
-        ground.add(self.fissures(ground, rng))
+        ground.add(self.compute_fissures(ground, rng))
 
-    def fissures(self, ground: Ground, rng: Generator) -> Ground:
+    def compute_fissures(self, ground: Ground, rng: Generator) -> Ground:
         """Compute the fissures on a separate grid."""
         part = ground.coarser(self.fissure_m)
         for scale in (1.0, 0.4):
@@ -356,27 +363,29 @@ class Fans(Parameters):
         radius = self.radius_m * rng.uniform(0.85, 1.15, apex_x.size)
         y = (divide_y * ground.period_m + offset) % ground.period_m
         apexes = np.column_stack([apex_x * ground.period_m, y, radius])
-        broad = ground.coarser(CONE_DETAIL * self.radius_m)
+        # until the fans are complete, the albedo grid of `cones` contains their coverage: 1 on a fan, 0 on the playa
+        cones = ground.coarser(CONE_DETAIL * self.radius_m)
         slope = float(np.tan(np.radians(self.slope_deg)))
         rounding = APEX_ROUNDING * self.radius_m
-        raise_cones(broad.height, broad.log_albedo, broad.spacing_m, apexes, slope, self.concavity, rounding)
+        raise_cones(cones.height, cones.log_albedo, cones.spacing_m, apexes, slope, self.concavity, rounding)
         if self.polygons is not None:
-            fissures = self.polygons.fissures(ground, rng)
-            playa_fraction = np.float32(1.0) - resample(broad.log_albedo, fissures.side)
+            fissures = self.polygons.compute_fissures(ground, rng)
+            playa_fraction = np.float32(1.0) - resample(cones.log_albedo, fissures.side)
             np.multiply(fissures.height, playa_fraction, out=fissures.height)
             np.multiply(fissures.log_albedo, playa_fraction, out=fissures.log_albedo)
-        relief = np.float32(self.playa_relief) + np.float32(1.0 - self.playa_relief) * broad.log_albedo
-        relief = refine(relief, ground.side)
-        np.multiply(ground.height, relief, out=ground.height)
-        np.multiply(ground.log_albedo, relief, out=ground.log_albedo)
-        broad.log_albedo[...] *= np.float32(self.fan_contrast)
-        ground.add(broad)
+        factor = np.float32(self.playa_relief) + np.float32(1.0 - self.playa_relief) * cones.log_albedo
+        factor = refine(factor, ground.side)
+        np.multiply(ground.height, factor, out=ground.height)
+        np.multiply(ground.log_albedo, factor, out=ground.log_albedo)
+        cones.log_albedo[...] *= np.float32(self.fan_contrast)
+        ground.add(cones)
         if self.polygons is not None:
             ground.add(fissures)
         if self.washes_per_fan:
             self._add_washes(ground, apexes, rng)
 
     def _add_washes(self, ground: Ground, apexes: Float64[np.ndarray, "fans 3"], rng: Generator) -> None:
+        """Cut the washes of all fans."""
         # until the channels are complete, the albedo grid of `part` contains their depth
         part = ground.coarser(self.wash_width_m / 3.0)
         count = self.washes_per_fan

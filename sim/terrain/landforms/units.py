@@ -22,9 +22,9 @@ from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS
 
 #: Samples of the terrain per sample of a cover, along each side.
 COVER_STEP = 4
-#: Hurst exponent of the fields whose level lines bound the units: outlines with a fractal dimension of 1.4.
+#: Hurst exponent of the fields whose level lines bound the units: outlines have the fractal dimension 2 - H = 1.4.
 OUTLINE_HURST = 0.6
-#: Iterations that fit the units' areas, and samples along each side on which areas are counted.
+#: Iterations of the fit of the units' areas, and maximum number of samples along each side for this fit.
 _FIT_STEPS, _FIT_SIDE = 40, 128
 
 
@@ -73,8 +73,8 @@ class SurfaceUnits(Parameters):
     ) -> Float32[np.ndarray, "cover cover 3"]:
         """Add the albedo of units, dust devil tracks and wind tails of craters; return the cover (see `Surface`)."""
         units = self.kinds
-        expected = np.array([unit.fraction for unit in units])
-        areas = rng.dirichlet(self.concentration * expected / expected.sum())
+        expected_areas = np.array([unit.fraction for unit in units])
+        areas = rng.dirichlet(self.concentration * expected_areas / expected_areas.sum())
         side = ground.side // COVER_STEP
         spacing = ground.period_m / side
         downwind = np.radians(270.0 - self.wind_from_deg - self.wind_spread_deg * rng.standard_normal())
@@ -82,17 +82,18 @@ class SurfaceUnits(Parameters):
         spectrum = spectrum.apply_low_pass(self.smallest_m)
         fields = np.stack([spectrum.draw_field(rng, 1.0) for _ in units], axis=-1)
         membership = self._compute_membership(fields, areas)
-        values = np.array([(unit.roughness, unit.texture, unit.rocks) for unit in units])
-        factors = np.exp(membership @ np.log(np.maximum(values, 1e-3)).astype(np.float32))
+        unit_factors = np.array([(unit.roughness, unit.texture, unit.rocks) for unit in units])
+        factors = np.exp(membership @ np.log(np.maximum(unit_factors, 1e-3)).astype(np.float32))
         log_albedo = np.ascontiguousarray(membership @ np.array([unit.tone for unit in units], dtype=np.float32))
         self._add_tracks(log_albedo, spacing, downwind, rng)
         ground.add(Ground(np.zeros_like(log_albedo), log_albedo, spacing))
         self._add_streaks(ground, craters, downwind, rng)
         if len(craters):
-            # rows of `stamp_craters`; a fresh crater has a depth of 0.4 radii below its rim
+            # rows of `draw_craters`; from the rim to the floor a fresh crater has a depth of 0.4 radii
             fill, depth, radius = craters[:, 6], craters[:, 3] + craters[:, 4], craters[:, 2]
             freshness = np.clip(depth / radius / 0.4, 0.0, 1.0)
-            rows = np.column_stack([craters[:, :3], 1.0 - 1.6 * fill, 1.0 + freshness])
+            floor_factor, ejecta_factor = 1.0 - 1.6 * fill, 1.0 + freshness
+            rows = np.column_stack([craters[:, :3], floor_factor, ejecta_factor])
             roughness = np.ascontiguousarray(factors[..., ROUGHNESS])
             scale_roughness(roughness, spacing, rows, 2.0)
             factors[..., ROUGHNESS] = roughness
@@ -117,6 +118,7 @@ class SurfaceUnits(Parameters):
     def _add_streaks(
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator
     ) -> None:
+        """Add wind tails to a random selection of the large craters."""
         large = craters[craters[:, 2] > 0.5 * self.streak_min_m]
         sources = large[rng.uniform(size=len(large)) < self.streak_fraction]
         radius, count = sources[:, 2], len(sources)
@@ -140,6 +142,7 @@ class SurfaceUnits(Parameters):
     def _softmax(
         self, fields: Float32[np.ndarray, "rows columns kinds"], shift: Float[np.ndarray, "kinds"]
     ) -> Float32[np.ndarray, "rows columns kinds"]:
+        """Compute the softmax of the shifted fields; `boundary` is its temperature."""
         logits = (fields + shift.astype(np.float32)) / np.float32(self.boundary)
         logits -= logits.max(axis=-1, keepdims=True)
         weights = np.exp(logits, out=logits)

@@ -116,6 +116,7 @@ def draw_diameters(parameters: RockParameters, area_m2: float, rng: Generator) -
     p, q = parameters, decay_per_m(parameters.abundance or 1.0)
 
     def density_per_log(d: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        # D n(D): number of rocks per area and natural logarithm of diameter
         return np.asarray(p.abundance * q * np.exp(-q * d) / (np.pi * d / 4.0))
 
     # cumulative number of rocks per square metre up to each diameter, by Simpson's rule in the logarithm of diameter
@@ -132,8 +133,8 @@ def draw_diameters(parameters: RockParameters, area_m2: float, rng: Generator) -
             f"{MAX_ROCKS:g} are allowed: choose a larger rocks.smallest_m"
         )
     quantile = rng.random(int(rng.poisson(expected)))
-    drawn = np.exp(np.interp(quantile * cumulative_count[-1], cumulative_count, np.log(diameter)))
-    return np.asarray(np.sort(drawn)[::-1])
+    diameters = np.exp(np.interp(quantile * cumulative_count[-1], cumulative_count, np.log(diameter)))
+    return np.asarray(np.sort(diameters)[::-1])
 
 
 @dataclass(frozen=True)
@@ -186,10 +187,10 @@ class RockField:
         Raises ValueError if there is no free position for a rock, or if the shape of a placed rock does not exist.
         """
         placed = parameters.placed
-        drawn = draw_diameters(parameters, surface.period_m**2, substream(rng, "rock sizes"))
+        random_diameter = draw_diameters(parameters, surface.period_m**2, substream(rng, "rock sizes"))
         appearance_rng = substream(rng, "rock looks")
         ratio = parameters.height_ratio * (
-            1.0 + parameters.height_spread * appearance_rng.uniform(-1.0, 1.0, drawn.size)
+            1.0 + parameters.height_spread * appearance_rng.uniform(-1.0, 1.0, random_diameter.size)
         )
         first_shape = list(shapes.FORMS).index(parameters.form) * SHAPES_OF_FORM
         placed_shape, placed_yaw, placed_rng = [], [], substream(rng, "placed rocks")
@@ -197,22 +198,22 @@ class RockField:
             if rock.shape is not None and rock.shape >= shapes.SHAPES:
                 allowed = f"0 to {shapes.SHAPES - 1}"
                 raise ValueError(f"rock '{rock.name}' has shape {rock.shape}; allowed: {allowed}")
-            random_shape = first_shape + int(placed_rng.integers(0, SHAPES_OF_FORM))
-            random_yaw_rad = float(placed_rng.uniform(-np.pi, np.pi))
-            placed_shape.append(random_shape if rock.shape is None else rock.shape)
-            placed_yaw.append(random_yaw_rad if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
-        diameter = np.concatenate([[rock.diameter_m for rock in placed], drawn])
-        drawn_shape = first_shape + appearance_rng.integers(0, SHAPES_OF_FORM, drawn.size)
+            default_shape = first_shape + int(placed_rng.integers(0, SHAPES_OF_FORM))
+            default_yaw_rad = float(placed_rng.uniform(-np.pi, np.pi))
+            placed_shape.append(default_shape if rock.shape is None else rock.shape)
+            placed_yaw.append(default_yaw_rad if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
+        diameter = np.concatenate([[rock.diameter_m for rock in placed], random_diameter])
+        random_shape = first_shape + appearance_rng.integers(0, SHAPES_OF_FORM, random_diameter.size)
         if parameters.forms is not None:
             weights = np.array(parameters.forms.weights())
-            form = substream(rng, "rock forms").choice(weights.size, drawn.size, p=weights / weights.sum())
-            drawn_shape = form * SHAPES_OF_FORM + drawn_shape % SHAPES_OF_FORM
+            form = substream(rng, "rock forms").choice(weights.size, random_diameter.size, p=weights / weights.sum())
+            random_shape = form * SHAPES_OF_FORM + random_shape % SHAPES_OF_FORM
             ratio *= np.array([definition.flatness for definition in shapes.FORMS.values()])[form]
-        height = np.concatenate([[rock.height_m or 0.5 * rock.diameter_m for rock in placed], ratio * drawn])
-        log_albedo = parameters.albedo_spread * substream(rng, "rock albedo").standard_normal(drawn.size)
+        height = np.concatenate([[rock.height_m or 0.5 * rock.diameter_m for rock in placed], ratio * random_diameter])
+        log_albedo = parameters.albedo_spread * substream(rng, "rock albedo").standard_normal(random_diameter.size)
         albedo = np.concatenate([np.ones(len(placed)), np.exp(log_albedo - 0.5 * parameters.albedo_spread**2)])
-        shape = np.concatenate([placed_shape, drawn_shape]).astype(np.int32)
-        yaw = np.concatenate([placed_yaw, appearance_rng.uniform(-np.pi, np.pi, drawn.size)])
+        shape = np.concatenate([placed_shape, random_shape]).astype(np.int32)
+        yaw = np.concatenate([placed_yaw, appearance_rng.uniform(-np.pi, np.pi, random_diameter.size)])
         radius = rock_shapes(shapes.COARSEST).reach[shape] * diameter
         xy = _draw_positions(parameters, radius, diameter, surface, substream(rng, "rock places"))
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
@@ -283,7 +284,7 @@ class RockField:
         return self._assemble(numbers, self.position_m[numbers], np.array([detail]))
 
     def _assemble(self, number: Numbers, position: Positions, detail: Numbers) -> RockMesh:
-        """Create the mesh of rocks, ordered by level of detail."""
+        """Create the mesh of rocks at positions, ordered by level of detail."""
         order = np.argsort(detail, kind="stable")
         number, position, detail = number[order], position[order], detail[order]
         diameter = self.diameter_m[number]
@@ -305,8 +306,8 @@ class RockField:
             counts.append(np.full(rocks.size, len(unit.faces)))
             start = stop
         body_of_face = np.repeat(np.arange(number.size, dtype=np.int32), np.concatenate(counts))
-        joined = (np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces))
-        return RockMesh(*joined, number.astype(np.int32)[body_of_face], body_of_face)
+        mesh_arrays = (np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces))
+        return RockMesh(*mesh_arrays, number.astype(np.int32)[body_of_face], body_of_face)
 
 
 def _draw_positions(
@@ -314,15 +315,17 @@ def _draw_positions(
 ) -> Float64[np.ndarray, "rocks 2"]:
     """Return the positions of placed rocks, and draw positions without overlap for the others by decreasing size."""
     period_m, density = surface.period_m, np.ascontiguousarray(surface.cover[..., ROCKS])
-    placed = np.array([(rock.east_m, rock.north_m) for rock in parameters.placed], dtype=np.float64).reshape(-1, 2)
-    placed %= period_m
-    count = placed.shape[0]
+    coordinates = [(rock.east_m, rock.north_m) for rock in parameters.placed]
+    placed_positions = np.array(coordinates, dtype=np.float64).reshape(-1, 2)
+    placed_positions %= period_m
+    count = placed_positions.shape[0]
     if radius.size == count:
-        return placed
-    occupied = np.column_stack([placed, radius[:count]])
+        return placed_positions
+    occupied = np.column_stack([placed_positions, radius[:count]])
     cell = max(CELL_OVER_DIAMETER * float(diameter[count:].mean()), period_m / 4096)
-    drawn = place_discs(radius[count:], occupied, density, period_m, cell, MAX_TRIES, rng)
-    unplaced = int(np.count_nonzero(np.isnan(drawn[:, 0])))
-    if unplaced:
-        raise ValueError(f"{unplaced} of {len(drawn)} rocks have no free position; a smaller rocks.abundance is needed")
-    return np.concatenate([placed, drawn])
+    random_positions = place_discs(radius[count:], occupied, density, period_m, cell, MAX_TRIES, rng)
+    n_unplaced = int(np.count_nonzero(np.isnan(random_positions[:, 0])))
+    if n_unplaced:
+        total = len(random_positions)
+        raise ValueError(f"{n_unplaced} of {total} rocks have no free position; a smaller rocks.abundance is needed")
+    return np.concatenate([placed_positions, random_positions])

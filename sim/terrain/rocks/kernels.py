@@ -51,7 +51,7 @@ def place_discs(
     next_entry = np.empty(n_entries, dtype=np.int32)
     disc_of_entry = np.empty(n_entries, dtype=np.int32)
     discs = np.empty((occupied.shape[0] + radii.size, 3), dtype=np.float64)
-    placed = np.full((radii.size, 2), np.nan, dtype=np.float64)
+    positions = np.full((radii.size, 2), np.nan, dtype=np.float64)
     n_listed, n_discs = 0, 0
     for disc in range(occupied.shape[0] + radii.size):
         is_existing = disc < occupied.shape[0]
@@ -91,7 +91,7 @@ def place_discs(
         if not is_free:
             continue
         if not is_existing:
-            placed[disc - occupied.shape[0], 0], placed[disc - occupied.shape[0], 1] = x, y
+            positions[disc - occupied.shape[0], 0], positions[disc - occupied.shape[0], 1] = x, y
         discs[n_discs, 0], discs[n_discs, 1], discs[n_discs, 2] = x, y, radius
         cell_rows = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
         cell_columns = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
@@ -103,7 +103,7 @@ def place_discs(
                 first_entry[i * side + j] = n_listed
                 n_listed += 1
         n_discs += 1
-    return placed
+    return positions
 
 
 @njit(cache=True)
@@ -115,8 +115,10 @@ def stamp_tails(
     `tails` has rows (x, y, half width, distance of the tip, height). `log_albedo` is the natural logarithm of the
     albedo of a ridge divided by that of the ground. The ridge rises from the centre of the rock to its edge. Its width
     and height are largest there, and decrease linearly to its tip. Its cross section at the offset t is
-    ``(1 - (t / half width)**2)**2``; the maximum slope is 1.54 times the height divided by the half width.
+    ``(1 - (t / half width)**2)**2``. The maximum slope is 1.54 times the height divided by the half width: the maximum
+    of ``4 t (1 - t**2)`` at ``t = 1 / sqrt(3)``.
     """
+    # the side is a power of two: `& mask` returns the index in the periodic square
     mask = samples.shape[0] - 1
     for n in range(tails.shape[0]):
         x, y, half_width, tip, height = tails[n]
@@ -173,6 +175,7 @@ def assemble(rocks: Placements, unit_vertices: Array, unit_normals: Array) -> tu
             vertices[row, 0] = position[n, 0] + r00 * x + r01 * y + ux * z
             vertices[row, 1] = position[n, 1] + r01 * x + r11 * y + uy * z
             vertices[row, 2] = position[n, 2] - ux * x - uy * y + uz * z
+            # normals are stretched by the inverse of the scale
             a = unit_normals[unit, v, 0] / sx
             b = unit_normals[unit, v, 1] / sy
             z = unit_normals[unit, v, 2] / sz

@@ -31,7 +31,7 @@ class RockForm:
     - short_axis_ratios: range of shortest / longest axis; middle / longest axis is 0.65 to 0.95
     - buried_fractions: range of the fraction of the height that is below the ground
     - flatness: factor of the ratio of height to diameter of a terrain's rocks
-    - folded: whether bumps meet in ridges
+    - folded: whether bumps form sharp ridges
     - bedding: whether two of the cuts are almost horizontal, and the others steep
     - pits: number of vesicles, open at the surface
     """
@@ -127,14 +127,15 @@ def max_pixels(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes le
 
 
 def _max_pixels_per_deviation() -> Float64[np.ndarray, "shapes levels"]:
+    """Compute the rock diameter in pixels at which a level deviates by one pixel: the diameter of a unit shape is 1."""
     shapes = rock_shapes(FINEST)
     limits = np.empty((SHAPES, FINEST))
     for number, shape in enumerate(_all_shapes()):
         finest, normals = shapes.vertices[number], shapes.normals[number]
         for detail in range(FINEST):
-            inverse = _corner_weights(detail) @ _fitted_inverse_radii(number, detail)
-            facets = shape.to_unit_shape(_icosphere(FINEST)[0] / inverse[:, None])
-            deviation = np.sum((facets - finest) * normals, axis=1)[finest[:, 2] > 0.0]
+            inverse_radii = _corner_weights(detail) @ _fitted_inverse_radii(number, detail)
+            facet_points = shape.to_unit_shape(_icosphere(FINEST)[0] / inverse_radii[:, None])
+            deviation = np.sum((facet_points - finest) * normals, axis=1)[finest[:, 2] > 0.0]
             limits[number, detail] = 1.0 / np.sqrt(np.mean(deviation**2))
     return limits
 
@@ -154,16 +155,16 @@ def _load_or_build(name: str, build: Callable[[], Float64[np.ndarray, "..."]]) -
     version = hashlib.sha256(identity.encode()).hexdigest()[:16]
     with suppress(OSError):
         path = cache_directory("terrain") / f"rocks-{name}-{version}.npy"
-        stored = load_array(path)
-        if stored is None:
-            built = build()
-            evict_files(path.parent, built.nbytes)
-            return save_array(path, built)
+        cached_array = load_array(path)
+        if cached_array is None:
+            array = build()
+            evict_files(path.parent, array.nbytes)
+            return save_array(path, array)
         touch(path)
-        return stored
-    built = build()
-    built.setflags(write=False)
-    return built
+        return cached_array
+    array = build()
+    array.setflags(write=False)
+    return array
 
 
 @cache
@@ -185,7 +186,7 @@ def _build_vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
 
 @cache
 def _reach() -> Float64[np.ndarray, "shapes"]:
-    """Compute the maximum horizontal distance from the origin over all levels; fitted corners can exceed the finest."""
+    """Compute the maximum horizontal distance from the origin over all levels; coarse levels can be the widest."""
     levels = [np.hypot(_vertices(k)[..., 0], _vertices(k)[..., 1]).max(axis=1) for k in range(len(SUBDIVISIONS))]
     reach: Float64[np.ndarray, "shapes"] = np.max(levels, axis=0)
     reach.setflags(write=False)
@@ -198,8 +199,8 @@ class _RockShape:
 
     In the shape's axes, before stretching, the distance of the surface from the centre along the unit vector d is
     ``(1 + sum((n_i . d / c_i)**p))**(-1/p) (1 + bumps(d))``, with the normals n_i and distances c_i of the cuts and the
-    sharpness p. For large p this is the minimum over the sphere and all cuts. Bumps are waves; those of clinker are
-    folded, so that they meet in sharp ridges. Vesicles are paraboloids below the surface.
+    sharpness p. For large p this is the minimum distance of the sphere and all cuts. Bumps are waves. The waves of
+    clinker are folded: their absolute values form sharp ridges. Vesicles are paraboloids below the surface.
     """
 
     cut_normals: Float64[np.ndarray, "cuts 3"]
@@ -227,6 +228,7 @@ class _RockShape:
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         waves = rng.standard_normal((sum(_BUMP_WAVES), 3))
         waves *= (np.repeat(_BUMP_WAVENUMBERS, _BUMP_WAVES) / np.linalg.norm(waves, axis=1))[:, None]
+        # n waves of amplitude a have the RMS a sqrt(n / 2)
         bumps = np.repeat(np.array(form.bumps) * np.sqrt(2.0 / np.array(_BUMP_WAVES)), _BUMP_WAVES)
         distances = rng.uniform(*form.cut_distances, cuts)
         if form.bedding:
@@ -234,7 +236,7 @@ class _RockShape:
         sharpest, roundest = form.sharpness
         phases = rng.uniform(0.0, 2.0 * np.pi, sum(_BUMP_WAVES))
         axes = np.array([1.0, rng.uniform(0.65, 0.95), rng.uniform(*form.short_axis_ratios)])
-        buried = float(rng.uniform(*form.buried_fractions))
+        buried_fraction = float(rng.uniform(*form.buried_fractions))
         pits = rng.standard_normal((form.pits, 3))
         return cls(
             cut_normals=normals,
@@ -245,7 +247,7 @@ class _RockShape:
             wave_heights=bumps,
             folded=form.folded,
             axes=axes,
-            buried_fraction=buried,
+            buried_fraction=buried_fraction,
             pit_directions=pits / np.linalg.norm(pits, axis=1, keepdims=True),
             pit_radii=rng.uniform(*_PIT_RADII, form.pits),
         )
@@ -258,31 +260,32 @@ class _RockShape:
     def normals(self, directions: Points) -> Points:
         """Compute outward unit normals by finite differences of the implicit surface ``|x| - r(x / |x|)``."""
 
-        def implicit(points: Points) -> Float64[np.ndarray, "n"]:
+        def surface_function(points: Points) -> Float64[np.ndarray, "n"]:
             length = np.linalg.norm(points, axis=1)
             return np.asarray(length - self.radius(points / length[:, None]))
 
-        # multiplication and division by the axes cancel, except for rounding
+        # the product `* axes / axes` does not move the points; it is part of the rounding of the stored normals
         surface_points = directions * self.radius(directions)[:, None] * self.axes / self.axes
         step = 1e-4
         differences = [
-            implicit(surface_points + offset) - implicit(surface_points - offset) for offset in step * np.eye(3)
+            surface_function(surface_points + offset) - surface_function(surface_points - offset)
+            for offset in step * np.eye(3)
         ]
         gradient = np.stack(differences, axis=1) / (2.0 * step) / (self.axes * self.frame[1])
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
     def radius(self, d: Points) -> Float64[np.ndarray, "n"]:
-        """Compute the distance of the surface along directions, in the shape's own axes."""
+        """Compute the distance of the surface along unit vectors d, in the shape's own axes."""
         inverse_distance = np.maximum(_dot_products(d, self.cut_normals), 0.0) / self.cut_distances
         radius = (1.0 + np.sum(inverse_distance**self.sharpness, axis=1)) ** (-1.0 / self.sharpness)
         phase = _dot_products(d, self.waves) + self.wave_phases
         wave = np.cos(phase)
         if self.folded:
-            # cusps point outwards; mean 0 and mean square 1/2 as without folding
+            # ridges point outwards; like a cosine, the wave has the mean 0 and the mean square 1/2
             wave = (2.0 / np.pi - np.abs(wave)) / np.sqrt(1.0 - 8.0 / np.pi**2)
         radius *= 1.0 + np.sum(self.wave_heights * wave, axis=1)
         if self.pit_radii.size:
-            # approximately (angle / radius)**2; overlapping vesicles: the deepest one
+            # 2 (1 - cos(angle)) is about angle**2; where vesicles overlap, the deepest one counts
             ratio2 = 2.0 * (1.0 - _dot_products(d, self.pit_directions)) / self.pit_radii**2
             radius *= 1.0 - np.max(_PIT_DEPTH * self.pit_radii * np.maximum(1.0 - ratio2, 0.0), axis=1)
         return np.asarray(radius)
@@ -294,7 +297,7 @@ class _RockShape:
 
     @cached_property
     def frame(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-        """Origin on the ground plane, and scale, that convert this shape to a unit shape."""
+        """Origin on the ground plane, and scale along each axis, that convert this shape to a unit shape."""
         points = _icosphere(FINEST)[0] * self.finest_radius[:, None] * self.axes
         lowest, highest = points[:, 2].min(), points[:, 2].max()
         ground = lowest + self.buried_fraction * (highest - lowest)
@@ -325,25 +328,26 @@ def _fitted_inverse_radii(number: int, detail: int) -> Float64[np.ndarray, "corn
     """Fit the inverse radii of a level's corners, so that its triangles approximate the finest shape (least squares).
 
     Along the direction sum(c d) of three corners with directions d and radii r, the distance of the triangle is
-    1 / sum(c / r). The inverse distance is therefore linear in the inverse radii of the corners.
+    1 / sum(c / r). The inverse distance is therefore linear in the inverse radii of the corners. Weights r**4 convert
+    squared errors of the inverse distance, d(1 / r) = -dr / r**2, to squared errors of the distance.
     """
     corners, radius = _corner_weights(detail), _all_shapes()[number].finest_radius
-    weighted = corners.multiply(radius[:, None] ** 4).tocsc()
-    return np.asarray(splu((corners.T @ weighted).tocsc()).solve(weighted.T @ (1.0 / radius)))
+    weighted_corners = corners.multiply(radius[:, None] ** 4).tocsc()
+    return np.asarray(splu((corners.T @ weighted_corners).tocsc()).solve(weighted_corners.T @ (1.0 / radius)))
 
 
 @cache
 def _corner_weights(detail: int) -> csc_matrix:
-    """Compute weights that express each direction of the finest shapes by the corners of the level's triangle there."""
+    """Compute the weights of the corners of a level's triangles whose sum is each direction of the finest shapes."""
     directions, faces = _icosphere(detail)
     finest = _icosphere(FINEST)[0]
     centroids = directions[faces].sum(axis=1)
     # the triangle that contains a direction is among the four triangles with the nearest centroids
-    near = np.argsort(-(finest @ centroids.T), axis=1, kind="stable")[:, :4]
+    candidates = np.argsort(-(finest @ centroids.T), axis=1, kind="stable")[:, :4]
     inverses = np.linalg.inv(directions[faces].transpose(0, 2, 1))
-    weights = np.einsum("nkij,nj->nki", inverses[near], finest)
+    weights = np.einsum("nkij,nj->nki", inverses[candidates], finest)
     rows = np.arange(len(finest))
-    best = np.argmax(weights.min(axis=2), axis=1)
-    corners = faces[near[rows, best]]
+    triangle = np.argmax(weights.min(axis=2), axis=1)
+    corners = faces[candidates[rows, triangle]]
     entries = (np.repeat(rows, 3), corners.ravel())
-    return csc_matrix((weights[rows, best].ravel(), entries), (len(finest), len(directions)))
+    return csc_matrix((weights[rows, triangle].ravel(), entries), (len(finest), len(directions)))

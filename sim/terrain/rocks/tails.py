@@ -25,10 +25,10 @@ class WindTails(Parameters):
     half width times the tangent of the angle of repose, limited to a fraction of the rock's height.
     """
 
-    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth the wind comes from")] = 330.0
-    length_heights: Annotated[Positive, Field(description="median length, heights of the rock; assumed")] = 4.0
+    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth from which the wind blows")] = 330.0
+    length_heights: Annotated[Positive, Field(description="median length in heights of the rock; assumed")] = 4.0
     length_spread: Annotated[NonNegative, Field(description="SD of the logarithm of the length; assumed")] = 0.4
-    height_fraction: Annotated[float, bounded_field(0.0, 1.0, "maximum height, heights of the rock; assumed")] = 0.4
+    height_fraction: Annotated[float, bounded_field(0.0, 1.0, "maximum height in heights of the rock; assumed")] = 0.4
     repose_deg: Annotated[float, Field(ge=5.0, le=36.0, description="slope of the ridge's sides; assumed")] = 20.0
     tone: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of the ridge's albedo over the ground's")] = 0.0
 

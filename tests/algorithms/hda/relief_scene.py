@@ -79,37 +79,37 @@ def make_bumps(*bumps: tuple[float, float, float, float], base: Height | None = 
 def intersect_relief(height: Height, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Intersect rays with the relief: march to the first step below ground, then refine.
 
-    Return points with the shape of `rays`. The distances first, last, low, high and s are along the rays, in metres.
+    Return points with the shape of `rays`. The distances first, last, low, high and distance are along the rays, in
+    metres. The relief must be between the heights -2 m and 3 m.
     """
-    # The relief is between the heights -2 m and 3 m.
     last = (origin[2] + 2.0) / -rays[..., 2]
     first = np.maximum((origin[2] - 3.0) / -rays[..., 2], 0.0)
     steps = 24
     low, high = first.copy(), last.copy()
     has_hit = np.zeros(first.shape, dtype=bool)
     for n in range(1, steps + 1):
-        s = first + (last - first) * n / steps
-        p = origin + s[..., None] * rays
-        is_below = ~has_hit & (p[..., 2] <= height(p[..., 0], p[..., 1]))
-        low = np.where(is_below, s - (last - first) / steps, low)
-        high = np.where(is_below, s, high)
+        distance = first + (last - first) * n / steps
+        points = origin + distance[..., None] * rays
+        is_below = ~has_hit & (points[..., 2] <= height(points[..., 0], points[..., 1]))
+        low = np.where(is_below, distance - (last - first) / steps, low)
+        high = np.where(is_below, distance, high)
         has_hit |= is_below
     # Regula falsi converges fast on smooth relief; every third step is a bisection.
     for n in range(30):
-        a = origin + low[..., None] * rays
-        b = origin + high[..., None] * rays
-        fa = a[..., 2] - height(a[..., 0], a[..., 1])
-        fb = b[..., 2] - height(b[..., 0], b[..., 1])
-        if n % 3 == 2 or np.any(fa == fb):
-            s = 0.5 * (low + high)
+        low_points = origin + low[..., None] * rays
+        high_points = origin + high[..., None] * rays
+        low_residual = low_points[..., 2] - height(low_points[..., 0], low_points[..., 1])
+        high_residual = high_points[..., 2] - height(high_points[..., 0], high_points[..., 1])
+        if n % 3 == 2 or np.any(low_residual == high_residual):
+            distance = 0.5 * (low + high)
         else:
-            s = low + (high - low) * np.clip(fa / (fa - fb), 0.0, 1.0)
-        p = origin + s[..., None] * rays
-        is_above = p[..., 2] > height(p[..., 0], p[..., 1])
-        low, high = np.where(is_above, s, low), np.where(is_above, high, s)
-        if n > 6 and float(np.max(np.abs(p[..., 2] - height(p[..., 0], p[..., 1])))) < 1e-7:
+            distance = low + (high - low) * np.clip(low_residual / (low_residual - high_residual), 0.0, 1.0)
+        points = origin + distance[..., None] * rays
+        is_above = points[..., 2] > height(points[..., 0], points[..., 1])
+        low, high = np.where(is_above, distance, low), np.where(is_above, high, distance)
+        if n > 6 and float(np.max(np.abs(points[..., 2] - height(points[..., 0], points[..., 1])))) < 1e-7:
             break
-    return np.asarray(origin + s[..., None] * rays)
+    return np.asarray(origin + distance[..., None] * rays)
 
 
 @dataclass(frozen=True)

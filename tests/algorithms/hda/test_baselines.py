@@ -58,6 +58,7 @@ def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene) -> No
     tracks = track_features(landing_scene.views[0].counts, landing_scene.views[1].counts, features, features, OPTIONS)
     motion = motion_from_tracks(landing_scene, tracks, OPTIONS)
     scene = make_scene()
+    # The baseline gets its true length.
     motion = motion.scale(
         float(np.linalg.norm(scene.second_from_first.translation))
         / float(np.linalg.norm(motion.second_from_first.translation))

@@ -25,7 +25,7 @@ def test_map_has_one_point_per_cell_on_average() -> None:
     extent = np.ptp(points[:, :2], axis=0)
     # The paper's cell size s = sqrt(A / N), and the number of whole cells that cover the box.
     assert ground.cell_m == pytest.approx(np.sqrt(extent[0] * extent[1] / 600))
-    assert ground.elevation_m.shape == tuple(int(np.ceil(e / ground.cell_m)) for e in extent[::-1])
+    assert ground.elevation_m.shape == tuple(int(np.ceil(side / ground.cell_m)) for side in extent[::-1])
 
 
 def test_cell_positions_and_indices_are_inverse() -> None:

@@ -36,7 +36,7 @@ OPTIONS = HdaOptions(
     max_roughness_m=0.12,
     max_slope_rad=float(np.deg2rad(12.0)),
 )
-#: Boulders in the left half of the image; the ground on the right is clear.
+#: Boulders (x, y, height, standard deviation, metres) in the left half of the image; the right half is clear.
 BOULDERS = ((-1.2, 1.5, 0.35, 0.12), (1.6, 1.6, 0.35, 0.12), (0.3, 0.6, 0.35, 0.12), (-2.0, 0.3, 0.35, 0.12))
 ESTIMATORS: dict[str, Callable[[HdaOptions], SiteEstimator]] = {
     "hda": HdaEstimator,
@@ -149,8 +149,7 @@ def test_too_steep_ground_has_no_safe_site() -> None:
 
 def test_gravity_from_fitted_plane_removes_mean_slope() -> None:
     steep = measure_pass(make_pass((0.3, 0.0), ()))
-    frame = replace(OPTIONS, surface_frame=SurfaceFrame.PLANE)
-    result = HdaEstimator(frame).estimate(steep)
+    result = HdaEstimator(replace(OPTIONS, surface_frame=SurfaceFrame.PLANE)).estimate(steep)
     assert result.outcome is SiteOutcome.SAFE_SITE
     ground = get_ground(result)
     first = get_details(result).views[0]
@@ -159,11 +158,12 @@ def test_gravity_from_fitted_plane_removes_mean_slope() -> None:
     assert np.rad2deg(np.arccos(normal @ np.array([-0.3, 0.0, 1.0]) / np.hypot(0.3, 1.0))) < 0.2
 
 
-def test_gravity_from_inclinometers_or_state(measurements: LandingMeasurements) -> None:
-    tilted = replace(measurements, up_body=Rotation.from_rotvec([0.0, 0.1, 0.0]).apply(measurements.up_body))
+def test_inclinometer_error_changes_slopes_only_if_inclinometers_are_used(measurements: LandingMeasurements) -> None:
+    # The inclinometers have an error of 0.1 rad.
+    inputs = replace(measurements, up_body=Rotation.from_rotvec([0.0, 0.1, 0.0]).apply(measurements.up_body))
     slopes = {}
     for frame in (SurfaceFrame.INCLINOMETER, SurfaceFrame.STATE):
-        result = HdaEstimator(replace(OPTIONS, surface_frame=frame)).estimate(tilted)
+        result = HdaEstimator(replace(OPTIONS, surface_frame=frame)).estimate(inputs)
         slopes[frame] = float(np.nanmedian(get_ground(result).hazards.slope_rad))
     assert slopes[SurfaceFrame.STATE] == pytest.approx(np.arctan(np.hypot(0.03, 0.02)), abs=0.005)
     assert abs(slopes[SurfaceFrame.INCLINOMETER] - slopes[SurfaceFrame.STATE]) > 0.05
@@ -234,10 +234,10 @@ def test_uniform_first_image_has_no_features(name: str, level: int, measurements
 @all_estimators
 @pytest.mark.parametrize("seed", [None, 3])
 def test_unrelated_second_image_has_no_tracks(name: str, seed: int | None, measurements: LandingMeasurements) -> None:
-    unrelated = np.full((240, 320), 1500, dtype=np.uint16)
+    unrelated_image = np.full((240, 320), 1500, dtype=np.uint16)
     if seed is not None:
-        unrelated = np.random.default_rng(seed).integers(0, 4096, (240, 320)).astype(np.uint16)
-    result = ESTIMATORS[name](OPTIONS).estimate(replace_image(measurements, 1, unrelated))
+        unrelated_image = np.random.default_rng(seed).integers(0, 4096, (240, 320)).astype(np.uint16)
+    result = ESTIMATORS[name](OPTIONS).estimate(replace_image(measurements, 1, unrelated_image))
     assert result.outcome is SiteOutcome.NO_TRACKS
     assert is_apriori_site(result, measurements)
 
@@ -258,10 +258,10 @@ def test_pure_rotation_is_reported() -> None:
     rotation = Rotation.from_euler("zyx", [3.0, 2.0, -2.0], degrees=True)
     centre = np.array([0.3, 0.0, -0.1])
     second = first * rigid(rotation, centre - rotation.apply(centre))
-    rotated = measure_pass(Pass(make_pass().height, (first, second)), np.random.default_rng(2))
-    result = HdaEstimator(OPTIONS).estimate(rotated)
+    inputs = measure_pass(Pass(make_pass().height, (first, second)), np.random.default_rng(2))
+    result = HdaEstimator(OPTIONS).estimate(inputs)
     assert result.outcome is SiteOutcome.NO_BASELINE
-    assert is_apriori_site(result, rotated)
+    assert is_apriori_site(result, inputs)
 
 
 def test_independently_moving_blocks_have_no_common_motion(measurements: LandingMeasurements) -> None:
@@ -271,8 +271,8 @@ def test_independently_moving_blocks_have_no_common_motion(measurements: Landing
     second = source.copy()
     for row in range(0, 240, 60):
         for column in range(0, 320, 64):
-            shifted = np.roll(source, rng.integers(-15, 16, 2), axis=(0, 1))
-            second[row : row + 60, column : column + 64] = shifted[row : row + 60, column : column + 64]
+            shifted_image = np.roll(source, rng.integers(-15, 16, 2), axis=(0, 1))
+            second[row : row + 60, column : column + 64] = shifted_image[row : row + 60, column : column + 64]
     result = HdaEstimator(OPTIONS).estimate(replace_image(measurements, 1, second))
     assert result.outcome is SiteOutcome.NO_MOTION
     assert is_apriori_site(result, measurements)
@@ -297,12 +297,12 @@ def test_any_image_returns_an_estimate(name: str, measurements: LandingMeasureme
 
 def test_poses_can_predict_feature_positions(scene: Pass) -> None:
     # A baseline of 1.5 m moves the ground by at least 60 px, beyond the search window without a prediction.
-    wide = Pass(scene.height, (scene.poses[0], make_pose(0.1, -1.5, 10.1, 7.0, 2.0, -1.0)))
-    inputs = measure_pass(wide)
-    seeded = HdaEstimator(replace(OPTIONS, track_seed=TrackSeed.POSE)).estimate(inputs)
-    assert seeded.outcome.converged
-    assert get_motion(seeded).parallax_px > 50.0
-    errors = compute_map_errors(wide, seeded)
+    wide_pass = Pass(scene.height, (scene.poses[0], make_pose(0.1, -1.5, 10.1, 7.0, 2.0, -1.0)))
+    inputs = measure_pass(wide_pass)
+    with_prediction = HdaEstimator(replace(OPTIONS, track_seed=TrackSeed.POSE)).estimate(inputs)
+    assert with_prediction.outcome.converged
+    assert get_motion(with_prediction).parallax_px > 50.0
+    errors = compute_map_errors(wide_pass, with_prediction)
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
     assert not HdaEstimator(OPTIONS).estimate(inputs).outcome.converged
 
@@ -326,8 +326,8 @@ def test_products_contain_figure_data(scene: Pass, measurements: LandingMeasurem
     assert products["grid"].shape == products["segment_ends"].shape == products["matched"].shape
     # Fig. 7 (landing paper): each cell projects to the pixel that shows it.
     row, column = products["site"].astype(int)
-    observed = scene.ground(0, products["map_pixels"][row, column][None])[0]
-    np.testing.assert_allclose(observed[:2], get_site(estimate)[:2], atol=0.05)
+    site_point = scene.ground(0, products["map_pixels"][row, column][None])[0]
+    np.testing.assert_allclose(site_point[:2], get_site(estimate)[:2], atol=0.05)
     # Products of stages that did not run are absent.
     without_range = HdaEstimator(OPTIONS).estimate(replace(measurements, slant_range_m=np.nan))
     assert hda_products(get_details(without_range)) == {}
@@ -341,10 +341,10 @@ def test_map_does_not_depend_on_image_brightness(scene: Pass, measurements: Land
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
 
 
-def test_dropped_frame_repeats_the_first_image(measurements: LandingMeasurements) -> None:
-    # The second image equals the first, but the poses differ.
-    repeated = replace_image(measurements, 1, measurements.images[0].counts)
-    result = HdaEstimator(OPTIONS).estimate(repeated)
+def test_repeated_first_image_has_no_baseline(measurements: LandingMeasurements) -> None:
+    # A dropped frame: the second image equals the first, but the poses differ.
+    inputs = replace_image(measurements, 1, measurements.images[0].counts)
+    result = HdaEstimator(OPTIONS).estimate(inputs)
     assert result.outcome is SiteOutcome.NO_BASELINE
 
 

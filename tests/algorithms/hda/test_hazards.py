@@ -37,8 +37,8 @@ def make_ground(rows: int = 80, columns: int = 100, slope_x: float = 0.0, slope_
 def add_bump(flat: ElevationMap, row: int, column: int, radius: float, height: float) -> ElevationMap:
     """Add a cylinder; its radius is in cells, its height in metres."""
     rows, columns = np.indices(flat.elevation_m.shape)
-    inside = np.hypot(rows - row, columns - column) <= radius
-    return replace(flat, elevation_m=flat.elevation_m + height * inside)
+    is_inside = np.hypot(rows - row, columns - column) <= radius
+    return replace(flat, elevation_m=flat.elevation_m + height * is_inside)
 
 
 @pytest.mark.parametrize("refine", [False, True])
@@ -65,7 +65,7 @@ def test_robust_fit_tolerates_almost_half_outliers() -> None:
     # Close to the breakdown point of 50 %: 45 of 100 points are outliers. The probability that 300 trials contain no
     # inlier triple is 1e-24.
     rng = np.random.default_rng(1)
-    x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(10), np.arange(10)))
+    x, y = (grid.astype(np.float64).ravel() for grid in np.meshgrid(np.arange(10), np.arange(10)))
     z = 3.0 + 0.2 * x - 0.1 * y + rng.normal(0.0, 0.01, 100)
     z[rng.permutation(100)[:45]] += rng.uniform(1.0, 5.0, 45)
     triples = rng.uniform(size=(300, 3))
@@ -81,20 +81,21 @@ def test_robust_fit_tolerates_almost_half_outliers() -> None:
 
 def test_robust_fit_has_least_median_of_tested_triples() -> None:
     rng = np.random.default_rng(2)
-    x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(5), np.arange(5)))
+    x, y = (grid.astype(np.float64).ravel() for grid in np.meshgrid(np.arange(5), np.arange(5)))
     z = rng.normal(size=25)
     triples = rng.uniform(size=(40, 3))
     result = robust_plane(x, y, z, triples, False)
     best = np.inf
     expected = None
-    for u in triples:
-        # Sampling without replacement: the second of 24 indices, then the third of 23.
+    for uniform_numbers in triples:
+        # Sampling without replacement: the first of 25 indices, the second of the other 24, then the third of 23.
         remaining = list(range(25))
-        i, j, k = (remaining.pop(int(u[n] * (25 - n))) for n in range(3))
-        design = np.array([[1.0, x[n], y[n]] for n in (i, j, k)])
+        indices = [remaining.pop(int(number * (25 - n))) for n, number in enumerate(uniform_numbers)]
+        design = np.array([[1.0, x[index], y[index]] for index in indices])
+        # The determinant of whole coordinates is a whole number: 0 if the points are collinear.
         if abs(np.linalg.det(design)) < 0.5:
             continue
-        plane = np.linalg.solve(design, z[[i, j, k]])
+        plane = np.linalg.solve(design, z[indices])
         median = np.sort(np.abs(z - plane[0] - plane[1] * x - plane[2] * y))[25 // 2 + 1]
         if median < best:
             best, expected = median, plane
@@ -104,7 +105,7 @@ def test_robust_fit_has_least_median_of_tested_triples() -> None:
 
 def test_refinement_reduces_noise() -> None:
     rng = np.random.default_rng(3)
-    x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(10), np.arange(10)))
+    x, y = (grid.astype(np.float64).ravel() for grid in np.meshgrid(np.arange(10), np.arange(10)))
     errors = []
     for _ in range(200):
         z = rng.normal(0.0, 1.0, 100)
@@ -269,7 +270,10 @@ SHARP = Resolution(window_m=0.0, noise_m=0.0)
 
 
 def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
-    """The limit uses the mean of the paraboloid 1 - 4 r^2 / D^2 over a centred square window of side w."""
+    """The limit uses the mean of the paraboloid 1 - 4 r^2 / D^2 over a centred square window of side w.
+
+    The base width D is narrowest_hazard x max_roughness_m = 0.4 m, and w is 0.1 m.
+    """
     options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
     x = np.linspace(-0.05, 0.05, 401)
     mean = float(np.mean(1.0 - 4.0 * (x[:, None] ** 2 + x**2) / 0.4**2))
@@ -279,7 +283,7 @@ def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
 
 
 def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
-    """A ridge of 0.3 m height and flanks of 1 m width: no plane over 2 m fits it within 0.1 m."""
+    """A ridge with a slope of 0.3 on both sides: no plane under a footprint on its crest fits within 0.1 m."""
     x = 0.05 * (np.arange(121) - 60)
     ground = ElevationMap(np.tile(-0.3 * np.abs(x), (121, 1)), np.zeros(2), 0.05)
     all_safe = np.full((121, 121), Safety.SAFE, dtype=np.uint8)
@@ -298,8 +302,8 @@ def test_coarse_map_has_no_safe_cells() -> None:
     options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
     coarse = Resolution(window_m=1.0, noise_m=0.0)
     # At the corners most of a footprint is outside the map.
-    inside = (slice(10, 50), slice(10, 50))
-    assert np.all(check_footprints(all_safe, ground, SHARP, options)[inside] == Safety.SAFE)
+    inner = (slice(10, 50), slice(10, 50))
+    assert np.all(check_footprints(all_safe, ground, SHARP, options)[inner] == Safety.SAFE)
     assert np.all(check_footprints(all_safe, ground, coarse, options) == Safety.HAZARD)
 
 

@@ -47,8 +47,8 @@ def test_interest_is_product_of_eigenvalue_excesses(noise: np.ndarray) -> None:
 
 
 def test_two_small_eigenvalues_are_not_a_feature() -> None:
-    # Interest P = (a - l)(c - l) - b^2 for the structure tensor [[a, b], [b, c]] and the threshold l (landing paper,
-    # Eq. 2). P is also positive if both eigenvalues are below l; the condition a > l excludes this case.
+    # The interest is P = (a - l)(c - l) - b^2 for the structure tensor [[a, b], [b, c]] and the threshold l (landing
+    # paper, Eq. 2). P is also positive if both eigenvalues are below l; the condition a > l excludes this case.
     low_contrast = np.random.default_rng(2).integers(0, 3, (60, 60)).astype(np.float32)
     assert not np.any(np.isfinite(eigenvalue_test(low_contrast, 11, 50.0)))
 
@@ -96,8 +96,8 @@ def test_correlation_peak_matches_shared_operators(noise: np.ndarray) -> None:
     template, window = first[40:51, 60:71], second[32:63, 50:77]
     surface = pseudo_normalized_correlation(template, window)
     actual = [
-        [matching.correlation(first, second, 45, 65, 37 + i, 55 + j, 5) for j in range(surface.shape[1])]
-        for i in range(surface.shape[0])
+        [matching.correlation(first, second, 45, 65, 37 + row, 55 + column, 5) for column in range(surface.shape[1])]
+        for row in range(surface.shape[0])
     ]
     np.testing.assert_allclose(actual, surface, atol=1e-6)
     peak = highest_peak(surface)
@@ -106,8 +106,8 @@ def test_correlation_peak_matches_shared_operators(noise: np.ndarray) -> None:
 
 
 def test_biquadratic_peak_is_exact_for_a_quadric() -> None:
-    r, c = np.mgrid[-1.0:2.0, -1.0:2.0]
-    z = 0.9 - 0.3 * (r - 0.2) ** 2 - 0.2 * (c + 0.35) ** 2 - 0.1 * (r - 0.2) * (c + 0.35)
+    row, column = np.mgrid[-1.0:2.0, -1.0:2.0]
+    z = 0.9 - 0.3 * (row - 0.2) ** 2 - 0.2 * (column + 0.35) ** 2 - 0.1 * (row - 0.2) * (column + 0.35)
     np.testing.assert_allclose(matching.fit_biquadratic_peak(z), (0.2, -0.35, 0.9), atol=1e-12)
 
 
@@ -190,9 +190,9 @@ def test_features_leaving_the_image_are_rejected() -> None:
     features = select_features(first, replace(OPTIONS, window_half_px=60))
     true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
     tracks = track_features(first, second, features, features, replace(OPTIONS, window_half_px=60))
-    outside = ~make_camera().in_frame(true_pixels)
-    assert outside.sum() >= 3
-    assert not np.any(tracks.accepted & outside)
+    is_outside = ~make_camera().in_frame(true_pixels)
+    assert is_outside.sum() >= 3
+    assert not np.any(tracks.accepted & is_outside)
 
 
 def test_search_starts_at_predicted_positions() -> None:
@@ -200,12 +200,12 @@ def test_search_starts_at_predicted_positions() -> None:
     first, second = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first, OPTIONS)
     true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
-    inside = np.all((true_pixels > 30) & (true_pixels < np.array([290, 210])), axis=1)
+    is_inside = np.all((true_pixels > 30) & (true_pixels < np.array([290, 210])), axis=1)
     # Features move by at least 70 px: without a prediction they leave the search window.
     unpredicted = track_features(first, second, features, features, OPTIONS)
     predicted = track_features(first, second, features, true_pixels + 9.0, OPTIONS)
-    assert np.mean(np.hypot(*(unpredicted.second - true_pixels).T)[inside] < 1.0) < 0.1
-    assert np.mean(np.hypot(*(predicted.second - true_pixels).T)[inside] < 1.0) > 0.9
+    assert np.mean(np.hypot(*(unpredicted.second - true_pixels).T)[is_inside] < 1.0) < 0.1
+    assert np.mean(np.hypot(*(predicted.second - true_pixels).T)[is_inside] < 1.0) > 0.9
 
 
 def test_tracks_near_boulders_are_correct_or_rejected() -> None:

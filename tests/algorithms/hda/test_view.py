@@ -1,4 +1,4 @@
-"""Tests of radiometric corrections: camera effects are removed from the images."""
+"""Tests of radiometric corrections: frame transfer smear and lens fall-off are removed from the images."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_corrected_counts_match_ideal_image(row_times_s: tuple[float, float]) ->
     # Ideal counts: 4 ms x 4e9 e/s / 4000 e/DN. Each count is rounded twice, and the response is at least 0.65.
     expected = 0.004 * 4e9 / 4000.0 * scene
     assert np.abs(counts - expected).max() < 0.01 * expected.mean()
-    smeared = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
-    max_smear = np.abs(smeared - expected).max() / expected.mean()
+    smeared_counts = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
+    max_smear = np.abs(smeared_counts - expected).max() / expected.mean()
     # The transfer of 240 rows takes 240 x 5 us = 1.2 ms, 30 % of the exposure time; lens fall-off reduces it.
     assert (max_smear > 0.2) == (row_times_s[0] > 0.0)

@@ -88,10 +88,10 @@ class Plane:
 
     def ranges(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Compute the distance along each ray, metres; NaN where the ray misses the front side."""
-        slope = directions @ self.normal
+        cosine = directions @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = ((self.point - origins) @ self.normal) / slope
-        return np.where((slope < 0.0) & (t > 0.0), t, np.nan)
+            distance = ((self.point - origins) @ self.normal) / cosine
+        return np.where((cosine < 0.0) & (distance > 0.0), distance, np.nan)
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,12 @@ class Sphere:
 
     def ranges(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Compute the distance along each ray, metres; NaN where the ray misses."""
+        # |offset + distance direction|**2 = radius**2 is a quadratic equation; the smaller root is the front side
         offset = origins - self.centre
-        b = np.sum(offset * directions, axis=-1)
-        discriminant = b * b - np.sum(offset * offset, axis=-1) + self.radius**2
+        half_linear = np.sum(offset * directions, axis=-1)
+        discriminant = half_linear * half_linear - np.sum(offset * offset, axis=-1) + self.radius**2
         with np.errstate(invalid="ignore"):
-            return np.asarray(-b - np.sqrt(discriminant))
+            return np.asarray(-half_linear - np.sqrt(discriminant))
 
 
 @dataclass(frozen=True)
@@ -130,21 +131,24 @@ class Scene:
     def render_image(
         self, camera: CameraModel, box: PixelBox, noise: np.random.Generator | None = None, noise_dn: float = 8.0
     ) -> MastImage:
-        """Render a part of the frame; each texture wave is averaged over the extent of the central pixel."""
+        """Render a part of the frame; each texture wave is averaged over the extent of the central pixel.
+
+        The average over a parallelogram attenuates a wave by a product of two sinc functions. `noise_dn` is the SD of
+        the noise.
+        """
         u = box.corner[0] + np.arange(box.size[0], dtype=np.float64)
         v = box.corner[1] + np.arange(box.size[1], dtype=np.float64)
         points = self.intersect(camera, np.stack(np.meshgrid(u, v), axis=-1))
         middle = points[box.size[1] // 2, box.size[0] // 2]
-        by_u = points[box.size[1] // 2, box.size[0] // 2 + 1] - middle
-        by_v = points[box.size[1] // 2 + 1, box.size[0] // 2] - middle
-        attenuated = self.texture.amplitudes.copy()
-        for extent in (by_u, by_v):
-            attenuated *= np.sinc(self.texture.vectors @ extent / (2.0 * np.pi))
-        is_relevant = np.abs(attenuated) > 1e-4
-        vectors, phases, amplitudes = (
-            x.astype(np.float32)
-            for x in (self.texture.vectors[is_relevant].T, self.texture.phases[is_relevant], attenuated[is_relevant])
-        )
+        column_step = points[box.size[1] // 2, box.size[0] // 2 + 1] - middle
+        row_step = points[box.size[1] // 2 + 1, box.size[0] // 2] - middle
+        attenuated_amplitudes = self.texture.amplitudes.copy()
+        for extent in (column_step, row_step):
+            attenuated_amplitudes *= np.sinc(self.texture.vectors @ extent / (2.0 * np.pi))
+        is_relevant = np.abs(attenuated_amplitudes) > 1e-4
+        vectors = self.texture.vectors[is_relevant].T.astype(np.float32)
+        phases = self.texture.phases[is_relevant].astype(np.float32)
+        amplitudes = attenuated_amplitudes[is_relevant].astype(np.float32)
         value = np.empty(points.shape[:2])
         for row, offsets in zip(value, (points - self.origin).astype(np.float32), strict=True):
             row[:] = np.cos(offsets @ vectors + phases) @ amplitudes
@@ -165,14 +169,14 @@ def pose(x: float, y: float, heading_rad: float = 0.0, tilt: Rotation | None = N
 class Drive:
     """A rover that tracks a target from stop to stop.
 
-    `mast` is the true mast, `calibrated` the model used by the tracker (default: the true mast). `pointing_error_rad`
+    `mast` is the true mast, `mast_model` the model used by the tracker (default: the true mast). `pointing_error_rad`
     is the true minus the commanded mast angle, for azimuth and elevation.
     """
 
     scene: Scene
     mast: MastCalibration
     tracker: TargetTracker
-    calibrated: MastCalibration | None = None
+    mast_model: MastCalibration | None = None
     noise: np.random.Generator | None = None
     pointing_error_rad: tuple[float, float] = (0.0, 0.0)
     measurements: list[RoverMeasurements] = field(default_factory=list)
@@ -185,16 +189,16 @@ class Drive:
     def stop(self, true_pose: RigidTransform, estimated_pose: RigidTransform | None = None) -> TargetUpdate | None:
         """Aim, capture images at the true pose and update; return None if the tracker has no aim."""
         rover_estimate = true_pose if estimated_pose is None else estimated_pose
-        tracker_mast = self.mast if self.calibrated is None else self.calibrated
+        tracker_mast = self.mast if self.mast_model is None else self.mast_model
         aim = self.tracker.aim(rover_estimate, tracker_mast)
         if aim is None:
             return None
         angles = (aim.azimuth_rad, aim.elevation_rad)
-        actual = (angles[0] + self.pointing_error_rad[0], angles[1] + self.pointing_error_rad[1])
+        true_angles = (angles[0] + self.pointing_error_rad[0], angles[1] + self.pointing_error_rad[1])
         self.measurements.append(
             RoverMeasurements(
-                left=self.scene.render_image(self.camera(true_pose, actual), aim.left, self.noise),
-                right=self.scene.render_image(self.camera(true_pose, actual, right=True), aim.right, self.noise),
+                left=self.scene.render_image(self.camera(true_pose, true_angles), aim.left, self.noise),
+                right=self.scene.render_image(self.camera(true_pose, true_angles, right=True), aim.right, self.noise),
                 mast=tracker_mast,
                 azimuth_rad=angles[0],
                 elevation_rad=angles[1],
@@ -218,7 +222,7 @@ MakeBody = Callable[[int, np.ndarray], Plane | Sphere]
 
 
 def make_face(seed: int, target: np.ndarray) -> Plane:
-    """Create a face through the target with a random tilt, visible to a rover at the origin."""
+    """Create a plane rock face through the target with a random tilt, visible to a rover at the origin."""
     rng = np.random.default_rng(seed)
     normal = np.array([-1.0, rng.uniform(-0.5, 0.5), rng.uniform(0.0, 1.0)])
     return Plane(target, normal / np.linalg.norm(normal))

@@ -33,9 +33,12 @@ def test_ten_pixel_drift_matches_the_paper() -> None:
 
 
 def test_table_1_requires_the_specified_pixel_pitch() -> None:
-    # The text derives 4.69 um from the sensor size, which results in 9.8 and 39.1 cm.
-    designs = [StereoDesign(d.name, d.focal_length_m, 4.8e-3 / 1024, d.baseline_m) for d in (PANCAM, NAVCAM)]
-    assert [accuracy_row(d).designation_cm for d in designs] == [9.8, 39.1]
+    # The text derives a pitch of 4.69 um from the sensor size (4.8 mm / 1024), which results in 9.8 and 39.1 cm.
+    designs = [
+        StereoDesign(design.name, design.focal_length_m, 4.8e-3 / 1024, design.baseline_m)
+        for design in (PANCAM, NAVCAM)
+    ]
+    assert [accuracy_row(design).designation_cm for design in designs] == [9.8, 39.1]
 
 
 def test_errors_scale_with_range_and_focal_length() -> None:

@@ -31,7 +31,7 @@ def draw_pose(rng: np.random.Generator) -> RigidTransform:
 
 
 def draw_targets(seed: int, count: int) -> np.ndarray:
-    """Points on the ground around the rover, 2 to 12 m away, in the rover frame."""
+    """Draw points on the ground around the rover, 2 to 12 m away, in the rover frame."""
     rng = np.random.default_rng(seed)
     azimuth, distance = rng.uniform(-2.5, 2.5, count), rng.uniform(2.0, 12.0, count)
     return np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), rng.uniform(-0.3, 0.5, count)], axis=1)
@@ -93,9 +93,9 @@ def test_rounding_does_not_shift_subframe_borders() -> None:
     aim = aim_at_position(target, navcam(), options)
     assert aim is not None
     for offset_m in (-1e-13, 1e-13, -3e-12, 3e-12):
-        repeated = aim_at_position(target + offset_m, navcam(), options)
-        assert repeated is not None
-        assert (repeated.left, repeated.right) == (aim.left, aim.right)
+        shifted_aim = aim_at_position(target + offset_m, navcam(), options)
+        assert shifted_aim is not None
+        assert (shifted_aim.left, shifted_aim.right) == (aim.left, aim.right)
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
@@ -131,10 +131,10 @@ def test_near_targets_need_pair_centred_pointing() -> None:
 
 def test_mast_limits_are_enforced() -> None:
     geometry = replace(MAST, azimuth_limits_rad=(-0.5, 0.5), elevation_limits_rad=(-0.6, 0.5))
-    limited = replace(navcam(), geometry=geometry)
-    assert mast_angles(np.array([8.0, 1.0, 0.0]), limited) is not None
-    assert mast_angles(np.array([0.0, -8.0, 0.0]), limited) is None  # to the right
-    assert mast_angles(np.array([1.0, 0.0, 0.0]), limited) is None  # at the foot of the mast
+    limited_mast = replace(navcam(), geometry=geometry)
+    assert mast_angles(np.array([8.0, 1.0, 0.0]), limited_mast) is not None
+    assert mast_angles(np.array([0.0, -8.0, 0.0]), limited_mast) is None  # to the right
+    assert mast_angles(np.array([1.0, 0.0, 0.0]), limited_mast) is None  # at the foot of the mast
 
 
 def test_aim_subframes_cover_the_search_windows() -> None:
@@ -179,8 +179,8 @@ def test_magnification_is_the_ratio_of_distances() -> None:
 
 def test_horizontal_axis_follows_skewed_image() -> None:
     h, v = np.array([500.0, -1200.0, 30.0]), np.array([400.0, 0.0, -1200.0])
-    skewed = Cahv(np.zeros(3), np.array([1.0, 0.0, 0.0]), h, v, (1024, 1024))
-    np.testing.assert_allclose(horizontal_axis(skewed), skewed.right, atol=1e-12)
+    skewed_camera = Cahv(np.zeros(3), np.array([1.0, 0.0, 0.0]), h, v, (1024, 1024))
+    np.testing.assert_allclose(horizontal_axis(skewed_camera), skewed_camera.right, atol=1e-12)
     np.testing.assert_allclose(horizontal_axis(navcam().left), navcam().left.right, atol=1e-12)
 
 
@@ -190,9 +190,9 @@ def test_image_roll_is_opposite_to_camera_roll(roll_deg: float) -> None:
     # The head rolls clockwise about its line of sight (+x forward): the image rolls counter-clockwise.
     roll_motion = rigid(Rotation.from_rotvec(np.deg2rad(roll_deg) * camera.a), np.zeros(3))
     target = camera.c + 5.0 * camera.rays(image_centre(camera))[1]
-    observed = roll_points(target, camera, camera, roll_motion.inv(), 0.05)
-    assert observed is not None
-    roll = roll_angle(observed)
+    points = roll_points(target, camera, camera, roll_motion.inv(), 0.05)
+    assert points is not None
+    roll = roll_angle(points)
     # The lens axis is 5 px from the rotation centre: the target moves in the image.
     assert np.degrees(roll) == pytest.approx(-roll_deg, abs=0.3)
 
@@ -210,9 +210,9 @@ def test_passing_a_target_rolls_its_image() -> None:
         assert angles is not None
         heads.append(stop * mast.geometry.rover_from_head(*angles))
     new_from_old = heads[1].inv() * heads[0]
-    observed = roll_points(heads[0].inv().apply(target), mast.left, mast.left, new_from_old, 0.001)
-    assert observed is not None
-    roll = roll_angle(observed)
+    points = roll_points(heads[0].inv().apply(target), mast.left, mast.left, new_from_old, 0.001)
+    assert points is not None
+    roll = roll_angle(points)
     azimuth_change = np.arctan2(0.9, 1.2)  # to the right
     depression = np.arctan2(1.5, np.hypot(0.9, 1.2))
     expected = np.arctan(np.tan(azimuth_change) * np.sin(depression))
@@ -264,10 +264,10 @@ def test_triangulation_inverts_projection(mast: MastCalibration) -> None:
 def test_diverging_lines_of_sight_have_no_range() -> None:
     left, right = navcam().left, navcam().right
     distant_point = np.array([1e3, 0.0, 0.0])
-    a, b = left.project(distant_point)[0], right.project(distant_point)[0]
-    assert triangulate(left, right, a, b) is not None
-    assert triangulate(left, right, a, b + np.array([3.0, 0.0])) is None  # they diverge
-    assert triangulate(left, left, a, a) is None
+    left_pixel, right_pixel = left.project(distant_point)[0], right.project(distant_point)[0]
+    assert triangulate(left, right, left_pixel, right_pixel) is not None
+    assert triangulate(left, right, left_pixel, right_pixel + np.array([3.0, 0.0])) is None  # they diverge
+    assert triangulate(left, left, left_pixel, left_pixel) is None
 
 
 def test_epipolar_curve_points_are_half_a_pixel_apart() -> None:

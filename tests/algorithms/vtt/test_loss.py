@@ -57,14 +57,14 @@ def test_tolerances_match_the_formula() -> None:
 
 def test_tolerances_decrease_with_target_distance() -> None:
     distances = [10.0 * 0.9**i for i in range(16)]
-    allowed = [
+    step_tolerances = [
         tolerances(Distances(10.0, old, new, old - new, 10.0 - new), navcam().left, navcam().right, OPTIONS)
         for old, new in pairwise(distances)
     ]
-    assert np.all(np.diff([a.distance_m for a in allowed]) < 0.0)
-    assert allowed[-1].distance_m < 0.11
+    assert np.all(np.diff([step.distance_m for step in step_tolerances]) < 0.0)
+    assert step_tolerances[-1].distance_m < 0.11
     # The initial designation uncertainty and the rover drift remain: the tolerance is never below either of them.
-    assert min(a.position_m for a in allowed) > 0.409
+    assert min(step.position_m for step in step_tolerances) > 0.409
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
@@ -75,9 +75,9 @@ def test_stereo_noise_rarely_loses_a_target(mast: MastCalibration) -> None:
     scale = mast.left.focal_lengths[0] * np.linalg.norm(mast.left.c - mast.right.c)
     old, new = (scale / (scale / r + rng.normal(0.0, 1.0 / 3.0, 100_000)) for r in (10.0, 9.0))
     correction = new - (old - 1.0 + rng.normal(0.0, 0.2 / 3.0, 100_000))
-    allowed = tolerances(Distances(10.0, 10.0, 9.0, 1.0, 1.0), mast.left, mast.right, OPTIONS)
-    assert np.mean(np.abs(correction) > allowed.distance_m) < 0.003
-    assert np.quantile(np.abs(correction), 0.99) > allowed.distance_m * 0.45  # the tolerance is not much too large
+    tolerance = tolerances(Distances(10.0, 10.0, 9.0, 1.0, 1.0), mast.left, mast.right, OPTIONS)
+    assert np.mean(np.abs(correction) > tolerance.distance_m) < 0.003
+    assert np.quantile(np.abs(correction), 0.99) > tolerance.distance_m * 0.45  # the tolerance is not much too large
 
 
 NORMAL, LOST, FAILURE = TrackingState.NORMAL, TrackingState.LOST, TrackingState.FAILURE
@@ -108,15 +108,15 @@ def test_state_without_target_is_unchanged() -> None:
 
 def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
     target_m, goal = np.array([1.5, 0.0, 0.1]), GoalCriterion(distance_m=1.5, tolerance_m=0.05)
-    tracked = TargetUpdate(NORMAL, (), target_m)
-    handed_over = hand_off(tracked, goal, navcam())
-    assert handed_over.outcome is HandOffOutcome.HANDED_OVER
-    assert handed_over.target is not None
-    np.testing.assert_array_equal(handed_over.target.position_rover, target_m)
+    tracked_target = TargetUpdate(NORMAL, (), target_m)
+    at_goal = hand_off(tracked_target, goal, navcam())
+    assert at_goal.outcome is HandOffOutcome.HANDED_OVER
+    assert at_goal.target is not None
+    np.testing.assert_array_equal(at_goal.target.position_rover, target_m)
     # Eq. 5 of the tracking paper at 1.75 m, from the mast axis at (0.35, 1.4) m: 1.25 cm of stereo error, 0.36 cm of
     # drift.
-    assert handed_over.target.error_m == pytest.approx(np.hypot(1.735**2 / 244.5, 2.5 * 1.735 / 1222.5), rel=0.01)
-    lost = hand_off(TargetUpdate(LOST, (TargetLoss.LOW_MATCH_SCORE,), target_m), goal, navcam())
-    assert (lost.outcome, lost.target) == (HandOffOutcome.NOT_TRACKED, None)
+    assert at_goal.target.error_m == pytest.approx(np.hypot(1.735**2 / 244.5, 2.5 * 1.735 / 1222.5), rel=0.01)
+    lost_target = hand_off(TargetUpdate(LOST, (TargetLoss.LOW_MATCH_SCORE,), target_m), goal, navcam())
+    assert (lost_target.outcome, lost_target.target) == (HandOffOutcome.NOT_TRACKED, None)
     away_from_goal = hand_off(TargetUpdate(NORMAL, (), np.array([1.6, 0.0, 0.1])), goal, navcam())
     assert (away_from_goal.outcome, away_from_goal.target) == (HandOffOutcome.NOT_AT_GOAL, None)

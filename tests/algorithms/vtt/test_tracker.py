@@ -59,8 +59,8 @@ def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_bod
             assert change is not None
             # The pose predicts the magnification, stereo measures it. 0.1 px of disparity changes the range by 0.4 %
             # at 10 m.
-            measured = get_details(previous).distance_m / get_details(current).distance_m
-            assert change.magnification == pytest.approx(measured, abs=0.012)
+            range_ratio = get_details(previous).distance_m / get_details(current).distance_m
+            assert change.magnification == pytest.approx(range_ratio, abs=0.012)
     assert np.sqrt(np.mean(np.sum(np.square(drifts), axis=1))) < 1.0
     assert np.max(np.linalg.norm(drifts, axis=1)) < 2.5
 
@@ -99,12 +99,13 @@ def test_track_drifts_without_subpixel_matching() -> None:
 def test_scaling_allows_larger_steps_than_pure_ncc() -> None:
     target = np.array([10.0, 0.1, 0.2])
     scene = make_scene(make_face(2, target), target, 2)
-    scaled = drive_to_target(Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW)), target, 0.23)
-    assert scaled[-1][1].found
-    assert get_details(scaled[-1][1]).distance_m < 2.05
-    pure = drive_to_target(Drive(scene, navcam(), VisualTargetTracker(replace(PURE_NCC, search_px=101))), target, 0.23)
-    assert pure[-1][1].state is TrackingState.LOST
-    assert TargetLoss.LOW_MATCH_SCORE in pure[-1][1].losses
+    scaled_stops = drive_to_target(Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW)), target, 0.23)
+    assert scaled_stops[-1][1].found
+    assert get_details(scaled_stops[-1][1]).distance_m < 2.05
+    ncc_tracker = VisualTargetTracker(replace(PURE_NCC, search_px=101))
+    ncc_stops = drive_to_target(Drive(scene, navcam(), ncc_tracker), target, 0.23)
+    assert ncc_stops[-1][1].state is TrackingState.LOST
+    assert TargetLoss.LOW_MATCH_SCORE in ncc_stops[-1][1].losses
 
 
 @pytest.mark.parametrize("roll", [True, False])
@@ -154,7 +155,8 @@ def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
     for step in (2.0, 8.0, 15.0):
         drive = Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW))
         first, second = (
-            pose(4.0 - 4.0 * np.cos(a), -4.0 * np.sin(a), a) for a in (np.deg2rad(-0.5 * step), np.deg2rad(0.5 * step))
+            pose(4.0 - 4.0 * np.cos(angle), -4.0 * np.sin(angle), angle)
+            for angle in (np.deg2rad(-0.5 * step), np.deg2rad(0.5 * step))
         )
         drive.tracker.designate(RoverTarget(first.inv().apply(target)), first)
         drive.stop(first)
@@ -278,7 +280,7 @@ def test_point_stereo_tolerates_two_pixel_misalignment(row_offset_px: float, is_
     assert isinstance(mast.right, Cahvor)
     misaligned = replace(mast, right=replace(mast.right, v=mast.right.v + row_offset_px * mast.right.a))
     drive = Drive(
-        make_scene(make_face(5, target), target, 5), mast, VisualTargetTracker(SMALL_WINDOW), calibrated=misaligned
+        make_scene(make_face(5, target), target, 5), mast, VisualTargetTracker(SMALL_WINDOW), mast_model=misaligned
     )
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0))
@@ -312,7 +314,7 @@ def test_detector_noise_has_little_effect() -> None:
     assert np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)) < 1.0
 
 
-# ----- another tracker with the same protocol -----
+# ----- another tracker with the same interface -----
 
 
 def test_lucas_kanade_tracks_in_the_same_loop() -> None:
@@ -347,7 +349,7 @@ def test_invalid_options_are_rejected(invalid: dict[str, object]) -> None:
 
 
 def hide_behind_board(scene: Scene) -> Scene:
-    """The scene behind a board with another texture, half-way to the target."""
+    """Return a scene that contains only a board with another texture, half-way to the target."""
     board = Plane(np.array([3.0, 0.0, 0.5]), np.array([-1.0, 0.0, 0.0]))
     return Scene((board,), draw_waves(99, count=100), board.point)
 
@@ -383,9 +385,9 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
     assert states == expected
     if states[-1] is TrackingState.FAILURE:
         drive.scene = clear_scene
-        repeated = drive.stop(pose(1.0, 0.0))
-        assert repeated is not None
-        assert (repeated.state, repeated.losses, repeated.found) == (TrackingState.FAILURE, (), False)
+        later_update = drive.stop(pose(1.0, 0.0))
+        assert later_update is not None
+        assert (later_update.state, later_update.losses, later_update.found) == (TrackingState.FAILURE, (), False)
     tracker.clear()
     assert tracker.state is TrackingState.NO_TARGET
     assert tracker.aim(pose(0.0, 0.0), navcam()) is None

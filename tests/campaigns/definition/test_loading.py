@@ -21,9 +21,9 @@ FAKE = "tests.campaigns.fake_scenario"
 
 def load_and_expect_error(path: Path | str, *overrides: str, cases: int | None = None, seed: int | None = None) -> str:
     """Return the message of the error that loading the campaign raises."""
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         load_campaign(str(path), overrides, cases, seed)
-    return str(raised.value)
+    return str(error.value)
 
 
 def test_omitted_parameters_get_their_defaults(campaign_file: CampaignFile) -> None:
@@ -160,9 +160,9 @@ def test_all_problems_are_listed_together(campaign_file: CampaignFile) -> None:
     path = campaign_file(
         "altitude_m = -1\nwnd = 3", extra_tables="[retain]\nshowcase = 'best'", dispersions="[dispersions]\nkind = 3"
     )
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         load_campaign(str(path), [], cases=0)
-    keys = {problem.key for problem in raised.value.problems}
+    keys = {problem.key for problem in error.value.problems}
     assert keys == {"cases", "parameters.altitude_m", "parameters.wnd", "retain.showcase", "dispersions.kind"}
 
 
@@ -210,9 +210,10 @@ def test_overrides_replace_values_and_dispersions(campaign_file: CampaignFile) -
     assert configuration.parameters["heights_m"] == [3.0, 4.5]
     # setting a parameter removes its dispersion
     assert set(configuration.dispersions) == {"terrain"}
-    changed = load_campaign(path, ['dispersions."wind.east_m_s".low=-5', "cases=3", "parameters.kind=x"]).configuration
-    assert changed.dispersions["wind.east_m_s"].quantile(1e-9) == pytest.approx(-5.0)
-    assert changed.cases == 3
+    overrides = ['dispersions."wind.east_m_s".low=-5', "cases=3", "parameters.kind=x"]
+    changed_configuration = load_campaign(path, overrides).configuration
+    assert changed_configuration.dispersions["wind.east_m_s"].quantile(1e-9) == pytest.approx(-5.0)
+    assert changed_configuration.cases == 3
 
 
 @pytest.mark.parametrize(

@@ -51,10 +51,10 @@ def test_misspelt_columns_are_reported_before_terrain_is_built(
     prepared_inputs: list[int] = []
     monkeypatch.setattr(DescentScenario, "prepare", lambda _, __, number: prepared_inputs.append(number))
     path = _write_campaign(tmp_path, metric, population, bound)
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         load_campaign(str(path))
-    assert f"requirements[0].{key}" in str(raised.value)
-    assert hint in str(raised.value)
+    assert f"requirements[0].{key}" in str(error.value)
+    assert hint in str(error.value)
     result = CliRunner().invoke(app, ["run", str(path), "-n", "1", "--jobs", "1", "--out", str(tmp_path / "run")])
     assert result.exit_code == 2
     assert hint in result.output

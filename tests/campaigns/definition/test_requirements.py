@@ -72,9 +72,9 @@ def test_campaign_may_change_population_and_confidence(tmp_path: Path) -> None:
 )
 def test_unknown_id_and_changed_bound_are_reported(tmp_path: Path, entry: str, message: str) -> None:
     path = write_campaign(tmp_path, requirement=f"[[requirements]]\n{entry}\n")
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         load_campaign(str(path))
-    assert message in str(raised.value)
+    assert message in str(error.value)
 
 
 ENTRY = (
@@ -102,9 +102,9 @@ def test_campaign_patterns_select_requirements(tmp_path: Path) -> None:
 def test_invalid_requirement_file_is_rejected(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "requirements.toml"
     path.write_text(text)
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         read_requirements(path)
-    assert message in str(raised.value)
+    assert message in str(error.value)
 
 
 def test_missing_file_is_reported(tmp_path: Path) -> None:

@@ -218,8 +218,8 @@ def test_used_memory_counts_only_private_pages(tmp_path: Path) -> None:
     # objects of earlier tests must not be released during the measurement
     gc.collect()
     initial_memory = used_memory([os.getpid()])
-    mapped = np.memmap(tmp_path / "terrain", dtype=np.uint8, mode="w+", shape=size)
-    mapped[:] = 1
+    mapped_file = np.memmap(tmp_path / "terrain", dtype=np.uint8, mode="w+", shape=size)
+    mapped_file[:] = 1
     memory_with_map = used_memory([os.getpid()])
     assert memory_with_map - initial_memory < 0.5 * size
     # not an array: NumPy could reuse memory that is already counted
@@ -241,16 +241,16 @@ def test_batches_last_about_one_second_and_shrink_at_the_end() -> None:
     assert max(sizes) == 20
     assert sizes[-1] == 1
     # batches of empty cases reach the maximum size; slow cases run one by one
-    empty = Batches(range(10_000), None, 2)
-    sizes = [len(empty.next())]
-    while batch := empty.next():
-        empty.record_time(sizes[-1], 0.0)
+    empty_cases = Batches(range(10_000), None, 2)
+    sizes = [len(empty_cases.next())]
+    while batch := empty_cases.next():
+        empty_cases.record_time(sizes[-1], 0.0)
         sizes.append(len(batch))
     assert max(sizes) == MAX_BATCH
-    slow = Batches(range(5), 5, 1)
-    slow.record_time(1, 30.0)
-    assert [len(slow.next()) for _ in range(5)] == [1] * 5
-    assert slow.next() == []
+    slow_cases = Batches(range(5), 5, 1)
+    slow_cases.record_time(1, 30.0)
+    assert [len(slow_cases.next()) for _ in range(5)] == [1] * 5
+    assert slow_cases.next() == []
 
 
 def test_status_board_shows_item_and_start(tmp_path: Path) -> None:

@@ -64,16 +64,16 @@ def test_run_killed_before_its_record_can_be_restarted(
 def test_record_with_wrong_types_is_rejected(
     failing_campaign: Path, tmp_path: Path, key: str, value: Any, message: str
 ) -> None:
-    stored = json.loads((failing_campaign / "campaign.json").read_text())
-    (tmp_path / "campaign.json").write_text(json.dumps({**stored, key: value}))
+    stored_record = json.loads((failing_campaign / "campaign.json").read_text())
+    (tmp_path / "campaign.json").write_text(json.dumps({**stored_record, key: value}))
     with pytest.raises(StoreError, match=message):
         record.read(tmp_path)
 
 
 def test_record_with_missing_key_is_rejected(failing_campaign: Path, tmp_path: Path) -> None:
-    stored = json.loads((failing_campaign / "campaign.json").read_text())
-    del stored["sessions"]
-    (tmp_path / "campaign.json").write_text(json.dumps(stored))
+    stored_record = json.loads((failing_campaign / "campaign.json").read_text())
+    del stored_record["sessions"]
+    (tmp_path / "campaign.json").write_text(json.dumps(stored_record))
     with pytest.raises(StoreError, match="damaged: it has no sessions"):
         record.read(tmp_path)
 
@@ -84,9 +84,9 @@ def test_record_with_missing_key_is_rejected(failing_campaign: Path, tmp_path: P
 def test_stored_parameters_with_wrong_types_are_rejected(
     failing_campaign: Path, tmp_path: Path, command: Callable[[Path], Any]
 ) -> None:
-    stored = json.loads((failing_campaign / "campaign.json").read_text())
-    stored["configuration"]["parameters"] = {"altitude_m": [1], "wind": 3}
-    (tmp_path / "campaign.json").write_text(json.dumps(stored))
+    stored_record = json.loads((failing_campaign / "campaign.json").read_text())
+    stored_record["configuration"]["parameters"] = {"altitude_m": [1], "wind": 3}
+    (tmp_path / "campaign.json").write_text(json.dumps(stored_record))
     shutil.copy(failing_campaign / ROWS_FILE, tmp_path)
     with pytest.raises(ConfigurationError, match=r"parameters\.altitude_m"):
         command(tmp_path)
@@ -136,9 +136,9 @@ def test_full_disk_is_reported_without_traceback(capsys: pytest.CaptureFixture[s
     def command() -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "somewhere")
 
-    with pytest.raises(typer.Exit) as raised:
+    with pytest.raises(typer.Exit) as error:
         command()
-    assert raised.value.exit_code == 2
+    assert error.value.exit_code == 2
     assert capsys.readouterr().err == "error: [Errno 28] No space left on device: 'somewhere'\n"
 
 

@@ -44,9 +44,9 @@ def test_campaign_with_failing_cases_finishes(
     for case in (0, 1, 2, 4, 7, 8, 9, 10, 11):
         assert differing_columns(rows[case], rows_without_faults[case]) == ()
     for case in (3, 5, 7):
-        replayed = replay(failing_campaign, case)
-        assert replayed.stored is not None
-        assert replayed.differing == ()
+        replay_result = replay(failing_campaign, case)
+        assert replay_result.stored is not None
+        assert replay_result.differing == ()
     assert watch.notes == []
 
 
@@ -65,15 +65,15 @@ def test_table_has_column_types_and_nan_values(failing_campaign: Path) -> None:
 
 
 def test_record_describes_the_run(failing_campaign: Path) -> None:
-    stored = record.read(failing_campaign)
-    assert (stored["schema"], stored["state"], stored["exit_code"]) == (1, "finished", None)
-    assert (stored["cases_finished"], stored["cases_crashed"], stored["seed"]) == (12, 3, 5)
-    assert stored["configuration"]["parameters"]["lowest_altitude_m"] == 0.0
-    assert stored["configuration"]["dispersions"]["wind.east_m_s"]["source"] == "test"
-    assert stored["requirements"][0]["population"] == "all"
-    assert stored["versions"]["numpy"] == np.__version__
-    assert {"python", "platform", "processor", "processor_features"} <= set(stored["environment"])
-    assert stored["started_utc"] <= stored["finished_utc"]
+    stored_record = record.read(failing_campaign)
+    assert (stored_record["schema"], stored_record["state"], stored_record["exit_code"]) == (1, "finished", None)
+    assert (stored_record["cases_finished"], stored_record["cases_crashed"], stored_record["seed"]) == (12, 3, 5)
+    assert stored_record["configuration"]["parameters"]["lowest_altitude_m"] == 0.0
+    assert stored_record["configuration"]["dispersions"]["wind.east_m_s"]["source"] == "test"
+    assert stored_record["requirements"][0]["population"] == "all"
+    assert stored_record["versions"]["numpy"] == np.__version__
+    assert {"python", "platform", "processor", "processor_features"} <= set(stored_record["environment"])
+    assert stored_record["started_utc"] <= stored_record["finished_utc"]
     files = ["campaign.json", "campaign.lock", "cases", "cases.parquet", "cases.sqlite"]
     assert sorted(path.name for path in failing_campaign.iterdir()) == files
 
@@ -119,9 +119,9 @@ def test_unknown_metric_stops_the_campaign_after_one_case(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     requirement = "[[requirements]]\nid='a'\nmetric='velocity_eror_m_s'\nbound=1\nprobability=0.9\nconfidence=0.9"
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         run(campaign_file(requirement=requirement), tmp_path / "run", watch, jobs=1)
-    assert "unknown column of numbers 'velocity_eror_m_s' (did you mean 'velocity_error_m_s'?)" in str(raised.value)
+    assert "unknown column of numbers 'velocity_eror_m_s' (did you mean 'velocity_error_m_s'?)" in str(error.value)
     assert record.read(tmp_path / "run")["state"] == "interrupted"
     refresh_table(tmp_path / "run")
     assert len(read_case_rows(tmp_path / "run")) == 1

@@ -1,4 +1,4 @@
-"""Tests that cases with invalid rows or closed files are recorded as crashed, with reason and conditions."""
+"""Tests of cases with invalid rows or closed files: they are recorded as crashed, with reason and conditions."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ def test_conditions_of_crashed_cases_are_stored(rows: list[Any]) -> None:
 
 
 def test_crashed_cases_count_as_failures_of_their_population(hostile_campaign: Path) -> None:
-    stored = read_run(hostile_campaign)
-    (verdict,) = evaluate_requirements(stored.frame, stored.requirements)
+    stored_run = read_run(hostile_campaign)
+    (verdict,) = evaluate_requirements(stored_run.frame, stored_run.requirements)
     assert (verdict.status, verdict.n, verdict.failures) == (Status.FAIL, 24, 2 * len(REASONS))
 
 

@@ -73,9 +73,9 @@ def test_changed_input_file_is_detected(finished_campaign: Path, table: Path, wa
 def test_missing_input_hashes_are_added_when_a_campaign_continues(
     finished_campaign: Path, table: Path, watch: RecordingWatch
 ) -> None:
-    stored = json.loads((finished_campaign / "campaign.json").read_text())
-    del stored["identity"]["inputs"]
-    (finished_campaign / "campaign.json").write_text(json.dumps(stored))
+    stored_record = json.loads((finished_campaign / "campaign.json").read_text())
+    del stored_record["identity"]["inputs"]
+    (finished_campaign / "campaign.json").write_text(json.dumps(stored_record))
     append_cases(finished_campaign, 1, ExecutorConfig(1), watch)
     assert any("table.csv" in note and "no hash is stored" in note for note in watch.notes)
     assert record.read(finished_campaign)["identity"]["inputs"]
@@ -109,9 +109,9 @@ def test_terrain_camera_and_datasheet_belong_to_the_identity(tmp_path: Path) -> 
     np.savez(files["site.npz"], dem=rng.normal(size=(64, 64)), dem_gsd=4.0)
     files["cam.cahv"].write_text(CAMERA.replace("1200", "1201"))
     files["sensor.toml"].write_text(DATASHEET.replace("25.0", "26.0"))
-    changed = initial_identity.differences(create_identity(configuration))
+    differences = initial_identity.differences(create_identity(configuration))
     # each difference starts with the path of the file
-    assert [line.split(" ")[0] for line in changed] == sorted(str(path) for path in files.values())
+    assert [line.split(" ")[0] for line in differences] == sorted(str(path) for path in files.values())
     # the campaign stores the content of the camera file and datasheet, so these files may be deleted
     files["cam.cahv"].unlink()
     files["sensor.toml"].unlink()

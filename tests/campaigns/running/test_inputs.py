@@ -105,10 +105,11 @@ def test_used_inputs_are_shared_inputs_of_the_campaign(name: str) -> None:
     campaign = load_campaign(name)
     all_inputs = campaign.scenario.shared_inputs(campaign.base_parameters())
     assert isinstance(campaign.scenario, SelectsInputs)
-    used = find_used_inputs(campaign, range(3))
-    assert set(used) <= set(all_inputs)
-    assert not all_inputs or used
-    assert all(campaign.scenario.missing_bytes(campaign.base_parameters(), shared_input) >= 0 for shared_input in used)
+    used_inputs = find_used_inputs(campaign, range(3))
+    assert set(used_inputs) <= set(all_inputs)
+    assert not all_inputs or used_inputs
+    parameters = campaign.base_parameters()
+    assert all(campaign.scenario.missing_bytes(parameters, shared_input) >= 0 for shared_input in used_inputs)
 
 
 def test_every_scenario_with_shared_inputs_selects_them() -> None:

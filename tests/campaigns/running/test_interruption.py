@@ -66,10 +66,10 @@ def test_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp_pa
     assert process.returncode == 130
     assert re.search(rb"interrupted; the rows so far are in \S+ \(\d+ of 500\)\. To continue: marsyard resume ", errors)
     assert b"Traceback" not in errors
-    stored = record.read(tmp_path / "run")
-    assert stored["state"] == "interrupted"
+    stored_record = record.read(tmp_path / "run")
+    assert stored_record["state"] == "interrupted"
     refresh_table(tmp_path / "run")
-    assert 0 < stored["cases_finished"] == len(read_case_rows(tmp_path / "run")) < 500
+    assert 0 < stored_record["cases_finished"] == len(read_case_rows(tmp_path / "run")) < 500
     assert (tmp_path / "run" / "cases.sqlite").exists()
     assert len(workers) == 2
     assert all(map(_has_ended, workers))
@@ -193,8 +193,9 @@ def test_hostile_cases_do_not_affect_other_cases(
     assert outcomes == expected
     for row, expected_row in zip(rows, read_case_rows(failing_campaign), strict=True):
         assert row["case"] in (*expected, 3, 5, 6) or differing_columns(row, expected_row) == ()
-    stored = record.read(tmp_path / "hostile")
-    assert (stored["state"], stored["cases_finished"], stored["cases_crashed"]) == ("finished", 12, 6)
+    stored_record = record.read(tmp_path / "hostile")
+    assert stored_record["state"] == "finished"
+    assert (stored_record["cases_finished"], stored_record["cases_crashed"]) == (12, 6)
     # each failed case has an error and a trace; case 4 exits without a trace
     assert all(rows[case]["error"] and "fake_scenario.py" in rows[case]["traceback"] for case in expected if case != 4)
     # only the case that timed out runs again
@@ -207,32 +208,32 @@ def test_hostile_cases_do_not_affect_other_cases(
 
 
 def _kill_and_resume(path: Path, directory: Path, cases: int, n_kills: int, rng: np.random.Generator) -> int:
-    """Kill and resume a campaign at random times; return how often it was still running when it was killed."""
+    """Kill and resume a campaign at random times; return the number of kills of a running campaign."""
     program = [sys.executable, "-m", "marsyard"]
     command = [*program, "run", str(path), "--jobs", "2", "-n", str(cases), "--out", str(directory)]
     command += ["--set", "retain.showcase=none"]
-    n_killed = 0
+    n_running = 0
     for _ in range(n_kills):
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
         while process.poll() is None and not (directory / "campaign.json").exists():
             time.sleep(0.02)
         time.sleep(rng.uniform(0.3, 3.0))
-        n_killed += process.poll() is None
+        n_running += process.poll() is None
         process.kill()
         process.communicate()
         command = [*program, "resume", str(directory), "--jobs", "2", "--allow-changed"]
     result = subprocess.run(command, capture_output=True, text=True)
     # exit code 3: no verdict on requirements
     assert result.returncode in (0, 3), result.stderr
-    return n_killed
+    return n_running
 
 
 def test_resumed_campaign_has_the_same_rows(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     path = campaign_file("sleep_s = 0.02", requirement="")
     assert _kill_and_resume(path, tmp_path / "killed", 150, 2, np.random.default_rng(8)) >= 1
-    uninterrupted = read_case_rows(run(path, tmp_path / "run", watch, "cases=150", "retain.showcase=none"))
-    resumed = read_case_rows(tmp_path / "killed")
-    assert [differing_columns(*pair) for pair in zip(resumed, uninterrupted, strict=True)] == [()] * 150
+    expected_rows = read_case_rows(run(path, tmp_path / "run", watch, "cases=150", "retain.showcase=none"))
+    resumed_rows = read_case_rows(tmp_path / "killed")
+    assert [differing_columns(*pair) for pair in zip(resumed_rows, expected_rows, strict=True)] == [()] * 150
     first, *later = record.read(tmp_path / "killed")["sessions"]
     assert first["command"] == "run"
     assert {session["command"] for session in later} == {"resume"}

@@ -84,8 +84,9 @@ def write_answers(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
 
 def test_external_answers_are_scored_as_in_a_normal_run(export: ExportFolders, tmp_path: Path) -> None:
     watch = RecordingWatch()
-    scored = create_scoring_campaign(*export, write_answers(tmp_path / "external.csv", estimate_exported_cases(export)))
-    run_campaign(scored, tmp_path / "scored", ExecutorConfig(1), watch)
+    answers = write_answers(tmp_path / "external.csv", estimate_exported_cases(export))
+    scoring_campaign = create_scoring_campaign(*export, answers)
+    run_campaign(scoring_campaign, tmp_path / "scored", ExecutorConfig(1), watch)
     normal_campaign = load_campaign(str(export.directory.parent / "fake.toml"))
     run_campaign(normal_campaign, tmp_path / "normal", ExecutorConfig(1), watch)
     for row, normal_row in zip(read_case_rows(tmp_path / "scored"), read_case_rows(tmp_path / "normal"), strict=True):

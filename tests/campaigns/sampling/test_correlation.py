@@ -18,7 +18,7 @@ from marsyard.campaigns.sampling.design import Correlation
 CampaignFile = Callable[..., Path]
 N_CASES = 4000
 TOP_LEVEL_KEYS = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
-#: Tolerance in standard errors: a correct sampler exceeds it for one of 16,000 seeds (normal, two-sided).
+#: Tolerance in standard errors: a correct sampler exceeds it for one of 16,000 seeds (normal distribution, two-sided).
 MAX_STANDARD_ERRORS = 4.0
 
 #: Three correlated parameters of different distributions, and one outside the group.
@@ -56,7 +56,7 @@ def draw_table(campaign: Campaign, cases: int = N_CASES) -> np.ndarray:
 
 
 def rank_standard_error(rank: float, cases: int) -> float:
-    """Standard error of Spearman's coefficient: sqrt((1 + r^2 / 2) / (n - 3)) (1 - r^2), an upper bound.
+    """Compute an upper bound of the standard error of Spearman's coefficient: sqrt((1 + r^2 / 2) / (n - 3)) (1 - r^2).
 
     Fisher's z of Pearson's coefficient has variance 1 / (n - 3) for normal numbers. The variance for Spearman's
     coefficient is (1 + r^2 / 2) times as large (Bonett & Wright 2000, Psychometrika 65, 23-28); dr/dz = 1 - r^2.
@@ -106,20 +106,21 @@ def test_correlated_parameters_have_their_marginal_distributions(campaign_file: 
 def test_normal_groups_have_the_specified_covariance(
     campaign_file: CampaignFile, east: str, north: str, matrix: str
 ) -> None:
-    """Whitened draws are independent standard normal numbers (Kolmogorov-Smirnov tests)."""
+    """Draws multiplied by the inverse Cholesky factor are independent standard normal numbers (whitening)."""
     draws = draw_table(load_correlated(campaign_file, NORMAL.format(east=east, north=north, matrix=matrix)))
     covariance = np.array([[4.0, -4.5], [-4.5, 9.0]])
-    whitened = np.linalg.solve(np.linalg.cholesky(covariance), (draws - [1.0, -2.0]).T)
-    for row in (*whitened, (whitened[0] + whitened[1]) / np.sqrt(2), (whitened[0] - whitened[1]) / np.sqrt(2)):
+    whitened_draws = np.linalg.solve(np.linalg.cholesky(covariance), (draws - [1.0, -2.0]).T)
+    first, second = whitened_draws
+    for row in (first, second, (first + second) / np.sqrt(2), (first - second) / np.sqrt(2)):
         assert stats.kstest(row, stats.norm.cdf).pvalue > 1e-3
-    assert stats.kstest((whitened**2).sum(axis=0), stats.chi2(2).cdf).pvalue > 1e-3
+    assert stats.kstest((whitened_draws**2).sum(axis=0), stats.chi2(2).cdf).pvalue > 1e-3
     # Wishart distribution: the variance of an entry s_ij is (c_ij^2 + c_ii c_jj) / (n - 1)
     variances = np.diag(covariance)
     standard_error = np.sqrt((covariance**2 + np.outer(variances, variances)) / (N_CASES - 1))
     assert np.all(np.abs(np.cov(draws.T) - covariance) < MAX_STANDARD_ERRORS * standard_error)
 
 
-def test_normal_correlation_gives_the_rank_correlation() -> None:
+def test_normal_correlation_has_the_specified_rank_correlation() -> None:
     """Compare 2 sin(pi/6 rho_s) with Spearman's coefficient of a bivariate normal by quadrature."""
     group = Correlation(parameters=("a", "b"), rank=((1.0, 0.4), (0.4, 1.0)))
     rho = group.normal_correlation[0, 1]
@@ -166,9 +167,9 @@ def test_overridden_parameter_is_removed_from_its_group(campaign_file: CampaignF
     ],
 )
 def test_invalid_correlations_are_rejected(matrices: dict[str, object], message: str) -> None:
-    with pytest.raises(ValidationError) as raised:
+    with pytest.raises(ValidationError) as error:
         Correlation.model_validate({"parameters": ["a", "b"], **matrices})
-    assert message in str(raised.value)
+    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -187,6 +188,6 @@ def test_invalid_correlations_are_rejected(matrices: dict[str, object], message:
     ],
 )
 def test_invalid_groups_are_rejected(campaign_file: CampaignFile, dispersions: str, message: str) -> None:
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         load_campaign(str(campaign_file(dispersions=dispersions)))
-    assert message in str(raised.value)
+    assert message in str(error.value)

@@ -88,7 +88,7 @@ def test_latin_hypercube_columns_are_uncorrelated(campaign_file: CampaignFile) -
 
 
 def test_sobol_design_is_a_digital_net(campaign_file: CampaignFile) -> None:
-    """The first two dimensions of 2^m points have one point per elementary interval of volume 2^-m (t = 0)."""
+    """In the first two dimensions, 2^8 points have one point per elementary interval of volume 2^-8."""
     points = read_probabilities(load_design(campaign_file, "sobol", 256), range(256))[:, :2]
     for exponent in range(9):
         intervals = np.floor(points * [2**exponent, 2 ** (8 - exponent)]).astype(int)
@@ -123,7 +123,7 @@ def test_single_case_equals_case_of_full_design(campaign_file: CampaignFile, kin
 def test_added_dispersion_does_not_change_other_draws(
     campaign_file: CampaignFile, kind: str, name: str, case: int
 ) -> None:
-    """The position in the file is arbitrary; in a Sobol design the new dispersion must be the last."""
+    """The new dispersion can be anywhere in the file, except in a Sobol design, where it must be the last."""
     other_dispersions = DISPERSIONS.replace('"wind.east_m_s" = {distribution = "uniform", low = 0, high = 1}', "")
     entry = f'"{name}" = {{distribution = "uniform", low = 0, high = 1}}\n'
     draws_without = load_design(campaign_file, kind, 64, dispersions=other_dispersions).draws(case)
@@ -140,11 +140,11 @@ def test_added_dispersion_does_not_change_other_draws(
 
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
 def test_appended_cases_do_not_change_earlier_cases(campaign_file: CampaignFile, kind: str) -> None:
-    before = load_design(campaign_file, kind, 33, nominal=True)
-    after = load_design(campaign_file, kind, 33, nominal=True, extra_keys="appended = [16, 8]")
-    assert after.configuration.total_cases == 57
-    assert [after.draws(case) for case in range(33)] == [before.draws(case) for case in range(33)]
-    points = read_probabilities(after, range(1, 57))
+    initial_campaign = load_design(campaign_file, kind, 33, nominal=True)
+    extended_campaign = load_design(campaign_file, kind, 33, nominal=True, extra_keys="appended = [16, 8]")
+    assert extended_campaign.configuration.total_cases == 57
+    assert [extended_campaign.draws(case) for case in range(33)] == [initial_campaign.draws(case) for case in range(33)]
+    points = read_probabilities(extended_campaign, range(1, 57))
     assert len(np.unique(points[:, 0])) == 56
     if kind != "random":
         for block in (points[:32], points[32:48], points[48:]):
@@ -171,9 +171,9 @@ def test_grid_is_a_full_factorial_in_all_designs(campaign_file: CampaignFile) ->
 
 
 def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
-    derived = 'altitude_m = {distribution = "derived", formula = "1000 + 100 * heights_m[1]"}\n'
-    fixed = 'lowest_altitude_m = {distribution = "fixed", value = 7.0}\n'
-    text = DISPERSIONS + GRID + derived + fixed
+    derived_entry = 'altitude_m = {distribution = "derived", formula = "1000 + 100 * heights_m[1]"}\n'
+    fixed_entry = 'lowest_altitude_m = {distribution = "fixed", value = 7.0}\n'
+    text = DISPERSIONS + GRID + derived_entry + fixed_entry
     campaign = load_design(campaign_file, "random", 7, dispersions=text, nominal=True)
     assert campaign.probabilities(0) is None
     nominal = campaign.parameters(0).model_dump()
@@ -204,6 +204,6 @@ def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
 def test_invalid_designs_are_rejected(
     campaign_file: CampaignFile, kind: str, cases: int, options: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error:
         load_design(campaign_file, kind, cases, **options)  # type: ignore[arg-type]
-    assert message in str(raised.value)
+    assert message in str(error.value)

@@ -38,6 +38,7 @@ def draw_uniform_numbers() -> list[float]:
 
 
 def draw_values(dispersion: Dispersion) -> np.ndarray:
+    """Draw one value of the dispersion per case."""
     return np.array([dispersion.quantile(value) for value in draw_uniform_numbers()])
 
 
@@ -77,7 +78,7 @@ _SHAPE_PARAMETERS: dict[str, dict[str, st.SearchStrategy[float]]] = {
 @given(data=st.data(), name=st.sampled_from(sorted(_SHAPE_PARAMETERS)))
 @settings(max_examples=25)
 def test_truncated_scipy_draws_follow_their_distribution(data: st.DataObject, name: str) -> None:
-    """The significance level of 1e-6 gives one false failure in 40,000 runs of 25 examples."""
+    """With a significance level of 1e-6, a correct sampler fails in one of 40,000 runs of 25 examples."""
     keys = {key: data.draw(values) for key, values in _SHAPE_PARAMETERS[name].items()}
     keys |= {"loc": data.draw(st.floats(-100.0, 100.0)), "scale": data.draw(st.floats(0.1, 100.0))}
     reference = getattr(stats, name)(**keys)
@@ -153,15 +154,15 @@ def test_formulas_use_draws_and_parameters(campaign_file: CampaignFile) -> None:
     assert list(draws[0]) == ["lowest_altitude_m", "altitude_m", "terrain", "heights_m.1"]
     values = {name: np.array([draw[name] for draw in draws]) for name in draws[0]}
     assert set(values["terrain"].tolist()) == {0, 1, 2, 3, 4}
-    standardised = (values["altitude_m"] - 1500.0 - 100.0 * values["terrain"]) / (5.0 + values["terrain"])
-    assert stats.kstest(standardised, stats.norm.cdf).pvalue > MIN_P_VALUE
+    standardised_altitude = (values["altitude_m"] - 1500.0 - 100.0 * values["terrain"]) / (5.0 + values["terrain"])
+    assert stats.kstest(standardised_altitude, stats.norm.cdf).pvalue > MIN_P_VALUE
     fraction = (values["lowest_altitude_m"] - values["altitude_m"] + 300.0) / 200.0
     assert stats.kstest(fraction, stats.uniform.cdf).pvalue > MIN_P_VALUE
     assert stats.kstest(values["heights_m.1"], stats.gamma(3, scale=3).cdf).pvalue > MIN_P_VALUE
     # formulas use the values of overrides
-    fixed = load_campaign(str(campaign_file("shared = 4", dispersions=text)), ["terrain=2"])
+    campaign_with_fixed_terrain = load_campaign(str(campaign_file("shared = 4", dispersions=text)), ["terrain=2"])
     assert (
-        fixed.configuration.dispersions["altitude_m"]
+        campaign_with_fixed_terrain.configuration.dispersions["altitude_m"]
         .insert_values({"terrain": 2})
         .describe()
         .startswith("normal(mean=1700")

@@ -99,8 +99,8 @@ def test_formulas_without_a_value_are_reported(text: str, message: str) -> None:
 @given(text=st.text(max_size=40) | st.text("ab.[]()+-*/0123456789e ,", max_size=40))
 def test_random_text_has_a_finite_value_or_is_rejected(text: str) -> None:
     try:
-        parsed = parse_formula(text)
-        value = parsed.evaluate(dict.fromkeys(parsed.names, 1.5))
+        formula = parse_formula(text)
+        value = formula.evaluate(dict.fromkeys(formula.names, 1.5))
     except ValueError:
         return
     assert math.isfinite(value)

@@ -1,4 +1,4 @@
-"""Tests of cases as points: marginal distributions, correlation, formulas, nominal values and text."""
+"""Tests of points of the sampling space: distributions, correlation, formulas, nominal values and text."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_points_have_the_distributions_of_the_cases(campaign_path: Path) -> None
     assert np.std(residuals) == pytest.approx(10.0, rel=0.06)
 
 
-def test_coordinates_are_quantiles(campaign_path: Path) -> None:
+def test_coordinates_are_quantiles_of_the_standard_normal_distribution(campaign_path: Path) -> None:
     campaign = load_campaign(str(campaign_path))
     values = campaign.draws_at(Point((1.0, 0.0, -2.0, 0.0, 0.0), 7))
     assert values["wind.east_m_s"] == pytest.approx(-30.0 + 60.0 * norm.cdf(1.0))
@@ -71,7 +71,7 @@ def test_extreme_coordinates_have_finite_values(campaign_path: Path) -> None:
         assert all(np.isfinite(value) for value in values.values() if isinstance(value, float))
 
 
-def test_text_keeps_the_point() -> None:
+def test_point_round_trips_as_text() -> None:
     point = Point((0.1, -1.0 / 3.0), 12, ("a.b",))
     assert Point.read(point.text) == point
     with pytest.raises(ValueError, match="not a point"):

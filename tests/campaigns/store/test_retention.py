@@ -98,8 +98,8 @@ def test_products_of_configured_cases_are_stored(
     directory = run(path, tmp_path / "run", watch, "cases=6", "retain.showcase=none", *overrides, jobs=1)
     rows = read_case_rows(directory)
     if cases is None:
-        answered = [row for row in rows if row["answered"]]
-        cases = sorted(row["case"] for row in sorted(answered, key=lambda row: -row["velocity_error_m_s"])[:2])
+        answered_rows = [row for row in rows if row["answered"]]
+        cases = sorted(row["case"] for row in sorted(answered_rows, key=lambda row: -row["velocity_error_m_s"])[:2])
     stored_cases = sorted(int(path.name) for path in (directory / "cases").iterdir())
     assert stored_cases == cases
     for case in stored_cases:

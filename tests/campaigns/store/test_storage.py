@@ -46,15 +46,15 @@ def test_rows_are_read_in_case_order(tmp_path: Path) -> None:
         {"case": 1, "x": 0.1 + 0.2, "flag": True},
     ]
     with open_store(tmp_path, rows) as store:
-        stored = [store.row(case) or {} for case in range(3)]
+        stored_rows = [store.row(case) or {} for case in range(3)]
         assert store.about == {"identity": "abc"}
         assert (store.count(), store.list_cases_with_outcomes(["VALID"]), store.count_unfinished()) == (3, [0, 1, 2], 0)
         assert store.row(1) == complete_row(rows[2])
         assert store.row(7) is None
-    assert [row["case"] for row in stored] == [0, 1, 2]
-    assert stored[1] == complete_row(rows[2])
-    assert math.isnan(float(stored[2]["x"]))
-    assert stored[0]["text"] == "ä\0\n"
+    assert [row["case"] for row in stored_rows] == [0, 1, 2]
+    assert stored_rows[1] == complete_row(rows[2])
+    assert math.isnan(float(stored_rows[2]["x"]))
+    assert stored_rows[0]["text"] == "ä\0\n"
 
 
 def test_missing_rows_are_listed_and_rows_replaced(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_store_of_another_version_is_rejected(tmp_path: Path) -> None:
         RowStore(tmp_path / "cases.sqlite")
 
 
-def write_rows_table(folder: Path, rows: Iterable[dict[str, Any]], measures: tuple[str, ...] = ()) -> Path:
+def write_case_table(folder: Path, rows: Iterable[dict[str, Any]], measures: tuple[str, ...] = ()) -> Path:
     with open_store(folder, rows) as store:
         write_table(folder / "t.parquet", store, measures)
     return folder / "t.parquet"
@@ -152,7 +152,7 @@ def test_columns_have_the_narrowest_type(tmp_path: Path) -> None:
         {"case": 1, "number": 2.5, "integer": 2, "mixed": "x", "large": 1, "only_case_1": "y"},
         {"case": 0, "number": 1, "integer": 1, "mixed": 1, "large": 10**30, "only_case_0": 1.0},
     ]
-    path = write_rows_table(tmp_path, rows, ("metric",))
+    path = write_case_table(tmp_path, rows, ("metric",))
     first, second = read_rows(path)
     assert (first["number"], type(first["integer"]), first["mixed"], first["large"]) == (1.0, int, "1", 1e30)
     assert math.isnan(second["only_case_0"])
@@ -169,16 +169,16 @@ def test_columns_have_the_narrowest_type(tmp_path: Path) -> None:
 def test_tables_are_written_in_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("marsyard.campaigns.store.table._GROUP_ROWS", 7)
     rows = [{"case": case, "x": case / 3, **({"y": case} if case % 5 else {"z": True})} for case in range(50)]
-    path = write_rows_table(tmp_path, rows)
+    path = write_case_table(tmp_path, rows)
     assert pq.ParquetFile(path).num_row_groups == 8
-    for row, stored in zip(rows, read_rows(path), strict=True):
+    for row, stored_row in zip(rows, read_rows(path), strict=True):
         # NaN differs from itself and marks a missing value
-        numbers = {name: value for name, value in stored.items() if value == value and name in ("case", "x", "y", "z")}
-        assert numbers == row
+        columns = {name: value for name, value in stored_row.items() if name in ("case", "x", "y", "z")}
+        assert {name: value for name, value in columns.items() if value == value} == row
 
 
 def test_empty_table_is_read_and_text_is_rejected(tmp_path: Path) -> None:
-    path = write_rows_table(tmp_path, [])
+    path = write_case_table(tmp_path, [])
     assert read_rows(path) == []
     path.write_text("not a table")
     with pytest.raises(StoreError, match="not a table of cases"):
@@ -247,7 +247,7 @@ def test_unsupported_products_are_rejected(tmp_path: Path, value: object) -> Non
         load_products(tmp_path)
 
 
-def test_numeric_columns_of_a_sum_are_its_summands() -> None:
+def test_numeric_metrics_contain_the_summands_of_a_sum() -> None:
     confidence = {"probability": 0.9, "confidence": 0.9}
     total = Requirement.model_validate({"id": "A", "metric": "a_s + b_s", "bound": 2.0, **confidence})
     boolean = Requirement.model_validate({"id": "B", "metric": "safe", **confidence})

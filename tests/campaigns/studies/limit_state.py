@@ -44,7 +44,10 @@ confidence = 0.9
 
 
 class LimitStateParameters(BaseModel):
-    """The load is 100 plus `beta` if (loads[0] + loads[1]) / sqrt(2), mixed with noise, equals its `beta`-quantile."""
+    """The load is ``100 + u - beta`` with the standard normal number u.
+
+    ``u = sqrt(1 - noise**2) (loads[0] + loads[1]) / sqrt(2) + noise n``, with a standard normal random number n.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -56,7 +59,7 @@ class LimitStateParameters(BaseModel):
 
 
 class LimitStateScenario:
-    """A violation of LOAD has the probability Phi(-beta) for any fraction of `noise`."""
+    """A violation of LOAD has the probability Phi(-beta) for any `noise`; Phi is the standard normal distribution."""
 
     name = "limit-state"
     parameters_type = LimitStateParameters
@@ -70,7 +73,7 @@ class LimitStateScenario:
     def run(self, parameters: LimitStateParameters, streams: Streams) -> CaseResult:
         time.sleep(parameters.sleep_s)
         noise = float(streams.generator("noise").standard_normal())
-        mixed = math.sqrt(1.0 - parameters.noise**2) * sum(parameters.loads) / math.sqrt(2.0) + parameters.noise * noise
-        margin = parameters.beta - mixed
+        u = math.sqrt(1.0 - parameters.noise**2) * sum(parameters.loads) / math.sqrt(2.0) + parameters.noise * noise
+        margin = parameters.beta - u
         row = {"load": 100.0 - margin, "is_safe": margin >= 0.0, "safety_margin": margin, "noise": noise}
         return CaseResult("VALID", True, row, {})

@@ -1,4 +1,4 @@
-"""A fast estimator scenario with a planted defect: it fails only with a low sun from one direction."""
+"""A fast scenario of an estimator with a planted defect: it fails only with a low sun and a yaw near 90 deg."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ population = "valid"
 
 
 class PlantedDefectParameters(BaseModel):
-    """Dispersions; only sun and yaw cause the defect."""
+    """Parameters of the scenario; only `sun_deg` and `yaw_deg` cause the defect."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -53,7 +53,10 @@ class PlantedDefectParameters(BaseModel):
 
 
 class PlantedDefectScenario:
-    """Errors above 5 m/s occur only for sun below 15 deg and yaw within 10 deg of 90; the error grows towards them."""
+    """Errors above 5 m/s occur only if the sun is below 15 deg and the yaw is within 10 deg of 90 deg.
+
+    The error increases towards this region.
+    """
 
     name = "planted-defect"
     parameters_type = PlantedDefectParameters
@@ -66,9 +69,9 @@ class PlantedDefectScenario:
 
     def run(self, parameters: PlantedDefectParameters, streams: Streams) -> CaseResult:
         noise = abs(float(streams.generator("noise").normal(scale=0.5)))
-        # distance from the region of the defect; from a distance of 1 on, the error is the noise
-        sun = max(parameters.sun_deg - 15.0, 0.0) / 15.0
-        yaw = max(abs(parameters.yaw_deg - 90.0) - 10.0, 0.0) / 60.0
-        nearness = max(1.0 - sun, 0.0) * max(1.0 - yaw, 0.0)
+        # scaled distances from the region of the defect; the error is only noise if one of them is at least 1
+        sun_distance = max(parameters.sun_deg - 15.0, 0.0) / 15.0
+        yaw_distance = max(abs(parameters.yaw_deg - 90.0) - 10.0, 0.0) / 60.0
+        nearness = max(1.0 - sun_distance, 0.0) * max(1.0 - yaw_distance, 0.0)
         error = 8.0 + noise if nearness == 1.0 else min(3.5 * nearness + noise, 4.9)
         return CaseResult("VALID", True, {"velocity_error_m_s": error, "sun_deg": parameters.sun_deg}, {})

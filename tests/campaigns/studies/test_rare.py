@@ -25,7 +25,7 @@ from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_r
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 from tests.campaigns.studies.limit_state import CAMPAIGN
 
-#: A confidence of 0.99, so that the fixed seeds give correct intervals.
+#: With a confidence of 0.99, the intervals of the fixed seeds contain the true probability.
 SETTINGS = RareSettings("LOAD", 5e-2, samples=100, replicates=(4,), confidence=0.99)
 TIMES = ("wall_time_s", "cpu_time_s")
 
@@ -37,7 +37,7 @@ def campaign_path(tmp_path: Path) -> Path:
     return path
 
 
-def start(
+def run_study(
     path: Path, directory: Path, settings: RareSettings = SETTINGS, *overrides: str, max_cases: int = 5000
 ) -> RareResult:
     campaign = load_campaign(str(path), overrides)
@@ -50,16 +50,16 @@ def rows_without_times(directory: Path) -> list[dict[str, object]]:
 
 @pytest.mark.parametrize("noise", [0.0, 0.6])
 def test_interval_contains_the_probability(campaign_path: Path, tmp_path: Path, noise: float) -> None:
-    result = start(campaign_path, tmp_path / "run", SETTINGS, f"noise={noise}")
+    result = run_study(campaign_path, tmp_path / "run", SETTINGS, f"noise={noise}")
     assert result.interval.lower < norm.sf(3.0) < result.interval.upper
     assert result.verdict is RareVerdict.PASS
     assert 0 < result.cases == len(read_case_rows(tmp_path / "run"))
     assert result.violations == sum(row["load"] > 100.0 for row in read_case_rows(tmp_path / "run"))
 
 
-def test_importance_sampling_decides(campaign_path: Path, tmp_path: Path) -> None:
-    settings = RareSettings("LOAD", 1e-2, "importance", 100, (3,), 300, 0.99)
-    result = start(campaign_path, tmp_path / "run", settings)
+def test_importance_sampling_interval_contains_the_probability(campaign_path: Path, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, max_probability=1e-2, method="importance", replicates=(3,), importance_cases=300)
+    result = run_study(campaign_path, tmp_path / "run", settings)
     assert result.effective_violations > 30.0
     with pytest.raises(CampaignError, match="importance sampling cannot be extended"):
         continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), additional=2)
@@ -68,8 +68,8 @@ def test_importance_sampling_decides(campaign_path: Path, tmp_path: Path) -> Non
 
 
 def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: Path) -> None:
-    by_bound = start(campaign_path, tmp_path / "bound")
-    by_margin = start(campaign_path, tmp_path / "margin", replace(SETTINGS, requirement="MARGIN"))
+    by_bound = run_study(campaign_path, tmp_path / "bound")
+    by_margin = run_study(campaign_path, tmp_path / "margin", replace(SETTINGS, requirement="MARGIN"))
     assert by_margin.interval == by_bound.interval
 
 
@@ -78,26 +78,26 @@ def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path
     sizes = ["--samples", "50", "--replicates", "2", "--jobs", "2"]
     options = ["--requirement", "LOAD", "--max-probability", "0.1", *sizes]
     command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--set", "sleep_s=0.03"]
-    killed, whole = tmp_path / "killed", tmp_path / "whole"
-    with subprocess.Popen([*command, "--out", str(killed)], stderr=subprocess.DEVNULL) as process:
-        log, deadline = killed / "cases.sqlite-wal", time.monotonic() + 120.0
+    killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
+    with subprocess.Popen([*command, "--out", str(killed_run)], stderr=subprocess.DEVNULL) as process:
+        log, deadline = killed_run / "cases.sqlite-wal", time.monotonic() + 120.0
         while not (log.exists() and log.stat().st_size > 12_000) and time.monotonic() < deadline:
             time.sleep(0.05)
         os.kill(process.pid, signal.SIGKILL)
-    assert record.read(killed)["state"] == "running"
-    resumed = subprocess.run(
-        [sys.executable, "-m", "marsyard", "resume", str(killed)], capture_output=True, text=True, check=False
+    assert record.read(killed_run)["state"] == "running"
+    resume_result = subprocess.run(
+        [sys.executable, "-m", "marsyard", "resume", str(killed_run)], capture_output=True, text=True, check=False
     )
     settings = RareSettings("LOAD", 0.1, samples=50, replicates=(2,))
-    undisturbed = start(campaign_path, whole, settings, "sleep_s=0.03", max_cases=20_000)
-    assert resumed.returncode == undisturbed.exit_code, resumed.stderr
-    assert "Probability of a violation per case" in resumed.stdout
-    assert rows_without_times(killed) == rows_without_times(whole)
-    assert record.read(killed)["study"]["result"] == record.read(whole)["study"]["result"]
+    reference = run_study(campaign_path, reference_run, settings, "sleep_s=0.03", max_cases=20_000)
+    assert resume_result.returncode == reference.exit_code, resume_result.stderr
+    assert "Probability of a violation per case" in resume_result.stdout
+    assert rows_without_times(killed_run) == rows_without_times(reference_run)
+    assert record.read(killed_run)["study"]["result"] == record.read(reference_run)["study"]["result"]
 
 
-def test_added_replicates_narrow_the_interval(campaign_path: Path, tmp_path: Path) -> None:
-    first = start(campaign_path, tmp_path / "run")
+def test_additional_replicates_narrow_the_interval(campaign_path: Path, tmp_path: Path) -> None:
+    first = run_study(campaign_path, tmp_path / "run")
     rows = rows_without_times(tmp_path / "run")
     second = continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), additional=5)
     assert len(second.replicates) == 9
@@ -108,7 +108,7 @@ def test_added_replicates_narrow_the_interval(campaign_path: Path, tmp_path: Pat
 
 
 def test_case_of_a_study_replays(campaign_path: Path, tmp_path: Path) -> None:
-    start(campaign_path, tmp_path / "run", SETTINGS, "noise=0.5")
+    run_study(campaign_path, tmp_path / "run", SETTINGS, "noise=0.5")
     # a late case of a Markov chain, in general with the random streams of an earlier case
     cases = [row["case"] for row in read_case_rows(tmp_path / "run")]
     for case in cases[-3:]:
@@ -117,22 +117,22 @@ def test_case_of_a_study_replays(campaign_path: Path, tmp_path: Path) -> None:
         replay(tmp_path / "run", cases[-1] + 1)
 
 
-def test_limit_of_cases_leaves_the_study_undecided(campaign_path: Path, tmp_path: Path) -> None:
-    result = start(campaign_path, tmp_path / "run", max_cases=350)
+def test_verdict_is_insufficient_at_the_limit_of_cases(campaign_path: Path, tmp_path: Path) -> None:
+    result = run_study(campaign_path, tmp_path / "run", max_cases=350)
     assert result.verdict is RareVerdict.INSUFFICIENT
     assert "limit of cases" in result.reason
     assert len(read_case_rows(tmp_path / "run")) <= 350
 
 
-def test_cases_near_the_limit_are_too_few(campaign_path: Path, tmp_path: Path) -> None:
+def test_small_study_is_insufficient_if_the_probability_equals_its_limit(campaign_path: Path, tmp_path: Path) -> None:
     settings = RareSettings("LOAD", float(norm.sf(3.0)), samples=50, replicates=(2,))
-    result = start(campaign_path, tmp_path / "run", settings)
+    result = run_study(campaign_path, tmp_path / "run", settings)
     assert result.verdict is RareVerdict.INSUFFICIENT
     assert result.exit_code == 3
 
 
 def test_campaign_commands_reject_a_study(campaign_path: Path, tmp_path: Path) -> None:
-    start(campaign_path, tmp_path / "run")
+    run_study(campaign_path, tmp_path / "run")
     with pytest.raises(CampaignError, match="contains a study"):
         resume_campaign(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
     with pytest.raises(CampaignError, match="contains a study"):
@@ -140,9 +140,9 @@ def test_campaign_commands_reject_a_study(campaign_path: Path, tmp_path: Path) -
 
 
 def test_changed_program_is_rejected(campaign_path: Path, tmp_path: Path) -> None:
-    start(campaign_path, tmp_path / "run")
-    stored = record.read(tmp_path / "run")
-    record.update(tmp_path / "run", {"identity": {**stored["identity"], "code": "other"}})
+    run_study(campaign_path, tmp_path / "run")
+    stored_record = record.read(tmp_path / "run")
+    record.update(tmp_path / "run", {"identity": {**stored_record["identity"], "code": "other"}})
     with pytest.raises(CampaignError, match="another program"):
         continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
 
@@ -158,20 +158,20 @@ def test_changed_program_is_rejected(campaign_path: Path, tmp_path: Path) -> Non
         ("LOAD", {"max_probability": 0.0}, "--max-probability"),
     ],
 )
-def test_wrong_settings_are_explained(
+def test_invalid_settings_are_reported(
     campaign_path: Path, tmp_path: Path, requirement: str, changes: dict[str, object], message: str
 ) -> None:
     values = {"requirement": requirement, "max_probability": 1e-2, **changes}
     with pytest.raises(CampaignError, match=message):
-        start(campaign_path, tmp_path / "run", RareSettings(**values))  # type: ignore[arg-type]
+        run_study(campaign_path, tmp_path / "run", RareSettings(**values))  # type: ignore[arg-type]
     assert not (tmp_path / "run").exists()
 
 
-def test_grid_has_no_probabilities(campaign_path: Path, tmp_path: Path) -> None:
+def test_grid_dispersions_are_rejected(campaign_path: Path, tmp_path: Path) -> None:
     grid = 'kind = { distribution = "grid", values = ["plain", "rough"] }'
     campaign_path.write_text(CAMPAIGN.replace('kind = { distribution = "choice", values = ["plain", "rough"] }', grid))
     with pytest.raises(CampaignError, match=r"dispersions\.kind: is a distribution 'grid'"):
-        start(campaign_path, tmp_path / "run")
+        run_study(campaign_path, tmp_path / "run")
 
 
 def test_campaign_file_cannot_be_adaptive(campaign_path: Path) -> None:
@@ -182,9 +182,9 @@ def test_campaign_file_cannot_be_adaptive(campaign_path: Path) -> None:
 def test_report_shows_the_verdict_of_the_study(campaign_path: Path, tmp_path: Path) -> None:
     options = ["--requirement", "LOAD", "--max-probability", "1e-2", "--samples", "100", "--jobs", "1"]
     command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--out", str(tmp_path / "run")]
-    completed = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert completed.returncode == 0, completed.stderr
-    assert "LOAD: PASS." in completed.stdout
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert "LOAD: PASS." in result.stdout
     data = json.loads((tmp_path / "run" / "report.json").read_text())
     assert (data["verdict"], data["exit_code"], data["verdicts"]) == ("PASS", 0, [])
     assert data["sections"]["rare"]["interval"]["lower"] < norm.sf(3.0)
@@ -196,6 +196,6 @@ def test_report_shows_the_verdict_of_the_study(campaign_path: Path, tmp_path: Pa
 def test_verdict_on_a_calibration_seed_cannot_be_pass(campaign_path: Path, tmp_path: Path) -> None:
     run = '[[calibration.runs]]\noptions = ["beta"]\ncampaign = "limit-state"\nseed = 3'
     campaign_path.write_text(f'{CAMPAIGN}\n[calibration]\nnamespace = "test"\n\n{run}\n')
-    result = start(campaign_path, tmp_path / "run")
+    result = run_study(campaign_path, tmp_path / "run")
     assert result.verdict is RareVerdict.INSUFFICIENT
     assert result.reason.startswith("The verdict would be PASS. Calibrated on these cases")

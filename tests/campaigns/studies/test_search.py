@@ -36,7 +36,7 @@ def campaign_path(tmp_path: Path) -> Path:
     return path
 
 
-def start(
+def run_search(
     path: Path, directory: Path, settings: SearchSettings, *, seed: int = 1, max_cases: int = 5000
 ) -> SearchResult:
     campaign = load_campaign(str(path), (), None, seed)
@@ -44,6 +44,7 @@ def start(
 
 
 def assert_reduced_to_causes(result: SearchResult) -> None:
+    """Assert that the search found the defect within 300 cases, and that its first failure has only the two causes."""
     assert result.first_violation is not None
     assert result.first_violation <= result.searched <= 300
     failure = result.failures[0]
@@ -54,7 +55,7 @@ def assert_reduced_to_causes(result: SearchResult) -> None:
 
 
 def test_planted_defect_is_found_and_reduced_to_its_two_causes(campaign_path: Path, tmp_path: Path) -> None:
-    result = start(campaign_path, tmp_path / "run", SearchSettings("VELOCITY"))
+    result = run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY"))
     assert_reduced_to_causes(result)
     assert replay(tmp_path / "run", result.failures[0].case).differing == ()
 
@@ -92,12 +93,12 @@ def test_campaign_without_violation_reports_the_smallest_margin(tmp_path: Path) 
         campaign, SearchSettings("LOAD", 60), 1000, tmp_path / "run", ExecutorConfig(1), RecordingWatch()
     )
     assert (result.violations, result.failures, result.exit_code) == (0, (), 0)
-    # the evolution strategies approach the corner of the allowed coordinates, at a load of 100 - 20 + 4 sqrt(2)
+    # the evolution strategies approach the corner (4, 4) of the allowed coordinates, at a margin of 20 - 8 / sqrt(2)
     assert 14.3 < result.min_margin < 18.0
 
 
 def test_limit_of_cases_ends_the_search(campaign_path: Path, tmp_path: Path) -> None:
-    result = start(campaign_path, tmp_path / "run", SearchSettings("VELOCITY"), max_cases=200)
+    result = run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY"), max_cases=200)
     assert "limit of cases" in result.reason
     assert result.cases <= 200
 
@@ -106,50 +107,50 @@ def test_limit_of_cases_ends_the_search(campaign_path: Path, tmp_path: Path) -> 
 def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
     options = ["--requirement", "VELOCITY", "-n", "150", "--jobs", "2"]
     command = [sys.executable, "-m", "marsyard", "search", str(campaign_path), *options]
-    killed, whole = tmp_path / "killed", tmp_path / "whole"
-    with subprocess.Popen([*command, "--out", str(killed)], stderr=subprocess.DEVNULL) as process:
-        log, deadline = killed / "cases.sqlite-wal", time.monotonic() + 120.0
+    killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
+    with subprocess.Popen([*command, "--out", str(killed_run)], stderr=subprocess.DEVNULL) as process:
+        log, deadline = killed_run / "cases.sqlite-wal", time.monotonic() + 120.0
         while not (log.exists() and log.stat().st_size > 20_000) and time.monotonic() < deadline:
             time.sleep(0.02)
         os.kill(process.pid, signal.SIGKILL)
-    resumed = subprocess.run(
-        [sys.executable, "-m", "marsyard", "resume", str(killed)], capture_output=True, text=True, check=False
+    resume_result = subprocess.run(
+        [sys.executable, "-m", "marsyard", "resume", str(killed_run)], capture_output=True, text=True, check=False
     )
-    undisturbed = start(campaign_path, whole, SearchSettings("VELOCITY", 150))
-    assert resumed.returncode == undisturbed.exit_code == 1, resumed.stderr
-    assert record.read(killed)["study"]["result"] == record.read(whole)["study"]["result"]
+    reference = run_search(campaign_path, reference_run, SearchSettings("VELOCITY", 150))
+    assert resume_result.returncode == reference.exit_code == 1, resume_result.stderr
+    assert record.read(killed_run)["study"]["result"] == record.read(reference_run)["study"]["result"]
     # the campaign file of the reduced violation violates the requirement in each of its cases
-    (plan,) = tomllib.loads((killed / "failures" / "nightly.toml").read_text())["campaigns"][:1]
-    file = killed / "failures" / plan["campaign"]
+    (plan,) = tomllib.loads((killed_run / "failures" / "nightly.toml").read_text())["campaigns"][:1]
+    file = killed_run / "failures" / plan["campaign"]
     run_options = ["--out", str(tmp_path / "regression"), "--jobs", "1"]
-    regression = subprocess.run(
+    run_result = subprocess.run(
         [sys.executable, "-m", "marsyard", "run", str(file), *run_options], capture_output=True, text=True, check=False
     )
-    assert regression.returncode == 1, regression.stderr
-    data = json.loads((killed / "report.json").read_text())
+    assert run_result.returncode == 1, run_result.stderr
+    data = json.loads((killed_run / "report.json").read_text())
     assert data["verdict"] == "FAIL"
     assert data["sections"]["search"]["failures"][0]["values"].keys() == {"sun_deg", "yaw_deg"}
-    assert "Reduced violations" in (killed / "report.html").read_text()
+    assert "Reduced violations" in (killed_run / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [({"cases": 5}, "--cases 5"), ({"restarts": 0}, "--restarts 0"), ({"max_failures": 0}, "--failures 0")],
 )
-def test_wrong_settings_are_explained(settings: dict[str, int], message: str) -> None:
+def test_invalid_settings_are_reported(settings: dict[str, int], message: str) -> None:
     with pytest.raises(CampaignError, match=message):
         SearchSettings("VELOCITY", **settings)
 
 
 def test_search_is_not_a_study_of_rare_violations(campaign_path: Path, tmp_path: Path) -> None:
-    start(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
+    run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
     with pytest.raises(CampaignError, match="does not contain a study of rare violations"):
         continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
 
 
 def test_rates_of_studies_cannot_be_compared(campaign_path: Path, tmp_path: Path) -> None:
-    start(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
+    run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
     command = [sys.executable, "-m", "marsyard", "compare", str(tmp_path / "run"), str(tmp_path / "run")]
-    completed = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert completed.returncode == 2
-    assert "contains a study" in completed.stderr
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert "contains a study" in result.stderr
