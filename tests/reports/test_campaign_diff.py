@@ -53,7 +53,7 @@ def test_campaigns_with_different_draws_are_compared_as_two_samples(make_rows: R
     assert not is_paired
     assert min(comparison.p_value for comparison in comparisons.values()) > 0.01
     _, worse_comparisons = _compare(
-        first, make_run(make_rows(300, seed=2, answered=0.6, error_scale=2.0), name="worse", seed=8)
+        first, make_run(make_rows(300, seed=2, answer_rate=0.6, error_scale=2.0), name="worse", seed=8)
     )
     assert worse_comparisons["answered"].p_value < 1e-6
     # no permutation of 10,000 has a larger difference
@@ -66,7 +66,7 @@ def test_terrains_of_different_sites_are_not_paired(make_rows: Rows, make_run: M
     # Errors depend on the terrain. Terrain numbers of two sites denote different terrains, so no pairs exist.
     def write_site_run(name: str, seed: int) -> Path:
         terrain_error = np.random.default_rng(seed).uniform(1.0, 3.0, 20)
-        frame = make_rows(400, terrains=20, answered=1.0, seed=seed)
+        frame = make_rows(400, terrains=20, answer_rate=1.0, seed=seed)
         frame["velocity_error_m_s"] = terrain_error[frame["terrain"]] + 0.1 * np.arange(400) / 400
         configuration = {"parameters": {"site": name}}
         return make_run(frame, name=name, seed=seed, configuration=configuration)

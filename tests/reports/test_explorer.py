@@ -19,7 +19,7 @@ METRIC = "velocity_error_m_s"
 
 
 def test_points_include_worst_unanswered_and_crashed_cases(make_rows: Rows) -> None:
-    frame = make_rows(12_000, crashed=3)
+    frame = make_rows(12_000, n_crashed=3)
     selected = choose_points(frame, METRIC)
     assert selected.size == MAX_POINTS
     assert np.all(np.diff(selected) > 0)
@@ -30,7 +30,7 @@ def test_points_include_worst_unanswered_and_crashed_cases(make_rows: Rows) -> N
 
 
 def test_explorer_data_contain_labels_outcomes_and_values(make_rows: Rows, make_run: Callable[..., Path]) -> None:
-    frame = make_rows(30, crashed=1)
+    frame = make_rows(30, n_crashed=1)
     run = read_run(make_run(frame))
     data = explorer_data(run, METRIC, 5.0, ["3"])
     assert [data["labels"][index] for index in data["axes"]] == [
@@ -52,7 +52,7 @@ def test_embedded_data_are_escaped() -> None:
 
 
 def test_notable_cases_are_worst_unanswered_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
-    frame = make_rows(60, crashed=2)
+    frame = make_rows(60, n_crashed=2)
     selected = notable_cases(read_run(make_run(frame)))
     errors = frame["velocity_error_m_s"]
     assert selected[:2] == errors.nlargest(2).index.tolist()

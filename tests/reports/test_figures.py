@@ -38,7 +38,7 @@ def _draw_all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure |
 
 @pytest.mark.parametrize(("cases", "bound"), [(1, 5.0), (24, None), (24, 0.0), (1500, 5.0)])
 def test_figures_are_well_formed(make_rows: Rows, cases: int, bound: float | None) -> None:
-    for index, figure in enumerate(_draw_all_figures(make_rows(cases, answered=1.0), bound)):
+    for index, figure in enumerate(_draw_all_figures(make_rows(cases, answer_rate=1.0), bound)):
         assert figure is not None
         root = ET.fromstring(svg_markup(figure, f"f{index}", 'errors & "more" <of them>'))  # noqa: S314
         assert root.get("aria-label") == 'errors & "more" <of them>'
@@ -46,7 +46,7 @@ def test_figures_are_well_formed(make_rows: Rows, cases: int, bound: float | Non
 
 
 def test_missing_data_give_no_figure(make_rows: Rows) -> None:
-    unanswered = make_rows(5, answered=0.0)
+    unanswered = make_rows(5, answer_rate=0.0)
     assert error_scatter(unanswered, METRIC, 5.0) is None
     assert error_histogram(unanswered, METRIC, 5.0) is None
     assert error_scatter_against(unanswered, METRIC, "off_nadir_max_deg", 5.0) is not None
@@ -100,7 +100,7 @@ def _scale_errors(frame: pd.DataFrame, rows: slice) -> pd.DataFrame:
 
 
 def test_histogram_has_an_overflow_bar(make_rows: Rows) -> None:
-    frame = _scale_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
+    frame = _scale_errors(make_rows(60, answer_rate=1.0), slice(0, 60, 12))
     figure = error_histogram(frame, METRIC, 5.0)
     assert figure is not None
     bars = [patch for patch in figure.axes[0].patches if isinstance(patch, Rectangle)]
@@ -114,7 +114,7 @@ def test_histogram_has_an_overflow_bar(make_rows: Rows) -> None:
 
 
 def test_error_axis_includes_the_95_percent_quantile(make_rows: Rows) -> None:
-    frame = _scale_errors(make_rows(60, answered=1.0), slice(None))
+    frame = _scale_errors(make_rows(60, answer_rate=1.0), slice(None))
     for draw in (error_histogram, error_distribution):
         figure = draw(frame, METRIC, 5.0)
         assert figure is not None
@@ -133,7 +133,7 @@ def _count_hollow_marks(figure: Figure) -> int:
 
 
 def test_points_beyond_the_axes_are_marked_and_counted(make_rows: Rows) -> None:
-    frame = _scale_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
+    frame = _scale_errors(make_rows(60, answer_rate=1.0), slice(0, 60, 12))
     figure = error_scatter(frame, METRIC, 5.0)
     assert figure is not None
     count = _count_hollow_marks(figure)

@@ -62,7 +62,7 @@ def test_answer_rates_have_clopper_pearson_intervals() -> None:
 
 
 def test_crashed_cases_of_unknown_overlap_count_as_failures(make_rows: Rows) -> None:
-    frame = make_rows(50, answered=1.0, crashed=5)
+    frame = make_rows(50, answer_rate=1.0, n_crashed=5)
     has_overlap: list[bool | None] = [True] * 45 + [None] * 5
     rates = answer_fractions(make_subject(frame.assign(feasible_overlap=pd.Series(has_overlap, dtype=object))))
     assert [(rate.hits, rate.n) for rate in rates.values()] == [(45, 50), (45, 50), (0, 45), (0, 45)]

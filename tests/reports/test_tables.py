@@ -68,7 +68,7 @@ def test_texts_are_not_interpreted_as_markup(make_rows: Rows, velocity: dict[str
 
 
 def test_outcomes_are_ordered_and_counted(make_rows: Rows) -> None:
-    frame = make_rows(200, crashed=2)
+    frame = make_rows(200, n_crashed=2)
     counts = outcome_counts(frame)
     assert counts[0][0] == "VALID"
     assert counts[-1] == ("CRASHED", 2)

@@ -48,7 +48,7 @@ def _read_message(case: Xml.Element, result: str) -> str:
 
 
 def test_junit_lists_failures_and_undecided_requirements(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    frame = make_rows(40, crashed=2, terrains=10_000)
+    frame = make_rows(40, n_crashed=2, terrains=10_000)
     # 32 of 34 cases succeed (crashed cases are failures): the rate meets 94 %, its lower bound does not
     by_rate = {**velocity, "id": "RATE", "probability": 0.94, "decide_by": "estimate"}
     requirements = [

@@ -29,8 +29,8 @@ def test_stored_schema_equals_the_layout() -> None:
     [
         {"cases": 24},
         {"cases": 400, "terrains": 60},
-        {"cases": 24, "crashed": 3},
-        {"cases": 24, "answered": 0.0},
+        {"cases": 24, "n_crashed": 3},
+        {"cases": 24, "answer_rate": 0.0},
         {"cases": 1},
     ],
 )

@@ -102,7 +102,7 @@ def test_non_finite_metric_fails(velocity: dict[str, Any], error: float) -> None
 
 
 def test_populations_select_cases(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    frame = make_rows(100, answered=0.8, crashed=3)
+    frame = make_rows(100, answer_rate=0.8, n_crashed=3)
     answered, crashed = int(frame["answered"].sum()), 3
     verdicts = {name: _evaluate(frame, velocity, population=name) for name in ("all", "completed", "valid")}
     assert [verdict.n for verdict in verdicts.values()] == [100, 100 - crashed, answered]
@@ -113,7 +113,7 @@ def test_populations_select_cases(make_rows: Rows, velocity: dict[str, Any]) -> 
 
 
 def test_empty_population_is_insufficient(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    verdict = _evaluate(make_rows(24, answered=0.0), velocity)
+    verdict = _evaluate(make_rows(24, answer_rate=0.0), velocity)
     assert (verdict.status, verdict.n, verdict.further_cases) == (Status.INSUFFICIENT, 0, 297)
     assert math.isnan(verdict.estimate)
     assert "No case" in verdict.note
@@ -440,7 +440,7 @@ def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
 
 
 def test_crashed_cases_are_counted_in_the_summary(make_rows: Rows) -> None:
-    summary = combine_verdicts([], make_rows(24, crashed=2))
+    summary = combine_verdicts([], make_rows(24, n_crashed=2))
     assert summary.crashed == 2
     assert "2 cases crashed" in summary.sentence
 

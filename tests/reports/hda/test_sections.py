@@ -1,4 +1,4 @@
-"""Tests of the report sections on landings against rows with known statistics."""
+"""Tests of the report sections on landings with rows of known statistics."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ def test_touchdown_errors_are_compared_with_table_2() -> None:
     frame = landing_frame(200)
     section = TOUCHDOWN(_make_subject(frame))
     assert section is not None
-    landed = frame[frame["landed"]]
-    assert section.data["landings"] == len(landed)
-    assert section.data["mean_m"]["touchdown_error_gps_m"] == pytest.approx(landed["touchdown_error_gps_m"].mean())
+    landings = frame[frame["landed"]]
+    assert section.data["landings"] == len(landings)
+    assert section.data["mean_m"]["touchdown_error_gps_m"] == pytest.approx(landings["touchdown_error_gps_m"].mean())
     assert section.data["paper_m"] == {"1": 1.21, "3": 1.20, "4": 0.89}
     assert np.mean([run["error_m"] for run in PAPER["landings"]]) == pytest.approx(1.1)
     assert TOUCHDOWN(_make_subject(frame.assign(landed=False))) is None
@@ -101,9 +101,9 @@ def test_reported_sites_are_scored_against_the_truth() -> None:
 
 def test_crashed_flights_are_counted_as_not_finished() -> None:
     frame = landing_frame(10)
-    unknown = ["site_reported", "site_safe", "no_site_reported", "answered"]
-    frame = frame.astype(dict.fromkeys([*unknown, "wide_site_exists"], object))
-    frame.loc[0, unknown] = None
+    unknown_columns = ["site_reported", "site_safe", "no_site_reported", "answered"]
+    frame = frame.astype(dict.fromkeys([*unknown_columns, "wide_site_exists"], object))
+    frame.loc[0, unknown_columns] = None
     frame.loc[0, "wide_site_exists"] = True
     assert sum(row["crashed"] for row in outcome_counts(frame).values()) == 1
 
@@ -178,13 +178,13 @@ def test_combined_changes_have_no_curve() -> None:
 
 def test_map_errors_have_the_expected_rank_correlations() -> None:
     rng = np.random.default_rng(4)
-    n = 60
-    frame = landing_frame(n).assign(
-        baseline_fraction=rng.uniform(0.05, 0.5, n),
-        texture=rng.uniform(0.1, 2.0, n),
+    cases = 60
+    frame = landing_frame(cases).assign(
+        baseline_fraction=rng.uniform(0.05, 0.5, cases),
+        texture=rng.uniform(0.1, 2.0, cases),
         height_m=10.0,
         range_m=10.0,
-        range_error_m=rng.normal(0.0, 0.1, n),
+        range_error_m=rng.normal(0.0, 0.1, cases),
         slope_error_rms_deg=1.0,
     )
     frame["elevation_noise_m"] = 0.01 / frame["baseline_fraction"]
