@@ -31,18 +31,18 @@ def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricCompariso
 
 def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) -> None:
     frame = make_rows(200, terrains=40)
-    worse = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
-    is_paired, comparisons = _compare(make_run(frame), make_run(worse, name="other"))
+    worse_frame = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
+    is_paired, comparisons = _compare(make_run(frame), make_run(worse_frame, name="other"))
     assert is_paired
     # errors larger by 2 %: the paired test detects them in spite of the large scatter
     assert comparisons["velocity error (m/s)"].p_value < 1e-9
     assert comparisons["answered"].p_value == 1.0
     assert comparisons["came to an end"].second.summary_value == 1.0
-    # with four terrains the sign test has p = 2 / 2^4, times 4 (Holm's correction) for the 4 metrics
+    # with four terrains the sign test has p = 2 / 2^4; Holm's correction for 4 metrics multiplies it by 4
     four_terrains = make_rows(200)
-    worse = four_terrains.assign(velocity_error_m_s=four_terrains["velocity_error_m_s"] * 1.02)
+    worse_frame = four_terrains.assign(velocity_error_m_s=four_terrains["velocity_error_m_s"] * 1.02)
     _, comparisons = _compare(
-        make_run(four_terrains, name="four-terrains"), make_run(worse, name="four-terrains-worse")
+        make_run(four_terrains, name="four-terrains"), make_run(worse_frame, name="four-terrains-worse")
     )
     assert comparisons["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
 
@@ -82,7 +82,7 @@ def _select_errors(run: StoredRun) -> tuple[pd.DataFrame, Metric]:
     return frame, next(metric for metric in metrics if metric.name == "velocity error (m/s)")
 
 
-def test_campaigns_without_common_metric_compare_completion(make_rows: Rows, make_run: MakeRun) -> None:
+def test_campaigns_without_common_metric_are_compared_by_completion(make_rows: Rows, make_run: MakeRun) -> None:
     first = make_run(make_rows(20)[["case", "outcome"]], [])
     _, comparisons = _compare(first, make_run(make_rows(20), name="other", seed=8))
     assert set(comparisons) == {"came to an end"}

@@ -20,12 +20,12 @@ from marsyard.reports.sections import script_hash
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
 VOID_ELEMENTS = {"meta", "link", "br", "img", "input", "hr", "path", "use", "circle", "line", "rect"}
-#: Minimum columns of a report with few figures.
+#: Minimum columns of a report.
 MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'&{{ 7*7 }}"
 
 
-class Page(HTMLParser):
+class PageParser(HTMLParser):
     """Parser that collects a page's elements, identifiers, references and event handlers."""
 
     def __init__(self, text: str) -> None:
@@ -62,15 +62,15 @@ class Page(HTMLParser):
                 self.handlers.append(name)
 
 
-def _write_and_read(directory: Path) -> tuple[str, Page, dict[str, Any]]:
+def _write_and_read(directory: Path) -> tuple[str, PageParser, dict[str, Any]]:
     path = write_report(directory)
     assert path == directory / "report.html"
     text = path.read_text(encoding="utf-8")
-    return text, Page(text), json.loads((directory / "report.json").read_text(encoding="utf-8"))
+    return text, PageParser(text), json.loads((directory / "report.json").read_text(encoding="utf-8"))
 
 
-def _check_page(text: str, page: Page) -> None:
-    """Check that a page is well formed, self-contained, without external scripts, and that its links have targets."""
+def _check_page(text: str, page: PageParser) -> None:
+    """Check that a page is well formed and self-contained, and that its links have targets."""
     assert page.open_tags == []
     assert len(page.ids) == len(set(page.ids))
     # one data element per script; the content security policy names the script by its hash

@@ -41,7 +41,7 @@ def test_rank_correlations_of_maps_have_intervals(maps: int, has_interval: bool)
 
 
 def test_bound_without_enough_cases_is_a_dash() -> None:
-    # a lower bound of the 5 % quantile at 90 % confidence needs 45 values
+    # a lower bound of the 5 % quantile at 90 % confidence needs 45 values: 0.95^45 = 0.0994
     (row,) = distance_grid({"sites": np.array([1.0, 2.0, 3.0])}).rows
     assert row[-1] == NOTHING
 

@@ -19,8 +19,8 @@ MakeRun = Callable[..., Path]
 
 def test_stored_schema_equals_the_layout() -> None:
     # to update the file: json.dump(CampaignReport.model_json_schema(), file, indent=1), followed by a newline
-    stored = SCHEMA_FILE.read_text()
-    assert json.loads(stored) == CampaignReport.model_json_schema()
+    schema_text = SCHEMA_FILE.read_text()
+    assert json.loads(schema_text) == CampaignReport.model_json_schema()
     assert get_args(CampaignReport.model_fields["report_schema"].annotation) == (SCHEMA,)
 
 

@@ -127,7 +127,8 @@ def test_interval_needs_two_replicates() -> None:
     ("lower", "upper", "verdict"), [(1e-6, 1e-4, "PASS"), (2e-4, 1e-3, "FAIL"), (5e-5, 5e-4, "INSUFFICIENT")]
 )
 def test_verdict_compares_the_bounds_with_the_limit(lower: float, upper: float, verdict: str) -> None:
-    assert decide(ProbabilityInterval(math.sqrt(lower * upper), lower, upper, confidence=0.9, log_sd=0.4), 1e-4) == verdict
+    interval = ProbabilityInterval(math.sqrt(lower * upper), lower, upper, confidence=0.9, log_sd=0.4)
+    assert decide(interval, 1e-4) == verdict
 
 
 def test_more_replicates_are_needed_near_the_limit() -> None:

@@ -50,13 +50,13 @@ def test_flights_with_one_footprint_are_pooled() -> None:
 def test_pooled_rate_interval_covers_the_true_rate() -> None:
     """90 % intervals cover the true rate of 10 %, although flights have different rates."""
     rng = np.random.default_rng(3)
-    n_covered = 0
+    n_covering = 0
     for _ in range(60):
         rates = rng.beta(1.0, 9.0, 40)
         frame = pd.DataFrame({"hazardous": rng.binomial(500, rates), "footprints": np.full(40, 500)})
         rate = pooled_rate(frame, "hazardous", "footprints")
-        n_covered += rate.lower <= 0.1 <= rate.upper
-    assert n_covered >= 45  # binomial(60, 0.9): mean 54, standard deviation 2.3
+        n_covering += rate.lower <= 0.1 <= rate.upper
+    assert n_covering >= 45  # binomial(60, 0.9): mean 54, standard deviation 2.3
 
 
 def test_rate_of_zero_has_no_bootstrap_interval() -> None:
