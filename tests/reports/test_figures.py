@@ -1,4 +1,7 @@
-"""Tests of the SVG figures of errors and outcomes. With a bound of 5 m/s the error axis ends at 15 m/s."""
+"""Tests of the SVG figures of errors and outcomes.
+
+An error axis ends at most at 3 times the bound (15 m/s for 5 m/s), unless more than a quarter of the errors exceed it.
+"""
 
 from __future__ import annotations
 
