@@ -174,7 +174,7 @@ def test_undecidable_campaign_stops() -> None:
     assert _find_next_look(32, 0, 33, probability=0.5) is None
 
 
-def test_adaptive_campaign_notes_its_end(tmp_path: Path) -> None:
+def test_adaptive_campaign_reports_its_end(tmp_path: Path) -> None:
     requirement = REQUIREMENT.replace("0.99", "0.5")
     dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
     path = write_campaign(tmp_path, "error_scale = 1e3", requirement=requirement, dispersions=dispersions)
@@ -186,7 +186,7 @@ def test_adaptive_campaign_notes_its_end(tmp_path: Path) -> None:
     assert watch.notes[-1] == "stopped after 128 of at most 128 cases"
 
 
-def test_gallery_repeats_its_cases_once(tmp_path: Path, marsyard: Command) -> None:
+def test_gallery_reruns_each_notable_case_once(tmp_path: Path, marsyard: Command) -> None:
     dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
     path, directory = write_campaign(tmp_path, dispersions=dispersions), tmp_path / "run"
     run_campaign(load_campaign(str(path), cases=12), directory, ExecutorConfig(jobs=1), RecordingWatch())
@@ -196,7 +196,7 @@ def test_gallery_repeats_its_cases_once(tmp_path: Path, marsyard: Command) -> No
     stored_cases = {int(folder.name) for folder in (directory / "cases").iterdir()}
     assert (notable - stored_cases, err) == (set(), "")
     assert out.count("rerun for its images") == len(notable - {_read_record(directory)["showcase"]})
-    # stored cases are not repeated
+    # cases with stored images are not run again
     assert "rerun for" not in marsyard("report", directory, "--gallery")[1]
 
 

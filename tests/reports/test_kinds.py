@@ -38,7 +38,9 @@ ALTITUDE = SectionDeclaration(
     requires=("altitude_error_m",),
     parts=(
         Statistics("altitude_error_m"),
-        Distribution([ERROR], ("altitude error (m)", "share of cases"), "Share of cases up to each error.", bound=5.0),
+        Distribution(
+            [ERROR], ("altitude error (m)", "fraction of cases"), "Fraction of cases up to each error.", bound=5.0
+        ),
         RateTable([Rate("answered", "answered", flag_rate("answered"))]),
         RateByCondition(Quantity("altitude_m"), [Rate("answered", "Answered", flag_rate("answered"))]),
         Scatter([Quantity("altitude_m")], [ERROR], "Every case, and medians of bins."),

@@ -52,6 +52,7 @@ def test_answer_rates_have_clopper_pearson_intervals() -> None:
         {"answered": is_answered, "feasible_overlap": has_overlap, METRIC: errors, "terrain": np.arange(n) // 2}
     )
     rates = list(answer_fractions(make_subject(frame)).values())
+    # valid answers of all cases, valid answers with feasible overlap, cases without overlap, wrong of valid answers
     assert [(rate.hits, rate.n) for rate in rates] == [(170, 200), (170, 180), (20, 200), (1, 170)]
     # 1 of 170, two-sided Clopper-Pearson at 90 %: BetaInv(0.05; 1, 170) and BetaInv(0.95; 2, 169)
     assert (rates[3].lower, rates[3].upper) == pytest.approx((0.000302, 0.027594), abs=2e-5)

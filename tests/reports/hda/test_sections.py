@@ -71,6 +71,7 @@ def test_run_times_are_scaled_to_the_sum_of_table_1() -> None:
     assert section.data["cases"] == 20
     times = section.data["stages"]
     assert sum(entry["scaled_s"] for entry in times) == pytest.approx(0.77)
+    # the stages of the synthetic rows take 6 + 4 + 6 + 1 ms
     assert section.data["factor"] == pytest.approx(0.77 / 0.017)
     assert [entry["parameters"] for entry in times] == ["70 features", "60 tracks", "600 points", "19x27 terrain map"]
     assert sum(stage["seconds"] for stage in PAPER["stages"]) < 1.0  # "less than one second"
@@ -154,6 +155,7 @@ def _make_motion_rows(column: str, sizes: list[float], fractions: list[float]) -
 
 def test_knee_is_at_90_percent_of_the_curve() -> None:
     (curve,) = tracking_curves(_make_motion_rows("roll_deg", [0.0, 8.0, 12.0, 16.0], [1.0, 0.96, 0.92, 0.52]))
+    # linear interpolation between 0.92 at 12 deg and 0.52 at 16 deg
     assert curve.knee_up == pytest.approx(12.2)
     assert np.isnan(curve.knee_down)
     (curve,) = tracking_curves(

@@ -123,6 +123,7 @@ def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
     faults = Faults(altitude_error=0.1, altitude_error_once=0.2, attitude_error_deg=3.0, attitude_error_once_deg=5.0)
     altitudes = add_altitude_faults(faults, [AltitudeMeasurement(100.0, time_s) for time_s in (0.0, 1.0, 2.0)])
     assert [entry.altitude_m for entry in altitudes] == pytest.approx([110.0, 130.0, 110.0])
+    # the heat shield moves away at 20 m/s
     readings = [AltitudeMeasurement(2000.0, time_s) for time_s in (0.0, 1.0, 2.0)]
     shield_ranges = add_altitude_faults(Faults(shield_range_m=60.0), readings)
     assert [entry.altitude_m for entry in shield_ranges] == [60.0, 80.0, 100.0]

@@ -113,8 +113,8 @@ def test_span_between_images_is_interpolated() -> None:
 
 def test_many_image_case_is_deterministic() -> None:
     parts: dict[str, Any] = {"pictures": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
-    first, repeated = run_descent(**parts), run_descent(**parts)
-    assert differing_columns(dict(first.row), dict(repeated.row)) == ()
+    first_case, repeated_case = run_descent(**parts), run_descent(**parts)
+    assert differing_columns(dict(first_case.row), dict(repeated_case.row)) == ()
 
 
 def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:

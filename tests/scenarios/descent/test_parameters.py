@@ -117,6 +117,7 @@ def test_custom_camera_distortion_error_applies_at_corner() -> None:
     custom = parameters.model_copy(update={"model": CustomCamera.from_camera(camera_optics(parameters).camera)})
     for camera_parameters in (parameters, custom):
         rng = np.random.default_rng(3)
+        # the fourth draw of the calibration is the distortion error
         normal_draw = np.random.default_rng(3).standard_normal(4)[3]
         true_camera, calibrated_model = (
             camera_optics(camera_parameters).camera,

@@ -25,8 +25,8 @@ def _drop_times(row: Any) -> dict[str, Any]:
 
 def test_case_is_deterministic(nominal_case: CaseResult) -> None:
     second_case = run_descent(1)
-    repeated = run_descent()
-    assert _drop_times(repeated.row) == _drop_times(nominal_case.row)
+    repeated_case = run_descent()
+    assert _drop_times(repeated_case.row) == _drop_times(nominal_case.row)
     assert second_case.row["image_hash"] != nominal_case.row["image_hash"]
 
 

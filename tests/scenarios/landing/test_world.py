@@ -29,7 +29,9 @@ def test_electron_count_is_independent_of_the_datasheet_sun_distance() -> None:
     assert electrons == pytest.approx([electrons[0]] * 3, rel=1e-12)
 
 
-@pytest.mark.parametrize(("bank", "n_built"), [(1, 1), (MAX_GROUNDS, MAX_GROUNDS), (MAX_GROUNDS + 1, 0), (10_000, 0)])
+@pytest.mark.parametrize(
+    ("bank", "n_terrains"), [(1, 1), (MAX_GROUNDS, MAX_GROUNDS), (MAX_GROUNDS + 1, 0), (10_000, 0)]
+)
 def test_only_small_banks_are_built_in_advance(bank: int, n_terrains: int) -> None:
     parameters = LandingScenarioParameters.model_validate({"location": {"bank": bank}})
     assert LandingScenario().shared_inputs(parameters) == tuple(range(n_terrains))

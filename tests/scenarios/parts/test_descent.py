@@ -139,12 +139,12 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
 def test_motion_is_deterministic_per_case() -> None:
     parameters = make_parameters(terrain=FLAT_TERRAIN, **CUSTOM_PARTS)
     surface = World.from_parameters(parameters).surface
-    first, repeated, second_case = (
+    first_row, repeated_row, second_row = (
         create_flight(parameters, surface, Streams(1, "test", case)).row for case in (0, 0, 1)
     )
-    assert first == repeated
-    assert first["flight_north_m_s"] != second_case["flight_north_m_s"]
-    assert not any(name.startswith("descent_") for name in first)
+    assert first_row == repeated_row
+    assert first_row["flight_north_m_s"] != second_row["flight_north_m_s"]
+    assert not any(name.startswith("descent_") for name in first_row)
 
 
 @pytest.mark.parametrize(

@@ -211,7 +211,7 @@ def drop_time_columns(row: Mapping[str, Scalar]) -> dict[str, str]:
     return {name: repr(value) for name, value in row.items() if "time" not in name}
 
 
-@pytest.mark.parametrize(("bank", "n_built"), [(8, 8), (100_000, 0)])
+@pytest.mark.parametrize(("bank", "n_terrains"), [(8, 8), (100_000, 0)])
 def test_only_small_banks_are_built_in_advance(bank: int, n_terrains: int) -> None:
     parameters = make_parameters(world={**SHORT_RUN["world"], "bank": bank})
     assert RoverScenario().shared_inputs(parameters) == tuple(range(n_terrains))
