@@ -73,9 +73,9 @@ class _SkipKernels(MetaPathFinder):
         return None
 
 
-_imported = sorted(set(CHECKED_PACKAGES) & set(sys.modules))
-if _imported:
-    raise RuntimeError(f"imported before the run-time checks of shapes were enabled: {', '.join(_imported)}")
+_early_imports = sorted(set(CHECKED_PACKAGES) & set(sys.modules))
+if _early_imports:
+    raise RuntimeError(f"imported before the run-time checks of shapes were enabled: {', '.join(_early_imports)}")
 jaxtyping.install_import_hook(CHECKED_PACKAGES, "beartype.beartype")
 sys.meta_path.insert(0, _SkipKernels())
 

@@ -36,7 +36,7 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a dashboard of three campaigns, one of them with images of a case."""
     folder, synthetic_runs = tmp_path_factory.mktemp("campaigns"), _load_synthetic_runs()
     for day, (site, cases) in enumerate((("gusev", 300), ("meridiani", 24), ("gusev", 24)), start=1):
-        frame = synthetic_runs.synthetic_frame(cases, terrains=1000, seed=day, crashed=day == 2)
+        frame = synthetic_runs.synthetic_frame(cases, terrains=1000, seed=day, n_crashed=day == 2)
         products = synthetic_runs.synthetic_products() if day == 1 else None
         changes = {"started_utc": f"2026-01-0{day}T00:00:00Z", "name": f"dimes-{site}"}
         directory = synthetic_runs.write_run(folder / f"run-{day}", frame, products=products, **changes)

@@ -1,4 +1,4 @@
-"""Tests of the bounds quoted in the documentation: they follow from the quoted counts."""
+"""Tests that the confidence bounds on documentation pages agree with the counts on the same page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def read_page(page: str) -> str:
-    """Return the text of a page in one line."""
+    """Return the text of a page; line breaks are replaced by spaces."""
     return " ".join((DOCS / page).read_text(encoding="utf-8").split())
 
 
@@ -48,16 +48,16 @@ def parse_percent(text: str) -> float:
 @pytest.mark.parametrize("column", [1, 2, 3])
 def test_quoted_bounds_on_wrong_velocities_are_correct(column: int) -> None:
     wrong, answers = parse_counts(find_cells("dimes.md", "wrong answers (error above 5 m/s)")[column])
-    quoted = find_cells("dimes.md", "upper 90 % confidence bound of the rate of wrong answers")[column]
-    assert parse_percent(quoted) == round(100.0 * proportion_upper(wrong, answers, 0.9), 2)
+    bound_cell = find_cells("dimes.md", "upper 90 % confidence bound of the rate of wrong answers")[column]
+    assert parse_percent(bound_cell) == round(100.0 * proportion_upper(wrong, answers, 0.9), 2)
 
 
 def test_quoted_intervals_of_wrong_answers_are_correct() -> None:
     page = read_page("dimes.md")
-    for (wrong, answers), quoted in (((1, 5), "0.5 to 71.6 %"), ((3, 10), "6.7 to 65.2 %")):
+    for (wrong, answers), interval_text in (((1, 5), "0.5 to 71.6 %"), ((3, 10), "6.7 to 65.2 %")):
         low, high = proportion_interval(wrong, answers, 0.95)
-        assert quoted == f"{100.0 * low:.1f} to {100.0 * high:.1f} %"
-        assert quoted in page
+        assert interval_text == f"{100.0 * low:.1f} to {100.0 * high:.1f} %"
+        assert interval_text in page
     assert "one in 300" not in page
 
 
@@ -74,14 +74,14 @@ def test_bound_of_landings_counts_terrains() -> None:
     ["chosen sites truly safe", "safe sites exist, none with safe surroundings", "`no safe site` where there is none"],
 )
 def test_quoted_bounds_of_hazardous_flights_are_correct(row_start: str) -> None:
-    _, measured, interval = find_cells("hda.md", row_start)
-    successes, n = parse_counts(re.sub(r"^at least ", "", measured))
+    _, rate_cell, interval_cell = find_cells("hda.md", row_start)
+    successes, n = parse_counts(re.sub(r"^at least ", "", rate_cell))
     lower = f"{100.0 * proportion_lower(successes, n, 0.9):.2f}"
-    assert re.search(rf"\b({lower}|{float(lower):.1f}) %", measured), f"expected {lower} % at 90 % confidence"
-    low, high = (100.0 * end for end in proportion_interval(successes, n, 0.95))
-    assert parse_percent(interval.split(" to ")[0] + " %") == round(low, 1)
-    if successes < n and not measured.startswith("at least"):
-        assert parse_percent(interval) == round(high, 1)
+    assert re.search(rf"\b({lower}|{float(lower):.1f}) %", rate_cell), f"expected {lower} % at 90 % confidence"
+    low, high = (100.0 * bound for bound in proportion_interval(successes, n, 0.95))
+    assert parse_percent(interval_cell.split(" to ")[0] + " %") == round(low, 1)
+    if successes < n and not rate_cell.startswith("at least"):
+        assert parse_percent(interval_cell) == round(high, 1)
 
 
 def test_groups_of_hazardous_flights_sum_to_all_flights() -> None:
@@ -104,9 +104,8 @@ def test_quoted_bounds_of_runs_to_the_goal_are_correct() -> None:
 
 def test_quoted_sample_sizes_are_correct() -> None:
     numbers = [minimum_sample_size(0.99, 0.9, failures) for failures in range(3)]
-    expected = "For 99 % at 90 % confidence, {} cases without a failure pass, {} with one failure, and {} with two."
-    expected = expected.format(*numbers)
-    assert expected in read_page("explanation/statistics.md")
+    sentence = "For 99 % at 90 % confidence, {} cases without a failure pass, {} with one failure, and {} with two."
+    assert sentence.format(*numbers) in read_page("explanation/statistics.md")
 
 
 def test_requirements_based_on_a_calibration_are_listed() -> None:

@@ -49,7 +49,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, PageParser]:
 
 
 def _select_local(targets: list[str]) -> Iterator[tuple[str, str]]:
-    """Yield path and fragment of each target within the site."""
+    """Yield path and fragment of each target without scheme and host, which is a file of the site."""
     for target in targets:
         parts = urlsplit(target)
         if not parts.scheme and not parts.netloc:
@@ -67,8 +67,8 @@ def test_links_have_targets(site: dict[Path, PageParser]) -> None:
 
 
 def test_pages_load_only_files_of_the_site(site: dict[Path, PageParser]) -> None:
-    loaded = [target for page in site.values() for target in page.resources]
-    assert [target for target in loaded if urlsplit(target).netloc] == []
+    resources = [target for page in site.values() for target in page.resources]
+    assert [target for target in resources if urlsplit(target).netloc] == []
     missing = [
         target
         for path, page in site.items()

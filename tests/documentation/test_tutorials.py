@@ -1,4 +1,4 @@
-"""Tests of the tutorials: their commands are run in order in an empty folder."""
+"""Tests that the commands of each tutorial succeed in an empty folder, in the order of the page."""
 
 from __future__ import annotations
 

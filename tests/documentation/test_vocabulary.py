@@ -1,6 +1,6 @@
-"""Tests that names, docstrings, comments and pages contain no words for which the field has a standard term.
+"""Tests that names, docstrings, comments and pages use the standard terms of the field.
 
-The rejected words occurred in earlier versions with a private meaning. docs/glossary.md defines the accepted terms.
+The rejected words replaced standard terms in earlier versions. docs/glossary.md defines the accepted terms.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports", "marsyard", "benchmarks", "tests")
-#: Words of a name, split at underscores and capitals, that have a standard term.
+#: Rejected words of names (split at underscores and capitals), with the standard term.
 NAME_WORDS = {
     "most": "max",
     "least": "min",
@@ -34,7 +34,7 @@ NAME_WORDS = {
 }
 #: Patterns of accepted names, with the reason.
 ALLOWED_NAMES = {r"least_(squares|median|absolute|sum)": "terms of estimation"}
-#: Patterns of rejected text, with the recommended form.
+#: Patterns of rejected text, with the replacement.
 PHRASES = {
     r"\banew\b": "again",
     r"\bbeside\b": "next to",
@@ -88,11 +88,11 @@ def find_prose(text: str) -> Iterator[tuple[str, int]]:
 
 def find_violations(text: str, line: int) -> Iterator[str]:
     """Yield a message for each rejected pattern in a text that starts at a line; quoted code is ignored."""
-    for number, part in enumerate(text.splitlines()):
-        plain = re.sub(r"`[^`]*`", "", part)
-        for pattern, recommended in PHRASES.items():
+    for number, text_line in enumerate(text.splitlines()):
+        plain = re.sub(r"`[^`]*`", "", text_line)
+        for pattern, replacement in PHRASES.items():
             if re.search(pattern, plain, re.IGNORECASE):
-                yield f"{line + number}: {part.strip()[:80]!r}: use {recommended}"
+                yield f"{line + number}: {text_line.strip()[:80]!r}: use {replacement}"
 
 
 def test_names_use_the_vocabulary() -> None:
@@ -100,7 +100,7 @@ def test_names_use_the_vocabulary() -> None:
         f"{path.relative_to(ROOT)}:{line}: {name} ({word}: use {NAME_WORDS[word]})"
         for path in list_python_files()
         for name, line in find_names(ast.parse(path.read_text(encoding="utf-8")))
-        if not any(re.search(allowed, name) for allowed in ALLOWED_NAMES)
+        if not any(re.search(pattern, name) for pattern in ALLOWED_NAMES)
         for word in split_name(name)
         if word in NAME_WORDS
     ]

@@ -1,4 +1,4 @@
-"""Tests of invalid input files: the command reports file and fault and exits with status 2."""
+"""Tests of invalid input files: the command reports the file and its fault, and exits with status 2."""
 
 from __future__ import annotations
 
@@ -17,15 +17,18 @@ from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
 from tests.scenarios.measured.folders import read_rows, write_text_rows, write_velocity_folder
 
-MARS = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
-DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")
+MARS_METRES = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
+MARS_DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")
 NO_DATA = -32767.0
 
 #: Function that writes a file to a path.
 WriteFile = Callable[[Path], object]
 
 
-def write_dtm(path: Path, *, crs: CRS = MARS, unit: str = "m", nodata: float | None = NO_DATA, side: int = 40) -> None:
+def write_dtm(
+    path: Path, *, crs: CRS = MARS_METRES, unit: str = "m", nodata: float | None = NO_DATA, side: int = 40
+) -> None:
+    """Write a DTM of 40 x 40 heights with one hole; another `side` gives a sparse file without heights."""
     heights = np.full((40, 40), -4450.0, dtype=np.float32)
     heights[7, 7] = NO_DATA
     profile = {"driver": "GTiff", "count": 1, "dtype": "float32", "nodata": nodata, "SPARSE_OK": "TRUE"}
@@ -38,7 +41,7 @@ def write_dtm(path: Path, *, crs: CRS = MARS, unit: str = "m", nodata: float | N
 
 
 def write_flight(path: Path, row: int, column: int, value: float) -> None:
-    """Write a vertical descent with one changed value; column 4 (qx) turns all poses upside down."""
+    """Write a vertical descent with one changed value; for column 4 (qx) the camera looks up in all poses."""
     times = np.arange(-6.0, 22.0, 0.5)
     poses = np.zeros((times.size, 8))
     poses[:, 0], poses[:, 3], poses[:, 7] = times, 1900.0 - 75.0 * times, 1.0
@@ -70,7 +73,12 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
 @pytest.mark.parametrize(
     ("table", "name", "write", "message"),
     [
-        (TERRAIN, "projection.tif", lambda path: write_dtm(path, crs=DEGREES), "is in degrees; project it to metres"),
+        (
+            TERRAIN,
+            "projection.tif",
+            lambda path: write_dtm(path, crs=MARS_DEGREES),
+            "is in degrees; project it to metres",
+        ),
         (TERRAIN, "nodata.tif", lambda path: write_dtm(path, nodata=None), "has no nodata value"),
         (TERRAIN, "units.tif", lambda path: write_dtm(path, unit="ft"), "its heights are in 'ft'; allowed: metres"),
         (TERRAIN, "huge.tif", lambda path: write_dtm(path, side=16384), "16384 x 16384 values; allowed: at most 5461"),

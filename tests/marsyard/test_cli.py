@@ -43,10 +43,10 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 
     def run_command(*arguments: object) -> CommandResult:
         monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as raised:
+        with pytest.raises(SystemExit) as error_info:
             cli.main()
         captured = capfd.readouterr()
-        return CommandResult(int(raised.value.code or 0), captured.out, captured.err)
+        return CommandResult(int(error_info.value.code or 0), captured.out, captured.err)
 
     return run_command
 
@@ -123,7 +123,7 @@ def _kill_after_first_rows(path: Path, directory: Path, cases: int) -> None:
     command += ["--out", str(directory)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     log = directory / "cases.sqlite-wal"
-    # the write-ahead log of an empty table has two pages of 4 kB; a log of more than four pages contains rows
+    # The write-ahead log of an empty table has two pages of 4.1 kB. A log of more than four pages contains rows.
     while not (log.exists() and log.stat().st_size > 4 * 4200) and process.poll() is None:
         time.sleep(0.05)
     process.kill()
@@ -133,25 +133,25 @@ def _kill_after_first_rows(path: Path, directory: Path, cases: int) -> None:
 def test_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Command) -> None:
     path = write_campaign(tmp_path, "sleep_s = 0.1", dispersions="", requirement=REQUIREMENT)
     _kill_after_first_rows(path, tmp_path / "run", 40)
-    before = (tmp_path / "run" / "campaign.json").read_bytes()
-    reported = marsyard("report", tmp_path / "run")
-    assert (reported.status, reported.err) == (3, "")
+    record_before = (tmp_path / "run" / "campaign.json").read_bytes()
+    report_result = marsyard("report", tmp_path / "run")
+    assert (report_result.status, report_result.err) == (3, "")
     message = re.search(
-        r"INCOMPLETE: (\d+) of 40 cases; the campaign was killed; to continue: marsyard resume (\S+)", reported.out
+        r"INCOMPLETE: (\d+) of 40 cases; the campaign was killed; to continue: marsyard resume (\S+)", report_result.out
     )
     assert message
     assert message[2] == str(tmp_path / "run")
     assert 0 < int(message[1]) == len(pd.read_parquet(tmp_path / "run" / "cases.parquet")) < 40
-    assert (tmp_path / "run" / "campaign.json").read_bytes() == before
-    rejected = marsyard("append", tmp_path / "run", 2)
-    assert (rejected.status, "is not finished (running): marsyard resume" in rejected.err) == (2, True)
-    resumed = marsyard("resume", tmp_path / "run", "--jobs", 1, "--allow-changed")
-    assert (resumed.status, "INCOMPLETE" in resumed.out) == (3, False)
+    assert (tmp_path / "run" / "campaign.json").read_bytes() == record_before
+    early_append = marsyard("append", tmp_path / "run", 2)
+    assert (early_append.status, "is not finished (running): marsyard resume" in early_append.err) == (2, True)
+    resume_result = marsyard("resume", tmp_path / "run", "--jobs", 1, "--allow-changed")
+    assert (resume_result.status, "INCOMPLETE" in resume_result.out) == (3, False)
     assert list(pd.read_parquet(tmp_path / "run" / "cases.parquet")["case"]) == list(range(40))
-    appended = marsyard("append", tmp_path / "run", 20, "--jobs", 1, "--allow-changed")
-    assert appended.status == 3
-    assert "of 60" in appended.out
-    assert "takes at least 230 cases without a failure; the campaign has 60" in appended.out
+    append_result = marsyard("append", tmp_path / "run", 20, "--jobs", 1, "--allow-changed")
+    assert append_result.status == 3
+    assert "of 60" in append_result.out
+    assert "takes at least 230 cases without a failure; the campaign has 60" in append_result.out
 
 
 def test_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,7 +164,7 @@ def test_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch: 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fake.toml"]
 
 
-def _crash_case(case: int) -> str:
+def _crashing_case_setting(case: int) -> str:
     return f"raising_cases = [{case}]"
 
 
@@ -172,13 +172,13 @@ def _crash_case(case: int) -> str:
     ("parameters", "requirement", "status", "verdict"),
     [
         ("", "", 0, "NO REQUIREMENT"),
-        (_crash_case(1), "", 1, "NO REQUIREMENT"),
-        # three cases on one terrain count as one case, which shows a rate of 10 % at 90 % confidence
+        (_crashing_case_setting(1), "", 1, "NO REQUIREMENT"),
+        # three cases on one terrain count as one case: the lower bound of one success is 10 % at 90 % confidence
         ("", REQUIREMENT.replace("0.99", "0.09"), 0, "PASS"),
         ("error_scale = 1e3", REQUIREMENT, 1, "FAIL"),
         ("", REQUIREMENT, 3, "INSUFFICIENT"),
         # the requirement is undecided, but a crash gives status 1
-        (_crash_case(1), REQUIREMENT.replace("0.99", "0.9"), 1, "INSUFFICIENT"),
+        (_crashing_case_setting(1), REQUIREMENT.replace("0.99", "0.9"), 1, "INSUFFICIENT"),
     ],
 )
 def test_exit_status_follows_verdict_and_crashes(
@@ -187,13 +187,13 @@ def test_exit_status_follows_verdict_and_crashes(
     path = write_campaign(tmp_path, parameters, dispersions="", requirement=requirement)
     result = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
     assert (result.status, f"verdict: {verdict}" in result.out) == (status, True), result.out + result.err
-    reported = marsyard("report", tmp_path / "run")
-    assert (reported.status, f"verdict: {verdict}" in reported.out) == (status, True)
+    report_result = marsyard("report", tmp_path / "run")
+    assert (report_result.status, f"verdict: {verdict}" in report_result.out) == (status, True)
 
 
 def test_configuration_error_precedes_failed_cases(tmp_path: Path, marsyard: Command) -> None:
-    wrong = REQUIREMENT.replace("velocity_error_m_s", "velocity_error_m")
-    path = write_campaign(tmp_path, _crash_case(0), dispersions="", requirement=wrong)
+    invalid_requirement = REQUIREMENT.replace("velocity_error_m_s", "velocity_error_m")
+    path = write_campaign(tmp_path, _crashing_case_setting(0), dispersions="", requirement=invalid_requirement)
     result = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
     assert result.status == 2
     assert "unknown column of numbers 'velocity_error_m' (did you mean 'velocity_error_m_s'?)" in result.err
@@ -241,7 +241,7 @@ def test_invalid_arguments_are_rejected(
     finished_run: Path, tmp_path: Path, marsyard: Command, arguments: list[str], message: str
 ) -> None:
     file = write_campaign(tmp_path)
-    result = marsyard(*(part.format(file=file, run=finished_run, folder=tmp_path) for part in arguments))
+    result = marsyard(*(argument.format(file=file, run=finished_run, folder=tmp_path) for argument in arguments))
     # Typer prints usage errors in a box with line breaks
     text = re.sub(r"[\s│]+", " ", result.err)
     assert result.status == 2
@@ -267,20 +267,20 @@ def test_default_output_folder_is_runs(tmp_path: Path, marsyard: Command, monkey
     path = write_campaign(tmp_path, dispersions="", requirement="")
     for _ in range(2):
         assert marsyard("run", path, "-n", 1, "--set", "retain.showcase=none", "--jobs", 1).status == 0
-    folders = sorted(entry.name for entry in (tmp_path / "runs").iterdir())
+    folders = sorted(path.name for path in (tmp_path / "runs").iterdir())
     assert len(folders) == 2
     assert all(re.fullmatch(r"fake-\d{8}T\d{6}Z(-2)?", name) for name in folders)
 
 
 def test_list_and_show_print_campaigns(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "120")  # wide enough for unbroken texts
-    listed = marsyard("list")
-    assert (listed.status, listed.err) == (0, "")
-    assert "dimes-smoke" in listed.out
-    details = marsyard("show", write_campaign(tmp_path), "--set", "terrain=2")
-    assert (details.status, details.err) == (0, "")
+    list_result = marsyard("list")
+    assert (list_result.status, list_result.err) == (0, "")
+    assert "dimes-smoke" in list_result.out
+    show_result = marsyard("show", write_campaign(tmp_path), "--set", "terrain=2")
+    assert (show_result.status, show_result.err) == (0, "")
     for text in ("uniform(low=-30.0, high=30.0)", "test", "lowest_altitude_m", "velocity", "12 cases, seed 5"):
-        assert text in details.out
+        assert text in show_result.out
 
 
 def test_names_in_brackets_are_not_markup(tmp_path: Path, marsyard: Command) -> None:
@@ -301,11 +301,11 @@ def test_help_is_fast() -> None:
     result = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", "marsyard", "--help"], capture_output=True, text=True
     )
-    elapsed = time.perf_counter() - start_s
+    elapsed_s = time.perf_counter() - start_s
     assert result.returncode == 0
     assert "Exit status: 0 all requirements met" in re.sub(r"[\s│]+", " ", result.stdout)
     # loose limit for a busy machine; no heavy package may be imported
-    assert elapsed < 3.0
+    assert elapsed_s < 3.0
     for package in ("numpy", "pandas", "scipy", "joblib", "pydantic", "matplotlib"):
         assert f" {package}\n" not in result.stderr
 

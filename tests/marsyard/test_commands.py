@@ -1,4 +1,4 @@
-"""Tests of properties of all commands."""
+"""Tests that all commands have a help text, and that commands which only print have a JSON option."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from marsyard.cli.app import app
 
-#: Commands that only print, and commands that write files; each command is in one of the two sets.
+#: Commands that only print, and commands that write files. Each command is in one of the two sets.
 PRINTING = {
     "list",
     "show",

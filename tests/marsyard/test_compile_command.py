@@ -1,4 +1,4 @@
-"""Tests of `marsyard compile`: one small case per system; compiled systems are skipped."""
+"""Tests of `marsyard compile`: each system has a small case for compilation; compiled systems are skipped."""
 
 from pathlib import Path
 

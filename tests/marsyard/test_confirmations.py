@@ -52,10 +52,10 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
 
     def run_command(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as raised:
+        with pytest.raises(SystemExit) as error_info:
             cli.main()
         captured = capfd.readouterr()
-        return int(raised.value.code or 0), captured.out, captured.err
+        return int(error_info.value.code or 0), captured.out, captured.err
 
     return run_command
 

@@ -91,14 +91,14 @@ def test_conformance_reports_changed_process_state(tmp_path: Path, monkeypatch: 
 def test_conformance_is_printed_as_json() -> None:
     result = CliRunner().invoke(app, ["conformance", "phase-correlation", "--json"])
     assert result.exit_code == 0
-    reported = json.loads(result.output)
-    assert (reported["algorithm"], reported["task"], reported["passed"], len(reported["checks"])) == (
-        "phase-correlation",
-        "velocity",
-        True,
-        9,
-    )
-    assert all(check["passed"] and check["asked"] for check in reported["checks"])
+    conformance_report = json.loads(result.output)
+    assert (
+        conformance_report["algorithm"],
+        conformance_report["task"],
+        conformance_report["passed"],
+        len(conformance_report["checks"]),
+    ) == ("phase-correlation", "velocity", True, 9)
+    assert all(check["passed"] and check["asked"] for check in conformance_report["checks"])
 
 
 @pytest.mark.parametrize(

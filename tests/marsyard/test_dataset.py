@@ -64,8 +64,8 @@ def test_only_terrains_of_the_cases_are_built(tmp_path: Path, monkeypatch: pytes
     path.write_text(CAMPAIGN.replace("bank = 1", "bank = 20").replace("samples = 512", "samples = 256") + dispersion)
     campaign = load_campaign(str(path))
     _prepare_terrains(campaign, range(2))
-    used = {campaign.parameters(case).model_dump()["location"]["terrain"] for case in range(2)}
-    assert len(list((tmp_path / "cache" / "terrain").iterdir())) == len(used)
+    terrains = {campaign.parameters(case).model_dump()["location"]["terrain"] for case in range(2)}
+    assert len(list((tmp_path / "cache" / "terrain").iterdir())) == len(terrains)
 
 
 def compute_points(sample: dict[str, Any], camera_file: Path, distance: np.ndarray) -> np.ndarray:
@@ -111,10 +111,10 @@ def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> Non
 
     # an interrupted data set is completed with identical files
     assert 0.0 <= sample["drawn"]["location.east_m"] <= 20.0
-    before = [path.read_bytes() for path in shards]
+    contents_before = [path.read_bytes() for path in shards]
     shards[0].unlink()
     assert run_dataset(tmp_path)[0] == 0
-    assert [path.read_bytes() for path in shards] == before
+    assert [path.read_bytes() for path in shards] == contents_before
     status, output = run_dataset(tmp_path, "--seed", "4")
     assert status == 2
     assert "contains another data set (configuration_sha256 differs)" in output
@@ -122,7 +122,7 @@ def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> Non
 
 def test_descent_sample_has_three_images(tmp_path: Path) -> None:
     settings = ["terrain.samples=512", "location.bank=8"]
-    arguments = [part for setting in settings for part in ("--set", setting)]
+    arguments = [argument for setting in settings for argument in ("--set", setting)]
     out = tmp_path / "set"
     result = CliRunner().invoke(
         app, ["dataset", "dimes-smoke", "-n", "1", "--jobs", "1", "--out", str(out), *arguments]

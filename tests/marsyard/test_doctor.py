@@ -56,9 +56,9 @@ def test_only_failures_change_the_exit_status(
     assert "2 GB [free]" in text
     assert "disk: see the manual" in text
     exit_status, text = run_doctor(as_json=True)
-    reported = json.loads(text)
-    assert (exit_status, reported["can_run"]) == (status, status == 0)
-    assert reported["checks"] == [
+    report = json.loads(text)
+    assert (exit_status, report["can_run"]) == (status, status == 0)
+    assert report["checks"] == [
         {"check": "disk", "finding": "2 GB [free]", "verdict": verdict.name.lower(), "remedy": "see the manual"}
     ]
 
@@ -92,17 +92,17 @@ def test_verdict_of_the_selected_backend(
     monkeypatch: pytest.MonkeyPatch, osmesa: Probe, egl: Probe, backend: str, verdict: Verdict, remedy: str
 ) -> None:
     monkeypatch.setenv("MARSYARD_GL", backend)
-    *_, last = doctor.check_rendering({"osmesa": osmesa, "egl": egl})
-    assert last.verdict is verdict
-    assert remedy in last.remedy
+    *_, selection = doctor.check_rendering({"osmesa": osmesa, "egl": egl})
+    assert selection.verdict is verdict
+    assert remedy in selection.remedy
 
 
 def test_backend_with_wrong_depth_fails() -> None:
     assert WORKING_BACKEND.measurements is not None
     inaccurate = Probe({**WORKING_BACKEND.measurements, "depth_error_m": 0.5})
-    first, *_, last = doctor.check_rendering({"osmesa": inaccurate})
+    first, *_, selection = doctor.check_rendering({"osmesa": inaccurate})
     assert first.verdict is Verdict.WARN
-    assert last.verdict is Verdict.FAIL
+    assert selection.verdict is Verdict.FAIL
 
 
 def test_package_from_another_folder_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -180,10 +180,10 @@ def test_more_threads_than_cores_give_a_warning() -> None:
 
 
 def test_unwritable_caches_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    occupied = tmp_path / "file"
-    occupied.touch()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(occupied / "numba"))
-    monkeypatch.setenv("MARSYARD_CACHE", str(occupied))
+    file = tmp_path / "file"
+    file.touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(file / "numba"))
+    monkeypatch.setenv("MARSYARD_CACHE", str(file))
     assert doctor.check_numba_cache().verdict is Verdict.WARN
     assert [check.verdict for check in doctor.check_disk()] == [Verdict.OK, Verdict.FAIL]
 

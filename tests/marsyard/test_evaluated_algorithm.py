@@ -74,23 +74,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _read_record(folder: Path) -> Mapping[str, Any]:
-    stored: Mapping[str, Any] = json.loads((folder / "run" / "campaign.json").read_text())
-    return stored
+    record: Mapping[str, Any] = json.loads((folder / "run" / "campaign.json").read_text())
+    return record
 
 
 def test_record_describes_the_algorithms(folder: Path) -> None:
-    tested, compared = _read_record(folder)["algorithms"]
-    assert (tested["spec"], tested["role"], tested["path"]) == (
+    tested_entry, compared_entry = _read_record(folder)["algorithms"]
+    assert (tested_entry["spec"], tested_entry["role"], tested_entry["path"]) == (
         "my_module:MyEstimator",
         "tested",
         "my_module:MyEstimator",
     )
-    assert (tested["version"], tested["options"]) == ("3.1", {"gain": 0.5})
-    assert re.fullmatch("[0-9a-f]{16}", tested["source_hash"])
-    assert (compared["spec"], compared["role"]) == ("homography", "compared")
-    assert compared["path"] == "marsyard.algorithms.baselines.homography:HomographyEstimator"
-    assert compared["version"]
-    assert compared["options"]
+    assert (tested_entry["version"], tested_entry["options"]) == ("3.1", {"gain": 0.5})
+    assert re.fullmatch("[0-9a-f]{16}", tested_entry["source_hash"])
+    assert (compared_entry["spec"], compared_entry["role"]) == ("homography", "compared")
+    assert compared_entry["path"] == "marsyard.algorithms.baselines.homography:HomographyEstimator"
+    assert compared_entry["version"]
+    assert compared_entry["options"]
 
 
 def test_reports_name_the_evaluated_algorithm(folder: Path) -> None:
@@ -133,22 +133,22 @@ def test_command_in_the_report_repeats_the_campaign(folder: Path, tmp_path: Path
     change_folder, command = [html.unescape(line) for line in re.findall(r"<code>(.*?)</code>", command_block[1])]
     assert shlex.split(change_folder) == ["cd", str(folder)]
     program = shlex.quote(str(Path(sys.executable).with_name("marsyard")))
-    repeated_run = tmp_path / "again"
-    line = command.replace("marsyard", program, 1) + f" --jobs 1 --out {shlex.quote(str(repeated_run))}"
+    second_run = tmp_path / "again"
+    line = command.replace("marsyard", program, 1) + f" --jobs 1 --out {shlex.quote(str(second_run))}"
     script = f"{change_folder} && {line}"
     result = subprocess.run(
         ["/bin/sh", "-c", script], cwd="/", capture_output=True, text=True, timeout=120, check=False
     )
     assert result.returncode in (1, 3), result.stderr
     first, second = (
-        json.loads((run_folder / "campaign.json").read_text()) for run_folder in (folder / "run", repeated_run)
+        json.loads((run_folder / "campaign.json").read_text()) for run_folder in (folder / "run", second_run)
     )
     assert first["configuration"] == second["configuration"]
     assert first["algorithms"] == second["algorithms"]
     columns = ("case", "outcome", "image_hash", "algorithm", "homography.velocity_error_m_s")
     rows = [
         [{column: row[column] for column in columns} for row in read_case_rows(run_folder)]
-        for run_folder in (folder / "run", repeated_run)
+        for run_folder in (folder / "run", second_run)
     ]
     assert rows[0] == rows[1]
     assert len(rows[0]) == 3
@@ -160,20 +160,22 @@ def test_appended_blocks_are_in_the_command(folder: Path) -> None:
 
     run = read_run(folder / "run")
     configuration = {**run.record["configuration"], "appended": [20]}
-    changed = type(run)(run.directory, run.frame, run.all_cases, {**run.record, "configuration": configuration}, ())
-    assert rerun_commands(changed)[-1] == "marsyard append runs/custom-campaign-again 20"
+    run_with_append = type(run)(
+        run.directory, run.frame, run.all_cases, {**run.record, "configuration": configuration}, ()
+    )
+    assert rerun_commands(run_with_append)[-1] == "marsyard append runs/custom-campaign-again 20"
 
 
 def test_records_of_earlier_versions_are_reported(folder: Path, tmp_path: Path) -> None:
-    old = tmp_path / "old"
-    old.mkdir()
-    (old / "cases.parquet").write_bytes((folder / "run" / "cases.parquet").read_bytes())
+    old_run = tmp_path / "old"
+    old_run.mkdir()
+    (old_run / "cases.parquet").write_bytes((folder / "run" / "cases.parquet").read_bytes())
     record = {key: value for key, value in _read_record(folder).items() if key not in ("command", "algorithms")}
-    (old / "campaign.json").write_text(json.dumps(record))
-    result = CliRunner().invoke(app, ["report", str(old)])
+    (old_run / "campaign.json").write_text(json.dumps(record))
+    result = CliRunner().invoke(app, ["report", str(old_run)])
     assert result.exit_code in (1, 3), result.output
-    page = (old / "report.html").read_text()
+    page = (old_run / "report.html").read_text()
     assert "marsyard run custom-campaign -n 3 --seed 9" in page
     assert "The original command was not recorded" in page
-    (row,) = csv.DictReader(io.StringIO((old / "verification.csv").read_text()))
+    (row,) = csv.DictReader(io.StringIO((old_run / "verification.csv").read_text()))
     assert (row["algorithm"], row["algorithm_version"]) == ("my_module:MyEstimator", "")

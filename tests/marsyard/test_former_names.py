@@ -46,8 +46,8 @@ NAMES = (("place", "location"), ("cone_minor_share", "cone_minor_fraction"), ("r
 
 
 def replace_deprecated_names(text: str) -> str:
-    for deprecated, current in NAMES:
-        text = text.replace(deprecated, current)
+    for deprecated_name, current_name in NAMES:
+        text = text.replace(deprecated_name, current_name)
     return text
 
 
@@ -61,21 +61,21 @@ def campaign_files(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_campaign_with_deprecated_names_equals_the_current_one(campaign_files: tuple[Path, Path]) -> None:
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as warning_records:
         warnings.simplefilter("always", DeprecatedNameWarning)
         campaign = load_campaign(str(campaign_files[0]))
     expected = load_campaign(str(campaign_files[1]))
     assert campaign.configuration == expected.configuration
     assert campaign.draws(1) == expected.draws(1)
-    texts = {str(warning.message) for warning in caught}
+    texts = {str(warning.message) for warning in warning_records}
     assert "'place' is now 'location'; the former name is accepted until 0.2" in texts
     assert {text.split("'")[1] for text in texts} == {"place", "cone_minor_share", "room"}
 
 
 def test_deprecated_value_of_an_option_sets_the_current_value() -> None:
-    deprecated = "where level ground at the measured range would move it by the on-board poses"
+    deprecated_value = "where level ground at the measured range would move it by the on-board poses"
     with pytest.warns(DeprecatedNameWarning, match="is now 'poses'"):
-        campaign = load_campaign("hda-benign", ["algorithm=hda-custom", f'hda.track_seed="{deprecated}"'])
+        campaign = load_campaign("hda-benign", ["algorithm=hda-custom", f'hda.track_seed="{deprecated_value}"'])
     assert campaign.configuration.parameters["hda"]["track_seed"] == "poses"
     with pytest.raises(ConfigurationError, match="input should be 'unchanged' or 'poses'"):
         load_campaign("hda-benign", ["hda.track_seed=nothing"])
@@ -98,9 +98,10 @@ def test_stored_campaign_is_read_with_current_names(campaign_files: tuple[Path, 
     expected = load_campaign(str(campaign_files[1])).configuration
     record.write_first_record(tmp_path, expected, create_identity(expected), "test")
     text = (tmp_path / "campaign.json").read_text()
-    for deprecated, current in (*NAMES, ("most_cases", "max_cases")):
+    for deprecated_name, current_name in (*NAMES, ("most_cases", "max_cases")):
+        # names follow a quotation mark, a point of a path, or a space of an expression
         for character in '". ':
-            text = text.replace(f"{character}{current}", f"{character}{deprecated}")
+            text = text.replace(f"{character}{current_name}", f"{character}{deprecated_name}")
     assert "place.terrain" in text
     assert "valid and room" in text
     (tmp_path / "campaign.json").write_text(text)
@@ -116,10 +117,10 @@ def test_deprecated_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path
     monkeypatch.setattr(sys, "argv", ["marsyard", "replay", str(tmp_path), "0", "--step"])
     with (
         pytest.warns(DeprecatedNameWarning, match="'--step' is now '--save-stages'"),
-        pytest.raises(SystemExit) as raised,
+        pytest.raises(SystemExit) as error_info,
     ):
         main()
-    assert raised.value.code == 2
+    assert error_info.value.code == 2
     assert sys.argv[-1] == "--save-stages"
 
 
@@ -127,10 +128,12 @@ def test_current_names_exist_and_deprecated_names_do_not() -> None:
     """Each current key of the table is a parameter of a scenario, and each current column a column of a scenario."""
     schemas = " ".join(json.dumps(scenario(name).parameters_type.model_json_schema()) for name in scenario_names())
     schemas += json.dumps(type(load_campaign("dimes-smoke").configuration).model_json_schema())
-    for deprecated, current in RENAMED_NAMES["keys"].items():
-        assert f'"{current}": {{' in schemas, current
-        assert deprecated in ("own", "least", "most") or f'"{deprecated}": {{' not in schemas, deprecated
+    for deprecated_name, current_name in RENAMED_NAMES["keys"].items():
+        assert f'"{current_name}": {{' in schemas, current_name
+        assert deprecated_name in ("own", "least", "most") or f'"{deprecated_name}": {{' not in schemas, deprecated_name
     column_sets = [columns for name in scenario_names() if (columns := row_columns(name)) is not None]
-    for deprecated, current in RENAMED_NAMES["columns"].items():
-        assert any(current in (*columns.flags, *columns.numbers) for columns in column_sets), current
-        assert not any(deprecated in (*columns.flags, *columns.numbers) for columns in column_sets), deprecated
+    for deprecated_name, current_name in RENAMED_NAMES["columns"].items():
+        assert any(current_name in (*columns.flags, *columns.numbers) for columns in column_sets), current_name
+        assert not any(deprecated_name in (*columns.flags, *columns.numbers) for columns in column_sets), (
+            deprecated_name
+        )

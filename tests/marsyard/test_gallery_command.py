@@ -34,11 +34,11 @@ class _PageParser(HTMLParser):
     def __init__(self) -> None:
         super().__init__()
         self.targets: list[str] = []
-        self.texts: list[str] = []
+        self.alternative_texts: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.targets += [value for name, value in attrs if name in ("href", "src") and value]
-        self.texts += [value or "" for name, value in attrs if tag == "img" and name == "alt"]
+        self.alternative_texts += [value or "" for name, value in attrs if tag == "img" and name == "alt"]
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +56,7 @@ def images() -> list[GalleryImage]:
 
 
 def test_every_site_and_camera_is_shown(images: list[GalleryImage]) -> None:
+    """Sites with terrain for descents also have a view of a descent."""
     assert {image.request.site for image in images} == set(sites())
     assert {image.request.camera for image in images} == set(PRESETS)
     for image in images:
@@ -76,8 +77,10 @@ def test_page_links_only_to_its_images(images: list[GalleryImage], tmp_path: Pat
             assert f'id="{link[1:]}"' in text
         elif not link.startswith("data:image/jpeg;base64,"):
             assert (page.parent / link).is_file()
-    assert len(parser.texts) == len(images)
-    assert all(image.caption in alternative for image, alternative in zip(images, parser.texts, strict=True))
+    assert len(parser.alternative_texts) == len(images)
+    assert all(
+        image.caption in alternative for image, alternative in zip(images, parser.alternative_texts, strict=True)
+    )
     for command in re.findall(r"<code>(marsyard render [^<]*)</code>", text):
         assert "--camera" in command
 
@@ -95,12 +98,12 @@ def test_contact_sheet_is_small(images: list[GalleryImage]) -> None:
     ]
     sheet = draw_contact_sheet(smooth_images)
     assert len(sheet) <= SHEET_BYTES
-    decoded = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert decoded is not None
-    assert len(np.unique(decoded)) > 8
+    sheet_image = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert sheet_image is not None
+    assert len(np.unique(sheet_image)) > 8
 
 
-def test_display_keeps_the_order_of_grey_values() -> None:
+def test_map_to_grey_keeps_the_order_of_brightness() -> None:
     rng = np.random.default_rng(3)
     ground = np.ones((120, 160), dtype=bool)
     ground[:20] = False
@@ -126,9 +129,9 @@ def test_existing_gallery_is_kept(
     (tmp_path / name).write_text("existing text")
     monkeypatch.setattr(gallery_command, "VIEWS", ())
     monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path)])
-    with pytest.raises(SystemExit) as raised:
+    with pytest.raises(SystemExit) as error_info:
         cli.main()
-    assert raised.value.code == 2
+    assert error_info.value.code == 2
     assert f"{tmp_path / name}: the file exists" in capfd.readouterr().err
     assert (tmp_path / name).read_text() == "existing text"
 
@@ -148,7 +151,7 @@ def test_unknown_terrain_file_format_is_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path), "--terrain", "relief.txt"])
-    with pytest.raises(SystemExit) as raised:
+    with pytest.raises(SystemExit) as error_info:
         cli.main()
-    assert raised.value.code == 2
+    assert error_info.value.code == 2
     assert "--terrain relief.txt is not a DTM file; allowed: .npz, .tif, .tiff" in capfd.readouterr().err

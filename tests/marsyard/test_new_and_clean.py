@@ -1,4 +1,4 @@
-"""Tests of `marsyard new` and `marsyard clean`, and of lists that are printed as JSON."""
+"""Tests of `marsyard new` and `marsyard clean`, and of the JSON output of lists."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_new_campaign_is_valid(working_folder: Path, system: str, scenario: str,
 
 @pytest.mark.parametrize("system", ["velocity", "landing", "tracking"])
 def test_new_campaign_draws_a_new_terrain_per_case(working_folder: Path, system: str) -> None:
-    """With few terrains, the verdict stays INSUFFICIENT for any number of cases."""
+    """Each of 1000 cases has its own terrain: with few terrains the verdict stays INSUFFICIENT."""
     status, output = run_command("new", "mine", "--system", system, "-n", "1000")
     assert (status, "note:" in output) == (0, False), output
     campaign = load_campaign("mine.toml")
@@ -84,6 +84,7 @@ def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) 
     cases, terrains = evidence_limits(load_campaign("dimes-smoke"))
     assert cases.startswith("DIMES-VEL: 99 % at 90 % confidence takes at least 230 cases")
     assert "has only 8 stored terrains (location.bank = 8)" in terrains
+    # ten stored terrains for each of the 230; 254 draws then have 230 different terrains (see test_verdicts)
     assert "--set location.bank=2300 -n 254" in terrains
     larger = load_campaign("dimes-smoke", ["location.bank=2300"], 254)
     assert evidence_limits(larger) == []

@@ -35,10 +35,10 @@ def nightly(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, 
         write_campaign(tmp_path, parameter_lines, requirement=requirement, dispersions=DISPERSIONS)
         command = ["marsyard", "nightly", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "out"), "--jobs", "1"]
         monkeypatch.setattr(sys, "argv", command)
-        with pytest.raises(SystemExit) as raised:
+        with pytest.raises(SystemExit) as error_info:
             cli.main()
         capfd.readouterr()
-        return int(raised.value.code or 0), (tmp_path / "out" / "nightly.md").read_text()
+        return int(error_info.value.code or 0), (tmp_path / "out" / "nightly.md").read_text()
 
     return run
 
@@ -106,14 +106,14 @@ def test_killed_run_is_shown_and_not_compared(
 def test_seeds_differ_between_nightly_runs(tmp_path: Path) -> None:
     assert len({night_seed(seed, night) for seed in range(20) for night in range(50)}) == 1000
     path = write_campaign(tmp_path)
-    campaign, other = (load_campaign(str(path), seed=seed) for seed in (1, 2))
-    assert hash_definition(campaign) == hash_definition(other)
-    assert hash_definition(campaign) != hash_definition(load_campaign(str(path), ["altitude_m=1500"]))
+    first_campaign, second_campaign = (load_campaign(str(path), seed=seed) for seed in (1, 2))
+    assert hash_definition(first_campaign) == hash_definition(second_campaign)
+    assert hash_definition(first_campaign) != hash_definition(load_campaign(str(path), ["altitude_m=1500"]))
 
 
 def test_campaigns_of_the_shipped_plan_load() -> None:
-    for planned in read_plan(PLAN_FILE).campaigns:
-        planned.load(0, 1, PLAN_FILE.parent)
+    for entry in read_plan(PLAN_FILE).campaigns:
+        entry.load(0, 1, PLAN_FILE.parent)
 
 
 @pytest.mark.parametrize(
@@ -127,6 +127,6 @@ def test_campaigns_of_the_shipped_plan_load() -> None:
 )
 def test_invalid_plans_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "plan.toml").write_text(text)
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error_info:
         read_plan(tmp_path / "plan.toml")
-    assert message in str(raised.value)
+    assert message in str(error_info.value)

@@ -52,7 +52,7 @@ def test_time_left_follows_the_rate_of_the_stage() -> None:
     first, second = (line for line in _render_bars(bars, clock) if line.strip())
     assert "5.0 s per item" in first
     assert "total 0:00:10" in first
-    # 7 remaining cases at 33.3 s per item
+    # three cases took 100 s; the remaining 7 take 233 s = 3:53 min
     assert "33.3 s per item" in second
     assert "0:03:53 left" in second
     clock.now_s += 1000.0
@@ -88,7 +88,7 @@ def test_compilation_is_reported_until_first_case_ends(tmp_path: Path, monkeypat
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(preparation, "REPORT_INTERVAL_S", 0.01)
     watch = RecordingWatch()
-    with report_compilation("descent", watch.note) as first_case_ended:
+    with report_compilation("descent", watch.note) as end_first_case:
         assert watch.notes[0].startswith("compiling numeric kernels once on this machine, about two minutes")
         assert "marsyard compile" in watch.notes[0]
         for number in range(3):
@@ -96,12 +96,12 @@ def test_compilation_is_reported_until_first_case_ends(tmp_path: Path, monkeypat
         deadline = time.monotonic() + 20.0
         while not any("3 functions so far" in note for note in watch.notes) and time.monotonic() < deadline:
             time.sleep(0.01)
-        first_case_ended()
+        end_first_case()
     assert any("3 functions so far" in note for note in watch.notes)
     assert re.fullmatch(r"numeric kernels are compiled, \d+ s", watch.notes[-1])
     # compiled kernels give no notes
     mark_ready("descent")
     second_watch = RecordingWatch()
-    with report_compilation("descent", second_watch.note) as first_case_ended:
-        first_case_ended()
+    with report_compilation("descent", second_watch.note) as end_first_case:
+        end_first_case()
     assert second_watch.notes == []

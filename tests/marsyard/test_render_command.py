@@ -25,9 +25,9 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
 
     def run_command(*arguments: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as raised:
+        with pytest.raises(SystemExit) as error_info:
             cli.main()
-        return int(raised.value.code or 0), capfd.readouterr().err
+        return int(error_info.value.code or 0), capfd.readouterr().err
 
     return run_command
 
@@ -67,7 +67,7 @@ def test_detector_image_from_above_is_consistent(marsyard: Command, tmp_path: Pa
     prefix = tmp_path / "hover"
     status, message = marsyard("render", "heli-hazardous", "--camera", "xc-55", "--out", prefix, "--azimuth", 30)
     assert status == 0, message
-    _check_image(prefix, (640, 480), multiple=256)  # 8 bits in 16
+    _check_image(prefix, (640, 480), multiple=256)  # 8-bit counts in a 16-bit file
     metadata = json.loads(Path(f"{prefix}.json").read_text())
     assert metadata["shot"]["altitude_m"] == 10.0
     assert metadata["detector"]["exposure_s"] == metadata["png"]["exposure_s"]
@@ -146,13 +146,13 @@ def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path) -> 
     assert status == 0, message
     assert "show filled holes of the DTM" in message
     with np.load(f"{prefix}.npz") as truth:
-        filled, points = truth["filled"], truth["point_m"]
-        assert filled.any()
-        assert not filled.all()
+        is_filled, points = truth["filled"], truth["point_m"]
+        assert is_filled.any()
+        assert not is_filled.all()
         # the DTM of 119 m is centred in 256 m; posts from column 90 have no height
         west_edge_m = round(0.5 * (256 - 119))
-        assert points[filled][:, 0].min() > west_edge_m + 89.0
+        assert points[is_filled][:, 0].min() > west_edge_m + 89.0
         np.testing.assert_allclose(np.nanmean(points[..., :2], axis=(0, 1)), 128.0, atol=3.0)
     metadata = json.loads(Path(f"{prefix}.json").read_text())
-    assert metadata["filled_fraction"] == pytest.approx(float(filled.mean()))
+    assert metadata["filled_fraction"] == pytest.approx(float(is_filled.mean()))
     assert metadata["cahvor"]["frame"].startswith("body")

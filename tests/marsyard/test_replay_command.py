@@ -35,12 +35,12 @@ def stored_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "my_scenario.py").write_text(SCENARIO)
     path = write_campaign(folder)
     path.write_text(path.read_text().replace("tests.campaigns.fake_scenario:FakeScenario", "my_scenario:MyScenario"))
-    before = Path.cwd()
+    working_folder = Path.cwd()
     os.chdir(folder)
     try:
         run(path, folder / "run", RecordingWatch(), "cases=2", "retain.products=all", jobs=1)
     finally:
-        os.chdir(before)
+        os.chdir(working_folder)
     assert (folder / "run" / "cases" / "0" / "products.json").exists()
     return folder / "run"
 
@@ -61,14 +61,14 @@ def test_missing_scenario_is_reported_and_changes_nothing(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [entry for entry in sys.path if entry != str(stored_run.parent)])
     monkeypatch.delitem(sys.modules, "my_scenario", raising=False)
-    before = _read_files(stored_run)
+    files_before = _read_files(stored_run)
     for command in (("replay", stored_run, 0), ("resume", stored_run, "--allow-changed")):
         status, output = run_command(*command)
         assert status == 2
         assert "cannot import scenario 'my_scenario:MyScenario': No module named 'my_scenario'" in output
         assert "Traceback" not in output
     assert {name: text for name, text in _read_files(stored_run).items() if name != "campaign.lock"} == {
-        name: text for name, text in before.items() if name != "campaign.lock"
+        name: text for name, text in files_before.items() if name != "campaign.lock"
     }
 
 
@@ -85,11 +85,11 @@ def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monke
     create_store(folder / ROWS_FILE, {"identity": "x"})
     identity = create_identity(configuration)
     record.write_first_record(folder, configuration.model_copy(update={"parameters": parameters}), identity, "nobody")
-    before = _read_files(folder)
+    files_before = _read_files(folder)
     status, output = run_command("replay", folder, 0)
     assert status == 2
     assert "cannot import algorithm 'my_absent_module:Estimator'" in output
-    assert _read_files(folder) == before
+    assert _read_files(folder) == files_before
 
 
 def test_products_are_kept_if_the_replayed_case_fails(
@@ -97,16 +97,16 @@ def test_products_are_kept_if_the_replayed_case_fails(
 ) -> None:
     copy = shutil.copytree(stored_run, tmp_path / "run")
     monkeypatch.chdir(stored_run.parent)
-    before = _read_files(copy / "cases")
+    files_before = _read_files(copy / "cases")
     text = (copy / "campaign.json").read_text()
-    changed = json.loads(text)
-    changed["configuration"]["parameters"]["raising_cases"] = [0]
-    (copy / "campaign.json").write_text(json.dumps(changed))
+    changed_record = json.loads(text)
+    changed_record["configuration"]["parameters"]["raising_cases"] = [0]
+    (copy / "campaign.json").write_text(json.dumps(changed_record))
     status, output = run_command("replay", copy, 0)
     assert status == 1
     assert "case 0: CRASHED" in output
     assert "keeps its previous products" in output
-    assert _read_files(copy / "cases") == before
+    assert _read_files(copy / "cases") == files_before
     (copy / "campaign.json").write_text(text)
     assert run_command("replay", copy, 0)[0] == 0
 
@@ -117,19 +117,19 @@ def test_read_only_folder_is_replayed_into_another(
     """Rows are read from a copy because SQLite writes files. `os.access` is patched because tests may run as root."""
     copy = shutil.copytree(stored_run, tmp_path / "run")
     monkeypatch.chdir(stored_run.parent)
-    access = os.access
+    original_access = os.access
 
     def deny_write_access(path: Path, mode: int, **options: bool) -> bool:
         is_denied = mode == os.W_OK and Path(path).is_relative_to(copy)
-        return not is_denied and access(path, mode, **options)
+        return not is_denied and original_access(path, mode, **options)
 
     opened_files: list[str] = []
-    connect = sqlite3.connect
+    original_connect = sqlite3.connect
     monkeypatch.setattr("os.access", deny_write_access)
 
     def record_open(name: str, **options: Any) -> sqlite3.Connection:
         opened_files.append(str(name))
-        connection: sqlite3.Connection = connect(name, **options)
+        connection: sqlite3.Connection = original_connect(name, **options)
         return connection
 
     monkeypatch.setattr("marsyard.campaigns.store.rows.sqlite3.connect", record_open)
@@ -144,19 +144,19 @@ def test_products_are_replaced_completely_or_not(tmp_path: Path, monkeypatch: py
     folder = tmp_path / "case"
     save_packed(folder, pack_products({"x": np.arange(3)}), {"case": 0})
     (folder / "note.txt").write_text("a file of the user")
-    before = _read_files(folder)
-    write_bytes = Path.write_bytes
+    files_before = _read_files(folder)
+    original_write_bytes = Path.write_bytes
 
     def raise_disk_full(path: Path, data: bytes) -> int:
         if path.name == "products.json":
             raise OSError(errno.ENOSPC, "No space left on device")
-        return write_bytes(path, data)
+        return original_write_bytes(path, data)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(Path, "write_bytes", raise_disk_full)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", raise_disk_full)
         with pytest.raises(StoreError, match="No space left on device"):
             save_packed(folder, pack_products({"x": np.arange(4)}), {"case": 1})
-    assert _read_files(folder) == before
+    assert _read_files(folder) == files_before
     save_packed(folder, pack_products({"x": np.arange(4)}), {"case": 1})
     assert load_products(folder)["x"].size == 4
-    assert set(_read_files(folder)) == set(before)
+    assert set(_read_files(folder)) == set(files_before)

@@ -58,8 +58,8 @@ def make_run(tmp_path: Path) -> MakeRun:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
 
-    def write_synthetic_run(name: str, seed_of_rows: int = 1, **changes: Any) -> Path:
-        frame = module.synthetic_frame(40, seed=seed_of_rows)[COLUMNS]
+    def write_synthetic_run(name: str, row_seed: int = 1, **changes: Any) -> Path:
+        frame = module.synthetic_frame(40, seed=row_seed)[COLUMNS]
         directory: Path = module.write_run(tmp_path / name, frame, **changes)
         return directory
 
@@ -70,10 +70,10 @@ def make_run(tmp_path: Path) -> MakeRun:
 def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
     def run_command(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as raised:
+        with pytest.raises(SystemExit) as error_info:
             cli.main()
         captured = capfd.readouterr()
-        return int(raised.value.code or 0), captured.out, captured.err
+        return int(error_info.value.code or 0), captured.out, captured.err
 
     return run_command
 
@@ -112,9 +112,9 @@ def test_two_campaigns_are_compared(make_run: MakeRun, marsyard: Command) -> Non
     assert (status, err) == (0, "")
     assert "came to an end" in out
     assert "different draws" in out
-    reported = json.loads(marsyard("compare", *runs, "--json")[1])
-    assert (reported["second"], reported["paired"]) == (str(runs[1]), False)
-    figures = {figure["name"]: figure for figure in reported["figures"]}
+    comparison = json.loads(marsyard("compare", *runs, "--json")[1])
+    assert (comparison["second"], comparison["paired"]) == (str(runs[1]), False)
+    figures = {figure["name"]: figure for figure in comparison["figures"]}
     assert figures["came to an end"]["first"] == {"rate": 1.0, "cases": 40}
 
 
@@ -132,10 +132,10 @@ def test_dashboard_is_written_and_served_locally(make_run: MakeRun, marsyard: Co
         with urllib.request.urlopen(f"{root}/") as answer:  # noqa: S310
             assert "Requirements and campaigns" in answer.read().decode()
         for invalid_path in ("/c/", "/../secret.txt", "/%2e%2e/secret.txt", "/outside-link"):
-            with pytest.raises(urllib.error.HTTPError) as raised:
+            with pytest.raises(urllib.error.HTTPError) as error_info:
                 urllib.request.urlopen(root + invalid_path)  # noqa: S310
-            assert raised.value.code == 404
-            raised.value.close()
+            assert error_info.value.code == 404
+            error_info.value.close()
         http_server.shutdown()
 
 
@@ -164,7 +164,7 @@ def test_undecided_campaign_continues() -> None:
     assert _find_next_look(128, 0, 512) is None
     assert _find_next_look(128, 128, 512) is None
     assert _find_next_look(512, 50, 512) is None
-    # a decision by the estimate needs no further evaluation
+    # a verdict by the observed rate needs no further evaluation
     assert _find_next_look(16, 1, 512, decide_by="estimate") is None
 
 
@@ -174,41 +174,43 @@ def test_undecidable_campaign_stops() -> None:
     assert _find_next_look(32, 0, 33, probability=0.5) is None
 
 
-def test_adaptive_campaign_notes_its_end(tmp_path: Path) -> None:
+def test_adaptive_campaign_reports_its_end(tmp_path: Path) -> None:
     requirement = REQUIREMENT.replace("0.99", "0.5")
     dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
     path = write_campaign(tmp_path, "error_scale = 1e3", requirement=requirement, dispersions=dispersions)
     campaign, watch = load_campaign(str(path), cases=128), RecordingWatch()
     run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), watch)
-    stored = record.stored_configuration(tmp_path / "run")
-    # all cases fail on one terrain, which counts as one case: no evaluation refutes a rate of 50 %
-    assert (stored.total_cases, stored.max_cases) == (128, 128)
+    configuration = record.stored_configuration(tmp_path / "run")
+    # All cases fail on one terrain, which counts as one case. One failure does not refute a rate of 50 %.
+    assert (configuration.total_cases, configuration.max_cases) == (128, 128)
     assert watch.notes[-1] == "stopped after 128 of at most 128 cases"
 
 
-def test_gallery_repeats_its_cases_once(tmp_path: Path, marsyard: Command) -> None:
+def test_gallery_reruns_each_notable_case_once(tmp_path: Path, marsyard: Command) -> None:
     dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
     path, directory = write_campaign(tmp_path, dispersions=dispersions), tmp_path / "run"
     run_campaign(load_campaign(str(path), cases=12), directory, ExecutorConfig(jobs=1), RecordingWatch())
-    expected = set(notable_cases(read_run(directory)))
-    assert len(expected) >= 4
+    notable = set(notable_cases(read_run(directory)))
+    assert len(notable) >= 4
     _, out, err = marsyard("report", directory, "--gallery")
-    stored = {int(folder.name) for folder in (directory / "cases").iterdir()}
-    assert (expected - stored, err) == (set(), "")
-    assert out.count("rerun for its images") == len(expected - {_read_record(directory)["showcase"]})
-    # stored cases are not repeated
+    stored_cases = {int(folder.name) for folder in (directory / "cases").iterdir()}
+    assert (notable - stored_cases, err) == (set(), "")
+    assert out.count("rerun for its images") == len(notable - {_read_record(directory)["showcase"]})
+    # cases with stored images are not run again
     assert "rerun for" not in marsyard("report", directory, "--gallery")[1]
 
 
 def _read_record(directory: Path) -> dict[str, Any]:
-    stored_record: dict[str, Any] = json.loads((directory / "campaign.json").read_text())
-    return stored_record
+    record_content: dict[str, Any] = json.loads((directory / "campaign.json").read_text())
+    return record_content
 
 
 def test_undecidable_requirements_are_rejected(tmp_path: Path) -> None:
     campaign = load_campaign(str(write_campaign(tmp_path, requirement="")))
     with pytest.raises(CampaignError, match="no requirement with a confidence level"):
         run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), RecordingWatch())
-    latin = write_campaign(tmp_path, extra_tables='[design]\nkind = "latin-hypercube"\n')
+    latin_hypercube = write_campaign(tmp_path, extra_tables='[design]\nkind = "latin-hypercube"\n')
     with pytest.raises(CampaignError, match="only independent random samples"):
-        run_until_decided(load_campaign(str(latin)), tmp_path / "run", ExecutorConfig(jobs=1), RecordingWatch())
+        run_until_decided(
+            load_campaign(str(latin_hypercube)), tmp_path / "run", ExecutorConfig(jobs=1), RecordingWatch()
+        )

@@ -111,16 +111,16 @@ def test_every_dispersion_is_reported(campaign: Path) -> None:
 
 
 def test_units_and_descriptions_come_from_the_scenario() -> None:
-    reported = json.loads(marsyard("show", "dimes-gusev", "--json").out)
-    dispersions = {dispersion["parameter"]: dispersion for dispersion in reported["dispersions"]}
+    output = json.loads(marsyard("show", "dimes-gusev", "--json").out)
+    dispersions = {dispersion["parameter"]: dispersion for dispersion in output["dispersions"]}
     sun = dispersions["sun.elevation_deg"]
     assert (sun["unit"], sun["description"], sun["bounds"]) == (
         "deg",
         "elevation of the sun above the horizon",
         [30.0, 60.0],
     )
-    assert all(dispersion["source"] for dispersion in reported["dispersions"])
-    assert all(dispersion["description"] for dispersion in reported["dispersions"])
+    assert all(dispersion["source"] for dispersion in output["dispersions"])
+    assert all(dispersion["description"] for dispersion in output["dispersions"])
 
 
 def test_draws_are_shown_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
@@ -131,10 +131,10 @@ def test_draws_are_shown_as_table_json_and_figure(campaign: Path, tmp_path: Path
     assert "nominal" in result.out
     assert f"figure: {figure}" in result.out
     assert "<svg" in figure.read_text()
-    reported = json.loads(marsyard("show", campaign, "--draw", 25, "--json").out)
-    assert [draw["case"] for draw in reported["draws"]] == list(range(25))
-    assert reported["draws"][0]["values"]["wind.east_m_s"] == 1.0
-    values = [draw["values"] for draw in reported["draws"]]
+    output = json.loads(marsyard("show", campaign, "--draw", 25, "--json").out)
+    assert [draw["case"] for draw in output["draws"]] == list(range(25))
+    assert output["draws"][0]["values"]["wind.east_m_s"] == 1.0
+    values = [draw["values"] for draw in output["draws"]]
     assert all(draw["lowest_altitude_m"] == pytest.approx(draw["altitude_m"] - 100.0) for draw in values)
     assert [draw["error_scale"] for draw in values[1:4]] == [0.5, 1.0, 1.5]
     assert f"{min(draw['altitude_m'] for draw in values[1:]):.5g}" in result.out

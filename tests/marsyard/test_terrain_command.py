@@ -69,7 +69,7 @@ def test_holes_are_rejected_or_counted_and_marked(tmp_path: Path) -> None:
     image = cv2.imread(str(figure))
     assert image is not None
     is_red = (image[..., 2].astype(int) - image[..., 1]) > 40
-    # 128 samples per side; the outline covers a few red pixels
+    # the tile of 64 samples is centred in 128 samples; its outline covers a few red pixels
     assert is_red.sum() == pytest.approx(31 * 64, rel=0.1)
     red_columns = np.flatnonzero(is_red.any(axis=0))
     assert red_columns[0] == pytest.approx(32, abs=1)

@@ -1,4 +1,4 @@
-"""Synthetic run folders with rows of known statistics."""
+"""Fixtures of synthetic run folders with rows of known statistics."""
 
 from __future__ import annotations
 
@@ -26,20 +26,29 @@ MakeRun = Callable[..., Path]
 
 
 def synthetic_frame(
-    cases: int, *, answered: float = 0.9, crashed: int = 0, error_scale: float = 1.0, terrains: int = 4, seed: int = 1
+    cases: int,
+    *,
+    answer_rate: float = 0.9,
+    n_crashed: int = 0,
+    error_scale: float = 1.0,
+    terrains: int = 4,
+    seed: int = 1,
 ) -> pd.DataFrame:
-    """Return rows of a synthetic descent campaign; `answered` is a probability, `error_scale` multiplies the errors."""
+    """Return rows of a synthetic descent campaign; `error_scale` multiplies the errors.
+
+    The standard deviation of the errors increases with the off-nadir angle: 0.5 m/s plus 1/30 m/s per degree.
+    """
     rng = np.random.default_rng(seed)
-    valid = rng.random(cases) < answered
-    outcome = np.where(valid, "VALID", rng.choice(["NO_TEMPLATE_AREA", "NO_VALID_TRACK", "IMU_MISMATCH"], cases))
+    is_valid = rng.random(cases) < answer_rate
+    outcome = np.where(is_valid, "VALID", rng.choice(["NO_TEMPLATE_AREA", "NO_VALID_TRACK", "IMU_MISMATCH"], cases))
     off_nadir = rng.uniform(0.0, 30.0, cases)
     error = rng.normal(0.0, error_scale * (0.5 + off_nadir[:, None] / 30.0), (cases, 2))
-    error[~valid] = np.nan
+    error[~is_valid] = np.nan
     frame = pd.DataFrame(
         {
             "case": np.arange(cases),
             "outcome": outcome,
-            "answered": valid,
+            "answered": is_valid,
             "velocity_error_m_s": np.hypot(*error.T),
             "velocity_error_x_m_s": error[:, 0],
             "velocity_error_y_m_s": error[:, 1],
@@ -58,14 +67,14 @@ def synthetic_frame(
             "traceback": "",
         }
     )
-    return _mark_crashed(frame, crashed)
+    return _mark_crashed(frame, n_crashed)
 
 
-def _mark_crashed(frame: pd.DataFrame, crashed: int) -> pd.DataFrame:
-    """Replace the last `crashed` rows by crashed cases, which have only an error message."""
-    if not crashed:
+def _mark_crashed(frame: pd.DataFrame, n_crashed: int) -> pd.DataFrame:
+    """Replace the last `n_crashed` rows by crashed cases, which have only an error message."""
+    if not n_crashed:
         return frame
-    rows = frame.index[-crashed:]
+    rows = frame.index[-n_crashed:]
     number_columns = frame.select_dtypes("number").columns.difference(["case", "wall_time_s", "cpu_time_s"])
     frame = frame.astype(dict.fromkeys(number_columns, "float64"))
     frame.loc[rows, number_columns] = np.nan
@@ -90,14 +99,15 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
     columns += ["ground_east_m", "ground_north_m", "failed_contrast", "failed_second_peak"]
     rows = []
     for pair in (0, 1):
-        for k in (0, 1):
-            u0, v0 = rng.uniform(60, 200, 2)
-            valid = float((pair, k) != (1, 1))
-            rows.append([pair, k, u0, v0, u0 + 12, v0 - 9, 5e4, 0.93, 2.1, 0.45, valid, 14.2, -8.8])
-            rows[-1] += [5.0 * (u0 - 128), 5.0 * (128 - v0), 0.0, 1.0 - valid]
-            products[f"window_{pair}_{k}"] = rng.normal(1500, 300, (61, 61)).astype(np.float32)
-            products[f"template_{pair}_{k}"] = rng.normal(1500, 300, (17, 17)).astype(np.float32)
-            products[f"match_{pair}_{k}"] = np.array([33.4, 39.2])
+        for template in (0, 1):
+            template_u, template_v = rng.uniform(60, 200, 2)
+            is_valid = float((pair, template) != (1, 1))
+            rows.append([pair, template, template_u, template_v, template_u + 12, template_v - 9, 5e4, 0.93, 2.1])
+            rows[-1] += [0.45, is_valid, 14.2, -8.8]
+            rows[-1] += [5.0 * (template_u - 128), 5.0 * (128 - template_v), 0.0, 1.0 - is_valid]
+            products[f"window_{pair}_{template}"] = rng.normal(1500, 300, (61, 61)).astype(np.float32)
+            products[f"template_{pair}_{template}"] = rng.normal(1500, 300, (17, 17)).astype(np.float32)
+            products[f"match_{pair}_{template}"] = np.array([33.4, 39.2])
         # nadir camera with 5 m per pixel; the field of view of the rectified camera is 1.5 times as wide
         lattice = np.stack(np.meshgrid(*(np.linspace(-64.0, 319.0, 17),) * 2), axis=-1)
         products |= {f"rectified_{pair}_{side}": lattice for side in (0, 1)}

@@ -10,7 +10,7 @@ VerdictName = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
 
 
 class _Part(BaseModel):
-    """Plain data; null stands for NaN and infinities."""
+    """Part of the report without further keys; null represents NaN and infinities."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -168,14 +168,14 @@ class CampaignReport(_Part):
 
     report_schema: Literal[5] = Field(alias="schema")
     campaign: str
-    state: Any = Field(description="from campaign.json, like seed, git_commit and the times")
+    state: Any = Field(description="value of campaign.json; also for seed, git_commit and the times")
     seed: Any
     git_commit: Any
     started_utc: Any
     finished_utc: Any
     cases: int
     crashed: int
-    sites: list[str] = Field(description="names in the rows, at most 24; the same holds for the algorithms")
+    sites: list[str] = Field(description="names in the rows, at most 24; also for `algorithms`")
     algorithms: list[str]
     algorithm_details: list[AlgorithmDescription] = Field(
         default=[], description="from campaign.json, the algorithm under test first"

@@ -31,18 +31,18 @@ def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricCompariso
 
 def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) -> None:
     frame = make_rows(200, terrains=40)
-    worse = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
-    is_paired, comparisons = _compare(make_run(frame), make_run(worse, name="other"))
+    worse_frame = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
+    is_paired, comparisons = _compare(make_run(frame), make_run(worse_frame, name="other"))
     assert is_paired
     # errors larger by 2 %: the paired test detects them in spite of the large scatter
     assert comparisons["velocity error (m/s)"].p_value < 1e-9
     assert comparisons["answered"].p_value == 1.0
     assert comparisons["came to an end"].second.summary_value == 1.0
-    # with four terrains the sign test has p = 2 / 2^4, times 4 (Holm's correction) for the 4 metrics
+    # with four terrains the sign test has p = 2 / 2^4; Holm's correction for 4 metrics multiplies it by 4
     four_terrains = make_rows(200)
-    worse = four_terrains.assign(velocity_error_m_s=four_terrains["velocity_error_m_s"] * 1.02)
+    worse_frame = four_terrains.assign(velocity_error_m_s=four_terrains["velocity_error_m_s"] * 1.02)
     _, comparisons = _compare(
-        make_run(four_terrains, name="four-terrains"), make_run(worse, name="four-terrains-worse")
+        make_run(four_terrains, name="four-terrains"), make_run(worse_frame, name="four-terrains-worse")
     )
     assert comparisons["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
 
@@ -53,7 +53,7 @@ def test_campaigns_with_different_draws_are_compared_as_two_samples(make_rows: R
     assert not is_paired
     assert min(comparison.p_value for comparison in comparisons.values()) > 0.01
     _, worse_comparisons = _compare(
-        first, make_run(make_rows(300, seed=2, answered=0.6, error_scale=2.0), name="worse", seed=8)
+        first, make_run(make_rows(300, seed=2, answer_rate=0.6, error_scale=2.0), name="worse", seed=8)
     )
     assert worse_comparisons["answered"].p_value < 1e-6
     # no permutation of 10,000 has a larger difference
@@ -66,7 +66,7 @@ def test_terrains_of_different_sites_are_not_paired(make_rows: Rows, make_run: M
     # Errors depend on the terrain. Terrain numbers of two sites denote different terrains, so no pairs exist.
     def write_site_run(name: str, seed: int) -> Path:
         terrain_error = np.random.default_rng(seed).uniform(1.0, 3.0, 20)
-        frame = make_rows(400, terrains=20, answered=1.0, seed=seed)
+        frame = make_rows(400, terrains=20, answer_rate=1.0, seed=seed)
         frame["velocity_error_m_s"] = terrain_error[frame["terrain"]] + 0.1 * np.arange(400) / 400
         configuration = {"parameters": {"site": name}}
         return make_run(frame, name=name, seed=seed, configuration=configuration)
@@ -82,7 +82,7 @@ def _select_errors(run: StoredRun) -> tuple[pd.DataFrame, Metric]:
     return frame, next(metric for metric in metrics if metric.name == "velocity error (m/s)")
 
 
-def test_campaigns_without_common_metric_compare_completion(make_rows: Rows, make_run: MakeRun) -> None:
+def test_campaigns_without_common_metric_are_compared_by_completion(make_rows: Rows, make_run: MakeRun) -> None:
     first = make_run(make_rows(20)[["case", "outcome"]], [])
     _, comparisons = _compare(first, make_run(make_rows(20), name="other", seed=8))
     assert set(comparisons) == {"came to an end"}

@@ -20,12 +20,12 @@ from marsyard.reports.sections import script_hash
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
 VOID_ELEMENTS = {"meta", "link", "br", "img", "input", "hr", "path", "use", "circle", "line", "rect"}
-#: Minimum columns of a report with few figures.
+#: Minimum columns of a report.
 MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'&{{ 7*7 }}"
 
 
-class Page(HTMLParser):
+class PageParser(HTMLParser):
     """Parser that collects a page's elements, identifiers, references and event handlers."""
 
     def __init__(self, text: str) -> None:
@@ -62,15 +62,15 @@ class Page(HTMLParser):
                 self.handlers.append(name)
 
 
-def _write_and_read(directory: Path) -> tuple[str, Page, dict[str, Any]]:
+def _write_and_read(directory: Path) -> tuple[str, PageParser, dict[str, Any]]:
     path = write_report(directory)
     assert path == directory / "report.html"
     text = path.read_text(encoding="utf-8")
-    return text, Page(text), json.loads((directory / "report.json").read_text(encoding="utf-8"))
+    return text, PageParser(text), json.loads((directory / "report.json").read_text(encoding="utf-8"))
 
 
-def _check_page(text: str, page: Page) -> None:
-    """Check that a page is well formed, self-contained, without external scripts, and that its links have targets."""
+def _check_page(text: str, page: PageParser) -> None:
+    """Check that a page is well formed and self-contained, and that its links have targets."""
     assert page.open_tags == []
     assert len(page.ids) == len(set(page.ids))
     # one data element per script; the content security policy names the script by its hash
@@ -104,12 +104,12 @@ FULL_COLUMNS = [
 RUNS: dict[str, Callable[[Rows], pd.DataFrame]] = {
     "small": lambda rows: rows(24)[FULL_COLUMNS],
     "large": lambda rows: rows(2000, error_scale=1.5, terrains=60)[FULL_COLUMNS],
-    "crashed": lambda rows: rows(24, crashed=3)[FULL_COLUMNS],
-    "only crashed": lambda rows: rows(4, crashed=4)[FULL_COLUMNS],
-    "no answer": lambda rows: rows(24, answered=0.0)[FULL_COLUMNS],
-    "one case": lambda rows: rows(1, answered=1.0)[FULL_COLUMNS],
+    "crashed": lambda rows: rows(24, n_crashed=3)[FULL_COLUMNS],
+    "only crashed": lambda rows: rows(4, n_crashed=4)[FULL_COLUMNS],
+    "no answer": lambda rows: rows(24, answer_rate=0.0)[FULL_COLUMNS],
+    "one case": lambda rows: rows(1, answer_rate=1.0)[FULL_COLUMNS],
     "no rows": lambda rows: rows(24).head(0),
-    "exact": lambda rows: rows(24, answered=1.0, error_scale=0.0)[FULL_COLUMNS],
+    "exact": lambda rows: rows(24, answer_rate=1.0, error_scale=0.0)[FULL_COLUMNS],
     "no errors": lambda rows: rows(24)[["case", "outcome"]],
     "only cases": lambda rows: rows(24)[["case"]],
     "wide range": lambda rows: rows(24)[FULL_COLUMNS].assign(velocity_error_m_s=np.geomspace(1e-9, 1e9, 24)),
@@ -129,7 +129,7 @@ def test_report_is_valid_for_any_run(make_rows: Rows, make_run: MakeRun, kind: s
 def test_small_report_contains_the_main_results(
     make_rows: Rows, make_run: MakeRun, dimes_products: dict[str, Any]
 ) -> None:
-    directory = make_run(make_rows(24, crashed=1), products=dimes_products)
+    directory = make_run(make_rows(24, n_crashed=1), products=dimes_products)
     text, page, report = _write_and_read(directory)
     _check_page(text, page)
     visible_text = " ".join(re.sub(r"<[^>]+>", " ", text).split())
@@ -178,7 +178,7 @@ def test_requirement_met_by_rate_has_its_own_symbol(
 
 def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: MakeRun) -> None:
     text, _, report = _write_and_read(
-        make_run(make_rows(400, answered=1.0, error_scale=0.1)[[*MIN_COLUMNS, "terrain"]])
+        make_run(make_rows(400, answer_rate=1.0, error_scale=0.1)[[*MIN_COLUMNS, "terrain"]])
     )
     assert (report["verdict"], report["verdicts"][0]["plain_status"]) == ("INSUFFICIENT", "PASS")
     assert "400 cases lie on 4 terrains. With too few failures" in text
@@ -187,7 +187,7 @@ def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: Ma
 def test_texts_from_files_are_escaped(
     make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any], dimes_products: dict[str, Any]
 ) -> None:
-    frame = make_rows(24, crashed=2)[FULL_COLUMNS]
+    frame = make_rows(24, n_crashed=2)[FULL_COLUMNS]
     frame["outcome"] = frame["outcome"].replace("VALID", HOSTILE)
     frame = frame.assign(error=HOSTILE, traceback=HOSTILE, site=[HOSTILE, "b"] * 12, gl_version=HOSTILE)
     frame[f"{HOSTILE}_deg"] = np.arange(24.0)

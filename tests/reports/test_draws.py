@@ -13,14 +13,14 @@ from marsyard.reports.draws import ParameterSample, draws_figure, save_figure
 
 def _make_draws() -> list[ParameterSample]:
     rng = np.random.default_rng(1)
-    x = rng.normal(size=300)
-    # wind components with correlation 0.99; the other parameters are independent or constant
+    wind_east = rng.normal(size=300)
+    # correlation of the wind components: 0.9 / sqrt(0.9^2 + 0.1^2) = 0.99; other parameters are independent or constant
     return [
-        ParameterSample("wind.east_m_s", x.tolist(), rng.normal(size=1000).tolist()),
-        ParameterSample("wind.north_m_s", (0.9 * x + 0.1 * rng.normal(size=300)).tolist()),
+        ParameterSample("wind.east_m_s", wind_east.tolist(), rng.normal(size=1000).tolist()),
+        ParameterSample("wind.north_m_s", (0.9 * wind_east + 0.1 * rng.normal(size=300)).tolist()),
         ParameterSample("heights_m.1", rng.uniform(size=300).tolist()),
         ParameterSample(
-            "kind", [["rough", "plain", {"a": 1}][k % 3] for k in range(300)], ["rough", "plain", {"a": 1}]
+            "kind", [["rough", "plain", {"a": 1}][index % 3] for index in range(300)], ["rough", "plain", {"a": 1}]
         ),
         ParameterSample("sleep_s", [0.0] * 300),
     ]

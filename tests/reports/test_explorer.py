@@ -19,18 +19,18 @@ METRIC = "velocity_error_m_s"
 
 
 def test_points_include_worst_unanswered_and_crashed_cases(make_rows: Rows) -> None:
-    frame = make_rows(12_000, crashed=3)
-    selected = choose_points(frame, METRIC)
-    assert selected.size == MAX_POINTS
-    assert np.all(np.diff(selected) > 0)
-    assert int(np.nanargmax(frame[METRIC])) in selected
-    assert {11_997, 11_998, 11_999} <= set(selected.tolist())
-    assert frame.iloc[selected]["outcome"].nunique() == frame["outcome"].nunique()
+    frame = make_rows(12_000, n_crashed=3)
+    points = choose_points(frame, METRIC)
+    assert points.size == MAX_POINTS
+    assert np.all(np.diff(points) > 0)
+    assert int(np.nanargmax(frame[METRIC])) in points
+    assert {11_997, 11_998, 11_999} <= set(points.tolist())
+    assert frame.iloc[points]["outcome"].nunique() == frame["outcome"].nunique()
     assert choose_points(frame.head(50), METRIC).tolist() == list(range(50))
 
 
 def test_explorer_data_contain_labels_outcomes_and_values(make_rows: Rows, make_run: Callable[..., Path]) -> None:
-    frame = make_rows(30, crashed=1)
+    frame = make_rows(30, n_crashed=1)
     run = read_run(make_run(frame))
     data = explorer_data(run, METRIC, 5.0, ["3"])
     assert [data["labels"][index] for index in data["axes"]] == [
@@ -52,25 +52,25 @@ def test_embedded_data_are_escaped() -> None:
 
 
 def test_notable_cases_are_worst_unanswered_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
-    frame = make_rows(60, crashed=2)
-    selected = notable_cases(read_run(make_run(frame)))
+    frame = make_rows(60, n_crashed=2)
+    cases = notable_cases(read_run(make_run(frame)))
     errors = frame["velocity_error_m_s"]
-    assert selected[:2] == errors.nlargest(2).index.tolist()
-    unanswered = frame.index[errors.isna() & ~frame["outcome"].eq("CRASHED")].tolist()
-    assert selected[2:4] == unanswered[:2]
-    assert len(selected) == len(set(selected)) == 6
-    assert not set(selected) & set(frame.index[frame["outcome"].eq("CRASHED")])
+    assert cases[:2] == errors.nlargest(2).index.tolist()
+    unanswered_cases = frame.index[errors.isna() & ~frame["outcome"].eq("CRASHED")].tolist()
+    assert cases[2:4] == unanswered_cases[:2]
+    assert len(cases) == len(set(cases)) == 6
+    assert not set(cases) & set(frame.index[frame["outcome"].eq("CRASHED")])
     assert notable_cases(read_run(make_run(frame.head(0), name="none"))) == []
 
 
 def test_gallery_starts_with_first_worst_and_unanswered_cases(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     frame = make_rows(40)
     run = replace(read_run(make_run(frame)), showcases=(7, *(case for case in range(40) if case != 7)))
-    selected = gallery_cases(run)
-    assert selected[0] == 7
-    assert len(selected) == len(set(selected)) == 7
-    worst = frame[METRIC].drop(7).sort_values(ascending=False).index[:2]
-    assert selected[1:3] == worst.tolist()
-    assert frame[METRIC].iloc[selected[3:5]].isna().all()
+    cases = gallery_cases(run)
+    assert cases[0] == 7
+    assert len(cases) == len(set(cases)) == 7
+    worst_cases = frame[METRIC].drop(7).sort_values(ascending=False).index[:2]
+    assert cases[1:3] == worst_cases.tolist()
+    assert frame[METRIC].iloc[cases[3:5]].isna().all()
     assert gallery_cases(replace(run, showcases=(7,))) == [7]
     assert gallery_cases(replace(run, showcases=())) == []

@@ -1,4 +1,7 @@
-"""Tests of the SVG figures of errors and outcomes."""
+"""Tests of the SVG figures of errors and outcomes.
+
+An error axis ends at most at 3 times the bound (15 m/s for 5 m/s), unless more than a quarter of the errors exceed it.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ def _draw_all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure |
 
 @pytest.mark.parametrize(("cases", "bound"), [(1, 5.0), (24, None), (24, 0.0), (1500, 5.0)])
 def test_figures_are_well_formed(make_rows: Rows, cases: int, bound: float | None) -> None:
-    for index, figure in enumerate(_draw_all_figures(make_rows(cases, answered=1.0), bound)):
+    for index, figure in enumerate(_draw_all_figures(make_rows(cases, answer_rate=1.0), bound)):
         assert figure is not None
         root = ET.fromstring(svg_markup(figure, f"f{index}", 'errors & "more" <of them>'))  # noqa: S314
         assert root.get("aria-label") == 'errors & "more" <of them>'
@@ -46,11 +49,11 @@ def test_figures_are_well_formed(make_rows: Rows, cases: int, bound: float | Non
 
 
 def test_missing_data_give_no_figure(make_rows: Rows) -> None:
-    unanswered = make_rows(5, answered=0.0)
-    assert error_scatter(unanswered, METRIC, 5.0) is None
-    assert error_histogram(unanswered, METRIC, 5.0) is None
-    assert error_scatter_against(unanswered, METRIC, "off_nadir_max_deg", 5.0) is not None
-    assert error_scatter_against(unanswered, METRIC, "no_such_column", 5.0) is None
+    frame = make_rows(5, answer_rate=0.0)
+    assert error_scatter(frame, METRIC, 5.0) is None
+    assert error_histogram(frame, METRIC, 5.0) is None
+    assert error_scatter_against(frame, METRIC, "off_nadir_max_deg", 5.0) is not None
+    assert error_scatter_against(frame, METRIC, "no_such_column", 5.0) is None
     without_outcomes = pd.DataFrame({"case": [0, 1], METRIC: [1.0, 2.0]})
     assert error_scatter(without_outcomes, METRIC, 5.0) is None
     assert outcome_bars(without_outcomes) is None
@@ -100,7 +103,7 @@ def _scale_errors(frame: pd.DataFrame, rows: slice) -> pd.DataFrame:
 
 
 def test_histogram_has_an_overflow_bar(make_rows: Rows) -> None:
-    frame = _scale_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
+    frame = _scale_errors(make_rows(60, answer_rate=1.0), slice(0, 60, 12))
     figure = error_histogram(frame, METRIC, 5.0)
     assert figure is not None
     bars = [patch for patch in figure.axes[0].patches if isinstance(patch, Rectangle)]
@@ -113,8 +116,8 @@ def test_histogram_has_an_overflow_bar(make_rows: Rows) -> None:
     assert any("> 15" in text.get_text() for text in figure.axes[0].texts)
 
 
-def test_error_axis_includes_the_95_percent_quantile(make_rows: Rows) -> None:
-    frame = _scale_errors(make_rows(60, answered=1.0), slice(None))
+def test_error_axis_is_extended_to_the_95_percent_quantile(make_rows: Rows) -> None:
+    frame = _scale_errors(make_rows(60, answer_rate=1.0), slice(None))
     for draw in (error_histogram, error_distribution):
         figure = draw(frame, METRIC, 5.0)
         assert figure is not None
@@ -122,8 +125,8 @@ def test_error_axis_includes_the_95_percent_quantile(make_rows: Rows) -> None:
     distribution = error_distribution(frame, METRIC, 5.0)
     assert distribution is not None
     axes = distribution.axes[0]
-    x, fraction = (np.asarray(values) for values in axes.lines[0].get_data())
-    assert fraction[x <= axes.get_xlim()[1]].max() > 0.9
+    errors, fractions = (np.asarray(values) for values in axes.lines[0].get_data())
+    assert fractions[errors <= axes.get_xlim()[1]].max() > 0.9
     assert any("beyond" in text.get_text() for text in axes.texts)
 
 
@@ -133,7 +136,7 @@ def _count_hollow_marks(figure: Figure) -> int:
 
 
 def test_points_beyond_the_axes_are_marked_and_counted(make_rows: Rows) -> None:
-    frame = _scale_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
+    frame = _scale_errors(make_rows(60, answer_rate=1.0), slice(0, 60, 12))
     figure = error_scatter(frame, METRIC, 5.0)
     assert figure is not None
     count = _count_hollow_marks(figure)

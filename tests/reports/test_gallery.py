@@ -22,10 +22,10 @@ METRIC = "velocity_error_m_s"
 
 
 def test_rank_correlations_have_intervals_and_need_enough_cases(make_rows: Rows) -> None:
-    few_captions = [figure.caption for figure in driver_figures(make_rows(12, answered=1.0), METRIC, 5.0)]
+    few_captions = [figure.caption for figure in driver_figures(make_rows(12, answer_rate=1.0), METRIC, 5.0)]
     assert few_captions
     assert not [caption for caption in few_captions if "correlation" in caption]
-    captions = [figure.caption for figure in driver_figures(make_rows(60, answered=1.0), METRIC, 5.0)]
+    captions = [figure.caption for figure in driver_figures(make_rows(60, answer_rate=1.0), METRIC, 5.0)]
     pattern = r"rank correlation −?\d\.\d{3} \(−?\d\.\d{3} to −?\d\.\d{3} at 90 % confidence\)"
     assert all(re.search(pattern, caption) for caption in captions)
 
@@ -41,7 +41,7 @@ def test_rank_correlations_of_maps_have_intervals(maps: int, has_interval: bool)
 
 
 def test_bound_without_enough_cases_is_a_dash() -> None:
-    # a lower bound of the 5 % quantile at 90 % confidence needs 45 values
+    # a lower bound of the 5 % quantile at 90 % confidence needs 45 values: 0.95^45 = 0.0994
     (row,) = distance_grid({"sites": np.array([1.0, 2.0, 3.0])}).rows
     assert row[-1] == NOTHING
 
@@ -52,6 +52,6 @@ def test_rounding_errors_are_printed_as_zero() -> None:
 
 
 def test_message_on_one_crashed_case_is_singular(make_rows: Rows) -> None:
-    frame = make_rows(8, crashed=1)
+    frame = make_rows(8, n_crashed=1)
     suite = Xml.fromstring(junit_xml("one", [], combine_verdicts([], frame)))  # noqa: S314
     assert [failure.get("message") for failure in suite.iter("failure")] == ["1 case crashed"]

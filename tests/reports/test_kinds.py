@@ -1,4 +1,4 @@
-"""Tests of report sections that are declared by their parts (statistics, rates, figures), with known statistics."""
+"""Tests of report sections that are declared as a list of parts: statistics, rates and figures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ ALTITUDE = SectionDeclaration(
     requires=("altitude_error_m",),
     parts=(
         Statistics("altitude_error_m"),
-        Distribution([ERROR], ("altitude error (m)", "share of cases"), "Share of cases up to each error.", bound=5.0),
+        Distribution(
+            [ERROR], ("altitude error (m)", "fraction of cases"), "Fraction of cases up to each error.", bound=5.0
+        ),
         RateTable([Rate("answered", "answered", flag_rate("answered"))]),
         RateByCondition(Quantity("altitude_m"), [Rate("answered", "Answered", flag_rate("answered"))]),
         Scatter([Quantity("altitude_m")], [ERROR], "Every case, and medians of bins."),
@@ -54,10 +56,10 @@ def make_subject(frame: pd.DataFrame, name: str = "altitude-flight-2") -> Subjec
 def make_rows_of_two_altitudes() -> pd.DataFrame:
     """Return 40 cases at two altitudes: all answered at 400 m with error 1 m, half answered at 800 m with error 2 m."""
     is_high = np.arange(40) >= 20
-    answered = ~is_high | (np.arange(40) % 2 == 0)
-    error = np.where(answered, 1.0 + is_high, np.nan)
+    is_answered = ~is_high | (np.arange(40) % 2 == 0)
+    error = np.where(is_answered, 1.0 + is_high, np.nan)
     return pd.DataFrame(
-        {"answered": answered, "altitude_m": np.where(is_high, 800.0, 400.0), "altitude_error_m": error}
+        {"answered": is_answered, "altitude_m": np.where(is_high, 800.0, 400.0), "altitude_error_m": error}
     )
 
 

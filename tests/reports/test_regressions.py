@@ -40,8 +40,8 @@ def _draw_metrics(
     """Draw the metrics of one nightly run from the pool; `error_factor` multiplies every error."""
     terrains = rng.integers(0, N_TERRAINS, N_CASES)
     errors = error_factor * pool[0][terrains, rng.integers(0, 200, N_CASES)]
-    answered = (rng.random(N_CASES) < pool[1][terrains]).astype(np.float64)
-    rates = [("within 2 m", (errors < 2.0).astype(np.float64)), ("answered", answered)]
+    is_answered = (rng.random(N_CASES) < pool[1][terrains]).astype(np.float64)
+    rates = [("within 2 m", (errors < 2.0).astype(np.float64)), ("answered", is_answered)]
     metrics = [NightMetric(name, True, float(values.mean()), Sample(values, terrains)) for name, values in rates]
     return [*metrics, NightMetric("error (m)", False, float(np.median(errors)), Sample(errors, terrains))]
 
@@ -49,7 +49,7 @@ def _draw_metrics(
 def _detect_changes(
     rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], error_factor: float = 1.0
 ) -> list[Change]:
-    """Compare one nightly run with seven earlier runs of two campaigns; only the first is changed by `error_factor`."""
+    """Compare a nightly run of two campaigns with seven earlier runs; `error_factor` changes the first campaign."""
     comparisons = []
     for campaign, factor in (("first", error_factor), ("second", 1.0)):
         earlier_runs = [_draw_metrics(rng, pool) for _ in range(7)]
@@ -69,9 +69,9 @@ def test_simulated_regression_is_detected() -> None:
     rng, pool = np.random.default_rng(3), _make_error_pool(4)
     n_detected = 0
     for _ in range(60):
-        detected = _detect_changes(rng, pool, 1.75)
+        changes = _detect_changes(rng, pool, 1.75)
         n_detected += ("first", "error (m)", True) in {
-            (change.campaign, change.metric, change.is_regression) for change in detected
+            (change.campaign, change.metric, change.is_regression) for change in changes
         }
     assert n_detected >= 57
 
@@ -93,8 +93,8 @@ def test_history_stores_campaigns_and_metrics(tmp_path: Path) -> None:
         night = _add_run(history, 1)
         history.finish(night, FINISHED)
     with History(tmp_path / "history.sqlite") as history:
-        (stored,) = history.nights()
-        assert (stored.night, stored.state, stored.git_commit) == (night, FINISHED, "abc")
+        (night_record,) = history.nights()
+        assert (night_record.night, night_record.state, night_record.git_commit) == (night, FINISHED, "abc")
         assert history.campaigns(night) == [_make_campaign()]
         metrics = history.metrics(night, "first")
         assert [metric.name for metric in metrics] == ["within 2 m", "answered", "error (m)"]

@@ -73,20 +73,22 @@ def test_rate_decides_for_designs_without_independent_draws(
     frame, design = make_rows(1000), read_sampling_design(configuration)
     frame["answered"], frame["velocity_error_m_s"] = True, np.where(np.arange(1000) % 50, 0.1, 99.0)
     requirements = [{**velocity, "probability": min_rate, "decide_by": "estimate"} for min_rate in (0.98, 0.99)]
-    met, missed = evaluate_requirements(frame, requirements, design)
-    assert (met.status, missed.status) == (Status.MET_BY_RATE, Status.FAIL)
-    assert (met.n, met.failures, met.estimate) == (1000, 20, 0.98)
-    assert math.isnan(met.lower)
-    assert met.note.startswith("Decided by the rate of these cases. No probability statement: ")
-    assert message in met.note
-    assert compute_exit_code([met], crashed=False) == 3
-    assert compute_exit_code([met, missed], crashed=False) == 1
-    summary = combine_verdicts([met, missed], frame, design)
+    met_verdict, failed_verdict = evaluate_requirements(frame, requirements, design)
+    assert (met_verdict.status, failed_verdict.status) == (Status.MET_BY_RATE, Status.FAIL)
+    assert (met_verdict.n, met_verdict.failures, met_verdict.estimate) == (1000, 20, 0.98)
+    assert math.isnan(met_verdict.lower)
+    assert met_verdict.note.startswith("Decided by the rate of these cases. No probability statement: ")
+    assert message in met_verdict.note
+    assert compute_exit_code([met_verdict], crashed=False) == 3
+    assert compute_exit_code([met_verdict, failed_verdict], crashed=False) == 1
+    summary = combine_verdicts([met_verdict, failed_verdict], frame, design)
     assert summary.word == "FAIL"
     assert summary.sentence.startswith("1 of 2 requirements met by the rate of these cases. No probability statement: ")
-    empty = evaluate_requirements(frame.assign(answered=False), [{**requirements[0], "population": "valid"}], design)
-    assert empty[0].status is Status.INSUFFICIENT
-    assert not combine_verdicts(empty, frame, design).sentence.startswith("0 of")
+    empty_population = evaluate_requirements(
+        frame.assign(answered=False), [{**requirements[0], "population": "valid"}], design
+    )
+    assert empty_population[0].status is Status.INSUFFICIENT
+    assert not combine_verdicts(empty_population, frame, design).sentence.startswith("0 of")
 
 
 def test_design_without_requirements_has_no_verdict(make_rows: Rows) -> None:

@@ -1,4 +1,4 @@
-"""Tests of optional report sections against rows with known statistics."""
+"""Tests of optional report sections with rows of known statistics."""
 
 from __future__ import annotations
 
@@ -45,13 +45,14 @@ def assign_errors(frame: pd.DataFrame, components: np.ndarray) -> pd.DataFrame:
 
 def test_answer_rates_have_clopper_pearson_intervals() -> None:
     n = 200
-    answered, has_overlap = np.arange(n) >= 30, np.arange(n) >= 20
+    is_answered, has_overlap = np.arange(n) >= 30, np.arange(n) >= 20
     errors = np.where(np.arange(n) == 100, 7.0, 1.0)
-    errors[~answered] = np.nan
+    errors[~is_answered] = np.nan
     frame = pd.DataFrame(
-        {"answered": answered, "feasible_overlap": has_overlap, METRIC: errors, "terrain": np.arange(n) // 2}
+        {"answered": is_answered, "feasible_overlap": has_overlap, METRIC: errors, "terrain": np.arange(n) // 2}
     )
     rates = list(answer_fractions(make_subject(frame)).values())
+    # valid answers of all cases, valid answers with feasible overlap, cases without overlap, wrong of valid answers
     assert [(rate.hits, rate.n) for rate in rates] == [(170, 200), (170, 180), (20, 200), (1, 170)]
     # 1 of 170, two-sided Clopper-Pearson at 90 %: BetaInv(0.05; 1, 170) and BetaInv(0.95; 2, 169)
     assert (rates[3].lower, rates[3].upper) == pytest.approx((0.000302, 0.027594), abs=2e-5)
@@ -62,7 +63,7 @@ def test_answer_rates_have_clopper_pearson_intervals() -> None:
 
 
 def test_crashed_cases_of_unknown_overlap_count_as_failures(make_rows: Rows) -> None:
-    frame = make_rows(50, answered=1.0, crashed=5)
+    frame = make_rows(50, answer_rate=1.0, n_crashed=5)
     has_overlap: list[bool | None] = [True] * 45 + [None] * 5
     rates = answer_fractions(make_subject(frame.assign(feasible_overlap=pd.Series(has_overlap, dtype=object))))
     assert [(rate.hits, rate.n) for rate in rates.values()] == [(45, 50), (45, 50), (0, 45), (0, 45)]
@@ -85,7 +86,7 @@ def test_condition_bins_have_correct_error_statistics() -> None:
     assert [entry["answered"]["n"] for entry in bins] == [200] * 5
     assert [entry["means"][0] for entry in bins] == pytest.approx([0.6, 1.8, 3.0, 4.2, 5.4], abs=0.15)
     assert [entry["sds"][1] for entry in bins] == pytest.approx([2.0] * 5, rel=0.2)
-    # 450 answers give a bound of the 99 % quantile; 180 answers do not
+    # A bound of the 99 % quantile at 90 % confidence needs 230 answers: a bin has 180, a site 450.
     assert bins[0]["quantile_bound"] == np.inf
     site_bin = section.data["site"][0]
     valid = frame[frame["answered"] & frame["site"].eq("a")]
@@ -97,7 +98,7 @@ def test_constant_conditions_are_omitted(make_rows: Rows) -> None:
     assert "sun_elevation_deg" not in dict(bin_conditions(frame))
     assert conditions_section(make_subject(frame[["answered", METRIC]])) is None
     # too few cases per category
-    assert "site" not in dict(bin_conditions(frame.assign(site=[f"site {k % 10}" for k in range(60)])))
+    assert "site" not in dict(bin_conditions(frame.assign(site=[f"site {index % 10}" for index in range(60)])))
 
 
 def test_variance_between_terrains_is_estimated() -> None:
@@ -112,9 +113,9 @@ def test_variance_between_terrains_is_estimated() -> None:
     assert variance["within_sd"] == pytest.approx(3.0, rel=0.08)
     assert variance["between_sd"] == pytest.approx(2.0, rel=0.2)
     assert variance["p_value"] < 1e-6
-    uncorrelated = terrain_variance(frame.assign(**{METRIC: rng.standard_normal(1000)}), METRIC)
-    assert uncorrelated is not None
-    assert uncorrelated["p_value"] > 0.01
+    variance_without_effect = terrain_variance(frame.assign(**{METRIC: rng.standard_normal(1000)}), METRIC)
+    assert variance_without_effect is not None
+    assert variance_without_effect["p_value"] > 0.01
     assert terrain_variance(frame.assign(terrain=np.arange(1000)), METRIC) is None
     assert terrain_variance(frame.drop(columns="terrain"), METRIC) is None
 
@@ -151,7 +152,10 @@ def test_faults_are_grouped_by_kind_and_size() -> None:
 
 
 def make_sensitive_rows(n: int, terrains: int, seed: int = 3) -> pd.DataFrame:
-    """Return rows whose mean error grows by 1 m/s from the 5 % to the 95 % quantile of the attitude rate."""
+    """Return rows whose mean error increases with the attitude rate.
+
+    The rate is uniform from 0 to 60 deg/s: from its 5 % to its 95 % quantile (54 deg/s) the error increases by 1 m/s.
+    """
     rng = np.random.default_rng(seed)
     rate = rng.uniform(0.0, 60.0, n)
     return pd.DataFrame(
@@ -172,7 +176,8 @@ def test_sensitivity_is_large_for_the_true_driver_only() -> None:
     effect, low, high = effects["attitude_rate_max_deg_s"].effect
     assert effect == pytest.approx(1.0, abs=0.08)
     assert low < 1.0 < high
-    # sum of two uniform variables with standard deviations 1.11 / sqrt(12) and 1 / sqrt(12): 0.743 of the total
+    # The error is a sum of uniform variables of widths 60 / 54 = 1.11 and 1. Standardised coefficient:
+    # 1.11 / sqrt(1.11^2 + 1^2) = 0.743
     assert effects["attitude_rate_max_deg_s"].coefficient[0] == pytest.approx(0.743, abs=0.05)
     for name in ("descent_rate_m_s", "altitude_1_m"):
         assert abs(effects[name].effect[0]) < 0.1
@@ -181,14 +186,14 @@ def test_sensitivity_is_large_for_the_true_driver_only() -> None:
 
 
 def test_sensitivity_intervals_have_90_percent_coverage() -> None:
-    n_covered = 0
+    n_covering = 0
     for seed in range(40):
         effects = estimate_effects(make_subject(make_sensitive_rows(120, 120, seed)), METRIC)
         (driver,) = (effect for effect in effects if effect.column == "attitude_rate_max_deg_s")
         # true effect between this sample's quantiles: 1/54 m/s per deg/s
-        n_covered += driver.effect[1] <= (driver.high - driver.low) / 54.0 <= driver.effect[2]
+        n_covering += driver.effect[1] <= (driver.high - driver.low) / 54.0 <= driver.effect[2]
     # binomial(40, 0.9): three standard deviations are 6
-    assert n_covered >= 36 - 6
+    assert n_covering >= 36 - 6
 
 
 def test_sensitivity_requires_all_drivers_and_enough_cases() -> None:
@@ -200,11 +205,13 @@ def test_sensitivity_requires_all_drivers_and_enough_cases() -> None:
 
 
 def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
-    uncorrected = np.linspace(5.0, 25.0, 100)
-    corrected = uncorrected - 4.0
-    corrected[:10] = uncorrected[:10] + 2.0
-    corrected[10:30] = uncorrected[10:30]
-    frame = pd.DataFrame({"touchdown_speed_corrected_m_s": corrected, "touchdown_speed_uncorrected_m_s": uncorrected})
+    uncorrected_m_s = np.linspace(5.0, 25.0, 100)
+    corrected_m_s = uncorrected_m_s - 4.0
+    corrected_m_s[:10] = uncorrected_m_s[:10] + 2.0
+    corrected_m_s[10:30] = uncorrected_m_s[10:30]
+    frame = pd.DataFrame(
+        {"touchdown_speed_corrected_m_s": corrected_m_s, "touchdown_speed_uncorrected_m_s": uncorrected_m_s}
+    )
     frame.loc[100] = [np.nan, np.nan]  # crashed
     section = LANDING(make_subject(frame))
     assert section is not None

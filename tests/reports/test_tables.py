@@ -68,7 +68,7 @@ def test_texts_are_not_interpreted_as_markup(make_rows: Rows, velocity: dict[str
 
 
 def test_outcomes_are_ordered_and_counted(make_rows: Rows) -> None:
-    frame = make_rows(200, crashed=2)
+    frame = make_rows(200, n_crashed=2)
     counts = outcome_counts(frame)
     assert counts[0][0] == "VALID"
     assert counts[-1] == ("CRASHED", 2)
@@ -148,9 +148,14 @@ def test_rate_without_cases_has_the_interval_0_to_1() -> None:
 
 
 def test_requirement_texts_describe_metric_and_population() -> None:
-    entries = {item["id"]: item for item in tomllib.loads(REQUIREMENTS.read_text(encoding="utf-8"))["requirements"]}
+    entries = {
+        requirement["id"]: requirement
+        for requirement in tomllib.loads(REQUIREMENTS.read_text(encoding="utf-8"))["requirements"]
+    }
     texts = {
-        name: requirement_text(Requirement.model_validate({k: v for k, v in entry.items() if k != "campaigns"}))
+        name: requirement_text(
+            Requirement.model_validate({key: value for key, value in entry.items() if key != "campaigns"})
+        )
         for name, entry in entries.items()
     }
     assert texts["VTT-POS"].startswith(

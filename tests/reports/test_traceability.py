@@ -42,13 +42,14 @@ def test_matrix_has_one_row_per_requirement(make_rows: Rows, velocity: dict[str,
 
 
 def _read_message(case: Xml.Element, result: str) -> str:
+    """Return the message of a JUnit test case with this result, `failure` or `skipped`."""
     element = case.find(result)
     assert element is not None
     return element.get("message", "")
 
 
 def test_junit_lists_failures_and_undecided_requirements(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    frame = make_rows(40, crashed=2, terrains=10_000)
+    frame = make_rows(40, n_crashed=2, terrains=10_000)
     # 32 of 34 cases succeed (crashed cases are failures): the rate meets 94 %, its lower bound does not
     by_rate = {**velocity, "id": "RATE", "probability": 0.94, "decide_by": "estimate"}
     requirements = [
@@ -60,12 +61,12 @@ def test_junit_lists_failures_and_undecided_requirements(make_rows: Rows, veloci
     verdicts = evaluate_requirements(frame, requirements)
     suite = Xml.fromstring(junit_xml(HOSTILE, verdicts, combine_verdicts(verdicts, frame)))  # noqa: S314
     assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("5", "2", "2")
-    fails, undecided, passes, met, completed = suite
-    assert _read_message(met, "skipped").startswith("MET BY RATE: ")
-    assert fails.find("failure") is not None
-    assert "INSUFFICIENT" in _read_message(undecided, "skipped")
-    assert [child.tag for child in passes] == ["system-out"]
-    assert _read_message(completed, "failure") == "2 cases crashed"
+    failing_case, undecided_case, passing_case, met_by_rate_case, completion_case = suite
+    assert _read_message(met_by_rate_case, "skipped").startswith("MET BY RATE: ")
+    assert failing_case.find("failure") is not None
+    assert "INSUFFICIENT" in _read_message(undecided_case, "skipped")
+    assert [child.tag for child in passing_case] == ["system-out"]
+    assert _read_message(completion_case, "failure") == "2 cases crashed"
 
 
 def test_report_writes_matrix_and_junit_files(make_rows: Rows, make_run: Callable[..., Path]) -> None:

@@ -19,8 +19,8 @@ MakeRun = Callable[..., Path]
 
 def test_stored_schema_equals_the_layout() -> None:
     # to update the file: json.dump(CampaignReport.model_json_schema(), file, indent=1), followed by a newline
-    stored = SCHEMA_FILE.read_text()
-    assert json.loads(stored) == CampaignReport.model_json_schema()
+    schema_text = SCHEMA_FILE.read_text()
+    assert json.loads(schema_text) == CampaignReport.model_json_schema()
     assert get_args(CampaignReport.model_fields["report_schema"].annotation) == (SCHEMA,)
 
 
@@ -29,8 +29,8 @@ def test_stored_schema_equals_the_layout() -> None:
     [
         {"cases": 24},
         {"cases": 400, "terrains": 60},
-        {"cases": 24, "crashed": 3},
-        {"cases": 24, "answered": 0.0},
+        {"cases": 24, "n_crashed": 3},
+        {"cases": 24, "answer_rate": 0.0},
         {"cases": 1},
     ],
 )

@@ -44,7 +44,7 @@ def test_verdict_passes_at_the_minimum_number_of_cases(velocity: dict[str, Any])
     assert _evaluate(_make_rows(230, 0), velocity).status is Status.PASS
     assert _evaluate(_make_rows(388, 1), velocity).status is Status.PASS
     undecided = _evaluate(_make_rows(229, 0), velocity)
-    # a verdict with appended cases is a second evaluation, so more than one additional case is needed
+    # After a first look that cannot pass, the second look needs 297 cases without failure at the corrected risk.
     assert (undecided.status, undecided.further_cases) == (Status.INSUFFICIENT, 297 - 229)
 
 
@@ -79,11 +79,11 @@ def test_status_follows_from_the_bounds(counts: tuple[int, int], probability: fl
     assert (verdict.status is Status.FAIL) == (upper < probability)
     if verdict.status is Status.INSUFFICIENT:
         assert verdict.further_cases
-        extended = pd.concat([_make_rows(n, failures), _make_rows(verdict.further_cases, 0)], ignore_index=True)
-        extended = extended.drop(columns="terrain").assign(case=np.arange(len(extended)))
-        (later,) = evaluate_requirements(extended, [requirement], SamplingDesign(first_look=n))
+        extended_rows = pd.concat([_make_rows(n, failures), _make_rows(verdict.further_cases, 0)], ignore_index=True)
+        extended_rows = extended_rows.drop(columns="terrain").assign(case=np.arange(len(extended_rows)))
+        (later,) = evaluate_requirements(extended_rows, [requirement], SamplingDesign(first_look=n))
         assert later.status is Status.PASS
-        (too_few,) = evaluate_requirements(extended[:-1], [requirement], SamplingDesign(first_look=n))
+        (too_few,) = evaluate_requirements(extended_rows[:-1], [requirement], SamplingDesign(first_look=n))
         assert too_few.status is Status.INSUFFICIENT
 
 
@@ -102,18 +102,18 @@ def test_non_finite_metric_fails(velocity: dict[str, Any], error: float) -> None
 
 
 def test_populations_select_cases(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    frame = make_rows(100, answered=0.8, crashed=3)
-    answered, crashed = int(frame["answered"].sum()), 3
+    frame = make_rows(100, answer_rate=0.8, n_crashed=3)
+    n_answered, n_crashed = int(frame["answered"].sum()), 3
     verdicts = {name: _evaluate(frame, velocity, population=name) for name in ("all", "completed", "valid")}
-    assert [verdict.n for verdict in verdicts.values()] == [100, 100 - crashed, answered]
+    assert [verdict.n for verdict in verdicts.values()] == [100, 100 - n_crashed, n_answered]
     n_beyond = int((frame["velocity_error_m_s"] > 5.0).sum())
     # a case without an answer fails if it belongs to the population
     failures = [verdict.failures for verdict in verdicts.values()]
-    assert failures == [100 - answered + n_beyond, 100 - crashed - answered + n_beyond, n_beyond]
+    assert failures == [100 - n_answered + n_beyond, 100 - n_crashed - n_answered + n_beyond, n_beyond]
 
 
 def test_empty_population_is_insufficient(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    verdict = _evaluate(make_rows(24, answered=0.0), velocity)
+    verdict = _evaluate(make_rows(24, answer_rate=0.0), velocity)
     assert (verdict.status, verdict.n, verdict.further_cases) == (Status.INSUFFICIENT, 0, 297)
     assert math.isnan(verdict.estimate)
     assert "No case" in verdict.note
@@ -160,8 +160,8 @@ def test_boolean_metric_counts_true_as_success() -> None:
 def test_populations_combine_columns() -> None:
     frame = _make_rows(100, 20).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) < 50)
     requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    combined = _evaluate(frame, requirement, population="valid and feasible_overlap")
-    assert (combined.n, combined.failures) == (40, 10)
+    verdict = _evaluate(frame, requirement, population="valid and feasible_overlap")
+    assert (verdict.n, verdict.failures) == (40, 10)
     assert (
         "feasible_overlap"
         in _evaluate(frame.assign(feasible_overlap=np.arange(100.0)), requirement, population="feasible_overlap").note
@@ -219,8 +219,8 @@ def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) ->
     few_crashes.loc[:1, "outcome"] = "CRASHED"
     few_crashes.loc[:1, "answered"] = False
     assert _evaluate(few_crashes, requirement, population=population).status is Status.PASS
-    outside = frame.assign(is_near=frame["answered"])
-    assert _evaluate(outside, requirement, population="valid and is_near").status is Status.PASS
+    outside_population = frame.assign(is_near=frame["answered"])
+    assert _evaluate(outside_population, requirement, population="valid and is_near").status is Status.PASS
 
 
 def test_estimate_decides_with_shared_terrains(velocity: dict[str, Any]) -> None:
@@ -279,6 +279,7 @@ def test_appended_cases_share_the_risk_of_two_evaluations(velocity: dict[str, An
     assert (first.status, first.bounds_confidence) == (Status.INSUFFICIENT, 0.9)
     assert (later.status, later.bounds_confidence > 0.99) == (Status.INSUFFICIENT, True)
     assert "evaluated more than once" in later.note
+    # with one failure, the second look needs 1049 cases at the corrected risk
     assert first.further_cases == 1049 - 230
     (sufficient,) = evaluate_requirements(_make_rows(1049, 1), [velocity], design)
     assert (sufficient.status, sufficient.n) == (Status.PASS, 1049)
@@ -336,15 +337,15 @@ def test_additional_cases_account_for_the_design_effect(velocity: dict[str, Any]
     assert verdict.clustered is not None
     assert verdict.clustered.design_effect == pytest.approx(5.0, rel=0.02)
     assert verdict.further_cases
-    extended = pd.concat(
+    extended_rows = pd.concat(
         [frame, _make_rows(verdict.further_cases, 0).assign(terrain=1000 + np.arange(verdict.further_cases) // 5)]
     )
-    extended["case"] = np.arange(len(extended))
+    extended_rows["case"] = np.arange(len(extended_rows))
     requirements = [{**velocity, "probability": 0.82}]
-    (later,) = evaluate_requirements(extended, requirements, SamplingDesign(first_look=1000))
+    (later,) = evaluate_requirements(extended_rows, requirements, SamplingDesign(first_look=1000))
     assert later.status is Status.PASS
     (earlier,) = evaluate_requirements(
-        extended.iloc[: 1000 + int(0.9 * verdict.further_cases)], requirements, SamplingDesign(first_look=1000)
+        extended_rows.iloc[: 1000 + int(0.9 * verdict.further_cases)], requirements, SamplingDesign(first_look=1000)
     )
     assert earlier.status is Status.INSUFFICIENT
 
@@ -377,12 +378,12 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     assert np.mean([np.unique(rng.integers(0, 2300, 254)).size >= 230 for _ in range(1000)]) > 0.99
     in_turn = _make_terrain_design(8, distribution="in-turn", low=0, high="location.bank - 1")
     assert "--set location.bank=230 -n 230" in evaluate_requirements(frame, [velocity], in_turn)[0].note
-    fixed = evaluate_requirements(frame.assign(terrain=0), [velocity], _make_terrain_design(8))[0]
-    assert "has only 1 stored terrain (location.terrain = 1)" in fixed.note
-    narrow = _make_terrain_design(100, distribution="integer", low=0, high=7)
-    assert 'dispersions."location.terrain"' in evaluate_requirements(frame, [velocity], narrow)[0].note
-    large = _make_terrain_design(1000, distribution="integer", low=0, high="location.bank - 1")
-    assert evaluate_requirements(frame, [velocity], large)[0].further_cases == 289
+    fixed_terrain = evaluate_requirements(frame.assign(terrain=0), [velocity], _make_terrain_design(8))[0]
+    assert "has only 1 stored terrain (location.terrain = 1)" in fixed_terrain.note
+    narrow_dispersion = _make_terrain_design(100, distribution="integer", low=0, high=7)
+    assert 'dispersions."location.terrain"' in evaluate_requirements(frame, [velocity], narrow_dispersion)[0].note
+    large_bank = _make_terrain_design(1000, distribution="integer", low=0, high="location.bank - 1")
+    assert evaluate_requirements(frame, [velocity], large_bank)[0].further_cases == 289
 
 
 def test_evaluations_of_an_adaptive_campaign_share_the_risk(velocity: dict[str, Any]) -> None:
@@ -410,9 +411,9 @@ def test_cases_of_unknown_terrain_are_independent(velocity: dict[str, Any]) -> N
 
 def test_evaluation_does_not_change_its_inputs(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame, requirement = make_rows(50), dict(velocity)
-    before = frame.copy()
+    frame_before = frame.copy()
     evaluate_requirements(frame, [requirement])
-    pd.testing.assert_frame_equal(frame, before)
+    pd.testing.assert_frame_equal(frame, frame_before)
     assert requirement == velocity
 
 
@@ -440,7 +441,7 @@ def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
 
 
 def test_crashed_cases_are_counted_in_the_summary(make_rows: Rows) -> None:
-    summary = combine_verdicts([], make_rows(24, crashed=2))
+    summary = combine_verdicts([], make_rows(24, n_crashed=2))
     assert summary.crashed == 2
     assert "2 cases crashed" in summary.sentence
 
@@ -474,5 +475,7 @@ def test_configured_conditions_also_restrict_the_result_of_all_cases(velocity: d
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.configured) == (5, 10, ("navcam",))
     assert verdict.all_cases.text.startswith("For comparison: if all 10 cases with the navcam counted, ")
     # the population is the configuration itself
-    (configured,) = evaluate_requirements(frame, [{**velocity, "population": "navcam"}], configured=("nav*",))
-    assert configured.all_cases is None
+    (configured_population,) = evaluate_requirements(
+        frame, [{**velocity, "population": "navcam"}], configured=("nav*",)
+    )
+    assert configured_population.all_cases is None

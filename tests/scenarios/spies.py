@@ -1,4 +1,4 @@
-"""Algorithms and scores for tests: spies record inputs and truth; other algorithms write to images, raise or exit."""
+"""Algorithms and a score for tests: some record their inputs, others write to images, raise or exit."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RECORDED_CASES: list[Any] = []
 
 
 class VelocitySpy:
-    """A velocity estimator without a valid answer."""
+    """Velocity estimator that records its inputs and has no valid answer."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
@@ -42,7 +42,7 @@ class VelocitySpy:
 
 
 class SiteSpy:
-    """A site estimator that does not converge."""
+    """Site estimator that records its inputs and does not converge."""
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """See `SiteEstimator`."""
@@ -54,30 +54,30 @@ class TrackerSpy:
     """The paper's tracker; records (pose, mast) of each `aim` call and the measurements of each update."""
 
     def __init__(self) -> None:
-        self.inner = VisualTargetTracker()
+        self.paper_tracker = VisualTargetTracker()
 
     @property
     def state(self) -> TrackingState:
         """See `TargetTracker`."""
-        return self.inner.state
+        return self.paper_tracker.state
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
         """See `TargetTracker`."""
-        self.inner.designate(target, world_from_rover)
+        self.paper_tracker.designate(target, world_from_rover)
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
         """See `TargetTracker`."""
         RECORDED_INPUTS.append((world_from_rover, mast))
-        return self.inner.aim(world_from_rover, mast)
+        return self.paper_tracker.aim(world_from_rover, mast)
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
         RECORDED_INPUTS.append(measurements)
-        return self.inner.update(measurements)
+        return self.paper_tracker.update(measurements)
 
     def clear(self) -> None:
         """See `TargetTracker`."""
-        self.inner.clear()
+        self.paper_tracker.clear()
 
 
 def record_case(case: ScoredVelocity | ScoredSite) -> dict[str, float]:
@@ -93,7 +93,7 @@ def _set_counts_to_zero(image: Any, *, make_writable: bool) -> None:
 
 
 class VelocityWriter(VelocitySpy):
-    """Writes to its read-only image."""
+    """Velocity estimator that writes to its read-only image."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
@@ -102,7 +102,7 @@ class VelocityWriter(VelocitySpy):
 
 
 class ForcedVelocityWriter(VelocitySpy):
-    """Makes an image writable and overwrites it."""
+    """Velocity estimator that makes an image writable and overwrites it."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
@@ -111,7 +111,7 @@ class ForcedVelocityWriter(VelocitySpy):
 
 
 class ForcedSiteWriter(SiteSpy):
-    """Makes an image writable and overwrites it."""
+    """Site estimator that makes an image writable and overwrites it."""
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """See `SiteEstimator`."""
@@ -120,17 +120,17 @@ class ForcedSiteWriter(SiteSpy):
 
 
 class ForcedTrackerWriter(TrackerSpy):
-    """Makes an image writable and overwrites it."""
+    """Tracker that makes an image writable and overwrites it."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
-        update = self.inner.update(measurements)
+        update = self.paper_tracker.update(measurements)
         _set_counts_to_zero(measurements.left, make_writable=True)
         return update
 
 
 class RaisingTracker(TrackerSpy):
-    """Raises an exception at the second stop."""
+    """Tracker that raises an exception at the second stop."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""

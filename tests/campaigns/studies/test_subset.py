@@ -20,8 +20,10 @@ from marsyard.campaigns.studies.interval import (
 from marsyard.campaigns.studies.subset import SubsetResult
 
 
-def run(margins: LimitState, dimension: int, samples: int, rng: np.random.Generator) -> tuple[SubsetResult, int]:
-    """Run one subset simulation with a new seed; also return its number of cases."""
+def run_with_random_seed(
+    margins: LimitState, dimension: int, samples: int, rng: np.random.Generator
+) -> tuple[SubsetResult, int]:
+    """Run one subset simulation of `samples` cases per level with a random seed; also return its number of cases."""
     return run_subset(margins, dimension, int(rng.integers(2**31)), samples)
 
 
@@ -31,44 +33,52 @@ def run(margins: LimitState, dimension: int, samples: int, rng: np.random.Genera
 def test_estimates_are_unbiased(dimension: int, probability: float, noise_fraction: float) -> None:
     rng = np.random.default_rng(1)
     margins = linear_margin(dimension, probability, noise_fraction)
-    estimates = [run(margins, dimension, 300, rng)[0].probability for _ in range(40)]
+    estimates = [run_with_random_seed(margins, dimension, 300, rng)[0].probability for _ in range(40)]
     ratio = np.array(estimates) / probability
+    # tolerance: three standard errors of the mean
     assert abs(ratio.mean() - 1.0) < 3.0 * ratio.std(ddof=1) / math.sqrt(len(ratio))
     assert ratio.std() < 1.5
 
 
 def test_intervals_of_replicates_cover_the_probability() -> None:
-    rng, covered = np.random.default_rng(2), 0
+    rng, n_covering = np.random.default_rng(2), 0
     margins = linear_margin(10, 1e-3)
     for _ in range(100):
-        results = [run(margins, 10, 100, rng)[0] for _ in range(4)]
-        interval = replicate_interval([item.probability for item in results], [item.reached for item in results], 0.9)
-        covered += interval.lower <= 1e-3 <= interval.upper
-    # 90 expected; the standard deviation of the count is 3
-    assert covered >= 82
+        results = [run_with_random_seed(margins, 10, 100, rng)[0] for _ in range(4)]
+        interval = replicate_interval(
+            [result.probability for result in results], [result.reached for result in results], 0.9
+        )
+        n_covering += interval.lower <= 1e-3 <= interval.upper
+    # coverage of 90 %: mean 90 of 100, standard deviation sqrt(100 * 0.9 * 0.1) = 3
+    assert n_covering >= 82
 
 
-def test_cost_is_a_small_fraction_of_counting() -> None:
+def test_simulation_needs_fewer_cases_than_counting() -> None:
     rng = np.random.default_rng(3)
-    results = [run(linear_margin(20, 1e-4), 20, 300, rng) for _ in range(40)]
-    estimates, cases = np.array([item.probability for item, _ in results]), np.mean([n for _, n in results])
+    results = [run_with_random_seed(linear_margin(20, 1e-4), 20, 300, rng) for _ in range(40)]
+    estimates = np.array([result.probability for result, _ in results])
+    mean_cases = np.mean([cases for _, cases in results])
+    # counting with n cases has the relative variance 1 / (n p)
     counting_cases = 1e4 / (estimates.std() / 1e-4) ** 2
-    assert cases < counting_cases / 8.0
+    assert mean_cases < counting_cases / 8.0
 
 
-def test_cases_that_cannot_violate_do_not_stop_the_simulation() -> None:
+def test_cases_outside_the_population_do_not_bias_the_estimate() -> None:
     def margins(coordinates: np.ndarray, streams: np.ndarray) -> np.ndarray:
-        # 95 % of the cases are outside the population
+        # 95 % of the cases are outside the population: 1.645 is the 95 % quantile of the normal distribution
         return np.where(coordinates[:, 0] > 1.645, 2.5 - coordinates[:, 1], np.inf)
 
     rng = np.random.default_rng(4)
-    estimates = [run(margins, 2, 300, rng)[0].probability for _ in range(30)]
+    estimates = [run_with_random_seed(margins, 2, 300, rng)[0].probability for _ in range(30)]
     assert np.mean(estimates) == pytest.approx(0.05 * norm.sf(2.5), rel=0.4)
 
 
-def test_margin_without_levels_gives_an_upper_limit() -> None:
+def test_margin_without_intermediate_values_gives_an_upper_limit() -> None:
+    """All cases of the first level have the same margin, so the simulation cannot approach the violations."""
     rng = np.random.default_rng(5)
-    result, cases = run(lambda coordinates, _: np.where(coordinates[:, 0] > 8.0, -1.0, 1.0), 2, 100, rng)
+    result, cases = run_with_random_seed(
+        lambda coordinates, _: np.where(coordinates[:, 0] > 8.0, -1.0, 1.0), 2, 100, rng
+    )
     assert not result.reached
     assert result.probability == 1.0
     assert cases == 100
@@ -78,10 +88,11 @@ def test_margin_without_levels_gives_an_upper_limit() -> None:
 def test_importance_sampling_is_unbiased_and_precise(dimension: int) -> None:
     rng = np.random.default_rng(6)
     margins = linear_margin(dimension, 1e-4)
-    violations = np.concatenate([run(margins, dimension, 200, rng)[0].violations for _ in range(4)])
+    violations = np.concatenate([run_with_random_seed(margins, dimension, 200, rng)[0].violations for _ in range(4)])
     density = fit_density(violations)
     assert density is not None
     coordinates, weights = density.draw(4000, rng)
+    # a tenth of the cases is drawn from the nominal density, which limits the weights to 10
     assert weights.max() <= 10.0
     interval = weighted_interval((weights * (margins(coordinates, weights) < 0.0)).tolist(), 0.99)
     assert interval.lower < 1e-4 < interval.upper
@@ -116,17 +127,20 @@ def test_interval_needs_two_replicates() -> None:
     ("lower", "upper", "verdict"), [(1e-6, 1e-4, "PASS"), (2e-4, 1e-3, "FAIL"), (5e-5, 5e-4, "INSUFFICIENT")]
 )
 def test_verdict_compares_the_bounds_with_the_limit(lower: float, upper: float, verdict: str) -> None:
-    assert decide(ProbabilityInterval(math.sqrt(lower * upper), lower, upper, 0.9, 0.4), 1e-4) == verdict
+    interval = ProbabilityInterval(math.sqrt(lower * upper), lower, upper, confidence=0.9, log_sd=0.4)
+    assert decide(interval, 1e-4) == verdict
 
 
 def test_more_replicates_are_needed_near_the_limit() -> None:
     interval = replicate_interval([0.8e-4, 0.5e-4, 1.2e-4, 0.7e-4], [True] * 4, 0.9)
-    near, far = (additional_replicates(interval, 4, max_probability) for max_probability in (1e-4, 2e-4))
-    assert near is not None
-    assert far is not None
-    assert near > far >= 1
+    near_limit, far_from_limit = (
+        additional_replicates(interval, 4, max_probability) for max_probability in (1e-4, 2e-4)
+    )
+    assert near_limit is not None
+    assert far_from_limit is not None
+    assert near_limit > far_from_limit >= 1
 
 
-def test_no_violation_gives_no_information() -> None:
+def test_interval_without_violations_is_0_to_1() -> None:
     interval = weighted_interval([0.0, 0.0, 0.0], 0.9)
     assert (interval.lower, interval.upper) == (0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Tests of the dashboard: entries, pages, links, escaping of texts and sparklines."""
+"""Tests of the dashboard: list of campaigns, pages, links, escaping of texts and sparklines."""
 
 from __future__ import annotations
 
@@ -100,13 +100,13 @@ def test_security_policy_contains_the_hash_of_the_script(make_rows: Rows, make_r
 def test_texts_are_escaped_and_files_stay_in_the_site(
     make_rows: Rows, make_run: MakeRun, tmp_path: Path, velocity: dict[str, Any]
 ) -> None:
-    frame = make_rows(12, crashed=1)[[*MIN_COLUMNS, "error"]].assign(error=HOSTILE)
+    frame = make_rows(12, n_crashed=1)[[*MIN_COLUMNS, "error"]].assign(error=HOSTILE)
     parameters = {"site": HOSTILE, "algorithm": HOSTILE}
     directory = make_run(frame, [{**velocity, "id": HOSTILE, "statement": HOSTILE}], name="hostile", git_commit=HOSTILE)
     record = (directory / "campaign.json").read_text()
-    stored = {**json.loads(record), "name": HOSTILE, "state": HOSTILE, "started_utc": HOSTILE}
-    stored["configuration"]["parameters"] = parameters
-    (directory / "campaign.json").write_text(json.dumps(stored))
+    hostile_record = {**json.loads(record), "name": HOSTILE, "state": HOSTILE, "started_utc": HOSTILE}
+    hostile_record["configuration"]["parameters"] = parameters
+    (directory / "campaign.json").write_text(json.dumps(hostile_record))
     text = _write_index(tmp_path)
     assert "alert('x')</script>" not in text
     assert "<img" not in text
@@ -133,8 +133,8 @@ def test_unreadable_campaign_is_reported_and_others_are_shown(
     make_rows: Rows, make_run: MakeRun, tmp_path: Path
 ) -> None:
     make_run(make_rows(6)[MIN_COLUMNS], name="readable")
-    damaged = make_run(make_rows(6)[MIN_COLUMNS], name="damaged")
-    (damaged / "cases.parquet").write_bytes(b"not a table")
+    damaged_run = make_run(make_rows(6)[MIN_COLUMNS], name="damaged")
+    (damaged_run / "cases.parquet").write_bytes(b"not a table")
     site = write_site(tmp_path / "site", [tmp_path])
     assert site.campaigns == 1
     assert len(site.problems) == 1
@@ -174,9 +174,9 @@ def _make_verdict(estimate: float, margin: float = -0.05) -> RequirementVerdict:
 def test_sparkline_rises_with_the_rate() -> None:
     line = sparkline([_make_verdict(0.9), _make_verdict(0.97), _make_verdict(1.0)])
     assert line is not None
-    heights = [float(point.split(",")[1]) for point in line.points.split()]
+    line_y = [float(point.split(",")[1]) for point in line.points.split()]
     # y of SVG points down: a higher rate has a smaller y
-    assert heights[0] > line.required_y > heights[1] > heights[2]
+    assert line_y[0] > line.required_y > line_y[1] > line_y[2]
     assert sparkline([_make_verdict(0.9)]) is None
     assert sparkline([_make_verdict(float("nan"))] * 3) is None
 

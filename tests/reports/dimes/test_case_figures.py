@@ -52,11 +52,11 @@ def test_images_are_binned_to_square_pixels(dimes_products: dict[str, Any]) -> N
 
 def test_template_squares_are_at_the_track_positions(dimes_products: dict[str, Any]) -> None:
     table = np.asarray(dimes_products["tracks"])
-    rectified, _, square, _ = _find_squares(draw_dimes_pair(dimes_products, 0), TEMPLATE)
-    assert _find_centre(square) == pytest.approx(tuple(table[0, 2:4]))
+    rectified_square, _, image_square, _ = _find_squares(draw_dimes_pair(dimes_products, 0), TEMPLATE)
+    assert _find_centre(image_square) == pytest.approx(tuple(table[0, 2:4]))
     # the rectified image is the image shifted by 64 px, at the same scale
-    assert _find_centre(rectified) == pytest.approx(tuple(table[0, 2:4] + 64.0))
-    assert rectified.get_width() == pytest.approx(17.0)
+    assert _find_centre(rectified_square) == pytest.approx(tuple(table[0, 2:4] + 64.0))
+    assert rectified_square.get_width() == pytest.approx(17.0)
 
 
 def test_rectified_matches_are_inside_their_windows(dimes_products: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Tests of the section on the field test: results next to the paper's values, and errors by category."""
+"""Tests of the report section on the field test: results are compared with the paper, errors shown by category."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ MakeRows = Callable[..., pd.DataFrame]
 
 @pytest.fixture
 def field_frame(make_rows: MakeRows) -> pd.DataFrame:
-    """Return 20 image triples in each of three cells, with 20, 10 and 0 answers; the paper lists two of them."""
-    frame = make_rows(60, answered=1.0)
+    """Return 20 image triples in each of three cells, with 20, 10 and 0 answers; the paper has values of two cells."""
+    frame = make_rows(60, answer_rate=1.0)
     frame["category"] = ["short time"] * 20 + ["same direction"] * 20 + ["opposite direction"] * 20
     frame["run"] = ["Kelso Run 3"] * 40 + ["Mojave Run 9"] * 20
-    unanswered = np.arange(60) >= 30
-    frame.loc[unanswered, "answered"] = False
-    frame.loc[unanswered, [name for name in frame if str(name).startswith("velocity_error")]] = np.nan
+    is_unanswered = np.arange(60) >= 30
+    frame.loc[is_unanswered, "answered"] = False
+    frame.loc[is_unanswered, [name for name in frame if str(name).startswith("velocity_error")]] = np.nan
     return frame
 
 

@@ -18,7 +18,10 @@ def products() -> dict[str, Any]:
     interval_ends_s = np.arange(1.0, N_IMAGES)
     no_interval = np.full((1, 2), np.nan)
     true_velocities = np.concatenate([no_interval, np.stack([10.0 + interval_ends_s, -interval_ends_s], axis=1)])
-    images = {f"image_{k}": np.random.default_rng(k).integers(0, 4095, (16, 64)) for k in range(1, N_IMAGES + 1)}
+    images = {
+        f"image_{number}": np.random.default_rng(number).integers(0, 4095, (16, 64))
+        for number in range(1, N_IMAGES + 1)
+    }
     return {
         **images,
         "after_spans_s": np.concatenate([no_interval, np.stack([interval_ends_s - 1.0, interval_ends_s], axis=1)]),
@@ -30,7 +33,7 @@ def products() -> dict[str, Any]:
 
 def test_all_images_and_estimates_are_drawn(products: dict[str, Any]) -> None:
     figure = draw_stream_case(products)
-    axes = [panel for part in figure.subfigs for panel in part.axes]
+    axes = [panel for subfigure in figure.subfigs for panel in subfigure.axes]
     assert sum(bool(panel.get_images()) for panel in axes) == N_IMAGES
     east, north = axes[-2:]
     for component, (plot, error) in enumerate(((east, 0.5), (north, 0.0))):

@@ -9,7 +9,7 @@ import pandas as pd
 
 #: Rows and columns of the elevation map.
 SHAPE = (24, 32)
-#: Cell of the elevation map, height of the camera, and focal length for images of 320 x 240 pixels.
+#: Cell size of the elevation map, height of the camera, and focal length for images of 320 x 240 pixels.
 CELL_M, HEIGHT_M, FOCAL_PX = 0.25, 10.0, 240.0
 
 
@@ -29,7 +29,7 @@ def synthetic_products() -> dict[str, Any]:
     pixels = np.stack([160.0 + FOCAL_PX * x / HEIGHT_M, 120.0 - FOCAL_PX * y / HEIGHT_M], axis=-1)
     features = rng.uniform(20.0, 220.0, (30, 2))
     grid = np.stack(np.meshgrid(np.arange(20.0, 300.0, 8.0), np.arange(20.0, 220.0, 8.0)), axis=-1).reshape(-1, 2)
-    accepted = rng.random(30) < 0.8
+    is_accepted = rng.random(30) < 0.8
     corner_rays = np.array([[-160, -120, 240], [160, -120, 240], [160, 120, 240], [-160, 120, 240]]) / FOCAL_PX
     camera = np.eye(4)
     camera[:3, 3] = (100.0, 50.0, HEIGHT_M)
@@ -43,12 +43,12 @@ def synthetic_products() -> dict[str, Any]:
         "image_2": rng.integers(0, 255, (240, 320)).astype(np.uint16),
         "features": features,
         "tracked": features + np.array([30.0, 0.0]),
-        "tracks_accepted": accepted,
+        "tracks_accepted": is_accepted,
         "rotation": np.eye(3),
         "translation": np.array([-1.0, 0.0, 0.0]),
         "true_rotation": np.eye(3),
         "true_translation": np.array([-1.1, 0.0, 0.0]),
-        "sparse_points": rng.uniform([-5.0, -4.0, 9.5], [5.0, 4.0, 10.0], (int(accepted.sum()), 3)),
+        "sparse_points": rng.uniform([-5.0, -4.0, 9.5], [5.0, 4.0, 10.0], (int(is_accepted.sum()), 3)),
         "frustum_0": corner_rays,
         "frustum_1": corner_rays,
         "grid": grid,

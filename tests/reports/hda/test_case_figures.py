@@ -40,11 +40,11 @@ def test_all_figures_of_a_complete_case_are_written(hda_products: dict[str, Any]
 
 def test_tracks_are_drawn_in_both_images(hda_products: dict[str, Any]) -> None:
     left, right = draw_tracks(hda_products).axes
-    accepted = hda_products["tracks_accepted"]
+    is_accepted = hda_products["tracks_accepted"]
     accepted_features, rejected_features = (np.array(line.get_data()).T for line in left.lines[:2])
-    np.testing.assert_array_equal(accepted_features, hda_products["features"][accepted])
-    np.testing.assert_array_equal(rejected_features, hda_products["features"][~accepted])
-    np.testing.assert_array_equal(np.array(right.lines[-1].get_data()).T, hda_products["tracked"][accepted])
+    np.testing.assert_array_equal(accepted_features, hda_products["features"][is_accepted])
+    np.testing.assert_array_equal(rejected_features, hda_products["features"][~is_accepted])
+    np.testing.assert_array_equal(np.array(right.lines[-1].get_data()).T, hda_products["tracked"][is_accepted])
 
 
 def test_second_camera_is_drawn_at_the_estimated_motion(hda_products: dict[str, Any]) -> None:
@@ -63,12 +63,12 @@ def test_only_accepted_matches_are_drawn(hda_products: dict[str, Any]) -> None:
     grid = np.array(left.lines[0].get_data()).T
     (squares,) = (line for line in right.lines if line.get_marker() == "s")
     assert to_hex(squares.get_color()) == BLUE
-    accepted = {
+    accepted_matches = {
         tuple(point) for point in hda_products["grid"][hda_products["matches_accepted"]] + np.array([30.0, 0.0])
     }
     drawn_matches = {tuple(point) for point in np.array(squares.get_data()).T}
     assert 0 < len(grid) <= 600
-    assert drawn_matches == accepted & {tuple(point) for point in grid + np.array([30.0, 0.0])}
+    assert drawn_matches == accepted_matches & {tuple(point) for point in grid + np.array([30.0, 0.0])}
 
 
 def test_maps_have_the_colours_of_the_paper(hda_products: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Tests of the report sections on landings against rows with known statistics."""
+"""Tests of the report sections on landings with rows of known statistics."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def test_flights_with_one_footprint_are_pooled() -> None:
 def test_pooled_rate_interval_covers_the_true_rate() -> None:
     """90 % intervals cover the true rate of 10 %, although flights have different rates."""
     rng = np.random.default_rng(3)
-    n_covered = 0
+    n_covering = 0
     for _ in range(60):
         rates = rng.beta(1.0, 9.0, 40)
         frame = pd.DataFrame({"hazardous": rng.binomial(500, rates), "footprints": np.full(40, 500)})
         rate = pooled_rate(frame, "hazardous", "footprints")
-        n_covered += rate.lower <= 0.1 <= rate.upper
-    assert n_covered >= 45  # binomial(60, 0.9): mean 54, standard deviation 2.3
+        n_covering += rate.lower <= 0.1 <= rate.upper
+    assert n_covering >= 45  # binomial(60, 0.9): mean 54, standard deviation 2.3
 
 
 def test_rate_of_zero_has_no_bootstrap_interval() -> None:
@@ -71,6 +71,7 @@ def test_run_times_are_scaled_to_the_sum_of_table_1() -> None:
     assert section.data["cases"] == 20
     times = section.data["stages"]
     assert sum(entry["scaled_s"] for entry in times) == pytest.approx(0.77)
+    # the stages of the synthetic rows take 6 + 4 + 6 + 1 ms
     assert section.data["factor"] == pytest.approx(0.77 / 0.017)
     assert [entry["parameters"] for entry in times] == ["70 features", "60 tracks", "600 points", "19x27 terrain map"]
     assert sum(stage["seconds"] for stage in PAPER["stages"]) < 1.0  # "less than one second"
@@ -80,9 +81,9 @@ def test_touchdown_errors_are_compared_with_table_2() -> None:
     frame = landing_frame(200)
     section = TOUCHDOWN(_make_subject(frame))
     assert section is not None
-    landed = frame[frame["landed"]]
-    assert section.data["landings"] == len(landed)
-    assert section.data["mean_m"]["touchdown_error_gps_m"] == pytest.approx(landed["touchdown_error_gps_m"].mean())
+    landings = frame[frame["landed"]]
+    assert section.data["landings"] == len(landings)
+    assert section.data["mean_m"]["touchdown_error_gps_m"] == pytest.approx(landings["touchdown_error_gps_m"].mean())
     assert section.data["paper_m"] == {"1": 1.21, "3": 1.20, "4": 0.89}
     assert np.mean([run["error_m"] for run in PAPER["landings"]]) == pytest.approx(1.1)
     assert TOUCHDOWN(_make_subject(frame.assign(landed=False))) is None
@@ -101,9 +102,9 @@ def test_reported_sites_are_scored_against_the_truth() -> None:
 
 def test_crashed_flights_are_counted_as_not_finished() -> None:
     frame = landing_frame(10)
-    unknown = ["site_reported", "site_safe", "no_site_reported", "answered"]
-    frame = frame.astype(dict.fromkeys([*unknown, "wide_site_exists"], object))
-    frame.loc[0, unknown] = None
+    unknown_columns = ["site_reported", "site_safe", "no_site_reported", "answered"]
+    frame = frame.astype(dict.fromkeys([*unknown_columns, "wide_site_exists"], object))
+    frame.loc[0, unknown_columns] = None
     frame.loc[0, "wide_site_exists"] = True
     assert sum(row["crashed"] for row in outcome_counts(frame).values()) == 1
 
@@ -154,6 +155,7 @@ def _make_motion_rows(column: str, sizes: list[float], fractions: list[float]) -
 
 def test_knee_is_at_90_percent_of_the_curve() -> None:
     (curve,) = tracking_curves(_make_motion_rows("roll_deg", [0.0, 8.0, 12.0, 16.0], [1.0, 0.96, 0.92, 0.52]))
+    # linear interpolation between 0.92 at 12 deg and 0.52 at 16 deg
     assert curve.knee_up == pytest.approx(12.2)
     assert np.isnan(curve.knee_down)
     (curve,) = tracking_curves(
@@ -178,13 +180,13 @@ def test_combined_changes_have_no_curve() -> None:
 
 def test_map_errors_have_the_expected_rank_correlations() -> None:
     rng = np.random.default_rng(4)
-    n = 60
-    frame = landing_frame(n).assign(
-        baseline_fraction=rng.uniform(0.05, 0.5, n),
-        texture=rng.uniform(0.1, 2.0, n),
+    cases = 60
+    frame = landing_frame(cases).assign(
+        baseline_fraction=rng.uniform(0.05, 0.5, cases),
+        texture=rng.uniform(0.1, 2.0, cases),
         height_m=10.0,
         range_m=10.0,
-        range_error_m=rng.normal(0.0, 0.1, n),
+        range_error_m=rng.normal(0.0, 0.1, cases),
         slope_error_rms_deg=1.0,
     )
     frame["elevation_noise_m"] = 0.01 / frame["baseline_fraction"]

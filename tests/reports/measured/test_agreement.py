@@ -24,7 +24,7 @@ def make_products(matches: int) -> dict[str, object]:
         [rng.uniform(0, 60, (matches, 4)), rng.normal(0, 0.5, (matches, 2)), np.ones((matches, 1))], 1
     )
     table[: matches // 4, 6] = 0.0
-    images = {f"image_{k}": rng.integers(0, 4095, (48, 64)).astype(np.uint16) for k in (1, 2)}
+    images = {f"image_{number}": rng.integers(0, 4095, (48, 64)).astype(np.uint16) for number in (1, 2)}
     return {**images, "matches_1": table}
 
 

@@ -20,7 +20,7 @@ def _make_single_terrain_sample(values: np.ndarray) -> Sample:
     return _make_sample(values, np.zeros(values.size))
 
 
-def test_rates_on_one_terrain_agree_with_fisher() -> None:
+def test_rates_on_one_terrain_agree_with_fishers_exact_test() -> None:
     new, old = np.repeat([1, 0], [7, 33]), np.repeat([1, 0], [2, 58])
     one_sided_p_value = stats.fisher_exact(np.array([[7, 33], [2, 58]]), "greater").pvalue
     assert difference_p_value(_make_single_terrain_sample(new), _make_single_terrain_sample(old)) == pytest.approx(
@@ -28,20 +28,20 @@ def test_rates_on_one_terrain_agree_with_fisher() -> None:
     )
 
 
-def test_errors_on_one_terrain_agree_with_mann_whitney() -> None:
+def test_errors_on_one_terrain_agree_with_the_mann_whitney_test() -> None:
     rng = np.random.default_rng(1)
     new, old = rng.exponential(1.4, 60), rng.exponential(1.0, 200)
     expected = stats.mannwhitneyu(new, old, use_continuity=False, method="asymptotic").pvalue
-    # about 50 permutations are more extreme: tolerance of three standard deviations
+    # permutations end after 50 exceedances: relative standard deviation 1 / sqrt(50), tolerance of three
     assert difference_p_value(_make_single_terrain_sample(new), _make_single_terrain_sample(old)) == pytest.approx(
         expected, rel=3 / math.sqrt(50)
     )
-    similar = rng.exponential(1.0, 60)
-    expected = stats.mannwhitneyu(similar, old, use_continuity=False, method="asymptotic").pvalue
+    new_without_change = rng.exponential(1.0, 60)
+    expected = stats.mannwhitneyu(new_without_change, old, use_continuity=False, method="asymptotic").pvalue
     assert expected > 0.05
-    assert difference_p_value(_make_single_terrain_sample(similar), _make_single_terrain_sample(old)) == pytest.approx(
-        expected
-    )
+    assert difference_p_value(
+        _make_single_terrain_sample(new_without_change), _make_single_terrain_sample(old)
+    ) == pytest.approx(expected)
 
 
 def test_tied_values_agree_with_the_hypergeometric_test() -> None:
@@ -60,11 +60,11 @@ def test_tied_values_agree_with_the_hypergeometric_test() -> None:
 
 
 def test_different_numbers_of_cases_per_terrain_are_not_a_change() -> None:
-    # skewed errors; new campaign: 1 case per terrain, old: 12. Most terrain means of the new campaign are lower.
+    # Skewed errors; new campaign: 1 case per terrain, old: 12. The median of the terrain means is lower for 1 case.
     rng = np.random.default_rng(5)
 
-    def draw_campaign(first: int, cases: int) -> Sample:
-        terrains = np.repeat(np.arange(first, first + 40), cases)
+    def draw_campaign(first_terrain: int, cases: int) -> Sample:
+        terrains = np.repeat(np.arange(first_terrain, first_terrain + 40), cases)
         return _make_sample(np.exp(1.5 * rng.normal(size=terrains.size)), terrains)
 
     p_values = [difference_p_value(draw_campaign(0, 1), draw_campaign(100, 12)) for _ in range(200)]
@@ -81,7 +81,7 @@ def test_large_counts_agree_with_the_exact_test() -> None:
 
 
 def test_different_mix_of_terrains_is_not_a_change() -> None:
-    # terrain 1 is difficult and has more cases in the new campaign: pooled rates change
+    # terrain 1 is difficult and has more cases in the new campaign: only the rate over all terrains changes
     rng = np.random.default_rng(2)
 
     def draw_campaign(easy: int, hard: int) -> Sample:
@@ -91,14 +91,14 @@ def test_different_mix_of_terrains_is_not_a_change() -> None:
     p_values = [difference_p_value(draw_campaign(40, 160), draw_campaign(160, 40)) for _ in range(300)]
     # standard deviation of a rate of 5 % in 300 comparisons: 1.26 %
     assert np.mean(np.array(p_values) < 0.05) <= 0.05 + 3 * 0.0126
-    pooled = [
+    pooled_p_values = [
         difference_p_value(
             _make_single_terrain_sample(draw_campaign(40, 160).values),
             _make_single_terrain_sample(draw_campaign(160, 40).values),
         )
         for _ in range(20)
     ]
-    assert max(pooled) < 0.05
+    assert max(pooled_p_values) < 0.05
 
 
 @pytest.mark.parametrize("is_rate", [True, False])
@@ -106,11 +106,11 @@ def test_correlated_cases_are_compared_by_terrain(is_rate: bool) -> None:
     # each campaign has new terrains with correlated cases: treating them as independent would give many false alarms
     rng = np.random.default_rng(3)
 
-    def draw_campaign(first: int) -> Sample:
-        terrains = np.repeat(np.arange(first, first + 20), 10)
+    def draw_campaign(first_terrain: int) -> Sample:
+        terrains = np.repeat(np.arange(first_terrain, first_terrain + 20), 10)
         if is_rate:
-            return _make_sample(rng.random(200) < rng.beta(0.5, 0.5, 20)[terrains - first], terrains)
-        return _make_sample(rng.normal(rng.normal(0.0, 3.0, 20)[terrains - first]), terrains)
+            return _make_sample(rng.random(200) < rng.beta(0.5, 0.5, 20)[terrains - first_terrain], terrains)
+        return _make_sample(rng.normal(rng.normal(0.0, 3.0, 20)[terrains - first_terrain]), terrains)
 
     campaign_pairs = [(draw_campaign(0), draw_campaign(100)) for _ in range(300)]
     assert np.mean([difference_p_value(*pair) < 0.05 for pair in campaign_pairs]) <= 0.05 + 3 * 0.0126
@@ -118,8 +118,9 @@ def test_correlated_cases_are_compared_by_terrain(is_rate: bool) -> None:
     assert (
         np.mean(
             [
-                difference_p_value(_make_single_terrain_sample(a.values), _make_single_terrain_sample(b.values)) < 0.05
-                for a, b in campaign_pairs[:40]
+                difference_p_value(_make_single_terrain_sample(new.values), _make_single_terrain_sample(old.values))
+                < 0.05
+                for new, old in campaign_pairs[:40]
             ]
         )
         > 0.2
@@ -134,7 +135,7 @@ def test_too_few_values_give_nan() -> None:
 
 
 def test_holm_correction_agrees_with_the_closed_form() -> None:
-    # Holm 1979: 0.01 * 3, max(0.02 * 2, 0.03), 0.5
+    # Holm 1979, smallest of m = 3 p-values first: 0.01 * 3, max(0.02 * 2, 0.03), 0.5 * 1
     assert correct_holm([0.02, math.nan, 0.5, 0.01])[::2] == pytest.approx([0.04, 0.5])
     assert correct_holm([0.02, math.nan, 0.5, 0.01])[3] == pytest.approx(0.03)
     assert correct_holm([]) == []

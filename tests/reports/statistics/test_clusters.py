@@ -19,12 +19,15 @@ CASES_PER_TERRAIN = 8
 def _draw_cases(
     rng: np.random.Generator, rate: float, correlation: float, terrains: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw beta-binomial cases: success rates of terrains follow a beta distribution with the given correlation."""
+    """Draw beta-binomial cases; return successes and terrain numbers.
+
+    The correlation r of a beta distribution with parameters a and b is 1 / (a + b + 1), so a + b = (1 - r) / r.
+    """
     if correlation == 1.0:
         rates = (rng.random(terrains) < rate).astype(float)
     else:
-        weight = (1 - correlation) / correlation
-        rates = rng.beta(rate * weight, (1 - rate) * weight, terrains)
+        parameter_sum = (1 - correlation) / correlation
+        rates = rng.beta(rate * parameter_sum, (1 - rate) * parameter_sum, terrains)
     terrain = np.repeat(np.arange(terrains), CASES_PER_TERRAIN)
     return rng.random(terrain.size) < rates[terrain], terrain
 
@@ -47,7 +50,10 @@ def test_bounds_for_clustered_cases_cover_the_true_rate(rate: float, terrains: i
 def test_bounds_cover_the_rate_if_bad_terrains_have_fewer_answers(
     terrains: int, cases_per_terrain: int, answer_rate: float, bad_fraction: float, rates: tuple[float, float]
 ) -> None:
-    """A bound that counts only terrains would miss the true rate in up to 99 % of these campaigns."""
+    """A bound that counts only terrains would miss the true rate in up to 99 % of these campaigns.
+
+    `rates`: success rates of bad and good terrains; `answer_rate`: rate of answers on bad terrains.
+    """
     rng = np.random.default_rng(15)
     weights = np.array([bad_fraction * answer_rate, 1.0 - bad_fraction])
     rate, n_missed = float(weights @ np.array(rates) / weights.sum()), np.zeros(2)
@@ -58,6 +64,7 @@ def test_bounds_cover_the_rate_if_bad_terrains_have_fewer_answers(
         success = rng.random(terrain.size) < np.where(is_bad, *rates)[terrain]
         evidence = clustered_evidence(success, terrain, 0.9)
         n_missed += evidence.lower > rate, evidence.upper < rate
+    # 400 campaigns: standard deviation of the coverage 1.5 %
     assert (n_missed / 400 <= 0.1 + 2 * 0.015).all()
 
 
@@ -98,16 +105,16 @@ def test_design_effect_of_independent_cases_is_about_one() -> None:
 
 def test_design_effect_of_identical_cases_is_the_cluster_size() -> None:
     rng = np.random.default_rng(14)
-    succeeds = rng.random(200) < 0.7
-    evidence = clustered_evidence(np.repeat(succeeds, 5), np.repeat(np.arange(200), 5), 0.9)
+    success_of_terrain = rng.random(200) < 0.7
+    evidence = clustered_evidence(np.repeat(success_of_terrain, 5), np.repeat(np.arange(200), 5), 0.9)
     # 5 identical cases per terrain, times m / (m - 1) for m = 200 terrains
     assert evidence.design_effect == pytest.approx(5 * 200 / 199)
     assert evidence.effective_n <= 200
-    assert evidence.lower < succeeds.mean() < evidence.upper
+    assert evidence.lower < success_of_terrain.mean() < evidence.upper
 
 
 def test_effective_sample_size_never_exceeds_the_cases() -> None:
-    # each terrain has 1 failure in 10 cases: less variance than independent cases
+    # each terrain has 1 failure in 10 cases: the rates of terrains vary less than for independent cases
     success = np.tile(np.arange(10) > 0, 100)
     evidence = clustered_evidence(success, np.repeat(np.arange(100), 10), 0.9)
     assert evidence.effective_n == 1000.0
@@ -115,7 +122,7 @@ def test_effective_sample_size_never_exceeds_the_cases() -> None:
     assert evidence.upper == proportion_upper(900, 1000, 0.9)
 
 
-def test_terrains_are_numbered_without_gaps() -> None:
+def test_terrains_are_numbered_consecutively() -> None:
     for terrain in ([7, 3, 7, 5], [-2, 10**15, -2], [4]):
         terrain_ids = np.array(terrain, dtype=np.int64)
         np.testing.assert_array_equal(number_terrains(terrain_ids), np.unique(terrain_ids, return_inverse=True)[1])

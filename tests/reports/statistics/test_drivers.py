@@ -1,4 +1,4 @@
-"""Tests of `estimate_driver`, the effect of a condition on errors: rank correlation, explained variance, intervals."""
+"""Tests of `estimate_driver` (effect of a condition on errors): rank correlation, explained variance, intervals."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from scipy import stats
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
 
 
-def _find_driver(x: np.ndarray, y: np.ndarray, groups: np.ndarray | None = None) -> Driver:
-    result = estimate_driver(x, y, groups, 0.9)
+def _estimate_driver(condition: np.ndarray, errors: np.ndarray, groups: np.ndarray | None = None) -> Driver:
+    result = estimate_driver(condition, errors, groups, 0.9)
     assert result is not None
     return result
 
 
 def test_linear_driver_has_the_expected_rank_correlation() -> None:
     rng = np.random.default_rng(1)
-    x, noise = rng.normal(size=(2, 4000))
-    result = _find_driver(x, x + noise)
-    assert result.correlation == pytest.approx(stats.spearmanr(x, x + noise).statistic)
+    condition, noise = rng.normal(size=(2, 4000))
+    result = _estimate_driver(condition, condition + noise)
+    assert result.correlation == pytest.approx(stats.spearmanr(condition, condition + noise).statistic)
     # Spearman's coefficient of a normal pair with Pearson's 1 / sqrt(2): 6 / pi asin(0.7071 / 2) = 0.690
     assert result.lower < 0.690 < result.upper
     # explained variance of the ranks: square of the coefficient
@@ -29,8 +29,8 @@ def test_linear_driver_has_the_expected_rank_correlation() -> None:
 
 def test_quadratic_driver_explains_variance_without_correlation() -> None:
     rng = np.random.default_rng(2)
-    x = rng.uniform(-1.0, 1.0, 2000)
-    result = _find_driver(x, x**2 + rng.normal(0.0, 0.05, 2000))
+    condition = rng.uniform(-1.0, 1.0, 2000)
+    result = _estimate_driver(condition, condition**2 + rng.normal(0.0, 0.05, 2000))
     assert abs(result.correlation) < 0.06
     assert result.share_lower > 0.8
 
@@ -39,7 +39,7 @@ def test_quadratic_driver_explains_variance_without_correlation() -> None:
 def test_intervals_of_an_unrelated_condition_contain_zero(n: int) -> None:
     # 200 samples: standard deviation of the coverage 2.1 % at 90 %, 1.5 % at 95 %
     rng = np.random.default_rng(3)
-    results = [_find_driver(rng.normal(size=n), rng.exponential(size=n)) for _ in range(200)]
+    results = [_estimate_driver(rng.normal(size=n), rng.exponential(size=n)) for _ in range(200)]
     assert np.mean([result.lower <= 0.0 <= result.upper for result in results]) >= 0.9 - 3 * 0.021
     assert np.mean([result.p_value < 0.1 for result in results]) <= 0.1 + 3 * 0.021
     # one-sided lower bound: above zero in at most 5 % of samples
@@ -56,15 +56,15 @@ def test_interval_for_a_condition_of_the_terrain_counts_terrains() -> None:
         slope, terrain_error = rng.normal(size=(2, 40))
         errors = terrain_error[groups] + rng.normal(size=800)
         for use_groups in n_missed:
-            result = _find_driver(slope[groups], errors, groups if use_groups else None)
+            result = _estimate_driver(slope[groups], errors, groups if use_groups else None)
             n_missed[use_groups] += not result.lower <= 0.0 <= result.upper
     assert n_missed[True] / 100 <= 0.1 + 3 * 0.03
     assert n_missed[False] / 100 > 0.5
 
 
 def test_binary_condition_has_a_significant_effect() -> None:
-    x = np.repeat([0.0, 1.0], [90, 10])
-    result = _find_driver(x, np.where(x == 1.0, 5.0, 1.0) + np.linspace(0.0, 0.5, 100))
+    condition = np.repeat([0.0, 1.0], [90, 10])
+    result = _estimate_driver(condition, np.where(condition == 1.0, 5.0, 1.0) + np.linspace(0.0, 0.5, 100))
     assert result.share > 0.2
     assert result.p_value < 1e-4
 

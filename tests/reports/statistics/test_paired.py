@@ -1,4 +1,4 @@
-"""Tests of paired comparisons of algorithms: closed forms, and error rates on shared terrains."""
+"""Tests of paired comparisons of algorithms: closed forms, and false alarm rates on shared terrains."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import pytest
 
 from marsyard.reports.statistics.changes import compare_errors, compare_successes
 
+#: Terrain numbers of 200 cases: 8 cases on each of 25 terrains.
 TERRAINS = np.repeat(np.arange(25), 8)
 
 
 def test_mcnemar_p_value_agrees_with_the_binomial_test() -> None:
     first_succeeds = np.array([True] * 9 + [False] * 1 + [True] * 5)
     second_succeeds = np.array([False] * 9 + [True] * 1 + [True] * 5)
-    only_first, only_second, p = compare_successes(first_succeeds, second_succeeds)
+    only_first, only_second, p_value = compare_successes(first_succeeds, second_succeeds)
     assert (only_first, only_second) == (9, 1)
-    assert p == pytest.approx(2 * (1 + 10) / 2**10)  # two-sided binomial test, n = 10
+    assert p_value == pytest.approx(2 * (1 + 10) / 2**10)  # two-sided binomial test, n = 10
     assert compare_successes(first_succeeds, first_succeeds)[2] == 1.0
 
 
-def test_false_alarm_rate_of_equal_algorithms_is_nominal_on_shared_terrains() -> None:
-    # the better algorithm depends on the terrain; 150 repetitions: standard deviation of a rate of 5 % is 1.8 %
+def test_equal_algorithms_on_shared_terrains_have_the_nominal_false_alarm_rate() -> None:
+    # Which algorithm is better depends on the terrain. 150 repetitions: standard deviation of a rate of 5 % is 1.8 %.
     rng = np.random.default_rng(1)
     success_alarms, error_alarms, independent_alarms = 0, 0, 0
     for _ in range(150):
@@ -45,7 +46,7 @@ def test_paired_mean_interval_covers_the_mean_on_shared_terrains() -> None:
 
 def test_no_pairs_give_nan() -> None:
     assert all(math.isnan(value) for value in compare_errors(np.zeros(0), None, 0.9))
-    mean, lower, upper, p = compare_errors(np.zeros(1), None, 0.9)
-    assert (mean, p) == (0.0, 1.0)
+    mean, lower, upper, p_value = compare_errors(np.zeros(1), None, 0.9)
+    assert (mean, p_value) == (0.0, 1.0)
     assert math.isnan(lower)
     assert math.isnan(upper)

@@ -13,7 +13,8 @@ from marsyard.reports.statistics.samples import ErrorEllipse, circular_error, er
 
 def _draw_errors(rng: np.random.Generator, n: int) -> np.ndarray:
     """Draw normal errors with standard deviations 3 and 1 about (2, -1), rotated by 30 degrees."""
-    rotation = np.array([[math.cos(0.5236), -math.sin(0.5236)], [math.sin(0.5236), math.cos(0.5236)]])
+    angle = 0.5236  # 30 degrees in radians
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     return np.asarray(np.array([2.0, -1.0]) + (rng.normal(size=(n, 2)) * [3.0, 1.0]) @ rotation.T)
 
 
@@ -27,7 +28,7 @@ def test_error_ellipse_of_normal_errors_has_the_true_axes() -> None:
     assert ellipse.inside == pytest.approx(0.95, abs=0.004)
 
 
-def test_error_ellipse_of_ten_errors_covers_the_next_error() -> None:
+def test_error_ellipse_of_ten_errors_contains_the_next_error_with_95_percent() -> None:
     # 4000 trials: standard deviation of the fraction 0.34 %
     rng = np.random.default_rng(2)
     n_inside = 0
@@ -42,7 +43,7 @@ def test_error_ellipse_of_ten_errors_covers_the_next_error() -> None:
     assert n_inside / 4000 == pytest.approx(0.95, abs=3 * 0.0034)
 
 
-def test_too_few_points_have_no_ellipse() -> None:
+def test_too_few_or_equal_points_have_no_ellipse() -> None:
     assert error_ellipse(np.ones((4, 2)), 0.95) is None
     assert error_ellipse(np.ones((50, 2)), 0.95) is None
     line = error_ellipse(np.column_stack([np.arange(50.0), np.zeros(50)]), 0.95)

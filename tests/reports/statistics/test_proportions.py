@@ -27,10 +27,11 @@ SAMPLE_SIZES = {
     (0.95, 0.95): (59, 93, 124, 153),
 }
 CONFIDENCES = st.sampled_from([0.5, 0.8, 0.9, 0.95, 0.99])
+#: Pairs (successes, cases).
 COUNTS = st.integers(0, 400).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
 
-def test_two_sided_interval_of_7_in_50_has_the_known_bounds() -> None:
+def test_two_sided_interval_of_7_of_50_has_the_tabulated_bounds() -> None:
     lower, upper = proportion_interval(7, 50, 0.95)
     assert (round(lower, 4), round(upper, 4)) == (0.0582, 0.2674)
 
@@ -58,8 +59,8 @@ def test_lower_bound_solves_its_equation(counts: tuple[int, int], confidence: fl
 @given(COUNTS, CONFIDENCES)
 def test_upper_bound_mirrors_the_lower_bound(counts: tuple[int, int], confidence: float) -> None:
     successes, n = counts
-    mirrored = 1.0 - proportion_lower(n - successes, n, confidence)
-    assert proportion_upper(successes, n, confidence) == pytest.approx(mirrored, abs=1e-12)
+    mirrored_bound = 1.0 - proportion_lower(n - successes, n, confidence)
+    assert proportion_upper(successes, n, confidence) == pytest.approx(mirrored_bound, abs=1e-12)
 
 
 @given(COUNTS, CONFIDENCES)
@@ -88,12 +89,12 @@ def test_invalid_confidence_is_rejected(confidence: float) -> None:
 
 @pytest.mark.parametrize("true_rate", [0.5, 0.9, 0.99])
 def test_exact_coverage_is_not_below_nominal(true_rate: float) -> None:
-    # exact coverage: sum over all outcomes of 60 cases
+    # exact coverage: sum of the probabilities of all success counts of 60 cases
     n, confidence = 60, 0.9
-    outcomes = np.arange(n + 1)
-    weights = stats.binom.pmf(outcomes, n, true_rate)
-    lower = np.array([proportion_lower(int(k), n, confidence) for k in outcomes])
-    upper = np.array([proportion_upper(int(k), n, confidence) for k in outcomes])
+    success_counts = np.arange(n + 1)
+    weights = stats.binom.pmf(success_counts, n, true_rate)
+    lower = np.array([proportion_lower(int(successes), n, confidence) for successes in success_counts])
+    upper = np.array([proportion_upper(int(successes), n, confidence) for successes in success_counts])
     assert weights[lower <= true_rate].sum() >= confidence - 1e-12
     assert weights[upper >= true_rate].sum() >= confidence - 1e-12
 

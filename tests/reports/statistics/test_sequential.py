@@ -23,7 +23,7 @@ from marsyard.reports.statistics.proportions import (
 )
 
 
-def test_planned_looks_are_at_halved_numbers_of_cases() -> None:
+def test_planned_looks_halve_the_number_of_cases() -> None:
     assert [look.cases for look in planned_looks(1000)] == [31, 62, 125, 250, 500, 1000]
     assert [look.cases for look in planned_looks(64)] == [16, 32, 64]
     assert [look.cases for look in planned_looks(20)] == [20]
@@ -37,7 +37,7 @@ def test_looks_spend_the_full_risk(cases: int) -> None:
     assert looks[-1].cases == cases
 
 
-def test_spent_fraction_is_that_of_the_last_look_reached() -> None:
+def test_spent_fraction_is_that_of_the_last_look() -> None:
     looks = planned_looks(64)
     assert [spent_fraction(looks, cases) for cases in (1, 16, 17, 64, 900)] == [0.25, 0.25, 0.25, 0.5, 0.5]
     assert confidence_at(0.9, 0.25) == pytest.approx(0.975)
@@ -50,41 +50,44 @@ def test_campaign_without_cases_is_rejected() -> None:
 
 @pytest.mark.parametrize("required_rate", [0.9, 0.99])
 def test_probability_of_false_verdicts_is_below_the_risk(required_rate: float) -> None:
-    # exact probability that any evaluation of up to 512 cases gives a verdict; the true rate is the required rate
+    # Exact probability that any look at up to 512 cases gives a verdict. The true rate is the required rate.
+    # p_undecided: probability of each number of failures without a verdict at earlier looks.
     looks, risk = planned_looks(512), 0.1
     for wrong_verdict in ("PASS", "FAIL"):
-        undecided, p_decided, previous_cases = np.ones(1), 0.0, 0
+        p_undecided, p_verdict, previous_cases = np.ones(1), 0.0, 0
         for look in looks:
-            added = look.cases - previous_cases
+            new_cases = look.cases - previous_cases
             previous_cases = look.cases
-            failures = np.arange(added + 1)
-            undecided = np.convolve(undecided, stats.binom.pmf(failures, added, 1.0 - required_rate))
+            failure_counts = np.arange(new_cases + 1)
+            p_undecided = np.convolve(p_undecided, stats.binom.pmf(failure_counts, new_cases, 1.0 - required_rate))
             confidence = confidence_at(1.0 - risk, look.risk_fraction)
-            for k in range(undecided.size):
-                successes = look.cases - k
-                passed = proportion_lower(successes, look.cases, confidence) >= required_rate
-                failed = proportion_upper(successes, look.cases, confidence) < required_rate
-                if passed or failed:
-                    p_decided += undecided[k] if (passed if wrong_verdict == "PASS" else failed) else 0.0
-                    undecided[k] = 0.0
-        assert 0.0 < p_decided <= risk
+            for failures in range(p_undecided.size):
+                successes = look.cases - failures
+                is_pass = proportion_lower(successes, look.cases, confidence) >= required_rate
+                is_fail = proportion_upper(successes, look.cases, confidence) < required_rate
+                if is_pass or is_fail:
+                    p_verdict += p_undecided[failures] if (is_pass if wrong_verdict == "PASS" else is_fail) else 0.0
+                    p_undecided[failures] = 0.0
+        assert 0.0 < p_verdict <= risk
 
 
 def test_repeated_looks_at_full_risk_pass_too_often() -> None:
-    # with the full risk at every evaluation, false verdicts are too frequent
+    # If each look uses the full risk of 10 %, more than 15 % of the campaigns pass at the limit of the requirement.
     rng = np.random.default_rng(4)
     looks = planned_looks(1000)
     n_passed = 0
     for _ in range(400):
-        failed = np.cumsum(rng.random(1000) < 0.1)
-        n_passed += any(proportion_lower(n - int(failed[n - 1]), n, 0.9) >= 0.9 for n in (look.cases for look in looks))
+        failure_counts = np.cumsum(rng.random(1000) < 0.1)
+        n_passed += any(
+            proportion_lower(n - int(failure_counts[n - 1]), n, 0.9) >= 0.9 for n in (look.cases for look in looks)
+        )
     assert n_passed / 400 > 0.15
 
 
 def _append_advised_cases(
     rng: np.random.Generator, first_cases: int, max_cases: int, pass_look: LaterLook, fail_look: LaterLook
 ) -> set[str]:
-    """Return the verdicts of a campaign with true and required rate 0.99 that appends the advised numbers of cases."""
+    """Return the verdicts of a campaign that appends the advised number of cases; true and required rate are 0.99."""
     cases, failures, verdicts = first_cases, int(rng.binomial(first_cases, 0.01)), set()
     pass_risk = fail_risk = 0.1
     while True:
@@ -94,9 +97,9 @@ def _append_advised_cases(
             return verdicts | {"PASS"}
         if cases >= max_cases:
             return verdicts
-        needed = min(max_cases, pass_look.cases_needed(cases, failures))
-        failures += int(rng.binomial(needed - cases, 0.01))
-        cases = needed
+        cases_needed = min(max_cases, pass_look.cases_needed(cases, failures))
+        failures += int(rng.binomial(cases_needed - cases, 0.01))
+        cases = cases_needed
         pass_risk, fail_risk = pass_look.risk_of_bound(cases), fail_look.risk_of_bound(cases)
 
 
@@ -105,41 +108,41 @@ def test_appending_advised_cases_keeps_the_confidence(first_cases: int) -> None:
     """Campaigns have at most 5000 cases. With uncorrected bounds at each evaluation, 38.6 % of them would pass."""
     rng = np.random.default_rng(21)
     pass_look, fail_look = LaterLook(0.01, 0.1, first_cases), LaterLook(0.99, 0.1, first_cases)
-    # cached methods keep the simulation fast
+    # cache the methods for a fast simulation; `LaterLook` is frozen
     for later_look in (pass_look, fail_look):
         object.__setattr__(later_look, "risk_of_bound", cache(later_look.risk_of_bound))
         object.__setattr__(later_look, "cases_needed", cache(later_look.cases_needed))
     verdicts = [_append_advised_cases(rng, first_cases, 5000, pass_look, fail_look) for _ in range(1500)]
     # standard deviation of a fraction of 10 % of 1500: 0.8 %
     for verdict in ("PASS", "FAIL"):
-        assert np.mean([verdict in reached for reached in verdicts]) <= 0.1 + 2 * 0.008
+        assert np.mean([verdict in campaign_verdicts for campaign_verdicts in verdicts]) <= 0.1 + 2 * 0.008
 
 
 @pytest.mark.parametrize("first_cases", [1, 24, 230, 388])
 @pytest.mark.parametrize(("rate", "confidence"), [(0.01, 0.9), (0.1, 0.95), (0.95, 0.9)])
 def test_frequent_looks_keep_the_risk(first_cases: int, rate: float, confidence: float) -> None:
-    """The exact probability of a verdict is at most the risk if the campaign is evaluated after every 10 cases."""
+    """The exact probability of a verdict is at most the risk if the campaign is evaluated after each 10 cases."""
     risk, look = 1.0 - confidence, LaterLook(rate, 1.0 - confidence, first_cases)
     counts = np.arange(first_cases + 1)
-    undecided = stats.binom.pmf(counts, first_cases, rate)
-    undecided[stats.binom.cdf(counts, first_cases, rate) <= risk] = 0.0
-    p_decided = 1.0 - undecided.sum()
+    p_undecided = stats.binom.pmf(counts, first_cases, rate)
+    p_undecided[stats.binom.cdf(counts, first_cases, rate) <= risk] = 0.0
+    p_verdict = 1.0 - p_undecided.sum()
     for cases in range(first_cases + 1, first_cases + 1501):
-        undecided = np.convolve(undecided, [1.0 - rate, rate])
+        p_undecided = np.convolve(p_undecided, [1.0 - rate, rate])
         if cases % 10 == 0:
             is_decided = stats.binom.cdf(np.arange(cases + 1), cases, rate) <= look.risk_of_bound(cases)
-            p_decided += undecided[is_decided].sum()
-            undecided[is_decided] = 0.0
-    assert p_decided <= risk
+            p_verdict += p_undecided[is_decided].sum()
+            p_undecided[is_decided] = 0.0
+    assert p_verdict <= risk
 
 
 @given(st.integers(0, 400), st.integers(0, 5), st.sampled_from([0.5, 0.9, 0.99]))
 def test_advised_number_of_cases_is_the_minimum(first_cases: int, failures: int, required_rate: float) -> None:
     look = LaterLook(1.0 - required_rate, 0.1, first_cases)
-    needed = look.cases_needed(max(first_cases, failures), failures)
+    cases_needed = look.cases_needed(max(first_cases, failures), failures)
 
     def passes(cases: int) -> bool:
         return proportion_lower(cases - failures, cases, 1.0 - look.risk_of_bound(cases)) >= required_rate
 
-    assert passes(needed)
-    assert needed == max(first_cases, failures) or not passes(needed - 1)
+    assert passes(cases_needed)
+    assert cases_needed == max(first_cases, failures) or not passes(cases_needed - 1)

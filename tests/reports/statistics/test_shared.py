@@ -1,4 +1,4 @@
-"""Tests of statistics for samples in which several values share a terrain: simulated coverage, and closed forms."""
+"""Tests of statistics of samples with several values per terrain: simulated coverage, and closed forms."""
 
 from __future__ import annotations
 
@@ -18,41 +18,44 @@ from marsyard.reports.statistics.samples import (
 
 
 def _draw_values(rng: np.random.Generator, terrains: int, correlation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Draw standard normal values, 1 to 14 per terrain, with this correlation between the values of a terrain."""
+    """Draw standard normal values, 1 to 14 per terrain, with a correlation between the values of a terrain.
+
+    Return the values and their terrain numbers (`groups`).
+    """
     groups = np.repeat(np.arange(terrains), rng.integers(1, 15, terrains))
-    terrain_part, case_part = rng.normal(size=terrains)[groups], rng.normal(size=groups.size)
-    return math.sqrt(correlation) * terrain_part + math.sqrt(1.0 - correlation) * case_part, groups
+    terrain_effect, case_effect = rng.normal(size=terrains)[groups], rng.normal(size=groups.size)
+    return math.sqrt(correlation) * terrain_effect + math.sqrt(1.0 - correlation) * case_effect, groups
 
 
 @pytest.mark.parametrize(("terrains", "correlation"), [(12, 0.3), (60, 0.9)])
 def test_intervals_of_mean_and_standard_deviation_have_nominal_coverage(terrains: int, correlation: float) -> None:
     # 200 samples at 95 %: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(1)
-    n_mean_covered, n_sd_covered, n_independent_covered = 0, 0, 0
+    n_mean_covering, n_sd_covering, n_independent_covering = 0, 0, 0
     for _ in range(200):
         values, groups = _draw_values(rng, terrains, correlation)
         lower, upper = mean_interval(values, 0.95, groups)
-        n_mean_covered += lower <= 0.0 <= upper
+        n_mean_covering += lower <= 0.0 <= upper
         lower, upper = standard_deviation_interval(values, 0.95, groups)
-        n_sd_covered += lower <= 1.0 <= upper
+        n_sd_covering += lower <= 1.0 <= upper
         lower, upper = stats.t.interval(0.95, values.size - 1, values.mean(), stats.sem(values))
-        n_independent_covered += lower <= 0.0 <= upper
-    assert min(n_mean_covered, n_sd_covered) / 200 >= 0.95 - 3 * 0.015
-    assert n_independent_covered / 200 < 0.85
+        n_independent_covering += lower <= 0.0 <= upper
+    assert min(n_mean_covering, n_sd_covering) / 200 >= 0.95 - 3 * 0.015
+    assert n_independent_covering / 200 < 0.85
 
 
 @pytest.mark.parametrize(("terrains", "correlation"), [(20, 0.3), (60, 0.3), (60, 0.9)])
 def test_quantile_bounds_have_nominal_coverage(terrains: int, correlation: float) -> None:
     # 400 samples at 90 %: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(2)
-    truth = stats.norm.ppf(0.9)
+    true_quantile = stats.norm.ppf(0.9)
     bounds = []
     for _ in range(400):
         values, groups = _draw_values(rng, terrains, correlation)
         bounds.append(quantile_bounds(values, 0.9, 0.9, groups))
     lower, upper = np.array(bounds).T
-    assert np.mean(lower <= truth) >= 0.9 - 3 * 0.015
-    assert np.mean(upper >= truth) >= 0.9 - 3 * 0.015
+    assert np.mean(lower <= true_quantile) >= 0.9 - 3 * 0.015
+    assert np.mean(upper >= true_quantile) >= 0.9 - 3 * 0.015
 
 
 def test_quantile_bound_needs_59_terrains() -> None:
@@ -65,13 +68,16 @@ def test_quantile_bound_needs_59_terrains() -> None:
 def test_identical_values_of_a_terrain_count_once() -> None:
     values = np.random.default_rng(3).normal(size=100)
     groups = np.repeat(np.arange(100), 10)
-    single, repeated = mean_interval(values, 0.95), mean_interval(np.repeat(values, 10), 0.95, groups)
-    assert repeated == pytest.approx(single, abs=0.02)
-    single, repeated = (
+    interval_of_single_values, interval_of_repeated_values = (
+        mean_interval(values, 0.95),
+        mean_interval(np.repeat(values, 10), 0.95, groups),
+    )
+    assert interval_of_repeated_values == pytest.approx(interval_of_single_values, abs=0.02)
+    interval_of_single_values, interval_of_repeated_values = (
         standard_deviation_interval(values, 0.95),
         standard_deviation_interval(np.repeat(values, 10), 0.95, groups),
     )
-    assert repeated == pytest.approx(single, rel=0.06)
+    assert interval_of_repeated_values == pytest.approx(interval_of_single_values, rel=0.06)
 
 
 def test_one_value_per_terrain_equals_independent_values() -> None:

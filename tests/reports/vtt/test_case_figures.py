@@ -32,15 +32,15 @@ def _find_squares(figure: Figure, colour: str) -> list[Rectangle]:
 
 def test_squares_mark_target_and_search_window() -> None:
     figure = draw_stops(make_products())
-    left, right = _find_squares(figure, TARGET)[:2]
+    left_square, right_square = _find_squares(figure, TARGET)[:2]
     # match at (480, 370), subframe origin at (400, 300), template of 21 pixels about the pixel centre
-    assert left.get_xy() == (80.0 - 10.5, 70.0 - 10.5)
-    assert (left.get_width(), left.get_height()) == (21.0, 21.0)
-    assert right.get_xy() == (70.0 - 10.5, 69.0 - 10.5)
+    assert left_square.get_xy() == (80.0 - 10.5, 70.0 - 10.5)
+    assert (left_square.get_width(), left_square.get_height()) == (21.0, 21.0)
+    assert right_square.get_xy() == (70.0 - 10.5, 69.0 - 10.5)
     assert len(_find_squares(figure, TARGET)) == 4  # no square at the stop that lost the target
     window = _find_squares(figure, WINDOW)[0]
     assert (window.get_xy(), window.get_width()) == ((9.5, 9.5), 141.0)
-    assert window.get_linestyle() != left.get_linestyle()  # distinct without colour
+    assert window.get_linestyle() != left_square.get_linestyle()  # distinct without colour
 
 
 def test_template_around_the_match_is_enlarged() -> None:
@@ -48,8 +48,8 @@ def test_template_around_the_match_is_enlarged() -> None:
     counts = np.zeros((161, 161), dtype=np.uint16)
     counts[70, 80] = 4000
     figure = draw_stops(case_products | {"stop_1_left": counts})
-    enlarged = np.asarray(figure.axes[1].get_images()[0].get_array())[..., 0]
-    bright = np.argwhere(enlarged > 128)
+    enlarged_template = np.asarray(figure.axes[1].get_images()[0].get_array())[..., 0]
+    bright = np.argwhere(enlarged_template > 128)
     # 21 pixels are enlarged to 126: one bright pixel becomes 6 x 6 pixels
     assert bright.min(axis=0).tolist() == [60, 60]
     assert bright.max(axis=0).tolist() == [65, 65]

@@ -1,4 +1,4 @@
-"""Tests of the report sections on visual target tracking against rows with known statistics."""
+"""Tests of the report sections on visual target tracking with rows of known statistics."""
 
 from __future__ import annotations
 
@@ -63,8 +63,10 @@ def _make_two_tracker_rows(step_sizes: int = 5) -> pd.DataFrame:
     frames = []
     for algorithm in ("vtt", "pure_ncc"):
         for skip in range(step_sizes):
-            tracked = np.arange(10) < (10 if algorithm == "vtt" else 8 - skip)
-            frames.append(make_rows(10, algorithm=algorithm, skip=skip, step=1.0 - 0.95 ** (skip + 1), tracked=tracked))
+            is_tracked = np.arange(10) < (10 if algorithm == "vtt" else 8 - skip)
+            frames.append(
+                make_rows(10, algorithm=algorithm, skip=skip, step=1.0 - 0.95 ** (skip + 1), tracked=is_tracked)
+            )
     return pd.concat(frames, ignore_index=True)
 
 
@@ -88,7 +90,13 @@ def test_step_rates_are_compared_with_fig_8() -> None:
 
 
 def test_step_rates_of_circles_and_turns_are_per_degree() -> None:
-    frame = pd.concat([make_rows(11, skip=k, step=5.0 * (k + 1), search_px=px) for k in range(3) for px in (200, 600)])
+    frame = pd.concat(
+        [
+            make_rows(11, skip=skip, step=5.0 * (skip + 1), search_px=window_px)
+            for skip in range(3)
+            for window_px in (200, 600)
+        ]
+    )
     frame = frame.reset_index(drop=True)
     circle_rates = step_rates(make_subject(frame, legs=[{"motion": "circle"}]))
     assert [(rate["line"], rate["step"]) for rate in circle_rates[:3]] == [
@@ -171,8 +179,8 @@ def test_updates_and_minutes_are_listed_per_mode_of_table_4() -> None:
     legs_driven += [{"motion": "approach", "autonav": True}]
     frame = make_rows(2)
     legs = [-1, 0, *[1] * 7, *[2] * 9, 3, *[4] * 4, *[5] * 4]
-    for n, leg in enumerate(legs, start=1):
-        frame[f"update_{n}_leg"], frame[f"update_{n}_time_s"] = float(leg), 60.0 * n
+    for number, leg in enumerate(legs, start=1):
+        frame[f"update_{number}_leg"], frame[f"update_{number}_time_s"] = float(leg), 60.0 * number
     frame.loc[1, ["update_27_leg", "update_27_time_s"]] = np.nan  # the second run ended one step earlier
     table = read_table(SINGLE_RUNS(make_subject(frame, CHECKOUT_3, legs=legs_driven)), 1)
     assert [row["Updates, paper"] for row in table] == ["2", "7", "10", "4", "4"]
@@ -214,8 +222,8 @@ def test_regression_runs_are_listed_by_driving_mode() -> None:
     frame = frame.assign(map_by=["none", "none", "body", "mast"], rock_height_m=[0.09, 0.09, 0.5, 0.5])
     set_values(frame, 3, tracked=False, outcome="NO_PATH", losses="none")
     section = regression_section(make_subject(frame, REGRESSION))
-    listed = [(row["Driving"], row["Rock"], row["Tracked to the goal"]) for row in read_table(section)]
-    assert listed == [
+    mode_rows = [(row["Driving"], row["Rock"], row["Tracked to the goal"]) for row in read_table(section)]
+    assert mode_rows == [
         ("Autonav by body cameras", "large", "1 of 1: 100 %"),
         ("Autonav by mast cameras", "large", "0 of 1: 0 %"),
         ("blind", "small", "1 of 1: 100 %"),

@@ -59,12 +59,16 @@ def set_values(frame: pd.DataFrame, index: int, **values: Any) -> None:
 def read_table(section: Section | None, block: int = 0) -> list[dict[str, str]]:
     """Return the rows of a section's table number `block` as dictionaries from heading to cell."""
     assert section is not None
-    grids = [part.grid for part in section.blocks if isinstance(part, Block) and part.grid is not None]
+    blocks = [entry for entry in section.blocks if isinstance(entry, Block)]
+    grids = [entry.grid for entry in blocks if entry.grid is not None]
     return [dict(zip(grids[block].head, row, strict=True)) for row in grids[block].rows]
 
 
 def make_products(stops: int = 3) -> dict[str, Any]:
-    """Return a case with subframes of 161 px at (400, 300), the target at (80, 70) in them, lost at the last stop."""
+    """Return products of a case that loses the target at the last stop.
+
+    Left subframes of 161 px have their corner at pixel (400, 300); the target is at pixel (80, 70) of the subframe.
+    """
     rng = np.random.default_rng(3)
     case_products: dict[str, Any] = {"template_px": 21}
     for number in range(1, stops + 1):
@@ -79,8 +83,10 @@ def make_products(stops: int = 3) -> dict[str, Any]:
         case_products[f"stop_{number}_point"] = np.array([481.5, 369.0])
     east = np.linspace(0.0, 8.0, stops)
     rover = np.column_stack([east, np.zeros(stops), np.zeros(stops)])
-    estimated = np.full((stops, 3), np.nan)
-    estimated[:-1] = np.column_stack([10.0 + 0.03 * np.arange(stops - 1), np.zeros(stops - 1), np.zeros(stops - 1)])
+    target_estimates = np.full((stops, 3), np.nan)
+    target_estimates[:-1] = np.column_stack(
+        [10.0 + 0.03 * np.arange(stops - 1), np.zeros(stops - 1), np.zeros(stops - 1)]
+    )
     return case_products | {
         "figures": {
             "range_m": 10.0 - east,
@@ -92,7 +98,7 @@ def make_products(stops: int = 3) -> dict[str, Any]:
         "rover_believed_m": rover + 0.05,
         "heading_deg": np.full(stops, 90.0),
         "target_m": np.array([10.0, 0.0, 0.2]),
-        "target_believed_m": estimated,
+        "target_believed_m": target_estimates,
         "path_true_m": rover[:, :2],
         "rocks_m": np.array([[10.1, 0.0, 0.4]]),
     }

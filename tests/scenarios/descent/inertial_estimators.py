@@ -7,7 +7,7 @@ from marsyard.sim.measurements import DescentMeasurements
 
 
 class InertialEstimator:
-    """Return the inertial velocity over the second pair."""
+    """Estimator that returns the inertial velocity over the second pair of images."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """Return the horizontal velocity (m/s) with the outcome VALID."""
@@ -15,7 +15,7 @@ class InertialEstimator:
 
 
 class SlowInertialEstimator(InertialEstimator):
-    """Return the same velocity after 0.1 s; on the slower flight computer the answer comes after the firing."""
+    """Estimator with a run time of 0.1 s; on the slower flight computer the answer comes after the firing."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """Return the velocity after 0.1 s of processor time."""

@@ -12,7 +12,7 @@ from marsyard.sim.streams import Streams
 SMALL_WORLD: dict[str, Any] = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "location": {"bank": 1}}
 #: The same terrain without relief.
 FLAT_TERRAIN = {"samples": 1024, "spacing_m": 3.0, "rms_slope_deg": 0.0, "craters_per_km2": 0.0}
-#: A descent that drifts with the wind, swings and rotates.
+#: A descent with wind drift, swing and rotation.
 DESCENT = {
     "wind_east_m_s": 14.0,
     "wind_north_m_s": -9.0,

@@ -16,7 +16,7 @@ from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 from tests.scenarios.descent.settings import FLAT_TERRAIN, IDEAL_INSTRUMENTS, NOISELESS_DETECTOR, make_parameters
 
-#: Rough ground on a long wave ("swell") with 200 m between trough and crest.
+#: Rough ground on a long wave of the terrain ("swell") with 200 m between trough and crest.
 RELIEF = {"samples": 1024, "spacing_m": 4.0, "rms_slope_deg": 1.0, "swell": {"relief_m": 200.0}}
 N_CASES = 5
 
@@ -33,15 +33,15 @@ def _run_descent(case: int, **parts: Any) -> tuple[list[Track], list[State], Des
         "nod_phase_deg": rng.uniform(0.0, 360.0),
         "heading_deg": rng.uniform(0.0, 360.0),
     }
-    p = make_parameters(**IDEAL_INSTRUMENTS, descent=motion, detector=NOISELESS_DETECTOR, **parts)
-    world, streams = World.from_parameters(p), Streams(5, "accuracy", case)
-    flight = create_flight(p, world.surface, streams)
-    states = states_at_images(p, flight)
-    optics = camera_optics(p.camera)
-    detector = Detector.draw(optics.fall_off, p.detector, streams.generator("detector response"))
-    images = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
-    instruments = Instruments.draw(p, world, flight, streams)
-    measurements = measure(p, world, flight.motion, images, detector, instruments, streams)
+    parameters = make_parameters(**IDEAL_INSTRUMENTS, descent=motion, detector=NOISELESS_DETECTOR, **parts)
+    world, streams = World.from_parameters(parameters), Streams(5, "accuracy", case)
+    flight = create_flight(parameters, world.surface, streams)
+    states = states_at_images(parameters, flight)
+    optics = camera_optics(parameters.camera)
+    detector = Detector.draw(optics.fall_off, parameters.detector, streams.generator("detector response"))
+    images = [counts for counts, _ in take_exposures(parameters, world, states, optics, detector, streams)]
+    instruments = Instruments.draw(parameters, world, flight, streams)
+    measurements = measure(parameters, world, flight.motion, images, detector, instruments, streams)
     details = DimesEstimator().estimate(measurements).details
     assert isinstance(details, DimesDetails)
     return [track for track in details.tracks if track.valid], states, measurements, world.surface
@@ -54,7 +54,7 @@ def _compute_velocity_errors(tracks: list[Track], states: list[State]) -> np.nda
 
 
 def test_flat_ground_velocity_error_is_within_15_cm_s() -> None:
-    """Requirement: 0.15 m/s rms over all valid tracks, also of cases without a reported velocity."""
+    """Requirement: 0.15 m/s rms over all valid tracks, including tracks of cases without a reported velocity."""
     runs = [_run_descent(case, terrain=FLAT_TERRAIN) for case in range(N_CASES)]
     errors = np.concatenate([_compute_velocity_errors(tracks, states) for tracks, states, _, _ in runs])
     assert len(errors) >= 3 * N_CASES
@@ -86,7 +86,7 @@ def test_relief_errors_match_geometric_prediction() -> None:
 def _predict_error(
     track: Track, states: list[State], measurements: DescentMeasurements, surface: Surface
 ) -> np.ndarray:
-    """Return the predicted velocity error of a track, m/s."""
+    """Return the predicted velocity error of a track, m/s; the test of relief errors defines the formula."""
     first, second = states[track.pair], states[track.pair + 1]
     altitude_1, altitude_2 = altitudes_at_images(measurements)[track.pair : track.pair + 2]
     template_size_px = len(track.template)

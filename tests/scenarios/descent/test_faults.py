@@ -82,7 +82,7 @@ def test_multiple_faults_have_no_size() -> None:
 
 
 def test_haze_reduces_contrast_but_not_brightness() -> None:
-    """Haze of optical depth 1 multiplies the contrast at nadir by exp(-1); the mean brightness is of the same order."""
+    """Haze of optical depth 1 reduces the contrast at nadir to exp(-1); the mean changes by less than a factor of 2."""
     pattern = np.where(np.indices((256, 256)).sum(axis=0) % 2, 0.12, 0.10)
     frame = _render_level_ground(2000.0, pattern)
     clear_image, hazy_image = (add_haze(frame, Environment(), SUN, depth / 2000.0) for depth in (0.0, 1.0))
@@ -96,15 +96,15 @@ def test_haze_reduces_contrast_but_not_brightness() -> None:
 def test_heat_shield_has_the_specified_size(angle_deg: float) -> None:
     """A disc with angular diameter a, perpendicular to the line of sight, covers the solid angle pi / 4 a^2."""
     frame = _render_level_ground(2000.0, np.full((256, 256), 0.5))
-    first = _make_state(2000.0)
-    heat_shield = HeatShield.draw(first, np.radians(angle_deg), np.random.default_rng(3))
-    shield_direction = heat_shield.centre_m - first.position_m
+    first_state = _make_state(2000.0)
+    heat_shield = HeatShield.draw(first_state, np.radians(angle_deg), np.random.default_rng(3))
+    shield_direction = heat_shield.centre_m - first_state.position_m
     face_on = replace(heat_shield, normal=shield_direction / np.linalg.norm(shield_direction), spin_rad_s=np.zeros(3))
     first_radiance = face_on.paint_over(frame.radiance, frame, SUN, 0.0)
     solid_angles_sr = frame.rays.pixel_angles.astype(np.float64) ** 2
     covered_sr = solid_angles_sr[(first_radiance != frame.radiance).reshape(-1)].sum()
     assert covered_sr == pytest.approx(np.pi / 4.0 * np.radians(angle_deg) ** 2, rel=0.1)
-    # the shield moves away at 20 m/s: 75 m in 3.75 s
+    # The shield moves away at 20 m/s: 75 m in 3.75 s. Its solid angle decreases with the square of the distance.
     later_radiance = face_on.paint_over(frame.radiance, frame, SUN, 3.75)
     distance_m = SHIELD_DIAMETER_M / np.radians(angle_deg)
     area_ratio = solid_angles_sr[(later_radiance != frame.radiance).reshape(-1)].sum() / covered_sr
@@ -112,6 +112,7 @@ def test_heat_shield_has_the_specified_size(angle_deg: float) -> None:
 
 
 def test_images_can_be_repeated_or_black() -> None:
+    """`corrupt_images` repeats the image before image 3, or sets image 1 to 0; its inputs do not change."""
     images = [np.full((4, 4), value, dtype=np.uint16) for value in (1, 2, 3)]
     assert [int(entry[0, 0]) for entry in corrupt_images(images, 3, 0)] == [1, 2, 2]
     assert [int(entry[0, 0]) for entry in corrupt_images(images, 0, 1)] == [0, 2, 3]
@@ -120,12 +121,13 @@ def test_images_can_be_repeated_or_black() -> None:
 
 def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
     faults = Faults(altitude_error=0.1, altitude_error_once=0.2, attitude_error_deg=3.0, attitude_error_once_deg=5.0)
-    altitudes = add_altitude_faults(faults, [AltitudeMeasurement(100.0, t) for t in (0.0, 1.0, 2.0)])
+    altitudes = add_altitude_faults(faults, [AltitudeMeasurement(100.0, time_s) for time_s in (0.0, 1.0, 2.0)])
     assert [entry.altitude_m for entry in altitudes] == pytest.approx([110.0, 130.0, 110.0])
-    readings = [AltitudeMeasurement(2000.0, t) for t in (0.0, 1.0, 2.0)]
+    # the heat shield moves away at 20 m/s
+    readings = [AltitudeMeasurement(2000.0, time_s) for time_s in (0.0, 1.0, 2.0)]
     shield_ranges = add_altitude_faults(Faults(shield_range_m=60.0), readings)
     assert [entry.altitude_m for entry in shield_ranges] == [60.0, 80.0, 100.0]
-    attitudes = [AttitudeMeasurement(Rotation.identity(), t) for t in (0.0, 1.0, 2.0)]
+    attitudes = [AttitudeMeasurement(Rotation.identity(), time_s) for time_s in (0.0, 1.0, 2.0)]
     tilts = [entry.world_from_body for entry in add_attitude_faults(faults, attitudes, np.random.default_rng(0))]
     assert np.degrees([tilts[0].magnitude(), tilts[2].magnitude()]) == pytest.approx([3.0, 3.0])
     assert np.degrees((tilts[1] * tilts[0].inv()).magnitude()) == pytest.approx(5.0)
@@ -134,12 +136,14 @@ def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
 
 def _render_descent(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]:
     """Return the three images of a descent, in counts."""
-    p = make_parameters(faults=faults, detector=NOISELESS_DETECTOR, **parts)
-    world, streams = World.from_parameters(p), Streams(1, "faults", 0)
-    states = states_at_images(p, create_flight(p, world.surface, streams))
-    optics = camera_optics(p.camera)
-    detector = Detector.draw(optics.fall_off, add_detector_faults(p.faults, p.detector), streams.generator("detector"))
-    return [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
+    parameters = make_parameters(faults=faults, detector=NOISELESS_DETECTOR, **parts)
+    world, streams = World.from_parameters(parameters), Streams(1, "faults", 0)
+    states = states_at_images(parameters, create_flight(parameters, world.surface, streams))
+    optics = camera_optics(parameters.camera)
+    detector = Detector.draw(
+        optics.fall_off, add_detector_faults(parameters.faults, parameters.detector), streams.generator("detector")
+    )
+    return [counts for counts, _ in take_exposures(parameters, world, states, optics, detector, streams)]
 
 
 def test_image_faults_change_the_expected_pixels() -> None:
@@ -166,18 +170,18 @@ def test_image_faults_change_the_expected_pixels() -> None:
 
 def test_calibration_errors_have_the_specified_standard_deviation() -> None:
     """Compare standard deviations of image centre and corner position over 300 draws of the calibration."""
-    p = CameraParameters()
-    true_camera = camera_optics(p).camera
-    cameras = [calibrated_camera(p, np.random.default_rng(seed)) for seed in range(300)]
+    parameters = CameraParameters()
+    true_camera = camera_optics(parameters).camera
+    cameras = [calibrated_camera(parameters, np.random.default_rng(seed)) for seed in range(300)]
     nadir = np.array([[0.0, 0.0, -1.0]])
     centre_shifts = np.stack([camera.project(nadir)[0][0] for camera in cameras]) - true_camera.project(nadir)[0][0]
-    # 300 draws determine a standard deviation to 4 %.
-    assert centre_shifts.std(axis=0) == pytest.approx([p.centre_error_px] * 2, rel=0.15)
+    # Relative standard error of a standard deviation from 300 draws: 1 / sqrt(600) = 4 %.
+    assert centre_shifts.std(axis=0) == pytest.approx([parameters.centre_error_px] * 2, rel=0.15)
     _, corner = true_camera.rays(np.array([[0.0, 0.0]]))
     corners = np.stack([camera.project(corner)[0][0] for camera in cameras])
     corner_shifts = corners - centre_shifts - true_camera.project(corner)[0][0]
     radial_shifts = corner_shifts @ np.array([-1.0, -1.0]) / np.sqrt(2.0)
-    expected = np.hypot(p.distortion_error_px, p.focal_error * np.hypot(511.5, 511.5))
+    expected = np.hypot(parameters.distortion_error_px, parameters.focal_error * np.hypot(511.5, 511.5))
     assert radial_shifts.std() == pytest.approx(expected, rel=0.15)
     assert np.abs(corner_shifts @ np.array([1.0, -1.0])).max() < 0.02
 

@@ -1,4 +1,4 @@
-"""Tests of the horizontal touchdown velocity: the thrusters cancel the estimated velocity, within their limits."""
+"""Tests of the horizontal touchdown velocity: the thrusters reduce it by the estimated velocity, up to a limit."""
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ def test_correct_answer_cancels_the_velocity() -> None:
 def test_steering_is_limited_by_its_capability() -> None:
     fast_velocity = 2.0 * TRUE_VELOCITY
     result = compute_touchdown(IDEAL, fast_velocity, fast_velocity.copy(), 17.0, make_rng())
+    # the true speed is 30 m/s
     np.testing.assert_allclose(np.hypot(*result.with_answer), 30.0 - IDEAL.max_steering_m_s)
 
 
@@ -44,13 +45,14 @@ def test_late_or_missing_answer_disables_steering(estimate: np.ndarray | None, a
 
 
 def test_burn_and_steering_errors_have_the_specified_standard_deviation() -> None:
-    p = LandingParameters(steering_error=0.1, burn_error_m_s=1.0)
+    parameters = LandingParameters(steering_error=0.1, burn_error_m_s=1.0)
     touchdowns = [
-        compute_touchdown(p, TRUE_VELOCITY, TRUE_VELOCITY.copy(), 17.0, np.random.default_rng(seed))
+        compute_touchdown(parameters, TRUE_VELOCITY, TRUE_VELOCITY.copy(), 17.0, np.random.default_rng(seed))
         for seed in range(2000)
     ]
     without_answer = np.stack([touchdown.without_answer for touchdown in touchdowns]) - TRUE_VELOCITY
     steering = np.stack([touchdown.with_answer - touchdown.without_answer for touchdown in touchdowns]) + TRUE_VELOCITY
-    # 4000 draws determine a standard deviation to 1.1 %.
+    # Relative standard error of a standard deviation from 4000 values: 1 / sqrt(8000) = 1.1 %.
+    # The steering error is 10 % of 15 m/s.
     assert without_answer.std() == pytest.approx(1.0, rel=0.05)
     assert steering.std() == pytest.approx(1.5, rel=0.05)

@@ -19,7 +19,7 @@ NINE_IMAGES: dict[str, Any] = {"pictures": 9, "descent": DESCENT | {"interval_s"
 
 
 class InertialEstimator:
-    """Return the mean inertial velocity over the last interval after each image, and its last value at the end."""
+    """Estimator that returns the mean inertial velocity of the last interval, and at the end the last velocity."""
 
     def start(self) -> None:
         self.frames: list[DescentFrame] = []
@@ -42,7 +42,7 @@ class InertialEstimator:
 
 
 class LastThreeQuartersEstimator(InertialEstimator):
-    """Return a mean velocity with a span from a quarter of the descent to the last image."""
+    """Estimator whose answer has a span from a quarter of the descent to the last image."""
 
     def finish(self) -> VelocityEstimate:
         first, *_, last = (frame.image.time_s for frame in self.frames)
@@ -51,7 +51,7 @@ class LastThreeQuartersEstimator(InertialEstimator):
 
 @pytest.fixture(scope="module")
 def nine_images() -> CaseResult:
-    """Run a case with nine images and ideal instruments: the inertial velocity is exact."""
+    """Run a case with nine images and ideal instruments; the inertial velocity is exact."""
     return run_descent(algorithm=STREAM_ESTIMATOR, compared=["dimes"], **NINE_IMAGES, **IDEAL_INSTRUMENTS)
 
 
@@ -113,19 +113,19 @@ def test_span_between_images_is_interpolated() -> None:
 
 def test_many_image_case_is_deterministic() -> None:
     parts: dict[str, Any] = {"pictures": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
-    first, repeated = run_descent(**parts), run_descent(**parts)
-    assert differing_columns(dict(first.row), dict(repeated.row)) == ()
+    first_case, repeated_case = run_descent(**parts), run_descent(**parts)
+    assert differing_columns(dict(first_case.row), dict(repeated_case.row)) == ()
 
 
 def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
     run_descent(algorithm=f"export:{tmp_path}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
-    exported = read_case(tmp_path / "cases" / "000000")
-    assert isinstance(exported, DescentMeasurements)
-    assert len(exported.images) == len(exported.attitudes) == len(exported.altitudes) == 4
-    assert exported.interval_velocities_m_s.shape == (3, 3)
-    assert exported.inertial_velocities_m_s is not None
+    exported_case = read_case(tmp_path / "cases" / "000000")
+    assert isinstance(exported_case, DescentMeasurements)
+    assert len(exported_case.images) == len(exported_case.attitudes) == len(exported_case.altitudes) == 4
+    assert exported_case.interval_velocities_m_s.shape == (3, 3)
+    assert exported_case.inertial_velocities_m_s is not None
     # The answer is scored over its span.
-    start, end = exported.tags_s[0], exported.tags_s[2]
+    start, end = exported_case.tags_s[0], exported_case.tags_s[2]
     answer_table = tmp_path / "answers.csv"
     answer_table.write_text(f"case,velocity_east_m_s,velocity_north_m_s,start_s,end_s\n0,1,2,{start!r},{end!r}\n")
     scored_case = run_descent(algorithm=f"answers:{answer_table}", pictures=4, descent=DESCENT | {"interval_s": 1.0})

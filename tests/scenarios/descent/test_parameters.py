@@ -38,16 +38,16 @@ def test_invalid_parameters_are_reported(invalid: dict[str, Any], message: str) 
 
 def test_site_terrain_can_be_overridden() -> None:
     settings = {"site": "gusev", "terrain": {"samples": 512, "spacing_m": 8.0, "rocks": {"smallest_m": 2.0}}}
-    p = DescentScenarioParameters.model_validate(settings)
+    parameters = DescentScenarioParameters.model_validate(settings)
     site_terrain = site("gusev").terrain("descent")
     rocks = site_terrain.rocks
     assert rocks is not None
     site_changes = {"samples": 512, "spacing_m": 8.0, "rocks": rocks.model_copy(update={"smallest_m": 2.0})}
-    assert p.terrain == site_terrain.model_copy(update=site_changes)
+    assert parameters.terrain == site_terrain.model_copy(update=site_changes)
 
 
 def test_site_cannot_be_dispersed() -> None:
-    """The site's terrain is read once with the campaign: a dispersed site name would change only the illumination."""
+    """The terrain of the site is read with the campaign. A dispersed site name would change only the illumination."""
     complete = DescentScenarioParameters.model_validate({"site": "gusev"}).model_dump(mode="json", round_trip=True)
     with pytest.raises(ValidationError, match="terrain is of gusev"):
         DescentScenarioParameters.model_validate(complete | {"site": "kelso"})
@@ -56,15 +56,15 @@ def test_site_cannot_be_dispersed() -> None:
 @pytest.mark.parametrize("settings", [{}, {"site": "kelso"}, {"dimes": {"subpixel": False}, "faults": {"haze": 2.0}}])
 def test_complete_parameters_round_trip(settings: dict[str, Any]) -> None:
     """Workers of a campaign receive the parameters as JSON."""
-    p = DescentScenarioParameters.model_validate(settings)
-    assert DescentScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True)) == p
+    parameters = DescentScenarioParameters.model_validate(settings)
+    assert DescentScenarioParameters.model_validate(parameters.model_dump(mode="json", round_trip=True)) == parameters
 
 
 def test_illumination_follows_the_site() -> None:
     """The site defines sunlight and reflectance; the brightness depends on sunlight and atmosphere."""
     small_terrain = {"terrain": {"samples": 256, "spacing_m": 16.0}, "location": {"bank": 1}}
     parameters = [DescentScenarioParameters.model_validate({"site": name} | small_terrain) for name in SITES]
-    mars, earth = (World.from_parameters(p) for p in parameters)
+    mars, earth = (World.from_parameters(site_parameters) for site_parameters in parameters)
     assert mars.ground is not None
     assert mars.sun.angular_radius_rad == pytest.approx(0.00308, rel=0.01)
     # Earth receives 1 / 0.44 of the sunlight on Mars; dust in the atmosphere of Mars increases the ratio.
@@ -90,32 +90,41 @@ def test_custom_cameras_are_stored_in_the_campaign(tmp_path: Path) -> None:
         "[lens]\nf_number = 4\nband_nm = [450, 700]\n"
     )
     settings = {"camera": {"model": str(calibration)}, "detector": str(sheet), "dimes": {"binned_size": [320, 240]}}
-    p = DescentScenarioParameters.model_validate(settings)
-    assert p.camera.model is not None
-    assert p.camera.model.size == (640, 480)
-    repeated = DescentScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True))
+    parameters = DescentScenarioParameters.model_validate(settings)
+    assert parameters.camera.model is not None
+    assert parameters.camera.model.size == (640, 480)
+    round_trip = DescentScenarioParameters.model_validate(parameters.model_dump(mode="json", round_trip=True))
     calibration.unlink()
     sheet.unlink()
-    assert DescentScenarioParameters.model_validate(repeated.model_dump(mode="json", round_trip=True)) == p
+    assert DescentScenarioParameters.model_validate(round_trip.model_dump(mode="json", round_trip=True)) == parameters
     # The calibrated camera differs by the specified errors (4 standard deviations): at the corner by their sum.
-    true_camera, calibrated = camera_optics(p.camera).camera, calibrated_camera(p.camera, np.random.default_rng(1))
+    true_camera, calibrated_model = (
+        camera_optics(parameters.camera).camera,
+        calibrated_camera(parameters.camera, np.random.default_rng(1)),
+    )
     directions = true_camera.rays(np.array([[0.0, 0.0], [320.0, 240.0], [639.0, 479.0]]))[1]
-    shifts_px = np.linalg.norm(calibrated.project(directions)[0] - true_camera.project(directions)[0], axis=1)
-    assert 0.0 < shifts_px[1] < 4.0 * p.camera.centre_error_px
+    shifts_px = np.linalg.norm(calibrated_model.project(directions)[0] - true_camera.project(directions)[0], axis=1)
+    assert 0.0 < shifts_px[1] < 4.0 * parameters.camera.centre_error_px
     # half of the image diagonal is 400 px
-    error_sum_px = p.camera.centre_error_px + p.camera.distortion_error_px + 400 * p.camera.focal_error
+    error_sum_px = (
+        parameters.camera.centre_error_px + parameters.camera.distortion_error_px + 400 * parameters.camera.focal_error
+    )
     assert shifts_px.max() < 4.0 * error_sum_px
 
 
 def test_custom_camera_distortion_error_applies_at_corner() -> None:
-    p = CameraParameters(focal_error=0.0, centre_error_px=0.0, distortion_error_px=2.0)
-    custom = p.model_copy(update={"model": CustomCamera.from_camera(camera_optics(p).camera)})
-    for camera_parameters in (p, custom):
+    parameters = CameraParameters(focal_error=0.0, centre_error_px=0.0, distortion_error_px=2.0)
+    custom = parameters.model_copy(update={"model": CustomCamera.from_camera(camera_optics(parameters).camera)})
+    for camera_parameters in (parameters, custom):
         rng = np.random.default_rng(3)
+        # the fourth draw of the calibration is the distortion error
         normal_draw = np.random.default_rng(3).standard_normal(4)[3]
-        true_camera, calibrated = camera_optics(camera_parameters).camera, calibrated_camera(camera_parameters, rng)
+        true_camera, calibrated_model = (
+            camera_optics(camera_parameters).camera,
+            calibrated_camera(camera_parameters, rng),
+        )
         corner = true_camera.rays(np.array([0.0, 0.0]))[1]
-        radial_shift_px = np.linalg.norm(calibrated.project(corner)[0] - 511.5) - np.linalg.norm(
+        radial_shift_px = np.linalg.norm(calibrated_model.project(corner)[0] - 511.5) - np.linalg.norm(
             true_camera.project(corner)[0] - 511.5
         )
         assert radial_shift_px == pytest.approx(2.0 * normal_draw, rel=0.02)

@@ -19,7 +19,7 @@ from marsyard.sim.dynamics.recorded import COLUMNS
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import make_parameters, run_descent
 
-#: OpenCV's camera axes in the body axes, as rows.
+#: OpenCV's camera axes in the axes of a body whose camera looks along -z; equal to its inverse.
 CAMERA_IN_BODY = Rotation.from_matrix([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
 NED_FROM_ENU = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
@@ -42,13 +42,17 @@ def _write_vertical_fall(folder: Path, *, height_m: float = 2200.0, tilt_deg: fl
 
 def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
     """The file has 50 Hz, north-east-down axes, attitudes of the camera and another time origin."""
-    simulated, p = run_descent(), make_parameters()
-    world = World.from_parameters(p)
-    flight = create_flight(p, world.surface, Streams(1, "test", 0))
+    simulated_case, parameters = run_descent(), make_parameters()
+    world = World.from_parameters(parameters)
+    flight = create_flight(parameters, world.surface, Streams(1, "test", 0))
     times = np.arange(-5.0, flight.firing_s + 1.0, 0.02)
     truth = flight.motion.motion(times)
     origin = np.array(
-        [p.location.east_m, p.location.north_m, world.surface.height(p.location.east_m, p.location.north_m)]
+        [
+            parameters.location.east_m,
+            parameters.location.north_m,
+            world.surface.height(parameters.location.east_m, parameters.location.north_m),
+        ]
     )
     file = _write_poses(
         tmp_path,
@@ -56,26 +60,26 @@ def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
         NED_FROM_ENU.apply(truth.positions_m - origin),
         NED_FROM_ENU * truth.attitudes * CAMERA_IN_BODY.inv(),
     )
-    recorded = run_descent(flight={"file": file, "axes": "ned", "first_picture_s": 1234.0})
-    assert recorded.outcome == simulated.outcome == "VALID"
+    recorded_case = run_descent(flight={"file": file, "axes": "ned", "first_picture_s": 1234.0})
+    assert recorded_case.outcome == simulated_case.outcome == "VALID"
     for name in ("velocity_true_x_m_s", "velocity_true_y_m_s", "altitude_1_m", "off_nadir_3_deg", "firing_after_s"):
-        assert recorded.row[name] == pytest.approx(simulated.row[name], abs=1e-2), name
+        assert recorded_case.row[name] == pytest.approx(simulated_case.row[name], abs=1e-2), name
     # Interpolation moves the camera by up to 0.1 mm: images and estimate change slightly.
     for axis in "xy":
         name = f"velocity_estimated_{axis}_m_s"
-        assert recorded.row[name] == pytest.approx(simulated.row[name], abs=0.05)
+        assert recorded_case.row[name] == pytest.approx(simulated_case.row[name], abs=0.05)
     # The instruments have the same errors.
     for name in ("attitude_error_common_deg", "altitude_error_2_m", "tag_error_1_s"):
-        assert recorded.row[name] == pytest.approx(simulated.row[name], rel=0.02, abs=1e-4), name
-    assert recorded.row["flight_file"] == file
-    assert not any(name.startswith("descent_wind") for name in recorded.row)
+        assert recorded_case.row[name] == pytest.approx(simulated_case.row[name], rel=0.02, abs=1e-4), name
+    assert recorded_case.row["flight_file"] == file
+    assert not any(name.startswith("descent_wind") for name in recorded_case.row)
 
 
 def test_flight_is_rotated_and_moved_to_its_start(tmp_path: Path) -> None:
     file = _write_vertical_fall(tmp_path)
-    p = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu", "turn_deg": 90.0}})
-    assert isinstance(p.flight, FlightFile)
-    motion = p.flight.motion(np.array([100.0, 200.0, 30.0]), 3.7)
+    parameters = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu", "turn_deg": 90.0}})
+    assert isinstance(parameters.flight, FlightFile)
+    motion = parameters.flight.motion(np.array([100.0, 200.0, 30.0]), 3.7)
     # The rotation by 90 deg turns east into south; after 5 s: 50 m south, 350 m lower.
     assert np.allclose(motion.state(0.0).position_m, [100.0, 200.0 - 50.0, 30.0 + 2200.0 - 350.0])
     assert np.allclose(motion.state(0.0).velocity_m_s, [0.0, -10.0, -70.0])
@@ -92,9 +96,9 @@ def test_lever_arm_and_mounting_are_applied(tmp_path: Path) -> None:
     file = _write_poses(tmp_path, times, positions, Rotation.identity(times.size))
     quaternion = tuple(Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])).as_quat().tolist())
     settings = {"file": file, "axes": "enu", "mounting": quaternion, "lever_m": (0.0, 0.0, -2.0)}
-    p = DescentScenarioParameters.model_validate({"flight": settings})
-    assert isinstance(p.flight, FlightFile)
-    state = p.flight.motion(np.zeros(3), 3.7).state(0.0)
+    parameters = DescentScenarioParameters.model_validate({"flight": settings})
+    assert isinstance(parameters.flight, FlightFile)
+    state = parameters.flight.motion(np.zeros(3), 3.7).state(0.0)
     assert np.allclose(state.attitude.as_matrix(), np.eye(3))
     assert state.position_m[2] == pytest.approx(2000.0 - 250.0 - 2.0)
 
@@ -119,9 +123,9 @@ def test_invalid_flights_are_rejected_on_load(tmp_path: Path) -> None:
 
 def test_changed_flight_file_is_rejected(tmp_path: Path) -> None:
     file = _write_vertical_fall(tmp_path)
-    p = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"}})
-    stored = p.model_dump(mode="json", round_trip=True)
-    assert DescentScenarioParameters.model_validate(stored) == p
+    parameters = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"}})
+    stored_parameters = parameters.model_dump(mode="json", round_trip=True)
+    assert DescentScenarioParameters.model_validate(stored_parameters) == parameters
     _write_vertical_fall(tmp_path, height_m=2300.0)
     with pytest.raises(ValidationError, match=r"file has changed since the campaign was created"):
-        DescentScenarioParameters.model_validate(stored)
+        DescentScenarioParameters.model_validate(stored_parameters)

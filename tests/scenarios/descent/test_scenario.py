@@ -15,7 +15,7 @@ from tests.scenarios.descent.settings import DESCENT, FLAT_TERRAIN, IDEAL_INSTRU
 
 @pytest.fixture(scope="module")
 def nominal_case() -> CaseResult:
-    """Run case 0 with the default parameters and the small terrain."""
+    """Run case 0 of the descent over the small terrain without changes of its parameters."""
     return run_descent()
 
 
@@ -25,15 +25,15 @@ def _drop_times(row: Any) -> dict[str, Any]:
 
 def test_case_is_deterministic(nominal_case: CaseResult) -> None:
     second_case = run_descent(1)
-    repeated = run_descent()
-    assert _drop_times(repeated.row) == _drop_times(nominal_case.row)
+    repeated_case = run_descent()
+    assert _drop_times(repeated_case.row) == _drop_times(nominal_case.row)
     assert second_case.row["image_hash"] != nominal_case.row["image_hash"]
 
 
 def test_each_catalogue_dispersion_is_reported() -> None:
     """The row has the value of each dispersion in a column that is named by the path or by the end of the path."""
-    dispersed = load_campaign("dimes-gusev").draws(3)
-    samples = {path: value for path, value in dispersed.items() if path != "location.terrain"}
+    draws = load_campaign("dimes-gusev").draws(3)
+    samples = {path: value for path, value in draws.items() if path != "location.terrain"}
     settings: dict[str, Any] = {"location": dict(SMALL_WORLD["location"]), "faults": {"late_s": 0.25}, "site": "gusev"}
     settings["terrain"] = dict(SMALL_WORLD["terrain"])
     for path, value in samples.items():
@@ -50,7 +50,7 @@ def test_each_catalogue_dispersion_is_reported() -> None:
     assert (row["fault"], row["fault_size"], row["terrain"]) == ("late_s", 0.25, 0)
     campaigns = [load_campaign(name).configuration for name in catalogue()]
     dispersed_paths = {path for entry in campaigns if entry.scenario == "descent" for path in entry.dispersions}
-    assert dispersed_paths == {*dispersed, "faults"}
+    assert dispersed_paths == {*draws, "faults"}
 
 
 @pytest.mark.parametrize("name", ["velocity", "firing_velocity"])
@@ -67,9 +67,9 @@ def test_velocity_error_is_estimate_minus_truth(nominal_case: CaseResult, name: 
 def test_figures_use_the_scored_data(nominal_case: CaseResult) -> None:
     row = nominal_case.row
     for kind in ("true", "estimated"):
-        stored = [float(row[f"velocity_{kind}_{axis}_m_s"]) for axis in "xy"]
-        np.testing.assert_allclose(nominal_case.products[f"velocity_{kind}_m_s"], stored)
-    assert all(nominal_case.products[f"image_{k}"].shape == (256, 1024) for k in (1, 2, 3))
+        row_velocity = [float(row[f"velocity_{kind}_{axis}_m_s"]) for axis in "xy"]
+        np.testing.assert_allclose(nominal_case.products[f"velocity_{kind}_m_s"], row_velocity)
+    assert all(nominal_case.products[f"image_{number}"].shape == (256, 1024) for number in (1, 2, 3))
 
 
 def test_true_velocity_is_the_mean_camera_velocity() -> None:
@@ -103,7 +103,7 @@ def test_ideal_instruments_are_reported_without_errors(nominal_case: CaseResult)
     row = run_descent(**IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN).row
     for name in ("attitude_error_common_deg", "attitude_error_independent_deg"):
         assert float(row[name]) < 1e-4 < float(nominal_case.row[name])
-    # A tenth of a second at 0.3 m/s^2 and a swing velocity of 2 m/s changes the altitude of 1400 m by 0.1 m.
+    # In 0.1 s, an acceleration of 0.3 m/s^2 and a swing velocity of 2 m/s change the altitude of 1400 m by about 0.1 m.
     assert abs(float(row["altitude_error_common"])) < 1e-4 < abs(float(nominal_case.row["altitude_error_common"]))
     assert float(row["velocity_change_error_m_s"]) < 1e-3 < float(nominal_case.row["velocity_change_error_m_s"])
 
@@ -158,7 +158,7 @@ def test_condition_columns_have_the_simulated_values(nominal_case: CaseResult) -
     row: Any = nominal_case.row
     assert row["altitude_1_m"] == pytest.approx(2000.0, abs=20.0)
     assert row["altitude_1_m"] - row["altitude_3_m"] == pytest.approx(7.5 * row["descent_rate_m_s"], abs=40.0)
-    assert row["off_nadir_max_deg"] == max(row[f"off_nadir_{k}_deg"] for k in (1, 2, 3))
+    assert row["off_nadir_max_deg"] == max(row[f"off_nadir_{number}_deg"] for number in (1, 2, 3))
     assert 0.0 < row["off_nadir_max_deg"] < 12.0 + 15.0
     assert row["sun_azimuth_deg"] == pytest.approx(270.0)
     assert row["sun_elevation_deg"] == pytest.approx(40.0)

@@ -23,7 +23,7 @@ HELICOPTER = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}})
 
 
 def test_receiver_outage_covers_images_and_landing() -> None:
-    """During the outage the filter propagates without updates: its errors grow by metres in 40 s."""
+    """During an outage of 40 s the filter propagates without position updates, so its position errors increase."""
     position_errors_m: dict[float, list[float]] = {0.0: [], 40.0: []}
     for outage_s, errors in position_errors_m.items():
         flight = add_receiver_outage(Faults(gps_outage_s=outage_s), HELICOPTER)
@@ -38,22 +38,23 @@ def test_receiver_outage_covers_images_and_landing() -> None:
     assert np.median(position_errors_m[40.0]) > 10.0 * np.median(position_errors_m[0.0])
 
 
-def test_stuck_altimeter_repeats_an_earlier_range() -> None:
+def test_altimeter_faults_replace_all_ranges() -> None:
     ranges = np.array([9.0, 10.0, 11.0])
     np.testing.assert_array_equal(add_range_faults(Faults(), ranges, 10.0), ranges)
+    # stuck at 20 % above the height of 10 m
     np.testing.assert_allclose(add_range_faults(Faults(laser_stuck=0.2), ranges, 10.0), 12.0)
     assert np.isnan(add_range_faults(Faults(laser_silent=1), ranges, 10.0)).all()
-    # A silent altimeter has an infinite range: always above the height at which the landing slows down.
+    # The landing treats a silent altimeter as an infinite range, above the height at which it slows down.
     assert stuck_range_m(Faults(laser_silent=1), 10.0) == np.inf
     assert stuck_range_m(Faults(), 10.0) is None
 
 
-def test_minimum_of_two_images_is_received() -> None:
+def test_two_images_are_received_for_any_loss_rate() -> None:
     rng = np.random.default_rng(0)
     assert len(draw_received_images(Faults(), 40, rng)) == 40
-    received = draw_received_images(Faults(lost_pictures=0.75), 40, rng)
-    assert len(np.unique(received)) == 10
-    assert np.all(np.diff(received) > 0)
+    image_numbers = draw_received_images(Faults(lost_pictures=0.75), 40, rng)
+    assert len(np.unique(image_numbers)) == 10
+    assert np.all(np.diff(image_numbers) > 0)
     assert len(draw_received_images(Faults(lost_pictures=1.0), 40, rng)) == 2
 
 
@@ -66,9 +67,13 @@ def test_flight_faults_require_a_flight(fault: dict[str, float]) -> None:
 
 def test_bad_pixels_can_be_listed() -> None:
     detector = preset("xc-55").detector
-    unlisted, listed = (
+    unlisted_defects, listed_defects = (
         add_detector_faults(Faults.model_validate({name: 0.01}), detector).defects
         for name in ("bad_pixels", "listed_bad_pixels")
     )
-    assert (unlisted.dead_fraction, unlisted.hot_fraction, unlisted.listed) == (0.01, 0.01, False)
-    assert (listed.dead_fraction, listed.hot_fraction, listed.listed) == (0.01, 0.01, True)
+    assert (unlisted_defects.dead_fraction, unlisted_defects.hot_fraction, unlisted_defects.listed) == (
+        0.01,
+        0.01,
+        False,
+    )
+    assert (listed_defects.dead_fraction, listed_defects.hot_fraction, listed_defects.listed) == (0.01, 0.01, True)

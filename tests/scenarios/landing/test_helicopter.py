@@ -50,7 +50,7 @@ def test_transit_has_forty_images_at_constant_height() -> None:
     assert 0.0 < np.abs(transit.tags_s - transit.times_s).max() < 6e-3
 
 
-def test_pose_errors_match_filter_and_persist_between_images() -> None:
+def test_pose_errors_have_the_receiver_variance_and_change_slowly() -> None:
     """Floating solutions have errors of half a metre that change by centimetres within a second."""
     errors, changes = [], []
     for case in range(25):
@@ -61,10 +61,10 @@ def test_pose_errors_match_filter_and_persist_between_images() -> None:
         )
         errors.append(first_error[:2])
         changes.append((later_error - first_error)[:2])
-    # Standard deviations 0.42 m and 0.55 m; 50 values determine a standard deviation to 10 %.
+    # Standard deviations of the receiver: 0.42 m and 0.55 m. The rms of 50 values has a standard error of 10 %.
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.sqrt((0.42**2 + 0.55**2) / 2.0), rel=0.3)
-    # The receiver error changes by 0.49 sqrt(2 / 120) = 0.063 m per second. The filter smooths it with velocities
-    # accurate to 1 cm/s.
+    # The receiver error (0.49 m rms, correlation time 120 s) changes by 0.49 sqrt(2 / 120) = 0.063 m in one second. The
+    # filter smooths the change with velocities accurate to 1 cm/s.
     assert 0.01 < np.sqrt(np.mean(np.square(changes))) < 0.063
 
 
@@ -74,8 +74,8 @@ def test_acceleration_causes_inclinometer_errors() -> None:
     for case in range(10):
         transit, _ = _fly_transit(case)
         for number in (0, 20, 39):
-            up = transit.state(number).attitude.apply(transit.up_body(number).copy())
-            errors.append(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0))))
+            measured_up = transit.state(number).attitude.apply(transit.up_body(number).copy())
+            errors.append(np.degrees(np.arccos(np.clip(measured_up[2], -1.0, 1.0))))
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 4.0
 
 
@@ -91,17 +91,19 @@ def test_landing_iteration_converges_to_a_consistent_flight() -> None:
         transit, touchdown = _fly_landing(case)
         assert touchdown.iterations < 8
         assert touchdown.path_change_m < 1e-3
-        path, navigated = touchdown.flight.path, touchdown.navigation_leg
+        path, landing_navigation = touchdown.flight.path, touchdown.navigation_leg
         errors = np.zeros((len(path.rows), 9))
         transit_navigation = transit.navigation_leg
         for column in range(9):
-            times = np.concatenate([transit_navigation.boundaries_s, navigated.boundaries_s[1:]])
-            values = np.concatenate([transit_navigation.errors(transit.flight.path), navigated.errors(path)[1:]])
+            times = np.concatenate([transit_navigation.boundaries_s, landing_navigation.boundaries_s[1:]])
+            values = np.concatenate(
+                [transit_navigation.errors(transit.flight.path), landing_navigation.errors(path)[1:]]
+            )
             errors[:, column] = np.interp(path.knots_s, times, values[:, column])
         assert np.all(np.abs(errors[-1, :2]) < 3.0)
         step = round((touchdown.time_s - path.start_s) / path.step_s)
         estimate = path.state(touchdown.time_s).position_m + errors[step, :3]
-        # The boundary is at most 10 ms before the touchdown: 5 mm at its speed.
+        # The last sample boundary is at most 10 ms before the touchdown: 5 mm at the touchdown speed.
         np.testing.assert_allclose(estimate, touchdown.estimated_m, atol=0.01)
 
 
@@ -151,7 +153,7 @@ def test_receiver_error_decorrelates_after_landing() -> None:
             errors.append(horizontal_distance_m(_land(transit, streams).gps_m, SITE))
     early_rms, late_rms = (float(np.sqrt(np.mean(np.square(errors)))) for errors in errors_by_delay.values())
     assert early_rms < 0.6 * late_rms
-    # 80 values determine a standard deviation to 8 %.
+    # The rms of 80 values (two axes of 40 flights) has a standard error of 1 / sqrt(160) = 8 %.
     assert late_rms == pytest.approx(np.sqrt(0.98), rel=0.25)
 
 

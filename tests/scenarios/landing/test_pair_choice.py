@@ -14,11 +14,12 @@ from marsyard.sim.sensor import preset
 
 CAMERA = preset("xc-55").cameras()[0]
 HEIGHT_M = 10.0
+#: Measured range at each of 40 images.
 RANGES_M = np.full(40, HEIGHT_M)
 
 
 def _make_poses(step_m: float, count: int = 40, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> list[PoseMeasurement]:
-    """Return nadir poses with a distance of `step_m` along the image columns; all but the first are rotated."""
+    """Return nadir poses that are `step_m` apart along x; all poses but the first are rotated by yaw and pitch."""
     poses = []
     for number in range(count):
         angles = [yaw_deg * (number > 0), pitch_deg * (number > 0)]
@@ -63,11 +64,11 @@ def test_motion_of_the_ground_in_the_image_is_limited() -> None:
     """At 10 m a pixel is 12.5 mm wide: 38 px are 0.475 m, which three steps of 0.125 m do not exceed, but four do."""
     choice = choose_pair(_make_poses(0.125), RANGES_M, CAMERA, PairParameters(max_shift_px=38.0), HEIGHT_M)
     assert choice.baseline_m == pytest.approx(0.375)
-    rotated = choose_pair(
+    rotated_choice = choose_pair(
         _make_poses(0.125, yaw_deg=10.0), RANGES_M, CAMERA, PairParameters(max_shift_px=38.0), HEIGHT_M
     )
-    assert rotated.first > 0  # a rotation of 10 deg after the first image moves the corners by 70 px
-    assert rotated.baseline_m == pytest.approx(0.375)
+    assert rotated_choice.first > 0  # a rotation of 10 deg after the first image moves the corners by 70 px
+    assert rotated_choice.baseline_m == pytest.approx(0.375)
 
 
 def test_missing_range_uses_commanded_height() -> None:

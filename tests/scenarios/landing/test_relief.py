@@ -1,4 +1,4 @@
-"""Tests of the true slope and roughness under a lander footprint: planes, blocks and uneven ground."""
+"""Tests of the true slope and roughness of the ground under a footprint: planes, blocks and uneven ground."""
 
 import numpy as np
 import pytest
@@ -51,21 +51,21 @@ def test_plane_minimises_absolute_deviations() -> None:
     footprints = relief.footprints(position[None], LIMITS)
     row, column = np.rint(relief.cells(position)).astype(int)
     # The lander radius of 1 m is 40 grid points.
-    i, j = (index.ravel() for index in np.mgrid[-40:41, -40:41])
-    in_footprint = np.hypot(i, j) <= 40
-    i, j = i[in_footprint], j[in_footprint]
-    heights = relief.heights_m[row + i, column + j]
+    row_offset, column_offset = (index.ravel() for index in np.mgrid[-40:41, -40:41])
+    in_footprint = np.hypot(row_offset, column_offset) <= 40
+    row_offset, column_offset = row_offset[in_footprint], column_offset[in_footprint]
+    heights = relief.heights_m[row + row_offset, column + column_offset]
     # Independent method: linear program for the same points, minimise sum t with -t <= z - plane <= t.
     # The fit uses every fourth row and column.
-    in_fit = (i % 4 == 0) & (j % 4 == 0)
-    design = np.stack([np.ones(len(i)), j * SPACING_M, i * SPACING_M], axis=-1)
-    fit_design, n = design[in_fit], int(in_fit.sum())
-    bounds = np.block([[fit_design, -np.eye(n)], [-fit_design, -np.eye(n)]])
+    in_fit = (row_offset % 4 == 0) & (column_offset % 4 == 0)
+    design = np.stack([np.ones(len(row_offset)), column_offset * SPACING_M, row_offset * SPACING_M], axis=-1)
+    fit_design, n_fit = design[in_fit], int(in_fit.sum())
+    bounds = np.block([[fit_design, -np.eye(n_fit)], [-fit_design, -np.eye(n_fit)]])
     solution = linprog(
-        np.r_[np.zeros(3), np.ones(n)],
+        np.r_[np.zeros(3), np.ones(n_fit)],
         bounds,
         np.r_[heights[in_fit], -heights[in_fit]],
-        bounds=[(None, None)] * (3 + n),
+        bounds=[(None, None)] * (3 + n_fit),
     )
     assert solution.x is not None
     plane = solution.x[:3]
@@ -99,5 +99,5 @@ def test_triangles_raise_the_ground() -> None:
     vertices = np.array([[0.0, 0.0, 1.0], [4.0, 0.0, 1.0], [0.0, 4.0, 3.0]])
     faces = np.array([[0, 1, 2], [0, 2, 1]], dtype=np.int32)
     kernels.raise_by_triangles(heights, 0.0, 0.0, 1.0, vertices, faces)
-    i, j = np.indices((5, 5))
-    np.testing.assert_allclose(heights, np.where(i + j <= 4, 1.0 + 0.5 * i, 0.0))
+    row, column = np.indices((5, 5))
+    np.testing.assert_allclose(heights, np.where(row + column <= 4, 1.0 + 0.5 * row, 0.0))

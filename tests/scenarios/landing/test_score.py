@@ -38,8 +38,8 @@ def make_flight() -> Flight:
 def make_truth(n_safe: int) -> GroundTruth:
     """Return 12 m x 12 m of ground, level in the west and too steep in the east, with `n_safe` safe positions.
 
-    Positions have a spacing of 1 m. 25 safe positions are a square, whose centre has a margin of one lander radius;
-    3 safe positions are a row without such a margin.
+    Positions have a spacing of 1 m. 25 safe positions form a square; its centre is one lander radius from unsafe
+    positions. 3 safe positions form a row without such a margin.
     """
     x, _ = np.meshgrid(np.arange(-6.0, 6.0, 0.1), np.arange(-6.0, 6.0, 0.1))
     axis_m = np.linspace(-4.0, 4.0, 9)
@@ -64,7 +64,7 @@ def make_truth(n_safe: int) -> GroundTruth:
 @pytest.mark.parametrize(
     ("n_safe", "population"), [(0, "no_safe_site_exists"), (3, "narrow_site_exists"), (25, "wide_site_exists")]
 )
-def test_each_flight_is_in_one_population(n_safe: int, population: str) -> None:
+def test_each_flight_is_in_exactly_one_population(n_safe: int, population: str) -> None:
     row = site_populations(make_truth(n_safe))
     populations = ("no_safe_site_exists", "narrow_site_exists", "wide_site_exists")
     assert [name for name in populations if row[name]] == [population]
@@ -90,8 +90,8 @@ def test_safe_site_or_no_site_is_a_correct_answer(
 
 
 def test_flight_without_landing_has_no_touchdown_score() -> None:
-    p, streams = LandingScenarioParameters(), Streams(1, "landing", 0)
-    row = landing_row(p, SiteEstimate(NO_SITE_REPORTED, None), make_flight(), make_truth(3), streams)
+    parameters, streams = LandingScenarioParameters(), Streams(1, "landing", 0)
+    row = landing_row(parameters, SiteEstimate(NO_SITE_REPORTED, None), make_flight(), make_truth(3), streams)
     assert row["landed"] is False
     assert "touchdown_safe" not in row
     # A campaign with touchdown requirements accepts a first case without a landing.

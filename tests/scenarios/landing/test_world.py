@@ -18,18 +18,20 @@ def test_sun_factor_is_1_at_the_planet_of_the_camera_specification(site_name: st
     assert environment.solar_irradiance / preset(camera).detector.sunlight == pytest.approx(1.0, abs=0.02)
 
 
-def test_electron_count_is_independent_of_datasheet_sun() -> None:
-    """Responsivity (electrons per second) scales with the sunlight that the datasheet specifies."""
+def test_electron_count_is_independent_of_the_datasheet_sun_distance() -> None:
+    """A datasheet for a more distant sun specifies a smaller responsivity (electrons/s), by the inverse square law."""
     small_terrain = {"terrain": {"samples": 256}, "location": {"bank": 1}}
     electrons = []
     for sun_au in (1.0, 1.5, 3.0):
         detector = {"preset": "xc-55", "sun_au": sun_au, "responsivity_e_s": 1e7 / sun_au**2}
-        p = LandingScenarioParameters.model_validate({**small_terrain, "detector": detector})
-        electrons.append(World.from_parameters(p).brightness * p.detector.responsivity_e_s)
+        parameters = LandingScenarioParameters.model_validate({**small_terrain, "detector": detector})
+        electrons.append(World.from_parameters(parameters).brightness * parameters.detector.responsivity_e_s)
     assert electrons == pytest.approx([electrons[0]] * 3, rel=1e-12)
 
 
-@pytest.mark.parametrize(("bank", "n_built"), [(1, 1), (MAX_GROUNDS, MAX_GROUNDS), (MAX_GROUNDS + 1, 0), (10_000, 0)])
-def test_only_small_banks_are_built_in_advance(bank: int, n_built: int) -> None:
+@pytest.mark.parametrize(
+    ("bank", "n_terrains"), [(1, 1), (MAX_GROUNDS, MAX_GROUNDS), (MAX_GROUNDS + 1, 0), (10_000, 0)]
+)
+def test_only_small_banks_are_built_in_advance(bank: int, n_terrains: int) -> None:
     parameters = LandingScenarioParameters.model_validate({"location": {"bank": bank}})
-    assert LandingScenario().shared_inputs(parameters) == tuple(range(n_built))
+    assert LandingScenario().shared_inputs(parameters) == tuple(range(n_terrains))

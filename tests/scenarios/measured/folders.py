@@ -39,11 +39,11 @@ def write_velocity_folder(
                 "sun_elevation_deg": np.degrees(np.arcsin(sun[2])),
             }
             if number == 2 and name in truth:
-                x, y, _ = _axes_from_world(ned).apply([*truth[name], 0.0])
-                row |= {"true_vx_m_s": x, "true_vy_m_s": y}
+                true_x, true_y, _ = _axes_from_world(ned).apply([*truth[name], 0.0])
+                row |= {"true_vx_m_s": true_x, "true_vy_m_s": true_y}
             rows.append(row)
-    first = next(iter(cases.values())).images[0]
-    return _write_campaign(folder, "velocity", first, rows, ned=ned)
+    first_image = next(iter(cases.values())).images[0]
+    return _write_campaign(folder, "velocity", first_image, rows, ned=ned)
 
 
 def write_landing_folder(
@@ -68,8 +68,8 @@ def _write_image(
     folder.mkdir(exist_ok=True)
     name = f"{case}-{number}.png"
     cv2.imwrite(str(folder / name), image.counts)
-    written_attitude = _axes_from_world(ned) * attitude * CAMERA_IN_BODY if ned else attitude
-    return {"case": case, "file": name, "time_s": image.time_s, **_quaternion_columns("", written_attitude)}
+    file_attitude = _axes_from_world(ned) * attitude * CAMERA_IN_BODY if ned else attitude
+    return {"case": case, "file": name, "time_s": image.time_s, **_quaternion_columns("", file_attitude)}
 
 
 def _axes_from_world(ned: bool) -> Rotation:

@@ -14,7 +14,7 @@ def test_exported_and_ingested_cameras_name_the_body_frame(tmp_path: Path) -> No
     measurements = inputs.descent()
     write_case(tmp_path, measurements)
     write_camera(tmp_path, 0, measurements.images[0].camera)
-    exported, ingested = tmp_path / "camera_1.cahvor", tmp_path / "cameras" / "000000.cahvor"
-    for path in (exported, ingested):
+    exported_file, ingested_file = tmp_path / "camera_1.cahvor", tmp_path / "cameras" / "000000.cahvor"
+    for path in (exported_file, ingested_file):
         assert path.read_text().startswith(f"# Frame: {BODY_FRAME}\n")
         assert read_cahvor(path) == measurements.images[0].camera

@@ -120,8 +120,8 @@ def test_image_formats_preserve_the_counts(tmp_path: Path, suffix: str) -> None:
         cv2.imwrite(str(folder / row["file"]), image.counts)
     write_text_rows(folder, rows)
     (tmp_path / "out").mkdir()
-    path, stored = ingest(folder, tmp_path / "out")
-    images = load_images(CasesFile(file=str(path)), stored.cases[0])
+    path, stored_cases = ingest(folder, tmp_path / "out")
+    images = load_images(CasesFile(file=str(path)), stored_cases.cases[0])
     for image, original in zip(images, measurements.images, strict=True):
         assert np.array_equal(image.counts, original.counts)
         assert image.camera == original.camera
@@ -161,10 +161,10 @@ def test_hazcam_image_with_the_attitude_of_its_label_looks_down(tmp_path: Path, 
     (folder / "ingest.toml").write_text('name = "hazcam"\ntask = "matching"\n[detector]\nbits = 12\n')
     (folder / "pictures.csv").write_text(f"case,file,time_s\nhazcam,{frame},0\nhazcam,{frame},1\n")
     (tmp_path / "out").mkdir()
-    path, stored = ingest(folder, tmp_path / "out")
-    picture = stored.cases[0].pictures[0]
+    path, stored_cases = ingest(folder, tmp_path / "out")
+    picture = stored_cases.cases[0].pictures[0]
     cases = CasesFile(file=str(path))
-    image = load_images(cases, stored.cases[0])[0]
+    image = load_images(cases, stored_cases.cases[0])[0]
     assert picture.pose.rotation.apply(image.camera.boresight())[2] < -0.3
     parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(path)}})
     row: dict[str, Any] = dict(MatchingScenario().run(parameters, Streams(0, "hazcam", 0)).row)

@@ -1,4 +1,4 @@
-"""Tests of ingested cases: answers equal those of the original measurements, and wrong poses are detected."""
+"""Tests of ingested cases: answers equal those of the original measurements; residuals show pose errors."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ TRUE_VELOCITY_M_S = inputs.DESCENT_VELOCITY_M_S[:2]
 
 def run_ingested(folder: Path, out: Path, **parameters: object) -> CaseResult:
     out.mkdir()
-    path, stored = ingest(folder, out)
+    path, stored_cases = ingest(folder, out)
     scenarios = (MatchingScenario(), MeasuredLandingScenario(), MeasuredVelocityScenario())
-    scenario = next(entry for entry in scenarios if entry.name == f"measured-{stored.task}")
+    scenario = next(entry for entry in scenarios if entry.name == f"measured-{stored_cases.task}")
     return scenario.run(scenario.parameters_type.model_validate({"cases": {"file": str(path)}, **parameters}), STREAMS)
 
 
 def score_descent(case: ScoredVelocity) -> dict[str, float | bool]:
     """Custom score of a descent: the velocity error if the true velocity is known."""
-    true_velocity, estimated = case.true_velocity_m_s, case.answer.velocity_m_s
-    if true_velocity is None or estimated is None:
+    true_velocity, estimated_velocity = case.true_velocity_m_s, case.answer.velocity_m_s
+    if true_velocity is None or estimated_velocity is None:
         return {"error_m_s": float("nan"), "known": False}
-    return {"error_m_s": float(np.hypot(*(estimated - true_velocity))), "known": True}
+    return {"error_m_s": float(np.hypot(*(estimated_velocity - true_velocity))), "known": True}
 
 
 def score_site(case: ScoredSite) -> dict[str, float]:
@@ -118,7 +118,7 @@ def test_landings_are_compared_with_measured_and_true_poses(tmp_path: Path) -> N
 def test_attitude_errors_are_detected(
     tmp_path: Path, error_deg: float, min_residual_px: float, max_residual_px: float
 ) -> None:
-    """A rotation about the direction of motion moves each match from its epipolar line by the angle in pixels."""
+    """A rotation about the direction of motion moves each match away from its epipolar line."""
     folder = write_landing_folder(tmp_path / "in", inputs.landing(), "matching")
     rows = read_rows(folder)
     error_rotation = Rotation.from_euler("x", error_deg, degrees=True)

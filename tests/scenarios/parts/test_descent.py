@@ -80,12 +80,12 @@ class RotatedAttitude:
 
 def record_inputs(case: ScoredDescent) -> dict[str, float | bool]:
     """Return the inputs of the score for comparison with the row."""
-    estimated = case.answer.velocity_m_s
+    estimated_velocity = case.answer.velocity_m_s
     first, second = case.states[1:3]
     true_velocity = (second.position_m - first.position_m)[:2] / (second.time_s - first.time_s)
     return {
         "altitude_m": case.measurements.altitudes[1].altitude_m,
-        "error_m_s": float("nan") if estimated is None else float(np.hypot(*(estimated - true_velocity))),
+        "error_m_s": np.nan if estimated_velocity is None else float(np.hypot(*(estimated_velocity - true_velocity))),
         "touchdown_m_s": float(np.hypot(*case.touchdown_m_s)),
         "firing_s": case.at_firing.time_s,
         "at_firing": bool(np.allclose(case.motion.state(case.at_firing.time_s).position_m, case.at_firing.position_m)),
@@ -93,10 +93,11 @@ def record_inputs(case: ScoredDescent) -> dict[str, float | bool]:
 
 
 def return_existing_column(case: ScoredDescent) -> dict[str, float]:
-    """Return a column; as `velocity_error`, its full name `velocity_error_m_s` exists in the row."""
+    """Return a column whose full name (function name and key) exists in the row: `velocity_error_m_s`."""
     return {"m_s": 1.0}
 
 
+# the name under which the campaign lists the score
 velocity_error = return_existing_column
 
 CUSTOM_PARTS: dict[str, Any] = {
@@ -112,7 +113,8 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
     result = run_descent(terrain=FLAT_TERRAIN, **ideal_instruments, **CUSTOM_PARTS)
     row = result.row
     assert result.outcome == "VALID"
-    # Motion: the row has the velocity of the custom flight; the firing is at 100 m above level ground.
+    # Motion: the row has the velocity of the custom flight. Firing is at 100 m above level ground: after a fall of
+    # 1900 m at 75 m/s.
     assert row["velocity_true_x_m_s"] == pytest.approx(11.0, abs=1e-6)
     assert row["velocity_true_y_m_s"] == pytest.approx(row["flight_north_m_s"], abs=1e-6)
     assert row["altitude_1_m"] == pytest.approx(2000.0, abs=1e-3)
@@ -135,12 +137,14 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
 
 
 def test_motion_is_deterministic_per_case() -> None:
-    p = make_parameters(terrain=FLAT_TERRAIN, **CUSTOM_PARTS)
-    surface = World.from_parameters(p).surface
-    first, repeated, second_case = (create_flight(p, surface, Streams(1, "test", case)).row for case in (0, 0, 1))
-    assert first == repeated
-    assert first["flight_north_m_s"] != second_case["flight_north_m_s"]
-    assert not any(name.startswith("descent_") for name in first)
+    parameters = make_parameters(terrain=FLAT_TERRAIN, **CUSTOM_PARTS)
+    surface = World.from_parameters(parameters).surface
+    first_row, repeated_row, second_row = (
+        create_flight(parameters, surface, Streams(1, "test", case)).row for case in (0, 0, 1)
+    )
+    assert first_row == repeated_row
+    assert first_row["flight_north_m_s"] != second_row["flight_north_m_s"]
+    assert not any(name.startswith("descent_") for name in first_row)
 
 
 @pytest.mark.parametrize(
@@ -156,28 +160,28 @@ def test_motion_is_deterministic_per_case() -> None:
 )
 def test_invalid_motion_is_reported(defect: str, message: str) -> None:
     flight = {**CUSTOM_PARTS["flight"], "options": {"defect": defect}}
-    p = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
+    parameters = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
     with pytest.raises(ValueError, match=message):
-        create_flight(p, World.from_parameters(p).surface, Streams(1, "test", 0))
+        create_flight(parameters, World.from_parameters(parameters).surface, Streams(1, "test", 0))
 
 
 @pytest.mark.parametrize("duration_s", [20.0, 20.05, 27.95, 28.0])
 def test_firing_is_at_the_end_of_a_short_motion(duration_s: float) -> None:
     """If the motion ends above the firing altitude, the firing is 0.1 s before its end, for any rounding of times."""
     flight = {**CUSTOM_PARTS["flight"], "options": {"east_m_s": 0.0, "duration_s": duration_s, "height_m": 5000.0}}
-    p = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
-    world, streams = World.from_parameters(p), Streams(1, "test", 0)
-    created_flight = create_flight(p, world.surface, streams)
+    parameters = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
+    world, streams = World.from_parameters(parameters), Streams(1, "test", 0)
+    created_flight = create_flight(parameters, world.surface, streams)
     assert created_flight.firing_s == pytest.approx(created_flight.motion.span_s[1] - 0.1)
-    navigation = Instruments.draw(p, world, created_flight, streams).navigation
+    navigation = Instruments.draw(parameters, world, created_flight, streams).navigation
     assert navigation.velocity(np.array([created_flight.firing_s])).shape == (1, 3)
 
 
 def test_motion_below_the_ground_is_reported() -> None:
     flight = {**CUSTOM_PARTS["flight"], "options": {"height_m": 500.0}}
-    p = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
+    parameters = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
     with pytest.raises(ValueError, match=r"at image 3 the camera is 62\.5 m below the ground"):
-        create_flight(p, World.from_parameters(p).surface, Streams(1, "test", 0))
+        create_flight(parameters, World.from_parameters(parameters).surface, Streams(1, "test", 0))
 
 
 def test_score_cannot_replace_a_column() -> None:

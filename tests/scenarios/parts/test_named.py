@@ -91,13 +91,13 @@ def test_module_that_raises_is_reported(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_options_of_parts_have_defaults_and_round_trip() -> None:
-    p = DescentScenarioParameters.model_validate(
+    parameters = DescentScenarioParameters.model_validate(
         {"flight": {"motion": "custom_parts:Glider", "options": {"glide_ratio": 0.25}}}
     )
-    assert isinstance(p.flight, CustomMotion)
-    assert p.flight.options == {"height_m": 1800.0, "speed_m_s": 60.0, "glide_ratio": 0.25, "roll_deg": 8.0}
-    assert p.flight.create().glide_ratio == 0.25
-    assert DescentScenarioParameters.model_validate(p.model_dump(mode="json")) == p
+    assert isinstance(parameters.flight, CustomMotion)
+    assert parameters.flight.options == {"height_m": 1800.0, "speed_m_s": 60.0, "glide_ratio": 0.25, "roll_deg": 8.0}
+    assert parameters.flight.create().glide_ratio == 0.25
+    assert DescentScenarioParameters.model_validate(parameters.model_dump(mode="json")) == parameters
 
 
 def test_part_is_found_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,12 +124,12 @@ def test_score_annotation_determines_its_inputs(tmp_path: Path, monkeypatch: pyt
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     names = ("any_case", "descent_or_landing", "landing", "flight", "callable_object")
-    accepted = {name: accepted_cases(load_score(f"custom_scores:{name}")) for name in names}
-    assert accepted["any_case"] == SCORED
-    assert accepted["descent_or_landing"] == (ScoredDescent, ScoredLanding)
-    assert accepted["landing"] == accepted["callable_object"] == (ScoredLanding,)
+    case_types = {name: accepted_cases(load_score(f"custom_scores:{name}")) for name in names}
+    assert case_types["any_case"] == SCORED
+    assert case_types["descent_or_landing"] == (ScoredDescent, ScoredLanding)
+    assert case_types["landing"] == case_types["callable_object"] == (ScoredLanding,)
     # ScoredFlight is a base class of ScoredDescent.
-    assert accepted["flight"] == (ScoredFlight, ScoredDescent)
+    assert case_types["flight"] == (ScoredFlight, ScoredDescent)
     with pytest.raises(ValueError, match="accepts ScoredLanding; allowed here: ScoredDescent"):
         load_score("custom_scores:landing", ScoredDescent)
     with pytest.raises(ValueError, match="must accept one argument"):

@@ -1,4 +1,4 @@
-"""Tests of the conformance suite for parts: the examples pass, and defects are reported."""
+"""Tests of the conformance suite for custom parts: the documented examples pass, and defects are reported."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from marsyard.scenarios.conformance import Finding, Subject, check_names, determ
 from marsyard.scenarios.conformance import parts as part_checks
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
+#: Beginning of a module with a defective part; `poses` returns a valid descent (times, positions, quaternions).
 MODULE_HEADER = """
 import os
 import numpy as np

@@ -61,12 +61,12 @@ def test_target_is_tracked_with_a_custom_pair(tmp_path: Path) -> None:
         "custom": {"left": str(camera), "baseline_m": 0.24},
         "detector": str(datasheet),
     }
-    p = RoverScenarioParameters.model_validate({**SHORT_RUN, "camera": custom})
+    parameters = RoverScenarioParameters.model_validate({**SHORT_RUN, "camera": custom})
     # The campaign stores all calibration values, so the files are not necessary.
     camera.unlink()
     datasheet.unlink()
-    p = RoverScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True))
-    result = RoverScenario().run(p, Streams(1, "own pair", 0))
+    parameters = RoverScenarioParameters.model_validate(parameters.model_dump(mode="json", round_trip=True))
+    result = RoverScenario().run(parameters, Streams(1, "own pair", 0))
     row = dict(result.row)
     assert (result.outcome, row["camera"], row["navcam"]) == ("COMPLETED", str(camera), False)
     # One pixel of disparity is 8 cm of range at 3.5 m (Eq. 1 of the tracking paper). The calibration error is at most

@@ -56,10 +56,10 @@ def test_stereo_map_agrees_with_true_heights(map_by: str) -> None:
     maps = {}
     for terrain in ("stereo", "oracle-heights"):
         changes = {"legs": [leg], "navigation": {"terrain": terrain}, "obstacles": [OBSTACLE]}
-        p = RoverScenarioParameters.model_validate({**SLIPPING_ROVER, **changes})
-        run = prepare_run(p, Streams(4, "rover tests", 0))
+        parameters = RoverScenarioParameters.model_validate({**SLIPPING_ROVER, **changes})
+        run = prepare_run(parameters, Streams(4, "rover tests", 0))
         target = run.vehicle.stance.world_from_rover.inv().apply(run.target.point_world.copy())
-        map_terrain(p, run, p.legs[0], run.create_target_estimate(target))
+        map_terrain(parameters, run, parameters.legs[0], run.create_target_estimate(target))
         assert run.navigator.terrain is not None
         maps[terrain] = run.navigator.terrain
     stereo, oracle = maps["stereo"].median_m, maps["oracle-heights"].median_m

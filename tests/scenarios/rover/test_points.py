@@ -30,7 +30,7 @@ def test_ray_distances_match_a_sphere(sphere: np.ndarray) -> None:
     # Nearer root of |offset + t * direction| = radius.
     projection = directions @ offset
     exact_distances = -projection - np.sqrt(projection * projection - offset @ offset + 0.25)
-    # The 5,120 flat triangles are inside the sphere by up to 0.1 % of the radius. Oblique rays increase the error.
+    # The 5,120 flat triangles lie inside the sphere by up to 0.1 % of the radius; oblique rays increase the error.
     np.testing.assert_allclose(ray_distances(sphere, eye, directions), exact_distances, atol=4e-3)
     assert np.isinf(ray_distances(sphere, eye, -directions[:1])[0])
 
@@ -69,10 +69,10 @@ def test_triangles_near_a_line_contain_all_intersections(sphere: np.ndarray) -> 
     eye, half_angle_rad = np.array([0.0, 0.0, 0.5]), 0.03
     rng = np.random.default_rng(2)
     for point in RockOutline.from_triangles(sphere, eye, 0.0).point(0.4, 0.7), np.array([5.0, 0.4, 0.8]):
-        selected = triangles_near_line(sphere, eye, point, half_angle_rad)
-        assert 0 < len(selected) < 0.2 * len(sphere)
+        near_triangles = triangles_near_line(sphere, eye, point, half_angle_rad)
+        assert 0 < len(near_triangles) < 0.2 * len(sphere)
         central_direction = (point - eye) / np.linalg.norm(point - eye)
         rays = central_direction + np.tan(half_angle_rad) * rng.uniform(-0.7, 0.7, (200, 3))
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         rays = rays[rays @ central_direction > np.cos(half_angle_rad)]
-        np.testing.assert_array_equal(ray_distances(selected, eye, rays), ray_distances(sphere, eye, rays))
+        np.testing.assert_array_equal(ray_distances(near_triangles, eye, rays), ray_distances(sphere, eye, rays))

@@ -77,6 +77,7 @@ def test_commands_of_turn_back_off_and_straight_legs() -> None:
         list(plan_step(turn_leg, 1, make_target(3.0, 0.0))),
     )
     assert np.degrees(first[0].turn_left_rad) == pytest.approx(-10.0)
+    # the short drives alternate between forward and backward
     assert first[1].forward_m + second[1].forward_m == 0.0
     back_off = LegParameters(motion="back-off", goal_m=7.0, step_m=0.4)
     (reverse,) = plan_step(back_off, 0, make_target(6.8, 0.0))

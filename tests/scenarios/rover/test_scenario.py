@@ -31,8 +31,8 @@ def make_streams(case: int = 0) -> Streams:
 
 
 def test_run_is_tracked_scored_and_deterministic() -> None:
-    scenario, p = RoverScenario(), make_parameters(score={"stored_updates": 2})
-    result = scenario.run(p, make_streams())
+    scenario, parameters = RoverScenario(), make_parameters(score={"stored_updates": 2})
+    result = scenario.run(parameters, make_streams())
     row: dict[str, Any] = dict(result.row)
     assert (result.outcome, result.answered) == ("COMPLETED", True)
     assert row["tracked"]
@@ -46,26 +46,26 @@ def test_run_is_tracked_scored_and_deterministic() -> None:
     assert row["range_end_m"] < row["range_start_m"] < 4.1
     assert abs(row["disparity_error_goal_px"]) <= 0.55
     assert row["update_2_magnification"] == pytest.approx(row["magnification_max"], rel=0.05)
-    repeated = dict(scenario.run(p, make_streams()).row)
+    repeated_row = dict(scenario.run(parameters, make_streams()).row)
     time_columns = {name for name in row if "time" in name}
-    assert {k: v for k, v in repeated.items() if k not in time_columns} == pytest.approx(
-        {k: v for k, v in row.items() if k not in time_columns}, abs=0.0, nan_ok=True
+    assert {name: value for name, value in repeated_row.items() if name not in time_columns} == pytest.approx(
+        {name: value for name, value in row.items() if name not in time_columns}, abs=0.0, nan_ok=True
     )
     stops = int(row["updates"])
-    stored = result.products
-    assert stored["rover_true_m"].shape == (stops, 3)
-    assert stored["stop_1_left"].dtype == np.uint16
-    assert stored["figures"]["match_score"].shape == (stops,)
+    products = result.products
+    assert products["rover_true_m"].shape == (stops, 3)
+    assert products["stop_1_left"].dtype == np.uint16
+    assert products["figures"]["match_score"].shape == (stops,)
 
 
 def test_designated_point_agrees_with_rendered_pixels() -> None:
     """The designated point, projected by the score, agrees with the 3-D points of the rendered pixels."""
-    p = make_parameters(camera={"detector_noise": False})
-    run = run_case(p, make_streams(1))
+    parameters = make_parameters(camera={"detector_noise": False})
+    run = run_case(parameters, make_streams(1))
     stop = run.stops[-1]
     column, row = (round(value) for value in stop.point_px)
     camera = run.rig.left.crop(column - 4, row - 4, (9, 9))
-    frame = process_renderer(p.backend).render(run.world.base, PixelRays.of(camera), stop.world_from_head)
+    frame = process_renderer(parameters.backend).render(run.world.base, PixelRays.of(camera), stop.world_from_head)
     surface_points = frame.points_world()[3:6, 3:6].reshape(-1, 3)
     # The central pixel shows an object, not ground or sky.
     assert frame.body[4, 4] >= 0
@@ -128,8 +128,8 @@ def test_targets_can_be_designated_by_position(designation: str) -> None:
 
 
 def test_wrong_target_reported_as_tracked_is_a_false_track() -> None:
-    p = make_parameters(algorithm="tests.scenarios.rover.trackers:OffsetTracker")
-    result = RoverScenario().run(p, make_streams())
+    parameters = make_parameters(algorithm="tests.scenarios.rover.trackers:OffsetTracker")
+    result = RoverScenario().run(parameters, make_streams())
     assert result.answered
     assert not result.row["tracked"]
     assert not result.row["true_track"]
@@ -138,8 +138,8 @@ def test_wrong_target_reported_as_tracked_is_a_false_track() -> None:
 
 
 def test_lost_target_is_not_a_valid_answer() -> None:
-    p = make_parameters(algorithm="tests.scenarios.rover.trackers:LosingTracker")
-    result = RoverScenario().run(p, make_streams())
+    parameters = make_parameters(algorithm="tests.scenarios.rover.trackers:LosingTracker")
+    result = RoverScenario().run(parameters, make_streams())
     assert (result.outcome, result.answered) == ("LOST", False)
     assert np.isnan(result.row["position_error_m"])
     assert result.row["true_track"]
@@ -147,8 +147,8 @@ def test_lost_target_is_not_a_valid_answer() -> None:
 
 
 def test_missing_answer_is_a_tracker_error() -> None:
-    p = make_parameters(algorithm="tests.scenarios.rover.trackers:SilentTracker")
-    result = RoverScenario().run(p, make_streams())
+    parameters = make_parameters(algorithm="tests.scenarios.rover.trackers:SilentTracker")
+    result = RoverScenario().run(parameters, make_streams())
     assert (result.outcome, result.answered) == ("BAD_ANSWER", False)
     assert result.failure is not None
     assert "the answer is a NoneType; allowed: a TargetUpdate" in result.failure.error
@@ -173,7 +173,9 @@ def test_trackers_share_the_images_of_a_drive() -> None:
     settings["drive"] = {**settings["drive"], "compared": ["pure-ncc", silent_tracker]}
     small_steps, large_steps = (SharedDriveParameters.model_validate({**settings, "skip": skip}) for skip in (0, 1))
     assert (small_steps.step, large_steps.step) == (5.0, 10.0)
-    results = [scenario.run(p, make_streams(case)) for case, p in enumerate((small_steps, large_steps))]
+    results = [
+        scenario.run(parameters, make_streams(case)) for case, parameters in enumerate((small_steps, large_steps))
+    ]
     assert [result.row["updates"] for result in results] == [3, 2]
     assert [result.row["at_10_deg"] for result in results] == [False, True]
     assert all(result.row["tracked"] for result in results)
@@ -187,11 +189,11 @@ def test_trackers_share_the_images_of_a_drive() -> None:
     row = results[0].row
     assert [result.row["obliquity_max_deg"] for result in results] == [row["obliquity_max_deg"]] * 2
     assert isinstance(row["obliquity_max_deg"], float)
-    allowed, exceeded = (
+    row_within_limit, row_above_limit = (
         scenario.run(SharedDriveParameters.model_validate({**settings, "face_deg": limit}), make_streams(0)).row
         for limit in (row["obliquity_max_deg"] + 0.1, row["obliquity_max_deg"] - 0.1)
     )
-    assert [(columns["in_view"], columns["on_face"]) for columns in (row, allowed, exceeded)] == [
+    assert [(columns["in_view"], columns["on_face"]) for columns in (row, row_within_limit, row_above_limit)] == [
         (True, True),
         (True, True),
         (True, False),
@@ -209,7 +211,7 @@ def drop_time_columns(row: Mapping[str, Scalar]) -> dict[str, str]:
     return {name: repr(value) for name, value in row.items() if "time" not in name}
 
 
-@pytest.mark.parametrize(("bank", "n_built"), [(8, 8), (100_000, 0)])
-def test_only_small_banks_are_built_in_advance(bank: int, n_built: int) -> None:
-    p = make_parameters(world={**SHORT_RUN["world"], "bank": bank})
-    assert RoverScenario().shared_inputs(p) == tuple(range(n_built))
+@pytest.mark.parametrize(("bank", "n_terrains"), [(8, 8), (100_000, 0)])
+def test_only_small_banks_are_built_in_advance(bank: int, n_terrains: int) -> None:
+    parameters = make_parameters(world={**SHORT_RUN["world"], "bank": bank})
+    assert RoverScenario().shared_inputs(parameters) == tuple(range(n_terrains))

@@ -14,49 +14,49 @@ from marsyard.sim.measurements import MastCalibration, RoverMeasurements, Target
 
 
 class OffsetTracker:
-    """Adds 0.3 m to the left to the positions of the paper's tracker, and reports the target as tracked."""
+    """The paper's tracker with positions that are 0.3 m too far to the left, reported as tracked."""
 
     def __init__(self) -> None:
-        self.inner = VisualTargetTracker()
+        self.paper_tracker = VisualTargetTracker()
 
     @property
     def state(self) -> TrackingState:
         """See `TargetTracker`."""
-        return self.inner.state
+        return self.paper_tracker.state
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
         """See `TargetTracker`."""
-        self.inner.designate(target, world_from_rover)
+        self.paper_tracker.designate(target, world_from_rover)
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
         """See `TargetTracker`."""
-        return self.inner.aim(world_from_rover, mast)
+        return self.paper_tracker.aim(world_from_rover, mast)
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
-        update = self.inner.update(measurements)
+        update = self.paper_tracker.update(measurements)
         assert update.position_rover is not None
         return replace(update, position_rover=update.position_rover + np.array([0.0, 0.3, 0.0]), details=None)
 
     def clear(self) -> None:
         """See `TargetTracker`."""
-        self.inner.clear()
+        self.paper_tracker.clear()
 
 
 class LosingTracker(OffsetTracker):
-    """Reports the target as lost after the first update."""
+    """Tracker that reports the target as lost after the first update."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
-        if self.inner.track is not None and self.inner.track.sighting is None:
-            return self.inner.update(measurements)
+        if self.paper_tracker.track is not None and self.paper_tracker.track.sighting is None:
+            return self.paper_tracker.update(measurements)
         position = np.array([3.0, 0.0, 0.3])
         return TargetUpdate(TrackingState.FAILURE, (TargetLoss.LOW_MATCH_SCORE,), position)
 
 
 class SilentTracker(OffsetTracker):
-    """Returns None for each update."""
+    """Tracker that returns None for each update."""
 
     def update(self, measurements: RoverMeasurements) -> Any:
         """See `TargetTracker`."""
-        self.inner.update(measurements)
+        self.paper_tracker.update(measurements)
