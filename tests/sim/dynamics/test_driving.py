@@ -82,7 +82,7 @@ def test_uphill_slip_increases_to_one(slope_deg: float, slip: float) -> None:
     start = settle(MER, ground, 0.0, 0.0, EAST)
     uphill = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=0.5), _rng())
     assert uphill.slip == pytest.approx(slip, abs=0.005)
-    # Reverse driving uphill has the same slip. Downhill the rover moves farther than commanded.
+    # Reverse driving uphill has the same slip. Downhill the rover gains 0.3 of the path that the slope costs uphill.
     facing_downhill = settle(MER, ground, 0.0, 0.0, -EAST)
     reverse = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), facing_downhill, DriveCommand(forward_m=-0.5), _rng())
     assert reverse.slip == pytest.approx(uphill.slip, abs=1e-9)
@@ -103,13 +103,16 @@ def test_rover_slides_downhill_across_a_slope(azimuth_rad: float) -> None:
 
 
 def test_slip_reduces_the_turn_angle() -> None:
+    """The default fraction of a lost turn is 0.03, plus half of the path fraction that the slope costs uphill."""
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
     result = drive(MER, Plane(), Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _rng())
     assert np.degrees(start.azimuth_rad - result.end.azimuth_rad) == pytest.approx(40.0 * 0.97)
     assert np.isnan(result.slip)
-    steep = uphill_east(15.0)
-    start = settle(MER, steep, 0.0, 0.0, EAST)
-    result = drive(MER, steep, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _rng())
+    steep_ground = uphill_east(15.0)
+    start = settle(MER, steep_ground, 0.0, 0.0, EAST)
+    result = drive(
+        MER, steep_ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _rng()
+    )
     assert 1.0 - result.turn_left_rad / np.radians(10.0) == pytest.approx(
         0.03 + 0.5 * (NO_RANDOM_SLIP.slip_fraction(np.radians(15.0)) - 0.01), rel=1e-6
     )
