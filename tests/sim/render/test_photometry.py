@@ -29,9 +29,7 @@ def flat() -> Surface:
     return Surface.from_samples(samples, 64.0)
 
 
-def _render_radiance(
-    renderer: Renderer, flat: Surface, law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray
-) -> float:
+def _render(renderer: Renderer, flat: Surface, law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
     """Render the radiance factor of flat ground in direct sunlight."""
     camera = Cahv.from_field_of_view(
         horizontal_rad=0.002,
@@ -50,13 +48,8 @@ def test_reflectance_law_is_reciprocal(renderer: Renderer, flat: Surface, law: P
     rng = np.random.default_rng(9)
     for _ in range(3):
         azimuths, elevations = rng.uniform(0.0, 2.0 * np.pi, 2), np.arcsin(rng.uniform(0.15, 1.0, 2))
-        sun, eye = (
-            direction(float(azimuth), float(elevation)) for azimuth, elevation in zip(azimuths, elevations, strict=True)
-        )
-        forward, backward = (
-            _render_radiance(renderer, flat, law, sun, eye),
-            _render_radiance(renderer, flat, law, eye, sun),
-        )
+        sun, eye = (direction(*angles) for angles in zip(azimuths.tolist(), elevations.tolist(), strict=True))
+        forward, backward = _render(renderer, flat, law, sun, eye), _render(renderer, flat, law, eye, sun)
         # I/F divided by the cosine of incidence is pi times the bidirectional reflectance.
         assert forward / sun[2] == pytest.approx(backward / eye[2], rel=1e-5)
 

@@ -40,8 +40,8 @@ def test_exposure_can_use_a_part_of_the_image() -> None:
 
 
 def test_unreachable_exposure_is_reported() -> None:
-    limited = AutoExposureParameters(max_exposure_s=0.001)
-    result = auto_expose(_make_detector(0.001), GROUND, limited, np.random.default_rng(2))
+    short_exposure = AutoExposureParameters(max_exposure_s=0.001)
+    result = auto_expose(_make_detector(0.001), GROUND, short_exposure, np.random.default_rng(2))
     assert not result.converged
     assert result.exposures_s == (0.001,)
     one_image = auto_expose(_make_detector(0.5), GROUND, AutoExposureParameters(pictures=1), np.random.default_rng(2))
