@@ -130,6 +130,7 @@ def test_better_instruments_reduce_the_errors() -> None:
     white = {"velocity_noise_m_s": (5e-3,) * 3, "velocity_wander_m_s": (0.0,) * 3, "clock": {}}
     accurate_receiver = RtkParameters.model_validate({"fixed": static, "floating": static} | white)
     path, imu, solution = _run_filter(0, ideal, accurate_receiver)
+    # Ten seconds after the start; the unit has 100 samples per second.
     errors = _compute_state_errors(path, imu, solution, np.arange(1000, 1550))
     assert np.abs(errors[:, :3]).max() < 6e-3
     assert np.abs(errors[:, 3:6]).max() < 0.015
@@ -185,6 +186,7 @@ def test_filter_resets_after_persistent_rejection() -> None:
     innovations = solution.innovations
     assert not innovations.used[(innovations.kinds == POSITION_FIX) & (innovations.axes == 0)][0]
     position_errors_m = np.abs(solution.positions_m - path.motion(imu.boundaries(*span)).positions_m)
+    # Errors after 0.8 s, and from 2 s on.
     assert position_errors_m[80, 0] > 15.0
     assert position_errors_m[200:].max() < 0.1
 

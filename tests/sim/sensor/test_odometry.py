@@ -133,6 +133,7 @@ def test_heading_errors_grow_and_shift_the_position() -> None:
     assert estimate.error_m(true_pose)[1] == pytest.approx(odometer.heading_drift_rad_m * 0.8 * 0.8 * 10.0, rel=1e-3)
     walk = EXACT.model_copy(update={"heading_walk_deg": 0.2})
     errors = [np.degrees(_estimate_poses(drives, walk, n)[1].heading_error_rad) for n in range(100)]
+    # The random walk grows with the square root of 4 m.
     assert np.std(errors) == pytest.approx(0.2 * 2.0, rel=0.22)
     turn_drives = _drive(Plane(), (DriveCommand(turn_left_rad=2.0),))
     odometer, estimate = _estimate_poses(turn_drives, EXACT.model_copy(update={"heading_scale_error": 0.01}), 4)

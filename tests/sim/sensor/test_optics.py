@@ -78,6 +78,7 @@ def test_dust_attenuates_light_and_is_absent_from_the_flat_field() -> None:
     assert 0.6**4 <= transmission.min() <= 0.6 + 1e-6
     # Four shadows of 12 px in an image of 128 px cover about 11 %.
     assert 0.03 < (transmission < 0.99).mean() < 0.4
+    # The smooth step of an edge has a slope of up to 1.5 over its width, which is at least the minimum radius of 8 px.
     assert np.abs(np.diff(transmission, axis=1)).max() < 0.4 * 1.5 / 8.0
     flat = np.ones((128, 128), dtype=np.float32)
     clean, with_dust = (

@@ -32,6 +32,7 @@ def test_errors_match_specified_and_reported_deviation(kind: str) -> None:
     factors = np.log(reported_m / getattr(RtkParameters(), kind).total_m)
     assert np.std(factors[:, 0]) == pytest.approx(0.1, rel=0.11)
     velocity_errors = np.array([(solutions.velocities_m_s - truth.velocities_m_s)[0] for _, solutions in samples])
+    # Default noise and wander of the velocity.
     np.testing.assert_allclose(velocity_errors.std(axis=0), np.hypot([0.03, 0.03, 0.05], [0.01, 0.01, 0.02]), rtol=0.11)
     assert all(solutions.fixed[0] == (kind == "fixed") for _, solutions in samples)
 
