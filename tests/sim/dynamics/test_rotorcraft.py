@@ -69,7 +69,7 @@ def test_air_shorter_than_the_flight_is_rejected() -> None:
         _fly_transit(air)
 
 
-def _touchdown_position(flight: RotorcraftFlight) -> np.ndarray:
+def _find_touchdown(flight: RotorcraftFlight) -> np.ndarray:
     time = flight.phase_start_s(Phase.ON_GROUND)
     assert time is not None
     return flight.path.state(time).position_m
@@ -145,15 +145,15 @@ def test_vibration_has_the_specified_frequency() -> None:
 
 
 def test_calm_air_landing_error_equals_navigation_error() -> None:
-    without_error = _touchdown_position(_fly_landing(**CALM))
+    without_error = _find_touchdown(_fly_landing(**CALM))
     np.testing.assert_allclose(without_error[:2], SITE_XY, atol=0.02)
-    with_error = _touchdown_position(_fly_landing(east_error_m=0.7, **CALM))
+    with_error = _find_touchdown(_fly_landing(east_error_m=0.7, **CALM))
     np.testing.assert_allclose(with_error[:2], SITE_XY - [0.7, 0.0], atol=0.02)
 
 
 def test_touchdown_error_is_proportional_to_gusts() -> None:
     def rms_error(gust_m_s: float) -> float:
-        errors = [_touchdown_position(_fly_landing(seed, gust_m_s=gust_m_s))[:2] - SITE_XY for seed in range(25)]
+        errors = [_find_touchdown(_fly_landing(seed, gust_m_s=gust_m_s))[:2] - SITE_XY for seed in range(25)]
         return float(np.sqrt(np.mean(np.square(errors))))
 
     # Without saturation, doubled gusts double the errors. The standard error of an RMS of 50 values is 10 %.

@@ -134,11 +134,11 @@ def test_hash_covers_all_kernels(kernels: Path, tmp_path: Path) -> None:
     copy = tmp_path / "kernels"
     shutil.copytree(kernels, copy)
     assert read_poses(copy / "flight.spice.toml").sha256 == read_poses(kernels / "flight.spice.toml").sha256
-    changed = tmp_path / "others"
-    shutil.copytree(kernels, changed)
-    with (changed / "site.tf").open("a") as file:
+    changed_copy = tmp_path / "others"
+    shutil.copytree(kernels, changed_copy)
+    with (changed_copy / "site.tf").open("a") as file:
         file.write("\\begintext\nanother remark\n")
-    assert read_poses(changed / "flight.spice.toml").sha256 != read_poses(kernels / "flight.spice.toml").sha256
+    assert read_poses(changed_copy / "flight.spice.toml").sha256 != read_poses(kernels / "flight.spice.toml").sha256
 
 
 @pytest.mark.parametrize(

@@ -47,17 +47,17 @@ def _propagate_at_full_rate(imu: Imu, approach: Approach, seeds: range) -> list[
     start = approach.attitudes(np.array([approach.start_s]))[0]
     boundaries = imu.boundaries(approach.start_s, approach.end_s)
     angles, velocities = true_increments(ProfileMotion(approach), boundaries)
-    exact = ImuIncrements(boundaries, 1.0 / imu.parameters.rate_hz, angles, velocities)
-    exact_solution = InertialSolution.propagate(exact, start, np.zeros(3), 0.0)
+    exact_increments = ImuIncrements(boundaries, 1.0 / imu.parameters.rate_hz, angles, velocities)
+    exact_solution = InertialSolution.propagate(exact_increments, start, np.zeros(3), 0.0)
     errors = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        measured = replace(
-            exact,
+        increments = replace(
+            exact_increments,
             delta_angles_rad=imu.gyro.measure(angles, boundaries, rng),
             delta_velocities_m_s=imu.accelerometer.measure(velocities, boundaries, rng),
         )
-        estimate = InertialSolution.propagate(measured, start, np.zeros(3), 0.0)
+        estimate = InertialSolution.propagate(increments, start, np.zeros(3), 0.0)
         attitude = (estimate.attitudes[-1] * exact_solution.attitudes[-1].inv()).as_rotvec()
         errors.append((attitude, estimate.velocities_m_s[-1] - exact_solution.velocities_m_s[-1]))
     return errors
