@@ -7,7 +7,7 @@ import ctypes
 
 
 def can_load(*names: str) -> bool:
-    """Whether at least one of these shared libraries can be loaded."""
+    """Return whether at least one of these shared libraries can be loaded."""
     for name in names:
         try:
             ctypes.CDLL(name)

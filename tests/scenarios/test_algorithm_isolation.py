@@ -88,6 +88,7 @@ def test_algorithm_cannot_change_the_measurements_of_other_algorithms(name: str,
     assert result.failure is not None
     assert "changed its measurements" in result.failure.error
     inputs = next(entry for entry in spies.RECORDED_INPUTS if not isinstance(entry, tuple))
+    # The writer sets the counts of its own copy to zero.
     assert all(counts.mean() > 1.0 for counts in list_image_counts(inputs))
     assert result.row[f"{spy}.error"] == ""
 
@@ -160,10 +161,10 @@ def test_answers_are_converted_to_numpy_arrays_and_floats() -> None:
     ],
 )
 def test_conditions_are_recorded_before_the_algorithm_runs(name: str, flags: set[str]) -> None:
-    recorded: dict[str, Scalar] = {}
-    with conditions_recorded_by(recorded.update), pytest.raises(SystemExit):
+    conditions: dict[str, Scalar] = {}
+    with conditions_recorded_by(conditions.update), pytest.raises(SystemExit):
         run_small_case(name, "ExitingAlgorithm")
-    assert flags <= recorded.keys()
+    assert flags <= conditions.keys()
 
 
 def test_runs_with_a_tracker_exception_count_as_failures() -> None:

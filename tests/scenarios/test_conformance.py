@@ -26,6 +26,7 @@ def has_texture(m):
 
 
 def run_suite(spec: str, *checks: str) -> dict[str, Finding]:
+    """Run the given checks, or all checks, of an algorithm; return the findings by name of the check."""
     subject = Subject(spec, determine_task(spec), 60.0)
     names = [name for name, _ in check_names(subject)]
     return {name: run_check(subject, names.index(name)) for name in (checks or names)}
@@ -47,7 +48,10 @@ def test_shipped_algorithms_conform(spec: str, monkeypatch: pytest.MonkeyPatch) 
 
 
 def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
-    """Write a module with a class `Defective` to a new current folder; its name is unique (Python caches modules)."""
+    """Write a module with a class `Defective` and make its folder current; its name is unique (Python caches modules).
+
+    Return the import path of the class.
+    """
     name = f"bad_{abs(hash(body))}"
     (folder / f"{name}.py").write_text(MODULE_HEADER + textwrap.dedent(body))
     monkeypatch.chdir(folder)
@@ -56,6 +60,7 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
 
 
 def format_estimator(lines: str) -> str:
+    """Return the source of a class `Defective` with these lines in its method `estimate`."""
     return "class Defective:\n    def estimate(self, m):\n" + textwrap.indent(textwrap.dedent(lines), " " * 8)
 
 

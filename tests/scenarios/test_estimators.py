@@ -45,8 +45,8 @@ def test_entry_point_is_an_algorithm_name_unless_it_is_built_in(monkeypatch: pyt
     entry_points = [
         EntryPoint(name, "marsyard.algorithms.baselines:HomographyEstimator", group) for name in ("installed", "dimes")
     ]
-    installed = {entry_point.name: entry_point for entry_point in entry_points}
-    monkeypatch.setattr(estimators, "list_installed", lambda: installed)
+    installed_entry_points = {entry_point.name: entry_point for entry_point in entry_points}
+    monkeypatch.setattr(estimators, "list_installed", lambda: installed_entry_points)
     assert isinstance(VELOCITY.make("installed", DimesOptions(), LIMITS), HomographyEstimator)
     assert not isinstance(VELOCITY.make("dimes", DimesOptions(), LIMITS), HomographyEstimator)
     with pytest.raises(ValueError, match=r"did you mean 'installed'.*dimes-plus.*homography, installed"):
@@ -75,13 +75,13 @@ def test_published_improved_and_custom_configurations(
     task: Task[Any, Any], name: str, key: str, improved_value: Any
 ) -> None:
     defaults = task.options()
-    changed = replace(defaults, **{key: improved_value})
+    improved_options = replace(defaults, **{key: improved_value})
     assert task.make(name, defaults, LIMITS).options == defaults
     assert getattr(task.make(f"{name}-plus", defaults, LIMITS).options, key) == improved_value
-    assert task.make(f"{name}-custom", changed, LIMITS).options == changed
+    assert task.make(f"{name}-custom", improved_options, LIMITS).options == improved_options
     for standard_name in (name, f"{name}-plus"):
         with pytest.raises(ValueError, match=f"define the option {key}; '{name}-custom' accepts it"):
-            task.make(standard_name, changed, LIMITS)
+            task.make(standard_name, improved_options, LIMITS)
 
 
 def test_improvement_of_a_published_algorithm_is_rejected_before_the_campaign() -> None:
@@ -145,8 +145,10 @@ def test_stream_and_three_image_estimators_are_distinguished(tmp_path: Path, mon
     for spec in ("stream_module:Mine", "stream_module:make", "installed", "exec-stream:cat", "serve-stream:cat -u"):
         VELOCITY.check(spec)
         assert isinstance(VELOCITY.make(spec, DimesOptions(), LIMITS), StreamedEstimator)
-    kinds = {spec: VELOCITY.accepts_stream(spec) for spec in ("installed", "serve-stream:cat", "exec:cat", "dimes")}
-    assert kinds == {"installed": True, "serve-stream:cat": True, "exec:cat": False, "dimes": False}
+    accepts_stream = {
+        spec: VELOCITY.accepts_stream(spec) for spec in ("installed", "serve-stream:cat", "exec:cat", "dimes")
+    }
+    assert accepts_stream == {"installed": True, "serve-stream:cat": True, "exec:cat": False, "dimes": False}
     # The result of a factory function is unknown without a call.
     assert VELOCITY.accepts_stream("stream_module:make") is None
     with pytest.raises(ValueError, match="is not a valid velocity estimator: missing members: finish"):

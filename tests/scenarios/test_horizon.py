@@ -29,14 +29,14 @@ def test_hill_stands_at_its_azimuth_and_distance() -> None:
     top = points[np.argmax(points[:, 2])]
     assert np.degrees(np.arctan2(top[0], top[1])) == pytest.approx(60.0, abs=4.0)
     assert np.hypot(top[0], top[1]) == pytest.approx(3000.0, abs=200.0)
-    # The ridges have an RMS of a quarter of the height. The top differs from the dome by up to a few times that.
+    # Ridges with an RMS height of a quarter of the hill's height raise or lower the top of the dome.
     assert 0.5 * 90.0 < top[2] - 5.0 < 2.0 * 90.0
     assert set(hills.names) == {HILL_NAME}
 
 
 def test_hill_is_lower_by_the_curvature_of_the_planet() -> None:
-    far = HILL.model_copy(update={"distance_m": 9000.0, "width_m": 2400.0, "depth_m": 1800.0})
-    near_top_m, far_top_m = (hill_objects([hill], 0.0, 0.2).triangles[..., 2].max() for hill in (HILL, far))
+    distant_hill = HILL.model_copy(update={"distance_m": 9000.0, "width_m": 2400.0, "depth_m": 1800.0})
+    near_top_m, far_top_m = (hill_objects([hill], 0.0, 0.2).triangles[..., 2].max() for hill in (HILL, distant_hill))
     # The meshes of both hills are geometrically similar, so their relative ridge heights are equal.
     drop_m = (9000.0**2 - 3000.0**2) / (2.0 * MARS_RADIUS_M)
     assert near_top_m - far_top_m == pytest.approx(drop_m, rel=0.2)
@@ -44,8 +44,8 @@ def test_hill_is_lower_by_the_curvature_of_the_planet() -> None:
 
 def test_faces_and_normals_of_hills_point_up() -> None:
     hills = hill_objects([HILL], 0.0, 0.2)
-    a, b, c = np.moveaxis(hills.triangles, 1, 0)
-    assert np.all(np.cross(b - a, c - a)[:, 2] > 0.0)
+    first, second, third = np.moveaxis(hills.triangles, 1, 0)
+    assert np.all(np.cross(second - first, third - first)[:, 2] > 0.0)
     assert np.all(hills.normals[..., 2] > 0.0)
 
 
@@ -63,6 +63,7 @@ def test_navigation_camera_sees_the_hills_of_gusev_above_the_horizon(gusev_image
     up_components = (
         image.frame.rays.directions.reshape(*is_hill.shape, 3) @ image.frame.world_from_body.rotation.as_matrix()[2]
     )
+    # The hill at this azimuth is 85 m high, at a distance of 2900 m.
     assert np.degrees(np.arcsin(up_components[is_hill].max())) == pytest.approx(np.degrees(85.0 / 2900.0), abs=1.0)
     assert image.frame.range_m[is_hill].min() > 1500.0
     # No pixel below a hill shows the sky.

@@ -84,12 +84,12 @@ def test_mesh_raises_the_true_heights_of_a_landing(tmp_path: Path, surface: Surf
 
 def test_changed_mesh_file_is_rejected(tmp_path: Path) -> None:
     file = write_box(tmp_path)
-    p = LandingScenarioParameters.model_validate({"meshes": [{"file": file, "kind": "rock", "size_m": 1.0}]})
-    stored = p.model_dump(mode="json", round_trip=True)
-    assert LandingScenarioParameters.model_validate(stored) == p
+    parameters = LandingScenarioParameters.model_validate({"meshes": [{"file": file, "kind": "rock", "size_m": 1.0}]})
+    stored_values = parameters.model_dump(mode="json", round_trip=True)
+    assert LandingScenarioParameters.model_validate(stored_values) == parameters
     write_box(tmp_path, extents=(1.0, 1.0, 1.0))
     with pytest.raises(ValidationError, match="has changed since the campaign was created"):
-        LandingScenarioParameters.model_validate(stored)
+        LandingScenarioParameters.model_validate(stored_values)
 
 
 def test_invalid_mesh_files_are_rejected(tmp_path: Path) -> None:

@@ -67,6 +67,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
 
 def _format_system(name: str, arguments: str = "") -> str:
+    """Return a module's source that defines a system with one scenario; `x:Y` is a placeholder of its import path."""
     return f"SYSTEM = System(name={name!r}, title='T', summary='S', scenarios={{'{name}-case': 'x:Y'}}{arguments})\n"
 
 

@@ -1,8 +1,8 @@
 """Tests that no algorithm receives the truth.
 
 Spy algorithms record their inputs. Each input field must differ from the truth in several cases. Not compared: images,
-exposure times, the sun direction (known from the ephemeris) and the mast geometry (its errors are in angles and
-cameras).
+exposure times, the sun direction (known from the ephemeris) and the mast geometry (the errors of angles and cameras
+include its errors).
 """
 
 from __future__ import annotations
@@ -46,36 +46,36 @@ def _clear_spies() -> Iterator[None]:
     spies.RECORDED_CASES.clear()
 
 
-def assert_differs(name: str, inputs: Any, true: Any) -> None:
+def assert_differs(name: str, inputs: Any, truth: Any) -> None:
     """Assert that an input differs from its true value by more than rounding."""
-    inputs, true = np.asarray(inputs, dtype=np.float64), np.asarray(true, dtype=np.float64)
-    assert np.abs(inputs - true).max() > 1e-9 * max(np.abs(true).max(), 1.0), f"{name} is the truth: {inputs}"
+    inputs, truth = np.asarray(inputs, dtype=np.float64), np.asarray(truth, dtype=np.float64)
+    assert np.abs(inputs - truth).max() > 1e-9 * max(np.abs(truth).max(), 1.0), f"{name} is the truth: {inputs}"
 
 
-def assert_cameras_differ(name: str, inputs: CameraModel, true: CameraModel) -> None:
+def assert_cameras_differ(name: str, inputs: CameraModel, truth: CameraModel) -> None:
     """Assert that the cameras project the same points to other pixels."""
-    assert inputs.size == true.size
+    assert inputs.size == truth.size
     columns, rows = inputs.size
     corners = np.array([[0.1 * columns, 0.1 * rows], [0.5 * columns, 0.5 * rows], [0.9 * columns, 0.8 * rows]])
-    assert_differs(name, inputs.rays(corners)[1], true.rays(corners)[1])
+    assert_differs(name, inputs.rays(corners)[1], truth.rays(corners)[1])
 
 
-def assert_poses_differ(name: str, inputs: RigidTransform, true: RigidTransform) -> None:
+def assert_poses_differ(name: str, inputs: RigidTransform, truth: RigidTransform) -> None:
     """Assert that the poses differ in position and attitude."""
-    assert_differs(f"{name}: position", inputs.translation, true.translation)
-    assert_rotations_differ(name, inputs.rotation, true.rotation)
+    assert_differs(f"{name}: position", inputs.translation, truth.translation)
+    assert_rotations_differ(name, inputs.rotation, truth.rotation)
 
 
-def assert_rotations_differ(name: str, inputs: Rotation, true: Rotation) -> None:
+def assert_rotations_differ(name: str, inputs: Rotation, truth: Rotation) -> None:
     """Assert that the rotations differ by more than 1e-7 rad; rounding causes 1e-8 rad."""
-    assert (inputs * true.inv()).magnitude() > 1e-7, f"{name} is the true attitude"
+    assert (inputs * truth.inv()).magnitude() > 1e-7, f"{name} is the true attitude"
 
 
 def assert_flat_field_differs(inputs: Numbers, detector: Detector) -> None:
     """Assert that the calibrated pixel response, shape (rows, columns), is not a multiple of the true response."""
     rows, columns = inputs.shape
-    true = detector.response.reshape(rows, -1, columns).mean(axis=1)
-    assert float(np.std(inputs / true)) > 1e-6
+    truth = detector.response.reshape(rows, -1, columns).mean(axis=1)
+    assert float(np.std(inputs / truth)) > 1e-6
 
 
 def assert_all_fields_are_compared(measurement_class: type[Any], names: set[str]) -> None:
@@ -87,35 +87,37 @@ def assert_all_fields_are_compared(measurement_class: type[Any], names: set[str]
 def test_descent_inputs_differ_from_truth(case: int) -> None:
     from tests.scenarios.descent.settings import DESCENT, SMALL_WORLD
 
-    p = DescentScenarioParameters.model_validate(
+    parameters = DescentScenarioParameters.model_validate(
         {**SMALL_WORLD, "descent": DESCENT, "algorithm": "tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE}
     )
     streams = Streams(1, "truth", case)
-    row = DescentScenario().run(p, streams).row
-    (inputs,), (true,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
-    assert isinstance(true, ScoredDescent)
-    camera = camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed)
-    response = Detector.draw(camera_optics(p.camera).fall_off, p.detector, streams.generator("detector response"))
-    assert_flight_inputs_differ(inputs, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
+    row = DescentScenario().run(parameters, streams).row
+    (inputs,), (truth,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
+    assert isinstance(truth, ScoredDescent)
+    camera = camera_optics(parameters.camera).camera.bin(columns=1, rows=parameters.detector.rows_summed)
+    response = Detector.draw(
+        camera_optics(parameters.camera).fall_off, parameters.detector, streams.generator("detector response")
+    )
+    assert_flight_inputs_differ(inputs, truth, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
     assert_flat_field_differs(inputs.images[0].calibration.flat_field, response)
-    times = np.array(p.image_times_s)
+    times = np.array(parameters.image_times_s)
     for image, attitude, time_s in zip(inputs.images, inputs.attitudes, times, strict=True):
         assert_differs("time tag", image.time_s, time_s)
         assert_differs("attitude's time tag", attitude.time_s, time_s)
-    true_displacements = np.diff([state.position_m for state in true.states], axis=0)
+    true_displacements = np.diff([state.position_m for state in truth.states], axis=0)
     assert_differs("interval velocities", inputs.interval_velocities_m_s, true_displacements / np.diff(times)[:, None])
-    for inertial, state in zip(inputs.inertial_velocities_m_s, true.states, strict=True):
+    for inertial, state in zip(inputs.inertial_velocities_m_s, truth.states, strict=True):
         assert_differs("inertial velocity", inertial, state.velocity_m_s)
 
 
 def assert_flight_inputs_differ(
-    inputs: DescentMeasurements, true: ScoredFlight, camera: CameraModel, altitudes_m: list[float]
+    inputs: DescentMeasurements, truth: ScoredFlight, camera: CameraModel, altitudes_m: list[float]
 ) -> None:
     """Assert that cameras, attitudes and altitudes differ from the truth."""
     names = {"images", "attitudes", "altitudes", "interval_velocities_m_s", "sun_direction", "inertial_velocities_m_s"}
     assert_all_fields_are_compared(DescentMeasurements, names)
     for image, attitude, altitude, state, altitude_m in zip(
-        inputs.images, inputs.attitudes, inputs.altitudes, true.states, altitudes_m, strict=True
+        inputs.images, inputs.attitudes, inputs.altitudes, truth.states, altitudes_m, strict=True
     ):
         assert_cameras_differ("camera", image.camera, camera)
         assert_rotations_differ("attitude", attitude.world_from_body, state.attitude)
@@ -128,13 +130,13 @@ def test_field_test_inputs_differ_from_truth(case: int) -> None:
     from tests.scenarios.test_fieldtest import make_parameters
 
     runs = [make_parameters().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}]
-    p = make_parameters(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE)
-    row = FieldTestScenario().run(p, Streams(5, "test", case)).row
-    (inputs,), (true,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
-    camera = field_camera().bin(columns=1, rows=p.detector.rows_summed)
-    assert_flight_inputs_differ(inputs, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
-    true_displacements = np.diff([state.position_m for state in true.states], axis=0)
-    true_velocities = true_displacements / p.triples.virtual_interval_s
+    parameters = make_parameters(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE)
+    row = FieldTestScenario().run(parameters, Streams(5, "test", case)).row
+    (inputs,), (truth,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
+    camera = field_camera().bin(columns=1, rows=parameters.detector.rows_summed)
+    assert_flight_inputs_differ(inputs, truth, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
+    true_displacements = np.diff([state.position_m for state in truth.states], axis=0)
+    true_velocities = true_displacements / parameters.triples.virtual_interval_s
     assert_differs("interval velocities", inputs.interval_velocities_m_s, true_velocities)
 
 
@@ -142,7 +144,7 @@ def test_field_test_inputs_differ_from_truth(case: int) -> None:
 @pytest.mark.parametrize("case", range(3))
 def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] | None) -> None:
     """Time tags are not compared: they are exact, because the pose errors include the clock error."""
-    p = LandingScenarioParameters.model_validate(
+    parameters = LandingScenarioParameters.model_validate(
         {
             "site": "heli-benign",
             "terrain": {"samples": 256},
@@ -151,19 +153,21 @@ def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] 
             **RECORDING_SCORE,
         }
     )
-    row: dict[str, Scalar] = dict(LandingScenario().run(p, Streams(1, "truth", case)).row)
-    (inputs,), (true,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
+    row: dict[str, Scalar] = dict(LandingScenario().run(parameters, Streams(1, "truth", case)).row)
+    (inputs,), (truth,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
     assert_all_fields_are_compared(
         LandingMeasurements, {"images", "poses", "slant_range_m", "up_body", "apriori_site_world"}
     )
-    for image, pose, state in zip(inputs.images, inputs.poses, true.states, strict=True):
-        assert_cameras_differ("camera", image.camera, p.optics.bin(columns=1, rows=p.detector.rows_summed))
+    for image, pose, state in zip(inputs.images, inputs.poses, truth.states, strict=True):
+        assert_cameras_differ(
+            "camera", image.camera, parameters.optics.bin(columns=1, rows=parameters.detector.rows_summed)
+        )
         assert_poses_differ("pose", pose.world_from_body, rigid(state.attitude, state.position_m))
-    first_state, range_m = true.states[0], float(row["range_m"])
+    first_state, range_m = truth.states[0], float(row["range_m"])
     assert_differs("slant range", inputs.slant_range_m, range_m)
     assert_differs("vertical", inputs.up_body, first_state.attitude.inv().apply([0.0, 0.0, 1.0]))
     site = inputs.apriori_site_world
-    assert_differs("a-priori site", site, first_state.world_from_body.apply(range_m * np.array(p.optics.a)))
+    assert_differs("a-priori site", site, first_state.world_from_body.apply(range_m * np.array(parameters.optics.a)))
     for pose in (inputs.poses[0].world_from_body, first_state.world_from_body):
         assert_differs("distance of the a-priori site", np.linalg.norm(site - pose.translation), range_m)
 
@@ -173,8 +177,8 @@ def test_rover_inputs_differ_from_truth(case: int) -> None:
     """The first stop is not compared: the estimated pose is defined as exact at the start."""
     from tests.scenarios.rover.short_run import SHORT_RUN
 
-    p = RoverScenarioParameters.model_validate({**SHORT_RUN, "algorithm": "tests.scenarios.spies:TrackerSpy"})
-    run = run_case(p, Streams(1, "truth", case))
+    parameters = RoverScenarioParameters.model_validate({**SHORT_RUN, "algorithm": "tests.scenarios.spies:TrackerSpy"})
+    run = run_case(parameters, Streams(1, "truth", case))
     aim_calls = [entry for entry in spies.RECORDED_INPUTS if isinstance(entry, tuple)]
     updates = [entry for entry in spies.RECORDED_INPUTS if isinstance(entry, RoverMeasurements)]
     assert len(aim_calls) == len(updates) == len(run.stops) >= 3
@@ -186,9 +190,9 @@ def test_rover_inputs_differ_from_truth(case: int) -> None:
         for mast in (aim_mast, inputs.mast):
             assert_cameras_differ("left camera", mast.left, run.rig.left)
             assert_cameras_differ("right camera", mast.right, run.rig.right)
-        true = stop.stance.world_from_rover
+        truth = stop.stance.world_from_rover
         head = mast.geometry.rover_from_head(inputs.azimuth_rad, inputs.elevation_rad)
-        assert_rotations_differ("mast's angles", head.rotation, (true.inv() * stop.world_from_head).rotation)
+        assert_rotations_differ("mast's angles", head.rotation, (truth.inv() * stop.world_from_head).rotation)
         if stop is not run.stops[0]:
-            assert_poses_differ("pose", inputs.world_from_rover, true)
-            assert_poses_differ("pose of an aim", aim_pose, true)
+            assert_poses_differ("pose", inputs.world_from_rover, truth)
+            assert_poses_differ("pose of an aim", aim_pose, truth)

@@ -56,11 +56,12 @@ def test_old_partial_files_are_removed(folder: Path) -> None:
 
 
 def test_default_limit_is_a_fraction_of_available_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The default is 40 % of the sum of free space and cache size, at most 10 GB."""
     monkeypatch.delenv("MARSYARD_CACHE_GB", raising=False)
     free = 20 * GIGA
     monkeypatch.setattr("marsyard.sim.cache.shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     assert limit_bytes(tmp_path, 0) == 8 * GIGA
-    # Existing cache files do not reduce the limit.
+    # Space that cache files already use counts as available.
     assert limit_bytes(tmp_path, 3 * GIGA) == 9.2 * GIGA
     free = 900 * GIGA
     assert limit_bytes(tmp_path, 0) == 10 * GIGA

@@ -14,11 +14,11 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def _print_cache_folder(sources: Path, cache: Path, **environment: str) -> str:
-    inherited = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    base_environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     result = subprocess.run(
         [sys.executable, "-c", "import os, marsyard.sim; print(os.environ['NUMBA_CACHE_DIR'])"],
         cwd=sources,
-        env=inherited | {"MARSYARD_CACHE": str(cache), "PYTHONPATH": str(sources)} | environment,
+        env=base_environment | {"MARSYARD_CACHE": str(cache), "PYTHONPATH": str(sources)} | environment,
         capture_output=True,
         text=True,
         check=True,

@@ -114,13 +114,13 @@ def test_replayed_case_equals_the_stored_row(runs: Path) -> None:
 
 
 def test_differing_row_is_reported(runs: Path, tmp_path: Path) -> None:
-    changed = tmp_path / "changed"
-    changed.mkdir()
-    (changed / "campaign.json").write_text((runs / "A" / "campaign.json").read_text())
+    changed_folder = tmp_path / "changed"
+    changed_folder.mkdir()
+    (changed_folder / "campaign.json").write_text((runs / "A" / "campaign.json").read_text())
     rows = pd.read_parquet(runs / "A" / "cases.parquet")
     rows["velocity_true_x_m_s"] += 1e-9 * (rows.index == 2)
-    rows.to_parquet(changed / "cases.parquet")
-    result = _run_marsyard("replay", str(changed), "2", "--out", str(tmp_path / "again"), cwd=tmp_path)
+    rows.to_parquet(changed_folder / "cases.parquet")
+    result = _run_marsyard("replay", str(changed_folder), "2", "--out", str(tmp_path / "again"), cwd=tmp_path)
     assert result.exit_code == 1
     assert "velocity_true_x_m_s" in result.output
 
@@ -138,11 +138,11 @@ def test_record_describes_the_run(runs: Path) -> None:
 
 
 def test_existing_campaign_is_not_overwritten(runs: Path) -> None:
-    before = (runs / "A" / "cases.parquet").read_bytes()
+    content = (runs / "A" / "cases.parquet").read_bytes()
     result = _run_marsyard("run", "small.toml", "--out", "A", cwd=runs)
     assert result.exit_code == EXIT_INVALID_INPUT
     assert "A" in result.stderr
-    assert (runs / "A" / "cases.parquet").read_bytes() == before
+    assert (runs / "A" / "cases.parquet").read_bytes() == content
 
 
 @pytest.mark.parametrize(

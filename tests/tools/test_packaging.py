@@ -50,16 +50,16 @@ def test_wheel_contains_one_package(wheel: Path) -> None:
 
 
 def test_wheel_works_next_to_modules_of_the_same_names(wheel: Path, tmp_path: Path) -> None:
-    installed, working_folder = tmp_path / "installed", tmp_path / "here"
+    install_folder, working_folder = tmp_path / "installed", tmp_path / "here"
     with ZipFile(wheel) as archive:
-        archive.extractall(installed)
+        archive.extractall(install_folder)
     for name in ("sim.py", "reports/__init__.py", "campaigns/__init__.py", "scenarios.py", "algorithms.py"):
         (working_folder / name).parent.mkdir(parents=True, exist_ok=True)
         (working_folder / name).write_text("raise ImportError('the wrong module')\n")
     script = (
-        f"import sys; sys.path.insert(1, {str(installed)!r})\n"
+        f"import sys; sys.path.insert(1, {str(install_folder)!r})\n"
         "import marsyard, marsyard.sim.camera, marsyard.reports.campaign\n"
-        f"assert marsyard.__file__.startswith({str(installed)!r}), marsyard.__file__\n"
+        f"assert marsyard.__file__.startswith({str(install_folder)!r}), marsyard.__file__\n"
         "from marsyard.cli.app import main\nsys.argv = ['marsyard', 'show', 'dimes-smoke']\nmain()\n"
     )
     result = subprocess.run(

@@ -72,20 +72,20 @@ def count_lines(file: Path) -> int:
 
 def test_second_setup_changes_nothing(checkout: Path) -> None:
     assert run_setup(checkout).returncode == 0
-    installed = count_lines(checkout.parent / "pip.log")
+    pip_calls = count_lines(checkout.parent / "pip.log")
     second = run_setup(checkout)
     assert (second.returncode, second.stdout, second.stderr) == (0, "", "")
-    assert count_lines(checkout.parent / "pip.log") == installed > 0
+    assert count_lines(checkout.parent / "pip.log") == pip_calls > 0
 
 
-@pytest.mark.parametrize("changed", ["pyproject.toml", "constraints.txt", "tools/setup.sh"])
-def test_changed_requirements_are_installed_again(checkout: Path, changed: str) -> None:
+@pytest.mark.parametrize("file_name", ["pyproject.toml", "constraints.txt", "tools/setup.sh"])
+def test_changed_requirements_are_installed_again(checkout: Path, file_name: str) -> None:
     run_setup(checkout)
-    installed = count_lines(checkout.parent / "pip.log")
-    with (checkout / changed).open("a") as file:
+    pip_calls = count_lines(checkout.parent / "pip.log")
+    with (checkout / file_name).open("a") as file:
         file.write("\n# changed\n")
     assert run_setup(checkout).returncode == 0
-    assert count_lines(checkout.parent / "pip.log") == 2 * installed
+    assert count_lines(checkout.parent / "pip.log") == 2 * pip_calls
 
 
 def test_interrupted_setup_starts_again(checkout: Path) -> None:
@@ -99,9 +99,9 @@ def test_interrupted_setup_starts_again(checkout: Path) -> None:
 def test_moved_checkout_is_set_up_again(checkout: Path) -> None:
     run_setup(checkout)
     (checkout / ".venv" / "old_file").touch()
-    moved = checkout.rename(checkout.with_name("moved"))
-    assert run_setup(moved).returncode == 0
-    assert not (moved / ".venv" / "old_file").exists()
+    new_checkout = checkout.rename(checkout.with_name("moved"))
+    assert run_setup(new_checkout).returncode == 0
+    assert not (new_checkout / ".venv" / "old_file").exists()
 
 
 def test_missing_backend_gives_one_line_and_status_0(checkout: Path) -> None:
@@ -154,6 +154,6 @@ def test_constraints_pin_every_dependency() -> None:
     assert [pin for pin in pins if not re.fullmatch(r"[a-z0-9-]+==[0-9][A-Za-z0-9.]*", pin)] == []
     assert pins == sorted(set(pins), key=lambda pin: pin.split("==")[0])
     project = (ROOT / "pyproject.toml").read_text()
-    required = set(re.findall(r'"([A-Za-z0-9-]+)>=[0-9.]+"', project))
-    assert required
-    assert required - {pin.split("==")[0] for pin in pins} == set()
+    dependencies = set(re.findall(r'"([A-Za-z0-9-]+)>=[0-9.]+"', project))
+    assert dependencies
+    assert dependencies - {pin.split("==")[0] for pin in pins} == set()

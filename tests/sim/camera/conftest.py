@@ -8,7 +8,7 @@ import pytest
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 
 
-def _navcam_376() -> Cahvor:
+def _make_navcam_376() -> Cahvor:
     """Return the left navcam as labelled in 1N491020376ILFCNY9P0706L0M1."""
     return Cahvor(
         c=np.array([0.442604, -0.0611635, -1.25106]),
@@ -21,7 +21,7 @@ def _navcam_376() -> Cahvor:
     )
 
 
-def _navcam_519() -> Cahvor:
+def _make_navcam_519() -> Cahvor:
     """Return the left navcam as labelled in 1N491020519ILFCNY9P0706L0M1."""
     return Cahvor(
         c=np.array([0.508813, -0.0504884, -1.24881]),
@@ -34,7 +34,7 @@ def _navcam_519() -> Cahvor:
     )
 
 
-def _hazcam() -> Cahvore:
+def _make_hazcam() -> Cahvore:
     """Return the left front hazcam as labelled in 1F483288473EFFCMUFP1214L0M1; model type 3."""
     return Cahvore(
         c=np.array([0.609331, -0.041064, -0.233849]),
@@ -49,38 +49,41 @@ def _hazcam() -> Cahvore:
     )
 
 
-def _pinhole() -> Cahv:
+def _make_pinhole() -> Cahv:
     """Return the navcam without lens distortion."""
-    navcam = _navcam_376()
+    navcam = _make_navcam_376()
     return Cahv(navcam.c, navcam.a, navcam.h, navcam.v, navcam.size)
 
 
 @pytest.fixture
 def navcam() -> Cahvor:
-    return _navcam_376()
+    return _make_navcam_376()
 
 
 @pytest.fixture
 def hazcam() -> Cahvore:
-    return _hazcam()
+    return _make_hazcam()
 
 
 @pytest.fixture
 def pinhole() -> Cahv:
-    return _pinhole()
+    return _make_pinhole()
 
 
 @pytest.fixture
 def labelled_cameras() -> dict[str, CameraModel]:
     """Return the cameras by product name."""
     return {
-        "1N491020376ILFCNY9P0706L0M1.IMG": _navcam_376(),
-        "1N491020519ILFCNY9P0706L0M1.IMG": _navcam_519(),
-        "1F483288473EFFCMUFP1214L0M1.IMG": _hazcam(),
+        "1N491020376ILFCNY9P0706L0M1.IMG": _make_navcam_376(),
+        "1N491020519ILFCNY9P0706L0M1.IMG": _make_navcam_519(),
+        "1F483288473EFFCMUFP1214L0M1.IMG": _make_hazcam(),
     }
 
 
-@pytest.fixture(params=[_pinhole, _navcam_376, _navcam_519, _hazcam], ids=["cahv", "navcam", "navcam turned", "hazcam"])
+@pytest.fixture(
+    params=[_make_pinhole, _make_navcam_376, _make_navcam_519, _make_hazcam],
+    ids=["cahv", "navcam", "navcam turned", "hazcam"],
+)
 def camera(request: pytest.FixtureRequest) -> CameraModel:
     model: CameraModel = request.param()
     return model

@@ -47,7 +47,7 @@ distortion_coefficients: !!opencv-matrix
 avg_reprojection_error: 4.4034956116049290e-001
 """
 
-#: A smartphone camera as published by ROS (README of a repository that streams Tango to ROS). Its rational model has no
+#: A smartphone camera in ROS's format (README of a repository that streams Tango to ROS). Its rational model has no
 #: coefficients k4 to k6.
 ROS = """image_width: 1920
 image_height: 1080
@@ -114,7 +114,7 @@ cam1:
   rostopic: /cam1/image_raw
 """
 
-#: The same first camera with Kalibr's equidistant model (README of a visual odometry).
+#: The same first camera with Kalibr's equidistant model (README of a visual odometry package).
 EQUIDISTANT = """cam0:
   camera_model: pinhole
   distortion_coeffs: [-0.0016509958435871643, 0.02437222940989351, -0.03582816956989852,
@@ -155,10 +155,10 @@ def write_file(folder: Path, text: str, name: str = "calibration.yaml") -> Path:
     return path
 
 
-def max_opencv_distance_px(
+def compute_max_opencv_distance_px(
     camera: CameraModel, matrix: np.ndarray, distortion: list[float], pose: RigidTransform | None = None
 ) -> float:
-    """Compute the maximum distance over the frame between Marsyard's and OpenCV's pixels of the same far points."""
+    """Compute the maximum distance over the frame between the pixels of Marsyard and OpenCV for the same far points."""
     columns, rows = (np.linspace(-0.5, extent - 0.5, 25) for extent in camera.size)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = camera.c + 1e5 * camera.rays(pixels)[1]
@@ -170,7 +170,7 @@ def max_opencv_distance_px(
     return float(np.max(np.linalg.norm(expected_pixels.reshape(-1, 2) - pixels, axis=1)))
 
 
-def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+def make_camera_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
@@ -183,7 +183,7 @@ def test_opencv_file_projects_like_opencv(tmp_path: Path) -> None:
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     matrix = storage.getNode("camera_matrix").mat()
     distortion = storage.getNode("distortion_coefficients").mat().ravel()
-    distance_px = max_opencv_distance_px(calibration.camera, matrix, distortion)
+    distance_px = compute_max_opencv_distance_px(calibration.camera, matrix, distortion)
     # The reported residual is computed at samples. The margin covers the pixels between them.
     assert distance_px < 1.1 * calibration.residual.max_px
     # The residual is less than the reprojection error of the calibration, 0.44 px.
@@ -193,7 +193,7 @@ def test_opencv_file_projects_like_opencv(tmp_path: Path) -> None:
 
 def test_file_of_current_opencv_is_read(tmp_path: Path) -> None:
     path = tmp_path / "written.yml"
-    matrix, distortion = camera_matrix(812.5, 810.25, 401.0, 299.5), np.array([-0.21, 0.045, 0.0, 0.0, 0.0])
+    matrix, distortion = make_camera_matrix(812.5, 810.25, 401.0, 299.5), np.array([-0.21, 0.045, 0.0, 0.0, 0.0])
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for name, value in (("image_width", 800), ("image_height", 600), ("camera_matrix", matrix)):
         storage.write(name, value)
@@ -202,7 +202,7 @@ def test_file_of_current_opencv_is_read(tmp_path: Path) -> None:
     (calibration,) = read_calibrations(path)
     # CAHVOR represents k1 and k2 exactly.
     assert calibration.residual.max_px < 1e-9
-    assert max_opencv_distance_px(calibration.camera, matrix, [*distortion]) < 1e-6
+    assert compute_max_opencv_distance_px(calibration.camera, matrix, [*distortion]) < 1e-6
 
 
 def test_opencv_json_is_read(tmp_path: Path) -> None:
@@ -210,7 +210,7 @@ def test_opencv_json_is_read(tmp_path: Path) -> None:
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for name, value in (("image_width", 800), ("image_height", 600)):
         storage.write(name, value)
-    storage.write("camera_matrix", camera_matrix(812.5, 810.25, 401.0, 299.5))
+    storage.write("camera_matrix", make_camera_matrix(812.5, 810.25, 401.0, 299.5))
     storage.write("distortion_coefficients", np.array([-0.21, 0.045, 0.0, 0.0]))
     storage.release()
     json.loads(path.read_text())
@@ -222,7 +222,7 @@ def test_ros_camera_info_is_read(tmp_path: Path) -> None:
     assert calibration.name == "camera_color"
     data = yaml.safe_load(ROS)
     matrix = np.reshape(data["camera_matrix"]["data"], (3, 3))
-    distance_px = max_opencv_distance_px(calibration.camera, matrix, data["distortion_coefficients"]["data"])
+    distance_px = compute_max_opencv_distance_px(calibration.camera, matrix, data["distortion_coefficients"]["data"])
     assert distance_px < 1.1 * calibration.residual.max_px
     assert calibration.residual.rms_px < 0.2
 
@@ -233,7 +233,7 @@ def test_ros_rational_lens_is_fitted(tmp_path: Path) -> None:
     text = ROS.replace("[0.09370951394834764, -0.1640721737187069, 0.0, 0.0, 0.1224192868301668]", str(coefficients))
     (calibration,) = read_calibrations(write_file(tmp_path, text.replace("cols: 5", "cols: 8")))
     matrix = np.reshape(yaml.safe_load(ROS)["camera_matrix"]["data"], (3, 3))
-    assert max_opencv_distance_px(calibration.camera, matrix, coefficients) < 1.1 * calibration.residual.max_px
+    assert compute_max_opencv_distance_px(calibration.camera, matrix, coefficients) < 1.1 * calibration.residual.max_px
 
 
 def test_kalibr_camera_chain_is_read(tmp_path: Path) -> None:
@@ -242,9 +242,16 @@ def test_kalibr_camera_chain_is_read(tmp_path: Path) -> None:
     pose = RigidTransform.from_matrix(np.array(data["cam1"]["T_cn_cnm1"]))
     coefficients = [[-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05], data["cam1"]["distortion_coeffs"]]
     assert (left.name, right.name) == ("cam0", "cam1")
-    assert max_opencv_distance_px(left.camera, camera_matrix(458.654, 457.296, 367.215, 248.375), coefficients[0]) < 0.5
     assert (
-        max_opencv_distance_px(right.camera, camera_matrix(457.587, 456.134, 379.999, 255.238), coefficients[1], pose)
+        compute_max_opencv_distance_px(
+            left.camera, make_camera_matrix(458.654, 457.296, 367.215, 248.375), coefficients[0]
+        )
+        < 0.5
+    )
+    assert (
+        compute_max_opencv_distance_px(
+            right.camera, make_camera_matrix(457.587, 456.134, 379.999, 255.238), coefficients[1], pose
+        )
         < 0.5
     )
     # EuRoC's stereo baseline is 11 cm; the second camera is right of the first.
@@ -272,7 +279,7 @@ def test_equidistant_lens_projects_like_opencv_fisheye(tmp_path: Path) -> None:
         points.reshape(-1, 1, 3),
         np.zeros(3),
         np.zeros(3),
-        camera_matrix(*data["intrinsics"]),
+        make_camera_matrix(*data["intrinsics"]),
         np.array(data["distortion_coeffs"]),
     )
     distances_px = np.linalg.norm(expected_pixels.reshape(-1, 2) - pixels, axis=1)
@@ -281,7 +288,7 @@ def test_equidistant_lens_projects_like_opencv_fisheye(tmp_path: Path) -> None:
 
 def test_fisheye_with_up_to_two_coefficients_is_exact_beyond_90_degrees() -> None:
     """Without coefficients the model of Kannala and Brandt is theta = r / f."""
-    matrix, size = camera_matrix(300.0, 300.0, 499.5, 499.5), (1000, 1000)
+    matrix, size = make_camera_matrix(300.0, 300.0, 499.5, 499.5), (1000, 1000)
     camera, residual = from_opencv_fisheye(matrix, np.zeros(4), size)
     assert residual.max_px < 1e-9
     corner = camera.rays(np.array([-0.5, -0.5]))[1]
@@ -292,7 +299,7 @@ def test_fisheye_with_up_to_two_coefficients_is_exact_beyond_90_degrees() -> Non
 
 def test_fisheye_pose_is_applied() -> None:
     pose = RigidTransform.from_components([0.1, -0.2, 0.3], Rotation.from_rotvec([0.2, -0.1, 0.4]))
-    matrix, size = camera_matrix(300.0, 310.0, 320.0, 240.0), (640, 480)
+    matrix, size = make_camera_matrix(300.0, 310.0, 320.0, 240.0), (640, 480)
     camera, _ = from_opencv_fisheye(matrix, np.array([0.01, -0.002, 0.0, 0.0]), size, pose)
     point = pose.inv().apply([0.3, -0.2, 1.0])
     expected_pixels, _ = cv2.fisheye.projectPoints(

@@ -26,7 +26,7 @@ def draw_transforms(draw: st.DrawFn) -> RigidTransform:
 
 
 def make_points(camera: CameraModel) -> np.ndarray:
-    """Return points over the complete frame at a distance of 4 m."""
+    """Return a grid of points over the complete frame, at a distance of 4 m from the camera."""
     origins, directions = camera.rays(camera.pixel_grid()[::100, ::100])
     return np.asarray(origins + 4 * directions)
 
@@ -124,10 +124,10 @@ def test_cropping_and_binning_commute(column: int, row: int, columns: int, rows:
 
 
 def test_changes_preserve_the_lens(hazcam: Cahvore) -> None:
-    changed = hazcam.crop(1, 2, (512, 256)).bin(2, 2).scale(3)
+    changed_camera = hazcam.crop(1, 2, (512, 256)).bin(2, 2).scale(3)
     for name in "caore":
-        assert np.array_equal(getattr(changed, name), getattr(hazcam, name))
-    assert changed.linearity == hazcam.linearity
+        assert np.array_equal(getattr(changed_camera, name), getattr(hazcam, name))
+    assert changed_camera.linearity == hazcam.linearity
 
 
 def test_invalid_changes_are_rejected(navcam: Cahvor) -> None:
@@ -258,18 +258,18 @@ def test_cameras_copy_their_arrays(navcam: Cahvor) -> None:
 
 def copy_by_pickle(camera: CameraModel) -> CameraModel:
     """Return the camera as a worker process receives it."""
-    copied: CameraModel = pickle.loads(pickle.dumps(camera))  # noqa: S301
-    return copied
+    camera_copy: CameraModel = pickle.loads(pickle.dumps(camera))  # noqa: S301
+    return camera_copy
 
 
 @pytest.mark.parametrize("copy_camera", [copy.copy, copy.deepcopy, copy_by_pickle])
 def test_copies_are_equal_and_immutable(camera: CameraModel, copy_camera: Callable[[CameraModel], CameraModel]) -> None:
     camera.rays(np.zeros(2))  # Fills the cache of the camera.
-    copied = copy_camera(camera)
-    assert copied == camera
-    assert hash(copied) == hash(camera)
-    assert not copied.c.flags.writeable
-    assert copied in {camera}
+    camera_copy = copy_camera(camera)
+    assert camera_copy == camera
+    assert hash(camera_copy) == hash(camera)
+    assert not camera_copy.c.flags.writeable
+    assert camera_copy in {camera}
 
 
 def test_different_cameras_differ(navcam: Cahvor, pinhole: Cahv) -> None:

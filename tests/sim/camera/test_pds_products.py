@@ -1,4 +1,4 @@
-"""Tests of reading images and poses of PDS3 products, from Opportunity and synthetic."""
+"""Tests of reading images and poses from PDS3 products of Opportunity and from synthetic products."""
 
 from __future__ import annotations
 

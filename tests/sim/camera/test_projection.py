@@ -31,6 +31,7 @@ def cahv_cameras(draw: st.DrawFn) -> Cahv:
 
 
 def tilt_axis(axis: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+    """Add a small vector to an axis and normalise the sum."""
     tilted = axis + tilt
     return np.asarray(tilted / np.linalg.norm(tilted))
 
@@ -187,8 +188,8 @@ def test_projection_of_real_cameras_matches_cmod(navcam: Cahvor, hazcam: Cahvore
         origins, directions = camera.rays(camera.pixel_grid()[::93, ::93].reshape(-1, 2))
         points = origins + 5 * directions
         expected = np.array([project_with_cmod(camera, point) for point in points])
-        # cmod uses O as labelled, with a length error of 1e-6: 2e-6 of omega in lambda. For f = 1223 px and mu up to
-        # 0.03 this is 1e-4 px.
+        # cmod uses O as labelled, whose length has an error of 1e-6. This causes an error of 2e-6 omega in lambda:
+        # 1e-4 px for f = 1223 px and mu up to 0.03.
         assert np.max(np.abs(camera.project(points)[0] - expected)) < 2e-4
 
 
@@ -219,7 +220,7 @@ def test_projection_centre_and_nan_are_not_visible(camera: CameraModel) -> None:
 
 
 def make_folding_camera() -> Cahvor:
-    """Return a camera with the distortion chi - 0.2 chi^3.
+    """Return a camera with the distortion chi - 0.2 chi^3, where chi is the tangent of the angle to the axis.
 
     It increases up to chi^2 = 1 / 0.6, with the value (2 / 3) sqrt(1 / 0.6).
     """
@@ -250,7 +251,7 @@ def test_pixels_beyond_distortion_range_have_no_ray() -> None:
     "r", [(0.0, -0.2, 0.0), (0.0, 0.3, -0.05), (0.0, -0.3, 0.06), (-0.5, 0.0, 0.0), (0.1, 2.0, 3.0)]
 )
 def test_rays_exist_up_to_the_distortion_limit(r: tuple[float, float, float]) -> None:
-    """Polynomials with an inflection are included: there an unbounded Newton iteration would leave the valid range."""
+    """Some polynomials have an inflection, where an unbounded Newton iteration would leave the valid range."""
     cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
     camera = Cahvor.from_cahv(cahv, r=r)
     chi = np.concatenate([np.geomspace(1e-9, 1e-3, 30), np.linspace(0.002, 8, 2000)])
@@ -293,7 +294,8 @@ def test_cahvore_with_linearity_one_equals_cahvor(navcam: Cahvor) -> None:
 # ----- the Jacobian -----
 
 
-def numerical_jacobian(camera: CameraModel, points: np.ndarray, step: float) -> np.ndarray:
+def compute_numerical_jacobian(camera: CameraModel, points: np.ndarray, step: float) -> np.ndarray:
+    """Compute the Jacobian of the projection by fourth-order central differences."""
     columns = []
     for axis in np.eye(3):
         plus, minus = (camera.project(points + sign * step * axis)[0] for sign in (1, -1))
@@ -309,14 +311,14 @@ def test_jacobian_of_real_cameras_matches_finite_differences(camera: CameraModel
     # Fourth-order differences with 1 mm at 3 m, slopes of 400 px/m: relative truncation (3e-4)^4, rounding of
     # 1e-12 px / 1e-3 m = 1e-9 px/m.
     assert analytic.shape == (*points.shape[:-1], 2, 3)
-    assert np.max(np.abs(analytic - numerical_jacobian(camera, points, 1e-3))) < 1e-7
+    assert np.max(np.abs(analytic - compute_numerical_jacobian(camera, points, 1e-3))) < 1e-7
 
 
 def test_jacobian_on_the_optical_axis_matches_finite_differences(navcam: Cahvor, hazcam: Cahvore) -> None:
     for camera in (navcam, hazcam):
         axis = camera.o / np.linalg.norm(camera.o)
         points = camera.c + 3 * axis + np.array([[0.0, 0.0, 0.0], [1e-12, 0, 0], [1e-7, 0, 1e-7]])
-        difference = camera.projection_jacobian(points) - numerical_jacobian(camera, points, 1e-3)
+        difference = camera.projection_jacobian(points) - compute_numerical_jacobian(camera, points, 1e-3)
         assert np.max(np.abs(difference)) < 1e-7
 
 
@@ -327,11 +329,12 @@ def test_jacobian_of_random_cameras_matches_finite_differences(
     origins, directions = camera.rays(pixels_from_fractions(camera, uv))
     points = origins + distance_m * directions
     analytic = camera.projection_jacobian(points)
-    numerical = numerical_jacobian(camera, points, 1e-4 * distance_m)
+    numerical = compute_numerical_jacobian(camera, points, 1e-4 * distance_m)
     is_valid = np.isfinite(numerical)  # Difference points may be outside the valid range.
-    size = np.linalg.norm(np.where(np.isfinite(analytic), analytic, 0), axis=(-2, -1), keepdims=True)
-    # Rounding of points 5000 m away: 1e-12 m / (1e-4 * 5 m) = 2e-9 of the slope; truncation adds to it near a limit.
-    assert np.all((np.abs(analytic - numerical) <= 2e-5 * size + 1e-7)[is_valid])
+    norm = np.linalg.norm(np.where(np.isfinite(analytic), analytic, 0), axis=(-2, -1), keepdims=True)
+    # Rounding of points 5000 m away: 1e-12 m / (1e-4 * 5 m) = 2e-9 of the slope. Near a limit the truncation error
+    # is larger.
+    assert np.all((np.abs(analytic - numerical) <= 2e-5 * norm + 1e-7)[is_valid])
 
 
 # ----- shapes -----

@@ -15,10 +15,10 @@ def make_flight(**changes: object) -> HelicopterFlight:
     return draw_helicopter_flight(parameters, ORIGIN, np.radians(70.0), 9.8, np.random.default_rng(7))
 
 
-@pytest.mark.parametrize("turns", [False, True])
-def test_velocity_rate_and_force_are_derivatives(turns: bool) -> None:
+@pytest.mark.parametrize("turns_with_flight", [False, True])
+def test_velocity_rate_and_force_are_derivatives(turns_with_flight: bool) -> None:
     """The truncation error of central differences over 0.4 ms is below 1e-6 m/s for the vibration of 13 Hz."""
-    flight, step = make_flight(turns_with_flight=turns), 2e-4
+    flight, step = make_flight(turns_with_flight=turns_with_flight), 2e-4
     times = np.linspace(-40.0, 2440.0, 400)
     before, motion, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
     velocity = (after.positions_m - before.positions_m) / (2.0 * step)

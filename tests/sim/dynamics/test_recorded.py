@@ -84,7 +84,7 @@ def _record_motion(spacing_s: float) -> RecordedMotion:
     return RecordedMotion(times, truth.positions_m, truth.attitudes, GRAVITY)
 
 
-def _max_spline_errors(spacing_s: float) -> dict[str, float]:
+def _compute_max_spline_errors(spacing_s: float) -> dict[str, float]:
     motion, times_s = _record_motion(spacing_s), np.linspace(1.0, 9.0, 501)
     actual, expected = motion.motion(times_s), _make_swaying_motion().motion(times_s)
     return {
@@ -97,12 +97,12 @@ def _max_spline_errors(spacing_s: float) -> dict[str, float]:
 
 
 def test_splines_converge_to_closed_form_motion() -> None:
-    """Errors of cubic splines are of order h^4 in value, h^3 in slope and h^2 in curvature.
+    """Errors of cubic splines with the step h are of order h^4 in value, h^3 in slope and h^2 in curvature.
 
-    Half the step h reduces them by factors of 16, 8 and 4.
+    Half the step reduces them by factors of 16, 8 and 4.
     """
     assert isinstance(_record_motion(0.1), Trajectory)
-    coarse, fine = _max_spline_errors(0.1), _max_spline_errors(0.05)
+    coarse, fine = _compute_max_spline_errors(0.1), _compute_max_spline_errors(0.05)
     for name, order in (("position", 4), ("velocity", 3), ("attitude", 4), ("rate", 3), ("force", 2)):
         assert fine[name] < coarse[name] / 2 ** (order - 0.5), name
     assert fine["position"] < 1e-5
@@ -120,17 +120,21 @@ def test_rates_and_forces_are_spline_derivatives() -> None:
         * _make_swaying_motion().motion(knots_s).attitudes
     )
     positions = _make_swaying_motion().motion(knots_s).positions_m + 0.1 * rng.standard_normal((knots_s.size, 3))
-    motion, times_s, h = RecordedMotion(knots_s, positions, noisy_attitudes, GRAVITY), np.linspace(0.5, 2.5, 57), 1e-5
-    before, centre, after = motion.motion(times_s - h), motion.motion(times_s), motion.motion(times_s + h)
-    assert np.allclose((after.positions_m - before.positions_m) / (2 * h), centre.velocities_m_s, atol=1e-4)
-    acceleration = (after.velocities_m_s - before.velocities_m_s) / (2 * h)
+    motion, times_s, step_s = (
+        RecordedMotion(knots_s, positions, noisy_attitudes, GRAVITY),
+        np.linspace(0.5, 2.5, 57),
+        1e-5,
+    )
+    before, centre, after = motion.motion(times_s - step_s), motion.motion(times_s), motion.motion(times_s + step_s)
+    assert np.allclose((after.positions_m - before.positions_m) / (2 * step_s), centre.velocities_m_s, atol=1e-4)
+    acceleration = (after.velocities_m_s - before.velocities_m_s) / (2 * step_s)
     assert np.allclose(
         centre.attitudes.apply(centre.specific_forces_m_s2),
         acceleration + np.array([0.0, 0.0, GRAVITY]),
         rtol=1e-4,
         atol=1e-2,
     )
-    body_rates = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2 * h)
+    body_rates = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2 * step_s)
     assert np.allclose(body_rates, centre.body_rates_rad_s, atol=1e-4)
 
 
@@ -145,7 +149,7 @@ def test_pandas_tables_are_read(tmp_path: Path) -> None:
         assert np.allclose(poses.positions_m, truth.positions_m, rtol=0, atol=1e-9)
         difference = Rotation.from_quat(poses.quaternions).inv() * truth.attitudes
         assert difference.magnitude().max() < 1e-9
-    # A file is read once; another file has another hash.
+    # A file is read only once. Different files have different hashes.
     assert read_poses(tmp_path / "poses.csv") is read_poses(tmp_path / "poses.csv")
     assert read_poses(tmp_path / "poses.csv").sha256 != read_poses(tmp_path / "poses.parquet").sha256
 

@@ -69,7 +69,7 @@ def test_air_shorter_than_the_flight_is_rejected() -> None:
         _fly_transit(air)
 
 
-def _touchdown_position(flight: RotorcraftFlight) -> np.ndarray:
+def _find_touchdown(flight: RotorcraftFlight) -> np.ndarray:
     time = flight.phase_start_s(Phase.ON_GROUND)
     assert time is not None
     return flight.path.state(time).position_m
@@ -103,7 +103,7 @@ def test_specific_force_is_rotor_thrust_plus_drag() -> None:
 
 
 def test_pitch_balances_drag_and_wind() -> None:
-    """In steady flight tan(pitch) is drag divided by weight; drag is proportional to the airspeed along the course."""
+    """In steady flight tan(pitch) is drag divided by weight; the drag per mass is the airspeed divided by 5 s."""
     for wind in (0.0, -3.0):
         air = CALM | {"east_m_s": wind * np.cos(COURSE), "north_m_s": wind * np.sin(COURSE)}
         flight = simulate_transit(
@@ -145,15 +145,15 @@ def test_vibration_has_the_specified_frequency() -> None:
 
 
 def test_calm_air_landing_error_equals_navigation_error() -> None:
-    exact = _touchdown_position(_fly_landing(**CALM))
-    np.testing.assert_allclose(exact[:2], SITE_XY, atol=0.02)
-    with_error = _touchdown_position(_fly_landing(east_error_m=0.7, **CALM))
+    without_error = _find_touchdown(_fly_landing(**CALM))
+    np.testing.assert_allclose(without_error[:2], SITE_XY, atol=0.02)
+    with_error = _find_touchdown(_fly_landing(east_error_m=0.7, **CALM))
     np.testing.assert_allclose(with_error[:2], SITE_XY - [0.7, 0.0], atol=0.02)
 
 
 def test_touchdown_error_is_proportional_to_gusts() -> None:
     def rms_error(gust_m_s: float) -> float:
-        errors = [_touchdown_position(_fly_landing(seed, gust_m_s=gust_m_s))[:2] - SITE_XY for seed in range(25)]
+        errors = [_find_touchdown(_fly_landing(seed, gust_m_s=gust_m_s))[:2] - SITE_XY for seed in range(25)]
         return float(np.sqrt(np.mean(np.square(errors))))
 
     # Without saturation, doubled gusts double the errors. The standard error of an RMS of 50 values is 10 %.
@@ -161,6 +161,7 @@ def test_touchdown_error_is_proportional_to_gusts() -> None:
 
 
 def test_phases_start_at_the_heights_of_the_paper() -> None:
+    # The ground height is 2 m + 0.1 times the distance east of the site.
     flight = _fly_landing(slope=0.1, craft=SMOOTH, **CALM)
     state = {phase: flight.path.state(time) for phase in Phase if (time := flight.phase_start_s(phase)) is not None}
     assert list(state) == list(Phase)
@@ -169,15 +170,15 @@ def test_phases_start_at_the_heights_of_the_paper() -> None:
     assert np.hypot(*(state[Phase.DESCENT].position_m[:2] - SITE_XY)) == pytest.approx(2.0, abs=0.25)
     flare_start = state[Phase.FLARE].position_m
     assert flare_start[2] - 2.0 - 0.1 * (flare_start[0] - SITE_XY[0]) == pytest.approx(1.5, abs=0.1)
-    landed = state[Phase.ON_GROUND]
-    assert landed.position_m[2] - 2.0 - 0.1 * (landed.position_m[0] - SITE_XY[0]) == pytest.approx(
+    touchdown = state[Phase.ON_GROUND]
+    assert touchdown.position_m[2] - 2.0 - 0.1 * (touchdown.position_m[0] - SITE_XY[0]) == pytest.approx(
         CRAFT.gear_m, abs=0.01
     )
-    assert landed.velocity_m_s[2] == pytest.approx(-GUIDANCE.flare_m_s, abs=0.05)
+    assert touchdown.velocity_m_s[2] == pytest.approx(-GUIDANCE.flare_m_s, abs=0.05)
     at_rest = flight.path.state(flight.path.span_s[1])
     np.testing.assert_allclose(at_rest.velocity_m_s, 0.0, atol=1e-9)
     np.testing.assert_allclose(at_rest.attitude.as_matrix()[:, 2], [0.0, 0.0, 1.0], atol=1e-9)
-    assert at_rest.time_s - landed.time_s == pytest.approx(GUIDANCE.rest_s, abs=0.05)
+    assert at_rest.time_s - touchdown.time_s == pytest.approx(GUIDANCE.rest_s, abs=0.05)
 
 
 def test_stuck_altimeter_prevents_deceleration() -> None:

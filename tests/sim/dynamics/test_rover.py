@@ -64,7 +64,8 @@ def test_chassis_pitch_is_the_mean_of_the_rocker_angles() -> None:
 
 
 def test_block_under_the_middle_wheel_rotates_the_bogie() -> None:
-    # The bogie pivot rises by the height of the block times its distance from the rear wheel / bogie wheelbase.
+    # The bogie pivot rises by the height of the block times its distance from the rear wheel / bogie wheelbase. The
+    # angle of a bogie is relative to its rocker, which rotates with the nose.
     block_m = 0.06
     stance = settle(MER, Mounds(((0.0, 0.61, block_m), (0.0, -0.61, block_m))), 0.0, 0.0, EAST)
     pivot_rise_m = block_m * (MER.rear_m + MER.bogie_pivot_x_m) / MER.rear_m
@@ -135,9 +136,9 @@ def test_rock_of_a_field_lifts_the_wheel() -> None:
 
 def test_stance_does_not_depend_on_initial_guess() -> None:
     ground = Mounds(((0.705, 0.53, 0.1), (-0.705, -0.53, 0.05)))
-    default = settle(MER, ground, 0.0, 0.0, EAST)
+    default_stance = settle(MER, ground, 0.0, 0.0, EAST)
     stance = settle(MER, ground, 0.0, 0.0, EAST, initial=settle(MER, uphill_east(5.0), 0.1, 0.0, EAST))
-    assert stance.world_from_rover.as_matrix() == pytest.approx(default.world_from_rover.as_matrix(), abs=1e-8)
+    assert stance.world_from_rover.as_matrix() == pytest.approx(default_stance.world_from_rover.as_matrix(), abs=1e-8)
 
 
 def test_pivots_must_lie_between_their_wheels() -> None:

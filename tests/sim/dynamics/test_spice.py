@@ -102,7 +102,9 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
         spiceypy.spkcls(spk)
         ticks = [spiceypy.sce2c(LANDER, begin + time) for time in times]
         # C matrices transform vectors from J2000 to camera axes; SPICE quaternions have the scalar first.
-        quaternions = [spiceypy.m2q(np.ascontiguousarray((rotation @ a.as_matrix()).T)) for a in attitudes]
+        quaternions = [
+            spiceypy.m2q(np.ascontiguousarray((rotation @ attitude.as_matrix()).T)) for attitude in attitudes
+        ]
         ck = spiceypy.ckopn(str(folder / "lander.bc"), "descent", 0)
         rates = np.zeros((len(times), 3))
         tick_span = (ticks[0], ticks[-1])
@@ -123,20 +125,20 @@ def test_kernels_reproduce_the_flight(kernels: Path) -> None:
 
 
 def test_kernel_pool_is_restored(kernels: Path) -> None:
-    loaded_count = spiceypy.ktotal("ALL")
+    kernel_count = spiceypy.ktotal("ALL")
     read_poses(kernels / "flight.spice.toml")
-    assert spiceypy.ktotal("ALL") == loaded_count
+    assert spiceypy.ktotal("ALL") == kernel_count
 
 
 def test_hash_covers_all_kernels(kernels: Path, tmp_path: Path) -> None:
     copy = tmp_path / "kernels"
     shutil.copytree(kernels, copy)
     assert read_poses(copy / "flight.spice.toml").sha256 == read_poses(kernels / "flight.spice.toml").sha256
-    changed = tmp_path / "others"
-    shutil.copytree(kernels, changed)
-    with (changed / "site.tf").open("a") as file:
+    changed_copy = tmp_path / "others"
+    shutil.copytree(kernels, changed_copy)
+    with (changed_copy / "site.tf").open("a") as file:
         file.write("\\begintext\nanother remark\n")
-    assert read_poses(changed / "flight.spice.toml").sha256 != read_poses(kernels / "flight.spice.toml").sha256
+    assert read_poses(changed_copy / "flight.spice.toml").sha256 != read_poses(kernels / "flight.spice.toml").sha256
 
 
 @pytest.mark.parametrize(

@@ -32,11 +32,11 @@ def test_wind_without_gusts_is_the_mean_wind() -> None:
     np.testing.assert_allclose(wind.without_gusts.velocities(heights)[:, 0], 20.0)
 
 
-def _structure_function(spectrum: str, lag_m: float, length_m: float) -> float:
+def _compute_structure_function(spectrum: str, lag_m: float, length_m: float) -> float:
     """Compute the mean squared difference over a lag for unit variance, from the band-limited Dryden spectrum."""
 
     def density(k: float) -> float:
-        """Compute the spectral density at wavenumber k, rad/m, not normalised."""
+        """Compute the spectral density at wavenumber k, rad/m, with an arbitrary factor; x is length times k."""
         x2 = (length_m * k) ** 2
         return 2.0 / (1.0 + x2) if spectrum == "longitudinal" else (1.0 + 3.0 * x2) / (1.0 + x2) ** 2
 
@@ -55,8 +55,8 @@ def test_gusts_have_dryden_spectra(lag_m: float) -> None:
     tolerance = 4.0 * np.sqrt(2.0 / n_draws)
     np.testing.assert_allclose(velocities_m_s[:, 0].var(axis=0), 4.0, rtol=tolerance)
     structure = np.mean((velocities_m_s[:, 1] - velocities_m_s[:, 0]) ** 2, axis=0) / 4.0
-    np.testing.assert_allclose(structure[:2], _structure_function("transverse", lag_m, 533.0), rtol=tolerance)
-    np.testing.assert_allclose(structure[2], _structure_function("longitudinal", lag_m, 533.0), rtol=tolerance)
+    np.testing.assert_allclose(structure[:2], _compute_structure_function("transverse", lag_m, 533.0), rtol=tolerance)
+    np.testing.assert_allclose(structure[2], _compute_structure_function("longitudinal", lag_m, 533.0), rtol=tolerance)
 
 
 def test_components_are_independent() -> None:

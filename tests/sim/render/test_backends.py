@@ -48,7 +48,7 @@ def _render_in_process(backend: str, folder: Path) -> dict[str, np.ndarray]:
     except OSError:
         pytest.skip(f"{LIBRARIES[backend]} is not installed: {backend} cannot be compared")
     path = folder / f"{backend}.npz"
-    environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
+    environment = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
     subprocess.run([sys.executable, "-c", SCRIPT, backend, str(path)], check=True, env=environment, timeout=120)
     return dict(np.load(path))
 
@@ -58,8 +58,8 @@ def test_osmesa_and_egl_render_equal_images(tmp_path: Path) -> None:
     # At crests a rounding difference in depth can select the near or the far side.
     assert np.mean(np.abs(egl["distance"] / osmesa["distance"] - 1.0) < 1e-6) > 0.999
     assert np.mean(np.abs(egl["radiance"] / osmesa["radiance"] - 1.0) < 1e-4) > 0.999
-    # With depth samples off the pixel centre (EGL multisampling), depths would differ by the slope times a quarter of a
-    # pixel: several tenths of a metre.
+    # With EGL multisampling the depth is sampled off the pixel centre. Depths would then differ by the slope times a
+    # quarter of a pixel: several tenths of a metre.
     assert np.abs(egl["depth"] - osmesa["depth"]).mean() < 1e-3
 
 
@@ -69,14 +69,14 @@ def test_unknown_backend_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         default_backend()
 
 
-@pytest.mark.parametrize(("installed", "expected"), [(("OSMesa", "EGL"), "osmesa"), (("EGL",), "egl"), ((), "osmesa")])
-def test_default_backend_is_installed(
-    monkeypatch: pytest.MonkeyPatch, installed: tuple[str, ...], expected: str
+@pytest.mark.parametrize(("libraries", "expected"), [(("OSMesa", "EGL"), "osmesa"), (("EGL",), "egl"), ((), "osmesa")])
+def test_default_backend_is_egl_only_without_osmesa(
+    monkeypatch: pytest.MonkeyPatch, libraries: tuple[str, ...], expected: str
 ) -> None:
     from marsyard.sim.render import backend
 
     monkeypatch.delenv("MARSYARD_GL", raising=False)
-    monkeypatch.setattr(backend, "find_library", lambda name: f"lib{name}.so" if name in installed else None)
+    monkeypatch.setattr(backend, "find_library", lambda name: f"lib{name}.so" if name in libraries else None)
     assert backend.default_backend() == expected
 
 
@@ -90,17 +90,21 @@ def _make_depth_view(height_m: float) -> tuple[np.ndarray, float, float, float]:
 def test_load_replaces_the_previous_geometry() -> None:
     """Depths of level ground and of a triangle above its centre are exact, for any load order.
 
-    The drawn number of a triangle is its object number plus 1; the number of ground is 0.
+    The rendered number of a triangle is its object number plus 1; the number of ground is 0.
     """
     corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0], [-30.0, 30.0, 0.0]])
     ground = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
-    above = np.array([[[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]]])
+    triangle = np.array([[[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]]])
     renderer = DepthRenderer(64, default_backend())
     with pytest.raises(RenderingError, match="no mesh"):
         renderer.draw(*_make_depth_view(20.0))
     no_triangles = (np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
-    for loaded, number in (((above, np.array([70000])), 70001), (no_triangles, 0), ((above, np.array([5])), 6)):
-        renderer.load(ground, *loaded)
+    for triangles, number in (
+        ((triangle, np.array([70000])), 70001),
+        (no_triangles, 0),
+        ((triangle, np.array([5])), 6),
+    ):
+        renderer.load(ground, *triangles)
         for height in (20.0, 10.0):
             depth, numbers = renderer.draw(*_make_depth_view(height))
             # The tolerance is the resolution of a 24-bit depth between 1 and 100 m.

@@ -59,10 +59,10 @@ def test_direct_sunlight_is_attenuated_by_the_optical_depth(
     layer = _make_layer(cover=0.4, optical_depth=1.0, edge_m=10.0)
     frame = _render_from_above(renderer, _make_scene(layer), descent_camera(128))
     elevation = np.radians(50.0)
-    clear = ALBEDO * np.sin(elevation)
-    scattered = layer.parameters.sky_light(SUN) * ALBEDO
-    assert frame.radiance.max() == pytest.approx(clear + scattered, rel=1e-4)
-    assert frame.radiance.min() == pytest.approx(clear * np.exp(-1.0 / np.sin(elevation)) + scattered, rel=1e-3)
+    sunlight = ALBEDO * np.sin(elevation)
+    skylight = layer.parameters.sky_light(SUN) * ALBEDO
+    assert frame.radiance.max() == pytest.approx(sunlight + skylight, rel=1e-4)
+    assert frame.radiance.min() == pytest.approx(sunlight * np.exp(-1.0 / np.sin(elevation)) + skylight, rel=1e-3)
 
 
 def test_rendered_transmittance_equals_truth(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
@@ -95,19 +95,19 @@ def test_zero_cover_is_bitwise_equal_to_no_clouds(
 ) -> None:
     camera = PixelRays.of(descent_camera(128))
     pose = rigid(Rotation.identity(), np.array([380.0, 200.0, 900.0]))
-    clear = Scene(terrain, (380.0, 200.0), SUN, Photometry())
-    zero_cover = replace(clear, clouds=_make_layer(cover=0.0))
+    clear_scene = Scene(terrain, (380.0, 200.0), SUN, Photometry())
+    zero_cover_scene = replace(clear_scene, clouds=_make_layer(cover=0.0))
     assert (
-        renderer.render(clear, camera, pose).radiance.tobytes()
-        == renderer.render(zero_cover, camera, pose, 40.0).radiance.tobytes()
+        renderer.render(clear_scene, camera, pose).radiance.tobytes()
+        == renderer.render(zero_cover_scene, camera, pose, 40.0).radiance.tobytes()
     )
 
 
 def test_scattered_light_does_not_exceed_the_removed_light() -> None:
     for depth in (0.0, 0.5, 5.0, 50.0):
         parameters = CloudParameters(optical_depth=depth, cover=0.4)
-        removed = 0.4 * (1.0 - parameters.direct_transmittance(SUN)) * SUN.direction[2]
-        assert 0.0 <= parameters.sky_light(SUN) <= removed
+        removed_light = 0.4 * (1.0 - parameters.direct_transmittance(SUN)) * SUN.direction[2]
+        assert 0.0 <= parameters.sky_light(SUN) <= removed_light
     assert CloudParameters(optical_depth=0.0).sky_light(SUN) == 0.0
 
 

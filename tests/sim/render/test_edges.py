@@ -91,34 +91,34 @@ def test_nearest_triangle_equals_exhaustive_search(rocky_view: View) -> None:
     np.testing.assert_allclose(result, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("side", "fraction"), [(2, 0.5), (3, 0.4)])
+@pytest.mark.parametrize(("side", "max_error_ratio"), [(2, 0.5), (3, 0.4)])
 def test_outlines_match_256_rays_per_pixel(
-    renderer: Renderer, rocky_view: View, reference: np.ndarray, side: int, fraction: float
+    renderer: Renderer, rocky_view: View, reference: np.ndarray, side: int, max_error_ratio: float
 ) -> None:
     one_ray_view = replace(rocky_view, scene=replace(rocky_view.scene, edge_rays=1))
     rays = rocky_view.rays(rocky_view.camera)
     single_ray = renderer.render(one_ray_view.scene, rays, rocky_view.world_from_body)
-    antialiased = renderer.render(replace(rocky_view.scene, edge_rays=side), rays, rocky_view.world_from_body)
+    multiple_rays = renderer.render(replace(rocky_view.scene, edge_rays=side), rays, rocky_view.world_from_body)
     edges = edge_pixels(single_ray.radiance, single_ray.range_m, single_ray.body)
     assert 500 < edges.size < 0.2 * single_ray.radiance.size
 
-    def error(radiance: np.ndarray) -> float:
+    def compute_error(radiance: np.ndarray) -> float:
         return float(np.sqrt(np.mean((radiance - reference).ravel()[edges] ** 2)) / reference.mean())
 
-    assert error(antialiased.radiance) < fraction * error(single_ray.radiance)
+    assert compute_error(multiple_rays.radiance) < max_error_ratio * compute_error(single_ray.radiance)
     # The mean brightness at outlines is unbiased.
-    mean_error = (antialiased.radiance - reference).ravel()[edges].mean() / reference.mean()
-    assert abs(mean_error) < 0.1 * error(single_ray.radiance)
+    mean_error = (multiple_rays.radiance - reference).ravel()[edges].mean() / reference.mean()
+    assert abs(mean_error) < 0.1 * compute_error(single_ray.radiance)
 
 
 def test_truth_is_at_pixel_centres(renderer: Renderer, rocky_view: View) -> None:
     rays = rocky_view.rays(rocky_view.camera)
     single_ray = renderer.render(replace(rocky_view.scene, edge_rays=1), rays, rocky_view.world_from_body)
-    antialiased = renderer.render(rocky_view.scene, rays, rocky_view.world_from_body)
+    multiple_rays = renderer.render(rocky_view.scene, rays, rocky_view.world_from_body)
     for layer in ("range_m", "body", "normal"):
-        assert getattr(single_ray, layer).tobytes() == getattr(antialiased, layer).tobytes()
-    changed = np.flatnonzero(single_ray.radiance.ravel() != antialiased.radiance.ravel())
-    assert np.isin(changed, edge_pixels(single_ray.radiance, single_ray.range_m, single_ray.body)).all()
+        assert getattr(single_ray, layer).tobytes() == getattr(multiple_rays, layer).tobytes()
+    changed_pixels = np.flatnonzero(single_ray.radiance.ravel() != multiple_rays.radiance.ravel())
+    assert np.isin(changed_pixels, edge_pixels(single_ray.radiance, single_ray.range_m, single_ray.body)).all()
 
 
 def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
@@ -137,8 +137,8 @@ def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
     # The last row, 63, ends at 63.5.
     expected = 63.5 - np.interp(np.arange(128), *border[np.argsort(border[:, 0])].T)
     errors = []
-    for count in (1, 3):
-        frame = renderer.render(replace(scene, edge_rays=count), PixelRays.of(camera), pose)
+    for edge_rays in (1, 3):
+        frame = renderer.render(replace(scene, edge_rays=edge_rays), PixelRays.of(camera), pose)
         ground, sky = frame.radiance[-1].mean(), frame.radiance[0].mean()
         fraction = ((frame.radiance - sky) / (ground - sky)).sum(axis=0)
         errors.append(float(np.sqrt(np.mean((fraction - expected) ** 2))))

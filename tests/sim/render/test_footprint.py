@@ -18,13 +18,13 @@ ROCKY = TerrainParameters(samples=512, spacing_m=3.0, rocks=RockParameters(abund
 
 
 def _is_inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether the footprint marks the cells of the positions (m)."""
+    """Return whether the footprint marks the cells of the positions (m)."""
     cells, west, south, per_metre = footprint
     column = np.floor((x - west) * per_metre).astype(int)
     row = np.floor((y - south) * per_metre).astype(int)
-    inside = (column >= 0) & (column < cells.shape[1]) & (row >= 0) & (row < cells.shape[0])
+    is_in_grid = (column >= 0) & (column < cells.shape[1]) & (row >= 0) & (row < cells.shape[0])
     is_shaded = np.zeros(x.shape, dtype=bool)
-    is_shaded[inside] = cells[row[inside], column[inside]]
+    is_shaded[is_in_grid] = cells[row[is_in_grid], column[is_in_grid]]
     return is_shaded
 
 
@@ -63,11 +63,11 @@ def test_footprint_does_not_change_images() -> None:
     pose = nadir_pose(ground.surface, 300.0, 200.0, 400.0)
     scene = site_scene(ground, Eye.of(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
     assert len(scene.objects) > 50
-    limited = process_renderer(default_backend()).render(scene, rays, pose)
-    unlimited = replace(scene)
-    unlimited.__dict__["footprint"] = ALL_GROUND
-    full = process_renderer(default_backend()).render(unlimited, rays, pose)
-    np.testing.assert_array_equal(limited.radiance, full.radiance)
+    frame = process_renderer(default_backend()).render(scene, rays, pose)
+    full_scene = replace(scene)
+    full_scene.__dict__["footprint"] = ALL_GROUND
+    full_frame = process_renderer(default_backend()).render(full_scene, rays, pose)
+    np.testing.assert_array_equal(frame.radiance, full_frame.radiance)
     assert not scene.footprint.cells.all()
 
 
@@ -90,5 +90,5 @@ def test_culling_does_not_change_images(elevation: float) -> None:
         np.testing.assert_array_equal(subset.radiance, full.radiance)
         np.testing.assert_array_equal(subset.range_m, full.range_m)
         # Culling keeps the spheres of the remaining objects.
-        recomputed = Objects(**{name: getattr(visible_scene.objects, name) for name in Objects.__dataclass_fields__})
-        np.testing.assert_array_equal(visible_scene.objects.spheres, recomputed.spheres)
+        new_objects = Objects(**{name: getattr(visible_scene.objects, name) for name in Objects.__dataclass_fields__})
+        np.testing.assert_array_equal(visible_scene.objects.spheres, new_objects.spheres)

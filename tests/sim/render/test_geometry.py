@@ -20,10 +20,10 @@ from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
-#: Ground whose brightness equals its albedo from any direction.
+#: Lambert reflectance: under the overhead sun, the radiance factor of level ground equals its albedo.
 ALBEDO_ONLY = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
 #: Tilted by 25 deg and rolled.
-TILTED = Rotation.from_euler("zxy", [30.0, 20.0, 15.0], degrees=True)
+ATTITUDE = Rotation.from_euler("zxy", [30.0, 20.0, 15.0], degrees=True)
 STRONG_DISTORTION = (0.01, -0.25, 0.08)
 
 
@@ -46,7 +46,7 @@ def _make_spotted_plane(height_m: float) -> tuple[Surface, np.ndarray]:
     return Surface.from_samples(samples, spacing), spots
 
 
-def _centroid(radiance: np.ndarray, position: np.ndarray) -> np.ndarray:
+def _compute_centroid(radiance: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Compute the centroid (column, row) of brightness above the background within 8 pixels of a position."""
     u0, v0 = np.rint(position).astype(int)
     patch = radiance[v0 - 8 : v0 + 9, u0 - 8 : u0 + 9].astype(np.float64)
@@ -56,7 +56,7 @@ def _centroid(radiance: np.ndarray, position: np.ndarray) -> np.ndarray:
     return np.asarray(np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum())
 
 
-def _expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
+def _compute_expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
     """Compute the centroid of a spot's image: the mean pixel of its points, weighted by brightness and image area.
 
     Perspective shifts it by about 0.01 px from the pixel of the centre.
@@ -76,23 +76,23 @@ def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_ca
     """Requirement: 0.05 px rms through a strongly distorted CAHVOR camera, tilted and rolled."""
     surface, spots = _make_spotted_plane(height_m=7.0)
     camera = descent_camera(r=STRONG_DISTORTION)
-    pose = rigid(TILTED, np.array([300.0, 700.0, 1207.0]))
+    pose = rigid(ATTITUDE, np.array([300.0, 700.0, 1207.0]))
     scene = Scene(surface, (300.0, 400.0), OVERHEAD, ALBEDO_ONLY)
     frame = renderer.render(scene, PixelRays.of(camera), pose)
     copies = np.arange(-2, 3) * surface.period_m
     all_spots = np.concatenate([spots + np.array([dx, dy, 0.0]) for dx in copies for dy in copies])
     pixels, visible = camera.transform(pose).project(all_spots)
-    inside = visible & (np.abs(pixels - 511.5) < 495.0).all(axis=-1)
-    result = np.stack([_centroid(frame.radiance, position) for position in pixels[inside]])
-    expected = np.stack([_expected_centroid(camera.transform(pose), spot) for spot in all_spots[inside]])
+    is_in_image = visible & (np.abs(pixels - 511.5) < 495.0).all(axis=-1)
+    result = np.stack([_compute_centroid(frame.radiance, position) for position in pixels[is_in_image]])
+    expected = np.stack([_compute_expected_centroid(camera.transform(pose), spot) for spot in all_spots[is_in_image]])
     error = result - expected
-    assert inside.sum() > 400
+    assert is_in_image.sum() > 400
     assert np.sqrt(np.mean(np.sum(error**2, axis=-1))) < 0.05
-    assert np.sqrt(np.mean(np.sum((result - pixels[inside]) ** 2, axis=-1))) < 0.05
+    assert np.sqrt(np.mean(np.sum((result - pixels[is_in_image]) ** 2, axis=-1))) < 0.05
     assert np.abs(error.mean(axis=0)).max() < 0.003
     # The distortion is significant: a pinhole camera would shift the spots by pixels.
-    pinhole, _ = descent_camera(r=(0.0, 0.0, 0.0)).transform(pose).project(all_spots[inside])
-    assert np.linalg.norm(pinhole - pixels[inside], axis=-1).max() > 20.0
+    pinhole, _ = descent_camera(r=(0.0, 0.0, 0.0)).transform(pose).project(all_spots[is_in_image])
+    assert np.linalg.norm(pinhole - pixels[is_in_image], axis=-1).max() > 20.0
 
 
 @pytest.mark.parametrize("height_m", [500.0, 2000.0])
@@ -101,7 +101,7 @@ def test_world_points_are_on_the_plane_and_on_rays(
 ) -> None:
     surface, _ = _make_spotted_plane(height_m=-3.0)
     camera = descent_camera(r=STRONG_DISTORTION)
-    pose = rigid(TILTED, np.array([100.0, 50.0, height_m - 3.0]))
+    pose = rigid(ATTITUDE, np.array([100.0, 50.0, height_m - 3.0]))
     frame = renderer.render(Scene(surface, (100.0, 50.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(camera), pose)
     points = frame.points_world()
     assert np.isfinite(points).all()
@@ -114,7 +114,7 @@ def test_world_points_are_on_the_plane_and_on_rays(
 
 
 def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, expected_m: float) -> float:
-    """Find the distance to the ground, m: march in steps of a fifth of a sample, then refine the root."""
+    """Find the distance t along a ray to the ground, m: march in steps of a fifth of a sample, then refine the root."""
     control = surface.levels[0][..., 0].astype(np.float64)
 
     def clearance(t: np.ndarray) -> np.ndarray:
@@ -125,23 +125,23 @@ def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, expected_m:
         return np.asarray(z - ground)
 
     t = np.arange(0.5 * expected_m, 1.5 * expected_m, 0.3)
-    first = int(np.argmax(clearance(t) < 0.0))
-    assert first > 0
-    return float(brentq(lambda s: clearance(s).item(), t[first - 1], t[first], xtol=1e-9))
+    first_below = int(np.argmax(clearance(t) < 0.0))
+    assert first_below > 0
+    return float(brentq(lambda t: clearance(t).item(), t[first_below - 1], t[first_below], xtol=1e-9))
 
 
 def test_rough_ground_ranges_match_independent_ray_cast(
     renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     rays = PixelRays.of(descent_camera())
-    pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
+    pose = rigid(ATTITUDE, np.array([380.0, 200.0, 1500.0]))
     frame = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
     rng = np.random.default_rng(8)
     pixels = rng.integers(0, frame.range_m.size, 300)
     directions = pose.rotation.apply(rays.directions[pixels].astype(np.float64))
     actual = frame.range_m.ravel()[pixels]
     expected = np.array(
-        [_cast_ray(terrain, pose.translation, ray, t) for ray, t in zip(directions, actual, strict=True)]
+        [_cast_ray(terrain, pose.translation, ray, range_m) for ray, range_m in zip(directions, actual, strict=True)]
     )
     assert np.mean(np.abs(actual / expected - 1.0) < 1e-6) >= 0.99
     assert np.abs(actual / expected - 1.0).max() < 1e-4
@@ -153,15 +153,16 @@ def test_grazing_rays_intersect_the_first_occluding_crest(terrain: Surface, use_
     rng = np.random.default_rng(3)
     count, ground = 400, Ground(terrain)
     origins = np.column_stack([rng.uniform(0.0, terrain.period_m, (count, 2)), np.full(count, ground.highest + 60.0)])
-    rays = np.array([direction(a, -np.radians(e)) for a, e in rng.uniform([-np.pi, 2.5], [np.pi, 5.0], (count, 2))])
+    angles = rng.uniform([-np.pi, 2.5], [np.pi, 5.0], (count, 2))
+    rays = np.array([direction(azimuth, -np.radians(elevation_deg)) for azimuth, elevation_deg in angles])
     expected = ground.cast(origins, rays, 4000.0, 0.05)
     level = GroundLevel(terrain.levels[0], terrain.ceilings[0] if use_ceilings else NO_CEILING, 1.0 / terrain.spacing_m)
     # With ceilings the search of the complete ray is fast. Without them it starts near the intersection.
     begin = 0.0 if use_ceilings else 0.8
     result = np.array(
         [
-            intersect_ground(level, Ray(*origin, *ray), begin * t, 1.25 * t)
-            for origin, ray, t in zip(origins, rays, expected, strict=True)
+            intersect_ground(level, Ray(*origin, *ray), begin * distance_m, 1.25 * distance_m)
+            for origin, ray, distance_m in zip(origins, rays, expected, strict=True)
         ]
     )
     assert np.median(expected) > 500.0 * terrain.spacing_m
@@ -179,10 +180,10 @@ def test_search_returns_infinity_beyond_its_end(terrain: Surface, use_ceilings: 
     for azimuth, elevation in rng.uniform([-np.pi, np.radians(20.0)], [np.pi, np.radians(50.0)], (50, 2)):
         origin = np.array([*rng.uniform(0.0, terrain.period_m, 2), ground.highest + 80.0])
         ray = direction(azimuth, -elevation)
-        t = float(ground.cast(origin[None], ray[None], 2000.0, 0.05)[0])
-        begin = t - 4.0 * terrain.spacing_m
-        assert intersect_ground(level, Ray(*origin, *ray), begin, t + 1e-3) == pytest.approx(t, rel=1e-6)
-        assert intersect_ground(level, Ray(*origin, *ray), begin, t - 1e-3) == np.inf
+        range_m = float(ground.cast(origin[None], ray[None], 2000.0, 0.05)[0])
+        begin = range_m - 4.0 * terrain.spacing_m
+        assert intersect_ground(level, Ray(*origin, *ray), begin, range_m + 1e-3) == pytest.approx(range_m, rel=1e-6)
+        assert intersect_ground(level, Ray(*origin, *ray), begin, range_m - 1e-3) == np.inf
 
 
 def test_entry_distance_is_at_the_height_of_the_highest_ground() -> None:
@@ -205,13 +206,13 @@ def test_blocks_below_a_ray_are_skipped(terrain: Surface) -> None:
         origin = np.array([*rng.uniform(0.0, terrain.period_m, 2), float(ceiling.max()) + 5.0])
         ray = direction(azimuth, -np.radians(rng.uniform(1.0, 20.0)))
         start = rng.uniform(0.0, 50.0)
-        skipped_to = skip_empty_blocks(level, Ray(*origin, *ray), start, 5000.0)
-        t = np.arange(start, skipped_to + 3.0 * block, 0.01 * block)
-        positions = origin + t[:, None] * ray
+        skip_end_m = skip_empty_blocks(level, Ray(*origin, *ray), start, 5000.0)
+        distances_m = np.arange(start, skip_end_m + 3.0 * block, 0.01 * block)
+        positions = origin + distances_m[:, None] * ray
         block_row, block_column = (np.floor(positions[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))
-        below = positions[:, 2] <= ceiling[block_row, block_column]
-        assert not below[t < skipped_to - 1e-6].any()
-        assert below[(t > skipped_to) & (t < skipped_to + 2.0 * block)].any()
+        is_below_ceiling = positions[:, 2] <= ceiling[block_row, block_column]
+        assert not is_below_ceiling[distances_m < skip_end_m - 1e-6].any()
+        assert is_below_ceiling[(distances_m > skip_end_m) & (distances_m < skip_end_m + 2.0 * block)].any()
 
 
 def test_mesh_resolution_does_not_change_the_image(
@@ -219,7 +220,7 @@ def test_mesh_resolution_does_not_change_the_image(
 ) -> None:
     """The mesh only defines the start of the search: a mesh three times as coarse gives the same image."""
     rays = PixelRays.of(descent_camera(256))
-    pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
+    pose = rigid(ATTITUDE, np.array([380.0, 200.0, 1500.0]))
     fine = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
     coarse = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY, mesh_finest_m=36.0), rays, pose)
     is_equal = np.abs(fine.range_m / coarse.range_m - 1.0) < 1e-6
@@ -252,7 +253,9 @@ def test_objects_out_of_view_do_not_change_the_image(
     rays = PixelRays.of(descent_camera(256))
     with_object, without_objects = (
         renderer.render(
-            Scene(terrain, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True), rays, rigid(TILTED, position)
+            Scene(terrain, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True),
+            rays,
+            rigid(ATTITUDE, position),
         )
         for objects in (object_above, Objects.none())
     )
@@ -264,9 +267,9 @@ def test_objects_out_of_view_do_not_change_the_image(
 def test_camera_below_the_ground_is_rejected(
     renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    buried = rigid(Rotation.identity(), np.array([0.0, 0.0, -1000.0]))
+    pose = rigid(Rotation.identity(), np.array([0.0, 0.0, -1000.0]))
     with pytest.raises(RenderingError, match="below the ground"):
-        renderer.render(Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(64)), buried)
+        renderer.render(Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(64)), pose)
 
 
 def test_image_does_not_depend_on_earlier_images(
@@ -274,9 +277,10 @@ def test_image_does_not_depend_on_earlier_images(
 ) -> None:
     rays = PixelRays.of(descent_camera(256))
     sun = Sun(direction(np.radians(100.0), np.radians(40.0)))
-    pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
+    pose = rigid(ATTITUDE, np.array([380.0, 200.0, 1500.0]))
     first = renderer.render(Scene(terrain, (380.0, 200.0), sun, Photometry()), rays, pose)
-    renderer.render(Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), rays, rigid(TILTED, np.array([0.0, 0.0, 900.0])))
-    repeated = renderer.render(Scene(terrain, (380.0, 200.0), sun, Photometry()), rays, pose)
-    assert first.radiance.tobytes() == repeated.radiance.tobytes()
-    assert first.range_m.tobytes() == repeated.range_m.tobytes()
+    other_pose = rigid(ATTITUDE, np.array([0.0, 0.0, 900.0]))
+    renderer.render(Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), rays, other_pose)
+    repetition = renderer.render(Scene(terrain, (380.0, 200.0), sun, Photometry()), rays, pose)
+    assert first.radiance.tobytes() == repetition.radiance.tobytes()
+    assert first.range_m.tobytes() == repetition.range_m.tobytes()

@@ -19,21 +19,22 @@ if sys.argv[1] == "keep":
 before = resident_bytes()
 block = b"1" * {SIZE}
 del block
-freed = resident_bytes()
+after_free = resident_bytes()
 return_freed_memory()
-print(freed - before, resident_bytes() - before)
+print(after_free - before, resident_bytes() - before)
 """
 
 
 def _measure_memory(mode: str) -> tuple[int, int]:
+    """Return the bytes in use after the block is freed, and after the memory is returned to the system."""
     result = subprocess.run([sys.executable, "-c", SCRIPT, mode], capture_output=True, text=True, check=True)
-    freed, returned = map(int, result.stdout.split())
-    return freed, returned
+    bytes_after_free, bytes_after_return = map(int, result.stdout.split())
+    return bytes_after_free, bytes_after_return
 
 
 def test_freed_memory_stays_allocated_until_it_is_returned() -> None:
-    freed, returned = _measure_memory("keep")
-    assert freed > 0.9 * SIZE
-    assert returned < 0.1 * SIZE
+    bytes_after_free, bytes_after_return = _measure_memory("keep")
+    assert bytes_after_free > 0.9 * SIZE
+    assert bytes_after_return < 0.1 * SIZE
     # By default the C library returns freed memory at once.
     assert _measure_memory("default")[0] < 0.1 * SIZE

@@ -42,7 +42,7 @@ def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.nda
     max_distance_m = 9.0
     rng = np.random.default_rng(9)
     buffer = np.empty(1500, dtype=np.int64)
-    listed = set(
+    listed_triangles = set(
         buffer[: list_in_beam(objects.hierarchy, Ray(*EYE, *axis), half_angle, max_distance_m, buffer)].tolist()
     )
     perpendicular = np.cross(axis, _draw_rays(rng, 400))
@@ -51,7 +51,7 @@ def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.nda
     hit_triangles: set[int] = set()
     for ray in np.cos(angles) * axis + np.sin(angles) * perpendicular:
         hit_triangles |= _list_hits(objects, ray, max_distance_m)
-    assert hit_triangles <= listed
+    assert hit_triangles <= listed_triangles
     # Only narrow beams may have no hits; otherwise the test would check nothing.
     assert hit_triangles or half_angle < 0.5
     # The beam lists triangles in a square frustum, which is larger than the cone at its corners.
@@ -59,8 +59,8 @@ def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.nda
     size = np.linalg.norm(objects.triangles - objects.triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
     axis_distance = centres @ axis
     off_axis_distance = np.linalg.norm(centres - axis_distance[:, None] * axis, axis=1)
-    in_frustum = off_axis_distance <= np.sqrt(2.0) * (np.tan(half_angle) * np.maximum(axis_distance, 0.0) + 2.0 * size)
-    assert listed <= set(np.flatnonzero(in_frustum).tolist())
+    is_near = off_axis_distance <= np.sqrt(2.0) * (np.tan(half_angle) * np.maximum(axis_distance, 0.0) + 2.0 * size)
+    assert listed_triangles <= set(np.flatnonzero(is_near).tolist())
 
 
 def test_beam_reports_an_overflow_of_its_list(objects: Objects) -> None:
@@ -74,7 +74,10 @@ def test_beam_reports_an_overflow_of_its_list(objects: Objects) -> None:
 
 
 def _list_hits(objects: Objects, ray: np.ndarray, max_distance_m: float) -> set[int]:
-    """List the indices of all triangles that a ray from the eye hits up to a distance, by barycentric coordinates."""
+    """List the indices of all triangles that a ray from the eye hits up to a distance.
+
+    The barycentric coordinates u and v and the distance t solve a linear system.
+    """
     first, second, third = objects.triangles.transpose(1, 0, 2)
     columns = np.stack([second - first, third - first, np.broadcast_to(-ray, first.shape)], axis=2)
     u, v, t = np.linalg.solve(columns, (EYE - first)[:, :, None])[:, :, 0].T

@@ -49,8 +49,8 @@ def test_lunar_lambert_matches_the_formula(renderer: Renderer, descent_camera: C
     cos_i, cos_e = sun.direction[2], -to_ground[..., 2]
     phase = np.arccos(-to_ground @ sun.direction)
 
-    def compute_surge(g: np.ndarray) -> np.ndarray:
-        return 1 + 0.8 / (1 + np.tan(g / 2) / 0.05)
+    def compute_surge(phase_angle: np.ndarray) -> np.ndarray:
+        return 1 + 0.8 / (1 + np.tan(phase_angle / 2) / 0.05)
 
     disc = 0.6 * 2 * cos_i / (cos_i + cos_e) + 0.4 * cos_i
     expected = 0.2 * (law.normalisation() * compute_surge(phase) * disc + 0.2)
@@ -75,11 +75,11 @@ def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: 
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
     camera = descent_camera(256)
     # The ground faces the eastern sun where its height decreases with x.
-    east = Sun(direction(np.radians(90.0), np.radians(40.0)))
-    frame = renderer.render(Scene(_make_surface(heights), (0.0, 0.0), east, law), PixelRays.of(camera), NADIR)
-    facing_east = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) < -0.5
-    facing_west = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) > 0.5
-    assert frame.radiance[facing_east].min() > frame.radiance[facing_west].max()
+    eastern_sun = Sun(direction(np.radians(90.0), np.radians(40.0)))
+    frame = renderer.render(Scene(_make_surface(heights), (0.0, 0.0), eastern_sun, law), PixelRays.of(camera), NADIR)
+    is_facing_east = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) < -0.5
+    is_facing_west = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) > 0.5
+    assert frame.radiance[is_facing_east].min() > frame.radiance[is_facing_west].max()
 
 
 def test_ground_facing_away_receives_only_sky_light(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
@@ -95,6 +95,7 @@ def test_ground_facing_away_receives_only_sky_light(renderer: Renderer, descent_
     )
     assert without_sky.min() == 0.0
     with_sky = _render(renderer, descent_camera(128), _make_surface(heights), low_sun, Photometry(sky_fraction=0.15))
+    # Sky fraction times albedo, with a margin of 10 %.
     assert with_sky.min() > 0.15 * 0.2 * 0.9
 
 
@@ -106,8 +107,8 @@ def test_albedo_finer_than_a_pixel_is_averaged(renderer: Renderer, descent_camer
     stripes = Surface.from_samples(samples, 1.0)
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
     overhead = Sun(np.array([0.0, 0.0, 1.0]))
-    high = rigid(Rotation.from_euler("z", 33.0, degrees=True), np.array([0.0, 0.0, 1200.0]))
-    radiance = _render(renderer, descent_camera(128), stripes, overhead, law, high)
+    pose = rigid(Rotation.from_euler("z", 33.0, degrees=True), np.array([0.0, 0.0, 1200.0]))
+    radiance = _render(renderer, descent_camera(128), stripes, overhead, law, pose)
     np.testing.assert_allclose(radiance, 0.3, rtol=0.01)
 
 

@@ -39,7 +39,7 @@ def _make_relief(coarsest_m: float, *heights_m: float) -> MicroRelief:
 
 def _sample_noise(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:
     """Compute value and x and y derivatives of the noise, shape (n, 3)."""
-    return np.array([relief_noise(a, b, seed) for a, b in zip(x.ravel(), y.ravel(), strict=True)])
+    return np.array([relief_noise(x_cell, y_cell, seed) for x_cell, y_cell in zip(x.ravel(), y.ravel(), strict=True)])
 
 
 @pytest.fixture(scope="module")
@@ -57,35 +57,40 @@ def test_noise_has_the_specified_variances_and_derivatives() -> None:
     assert np.mean(noise[:, 0] ** 2) == pytest.approx(HEIGHT_VARIANCE, rel=0.03)
     assert np.mean(noise[:, 1:] ** 2) == pytest.approx(SLOPE_VARIANCE, rel=0.03)
     step = 1e-5
-    along_x = (_sample_noise(x + step, y)[:, 0] - _sample_noise(x - step, y)[:, 0]) / (2.0 * step)
-    along_y = (_sample_noise(x, y + step)[:, 0] - _sample_noise(x, y - step)[:, 0]) / (2.0 * step)
-    np.testing.assert_allclose(noise[:, 1], along_x, atol=1e-5)
-    np.testing.assert_allclose(noise[:, 2], along_y, atol=1e-5)
+    derivative_x = (_sample_noise(x + step, y)[:, 0] - _sample_noise(x - step, y)[:, 0]) / (2.0 * step)
+    derivative_y = (_sample_noise(x, y + step)[:, 0] - _sample_noise(x, y - step)[:, 0]) / (2.0 * step)
+    np.testing.assert_allclose(noise[:, 1], derivative_x, atol=1e-5)
+    np.testing.assert_allclose(noise[:, 2], derivative_y, atol=1e-5)
 
 
 @pytest.mark.parametrize("hurst", [0.5, 0.75, 0.9])
 def test_octaves_continue_the_spectrum_of_the_terrain(hurst: float) -> None:
-    """Height differences over short lags agree with the integral of the terrain's spectrum beyond its samples."""
+    """Height differences over short lags agree with the integral of the terrain's spectrum beyond its samples.
+
+    The coarsest octave has a median of 0.61 waves per cell and begins at 1 / sqrt(2) of that frequency.
+    """
     slope_rad, baseline_m, outer_m, spacing_m = np.radians(3.0), 1.0, 15.0, 0.2
     coarsest, heights = octave_heights(hurst, slope_rad, baseline_m, outer_m, spacing_m)
     k0 = 2.0 * np.pi / outer_m
 
-    def structure(lag: float, above: float = 0.0) -> float:
-        """Mean square difference over a lag for unit variance, from waves with wavenumbers greater than `above`."""
-        k = np.geomspace(max(above, 1e-4 * k0), 2.0 * np.pi / 0.0005, 200_001)
+    def structure_function(lag: float, min_wavenumber: float = 0.0) -> float:
+        """Compute the mean square difference over a lag for unit variance, from waves above `min_wavenumber`, rad/m."""
+        k = np.geomspace(max(min_wavenumber, 1e-4 * k0), 2.0 * np.pi / 0.0005, 200_001)
         power = 2.0 * hurst * k0 ** (2.0 * hurst) * k * (k**2 + k0**2) ** -(hurst + 1.0)
         return float(np.trapezoid(2.0 * power * (1.0 - special.j0(k * lag)), k))
 
-    scale = (np.tan(slope_rad) * baseline_m) ** 2 / structure(baseline_m)
-    shortest = 2.0 * np.pi * 0.61 / coarsest / np.sqrt(2.0)
+    variance = (np.tan(slope_rad) * baseline_m) ** 2 / structure_function(baseline_m)
+    min_octave_wavenumber = 2.0 * np.pi * 0.61 / coarsest / np.sqrt(2.0)
     x, y = np.random.default_rng(4).uniform(0.0, 50.0, (2, 20000))
     for lag in (0.01, 0.03):
-        change = np.zeros(x.size)
+        height_changes = np.zeros(x.size)
         for octave, height in enumerate(heights):
             cell = coarsest * 0.5**octave
-            change += height * (_sample_noise((x + lag) / cell, y / cell, octave)[:, 0])
-            change -= height * (_sample_noise(x / cell, y / cell, octave)[:, 0])
-        assert np.sqrt(np.mean(change**2)) == pytest.approx(np.sqrt(scale * structure(lag, shortest)), rel=0.1)
+            height_changes += height * (_sample_noise((x + lag) / cell, y / cell, octave)[:, 0])
+            height_changes -= height * (_sample_noise(x / cell, y / cell, octave)[:, 0])
+        assert np.sqrt(np.mean(height_changes**2)) == pytest.approx(
+            np.sqrt(variance * structure_function(lag, min_octave_wavenumber)), rel=0.1
+        )
 
 
 @pytest.mark.parametrize("cell_px", [4.0, 2.0])
@@ -111,12 +116,14 @@ def test_unresolved_octaves_only_add_to_the_variance() -> None:
     add_relief_slopes(position, position, np.array([1.001 / MIN_CELLS]), _make_relief(1.0, 0.1, 0.1), *outputs)
     assert outputs[0][0] == outputs[1][0] == outputs[2][0] == 0.0
     assert outputs[3][0] == pytest.approx((0.1**2 + 0.2**2) * SLOPE_VARIANCE)
+    # Octaves with cells of up to sqrt(FADING) footprints are unresolved.
     assert pytest.approx(MIN_CELLS**2) == FADING
 
 
 @pytest.mark.parametrize("elevation_deg", [5.0, 15.0, 30.0, 60.0])
 @pytest.mark.parametrize("slope_deg", [5.0, 15.0, 25.0])
 def test_shadowing_equals_smiths_formula(elevation_deg: float, slope_deg: float) -> None:
+    """Smith's parameter a is the tangent of the elevation divided by sqrt(2) times the RMS slope sigma."""
     cosine, sigma = np.sin(np.radians(elevation_deg)), np.tan(np.radians(slope_deg))
     a = cosine / (np.sqrt(2.0) * sigma * np.sqrt(1.0 - cosine**2))
     smith_lambda = 0.5 * (np.exp(-(a**2)) / (a * np.sqrt(np.pi)) - special.erfc(a))
@@ -130,9 +137,9 @@ def _shade_heights(heights: np.ndarray, step_m: float, sun: np.ndarray) -> np.nd
     horizontal = np.hypot(*sun[:2])
     rise, is_shaded = sun[2] / horizontal * step_m, np.zeros(heights.shape, dtype=bool)
     rows, columns = np.mgrid[: heights.shape[0], : heights.shape[1]].astype(float)
-    for k in range(1, int(np.ptp(heights) / rise) + 2):
-        positions = [rows + k * sun[1] / horizontal, columns + k * sun[0] / horizontal]
-        is_shaded |= map_coordinates(heights, positions, order=1, mode="nearest") > heights + k * rise
+    for step in range(1, int(np.ptp(heights) / rise) + 2):
+        positions = [rows + step * sun[1] / horizontal, columns + step * sun[0] / horizontal]
+        is_shaded |= map_coordinates(heights, positions, order=1, mode="nearest") > heights + step * rise
     return np.where(is_shaded, 0.0, np.maximum(cosine, 0.0))
 
 

@@ -89,6 +89,6 @@ def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer, distance_
     depression_rad = np.arctan2(0.9, distance_m)
     view = View(scene, camera, rigid(Rotation.from_euler("y", depression_rad), eye))
     for motion in measure(renderer, view, np.array([0.3, 0.75])):
-        on_rock = motion.error[motion.body >= 0]
-        assert len(on_rock) > 60
-        assert np.abs(on_rock.mean(axis=0)).max() < MAX_MEAN_ERROR_PX
+        rock_errors = motion.error[motion.body >= 0]
+        assert len(rock_errors) > 60
+        assert np.abs(rock_errors.mean(axis=0)).max() < MAX_MEAN_ERROR_PX

@@ -46,8 +46,8 @@ def test_cone_selects_facing_triangles_of_bodies_within_it() -> None:
     result = objects.in_cone(eye, np.array([0.0, 0.0, -1.0]), 1e-3)
     first, second, third = objects.triangles.transpose(1, 0, 2)
     is_facing = np.einsum("ij,ij->i", np.cross(second - first, third - first), eye - first) > 0.0
-    in_cone = objects.body_of_triangle == 2
-    assert 20 < np.count_nonzero(is_facing & in_cone) < 60
-    assert set(np.flatnonzero(is_facing & in_cone)) <= set(result)
+    is_in_cone = objects.body_of_triangle == 2
+    assert 20 < np.count_nonzero(is_facing & is_in_cone) < 60
+    assert set(np.flatnonzero(is_facing & is_in_cone)) <= set(result)
     assert is_facing[result].all()
     assert (np.diff(result) > 0).all()

@@ -11,9 +11,9 @@ from marsyard.sim.terrain import Surface
 def test_kernels_receive_a_constant_number_of_levels(side: int) -> None:
     surface = Surface.from_samples(np.zeros((side, side, 2), dtype=np.float32), 1.0)
     ground = ground_struct(surface, (0.0, 1.0, 0.0, 1.0, 2.0), ceilings=True)
-    levels, coarsest = ground.levels, ground.top_level
+    levels, top_level = ground.levels, ground.top_level
     assert len(levels) == len(ground.ceilings) == LEVELS
-    assert levels[coarsest].shape[0] == 16
+    assert levels[top_level].shape[0] == 16
     assert all(level is expected for level, expected in zip(levels, surface.levels, strict=False))
     # Kernels are compiled for levels of the same array type.
     assert {(level.dtype.str, level.flags.writeable, level.flags.c_contiguous) for level in levels} == {

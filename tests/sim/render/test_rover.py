@@ -37,6 +37,7 @@ def test_rover_stands_on_the_ground_with_specified_size(rover: RoverParameters, 
     low, high = objects.triangles.min(axis=(0, 1)), objects.triangles.max(axis=(0, 1))
     # Wheels are prisms with 24 sides: the middle of a side is 1 % of the radius closer to the axis than a corner.
     assert low[2] == pytest.approx(2.0, abs=0.01 * rover.wheel_radius_m)
+    # The head extends 0.06 m above its centre.
     assert high[2] == pytest.approx(2.0 + (mast.base_m + mast.elbow_m + mast.head_m)[2] + 0.06, abs=1e-9)
     assert (low[1], high[1]) == pytest.approx(
         (20.0 - 0.5 * rover.body_width_m, 20.0 + 0.5 * rover.body_width_m), abs=0.2
@@ -49,7 +50,7 @@ def test_normals_point_outwards() -> None:
     stance = settle(MER, Plane(), 0.0, 0.0, EAST)
     objects = rover_objects(MER, stance, MER_MAST, 0.3, -0.2)
     # For closed bodies the flux of the position vector through the faces is three times the volume, so it is positive.
-    face_normals = np.cross(*(objects.triangles[:, k] - objects.triangles[:, 0] for k in (1, 2)))
+    face_normals = np.cross(*(objects.triangles[:, corner] - objects.triangles[:, 0] for corner in (1, 2)))
     assert np.einsum("ti,ti->", objects.triangles[:, 0], face_normals) > 0.0
     lengths = np.linalg.norm(face_normals, axis=1, keepdims=True)
     assert objects.normals[:, 0] == pytest.approx(face_normals / lengths)
@@ -111,10 +112,10 @@ def test_mast_shadow_is_opposite_the_sun(renderer: Renderer) -> None:
     points = frame.points_world()
     is_shaded = frame.radiance < 0.1 * frame.radiance.max()
     assert 0.1 < np.mean(is_shaded) < 0.5
-    # The shadow is a band along the east-west direction, as wide as the mast.
-    band = points[is_shaded & (np.abs(points[..., 0] - expected[0]) < 0.1)]
-    assert band[:, 1].mean() == pytest.approx(expected[1], abs=0.01)
-    assert np.ptp(band[:, 1]) == pytest.approx(2 * 0.05, abs=0.02)
+    # The shadow is a band along the east-west direction, as wide as the mast (radius 0.05 m).
+    band_points = points[is_shaded & (np.abs(points[..., 0] - expected[0]) < 0.1)]
+    assert band_points[:, 1].mean() == pytest.approx(expected[1], abs=0.01)
+    assert np.ptp(band_points[:, 1]) == pytest.approx(2 * 0.05, abs=0.02)
 
 
 @pytest.mark.parametrize(("rover", "mast"), [(MER, MER_MAST), (ROCKY_8, RESEARCH_MAST)])

@@ -114,7 +114,7 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
 
 @pytest.mark.parametrize("elevation", [-0.2, 0.15, 1.0, np.pi / 2])
 def test_shaded_positions_equal_an_exhaustive_search(elevation: float) -> None:
-    """Random triangles of many sizes and orientations in overlapping bodies."""
+    """The bodies overlap and consist of random triangles of many sizes and orientations."""
     rng = np.random.default_rng(8)
     centres = rng.uniform(-5.0, 5.0, (60, 1, 1, 3))
     triangles = (centres + 10.0 ** rng.uniform(-1.5, 0.3, (60, 1, 1, 1)) * rng.normal(size=(60, 7, 3, 3))).reshape(
@@ -141,16 +141,16 @@ def test_shadow_sweep_of_an_area_equals_the_full_sweep(terrain: Surface, azimuth
     heights = height_range(terrain.levels[0])
     area_m = (-40.0, 60.0, 700.0, 760.0)
     full_shadow, area_shadow = (ground_shadow(terrain, sun, heights), ground_shadow(terrain, sun, heights, area_m))
-    full, area, spacing = full_shadow.height, area_shadow.height, full_shadow.spacing
+    full_grid, area_grid, spacing = full_shadow.height, area_shadow.height, full_shadow.spacing
     assert full_shadow[2:] == area_shadow[2:]
-    assert len(area) < len(full)
-    x, y = (np.arange(int(a / spacing) - 1, int(b / spacing) + 3) for a, b in (area_m[:2], area_m[2:]))
+    assert len(area_grid) < len(full_grid)
+    x, y = (np.arange(int(low / spacing) - 1, int(high / spacing) + 3) for low, high in (area_m[:2], area_m[2:]))
     rows, columns = (x, y) if full_shadow.along_x else (y, x)
-    # grids are periodic; their number of rows and columns is a power of 2
-    full_values, part_values = (
-        grid[np.ix_(rows & (len(grid) - 1), columns & (len(grid) - 1))] for grid in (full, area)
+    # Grids are periodic; their numbers of rows and columns are powers of two.
+    full_values, area_values = (
+        grid[np.ix_(rows & (len(grid) - 1), columns & (len(grid) - 1))] for grid in (full_grid, area_grid)
     )
-    np.testing.assert_array_equal(part_values, full_values)
+    np.testing.assert_array_equal(area_values, full_values)
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 225.0])
@@ -173,7 +173,7 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
     assert is_sun_above_slopes(just_above, max_slopes)
     assert slope_bounds(terrain, just_above) == max_slopes
     assert not is_sun_above_slopes(just_below, max_slopes)
-    # below this elevation ground may hide part of the sun, which infinite bounds report
+    # Below this elevation the ground may hide part of the sun; the bounds are infinite.
     assert slope_bounds(terrain, just_below) == (np.inf, np.inf)
     # The sweep finds no shadow; the tolerance covers rounding.
     shadow = ground_shadow(terrain, just_above, height_range(terrain.levels[0]))
@@ -185,7 +185,7 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
 
 
 def test_bounds_contain_all_ground_in_a_cone() -> None:
-    """The ground is not below -0.4 m. Positions are drawn in the cone, most of them near that height."""
+    """The ground is not below -0.4 m. Random positions are in the cone, most of them near that height."""
     lowest_m = -0.4
     rng = np.random.default_rng(2)
     apex, half_angle_rad = np.array([3.0, -2.0, 1.5]), 0.12
@@ -199,5 +199,5 @@ def test_bounds_contain_all_ground_in_a_cone() -> None:
     low, high = np.array(bounds).reshape(2, 2).T
     assert np.all((positions[:, :2] > low) & (positions[:, :2] < high))
     assert np.all(high - low < 1.1 * np.ptp(np.vstack([positions, apex])[:, :2], axis=0))
-    # a cone that contains the horizon has no bounds
+    # A cone that contains the horizon has no bounds.
     assert ground_in_cones([(apex, direction(2.0, -0.1), half_angle_rad)], lowest_m) is None

@@ -46,11 +46,12 @@ def test_sky_irradiance_on_level_ground_matches_its_fraction(elevation_deg: floa
     photometry = replace(DUSTY, sky=DustySky(depth, 0.95, 0.65))
     sun = Sun(direction(0.3, np.radians(elevation_deg)))
     coefficients = photometry.sky_coefficients(sun)
-    squared, azimuth_turns = qmc.Sobol(2, rng=np.random.default_rng(2)).random_base2(14).T
-    up, horizontal, azimuth = np.sqrt(squared), np.sqrt(1.0 - squared), 2.0 * np.pi * azimuth_turns
+    up_squared, azimuth_turns = qmc.Sobol(2, rng=np.random.default_rng(2)).random_base2(14).T
+    up, horizontal, azimuth = np.sqrt(up_squared), np.sqrt(1.0 - up_squared), 2.0 * np.pi * azimuth_turns
     directions = np.stack([horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), up], axis=1)
     cos_sun_angles = directions @ sun.direction
-    # The directions have a density proportional to the sine of elevation; the solar disc is excluded.
+    # The directions have a density proportional to the sine of elevation. Angles of at least 1e-3 rad from the sun
+    # exclude the solar disc.
     brightness = [
         sky_brightness(coefficients, sun.direction[2], 1e-9, ray[2], min(cos_angle, np.cos(1e-3)), 1e-3)
         for ray, cos_angle in zip(directions, cos_sun_angles, strict=True)
@@ -61,17 +62,21 @@ def test_sky_irradiance_on_level_ground_matches_its_fraction(elevation_deg: floa
 
 
 def test_sky_radiance_matches_the_formula(renderer: Renderer) -> None:
+    """Single scattering by the Henyey-Greenstein phase function plus a constant.
+
+    mu and mu0 are the sines of the elevations of view and sun. The optical depth excludes the forward peak.
+    """
     camera, sun = _make_sky_camera(), Sun(direction(np.radians(160.0), np.radians(35.0)))
     frame = _render_from_mast(renderer, camera, sun, DUSTY)
     _, directions = camera.rays(camera.pixel_grid())
-    sky = ~np.isfinite(frame.range_m) & (directions[..., 2] > 0.01)
-    mu, mu0 = directions[..., 2][sky], sun.direction[2]
-    phase = (1 - 0.65**2) / (1 + 0.65**2 - 2 * 0.65 * (directions @ sun.direction)[sky]) ** 1.5
+    is_sky = ~np.isfinite(frame.range_m) & (directions[..., 2] > 0.01)
+    mu, mu0 = directions[..., 2][is_sky], sun.direction[2]
+    phase = (1 - 0.65**2) / (1 + 0.65**2 - 2 * 0.65 * (directions @ sun.direction)[is_sky]) ** 1.5
     depth = 0.5 * (1.0 - 0.95 * 0.65**2)
     single_scattering = 0.95 * 0.5 / (4.0 * depth) * phase * mu0 / (mu0 - mu) * (1.0 - np.exp(depth / mu0 - depth / mu))
     assert single_scattering.min() > 0.0
     # The remainder is isotropic.
-    multiple_scattering = frame.radiance[sky] - single_scattering
+    multiple_scattering = frame.radiance[is_sky] - single_scattering
     assert multiple_scattering.mean() > 0.01
     np.testing.assert_allclose(multiple_scattering, multiple_scattering.mean(), atol=1e-4)
 
@@ -84,22 +89,25 @@ def test_sky_is_brighter_towards_the_sun_and_the_horizon(renderer: Renderer) -> 
         for azimuth, photometry in ((0.0, DUSTY), (np.pi, DUSTY), (np.pi, isotropic_photometry))
     )
     _, directions = camera.rays(camera.pixel_grid())
-    top, middle, low = (int(np.abs(directions[:, 100, 2] - np.sin(np.radians(e))).argmin()) for e in (28.0, 15.0, 1.5))
+    top, middle, bottom = (
+        int(np.abs(directions[:, 100, 2] - np.sin(np.radians(elevation_deg))).argmin())
+        for elevation_deg in (28.0, 15.0, 1.5)
+    )
     assert towards_sun[top] > 2.0 * away_from_sun[top]
-    assert isotropic[low] > isotropic[middle] > isotropic[top]
+    assert isotropic[bottom] > isotropic[middle] > isotropic[top]
 
 
 def test_solar_disc_contains_the_direct_irradiance(renderer: Renderer) -> None:
     camera = _make_sky_camera(400)
     sun = Sun(direction(np.radians(3.0), np.radians(14.0)))
     frame = _render_from_mast(renderer, camera, sun, DUSTY)
-    disc = frame.radiance > 1000.0
-    solid_angle = np.square(PixelRays.of(camera).pixel_angles.reshape(disc.shape))
+    is_disc = frame.radiance > 1000.0
+    solid_angle = np.square(PixelRays.of(camera).pixel_angles.reshape(is_disc.shape))
     # The radiance factor is pi times the radiance divided by the irradiance of a plane that faces the sun.
-    assert (frame.radiance * solid_angle)[disc].sum() == pytest.approx(np.pi, rel=0.03)
+    assert (frame.radiance * solid_angle)[is_disc].sum() == pytest.approx(np.pi, rel=0.03)
     expected, visible = camera.project(1e9 * sun.direction)
     assert visible
-    rows, columns = np.nonzero(disc)
+    rows, columns = np.nonzero(is_disc)
     assert np.abs([columns.mean() - expected[0], rows.mean() - expected[1]]).max() < 0.25
 
 

@@ -20,8 +20,8 @@ def test_vectorised_spline_equals_single_evaluation() -> None:
     indices = np.sort(rng.permutation(STRIP)[:100])
     cells = allocate_cells()
     fetch_levels(SURFACE.levels, 1.0 / SPACING_M, level_of, indices, indices.size, x, y, cells)
-    for k in indices:
-        scale = 1.0 / SPACING_M / 2.0 ** level_of[k]
-        height, slope_x, slope_y, albedo = spline(cells[0], cells[1], int(k))
-        expected = sample(SURFACE.levels[level_of[k]], scale, x[k], y[k])
+    for index in indices:
+        scale = 1.0 / SPACING_M / 2.0 ** level_of[index]
+        height, slope_x, slope_y, albedo = spline(cells[0], cells[1], int(index))
+        expected = sample(SURFACE.levels[level_of[index]], scale, x[index], y[index])
         np.testing.assert_allclose((height, slope_x * scale, slope_y * scale, albedo), expected, rtol=0.0, atol=1e-14)

@@ -18,11 +18,11 @@ def test_noise_has_the_specified_variance() -> None:
 
 @pytest.mark.parametrize("footprint_m", [1e-4, 3e-3, 0.1])
 def test_mean_albedo_is_unchanged_at_any_distance(footprint_m: float) -> None:
-    strongest = max((site.ground_texture for site in sites().values()), key=lambda texture: max(texture.amplitudes))
-    octaves = np.array(strongest.amplitudes)
+    texture = max((site.ground_texture for site in sites().values()), key=lambda texture: max(texture.amplitudes))
+    octaves = np.array(texture.amplitudes)
     log_albedo = np.zeros(len(POSITIONS))
     add_texture(
-        *POSITIONS.T.copy(), np.full(len(POSITIONS), footprint_m), strongest.coarsest_m, octaves, ONES, log_albedo
+        *POSITIONS.T.copy(), np.full(len(POSITIONS), footprint_m), texture.coarsest_m, octaves, ONES, log_albedo
     )
     assert np.mean(np.exp(log_albedo)) == pytest.approx(1.0, abs=0.005)
 
@@ -49,5 +49,5 @@ def test_octave_is_attenuated_as_by_averaging_over_a_pixel(cell_px: float) -> No
     add_texture(*positions.T.copy(), np.full(len(positions), 1e-6), 1.0, np.array([0.1]), strength, sharp)
     add_texture(*positions.T.copy(), np.full(len(positions), 1.0 / cell_px), 1.0, np.array([0.1]), strength, attenuated)
     # The kernel uses the attenuation of the median wavelength of the octave.
-    mean = ndimage.uniform_filter(sharp.reshape(side, side), samples_per_pixel, mode="nearest")
-    assert np.std(attenuated) / np.std(sharp) == pytest.approx(np.std(mean) / np.std(sharp), abs=0.03)
+    pixel_means = ndimage.uniform_filter(sharp.reshape(side, side), samples_per_pixel, mode="nearest")
+    assert np.std(attenuated) / np.std(sharp) == pytest.approx(np.std(pixel_means) / np.std(sharp), abs=0.03)

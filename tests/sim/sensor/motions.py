@@ -22,7 +22,10 @@ def uniform_motion(rows_s: float, columns_s: float) -> ImageMotion:
 
 @dataclass(frozen=True)
 class Swaying:
-    """Motion of a body that spins about the vertical, nods about its x axis, falls on a parabola and sways east."""
+    """Motion of a body that spins about the vertical, nods about its x axis, falls on a parabola and sways east.
+
+    `tilt` is the attitude at time 0.
+    """
 
     spin_rad_s: float = 0.0
     nod_rad: float = 0.0
@@ -39,14 +42,14 @@ class Swaying:
         return -np.inf, np.inf
 
     def state(self, time_s: float) -> State:
-        m = self.motion(np.array([time_s]))
+        motion = self.motion(np.array([time_s]))
         return State(
             time_s,
-            m.positions_m[0],
-            m.velocities_m_s[0],
-            m.attitudes[0],
-            m.body_rates_rad_s[0],
-            m.specific_forces_m_s2[0],
+            motion.positions_m[0],
+            motion.velocities_m_s[0],
+            motion.attitudes[0],
+            motion.body_rates_rad_s[0],
+            motion.specific_forces_m_s2[0],
         )
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
@@ -56,7 +59,7 @@ class Swaying:
         attitudes = self.tilt * Rotation.from_rotvec(self.spin_rad_s * t * up) * nod
         rates = nod.inv().apply(np.broadcast_to(self.spin_rad_s * up, (times_s.size, 3)).copy())
         rates = rates + self.nod_rad * self.nod_rad_s * np.cos(self.nod_rad_s * t) * x_axis
-        # Velocity, acceleration and angular frequency of the sway.
+        # Initial velocity v and constant acceleration a of the parabola; angular frequency k of the sway.
         v, a, k = np.array(self.velocity_m_s), np.array(self.acceleration_m_s2), self.sway_rad_s
         accelerations = a - self.sway_m * k**2 * np.sin(k * t) * east
         return Motion(

@@ -31,12 +31,12 @@ def euroc(tmp_path: Path) -> Path:
 
 
 def test_mounting_preserves_all_angles(euroc: Path) -> None:
-    unmounted, custom = read_camera(euroc), CHOICE.validate_python({"file": str(euroc)})
-    mounted = custom.camera()
-    assert np.array_equal(mounted.a, [0.0, 0.0, -1.0])
-    assert np.array_equal(mounted.c, np.zeros(3))
+    file_camera, custom = read_camera(euroc), CHOICE.validate_python({"file": str(euroc)})
+    mounted_camera = custom.camera()
+    assert np.array_equal(mounted_camera.a, [0.0, 0.0, -1.0])
+    assert np.array_equal(mounted_camera.c, np.zeros(3))
     pixels = np.array([[0.0, 0.0], [751.0, 10.0], [400.0, 479.0], [100.0, 200.0]])
-    actual, expected = (camera.rays(pixels)[1] for camera in (mounted, unmounted))
+    actual, expected = (camera.rays(pixels)[1] for camera in (mounted_camera, file_camera))
     assert np.allclose(actual @ actual.T, expected @ expected.T, rtol=0, atol=1e-12)
     # Mounted axes: columns along +x, upper image edge along +y, viewing direction -z. OpenCV's y and z are inverted.
     point = np.array([0.1, -0.2, 1.0])
@@ -48,7 +48,7 @@ def test_mounting_preserves_all_angles(euroc: Path) -> None:
         np.array([-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]),
     )
     # The tolerance covers the fit, and the 0.01 deg tilt of A that the tangential distortion causes.
-    assert np.allclose(mounted.project(point * [1.0, -1.0, -1.0])[0], expected_pixels.ravel(), rtol=0, atol=0.2)
+    assert np.allclose(mounted_camera.project(point * [1.0, -1.0, -1.0])[0], expected_pixels.ravel(), rtol=0, atol=0.2)
 
 
 def test_opportunity_labels_can_be_mounted(shared_data: Path) -> None:
@@ -56,21 +56,21 @@ def test_opportunity_labels_can_be_mounted(shared_data: Path) -> None:
     custom = CHOICE.validate_python(str(label))
     assert custom.model == "CAHVOR"
     assert custom.size == (1024, 1024)
-    unmounted = read_camera(label)
-    assert isinstance(unmounted, Cahvor)
+    file_camera = read_camera(label)
+    assert isinstance(file_camera, Cahvor)
     pixels = np.array([[0.0, 0.0], [1023.0, 10.0], [400.0, 900.0]])
-    actual, expected = (camera.rays(pixels)[1] for camera in (custom.camera(), unmounted))
+    actual, expected = (camera.rays(pixels)[1] for camera in (custom.camera(), file_camera))
     # The label rounds A to six digits.
     assert np.allclose(actual @ actual.T, expected @ expected.T, rtol=0, atol=1e-6)
 
 
 def test_stored_camera_replaces_the_file(euroc: Path) -> None:
     custom = CHOICE.validate_python(str(euroc))
-    stored = custom.model_dump(mode="json")
+    stored_values = custom.model_dump(mode="json")
     euroc.write_text("changed: true")
-    assert CHOICE.validate_python(stored) == custom
+    assert CHOICE.validate_python(stored_values) == custom
     assert CHOICE.validate_json(custom.model_dump_json()) == custom
-    assert hash(CHOICE.validate_python(stored)) == hash(custom)
+    assert hash(CHOICE.validate_python(stored_values)) == hash(custom)
 
 
 def test_preset_names_are_accepted(euroc: Path) -> None:
@@ -81,9 +81,9 @@ def test_preset_names_are_accepted(euroc: Path) -> None:
 
 def test_mirrored_images_are_rejected(euroc: Path) -> None:
     camera = read_camera(euroc)
-    mirrored = camera._with(h=-camera.h)
+    mirrored_camera = camera._with(h=-camera.h)
     with pytest.raises(ValueError, match="mirrored"):
-        mount_looking_down(mirrored)
+        mount_looking_down(mirrored_camera)
 
 
 @pytest.mark.parametrize(

@@ -38,39 +38,39 @@ def write_datasheet(folder: Path, text: str = DATASHEET) -> Path:
 
 
 def test_parameters_follow_from_the_datasheet(tmp_path: Path) -> None:
-    p = read_datasheet(write_datasheet(tmp_path)).parameters()
-    assert p.gain_e_dn == pytest.approx(10500 / 4096)
-    assert p.rows_summed == 1
-    assert p.transfer_row_s == p.clear_row_s == 0.0
-    assert p.readout_row_s == pytest.approx(0.0512 / 1536)
+    detector = read_datasheet(write_datasheet(tmp_path)).parameters()
+    assert detector.gain_e_dn == pytest.approx(10500 / 4096)
+    assert detector.rows_summed == 1
+    assert detector.transfer_row_s == detector.clear_row_s == 0.0
+    assert detector.readout_row_s == pytest.approx(0.0512 / 1536)
     # At its specified temperature the dark current is that of the datasheet.
-    assert p.temperature_c == 20.0
-    assert p.dark_e_s * p.dark_growth == pytest.approx(1.0)
-    # The diffraction is wavelength times f-number / pixel pitch.
-    assert p.optics.diffraction_px == pytest.approx(0.55 * 4 / 3.45, rel=0.02)
+    assert detector.temperature_c == 20.0
+    assert detector.dark_e_s * detector.dark_growth == pytest.approx(1.0)
+    # The diffraction is the mean wavelength, 0.55 um, times the f-number, divided by the pixel pitch.
+    assert detector.optics.diffraction_px == pytest.approx(0.55 * 4 / 3.45, rel=0.02)
     # A radiance factor of 0.3 fills 60 % of the full well.
-    assert 0.3 * p.responsivity_e_s * p.exposure_s == pytest.approx(0.6 * 10500)
+    assert 0.3 * detector.responsivity_e_s * detector.exposure_s == pytest.approx(0.6 * 10500)
 
 
 def test_responsivity_counts_solar_photons(tmp_path: Path) -> None:
     """The solar irradiance is 475 W/m2 between 420 and 680 nm (ASTM E490). The mean photon energy is that of 550 nm."""
-    p = read_datasheet(write_datasheet(tmp_path, "sun_au = 1.0\n" + DATASHEET)).parameters()
+    detector = read_datasheet(write_datasheet(tmp_path, "sun_au = 1.0\n" + DATASHEET)).parameters()
     photons_m2_s = 475.0 / (6.62607015e-34 * 2.99792458e8 / 550e-9)
     expected = 0.65 * 0.9 * (3.45e-6) ** 2 * photons_m2_s / (4.0 * 4.0**2)
     # The sun is modelled as a black body, whose irradiance is up to 9 % below ASTM E490 in green light.
-    assert p.responsivity_e_s == pytest.approx(expected, rel=0.1)
+    assert detector.responsivity_e_s == pytest.approx(expected, rel=0.1)
     # `sunlight` is the solar irradiance at `sun_au`, relative to 1 au.
-    assert p.sunlight == 1.0
-    far_from_sun = read_datasheet(write_datasheet(tmp_path, "sun_au = 3.0\n" + DATASHEET)).parameters()
-    assert far_from_sun.responsivity_e_s / far_from_sun.sunlight == pytest.approx(p.responsivity_e_s)
+    assert detector.sunlight == 1.0
+    distant_detector = read_datasheet(write_datasheet(tmp_path, "sun_au = 3.0\n" + DATASHEET)).parameters()
+    assert distant_detector.responsivity_e_s / distant_detector.sunlight == pytest.approx(detector.responsivity_e_s)
 
 
 def test_constant_efficiency_curve_equals_scalar_efficiency(tmp_path: Path) -> None:
     curve = DATASHEET.replace("quantum_efficiency = 0.65\n", "").replace(
         "[lens]", "[quantum_efficiency]\nwavelength_nm = [300.0, 900.0]\nefficiency = [0.65, 0.65]\n\n[lens]"
     )
-    scalar = read_datasheet(write_datasheet(tmp_path)).parameters()
-    assert read_datasheet(write_datasheet(tmp_path, curve)).parameters() == scalar
+    parameters = read_datasheet(write_datasheet(tmp_path)).parameters()
+    assert read_datasheet(write_datasheet(tmp_path, curve)).parameters() == parameters
 
 
 def test_mer_ccd_from_datasheet_matches_the_preset(tmp_path: Path) -> None:
@@ -111,15 +111,15 @@ def test_stored_parameters_do_not_need_the_datasheet_file(tmp_path: Path) -> Non
     path.write_text("")
     assert CHOICE.validate_python(parameters.model_dump(mode="json")) == parameters
     path.write_text(DATASHEET)
-    changed = CHOICE.validate_python({"file": str(path), "temperature_c": -10.0, "optics": {"dust_discs": 3}})
-    assert (changed.temperature_c, changed.optics.dust_discs) == (-10.0, 3)
-    assert changed.full_well_e == parameters.full_well_e
+    custom = CHOICE.validate_python({"file": str(path), "temperature_c": -10.0, "optics": {"dust_discs": 3}})
+    assert (custom.temperature_c, custom.optics.dust_discs) == (-10.0, 3)
+    assert custom.full_well_e == parameters.full_well_e
     # The stored values suffice after the file is deleted.
-    stored = changed.model_dump(mode="json")
+    stored_values = custom.model_dump(mode="json")
     path.unlink()
-    assert CHOICE.validate_python(stored) == changed
+    assert CHOICE.validate_python(stored_values) == custom
     assert CHOICE.validate_python("xc-55") == preset("xc-55").detector
-    assert np.isfinite(changed.dark_growth)
+    assert np.isfinite(custom.dark_growth)
 
 
 FAULTS = [

@@ -12,10 +12,10 @@ from tests.sim.sensor.motions import uniform_motion
 
 #: A uniform and a dark scene: radiance factors, shape (rows, columns).
 UNIFORM = np.ones((64, 48), dtype=np.float32)
+DARK = np.zeros_like(UNIFORM)
 #: Optics without spread.
 SHARP = OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)
 NO_ERRORS = {"response_spread": 0.0, "calibration_error": 0.0, "read_noise_e": 0.0, "optics": SHARP}
-DARK = np.zeros_like(UNIFORM)
 
 
 def _make_detector(shape: tuple[int, int] = UNIFORM.shape, **changes: object) -> Detector:
@@ -58,8 +58,8 @@ def test_rows_are_summed_and_columns_are_not() -> None:
 
 def test_signal_saturates_at_full_well_and_full_scale() -> None:
     counts = _make_detector().expose(1e3 * UNIFORM, np.random.default_rng(0))
-    p = DetectorParameters()
-    assert (counts == min(4095, round(p.full_well_e / p.gain_e_dn + p.offset_dn))).all()
+    parameters = DetectorParameters()
+    assert (counts == min(4095, round(parameters.full_well_e / parameters.gain_e_dn + parameters.offset_dn))).all()
     assert (_make_detector(gain_e_dn=1.0).expose(1e3 * UNIFORM, np.random.default_rng(0)) == 4095).all()
 
 
@@ -75,7 +75,7 @@ def test_calibration_response_has_the_specified_error() -> None:
         UNIFORM, DetectorParameters(response_spread=0.02, calibration_error=0.005), np.random.default_rng(3)
     )
     true_response = detector.response.reshape(16, 4, 48).mean(axis=1)
-    # The standard error of the deviation from 768 pixels is 2.6 %.
+    # The standard error of the deviation from 768 pixels is 2.6 %. The mean of four rows has half the deviation of one.
     assert (detector.calibration.flat_field / true_response).std() == pytest.approx(0.005, rel=0.1)
     assert true_response.std() == pytest.approx(0.02 / 2, rel=0.1)
 
@@ -96,29 +96,29 @@ def test_dimes_correction_removes_the_smear() -> None:
         .astype(np.float32)
     )
     detector = _make_detector(scene.shape)
-    p = detector.parameters
+    parameters = detector.parameters
 
     def sum_rows(charge: np.ndarray) -> np.ndarray:
-        return np.asarray(charge.reshape(256, 4, 32).sum(axis=1) / p.gain_e_dn)
+        return np.asarray(charge.reshape(256, 4, 32).sum(axis=1) / parameters.gain_e_dn)
 
-    smeared = sum_rows(detector.charge(scene))
-    exposed = sum_rows(scene * np.float32(p.responsivity_e_s * p.exposure_s))
-    assert np.abs(smeared - exposed).max() > 0.2 * p.full_scale_dn
-    assert smeared.max() < p.full_scale_dn
-    error = remove_frame_transfer(smeared, detector.calibration, 4) - exposed
+    smeared_counts = sum_rows(detector.charge(scene))
+    exposed_counts = sum_rows(scene * np.float32(parameters.responsivity_e_s * parameters.exposure_s))
+    assert np.abs(smeared_counts - exposed_counts).max() > 0.2 * parameters.full_scale_dn
+    assert smeared_counts.max() < parameters.full_scale_dn
+    error = remove_frame_transfer(smeared_counts, detector.calibration, 4) - exposed_counts
     # The requirement is 0.2 % of full scale. The residual is caused by differences between the rows that are summed.
-    assert np.abs(error).max() < 0.002 * p.full_scale_dn
+    assert np.abs(error).max() < 0.002 * parameters.full_scale_dn
 
 
 def test_dark_current_doubles_every_six_degrees() -> None:
     cold, warm = (_make_detector(temperature_c=t).dark_charge() for t in (-34.0, -28.0))
     np.testing.assert_allclose(warm, 2.0 * cold, rtol=1e-6)
     detector = _make_detector(temperature_c=0.0)
-    p = detector.parameters
-    seconds = dark_seconds(p, 64)
-    assert seconds[0] == pytest.approx(p.exposure_s + 64 * p.transfer_row_s)
-    np.testing.assert_allclose(np.diff(seconds), p.readout_row_s)
-    np.testing.assert_allclose(detector.dark_charge()[:, 0], 4 * p.dark_e_s * seconds, rtol=1e-6)
+    parameters = detector.parameters
+    seconds = dark_seconds(parameters, 64)
+    assert seconds[0] == pytest.approx(parameters.exposure_s + 64 * parameters.transfer_row_s)
+    np.testing.assert_allclose(np.diff(seconds), parameters.readout_row_s)
+    np.testing.assert_allclose(detector.dark_charge()[:, 0], 4 * parameters.dark_e_s * seconds, rtol=1e-6)
 
 
 def test_dark_current_adds_signal_and_shot_noise() -> None:
@@ -156,11 +156,11 @@ def test_bursts_disturb_runs_along_the_rows() -> None:
         (undisturbed.expose(scene, np.random.default_rng(n)), disturbed.expose(scene, np.random.default_rng(n)))
         for n in range(60)
     ]
-    changed = np.stack([(a != b).reshape(-1) for a, b in pairs])
+    is_disturbed = np.stack([(without_bursts != with_bursts).reshape(-1) for without_bursts, with_bursts in pairs])
     # The standard error from 180 bursts of 200 pixels is 10 %. The image border clips 1 % of the pixels.
-    assert changed.sum() / 60 == pytest.approx(600.0, rel=0.25)
+    assert is_disturbed.sum() / 60 == pytest.approx(600.0, rel=0.25)
     # A burst is one run of pixels, so few disturbed pixels follow an undisturbed one (some noise rounds to zero).
-    run_starts = (changed[:, 1:] & ~changed[:, :-1]).sum() / 60
+    run_starts = (is_disturbed[:, 1:] & ~is_disturbed[:, :-1]).sum() / 60
     assert run_starts < 10.0
 
 

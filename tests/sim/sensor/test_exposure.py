@@ -21,6 +21,7 @@ def test_auto_exposure_converges_from_dark_and_bright(start_s: float) -> None:
     result = auto_expose(_make_detector(start_s), GROUND, OPTIONS, np.random.default_rng(2))
     assert result.converged
     assert len(result.exposures_s) <= 5
+    # By default the 98th percentile of the counts is at 75 % of full scale.
     image = result.detector.expose(GROUND, np.random.default_rng(3))
     assert np.percentile(image, 98.0) == pytest.approx(0.75 * 4095, rel=OPTIONS.tolerance + 0.01)
     assert result.detector.calibration.exposure_s == result.exposures_s[-1]
@@ -36,12 +37,13 @@ def test_exposure_can_use_a_part_of_the_image() -> None:
     )
     assert full_image.converged
     assert ground_region.converged
+    # The controlled radiance is that of the sky, 0.6, or the maximum of the ground, 0.12.
     assert ground_region.exposures_s[-1] / full_image.exposures_s[-1] == pytest.approx(0.6 / 0.12, rel=0.12)
 
 
 def test_unreachable_exposure_is_reported() -> None:
-    limited = AutoExposureParameters(max_exposure_s=0.001)
-    result = auto_expose(_make_detector(0.001), GROUND, limited, np.random.default_rng(2))
+    short_exposure = AutoExposureParameters(max_exposure_s=0.001)
+    result = auto_expose(_make_detector(0.001), GROUND, short_exposure, np.random.default_rng(2))
     assert not result.converged
     assert result.exposures_s == (0.001,)
     one_image = auto_expose(_make_detector(0.5), GROUND, AutoExposureParameters(pictures=1), np.random.default_rng(2))

@@ -26,7 +26,7 @@ def perfect_unit(**errors: object) -> ImuParameters:
     return ImuParameters.model_validate(NO_ERRORS | errors)
 
 
-def _allan_deviation(rates: Float64[np.ndarray, "n channels"], samples: int) -> float:
+def _compute_allan_deviation(rates: Float64[np.ndarray, "n channels"], samples: int) -> float:
     """Compute the Allan deviation of all channels for averages over `samples` samples (IEEE Std 952, annex C)."""
     count = len(rates) // samples
     means = rates[: count * samples].reshape(count, samples, -1).mean(axis=1)
@@ -34,6 +34,7 @@ def _allan_deviation(rates: Float64[np.ndarray, "n channels"], samples: int) -> 
 
 
 def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
+    """The Allan deviation over the averaging time tau matches the formula for white noise plus a Markov bias."""
     # Angular random walk, deg/sqrt(h); bias wander, deg/h; its correlation time, s; sample rate, Hz.
     walk, wander, correlation_s, rate = 0.07, 1.0, 100.0, 4.0
     parameters = perfect_unit(
@@ -46,7 +47,8 @@ def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
 
     def compute_expected_deviation(tau: float) -> float:
         x = tau / correlation_s
-        # White noise N^2 / tau and an exponentially correlated bias (IEEE Std 952, eq. C.14, with q T = 2 sd^2).
+        # White noise N^2 / tau and an exponentially correlated bias with the correlation time T and the standard
+        # deviation sd (IEEE Std 952, eq. C.14, with q T = 2 sd^2).
         markov = (wander * DEG_H) ** 2 / x**2 * (2.0 * x - 3.0 + 4.0 * np.exp(-x) - np.exp(-2.0 * x))
         return float(np.sqrt((walk * DEG_SQRT_H) ** 2 / tau + markov))
 
@@ -54,8 +56,10 @@ def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
     # standard errors are sqrt(tau / (3 x 43200)): 0.6 % and 3.8 %. Tolerances are three times that, plus 1 % for
     # interpolation of the bias.
     assert compute_expected_deviation(5.0) == pytest.approx(walk * DEG_SQRT_H / np.sqrt(5.0), rel=0.01)
-    assert _allan_deviation(rates, int(5.0 * rate)) == pytest.approx(compute_expected_deviation(5.0), rel=0.03)
-    assert _allan_deviation(rates, int(190.0 * rate)) == pytest.approx(compute_expected_deviation(190.0), rel=0.12)
+    assert _compute_allan_deviation(rates, int(5.0 * rate)) == pytest.approx(compute_expected_deviation(5.0), rel=0.03)
+    assert _compute_allan_deviation(rates, int(190.0 * rate)) == pytest.approx(
+        compute_expected_deviation(190.0), rel=0.12
+    )
     assert compute_expected_deviation(190.0) > 0.618 * wander * DEG_H
 
 
@@ -84,10 +88,10 @@ def test_scale_and_misalignment_apply_to_true_increments() -> None:
 def test_rounding_errors_do_not_accumulate() -> None:
     parameters = perfect_unit(gyro_count_rad=1e-3, gyro_bias_deg_h=1.0 / DEG_H)
     imu = Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(0))
-    measured = imu.increments(AT_REST, 0.0, 10.0, np.random.default_rng(0)).delta_angles_rad
-    np.testing.assert_allclose(measured / 1e-3, np.rint(measured / 1e-3), atol=1e-9)
+    delta_angles = imu.increments(AT_REST, 0.0, 10.0, np.random.default_rng(0)).delta_angles_rad
+    np.testing.assert_allclose(delta_angles / 1e-3, np.rint(delta_angles / 1e-3), atol=1e-9)
     true_angles = imu.gyro.bias * (np.arange(1, 4001)[:, None] / 400.0)
-    assert np.abs(np.cumsum(measured, axis=0) - true_angles).max() <= 0.5e-3 + 1e-12
+    assert np.abs(np.cumsum(delta_angles, axis=0) - true_angles).max() <= 0.5e-3 + 1e-12
 
 
 def test_bias_follows_temperature() -> None:
@@ -99,7 +103,7 @@ def test_bias_follows_temperature() -> None:
     np.testing.assert_allclose(bias[3], imu.gyro.bias_per_k * 20.0, rtol=1e-8)
 
 
-def test_drawn_errors_have_the_specified_deviations() -> None:
+def test_random_errors_have_the_specified_deviations() -> None:
     parameters = ImuParameters()
     units = [Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(seed)) for seed in range(400)]
     milli_g = 1e-3 * STANDARD_GRAVITY_M_S2

@@ -78,16 +78,18 @@ def test_accelerometer_bias_and_tilt_cause_velocity_errors() -> None:
 
 
 def test_random_walks_have_the_specified_deviation() -> None:
-    attitude, velocity = [], []
+    attitudes_deg, velocities_m_s = [], []
     for seed in range(150):
-        noisy = perfect_unit(rate_hz=50.0, angular_random_walk_deg_sqrt_h=0.07, velocity_random_walk_ug_sqrt_hz=50.0)
-        _, solution = _navigate(Swaying(), noisy, seed=seed)
-        attitude.append(np.degrees(solution.attitude(np.array([18.0]))[0].as_rotvec()))
-        velocity.append(solution.velocity(np.array([18.0]))[0, 2])
+        parameters = perfect_unit(
+            rate_hz=50.0, angular_random_walk_deg_sqrt_h=0.07, velocity_random_walk_ug_sqrt_hz=50.0
+        )
+        _, solution = _navigate(Swaying(), parameters, seed=seed)
+        attitudes_deg.append(np.degrees(solution.attitude(np.array([18.0]))[0].as_rotvec()))
+        velocities_m_s.append(solution.velocity(np.array([18.0]))[0, 2])
     # The standard errors from 450 and 150 values are 3.3 % and 5.8 %; the tolerance is three times that. Tilt does not
     # affect the z velocity.
-    assert np.std(attitude) == pytest.approx(0.07 * np.sqrt(20.0 / 3600.0), rel=0.1)
-    assert np.std(velocity) == pytest.approx(50e-6 * 9.80665 * np.sqrt(20.0), rel=0.18)
+    assert np.std(attitudes_deg) == pytest.approx(0.07 * np.sqrt(20.0 / 3600.0), rel=0.1)
+    assert np.std(velocities_m_s) == pytest.approx(50e-6 * 9.80665 * np.sqrt(20.0), rel=0.18)
 
 
 def test_tag_error_of_10_ms_shifts_ground_by_21_m() -> None:
@@ -98,11 +100,11 @@ def test_tag_error_of_10_ms_shifts_ground_by_21_m() -> None:
     tag = clock.tags(np.array([3.75]), np.random.default_rng(0))
     angle_error = (solution.attitude(tag)[0] * motion.state(3.75).attitude.inv()).magnitude()
     assert 2000.0 * np.tan(angle_error) == pytest.approx(20.9, abs=0.1)
-    # A clock offset shared with the unit has no effect.
+    # If the unit has the same clock offset, the error is zero.
     imu = Imu.draw(perfect_unit(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
     increments = imu.increments(motion, *SPAN, np.random.default_rng(0))
-    shared = InertialSolution.propagate(increments, motion.state(SPAN[0]).attitude, np.zeros(3), GRAVITY)
-    assert (shared.attitude(tag)[0] * motion.state(3.75).attitude.inv()).magnitude() < 1e-9
+    synchronous_solution = InertialSolution.propagate(increments, motion.state(SPAN[0]).attitude, np.zeros(3), GRAVITY)
+    assert (synchronous_solution.attitude(tag)[0] * motion.state(3.75).attitude.inv()).magnitude() < 1e-9
 
 
 def test_time_tags_increase_despite_large_jitter() -> None:

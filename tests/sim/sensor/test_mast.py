@@ -44,12 +44,12 @@ def test_error_free_mast_points_as_commanded() -> None:
 
 def test_backlash_lags_by_half_and_absorbs_short_reversals() -> None:
     mast = Mast.draw(EXACT_POINTING.model_copy(update={"backlash_deg": 0.2}), MER_MAST, _make_rng())
-    forward, repeated, short_reverse, reverse, long_reverse = (
+    forward, same_command, short_reverse, reverse, long_reverse = (
         np.degrees(state.true_rad[0]) for state in _move_mast(mast, [10.0, 10.0, 9.9, 9.5, -20.0])
     )
     # From below the axis stops 0.1 deg below the command, from above 0.1 deg above it. A reversal by 0.1 deg is within
     # the backlash of 0.2 deg.
-    assert [forward, repeated, short_reverse, reverse, long_reverse] == pytest.approx([9.9, 9.9, 9.9, 9.6, -19.9])
+    assert [forward, same_command, short_reverse, reverse, long_reverse] == pytest.approx([9.9, 9.9, 9.9, 9.6, -19.9])
     # The encoder is on the motor side of the gears and does not measure the backlash.
     assert np.degrees([state.readings_rad[0] for state in _move_mast(mast, [10.0, 9.9])]) == pytest.approx([10.0, 9.9])
 
@@ -83,8 +83,8 @@ def test_mast_stops_at_its_elevation_limit() -> None:
 
 
 def test_mer_navcam_position_matches_opportunity_labels() -> None:
-    # Measured angles (rad) and C of 1N491020376 and 1N491020519. In the label frame y is right and z is down. Its
-    # origin is 0.29 m higher.
+    # Measured angles (rad) and camera position C of 1N491020376 and 1N491020519. In the label frame y is right and z is
+    # down. Its origin is 0.29 m higher.
     mast = stereo_mast("mer-navcam")
     for azimuth, elevation, centre in (
         (-0.340449, -0.10962, (0.442604, -0.0611635, -1.25106)),
@@ -99,9 +99,9 @@ def test_mer_navcam_position_matches_opportunity_labels() -> None:
 def test_ideal_calibration_equals_the_design(name: str) -> None:
     design = stereo_mast(name)
     head = StereoHead.draw(design, EXACT_CALIBRATION, _make_rng())
-    for calibrated, ideal in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
+    for camera, ideal_camera in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
         for vector in ("c", "a", "h", "v"):
-            assert getattr(calibrated, vector) == pytest.approx(getattr(ideal, vector), abs=1e-9)
+            assert getattr(camera, vector) == pytest.approx(getattr(ideal_camera, vector), abs=1e-9)
     assert head.disparity_error_px(5.0) == pytest.approx(0.0, abs=1e-8)
 
 
@@ -123,11 +123,11 @@ def test_disparity_error_causes_range_error_of_eq_1(name: str, seed: int) -> Non
     assert head.disparity_error_px(2.0) == pytest.approx(error, rel=0.02)
     point = np.array([range_m, 0.0, 0.0])
     pixels = [camera.project(point)[0] for camera in (design.left, design.right)]
-    measured = _triangulate_range_m(head.calibrated.left, head.calibrated.right, pixels)
+    measured_range_m = _triangulate_range_m(head.calibrated.left, head.calibrated.right, pixels)
     baseline = float(np.linalg.norm(design.left.c - design.right.c))
     expected = range_m**2 / (design.left.focal_lengths[0] * baseline) * error
     # Eq. 1 of the tracking paper is of first order in error / disparity. The disparity is 25 px at 10 m for the navcam.
-    assert measured - np.hypot(range_m, 0.5 * baseline) == pytest.approx(expected, rel=0.03)
+    assert measured_range_m - np.hypot(range_m, 0.5 * baseline) == pytest.approx(expected, rel=0.03)
 
 
 def test_disparity_errors_are_uniform_within_their_bound() -> None:
@@ -140,35 +140,35 @@ def test_disparity_errors_are_uniform_within_their_bound() -> None:
 
 def test_row_errors_and_common_rotations_shift_images() -> None:
     design, point = stereo_mast("research-navcam"), np.array([50.0, 0.0, 0.0])
-    misaligned = StereoHead.draw(
+    misaligned_pair = StereoHead.draw(
         design, EXACT_CALIBRATION.model_copy(update={"epipolar_error_px": 1.0}), _make_rng(5)
     ).calibrated
-    rows = [camera.project(point)[0][1] for camera in (misaligned.left, misaligned.right)]
-    columns = [camera.project(point)[0][0] for camera in (misaligned.left, misaligned.right)]
+    rows = [camera.project(point)[0][1] for camera in (misaligned_pair.left, misaligned_pair.right)]
+    columns = [camera.project(point)[0][0] for camera in (misaligned_pair.left, misaligned_pair.right)]
     expected = [camera.project(point)[0][0] for camera in (design.left, design.right)]
     assert columns == pytest.approx(expected, abs=1e-3)
     # The second draw of the generator is the epipolar error.
     rng = _make_rng(5)
     rng.uniform()
     assert abs(rows[0] - rows[1]) == pytest.approx(abs(rng.standard_normal()), rel=1e-3)
-    rotated = StereoHead.draw(design, EXACT_CALIBRATION.model_copy(update={"alignment_deg": 1.0}), _make_rng(5))
+    head = StereoHead.draw(design, EXACT_CALIBRATION.model_copy(update={"alignment_deg": 1.0}), _make_rng(5))
     shifts = [
-        calibrated.project(point)[0] - ideal.project(point)[0]
-        for calibrated, ideal in ((rotated.calibrated.left, design.left), (rotated.calibrated.right, design.right))
+        camera.project(point)[0] - ideal_camera.project(point)[0]
+        for camera, ideal_camera in ((head.calibrated.left, design.left), (head.calibrated.right, design.right))
     ]
     assert np.linalg.norm(shifts[0]) > 5.0
     assert shifts[0] == pytest.approx(shifts[1], abs=0.5)
-    assert rotated.disparity_error_px(20.0) == pytest.approx(0.0, abs=1e-6)
+    assert head.disparity_error_px(20.0) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_focal_length_errors_scale_the_image() -> None:
     design = stereo_mast("research-navcam")
     head = StereoHead.draw(design, EXACT_CALIBRATION.model_copy(update={"focal_error": 0.01}), _make_rng(3))
     point = np.array([10.0, 2.0, 1.0])
-    for calibrated, ideal in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
-        centre = np.array(ideal.image_centre)
-        ratio = (calibrated.project(point)[0] - centre) / (ideal.project(point)[0] - centre)
-        scale = calibrated.focal_lengths[0] / ideal.focal_lengths[0]
+    for camera, ideal_camera in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
+        centre = np.array(ideal_camera.image_centre)
+        ratio = (camera.project(point)[0] - centre) / (ideal_camera.project(point)[0] - centre)
+        scale = camera.focal_lengths[0] / ideal_camera.focal_lengths[0]
         assert ratio == pytest.approx([scale, scale])
         assert scale != pytest.approx(1.0, abs=1e-6)
 

@@ -26,9 +26,9 @@ EXPOSURE_S = 4e-3
 def _sum_sharp_images(
     image_at: Callable[[float], Image], shape: tuple[int, int], transfer_row_s: float, clear_row_s: float, rows: int
 ) -> Image:
-    """Compute the radiance x seconds that the charge of each pixel collects; `image_at` renders at a time, s.
+    """Compute the radiance x seconds that the charge of each pixel collects, from 24 images of the exposure.
 
-    `rows` transfer steps use one image.
+    `image_at` renders an image at a time, s. Groups of `rows` transfer steps use one image.
     """
     total = sum((image_at(((n + 0.5) / 24 - 0.5) * EXPOSURE_S) for n in range(24)), np.zeros(shape)) * EXPOSURE_S / 24
     for first in range(1, shape[0], rows):
@@ -64,9 +64,9 @@ def test_rotating_camera_matches_many_renderings() -> None:
     response = natural_fall_off(camera)
 
     def render_at(time_s: float) -> Image:
-        rotated = Rotation.from_rotvec(rate * time_s) * attitude
+        rotation = Rotation.from_rotvec(rate * time_s) * attitude
         return np.asarray(
-            renderer.render(scene, rays, rigid(rotated, position + velocity * time_s)).radiance * response
+            renderer.render(scene, rays, rigid(rotation, position + velocity * time_s)).radiance * response
         )
 
     frame = renderer.render(scene, rays, rigid(attitude, position))
@@ -75,11 +75,11 @@ def test_rotating_camera_matches_many_renderings() -> None:
     result = moving_exposure(frame.radiance, response, motion, EXPOSURE_S, transfer_row_s, clear_row_s)
     expected = _sum_sharp_images(render_at, (size, size), transfer_row_s, clear_row_s, rows=6)
     # Pixels outside the frame have no radiance, so a border as wide as the image motion is excluded.
-    inside = np.s_[13:-13, 13:-13]
-    error = (result - expected)[inside] / expected.mean()
+    inner = np.s_[13:-13, 13:-13]
+    error = (result - expected)[inner] / expected.mean()
     assert np.sqrt((error**2).mean()) < 0.004
-    static = (frame.radiance * response * EXPOSURE_S)[inside]
-    assert np.abs(static / static.mean() - expected[inside] / expected[inside].mean()).std() > 0.02
+    static_image = (frame.radiance * response * EXPOSURE_S)[inner]
+    assert np.abs(static_image / static_image.mean() - expected[inner] / expected[inner].mean()).std() > 0.02
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 1400.0), (1400.0, 0.0), (-1000.0, 800.0), (6.0, -4.0)])
@@ -123,8 +123,8 @@ def test_smear_trail_of_a_moving_dot_is_inclined() -> None:
         centre = (image[row] * columns[row]).sum() / image[row].sum()
         assert centre == pytest.approx(40.0 + 1000.0 * (0.5 * EXPOSURE_S + (row - 20 - 0.5) * 5e-5), abs=0.05)
     # During clearing the charge of higher rows passes the dot before the exposure; the higher the row, the earlier.
-    cleared = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 0.0, 5e-5)
-    centre = (cleared[5] * columns[5]).sum() / cleared[5].sum()
+    clearing_image = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 0.0, 5e-5)
+    centre = (clearing_image[5] * columns[5]).sum() / clearing_image[5].sum()
     assert centre == pytest.approx(40.0 - 1000.0 * (0.5 * EXPOSURE_S + 14.5 * 5e-5), abs=0.05)
 
 
@@ -192,14 +192,14 @@ def test_border_of_moving_image_approximates_wider_image(velocity: tuple[float, 
     margin = 12
     rng = np.random.default_rng(2)
     waves = gaussian_filter(rng.standard_normal((280, 280)), 2.0)
-    wide = (1.0 + 0.1 * waves / waves.std()).astype(np.float32)
-    inside = np.s_[margin:-margin, margin:-margin]
-    frame = np.ascontiguousarray(wide[inside])
-    response = np.zeros_like(wide)
-    response[inside] = 1.0
+    wide_scene = (1.0 + 0.1 * waves / waves.std()).astype(np.float32)
+    inner = np.s_[margin:-margin, margin:-margin]
+    frame = np.ascontiguousarray(wide_scene[inner])
+    response = np.zeros_like(wide_scene)
+    response[inner] = 1.0
     motion = uniform_motion(*velocity)
     from_frame = moving_exposure(frame, np.ones_like(frame), motion, EXPOSURE_S, 5e-6, 1e-6)
-    from_wider_image = moving_exposure(wide, response, motion, EXPOSURE_S, 5e-6, 1e-6)[inside]
+    from_wider_image = moving_exposure(wide_scene, response, motion, EXPOSURE_S, 5e-6, 1e-6)[inner]
     error = (from_frame - from_wider_image) / from_wider_image.mean()
     rows, columns = (np.asarray(indices) for indices in np.indices(frame.shape))
     border_distance: np.ndarray = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])

@@ -58,7 +58,7 @@ def _run_filter(
     return path, imu, navigation.run(start, increments, solutions, readings, np.array(covariance_times_s))
 
 
-def _state_errors(path: FlownPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray) -> np.ndarray:
+def _compute_state_errors(path: FlownPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray) -> np.ndarray:
     """Compute the true minus the estimated state, fifteen columns (position, velocity, attitude, two biases).
 
     Scale and misalignment errors of the accelerometer count as a bias: their product with gravity.
@@ -84,35 +84,40 @@ def test_errors_are_consistent_with_the_covariance() -> None:
     The state of each flight has fifteen degrees of freedom.
     """
     receiver_with_float_solutions = RtkParameters(float_fraction=0.3, float_s=10.0)
-    squares = []
+    squared_errors = []
     for seed in range(N_FLIGHTS):
         path, imu, solution = _run_filter(
             seed, rtk_parameters=receiver_with_float_solutions, covariance_times_s=(-3.0, 0.0, 2.5, 5.0)
         )
-        errors = _state_errors(path, imu, solution, solution.covariance_indices)
+        errors = _compute_state_errors(path, imu, solution, solution.covariance_indices)
         covariances = solution.covariances
-        squares.append([float(e @ np.linalg.solve(p, e)) for e, p in zip(errors, covariances, strict=True)])
-    low, high = (float(chi2.ppf(p, 15 * N_FLIGHTS)) / N_FLIGHTS for p in (0.001, 0.999))
-    means = np.mean(squares, axis=0)
+        squared_errors.append(
+            [
+                float(error @ np.linalg.solve(covariance, error))
+                for error, covariance in zip(errors, covariances, strict=True)
+            ]
+        )
+    low, high = (float(chi2.ppf(probability, 15 * N_FLIGHTS)) / N_FLIGHTS for probability in (0.001, 0.999))
+    means = np.mean(squared_errors, axis=0)
     assert np.all((means > low) & (means < high)), means
 
 
 def test_innovations_are_white() -> None:
-    normalised: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
+    normalised_innovations: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
     products: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
     for seed in range(20):
         innovations = _run_filter(seed)[2].innovations
         assert np.mean(innovations.used) > 0.99
-        for kind in normalised:
+        for kind in normalised_innovations:
             for axis in range(3):
-                selected = (innovations.kinds == kind) & (innovations.axes == axis) & (innovations.times_s > -8.0)
-                values = innovations.normalised[selected]
-                normalised[kind].extend(values)
+                is_selected = (innovations.kinds == kind) & (innovations.axes == axis) & (innovations.times_s > -8.0)
+                values = innovations.normalised[is_selected]
+                normalised_innovations[kind].extend(values)
                 products[kind].extend(values[1:] * values[:-1])
-    for kind in normalised:
-        # The standard errors from 7,600 values are 1.6 % of the variance and 0.011 of the correlation. Unmodelled bias
-        # increases both.
-        assert np.var(normalised[kind]) == pytest.approx(1.0, abs=0.1)
+    for kind in normalised_innovations:
+        # The standard errors from 7,600 values are 1.6 % of the variance and 0.011 of the correlation. A bias that the
+        # filter does not model increases both.
+        assert np.var(normalised_innovations[kind]) == pytest.approx(1.0, abs=0.1)
         assert abs(np.mean(products[kind])) < 0.12
 
 
@@ -125,38 +130,42 @@ def test_better_instruments_reduce_the_errors() -> None:
     white = {"velocity_noise_m_s": (5e-3,) * 3, "velocity_wander_m_s": (0.0,) * 3, "clock": {}}
     accurate_receiver = RtkParameters.model_validate({"fixed": static, "floating": static} | white)
     path, imu, solution = _run_filter(0, ideal, accurate_receiver)
-    errors = _state_errors(path, imu, solution, np.arange(1000, 1550))
+    # Ten seconds after the start; the unit has 100 samples per second.
+    errors = _compute_state_errors(path, imu, solution, np.arange(1000, 1550))
     assert np.abs(errors[:, :3]).max() < 6e-3
     assert np.abs(errors[:, 3:6]).max() < 0.015
 
 
 def test_outage_errors_are_consistent_with_the_covariance() -> None:
-    """Without fixes for eight seconds the position drifts by decimetres, as for a tilt error of 0.2 deg."""
+    """Without fixes for eight seconds the position drifts by decimetres, as for a tilt error of 0.2 deg.
+
+    The normalised squared error of position, velocity and attitude has nine degrees of freedom.
+    """
     with_outage = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_fraction=0.0)
-    squares, horizontal_errors_m = [], []
+    squared_errors, horizontal_errors_m = [], []
     for seed in range(N_FLIGHTS):
         path, imu, solution = _run_filter(seed, rtk_parameters=with_outage, covariance_times_s=(5.0,))
-        error = _state_errors(path, imu, solution, solution.covariance_indices)[0]
-        squares.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
+        error = _compute_state_errors(path, imu, solution, solution.covariance_indices)[0]
+        squared_errors.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
         horizontal_errors_m.append(np.hypot(*error[:2]))
     assert 0.2 < np.sqrt(np.mean(np.square(horizontal_errors_m))) < 3.0
     # The errors agree with the covariance during the outage.
-    low, high = (float(chi2.ppf(p, 9 * N_FLIGHTS)) / N_FLIGHTS for p in (0.001, 0.999))
-    assert low < np.mean(squares) < high
+    low, high = (float(chi2.ppf(probability, 9 * N_FLIGHTS)) / N_FLIGHTS for probability in (0.001, 0.999))
+    assert low < np.mean(squared_errors) < high
 
 
 def test_stuck_instruments_are_ignored() -> None:
-    stuck = TiltCompassParameters(heading_stuck_s=-8.0, tilt_stuck_s=-8.0)
-    tilts: dict[str, list[np.ndarray]] = {name: [] for name in ("free", "stuck")}
+    stuck_parameters = TiltCompassParameters(heading_stuck_s=-8.0, tilt_stuck_s=-8.0)
+    attitude_errors_deg: dict[str, list[np.ndarray]] = {name: [] for name in ("free", "stuck")}
     for seed in range(20):
-        for name, compass_parameters in (("free", COMPASS), ("stuck", stuck)):
+        for name, compass_parameters in (("free", COMPASS), ("stuck", stuck_parameters)):
             path, imu, solution = _run_filter(seed, compass_parameters=compass_parameters)
-            error = _state_errors(path, imu, solution, np.array([1500]))[0]
-            tilts[name].append(np.degrees(error[6:9]))
+            error = _compute_state_errors(path, imu, solution, np.array([1500]))[0]
+            attitude_errors_deg[name].append(np.degrees(error[6:9]))
             if name == "stuck":
                 late_kinds = solution.innovations.kinds[solution.innovations.times_s > -7.0]
                 assert set(late_kinds) == {POSITION_FIX, VELOCITY_FIX}
-    rms_free, rms_stuck = (np.sqrt(np.mean(np.square(tilts[name]), axis=0)) for name in ("free", "stuck"))
+    rms_free, rms_stuck = (np.sqrt(np.mean(np.square(attitude_errors_deg[name]), axis=0)) for name in ("free", "stuck"))
     # The receiver's velocities determine the tilt with or without inclinometers.
     assert np.all(rms_stuck[:2] < 1.5 * rms_free[:2] + 0.05)
     assert rms_stuck[2] < 4.0
@@ -177,6 +186,7 @@ def test_filter_resets_after_persistent_rejection() -> None:
     innovations = solution.innovations
     assert not innovations.used[(innovations.kinds == POSITION_FIX) & (innovations.axes == 0)][0]
     position_errors_m = np.abs(solution.positions_m - path.motion(imu.boundaries(*span)).positions_m)
+    # Errors after 0.8 s, and from 2 s on.
     assert position_errors_m[80, 0] > 15.0
     assert position_errors_m[200:].max() < 0.1
 

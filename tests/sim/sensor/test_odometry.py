@@ -30,8 +30,8 @@ def _drive(ground: Ground, commands: tuple[DriveCommand, ...], slip: SlipParamet
     return drives
 
 
-def _attitude_error_rad(estimate: PoseEstimate, true_pose: RigidTransform) -> np.ndarray:
-    """Rotation vector in world axes from the true to the estimated attitude."""
+def _compute_error_rad(estimate: PoseEstimate, true_pose: RigidTransform) -> np.ndarray:
+    """Compute the rotation vector in world axes from the true to the estimated attitude."""
     return np.asarray((estimate.world_from_rover.rotation * true_pose.rotation.inv()).as_rotvec())
 
 
@@ -60,9 +60,9 @@ def test_visual_odometry_detects_slip_and_wheels_do_not() -> None:
     true_pose = drives[-1].end.world_from_rover
     _, wheels = _estimate_poses(drives, EXACT, 0)
     _, visual = _estimate_poses(drives, EXACT, 0, visual=True)
-    slipped_m = slip.slip_fraction(np.radians(15.0)) * 3 * STRAIGHT.forward_m
+    slip_distance_m = slip.slip_fraction(np.radians(15.0)) * 3 * STRAIGHT.forward_m
     direction = np.array([np.cos(np.radians(15.0)), 0.0, np.sin(np.radians(15.0))])
-    assert wheels.error_m(true_pose) == pytest.approx(slipped_m * direction, abs=1e-7)
+    assert wheels.error_m(true_pose) == pytest.approx(slip_distance_m * direction, abs=1e-7)
     assert visual.error_m(true_pose) == pytest.approx(np.zeros(3), abs=1e-7)
 
 
@@ -70,7 +70,7 @@ def test_gyros_measure_turns_reduced_by_wheel_slip() -> None:
     slip = SlipParameters(turn=0.2, step_spread=0.0, wander_deg_m=0.0)
     drives = _drive(Plane(), (DriveCommand(turn_left_rad=1.0), STRAIGHT), slip)
     _, estimate = _estimate_poses(drives, EXACT, 0)
-    assert _attitude_error_rad(estimate, drives[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
+    assert _compute_error_rad(estimate, drives[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
 
 
 def test_gyro_misalignment_causes_attitude_errors_in_turns() -> None:
@@ -79,15 +79,16 @@ def test_gyro_misalignment_causes_attitude_errors_in_turns() -> None:
     straight = _drive(ground, (STRAIGHT, STRAIGHT))
     odometer, estimate = _estimate_poses(straight, parameters, 3)
     assert odometer.initial_estimate.world_from_rover is straight[0].start.world_from_rover
-    assert _attitude_error_rad(estimate, straight[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
+    assert _compute_error_rad(estimate, straight[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
     half_turn = _drive(ground, (DriveCommand(turn_left_rad=np.pi),))
     odometer, estimate = _estimate_poses(half_turn, parameters, 3)
-    error_rad = np.linalg.norm(_attitude_error_rad(estimate, half_turn[-1].end.world_from_rover))
+    error_rad = np.linalg.norm(_compute_error_rad(estimate, half_turn[-1].end.world_from_rover))
     # After half a turn the misalignment appears twice.
     assert error_rad == pytest.approx(2.0 * odometer.misalignment.magnitude(), rel=0.01)
 
 
-def test_visual_odometry_error_is_two_percent_of_the_distance() -> None:
+def test_odometry_errors_are_specified_fractions_of_the_distance() -> None:
+    """The default errors after 8 m are 2 % with visual odometry and 1.1 % with wheels that do not slip."""
     drives = _drive(Plane(), (DriveCommand(forward_m=2.0),) * 4)
     end = drives[-1].end.world_from_rover
     errors = [
@@ -104,17 +105,17 @@ def test_visual_odometry_error_is_two_percent_of_the_distance() -> None:
 
 def test_scale_errors_are_constant_and_random_walks_are_not() -> None:
     drives = _drive(Plane(), (STRAIGHT,) * 8)
-    half, full = drives[3].end.world_from_rover, drives[7].end.world_from_rover
+    middle_pose, end_pose = drives[3].end.world_from_rover, drives[7].end.world_from_rover
 
-    def forward_errors(parameters: OdometryParameters) -> tuple[np.ndarray, np.ndarray]:
-        middle = [_estimate_poses(drives[:4], parameters, n)[1].error_m(half)[0] for n in range(80)]
-        end = [_estimate_poses(drives, parameters, n)[1].error_m(full)[0] for n in range(80)]
+    def compute_forward_errors(parameters: OdometryParameters) -> tuple[np.ndarray, np.ndarray]:
+        middle = [_estimate_poses(drives[:4], parameters, n)[1].error_m(middle_pose)[0] for n in range(80)]
+        end = [_estimate_poses(drives, parameters, n)[1].error_m(end_pose)[0] for n in range(80)]
         return np.array(middle), np.array(end)
 
-    middle, end = forward_errors(EXACT.model_copy(update={"scale_error": 0.01}))
+    middle, end = compute_forward_errors(EXACT.model_copy(update={"scale_error": 0.01}))
     assert end == pytest.approx(2.0 * middle)
     assert np.std(end) == pytest.approx(0.01 * 6.4, rel=0.25)
-    middle, end = forward_errors(EXACT.model_copy(update={"walk_m": 0.01}))
+    middle, end = compute_forward_errors(EXACT.model_copy(update={"walk_m": 0.01}))
     assert np.std(end) == pytest.approx(0.01 * np.sqrt(6.4), rel=0.25)
     # At half the distance a random walk has half of its final variance: the correlation is sqrt(0.5).
     assert np.corrcoef(middle, end)[0, 1] == pytest.approx(np.sqrt(0.5), abs=0.22)
@@ -126,12 +127,13 @@ def test_heading_errors_grow_and_shift_the_position() -> None:
     drift = EXACT.model_copy(update={"heading_drift_deg_m": 0.5})
     odometer, estimate = _estimate_poses(drives, drift, 2)
     assert estimate.heading_error_rad == pytest.approx(4.0 * odometer.heading_drift_rad_m)
-    assert _attitude_error_rad(estimate, true_pose) == pytest.approx([0.0, 0.0, estimate.heading_error_rad], abs=1e-9)
+    assert _compute_error_rad(estimate, true_pose) == pytest.approx([0.0, 0.0, estimate.heading_error_rad], abs=1e-9)
     # The heading error at the start of a drive shifts its end sideways. The five errors are 0, 1, 2, 3 and 4 times that
     # of one drive of 0.8 m.
     assert estimate.error_m(true_pose)[1] == pytest.approx(odometer.heading_drift_rad_m * 0.8 * 0.8 * 10.0, rel=1e-3)
     walk = EXACT.model_copy(update={"heading_walk_deg": 0.2})
     errors = [np.degrees(_estimate_poses(drives, walk, n)[1].heading_error_rad) for n in range(100)]
+    # The random walk grows with the square root of 4 m.
     assert np.std(errors) == pytest.approx(0.2 * 2.0, rel=0.22)
     turn_drives = _drive(Plane(), (DriveCommand(turn_left_rad=2.0),))
     odometer, estimate = _estimate_poses(turn_drives, EXACT.model_copy(update={"heading_scale_error": 0.01}), 4)

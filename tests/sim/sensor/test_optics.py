@@ -37,7 +37,7 @@ def test_total_light_is_conserved_at_the_border() -> None:
 def test_point_spread_has_the_specified_modulation_transfer() -> None:
     """The modulation at half the Nyquist frequency has a closed form; the kernel includes light beyond its ends."""
     frequency = 0.25
-    # Spatial frequency relative to the cut-off of diffraction.
+    # Spatial frequency s relative to the cut-off of diffraction.
     s = frequency * OPTICS.diffraction_px
     diffraction = 2.0 / np.pi * (np.arccos(s) - s * np.sqrt(1.0 - s * s))
     diffusion = np.exp(-2.0 * (np.pi * OPTICS.diffusion_px * frequency) ** 2)
@@ -78,6 +78,7 @@ def test_dust_attenuates_light_and_is_absent_from_the_flat_field() -> None:
     assert 0.6**4 <= transmission.min() <= 0.6 + 1e-6
     # Four shadows of 12 px in an image of 128 px cover about 11 %.
     assert 0.03 < (transmission < 0.99).mean() < 0.4
+    # The smooth step of an edge has a slope of up to 1.5 over its width, which is at least the minimum radius of 8 px.
     assert np.abs(np.diff(transmission, axis=1)).max() < 0.4 * 1.5 / 8.0
     flat = np.ones((128, 128), dtype=np.float32)
     clean, with_dust = (
@@ -89,16 +90,18 @@ def test_dust_attenuates_light_and_is_absent_from_the_flat_field() -> None:
 
 @pytest.mark.parametrize("diameter", [1.0, 2.5])
 def test_defocus_has_the_transfer_of_a_uniform_disc(diameter: float) -> None:
-    sharp, defocused = (OpticsParameters(diffraction_px=0.0, diffusion_px=0.0, defocus_px=d) for d in (1e-6, diameter))
+    sharp_optics, defocused_optics = (
+        OpticsParameters(diffraction_px=0.0, diffusion_px=0.0, defocus_px=defocus_px) for defocus_px in (1e-6, diameter)
+    )
     frequency = np.array([0.1, 0.2, 0.3])
     offsets = np.arange(-6, 7)
     waves = np.cos(2.0 * np.pi * frequency[:, None] * offsets)
-    measured = waves @ line_spread(defocused) / (waves @ line_spread(sharp))
+    modulation = waves @ line_spread(defocused_optics) / (waves @ line_spread(sharp_optics))
     x = np.pi * diameter * frequency
     # Bessel function J1(x): the integral of cos(t - x sin t) from 0 to pi, divided by pi.
     t = np.linspace(0.0, np.pi, 2001)
     bessel = np.trapezoid(np.cos(t - x[:, None] * np.sin(t)), t, axis=1) / np.pi
-    np.testing.assert_allclose(measured, 2.0 * bessel / x, atol=0.02)
+    np.testing.assert_allclose(modulation, 2.0 * bessel / x, atol=0.02)
 
 
 def test_stray_light_reduces_contrast_but_not_the_mean() -> None:

@@ -12,7 +12,7 @@ class _Campaign(BaseModel):
     detector: DetectorChoice = DetectorParameters()
 
 
-def _fields_of_view_deg(name: str) -> tuple[float, float]:
+def _compute_fields_of_view_deg(name: str) -> tuple[float, float]:
     """Compute the angles between the centres of opposite image edges, deg."""
     camera = preset(name).cameras()[0]
     columns, rows = camera.size
@@ -23,7 +23,7 @@ def _fields_of_view_deg(name: str) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(
-    ("name", "h_deg", "v_deg", "tolerance"),
+    ("name", "horizontal_deg", "vertical_deg", "tolerance"),
     [
         ("mer-descent-flown", 45.0, 45.0, 1.0),
         ("mer-descent-field", 45.0, 45.0, 1.0),
@@ -35,8 +35,10 @@ def _fields_of_view_deg(name: str) -> tuple[float, float]:
         ("research-pancam", 17.0, 13.0, 0.5),
     ],
 )
-def test_presets_have_the_specified_fields_of_view(name: str, h_deg: float, v_deg: float, tolerance: float) -> None:
-    assert _fields_of_view_deg(name) == pytest.approx((h_deg, v_deg), abs=tolerance)
+def test_presets_have_the_specified_fields_of_view(
+    name: str, horizontal_deg: float, vertical_deg: float, tolerance: float
+) -> None:
+    assert _compute_fields_of_view_deg(name) == pytest.approx((horizontal_deg, vertical_deg), abs=tolerance)
 
 
 def test_helicopter_camera_has_lens_distortion() -> None:
@@ -48,8 +50,8 @@ def test_helicopter_camera_has_lens_distortion() -> None:
     )
     corner = np.array([[639.5, 479.5]]) - 0.5
     point = 10.0 * ideal.rays(corner)[1]
-    (distorted,), _ = camera.project(point)
-    distortion_px = np.linalg.norm(corner[0] - [319.5, 239.5]) - np.linalg.norm(distorted - [319.5, 239.5])
+    (distorted_pixel,), _ = camera.project(point)
+    distortion_px = np.linalg.norm(corner[0] - [319.5, 239.5]) - np.linalg.norm(distorted_pixel - [319.5, 239.5])
     assert distortion_px == pytest.approx(0.018 * 400.0, abs=0.3)
 
 
@@ -87,11 +89,12 @@ def test_each_preset_exposes_an_image(name: str) -> None:
     """Ground of radiance factor 0.3 fills about 60 % of full scale on axis; for the descent camera 5 to 10 %."""
     camera = preset(name)
     fall_off = natural_fall_off(camera.cameras()[0])[::8, ::8]
-    p = camera.detector.model_copy(update={"rows_summed": 1, "transfer_row_s": 0.0, "clear_row_s": 0.0})
-    detector = Detector.draw(np.ascontiguousarray(fall_off), p, np.random.default_rng(0))
+    parameters = camera.detector.model_copy(update={"rows_summed": 1, "transfer_row_s": 0.0, "clear_row_s": 0.0})
+    detector = Detector.draw(np.ascontiguousarray(fall_off), parameters, np.random.default_rng(0))
     counts = detector.expose(0.3 * np.ones_like(fall_off), np.random.default_rng(1))
     rows, columns = counts.shape
-    level = np.median(counts[rows // 2 - 5 : rows // 2 + 5, columns // 2 - 5 : columns // 2 + 5]) / p.full_scale_dn
+    central_counts = counts[rows // 2 - 5 : rows // 2 + 5, columns // 2 - 5 : columns // 2 + 5]
+    level = np.median(central_counts) / parameters.full_scale_dn
     if "descent" in name:
         assert 0.05 < level < 0.1
     else:
@@ -115,13 +118,13 @@ def test_unknown_preset_is_rejected() -> None:
 
 
 def test_campaign_can_modify_a_preset() -> None:
-    chosen = _Campaign.model_validate(
+    detector = _Campaign.model_validate(
         {"detector": {"preset": "mer-descent-field", "temperature_c": 23.0, "optics": {"dust_discs": 3}}}
     ).detector
     expected = preset("mer-descent-field").detector
-    assert chosen.responsivity_e_s == expected.responsivity_e_s
-    assert chosen.temperature_c == 23.0
-    assert chosen.optics == expected.optics.model_copy(update={"dust_discs": 3})
+    assert detector.responsivity_e_s == expected.responsivity_e_s
+    assert detector.temperature_c == 23.0
+    assert detector.optics == expected.optics.model_copy(update={"dust_discs": 3})
     assert _Campaign.model_validate({"detector": {"rows_summed": 2}}).detector.rows_summed == 2
     with pytest.raises(ValidationError, match="unknown camera preset"):
         _Campaign.model_validate({"detector": {"preset": "kodak"}})

@@ -12,11 +12,11 @@ from marsyard.sim.sensor.optics import DARK_E_S, DARKEST_RADIANCE_FACTOR, LightP
 FLIGHT_CAMERA, FIELD_CAMERA = preset("mer-descent-flown"), preset("mer-descent-field")
 
 
-def _signal_to_noise(p: DetectorParameters, radiance_factor: float) -> float:
+def _compute_snr(parameters: DetectorParameters, radiance_factor: float) -> float:
     """Compute the mean SNR of the rows on axis: shot noise, dark current, readout and rounding; no smear."""
-    signal = radiance_factor * p.responsivity_e_s * p.exposure_s * p.rows_summed
-    dark = p.rows_summed * p.dark_e_s * p.dark_growth * dark_seconds(p, 1024)
-    noise = np.sqrt(signal + dark + p.read_noise_e**2 + p.gain_e_dn**2 / 12.0)
+    signal = radiance_factor * parameters.responsivity_e_s * parameters.exposure_s * parameters.rows_summed
+    dark = parameters.rows_summed * parameters.dark_e_s * parameters.dark_growth * dark_seconds(parameters, 1024)
+    noise = np.sqrt(signal + dark + parameters.read_noise_e**2 + parameters.gain_e_dn**2 / 12.0)
     return float(np.mean(signal / noise))
 
 
@@ -48,10 +48,10 @@ def test_signal_to_noise_and_dark_current_match_the_paper(
     The tolerances are 2 for the ratio and a factor of 1.2 for the fractions of noise from dark current.
     """
     for camera in (FLIGHT_CAMERA, FIELD_CAMERA):
-        p = camera.detector.model_copy(update={"temperature_c": temperature_c})
-        assert _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) == pytest.approx(ratio, abs=2.0)
-        without_dark = _signal_to_noise(p.model_copy(update={"dark_e_s": 0.0}), DARKEST_RADIANCE_FACTOR)
-        actual_fraction = 1.0 - _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) / without_dark
+        parameters = camera.detector.model_copy(update={"temperature_c": temperature_c})
+        assert _compute_snr(parameters, DARKEST_RADIANCE_FACTOR) == pytest.approx(ratio, abs=2.0)
+        without_dark = _compute_snr(parameters.model_copy(update={"dark_e_s": 0.0}), DARKEST_RADIANCE_FACTOR)
+        actual_fraction = 1.0 - _compute_snr(parameters, DARKEST_RADIANCE_FACTOR) / without_dark
         if dark_fraction is None:
             assert actual_fraction < 0.001
         else:
@@ -68,12 +68,12 @@ def test_field_test_and_flight_collect_similar_charge() -> None:
 
 
 def test_default_detector_equals_the_flight_descent_camera() -> None:
-    p = DetectorParameters()
+    parameters = DetectorParameters()
     flight = FLIGHT_CAMERA.detector.model_dump()
-    assert p.responsivity_e_s == pytest.approx(flight.pop("responsivity_e_s"), rel=2e-3)
-    assert p.optics.diffraction_px == pytest.approx(flight.pop("optics")["diffraction_px"], abs=0.01)
-    assert p.model_dump(include=set(flight)) == flight
-    assert p.dark_e_s == DARK_E_S
+    assert parameters.responsivity_e_s == pytest.approx(flight.pop("responsivity_e_s"), rel=2e-3)
+    assert parameters.optics.diffraction_px == pytest.approx(flight.pop("optics")["diffraction_px"], abs=0.01)
+    assert parameters.model_dump(include=set(flight)) == flight
+    assert parameters.dark_e_s == DARK_E_S
 
 
 def test_responsivity_depends_on_aperture_pixel_area_band_and_distance() -> None:

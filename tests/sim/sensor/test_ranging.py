@@ -58,8 +58,8 @@ def _make_rough_surface(seed: int) -> Surface:
     return _make_surface(30.0 * heights / heights.std(), 2.0)
 
 
-def _beam_axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray, "3"]:
-    """Compute the unit vector at a tilt from nadir towards an azimuth, world axes."""
+def _make_axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray, "3"]:
+    """Return the unit vector of a beam at a tilt from nadir towards an azimuth, world axes."""
     tilt, azimuth = np.radians([tilt_deg, azimuth_deg])
     return np.array([np.sin(tilt) * np.sin(azimuth), np.sin(tilt) * np.cos(azimuth), -np.cos(tilt)])
 
@@ -131,21 +131,21 @@ def test_readings_have_constant_rate_and_random_phase() -> None:
 def test_radar_scale_is_common_and_noise_is_independent() -> None:
     static = Swaying(position_m=(0.0, 0.0, 1000.0))
     parameters = RadarParameters(scale_error=0.01, noise=0.001, count_m=0.0)
-    common, noise = [], []
+    common_errors, noise_errors = [], []
     for seed in range(300):
         rng = np.random.default_rng(seed)
         radar = RadarAltimeter.draw(parameters, FLAT, rng)
         first, second = radar.measure(static, np.array([0.0, 1.0]), rng).values
-        common.append(0.5 * (first + second) - 1000.0)
-        noise.append((first - second) / np.sqrt(2.0))
+        common_errors.append(0.5 * (first + second) - 1000.0)
+        noise_errors.append((first - second) / np.sqrt(2.0))
     # The standard error of the deviation from 300 values is 4 %; the tolerance is three times that.
-    assert np.std(common) == pytest.approx(10.0, rel=0.12)
-    assert np.std(noise) == pytest.approx(1.0, rel=0.12)
+    assert np.std(common_errors) == pytest.approx(10.0, rel=0.12)
+    assert np.std(noise_errors) == pytest.approx(1.0, rel=0.12)
 
 
 def test_default_radar_error_is_one_percent_at_3_sigma() -> None:
-    p = RadarParameters()
-    assert 3.0 * np.hypot(p.scale_error, p.noise) == pytest.approx(0.01, rel=0.01)
+    parameters = RadarParameters()
+    assert 3.0 * np.hypot(parameters.scale_error, parameters.noise) == pytest.approx(0.01, rel=0.01)
 
 
 def test_radar_is_quantised_and_limited_in_range() -> None:
@@ -163,14 +163,14 @@ def test_radar_is_quantised_and_limited_in_range() -> None:
 def test_radar_over_a_slope_measures_the_perpendicular_distance(slope_deg: float) -> None:
     surface = _make_plane(np.tan(np.radians(slope_deg)))
     position = np.array([MIDDLE, MIDDLE, 1000.0])
-    result = first_return(surface, position, _beam_axis(0.0), np.radians(30.0), 5000.0)
+    result = first_return(surface, position, _make_axis(0.0), np.radians(30.0), 5000.0)
     assert result == pytest.approx(1000.0 * np.cos(np.radians(slope_deg)), abs=0.1)
 
 
 def test_narrow_beam_measures_the_range_at_its_uphill_edge() -> None:
     surface = _make_plane(np.tan(np.radians(20.0)))
     position = np.array([MIDDLE, MIDDLE, 1000.0])
-    result = first_return(surface, position, _beam_axis(0.0), np.radians(5.0), 5000.0)
+    result = first_return(surface, position, _make_axis(0.0), np.radians(5.0), 5000.0)
     # The nearest ray is 5 deg uphill of nadir. Its range r solves r cos 5 = 1000 - r sin 5 tan 20.
     expected = 1000.0 / (np.cos(np.radians(5.0)) + np.sin(np.radians(5.0)) * np.tan(np.radians(20.0)))
     assert result == pytest.approx(expected, rel=5e-4)
@@ -179,7 +179,7 @@ def test_narrow_beam_measures_the_range_at_its_uphill_edge() -> None:
 @pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 30.0, 40.0, 60.0])
 def test_tilt_beyond_half_beam_width_increases_the_range(tilt_deg: float) -> None:
     position = np.array([0.0, 0.0, 1500.0])
-    result = first_return(FLAT, position, _beam_axis(tilt_deg, 33.0), np.radians(30.0), 5000.0)
+    result = first_return(FLAT, position, _make_axis(tilt_deg, 33.0), np.radians(30.0), 5000.0)
     off_nadir = max(np.radians(tilt_deg - 30.0), 0.0)
     assert result == pytest.approx(1500.0 / np.cos(off_nadir), rel=5e-4)
 
@@ -189,32 +189,31 @@ def test_radar_near_a_cliff_measures_the_range_to_its_edge() -> None:
     edge = SIDE // 2 + 60
     heights[:, edge:] = 200.0
     position = np.array([MIDDLE, MIDDLE, 1500.0])
-    result = first_return(_make_surface(heights), position, _beam_axis(0.0), np.radians(30.0), 5000.0)
+    result = first_return(_make_surface(heights), position, _make_axis(0.0), np.radians(30.0), 5000.0)
     # The spline turns the step into a ramp, whose top is one cell beyond the edge.
     assert result == pytest.approx(np.hypot(61 * SPACING, 1300.0), abs=0.1)
     # The edge is 13 deg from nadir, outside a beam with a half angle of 10 deg.
-    assert first_return(_make_surface(heights), position, _beam_axis(0.0), np.radians(10.0), 5000.0) == pytest.approx(
-        1500.0
-    )
+    result = first_return(_make_surface(heights), position, _make_axis(0.0), np.radians(10.0), 5000.0)
+    assert result == pytest.approx(1500.0)
 
 
 @pytest.mark.parametrize(("height", "tilt_deg"), [(2000.0, 0.0), (1400.0, 25.0), (2000.0, 38.0)])
 def test_first_return_matches_a_dense_scan(height: float, tilt_deg: float) -> None:
     surface = _make_rough_surface(int(height + tilt_deg))
-    position, axis = np.array([300.0, 700.0, height]), _beam_axis(tilt_deg, 200.0)
+    position, axis = np.array([300.0, 700.0, height]), _make_axis(tilt_deg, 200.0)
     line = np.arange(-1500.0, 1500.0, 2.0)
     x, y = np.meshgrid(line, line)
     depth = height - surface.height(300.0 + x, 700.0 + y)
     ranges = np.sqrt(x**2 + y**2 + depth**2)
-    in_beam = x * axis[0] + y * axis[1] - depth * axis[2] >= ranges * np.cos(np.radians(30.0))
+    is_in_beam = x * axis[0] + y * axis[1] - depth * axis[2] >= ranges * np.cos(np.radians(30.0))
     result = first_return(surface, position, axis, np.radians(30.0), 5000.0)
     # The requirement is 0.05 % of the altitude.
-    assert result == pytest.approx(ranges[in_beam].min(), abs=5e-4 * height)
+    assert result == pytest.approx(ranges[is_in_beam].min(), abs=5e-4 * height)
 
 
 def test_radar_above_the_horizon_has_no_return() -> None:
     for height in (1000.0, 1.0):
-        assert first_return(FLAT, np.array([0.0, 0.0, height]), _beam_axis(150.0), np.radians(30.0), 5000.0) == np.inf
+        assert first_return(FLAT, np.array([0.0, 0.0, height]), _make_axis(150.0), np.radians(30.0), 5000.0) == np.inf
 
 
 def test_radar_on_a_ledge_measures_the_ground_below() -> None:
@@ -223,10 +222,10 @@ def test_radar_on_a_ledge_measures_the_ground_below() -> None:
     heights[:, :edge] = 400.0
     # The radar is 1 m above the ledge, 20 m from its edge. The narrow beam points east, 60 deg from nadir.
     position = np.array([edge * SPACING - 20.0, MIDDLE, 401.0])
-    result = first_return(_make_surface(heights), position, _beam_axis(60.0), np.radians(2.0), 5000.0)
+    result = first_return(_make_surface(heights), position, _make_axis(60.0), np.radians(2.0), 5000.0)
     assert result < 10.0
     position = np.array([edge * SPACING + 15.0, MIDDLE, 401.0])
-    result = first_return(_make_surface(heights), position, _beam_axis(60.0), np.radians(2.0), 5000.0)
+    result = first_return(_make_surface(heights), position, _make_axis(60.0), np.radians(2.0), 5000.0)
     assert result == pytest.approx(401.0 / np.cos(np.radians(58.0)), rel=5e-3)
 
 
@@ -256,8 +255,8 @@ def test_boresight_error_has_the_specified_deviation() -> None:
 
 
 def test_side_lobes_receive_the_ground_at_nadir() -> None:
-    """Tilted by 50 deg, the beam of 60 deg width ends 20 deg from nadir. The side lobes include the nadir."""
-    tilted = Swaying(position_m=(160.0, 160.0, 1000.0), tilt=Rotation.from_rotvec([0.0, np.radians(50.0), 0.0]))
+    """A beam of 60 deg width, tilted by 50 deg, ends 20 deg from nadir. The side lobes include the nadir."""
+    tilted_motion = Swaying(position_m=(160.0, 160.0, 1000.0), tilt=Rotation.from_rotvec([0.0, np.radians(50.0), 0.0]))
     times = np.arange(100) * 0.1
     main_lobe, with_side_lobes = (
         RadarAltimeter.draw(
@@ -265,7 +264,7 @@ def test_side_lobes_receive_the_ground_at_nadir() -> None:
             FLAT,
             np.random.default_rng(0),
         )
-        .measure(tilted, times, np.random.default_rng(1))
+        .measure(tilted_motion, times, np.random.default_rng(1))
         .values
         for fraction in (0.0, 0.3)
     )

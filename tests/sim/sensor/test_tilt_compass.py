@@ -49,8 +49,8 @@ def test_acceleration_tilts_vertical_and_rotates_heading() -> None:
     heading_error = np.arctan2(0.5 / specific_force * np.sin(dip), np.cos(dip))
     assert np.degrees(heading_error) > 10.0
     assert readings.headings_rad[0] == pytest.approx(0.5 * np.pi - heading_error, abs=1e-9)
-    level = _read(motion, np.array([0.0]), dip_deg=0.0)
-    assert level.headings_rad[0] == pytest.approx(0.5 * np.pi, abs=1e-9)
+    horizontal_field = _read(motion, np.array([0.0]), dip_deg=0.0)
+    assert horizontal_field.headings_rad[0] == pytest.approx(0.5 * np.pi, abs=1e-9)
 
 
 def test_inclinometers_lag_as_a_first_order_system() -> None:
@@ -75,13 +75,13 @@ def test_iron_causes_one_and_two_cycle_heading_errors() -> None:
     deviations_deg = []
     for seed in range(300):
         unit = TiltCompass.draw(parameters, np.random.default_rng(seed))
-        expected = unit.deviation_rad(azimuths)
+        errors_rad = unit.deviation_rad(azimuths)
         motions = [Swaying(tilt=Rotation.from_euler("z", 0.5 * np.pi - azimuth)) for azimuth in azimuths]
         reading_rng = np.random.default_rng(0)
         if seed < 3:
             headings = [unit.measure(motion, np.array([0.0]), reading_rng).headings_rad[0] for motion in motions]
-            np.testing.assert_allclose(np.angle(np.exp(1j * (headings - azimuths - expected))), 0.0, atol=1e-9)
-        deviations_deg.append(np.degrees(expected))
+            np.testing.assert_allclose(np.angle(np.exp(1j * (headings - azimuths - errors_rad))), 0.0, atol=1e-9)
+        deviations_deg.append(np.degrees(errors_rad))
     modes = np.fft.rfft(np.array(deviations_deg), axis=1) / azimuths.size
     # Deviations of the constant error (300 values) and of the errors with one and two cycles (600 values each).
     assert modes[:, 0].real.std() == pytest.approx(0.8, rel=0.12)

@@ -23,25 +23,25 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "terrain"
 
 
-def _terrain_bytes(bank: TerrainBank, number: int) -> bytes:
+def _read_bytes(bank: TerrainBank, number: int) -> bytes:
     return b"".join(level.tobytes() for level in bank.terrain(number).levels)
 
 
 def test_cached_terrain_equals_the_built_terrain(cache: Path) -> None:
     bank = TerrainBank(SMALL, seed=1)
-    built = _terrain_bytes(bank, 0)
+    expected = _read_bytes(bank, 0)
     assert len(list(cache.iterdir())) == 1
-    assert _terrain_bytes(bank, 0) == built
+    assert _read_bytes(bank, 0) == expected
     next(cache.iterdir()).unlink()
-    assert _terrain_bytes(bank, 0) == built
+    assert _read_bytes(bank, 0) == expected
 
 
 def test_number_seed_and_parameters_identify_a_terrain(cache: Path) -> None:
     terrains = {
-        _terrain_bytes(TerrainBank(SMALL, 1), 0),
-        _terrain_bytes(TerrainBank(SMALL, 1), 1),
-        _terrain_bytes(TerrainBank(SMALL, 2), 0),
-        _terrain_bytes(TerrainBank(SMALL.model_copy(update={"hurst": 0.5}), 1), 0),
+        _read_bytes(TerrainBank(SMALL, 1), 0),
+        _read_bytes(TerrainBank(SMALL, 1), 1),
+        _read_bytes(TerrainBank(SMALL, 2), 0),
+        _read_bytes(TerrainBank(SMALL.model_copy(update={"hurst": 0.5}), 1), 0),
     }
     assert len(terrains) == 4
 
@@ -49,30 +49,30 @@ def test_number_seed_and_parameters_identify_a_terrain(cache: Path) -> None:
 @pytest.mark.parametrize("damage", [b"", b"not an array", None])
 def test_damaged_file_is_rebuilt(cache: Path, damage: bytes | None) -> None:
     bank = TerrainBank(SMALL, seed=1)
-    built = _terrain_bytes(bank, 3)
+    expected = _read_bytes(bank, 3)
     path = next(cache.iterdir())
     path.write_bytes(path.read_bytes()[:1000] if damage is None else damage)
     with pytest.warns(CacheWarning, match="damaged and will be rebuilt"):
-        assert _terrain_bytes(bank, 3) == built
-    assert _terrain_bytes(bank, 3) == built
+        assert _read_bytes(bank, 3) == expected
+    assert _read_bytes(bank, 3) == expected
 
 
 def test_zeroed_cache_file_is_rebuilt(cache: Path) -> None:
     """The process has already verified the file. Writing zeros changes its modification time."""
     bank = TerrainBank(SMALL, seed=1)
-    built = _terrain_bytes(bank, 0)
-    assert _terrain_bytes(bank, 0) == built
+    expected = _read_bytes(bank, 0)
+    assert _read_bytes(bank, 0) == expected
     with next(cache.iterdir()).open("r+b") as file:
         file.seek(5000)
         file.write(bytes(20_000))
     with pytest.warns(CacheWarning, match="checksum"):
-        assert _terrain_bytes(bank, 0) == built
-    assert _terrain_bytes(bank, 0) == built
+        assert _read_bytes(bank, 0) == expected
+    assert _read_bytes(bank, 0) == expected
 
 
 def test_file_is_verified_once_per_process(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bank = TerrainBank(SMALL, seed=1)
-    built = _terrain_bytes(bank, 0)
+    expected = _read_bytes(bank, 0)
     monkeypatch.setattr("marsyard.sim.cache._VERIFIED", {})
     checked_sizes: list[int] = []
     compute_checksum = cache_module._compute_checksum
@@ -82,7 +82,7 @@ def test_file_is_verified_once_per_process(cache: Path, monkeypatch: pytest.Monk
         return compute_checksum(array)
 
     monkeypatch.setattr("marsyard.sim.cache._compute_checksum", count_and_compute)
-    assert [_terrain_bytes(bank, 0), _terrain_bytes(bank, 0)] == [built, built]
+    assert [_read_bytes(bank, 0), _read_bytes(bank, 0)] == [expected, expected]
     assert len(checked_sizes) == 1
 
 
@@ -106,7 +106,7 @@ def test_terrain_is_synced_before_rename(cache: Path, monkeypatch: pytest.Monkey
 
 def test_terrains_are_built_without_a_writable_cache(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bank = TerrainBank(SMALL, seed=1)
-    built = _terrain_bytes(bank, 0)
+    expected = _read_bytes(bank, 0)
     next(cache.iterdir()).unlink()
 
     def raise_disk_full(_: int) -> None:
@@ -114,7 +114,7 @@ def test_terrains_are_built_without_a_writable_cache(cache: Path, monkeypatch: p
 
     monkeypatch.setattr("os.fsync", raise_disk_full)
     with pytest.warns(CacheWarning, match="No space left"):
-        assert _terrain_bytes(bank, 0) == built
+        assert _read_bytes(bank, 0) == expected
     assert not list(cache.iterdir())
 
 
@@ -139,13 +139,13 @@ def test_unused_terrain_is_evicted_for_the_next(cache: Path, monkeypatch: pytest
     size = next(cache.iterdir()).stat().st_size
     monkeypatch.setenv("MARSYARD_CACHE_GB", f"{2.5 * size / 1e9:.12f}")
     first = set(cache.iterdir())
-    built = _terrain_bytes(bank, 1)
+    expected = _read_bytes(bank, 1)
     second = set(cache.iterdir()) - first
     bank.terrain(2)
     assert len(list(cache.iterdir())) == 2
     assert first <= set(cache.iterdir()), "in use by this process"
     assert not second & set(cache.iterdir())
-    assert _terrain_bytes(bank, 1) == built
+    assert _read_bytes(bank, 1) == expected
     assert np.isfinite(terrain_in_use.levels[0]).all()
 
 
@@ -169,4 +169,4 @@ def test_concurrent_builds_in_a_small_cache_are_complete(cache: Path, monkeypatc
 
 def _hash_terrains(_: int) -> list[str]:
     bank = TerrainBank(SMALL, seed=1)
-    return [hashlib.sha256(_terrain_bytes(bank, number % 8)).hexdigest() for number in range(24)]
+    return [hashlib.sha256(_read_bytes(bank, number % 8)).hexdigest() for number in range(24)]

@@ -52,12 +52,12 @@ def test_surface_interpolates_the_posts(npz: Path) -> None:
     extent = embed(source, 256, 1.0).extent
     assert (extent.holes, extent.ortho_holes) == (6, 8 * COLUMNS)
     surface = build_surface(make_terrain_parameters(source))
-    full, _ = fill_holes(read_rasters(source)[0].values)
+    heights, _ = fill_holes(read_rasters(source)[0].values)
     x, y = np.meshgrid(extent.west_m + np.arange(11, COLUMNS - 11), extent.south_m + np.arange(11, ROWS - 11))
-    expected = full[11:-11, 11:-11] - full.mean()
+    expected = heights[11:-11, 11:-11] - heights.mean()
     np.testing.assert_allclose(surface.height(x, y), expected, atol=1e-4)
     # The first row of the file is the northernmost row.
-    np.testing.assert_allclose(full[-1], make_dem()[0], atol=1e-4)
+    np.testing.assert_allclose(heights[-1], make_dem()[0], atol=1e-4)
 
 
 @pytest.mark.parametrize("spacing_m", [0.5, 1.5])
@@ -126,8 +126,8 @@ def test_hirise_tile_is_imported(shared_data: Path) -> None:
     surface = build_surface(make_terrain_parameters(source, samples=512))
     extent = embed(source, 512, 1.0).extent
     assert (extent.east_m - extent.west_m, extent.north_m - extent.south_m) == (347.0, 336.0)
-    inside = surface.levels[0][100:400, 100:400, 0]
-    assert np.ptp(inside) == pytest.approx(-4437.883 + 4472.67, abs=1.0)
+    inner_heights = surface.levels[0][100:400, 100:400, 0]
+    assert np.ptp(inner_heights) == pytest.approx(-4437.883 + 4472.67, abs=1.0)
 
 
 @pytest.mark.parametrize(
@@ -198,17 +198,17 @@ def test_statistics_use_only_valid_posts(tmp_path: Path) -> None:
     path = tmp_path / "half.npz"
     np.savez(path, dem=heights, dem_gsd=1.0)
     source = RealTerrain(dtm=path, border_m=2.0, roughen=False, max_hole_fraction=0.6)
-    embedded = embed(source, 256, 1.0)
-    assert embedded.extent.hole_fraction == pytest.approx(0.5)
-    assert embedded.real_samples(256).sum() == np.isfinite(heights).sum()
-    assert embedded.filled_samples(256).sum() == np.isnan(heights).sum()
-    measured = terrain_statistics(build_surface(make_terrain_parameters(source)), embedded.real_samples(256))
-    full = heights[:, :80]
-    rises = (full[30:] - full[:-30], full[:, 30:] - full[:, :-30])
+    embedding = embed(source, 256, 1.0)
+    assert embedding.extent.hole_fraction == pytest.approx(0.5)
+    assert embedding.real_samples(256).sum() == np.isfinite(heights).sum()
+    assert embedding.filled_samples(256).sum() == np.isnan(heights).sum()
+    statistics = terrain_statistics(build_surface(make_terrain_parameters(source)), embedding.real_samples(256))
+    valid_heights = heights[:, :80]
+    rises = (valid_heights[30:] - valid_heights[:-30], valid_heights[:, 30:] - valid_heights[:, :-30])
     expected = np.mean([np.degrees(np.arctan(np.abs(rise) / 30.0)).mean() for rise in rises])
     # The outermost 2 m blend into the synthetic terrain.
-    assert measured.mean_slope_30_m_deg == pytest.approx(expected, rel=0.02)
-    assert measured.relief_m == pytest.approx(float(np.ptp(full)), rel=0.02)
+    assert statistics.mean_slope_30_m_deg == pytest.approx(expected, rel=0.02)
+    assert statistics.relief_m == pytest.approx(float(np.ptp(valid_heights)), rel=0.02)
 
 
 def test_many_holes_are_rejected_unless_allowed(tmp_path: Path) -> None:

@@ -42,12 +42,12 @@ LANDFORMS = {
 @pytest.mark.parametrize("name", LANDFORMS)
 def test_equal_seeds_produce_equal_bytes(name: str) -> None:
     parameters = make_parameters(**{name: LANDFORMS[name]})
-    first, repeated, other_seed = (
+    first, same_seed, other_seed = (
         synthesise_heights(parameters),
         synthesise_heights(parameters),
         synthesise_heights(parameters, seed=2),
     )
-    assert first.tobytes() == repeated.tobytes()
+    assert first.tobytes() == same_seed.tobytes()
     assert np.isfinite(first).all()
     assert np.ptp(first) > 0.0
     assert (name == "ramp") == np.array_equal(first, other_seed)
@@ -56,9 +56,10 @@ def test_equal_seeds_produce_equal_bytes(name: str) -> None:
 @pytest.mark.parametrize("name", ["dunes", "lava", "swell", "ramp", "gullies", "playa"])
 def test_added_landform_does_not_change_others(name: str) -> None:
     """The contribution of a landform to the heights does not depend on the other landforms."""
-    rough = make_parameters(rms_slope_deg=2.0, ripples=LANDFORMS["ripples"])
+    rough_parameters = make_parameters(rms_slope_deg=2.0, ripples=LANDFORMS["ripples"])
     contribution = synthesise_heights(make_parameters(**{name: LANDFORMS[name]}))
-    difference = synthesise_heights(rough.model_copy(update={name: LANDFORMS[name]})) - synthesise_heights(rough)
+    with_landform = rough_parameters.model_copy(update={name: LANDFORMS[name]})
+    difference = synthesise_heights(with_landform) - synthesise_heights(rough_parameters)
     np.testing.assert_allclose(difference, contribution, atol=1e-3)
 
 
@@ -84,14 +85,14 @@ def test_bytes_do_not_depend_on_the_number_of_threads() -> None:
 def test_dunes_have_specified_wavelength_height_and_slip_faces() -> None:
     dunes = Dunes(wavelength_m=64.0, height_m=4.0, wind_from_deg=270.0, crest_length=6.0, regularity=4.0)
     surface = synthesise(make_parameters(samples=1024, spacing_m=1.0, dunes=dunes), np.random.default_rng(3))
-    z = surface.levels[0][..., 0].astype(np.float64)
-    power = (np.abs(np.fft.rfft(z, axis=1)) ** 2).mean(axis=0)
+    heights = surface.levels[0][..., 0].astype(np.float64)
+    power = (np.abs(np.fft.rfft(heights, axis=1)) ** 2).mean(axis=0)
     assert np.argmax(power[1:]) + 1 == pytest.approx(1024 / 64, abs=1.5)
     # Downwind is east. The lee slopes face east and are steepest, at the angle of repose.
     x, y = np.meshgrid(np.arange(0, 1024, 0.5), np.arange(0, 1024, 16.0))
     slope = surface.gradient(x, y)[..., 0]
-    steepest = np.degrees(np.arctan(-np.quantile(slope, 0.01)))
-    assert 30.0 <= steepest <= 34.0
+    lee_slope_deg = np.degrees(np.arctan(-np.quantile(slope, 0.01)))
+    assert 30.0 <= lee_slope_deg <= 34.0
     assert np.degrees(np.arctan(slope.max())) < 20.0, "the stoss slope is gentle"
     assert np.mean(slope > 0) > 0.7, "the stoss slope is longer than the lee slope"
 
@@ -111,11 +112,11 @@ def test_wind_direction_rotates_the_crests() -> None:
     crests_north = synthesise_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=270.0)))
     crests_east = synthesise_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=180.0)))
 
-    def mean_change(z: np.ndarray, axis: int) -> float:
-        return float(np.abs(np.roll(z, -20, axis=axis) - z).mean())
+    def compute_mean_change(heights: np.ndarray, axis: int) -> float:
+        return float(np.abs(np.roll(heights, -20, axis=axis) - heights).mean())
 
-    assert mean_change(crests_north, 1) > 2 * mean_change(crests_north, 0)
-    assert mean_change(crests_east, 0) > 2 * mean_change(crests_east, 1)
+    assert compute_mean_change(crests_north, 1) > 2 * compute_mean_change(crests_north, 0)
+    assert compute_mean_change(crests_east, 0) > 2 * compute_mean_change(crests_east, 1)
 
 
 def test_lava_is_rough_at_metres_and_smooth_at_larger_scales() -> None:
@@ -137,8 +138,8 @@ def test_ramp_has_its_slope_in_the_specified_direction(slope_deg: float, uphill:
     uphill_axis, cross_axis = (0, 1) if uphill == "east" else (1, 0)
     np.testing.assert_allclose(np.degrees(np.arctan(gradient[:, uphill_axis])), slope_deg, atol=0.05)
     np.testing.assert_allclose(gradient[:, cross_axis], 0.0, atol=1e-4)
-    level = surface.gradient(*((0.0, 5.0) if uphill == "east" else (5.0, 0.0)))
-    np.testing.assert_allclose(level, 0.0, atol=1e-4)
+    base_gradient = surface.gradient(*((0.0, 5.0) if uphill == "east" else (5.0, 0.0)))
+    np.testing.assert_allclose(base_gradient, 0.0, atol=1e-4)
 
 
 def test_swell_has_the_specified_relief() -> None:
@@ -149,10 +150,10 @@ def test_fans_descend_to_an_almost_level_playa() -> None:
     fans = Fans(radius_m=250.0, apex_spacing_m=150.0, divides=1, slope_deg=4.0, washes_per_fan=0)
     surface = synthesise(make_parameters(samples=512, rms_slope_deg=1.0, fans=fans), np.random.default_rng(2))
     x = np.linspace(0.0, surface.period_m, 200)
-    on_fan = np.degrees(np.arctan(np.abs(surface.gradient(x, np.full_like(x, 110.0))[:, 1])))
-    on_playa = surface.gradient(x, np.full_like(x, 384.0))
-    assert 2.0 < np.median(on_fan) < 5.0
-    assert np.degrees(np.arctan(np.abs(on_playa))).mean() < 0.2
+    fan_slopes_deg = np.degrees(np.arctan(np.abs(surface.gradient(x, np.full_like(x, 110.0))[:, 1])))
+    playa_gradients = surface.gradient(x, np.full_like(x, 384.0))
+    assert 2.0 < np.median(fan_slopes_deg) < 5.0
+    assert np.degrees(np.arctan(np.abs(playa_gradients))).mean() < 0.2
     albedo_fan, albedo_playa = surface.albedo(x, np.full_like(x, 110.0)), surface.albedo(x, np.full_like(x, 384.0))
     assert np.log(albedo_fan.mean() / albedo_playa.mean()) == pytest.approx(fans.fan_contrast, abs=0.02)
 
@@ -163,9 +164,9 @@ def test_gullies_have_steep_walls() -> None:
     x, y = np.meshgrid(np.arange(0, 128, 0.25), np.arange(0, 128, 0.25))
     slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
     assert 25.0 < np.quantile(slope, 0.995) < 45.0
-    z = surface.levels[0][..., 0]
-    assert np.mean(z > -0.01) > 0.4, "the ground between gullies is unchanged"
-    assert z.min() < -1.0
+    heights = surface.levels[0][..., 0]
+    assert np.mean(heights > -0.01) > 0.4, "the ground between gullies is unchanged"
+    assert heights.min() < -1.0
 
 
 def test_refined_control_values_define_the_same_surface() -> None:
@@ -180,8 +181,8 @@ def test_refined_control_values_define_the_same_surface() -> None:
 
 def test_smooth_fields_have_unit_power() -> None:
     powers = [
-        np.mean(np.sum(draw_smooth_fields(100.0, 4.0, 8.0, 0.3, np.random.default_rng(s)) ** 2.0, axis=2))
-        for s in range(30)
+        np.mean(np.sum(draw_smooth_fields(100.0, 4.0, 8.0, 0.3, np.random.default_rng(seed)) ** 2.0, axis=2))
+        for seed in range(30)
     ]
     assert np.mean(powers) == pytest.approx(1.0, abs=0.05)
 
@@ -218,27 +219,29 @@ def test_inconsistent_landforms_are_rejected(invalid: dict[str, object], message
 
 
 def test_dune_kernel_matches_scipy() -> None:
-    """Compare the spline and arctangent of the kernel with SciPy and NumPy."""
-    side, spacing, crest, steepest = 128, 3.0, 4.0, 0.6
+    """Compare the spline and arctangent of `add_dunes` with SciPy and NumPy; the other formulas are the same."""
+    side, spacing, crest, max_slope = 128, 3.0, 4.0, 0.6
     modulation = np.random.default_rng(2).normal(size=(32, 32, 2)).astype(np.float32)
     wave = 2.0 * np.pi / (side * spacing) * np.array([5.0, -3.0])
     height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
-    add_dunes(height, log_albedo, spacing, modulation, Bedforms(wave[0], wave[1], crest, steepest, 0.3))
+    add_dunes(height, log_albedo, spacing, modulation, Bedforms(wave[0], wave[1], crest, max_slope, 0.3))
     rows, columns = np.mgrid[:side, :side]
     real, imaginary = (
-        map_coordinates(c.astype(np.float64), [rows / 4, columns / 4], order=3, mode="grid-wrap", prefilter=False)
-        for c in np.moveaxis(modulation, -1, 0)
+        map_coordinates(
+            component.astype(np.float64), [rows / 4, columns / 4], order=3, mode="grid-wrap", prefilter=False
+        )
+        for component in np.moveaxis(modulation, -1, 0)
     )
     strength = np.hypot(real, imaginary)
     phase = spacing * (wave[0] * columns + wave[1] * rows) + np.arctan2(imaginary, real)
-    u = np.mod(phase / (2.0 * np.pi), 1.0)
+    crest_phase = np.mod(phase / (2.0 * np.pi), 1.0)
     crest_height = crest * np.minimum(strength, 1.6)
-    slip = np.clip(4.0 / 3.0 * crest_height * np.linalg.norm(wave) / (2.0 * np.pi * steepest), 0.01, 0.5)
-    stoss, face = u / (1.0 - slip), (1.0 - u) / slip
+    slip_fraction = np.clip(4.0 / 3.0 * crest_height * np.linalg.norm(wave) / (2.0 * np.pi * max_slope), 0.01, 0.5)
+    stoss, slip_face = crest_phase / (1.0 - slip_fraction), (1.0 - crest_phase) / slip_fraction
     shape = np.where(
-        u < 1.0 - slip,
+        crest_phase < 1.0 - slip_fraction,
         0.25 * stoss + 0.75 * stoss**2 * (3.0 - 2.0 * stoss),
-        np.where(face > 0.5, 4.0 / 3.0 * face - 1.0 / 3.0, 4.0 / 3.0 * face**2),
+        np.where(slip_face > 0.5, 4.0 / 3.0 * slip_face - 1.0 / 3.0, 4.0 / 3.0 * slip_face**2),
     )
     np.testing.assert_allclose(height, crest_height * shape, atol=1e-5)
     np.testing.assert_allclose(log_albedo, 0.3 * (shape - 0.5) * np.minimum(strength, 1.0), atol=1e-5)
@@ -253,13 +256,13 @@ def test_ejecta_have_seven_and_twelve_rays() -> None:
     stamp_craters(height, log_albedo, spacing, crater, max_radius)
     y, x = np.mgrid[:side, :side] - 64.0
     r, azimuth = np.hypot(x, y) / radius, np.arctan2(y, x)
-    outside = (r > 1.1) & (r < max_radius)
+    is_ejecta = (r > 1.1) & (r < max_radius)
     fade = (max_radius - r) / (max_radius - 1.0)
     rays = np.cos(7.0 * azimuth + phase) + np.cos(12.0 * azimuth + 2.3 * phase)
     blanket = rim / np.maximum(r, 0.6) ** 3 * fade * (1.0 + 0.25 * rays * np.minimum(2.0 * (r - 1.0), 1.0))
-    np.testing.assert_allclose(height[outside], blanket[outside], atol=1e-6)
+    np.testing.assert_allclose(height[is_ejecta], blanket[is_ejecta], atol=1e-6)
     ray_contrast = np.maximum(fade**2 * (1.0 + 0.5 * rays), 0.0)
-    np.testing.assert_allclose(log_albedo[outside], 0.2 * ray_contrast[outside], atol=1e-6)
+    np.testing.assert_allclose(log_albedo[is_ejecta], 0.2 * ray_contrast[is_ejecta], atol=1e-6)
 
 
 def test_cracks_follow_periodic_voronoi_borders() -> None:
@@ -275,8 +278,10 @@ def test_cracks_follow_periodic_voronoi_borders() -> None:
         np.asarray, cKDTree(positions, boxsize=np.full(2, float(count))).query(np.stack([x, y], axis=-1), k=2)
     )
     separation = (positions[nearest[..., 1]] - positions[nearest[..., 0]] + count / 2) % count - count / 2
-    border = 0.5 * (distance[..., 1] ** 2 - distance[..., 0] ** 2) / np.linalg.norm(separation, axis=-1) * cell
-    fraction = np.clip(1.0 - border / width, 0.0, None)
+    border_distance_m = (
+        0.5 * (distance[..., 1] ** 2 - distance[..., 0] ** 2) / np.linalg.norm(separation, axis=-1) * cell
+    )
+    fraction = np.clip(1.0 - border_distance_m / width, 0.0, None)
     # The kernel searches one cell on each side for the two nearest points; few of them are farther away.
     assert np.mean(np.isclose(height, -0.2 * fraction, atol=1e-6)) > 0.999
     assert np.mean(np.isclose(log_albedo, -0.1 * fraction, atol=1e-6)) > 0.999
@@ -284,6 +289,6 @@ def test_cracks_follow_periodic_voronoi_borders() -> None:
 
 def test_dunes_finer_than_the_grid_are_sampled_directly() -> None:
     """Both the dunes and their modulation are finer than the grid spacing."""
-    tiny = Dunes(wavelength_m=1.0, height_m=0.05, regularity=0.3, crest_length=0.5)
-    z = synthesise_heights(make_parameters(samples=64, spacing_m=3.0, ripples=tiny))
-    assert 0.0 < np.ptp(z) < 0.1
+    ripples = Dunes(wavelength_m=1.0, height_m=0.05, regularity=0.3, crest_length=0.5)
+    heights = synthesise_heights(make_parameters(samples=64, spacing_m=3.0, ripples=ripples))
+    assert 0.0 < np.ptp(heights) < 0.1

@@ -64,7 +64,7 @@ def test_shapes_are_closed_and_of_unit_size(detail: int, triangles: int) -> None
         assert len(mesh.faces) == triangles
         assert mesh.is_watertight
         assert mesh.volume > 0.0
-        assert mesh.bounds[0, 2] < -0.02, "part of it is buried"
+        assert mesh.bounds[0, 2] < -0.02, "the lower part is buried"
         assert np.hypot(*shapes.vertices[number, :, :2].T).max() <= shapes.reach[number] + 1e-12
     np.testing.assert_allclose(np.linalg.norm(shapes.normals, axis=2), 1.0, atol=1e-12)
 
@@ -90,8 +90,12 @@ def test_shapes_are_different() -> None:
             assert np.abs(vertices[first] - vertices[second]).max() > 0.05
 
 
-def _rocks_per_m2(abundance: float, smallest_m: float, largest_m: float) -> float:
-    """Compute the number of rocks between two diameters: the integral of the covered area density / rock area."""
+def _compute_rocks_per_m2(abundance: float, smallest_m: float, largest_m: float) -> float:
+    """Compute the number of rocks between two diameters by integration over the diameter d.
+
+    Rocks of at least the diameter d cover the fraction abundance exp(-q d) of the ground. Its density divided by the
+    area of a rock is the number density.
+    """
     q = decay_per_m(abundance)
     return float(quad(lambda d: abundance * q * np.exp(-q * d) / (0.25 * np.pi * d * d), smallest_m, largest_m)[0])
 
@@ -103,16 +107,16 @@ def test_rock_sizes_follow_golombek(abundance: float) -> None:
     area = 1.5e4 if abundance > 0.02 else 1.0e5
     diameters = draw_diameters(parameters, area, np.random.default_rng(3))
     for min_diameter in (0.05, 0.1, 0.2, 0.4):
-        above = diameters[diameters >= min_diameter]
-        fraction = np.sum(np.pi / 4 * above**2) / area
+        large_diameters = diameters[diameters >= min_diameter]
+        fraction = np.sum(np.pi / 4 * large_diameters**2) / area
         # Standard deviation of a compound Poisson sum.
-        sigma = np.sqrt(np.sum((np.pi / 4 * above**2) ** 2)) / area
+        sigma = np.sqrt(np.sum((np.pi / 4 * large_diameters**2) ** 2)) / area
         expected = abundance * np.exp(-decay_per_m(abundance) * min_diameter)
         assert fraction == pytest.approx(expected, abs=max(0.1 * expected, 3 * sigma))
         if min_diameter < 0.2:
             assert 3 * sigma < 0.1 * expected, "enough rocks for a tolerance of 10 %"
-        number = area * _rocks_per_m2(abundance, min_diameter, 10.0)
-        assert above.size == pytest.approx(number, abs=max(0.02 * number, 4 * np.sqrt(number)))
+        number = area * _compute_rocks_per_m2(abundance, min_diameter, 10.0)
+        assert large_diameters.size == pytest.approx(number, abs=max(0.02 * number, 4 * np.sqrt(number)))
 
 
 def test_no_two_rocks_overlap(field: RockField) -> None:
@@ -128,24 +132,24 @@ def test_no_two_rocks_overlap(field: RockField) -> None:
 
 def test_max_rock_density_is_reached(ground: Surface) -> None:
     field = make_field(ground, abundance=0.4, smallest_m=0.06, placed=())
-    covered = np.sum(np.pi / 4 * field.diameter_m**2) / field.period_m**2
-    assert covered == pytest.approx(0.4 * np.exp(-0.06 * decay_per_m(0.4)), rel=0.1)
+    covered_fraction = np.sum(np.pi / 4 * field.diameter_m**2) / field.period_m**2
+    assert covered_fraction == pytest.approx(0.4 * np.exp(-0.06 * decay_per_m(0.4)), rel=0.1)
 
 
 def test_equal_seeds_produce_equal_rocks(ground: Surface, field: RockField) -> None:
-    repeated, other_seed = make_field(ground), make_field(ground, seed=2)
+    same_seed, other_seed = make_field(ground), make_field(ground, seed=2)
     for name in ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up"):
-        assert getattr(field, name).tobytes() == getattr(repeated, name).tobytes()
+        assert getattr(field, name).tobytes() == getattr(same_seed, name).tobytes()
     assert len(other_seed) != len(field) or not np.array_equal(other_seed.position_m, field.position_m)
 
 
 def test_rocks_stand_on_the_ground_along_its_normal(ground: Surface, field: RockField) -> None:
     x, y, z = field.position_m.T
     np.testing.assert_allclose(z, ground.height(x, y), atol=1e-12)
-    small = field.diameter_m < 0.4
-    normal = np.column_stack([-ground.gradient(x, y)[small], np.ones(small.sum())])
+    is_small = field.diameter_m < 0.4
+    normal = np.column_stack([-ground.gradient(x, y)[is_small], np.ones(is_small.sum())])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    np.testing.assert_allclose(field.up[small], normal, atol=1e-9)
+    np.testing.assert_allclose(field.up[is_small], normal, atol=1e-9)
     assert np.all(
         (field.height_m[1:] / field.diameter_m[1:] >= 0.35) & (field.height_m[1:] / field.diameter_m[1:] <= 0.65)
     )
@@ -167,18 +171,18 @@ def test_placed_rock_has_its_name_and_position(ground: Surface, field: RockField
 
 
 def test_near_returns_rocks_around_a_position_in_any_period(field: RockField) -> None:
-    original = field.near(2.0, 1.0, 9.0, detail=COARSE)
-    assert set(np.unique(original.rock_of_face)) == {
+    mesh = field.near(2.0, 1.0, 9.0, detail=COARSE)
+    assert set(np.unique(mesh.rock_of_face)) == {
         n
         for n, (x, y) in enumerate(field.position_m[:, :2])
         if np.hypot((x - 2 + 32) % 64 - 32, (y - 1 + 32) % 64 - 32) <= 9.0
     }
-    shifted = field.near(2.0 - 64.0, 1.0 + 128.0, 9.0, detail=COARSE)
-    np.testing.assert_array_equal(shifted.rock_of_face, original.rock_of_face)
-    np.testing.assert_allclose(shifted.vertices - [-64.0, 128.0, 0.0], original.vertices, atol=1e-9)
-    assert original.faces.max() == len(original.vertices) - 1
-    assert len(original.rock_of_face) == len(original.faces)
-    np.testing.assert_allclose(np.linalg.norm(original.vertex_normals, axis=1), 1.0, atol=1e-12)
+    shifted_mesh = field.near(2.0 - 64.0, 1.0 + 128.0, 9.0, detail=COARSE)
+    np.testing.assert_array_equal(shifted_mesh.rock_of_face, mesh.rock_of_face)
+    np.testing.assert_allclose(shifted_mesh.vertices - [-64.0, 128.0, 0.0], mesh.vertices, atol=1e-9)
+    assert mesh.faces.max() == len(mesh.vertices) - 1
+    assert len(mesh.rock_of_face) == len(mesh.faces)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertex_normals, axis=1), 1.0, atol=1e-12)
 
 
 def test_detail_follows_apparent_size_and_small_rocks_are_omitted(field: RockField) -> None:
@@ -187,9 +191,9 @@ def test_detail_follows_apparent_size_and_small_rocks_are_omitted(field: RockFie
     assert field.diameter_m[rocks].min() >= 0.3
     assert triangles[rocks == field.by_name("target")] == 5120
     assert triangles.min() == 80
-    empty = field.near(3.0, 58.0, 20.0, smallest_m=90.0)
-    assert empty.faces.shape == (0, 3)
-    assert empty.vertices.shape == (0, 3)
+    empty_mesh = field.near(3.0, 58.0, 20.0, smallest_m=90.0)
+    assert empty_mesh.faces.shape == (0, 3)
+    assert empty_mesh.vertices.shape == (0, 3)
 
 
 def test_clinker_has_rougher_shapes_than_blocks(ground: Surface) -> None:
@@ -223,9 +227,9 @@ def test_small_terrain_repeats_in_the_view(field: RockField) -> None:
 def test_faces_point_outwards(field: RockField) -> None:
     mesh = field.near(20.0, 20.0, 10.0, detail=MEDIUM)
     corners = mesh.vertices[mesh.faces]
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    smooth = mesh.vertex_normals[mesh.faces].mean(axis=1)
-    assert np.mean(np.sum(outward * smooth, axis=1) > 0.0) > 0.995
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    mean_normals = mesh.vertex_normals[mesh.faces].mean(axis=1)
+    assert np.mean(np.sum(face_normals * mean_normals, axis=1) > 0.0) > 0.995
 
 
 @pytest.mark.parametrize(
@@ -286,6 +290,6 @@ def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.
         files = sorted((tmp_path / "terrain").glob("rocks-*.npy"))
     # The files contain vertices of five levels, normals of two levels, and the sizes in pixels.
     assert len(files) == 8
-    for built, stored in zip(*results, strict=True):
-        np.testing.assert_array_equal(built, stored)
+    for first, second in zip(*results, strict=True):
+        np.testing.assert_array_equal(first, second)
     assert not any(array.flags.writeable for array in results[1][:2])

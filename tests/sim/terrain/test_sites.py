@@ -22,10 +22,10 @@ def site_statistics() -> dict[str, TerrainStatistics]:
     result = {}
     for name in (*FIELD_SITES, *MARS_SITES):
         parameters = site(name).terrain("descent")
-        halved = parameters.model_copy(
+        coarse_parameters = parameters.model_copy(
             update={"samples": parameters.samples // 2, "spacing_m": 2 * parameters.spacing_m}
         )
-        result[name] = terrain_statistics(synthesise(halved, np.random.default_rng(1)))
+        result[name] = terrain_statistics(synthesise(coarse_parameters, np.random.default_rng(1)))
     return result
 
 
@@ -62,23 +62,23 @@ def test_kelso_rises_over_200_m_and_ivanpah_is_the_flattest(site_statistics: dic
         assert site_statistics["ivanpah"].mean_slope_90_m_deg < site_statistics[other_site].mean_slope_90_m_deg
 
 
-def _median_contrast(name: str) -> float:
+def _compute_median_contrast(name: str) -> float:
     parameters = site(name).terrain("descent")
     coarse = parameters.model_copy(update={"samples": 1024, "spacing_m": 4 * parameters.spacing_m})
     return float(
-        np.median([terrain_statistics(synthesise(coarse, np.random.default_rng(k))).contrast for k in range(5)])
+        np.median([terrain_statistics(synthesise(coarse, np.random.default_rng(seed))).contrast for seed in range(5)])
     )
 
 
 def test_contrast_of_pisgah_is_below_that_of_the_mars_sites() -> None:
     """The paper states that the contrast is "similar to contrast measured on descent images synthesized" from MOC.
 
-    This is a lower limit of the contrast on Mars.
+    The contrast of these images is a lower limit of the contrast on Mars.
     """
-    pisgah = _median_contrast("pisgah")
+    pisgah = _compute_median_contrast("pisgah")
     assert pisgah < 0.1
     for name in MARS_SITES:
-        assert 0.5 < pisgah / _median_contrast(name) < 1.0
+        assert 0.5 < pisgah / _compute_median_contrast(name) < 1.0
 
 
 def test_sites_have_complete_parameters() -> None:
@@ -115,7 +115,8 @@ def test_mean_slope_of_a_sine_wave_and_of_a_part_of_it() -> None:
     phase = 2 * np.pi * np.arange(side) / side
     samples[..., 0] = 10.0 * np.sin(2 * phase)[None, :]
     surface = Surface.from_samples(samples, spacing)
-    # The mean absolute slope of a sine is 2 / pi of its maximum; along its crests the slope is zero.
+    # The mean absolute slope of a sine is 2 / pi of its maximum. The mean over both axes is half of that, because the
+    # slope along the crests is zero.
     steepest = 10.0 * 2 * 2 * np.pi / 512
     assert mean_slope_deg(surface, 16.0) == pytest.approx(np.degrees(steepest * 2 / np.pi) / 2, rel=0.02)
     # The included part is near the zero crossing at x = 256 m, where the slope has its maximum.
@@ -137,7 +138,7 @@ def test_sky_light_increases_with_dust() -> None:
     sun_elevation = np.radians(45.0)
     fractions = [Environment(optical_depth=tau).sky_fraction(sun_elevation) for tau in (0.0, 0.2, 0.5, 0.9)]
     assert fractions[0] == 0.0
-    assert all(a < b for a, b in pairwise(fractions))
+    assert all(less < more for less, more in pairwise(fractions))
     assert Environment(optical_depth=0.0).direct_fraction(sun_elevation) == 1.0
     # Without absorption and with isotropic scattering Eddington's approximation has a closed form. Over black ground
     # the transmitted fraction is (2 + 3 mu + (2 - 3 mu) exp(-tau / mu)) / (4 + 3 tau) (Shettle & Weinman 1970).
@@ -164,12 +165,12 @@ def test_terrain_with_landforms_is_read_from_a_file() -> None:
 
 def test_site_terrain_can_be_partly_changed() -> None:
     default = site("gusev").terrain("ground")
-    changed = site("gusev").terrain("ground", {"samples": 512, "rocks": {"abundance": 0.2}, "ripples": None})
+    custom = site("gusev").terrain("ground", {"samples": 512, "rocks": {"abundance": 0.2}, "ripples": None})
     assert default.rocks is not None
-    assert changed.rocks is not None
-    assert (changed.samples, changed.rocks.abundance, changed.ripples) == (512, 0.2, None)
-    assert changed.rocks.model_copy(update={"abundance": default.rocks.abundance}) == default.rocks
-    assert changed.albedo == default.albedo
+    assert custom.rocks is not None
+    assert (custom.samples, custom.rocks.abundance, custom.ripples) == (512, 0.2, None)
+    assert custom.rocks.model_copy(update={"abundance": default.rocks.abundance}) == default.rocks
+    assert custom.albedo == default.albedo
     with_dunes = site("gusev").terrain("descent", {"dunes": {"wavelength_m": 40.0}})
     assert with_dunes.dunes is not None
     assert with_dunes.dunes.wavelength_m == 40.0
@@ -198,8 +199,8 @@ def test_imported_terrain_replaces_the_relief_of_a_site(shared_data: Path) -> No
     changes = {"samples": 512, "spacing_m": 1.0, "source": {"dtm": tile, "ortho_east_m": 2.0, "ortho_north_m": -1.0}}
     parameters = site("gusev").terrain("descent", changes)
     surface = synthesise(parameters, np.random.default_rng(1))
-    inside = surface.levels[0][100:400, 100:400, 0]
-    assert np.ptp(inside) == pytest.approx(-4437.883 + 4472.67, abs=1.0)
+    inner_heights = surface.levels[0][100:400, 100:400, 0]
+    assert np.ptp(inner_heights) == pytest.approx(-4437.883 + 4472.67, abs=1.0)
     assert surface.levels[0][..., 1].mean() == pytest.approx(0.22, rel=0.01)
     assert parameters.rocks is not None
     assert len(RockField.on(surface, parameters.rocks, np.random.default_rng(1))) > 0

@@ -35,11 +35,11 @@ def test_height_matches_scipy_cubic_b_spline(
 
 def test_gradient_is_the_derivative_of_height(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
     x, y = positions
-    # The error of central differences of a piecewise cubic is h^2/6 times a third derivative of order 1.
+    # The error of central differences with the step h is h^2/6 times the third derivative of the cubic, about 1.
     step = 1e-4
-    along_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
-    along_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
-    np.testing.assert_allclose(surface.gradient(x, y), np.stack([along_x, along_y], axis=-1), atol=1e-7)
+    derivative_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
+    derivative_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
+    np.testing.assert_allclose(surface.gradient(x, y), np.stack([derivative_x, derivative_y], axis=-1), atol=1e-7)
 
 
 @pytest.mark.parametrize("level", [0, 2])

@@ -13,10 +13,10 @@ from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, d
 def test_equal_seeds_produce_equal_bytes() -> None:
     parameters = TerrainParameters(samples=128)
     first = synthesise(parameters, np.random.default_rng(3))
-    repeated = synthesise(parameters, np.random.default_rng(3))
+    same_seed = synthesise(parameters, np.random.default_rng(3))
     other_seed = synthesise(parameters, np.random.default_rng(4))
-    for a, b in zip(first.levels, repeated.levels, strict=True):
-        assert a.tobytes() == b.tobytes()
+    for level, same_level in zip(first.levels, same_seed.levels, strict=True):
+        assert level.tobytes() == same_level.tobytes()
     assert first.levels[0].tobytes() != other_seed.levels[0].tobytes()
 
 
@@ -36,10 +36,12 @@ def test_structure_function_has_specified_slope_and_exponent(hurst: float) -> No
     lags = np.array([4, 8, 20])
     roughness = np.zeros(3)
     for seed in range(6):
-        z = synthesise(parameters, np.random.default_rng(seed)).levels[0][..., 0].astype(np.float64)
+        heights = synthesise(parameters, np.random.default_rng(seed)).levels[0][..., 0].astype(np.float64)
         roughness += [
-            np.mean((np.roll(z, -lag, axis=1) - z) ** 2 + (np.roll(z, -lag, axis=0) - z) ** 2) for lag in lags
+            np.mean((np.roll(heights, -lag, axis=1) - heights) ** 2 + (np.roll(heights, -lag, axis=0) - heights) ** 2)
+            for lag in lags
         ]
+    # The sum has 12 terms: six terrains and two axes.
     rms = np.sqrt(roughness / 12.0)
     slope_deg = np.degrees(np.arctan(rms[2] / (lags[2] * parameters.spacing_m)))
     assert slope_deg == pytest.approx(3.0, rel=0.1)
@@ -61,8 +63,9 @@ def test_crater_sizes_follow_the_power_law() -> None:
     diameters = 2 * draw_craters(parameters, np.random.default_rng(2))[:, 2]
     expected = 200.0 * area_km2
     assert diameters.size == pytest.approx(expected, abs=4 * np.sqrt(expected))
-    above = np.count_nonzero(diameters > 20.0)
-    assert above == pytest.approx(expected / 4, abs=4 * np.sqrt(expected / 4))
+    # With an exponent of 2, a quarter of the craters have twice the minimum diameter.
+    large_craters = np.count_nonzero(diameters > 20.0)
+    assert large_craters == pytest.approx(expected / 4, abs=4 * np.sqrt(expected / 4))
     assert diameters.min() >= 10.0
     assert diameters.max() <= parameters.crater_diameter_max_m
 

@@ -34,7 +34,7 @@ def _make_units(**changes: Any) -> SurfaceUnits:
     return SurfaceUnits.model_validate({"kinds": KINDS, "boundary": 0.02, **changes})
 
 
-def _apply(units: SurfaceUnits, seed: int = 1, side: int = 1024) -> tuple[Ground, np.ndarray]:
+def _apply_units(units: SurfaceUnits, seed: int = 1, side: int = 1024) -> tuple[Ground, np.ndarray]:
     ground = Ground(np.zeros((side, side), dtype=np.float32), np.zeros((side, side), dtype=np.float32), 2.0)
     return ground, units.apply(ground, NO_CRATERS, np.random.default_rng(seed))
 
@@ -46,28 +46,29 @@ def _make_parameters(**changes: Any) -> TerrainParameters:
 
 def test_units_have_the_specified_areas_factors_and_tones() -> None:
     """With sharp boundaries and fixed areas, each unit has its area, its factors and its albedo."""
-    ground, cover = _apply(_make_units(concentration=1e6))
+    ground, cover = _apply_units(_make_units(concentration=1e6))
     for kind in KINDS:
-        inside = np.isclose(cover[..., TEXTURE], kind.get("texture", 1.0), rtol=0.05)
-        assert inside.mean() == pytest.approx(kind["fraction"], abs=0.05)
-        assert np.median(cover[inside, ROUGHNESS]) == pytest.approx(kind.get("roughness", 1.0), rel=0.05)
-        assert np.median(ground.log_albedo[::4, ::4][inside]) == pytest.approx(kind.get("tone", 0.0), abs=0.02)
+        is_inside = np.isclose(cover[..., TEXTURE], kind.get("texture", 1.0), rtol=0.05)
+        assert is_inside.mean() == pytest.approx(kind["fraction"], abs=0.05)
+        assert np.median(cover[is_inside, ROUGHNESS]) == pytest.approx(kind.get("roughness", 1.0), rel=0.05)
+        assert np.median(ground.log_albedo[::4, ::4][is_inside]) == pytest.approx(kind.get("tone", 0.0), abs=0.02)
     assert cover[..., ROCKS].mean() == pytest.approx(1.0, rel=1e-4)
 
 
 def test_unit_areas_vary_between_terrains() -> None:
-    dust = [np.mean(_apply(_make_units(), seed, 256)[1][..., TEXTURE] < 0.4) for seed in range(40)]
-    # The areas have a Dirichlet distribution: variance a (1 - a) / (concentration + 1).
-    assert np.std(dust) == pytest.approx(np.sqrt(0.3 * 0.7 / 9.0), rel=0.35)
-    assert np.mean(dust) == pytest.approx(0.3, abs=0.08)
+    dust_fractions = [np.mean(_apply_units(_make_units(), seed, 256)[1][..., TEXTURE] < 0.4) for seed in range(40)]
+    # The areas have a Dirichlet distribution: variance a (1 - a) / (concentration + 1), with the default
+    # concentration of 8.
+    assert np.std(dust_fractions) == pytest.approx(np.sqrt(0.3 * 0.7 / 9.0), rel=0.35)
+    assert np.mean(dust_fractions) == pytest.approx(0.3, abs=0.08)
 
 
 def test_patches_are_longer_along_the_wind() -> None:
     units = _make_units(wind_from_deg=270.0, wind_spread_deg=0.0, elongation=4.0, largest_m=300.0)
-    texture = np.log(_apply(units)[1][..., TEXTURE])
+    texture = np.log(_apply_units(units)[1][..., TEXTURE])
     texture -= texture.mean()
-    along_x, along_y = (np.mean(texture * np.roll(texture, 10, axis=axis)) for axis in (1, 0))
-    assert along_x > 1.2 * along_y
+    correlation_x, correlation_y = (np.mean(texture * np.roll(texture, 10, axis=axis)) for axis in (1, 0))
+    assert correlation_x > 1.2 * correlation_y
 
 
 def test_units_increase_the_patchiness_of_the_albedo() -> None:
@@ -101,12 +102,12 @@ def test_crater_sizes_follow_saturation_and_production() -> None:
         crater_exponent=1.83,
         crater_knee_m=60.0,
     )
-    diameter = 2.0 * draw_craters(parameters, np.random.default_rng(5))[:, 2]
-    assert np.all(np.diff(diameter) <= 0.0)
-    above = {size: np.count_nonzero(diameter > size) for size in (8.0, 16.0, 32.0, 64.0, 128.0)}
-    assert np.log2(above[8.0] / above[16.0]) == pytest.approx(1.83, abs=0.15)
-    assert np.log2(above[16.0] / above[32.0]) == pytest.approx(1.83, abs=0.15)
-    assert np.log2(above[64.0] / above[128.0]) == pytest.approx(3.2, abs=0.25)
+    diameters = 2.0 * draw_craters(parameters, np.random.default_rng(5))[:, 2]
+    assert np.all(np.diff(diameters) <= 0.0)
+    counts = {size: np.count_nonzero(diameters > size) for size in (8.0, 16.0, 32.0, 64.0, 128.0)}
+    assert np.log2(counts[8.0] / counts[16.0]) == pytest.approx(1.83, abs=0.15)
+    assert np.log2(counts[16.0] / counts[32.0]) == pytest.approx(1.83, abs=0.15)
+    assert np.log2(counts[64.0] / counts[128.0]) == pytest.approx(3.2, abs=0.25)
 
 
 def test_crater_floor_has_its_tone() -> None:
@@ -136,7 +137,7 @@ def test_wind_tails_lie_downwind_of_their_craters() -> None:
 
 
 def test_dust_devil_tracks_are_darker() -> None:
-    ground, _ = _apply(_make_units(kinds=PLAIN, tracks_per_km2=20.0, track_tone=-0.12))
+    ground, _ = _apply_units(_make_units(kinds=PLAIN, tracks_per_km2=20.0, track_tone=-0.12))
     assert -0.3 < ground.log_albedo.min() < -0.08
     assert ground.log_albedo.max() < 1e-6
     assert 0.02 < np.mean(ground.log_albedo < -0.02) < 0.9
