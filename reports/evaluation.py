@@ -25,18 +25,27 @@ from marsyard.reports.wording import count, format_fraction, percent
 from marsyard.scenarios.systems import RowColumns, row_columns
 
 
+#: Headline of a study that decides no requirement.
+_NO_VERDICT = "NO VERDICT"
+
+
 @dataclass(frozen=True)
 class OverallVerdict:
-    """Verdict of a campaign: status (None without requirements), number of crashed cases, and a sentence."""
+    """Verdict of a campaign.
+
+    - status: None without requirements, and for a study without a verdict
+    - crashed: number of crashed cases; sentence: explanation; without_status: headline if there is no status
+    """
 
     status: Status | None
     crashed: int
     sentence: str
+    without_status: str = "NO REQUIREMENT"
 
     @property
     def word(self) -> str:
         """The headline."""
-        return "NO REQUIREMENT" if self.status is None else str(self.status)
+        return self.without_status if self.status is None else str(self.status)
 
 
 def combine_verdicts(
@@ -151,7 +160,9 @@ def _evaluate_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVer
     if study.get("kind") == "search":
         violations, status = int(result.get("violations") or 0), Status.FAIL if result.get("violations") else None
         sentence = f"{count(violations, 'violation')} of {study.get('requirement')} found. See the section."
-        return OverallVerdict(status, crashed, sentence)
+        return OverallVerdict(status, crashed, sentence, _NO_VERDICT)
+    if study.get("kind") == "budget":
+        return OverallVerdict(None, crashed, "The study computes an error budget. See the section.", _NO_VERDICT)
     statement = f"a violation of {study.get('requirement')} has a probability of at most {study.get('max_probability')}"
     return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {statement}.")
 

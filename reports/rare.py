@@ -103,8 +103,12 @@ def rare_section(subject: Subject) -> Section | None:
     grid = Grid(["Replicate", "Probability", "Levels", "Violation reached"], rows)
     note = (
         "Each replicate is an independent subset simulation. Each level contains a tenth of the cases of the "
-        "previous level. The interval comes from the spread of the replicates, since the error that one replicate "
-        "estimates for itself is too small."
+        "previous level. The error that one replicate estimates for itself is too small. "
+        + (
+            "The interval comes from the spread of the replicates."
+            if study["method"] == "subset"
+            else "The interval comes from importance sampling around the violations of the replicates."
+        )
     )
     figure = svg_figure(
         _draw_levels(replicates, float(study["max_probability"])),

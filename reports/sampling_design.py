@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -48,7 +47,7 @@ class TerrainSupply:
         if not self.key.endswith(".bank"):
             return f"{text} Widen the range of {self.key}, and the bank, and run the campaign again."
         # 1.1 n random draws from 10 n terrains give 10 n (1 - exp(-0.11)) = 1.04 n different terrains on average
-        bank, cases = 10 * min_terrains, math.ceil(1.1 * min_terrains)
+        bank, cases = 10 * min_terrains, -(-11 * min_terrains // 10)
         if self.in_turn:
             bank = cases = min_terrains
         remedy = f"{bank:,} stored terrains and {cases:,} cases: --set {self.key}={bank} -n {cases}."

@@ -151,15 +151,11 @@ class RunningProgram:
             if early_output := _read_pending(self._process.stdout):
                 message = f"it wrote {shorten(early_output)} before the request; expected one line per request"
                 raise self._end_with_fault(Fault.BAD_ANSWER, message)
-            try:
-                if self._process.stdin is None or self._process.stdin.closed:
-                    raise BrokenPipeError
-                self._process.stdin.write(f"{request}\n".encode())
-                self._process.stdin.flush()
-            except BrokenPipeError:
-                self._wait()
-                raise self._end_with_fault(Fault.CRASHED, "it closed its input") from None
-        self._read(lambda: b"\n" in self._stdout)
+        try:
+            self._read(lambda: b"\n" in self._stdout, b"" if request is None else f"{request}\n".encode())
+        except BrokenPipeError:
+            self._wait()
+            raise self._end_with_fault(Fault.CRASHED, "it closed its input") from None
         if b"\n" not in self._stdout:
             self._wait()
             raise self._end_with_fault(Fault.CRASHED, "its output ended without an answer")
@@ -180,16 +176,29 @@ class RunningProgram:
             with suppress(BrokenPipeError):
                 self._process.stdin.close()
 
-    def _read(self, is_complete: Callable[[], bool]) -> None:
-        """Read both streams until they end or `is_complete()` is true, within the limits on time, memory and size."""
+    def _read(self, is_complete: Callable[[], bool], request: bytes = b"") -> None:
+        """Send a request and read both streams until they end or `is_complete()` is true.
+
+        The limits on time, memory and size also hold while a program does not read its input. Raises BrokenPipeError
+        if the program has closed its input.
+        """
         with selectors.DefaultSelector() as selector:
+            if request:
+                if self._process.stdin is None or self._process.stdin.closed:
+                    raise BrokenPipeError
+                os.set_blocking(self._process.stdin.fileno(), False)
+                selector.register(self._process.stdin, selectors.EVENT_WRITE)
             for stream, buffer in ((self._process.stdout, self._stdout), (self._process.stderr, self._stderr)):
                 if stream is not None:
                     selector.register(stream, selectors.EVENT_READ, buffer)
-            while selector.get_map() and not is_complete():
+            while selector.get_map() and (request or not is_complete()):
                 self._check_limits()
                 for key, _ in selector.select(_POLL_S):
-                    if data := os.read(key.fd, 1 << 16):
+                    if key.fileobj is self._process.stdin:
+                        request = request[os.write(key.fd, request[: 1 << 16]) :]
+                        if not request:
+                            selector.unregister(key.fileobj)
+                    elif data := os.read(key.fd, 1 << 16):
                         key.data.extend(data)
                     else:
                         selector.unregister(key.fileobj)

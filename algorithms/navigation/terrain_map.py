@@ -115,7 +115,10 @@ class TerrainMap:
         return TerrainMap(self.corner_m, *layers)
 
     def without_hazards(self, centre_m: Vector2, radius_m: float) -> TerrainMap:
-        """Return the map with level ground in a disc, so that the target's rock is not a hazard."""
+        """Return the map with level ground in a disc, so that the target's rock is not a hazard.
+
+        The level is the median of the ground around the disc; the disc is unmapped if that ground is unmapped.
+        """
         axis = self.corner_m[:, None] + CELL_M * np.arange(len(self.median_m))
         east, north = np.meshgrid(axis[0] - centre_m[0], axis[1] - centre_m[1])
         inside = np.hypot(east, north) <= radius_m

@@ -405,13 +405,15 @@ def compute_budget(
     ]
     total_bounds, closure_bounds = np.percentile(total, bounds), np.percentile(closure, bounds)
     return Budget(
-        tuple(sorted(contributions, key=lambda item: -item.mean)),
-        float(total[0]),
-        *map(float, total_bounds),
-        float(none[0]),
-        float(closure[0]),
-        *map(float, closure_bounds),
-        int(is_common.sum()),
+        contributions=tuple(sorted(contributions, key=lambda item: -item.mean)),
+        total=float(total[0]),
+        total_lower=float(total_bounds[0]),
+        total_upper=float(total_bounds[1]),
+        remaining=float(none[0]),
+        closure=float(closure[0]),
+        closure_lower=float(closure_bounds[0]),
+        closure_upper=float(closure_bounds[1]),
+        common=int(is_common.sum()),
     )
 
 

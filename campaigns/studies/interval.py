@@ -81,8 +81,9 @@ def decide(interval: ProbabilityInterval, max_probability: float) -> RareVerdict
 
 
 def additional_replicates(interval: ProbabilityInterval, replicates: int, max_probability: float) -> int | None:
-    """Estimate the number of additional replicates that decide the verdict; None if the estimate equals the limit.
+    """Estimate the number of additional replicates that decide the verdict.
 
+    None if the estimate is so close to the limit that fewer than 10,000 replicates do not decide it.
     The spread of the replicates is assumed to remain the same.
     """
     distance = abs(math.log(max_probability / interval.estimate)) if interval.estimate > 0.0 else math.inf

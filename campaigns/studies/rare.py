@@ -229,7 +229,8 @@ class _Study:
             verdict, reason = RareVerdict.INSUFFICIENT, f"The verdict would be PASS. {evidence.text}"
         additional = None
         if verdict is RareVerdict.INSUFFICIENT and not contributions:
-            replicates_needed = additional_replicates(subset_interval, len(results), settings.max_probability)
+            next_interval = replace(subset_interval, confidence=0.5 * (1.0 + confidence))
+            replicates_needed = additional_replicates(next_interval, len(results), settings.max_probability)
             cases_per_replicate = self._runner.n_cases / len(results)
             additional = None if replicates_needed is None else math.ceil(replicates_needed * cases_per_replicate)
         return self._finish(verdict, interval, results, subset_interval, effective, additional, reason)
@@ -266,8 +267,10 @@ class _Study:
         )
 
     def _max_cases(self, replicates: int) -> int:
-        """Compute the number of cases of replicates that reach their least likely level, with a factor 10 per level."""
-        levels = math.ceil(-math.log10(_MIN_PROBABILITY_FRACTION * self._settings.max_probability))
+        """Compute the number of cases of replicates that reach their least likely level."""
+        levels = math.ceil(
+            math.log(_MIN_PROBABILITY_FRACTION * self._settings.max_probability) / math.log(LEVEL_FRACTION)
+        )
         return math.ceil(replicates * self._settings.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
 
     def _generator(self, name: str) -> np.random.Generator:

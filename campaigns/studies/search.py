@@ -198,7 +198,7 @@ class SearchStudy:
             violating_cases = [item for item in self._evaluated if item.margin < 0.0]
             violations = len(violating_cases)
             observer.begin("reduction", _REDUCTION_CASES * min(violations, self.settings.max_failures))
-            failures = self._reduce_all(violating_cases)
+            self._reduce_all(violating_cases, failures)
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
             searched = searched or len(self._evaluated)
@@ -242,7 +242,7 @@ class SearchStudy:
         dimension = len(self.campaign.drawn_paths)
         exponent = int(math.log2(max(_EXPLORATION_FRACTION * self.settings.cases, 2.0)))
         sequence = qmc.Sobol(dimension, rng=np.random.default_rng(self._seed("exploration"))).random_base2(exponent)
-        coordinates = ndtri(np.clip(sequence, 1e-6, 1.0 - 1e-6))
+        coordinates = np.clip(ndtri(sequence), -_MAX_COORDINATE, _MAX_COORDINATE)
         self._evaluate([Candidate(tuple(point.tolist())) for point in coordinates])
 
     def _evolve(self) -> None:
@@ -286,10 +286,12 @@ class SearchStudy:
                 break
         return starts
 
-    def _reduce_all(self, violating_cases: list[_Evaluated]) -> list[Failure]:
-        """Reduce the most likely violation, remove those with the same cause, and repeat with the others."""
+    def _reduce_all(self, violating_cases: list[_Evaluated], failures: list[Failure]) -> None:
+        """Reduce the most likely violation, remove those with the same cause, and repeat with the others.
+
+        failures: receives the reduced violations, also those before a CaseLimitError
+        """
         remaining = sorted(violating_cases, key=lambda item: float(np.linalg.norm(item.point.coordinates)))
-        failures: list[Failure] = []
         reduced_points: list[tuple[list[str], np.ndarray]] = []
         while remaining and len(failures) < self.settings.max_failures:
             first = remaining[0]
@@ -326,7 +328,6 @@ class SearchStudy:
                     reduction.outcome,
                 )
             )
-        return failures
 
     def _remove_dispersions(self, failure: _Evaluated) -> _Evaluated:
         """Reset groups of dispersions to the campaign's parameters, as long as the case remains a violation."""

@@ -241,12 +241,11 @@ def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side_px: flo
 def _title_lines(stop: StopImages) -> list[str]:
     """Format the three lines above a stop's images; unknown quantities are omitted."""
     formats = {
-        "range_m": "{:.2f} m", "azimuth_deg": "azimuth {:+.1f}°", "elevation_deg": "elevation {:+.1f}°",
-        "magnification": "× {:.3f}", "roll_change_deg": "roll {:+.1f}°", "match_score": "NCC {:.2f}",
+        "range_m": "{:.2f} m", "azimuth_deg": "azimuth {:+z.1f}°", "elevation_deg": "elevation {:+z.1f}°",
+        "magnification": "× {:.3f}", "roll_change_deg": "roll {:+z.1f}°", "match_score": "NCC {:.2f}",
         "stereo_score": "stereo {:.2f}", "error_px": "error {:.1f} px",
     }  # fmt: skip
-    # values that would be printed as -0.0 become 0
-    values = {name: 0.0 if abs(stop.quantity(name)) < 0.05 else stop.quantity(name) for name in formats}
+    values = {name: stop.quantity(name) for name in formats}
     texts = {
         name: formats[name].format(value).replace("-", "−") for name, value in values.items() if np.isfinite(value)
     }

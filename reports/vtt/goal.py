@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import math
+
 import numpy as np
 import pandas as pd
 
@@ -133,12 +135,12 @@ def _expected_errors() -> str:
         stereo = stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m)
         drift = drift_error_m(GOAL_M, design.focal_px, 1.0)
         errors.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
-    # 230 runs: ln(1 - CONFIDENCE) / ln(QUANTILE), rounded up
+    min_runs = math.ceil(math.log(1.0 - CONFIDENCE) / math.log(QUANTILE))
     return (
         f"By Eqs. 1 and 4, one pixel of disparity error at {GOAL_M:g} m corresponds to an error along the line of "
         f"sight, and one pixel of drift to an error across it; for the paper's cameras: {'; '.join(errors)}. The "
         f"bound of the {format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence needs at least "
-        "230 runs."
+        f"{min_runs} runs."
     )
 
 

@@ -168,7 +168,7 @@ class LanderParameters(Parameters):
     """The lander's shadow in its own images, modelled as the shadow of a disc at the camera's position.
 
     The parachute's canopy dominates. Its diameter is 15.09 m (nominal) times 0.72 (inflated; Witkowski & Bruno 2003,
-    MER parachute); it covers the whole sun. Backshell and lander, 2.65 m in diameter, cover 1/20 of the sun from 2 km;
+    MER parachute); from 2 km it covers 80 % of the sun. Backshell and lander, 2.65 m in diameter, cover 1/20 of the sun from 2 km;
     for a high sun their shadow is inside the shadow of the canopy. The canopy is about 40 m above the camera, which
     moves its shadow by 1 deg in the view. This is not modelled: DIMES masks a zero-phase spot of 4 deg.
     """

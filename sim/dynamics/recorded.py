@@ -199,9 +199,7 @@ def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     if first_line.startswith("#timestamp") and "," in first_line:
         frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
         values = frame.to_numpy(dtype=np.float64)
-        # nanoseconds since 1970 exceed the precision of a float, therefore integers are subtracted first
-        values[:, 0] = 1e-9 * (frame[0] - int(frame[0].iloc[0])).to_numpy(dtype=np.float64)
-        values[:, 0] += 1e-9 * int(frame[0].iloc[0])
+        values[:, 0] *= 1e-9
         return np.asarray(values[:, [0, 1, 2, 3, 5, 6, 7, 4]])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # empty files are reported below; cells without a column name are ignored

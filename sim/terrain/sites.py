@@ -55,6 +55,8 @@ class Environment(Parameters):
             return 0.0
         mu = max(float(np.sin(sun_elevation_rad)), MIN_SUN_SINE)
         k = np.sqrt(3.0 * (1.0 - albedo) * (1.0 - albedo * asymmetry))
+        if abs(1.0 - k * mu) < 1e-6:
+            mu *= 1.0 + 2e-6  # the particular solution is singular at k mu = 1, but the irradiance is continuous
         p = np.sqrt(3.0 * (1.0 - albedo) / (1.0 - albedo * asymmetry))
         # intensity I + I1 cos(angle from the nadir) for a solar flux of pi, particular solution -alpha, -beta
         alpha = 0.75 * albedo * mu**2 * (1.0 + asymmetry * (1.0 - albedo)) / (1.0 - (k * mu) ** 2)

@@ -182,7 +182,7 @@ class CampaignReport(_Part):
     )
     sampling: SamplingDescription
     evidence: Evidence
-    verdict: VerdictName | Literal["NO REQUIREMENT"]
+    verdict: VerdictName | Literal["NO REQUIREMENT", "NO VERDICT"]
     sentence: str
     exit_code: Literal[0, 1, 3]
     verdicts: list[RequirementVerdict]

@@ -368,14 +368,14 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     message = (
         "To show a success rate of 99 % at 90 % confidence, the cases must include at least 230 different terrains. "
         "The campaign has only 8 stored terrains (location.bank = 8). Run the campaign again with 2,300 stored "
-        "terrains and 254 cases: --set location.bank=2300 -n 254."
+        "terrains and 253 cases: --set location.bank=2300 -n 253."
     )
     assert message in verdict.note
     assert message in combine_verdicts([verdict], frame).sentence
     assert "would do" not in combine_verdicts([verdict], frame).sentence
-    # 254 draws of 2300 terrains have 230 different terrains in more than 99 % of campaigns
+    # 253 draws of 2300 terrains have 230 different terrains in more than 99 % of campaigns
     rng = np.random.default_rng(3)
-    assert np.mean([np.unique(rng.integers(0, 2300, 254)).size >= 230 for _ in range(1000)]) > 0.99
+    assert np.mean([np.unique(rng.integers(0, 2300, 253)).size >= 230 for _ in range(1000)]) > 0.99
     in_turn = _make_terrain_design(8, distribution="in-turn", low=0, high="location.bank - 1")
     assert "--set location.bank=230 -n 230" in evaluate_requirements(frame, [velocity], in_turn)[0].note
     fixed_terrain = evaluate_requirements(frame.assign(terrain=0), [velocity], _make_terrain_design(8))[0]
