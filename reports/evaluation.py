@@ -24,7 +24,6 @@ from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, evaluate_requir
 from marsyard.reports.wording import count, format_fraction, percent
 from marsyard.scenarios.systems import RowColumns, row_columns
 
-
 #: Headline of a study that decides no requirement.
 _NO_VERDICT = "NO VERDICT"
 

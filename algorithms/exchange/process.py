@@ -147,10 +147,9 @@ class RunningProgram:
         self._stdout.clear()
         self._stderr.clear()
         self._deadline_s = time.monotonic() + self.limits.time_s
-        if request is not None:
-            if early_output := _read_pending(self._process.stdout):
-                message = f"it wrote {shorten(early_output)} before the request; expected one line per request"
-                raise self._end_with_fault(Fault.BAD_ANSWER, message)
+        if request is not None and (early_output := _read_pending(self._process.stdout)):
+            message = f"it wrote {shorten(early_output)} before the request; expected one line per request"
+            raise self._end_with_fault(Fault.BAD_ANSWER, message)
         try:
             self._read(lambda: b"\n" in self._stdout, b"" if request is None else f"{request}\n".encode())
         except BrokenPipeError:

@@ -268,9 +268,8 @@ class _Study:
 
     def _max_cases(self, replicates: int) -> int:
         """Compute the number of cases of replicates that reach their least likely level."""
-        levels = math.ceil(
-            math.log(_MIN_PROBABILITY_FRACTION * self._settings.max_probability) / math.log(LEVEL_FRACTION)
-        )
+        min_probability = _MIN_PROBABILITY_FRACTION * self._settings.max_probability
+        levels = math.ceil(math.log(min_probability) / math.log(LEVEL_FRACTION))
         return math.ceil(replicates * self._settings.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
 
     def _generator(self, name: str) -> np.random.Generator:

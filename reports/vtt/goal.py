@@ -5,10 +5,9 @@ Sections and equations are those of Kim et al., "Targeted Driving Using Visual T
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
-
-import math
 
 import numpy as np
 import pandas as pd

@@ -168,9 +168,9 @@ class LanderParameters(Parameters):
     """The lander's shadow in its own images, modelled as the shadow of a disc at the camera's position.
 
     The parachute's canopy dominates. Its diameter is 15.09 m (nominal) times 0.72 (inflated; Witkowski & Bruno 2003,
-    MER parachute); from 2 km it covers 80 % of the sun. Backshell and lander, 2.65 m in diameter, cover 1/20 of the sun from 2 km;
-    for a high sun their shadow is inside the shadow of the canopy. The canopy is about 40 m above the camera, which
-    moves its shadow by 1 deg in the view. This is not modelled: DIMES masks a zero-phase spot of 4 deg.
+    MER parachute); from 2 km it covers 80 % of the sun. Backshell and lander, 2.65 m in diameter, cover 1/20
+    of it; for a high sun their shadow is inside the shadow of the canopy. The canopy is about 40 m above the camera,
+    which moves its shadow by 1 deg in the view. This is not modelled: DIMES masks a zero-phase spot of 4 deg.
     """
 
     caster_diameter_m: Annotated[float, bounded_field(0.0, 100.0, "diameter of the shadow disc")] = 10.9

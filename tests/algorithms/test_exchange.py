@@ -22,6 +22,7 @@ from marsyard.algorithms.exchange import (
     read_case,
     write_case,
 )
+from marsyard.algorithms.exchange.process import RunningProgram
 from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, PoseMeasurement
@@ -350,3 +351,12 @@ def test_python_example_estimates_velocity(measurements: DescentMeasurements, mo
     assert result.velocity_m_s is not None
     assert np.hypot(*(result.velocity_m_s - TRUE_VELOCITY)) < 1.0
     assert result.covariance_m2_s2 is not None
+
+
+def test_program_that_does_not_read_a_long_request_times_out() -> None:
+    limits = ExecutableLimits(time_s=1.0)
+    program = RunningProgram((sys.executable, "-c", "import time; time.sleep(60)"), limits)
+    # longer than the buffer of a pipe, 64 kB on Linux
+    with pytest.raises(AlgorithmError) as error:
+        program.read_line("x" * 1_000_000)
+    assert error.value.fault is Fault.TIMED_OUT
