@@ -31,6 +31,11 @@ REMAINING = "images, matching and scene"
 _MAX_INDICES = 12
 
 
+def signed_percent(fraction: float) -> str:
+    """Format a fraction of the total with one decimal; contributions can be negative, and above 100 %."""
+    return f"{100.0 * fraction:z.1f} %".replace("-", "−")
+
+
 def read_budget(record: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the settings of an error budget with its `result`; empty for another run or an unfinished study."""
     study = table(record.get("study"))
@@ -45,18 +50,18 @@ def budget_sentences(study: Mapping[str, Any]) -> list[str]:
     sentences: list[str] = []
     budget = table(result.get("budget"))
     if budget:
-        unit = split_unit(result["quantity"])[1]
         total = budget["total"]
         largest = ", ".join(
-            f"{item['title']} {percent(item['mean'] / total)}"
+            f"{item['title']} {signed_percent(item['mean'] / total)}"
             for item in budget["contributions"][:3]
             if item["mean"] > 0
         )
         sentences += [
-            f"{study['requirement']}: {_statistic(result)} of {label(result['quantity'])} {number(math.sqrt(total))} "
-            f"{unit} with all sources of error, {number(math.sqrt(max(budget['remaining'], 0.0)))} {unit} without any, "
-            f"in {budget['common']} of {count(int(result['cases']), 'base case')} with an error in all configurations.",
-            f"Largest contributions to the mean square: {largest}; {REMAINING} {percent(budget['remaining'] / total)}.",
+            f"{study['requirement']}: {_statistic(result)} of {label(result['quantity'])}: {number(math.sqrt(total))} "
+            f"with all sources of error, {_signed_root(budget['remaining'])} without any, in "
+            f" {budget['common']} of {count(int(result['cases']), 'base case')} with an error in all configurations.",
+            f"Largest contributions to the mean square: {largest}; "
+            f"{REMAINING} {signed_percent(budget['remaining'] / total)}.",
             _closure_sentence(budget, float(study["confidence"])),
         ]
     if result["indices"]:
@@ -76,9 +81,9 @@ def _statistic(result: Mapping[str, Any]) -> str:
 
 
 def _closure_sentence(budget: Mapping[str, Any], confidence: float) -> str:
-    bounds = f"{percent(budget['closure_lower'])} to {percent(budget['closure_upper'])}"
+    bounds = f"{signed_percent(budget['closure_lower'])} to {signed_percent(budget['closure_upper'])}"
     interval = f"{percent(confidence)} interval {bounds}"
-    text = f"The contributions add up to {percent(budget['closure'])} of the total ({interval})"
+    text = f"The contributions add up to {signed_percent(budget['closure'])} of the total ({interval})"
     if abs(budget["closure"] - 1.0) > MAX_CLOSURE_ERROR:
         return f"{text}: interactions of three or more sources matter, and the contributions are not additive."
     return f"{text}."
@@ -112,9 +117,9 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
     rows = [
         [
             item["title"],
-            percent(item["mean"] / total),
-            f"{percent(item['lower'] / total)} to {percent(item['upper'] / total)}",
-            percent(0.5 * (item["removed"] - item["alone"]) / total),
+            signed_percent(item["mean"] / total),
+            f"{signed_percent(item['lower'] / total)} to {signed_percent(item['upper'] / total)}",
+            signed_percent(0.5 * (item["removed"] - item["alone"]) / total),
             _signed_root(item["alone"] + budget["remaining"]),
             _signed_root(total - item["removed"]),
             f"{item['answered'][1]} of {n_cases}",
@@ -123,7 +128,7 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
         for item in budget["contributions"]
     ]
     rows.append(
-        [REMAINING, percent(budget["remaining"] / total), "", "", _signed_root(budget["remaining"]), "", "", ""]
+        [REMAINING, signed_percent(budget["remaining"] / total), "", "", _signed_root(budget["remaining"]), "", "", ""]
     )
     statistic = _statistic(result)
     figure = svg_figure(

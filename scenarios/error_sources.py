@@ -9,6 +9,7 @@ from functools import cache
 from typing import Any
 
 from marsyard.scenarios.systems import find_system
+from marsyard.scenarios.systems import scenario as find_scenario
 
 
 @dataclass(frozen=True)
@@ -55,19 +56,23 @@ def _exact_value(path: str, value: Any) -> Any:
 
 @cache
 def error_sources(scenario: str) -> tuple[ErrorSource, ...]:
-    """Return the sources of error of a scenario; empty if its system has no such file.
+    """Return the sources of error of a scenario, by the name in campaign files; empty if it names none.
 
-    Raises ValueError for an invalid file.
+    They are in the file of its system. A scenario ``module:Class`` without a system has them in the attribute
+    `error_sources` of its class. Raises ValueError for an invalid file.
     """
     system = find_system(scenario)
-    if system is None or system.error_sources is None:
+    if system is None:
+        return tuple(getattr(find_scenario(scenario), "error_sources", ()))
+    if system.error_sources is None:
         return ()
     try:
         scenarios = tomllib.loads(system.error_sources.read_text(encoding="utf-8"))
         tables = scenarios.get(scenario, {})
+        prefix = tables.get("prefix", "")
         tables = scenarios[tables["sources_of"]] if "sources_of" in tables else tables
         return tuple(
-            ErrorSource(name, str(table["title"]), tuple(map(str, table["parameters"])))
+            ErrorSource(name, str(table["title"]), tuple(f"{prefix}{path}" for path in table["parameters"]))
             for name, table in tables.items()
         )
     except (OSError, ValueError, LookupError, TypeError) as error:

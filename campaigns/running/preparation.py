@@ -127,12 +127,14 @@ def report_compilation(scenario: str, note: Callable[[str], None]) -> Iterator[C
             number = count_compiled_functions() - initial_count
             note(f"compiling numeric kernels: {number} functions so far, {time.monotonic() - start_s:.0f} s")
 
+    thread = threading.Thread(target=report, daemon=True)
+
     def finish() -> None:
         if not is_done.is_set():
             is_done.set()
+            thread.join()  # its last note precedes this one
             note(f"numeric kernels are compiled, {time.monotonic() - start_s:.0f} s")
 
-    thread = threading.Thread(target=report, daemon=True)
     thread.start()
     try:
         yield finish

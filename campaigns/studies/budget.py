@@ -273,7 +273,8 @@ class _Study:
         budget = compute_budget(errors, groups, self._sources, self._is_centred, settings.confidence)
         if budget is None and n and not reason:
             reason = (
-                f"Fewer than {MIN_COMMON} base cases have an error in all configurations, so that there is no budget."
+                f"Fewer than {MIN_COMMON} base cases have an error in all configurations, or all errors are equal, so "
+                "that there is no budget."
             )
         return BudgetResult(
             self._quantity,
@@ -359,7 +360,9 @@ def compute_budget(
     is_centred: bool,
     confidence: float,
 ) -> Budget | None:
-    """Compute the contributions from the base cases with an error in all configurations; None for too few of them.
+    """Compute the contributions from the base cases with an error in all configurations.
+
+    None for too few of these cases, or for equal errors.
 
     The intervals are percentiles of a bootstrap over groups of cases (terrains).
 
@@ -381,6 +384,8 @@ def compute_budget(
     squares = weights @ (values**2).T
     if is_centred:
         squares = squares - (weights @ values.T) ** 2
+    if squares[:, 0].min() <= 0.0:
+        return None
     total, none = squares[:, 0], squares[:, 1]
     removed = total[:, None] - squares[:, 2 : 2 + n_sources]
     alone = squares[:, 2 + n_sources :] - none[:, None]

@@ -33,6 +33,8 @@ from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
 from marsyard.sim.kernel_cache import mark_ready
 
+#: Number of first cases after which a study without a finished case ends.
+_MAX_FIRST_CRASHES = 20
 #: Key of a study's settings and results in the record of its folder.
 STUDY_KEY = "study"
 
@@ -85,7 +87,7 @@ class PointRunner:
     ) -> None:
         self._campaign, self._directory, self._store = campaign, directory, store
         self._executor, self._observer = executor, observer
-        self._is_checked = False
+        self._is_checked = self._has_finished_case = False
         #: Number of cases evaluated so far.
         self.n_cases = 0
         #: Function that is called when the first case has ended.
@@ -99,7 +101,8 @@ class PointRunner:
     def run(self, candidates: Sequence[Candidate]) -> list[Row]:
         """Evaluate points in parallel; return their rows in the same order.
 
-        Raises CaseLimitError before the first case beyond the limit, and StoreError if a stored row has another point.
+        Raises CaseLimitError before the first case beyond the limit, StoreError if a stored row has another point, and
+        CampaignError if none of the first cases finished.
         """
         first = self.n_cases
         limit = self._campaign.configuration.total_cases
@@ -135,6 +138,10 @@ class PointRunner:
                 rows[int(completed.row["case"])] = completed.row
                 self._observer.step()
         self.n_cases += len(candidates)
+        self._has_finished_case |= any(row["outcome"] not in ENGINE_FAILURES for row in rows.values())
+        if not self._has_finished_case and self.n_cases >= _MAX_FIRST_CRASHES:
+            error = next(iter(rows.values())).get("error")
+            raise CampaignError(f"{self._directory}: none of the first {self.n_cases} cases finished: {error}")
         return [rows[case] for case in points]
 
 

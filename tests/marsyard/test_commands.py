@@ -23,7 +23,7 @@ PRINTING = {
 }
 WRITING = {
     "run", "resume", "append", "replay", "report", "dashboard", "nightly", "gallery", "render", "dataset", "new",
-    "ingest", "export", "score", "compile", "rare", "search",
+    "ingest", "export", "score", "compile", "rare", "search", "budget",
 }  # fmt: skip
 
 

@@ -84,9 +84,9 @@ def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) 
     cases, terrains = evidence_limits(load_campaign("dimes-smoke"))
     assert cases.startswith("DIMES-VEL: 99 % at 90 % confidence takes at least 230 cases")
     assert "has only 8 stored terrains (location.bank = 8)" in terrains
-    # ten stored terrains for each of the 230; 254 draws then have 230 different terrains (see test_verdicts)
-    assert "--set location.bank=2300 -n 254" in terrains
-    larger = load_campaign("dimes-smoke", ["location.bank=2300"], 254)
+    # ten stored terrains for each of the 230; 253 draws then have 230 different terrains (see test_verdicts)
+    assert "--set location.bank=2300 -n 253" in terrains
+    larger = load_campaign("dimes-smoke", ["location.bank=2300"], 253)
     assert evidence_limits(larger) == []
     # more cases on the same terrains do not add evidence
     (terrains,) = evidence_limits(load_campaign("dimes-smoke", cases=1000))

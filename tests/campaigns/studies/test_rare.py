@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +20,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.interval import RareVerdict
 from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_rare, start_rare
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
+from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.limit_state import CAMPAIGN
 
 #: With a confidence of 0.99, the intervals of the fixed seeds contain the true probability.
@@ -75,19 +73,10 @@ def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: 
 
 @pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
-    sizes = ["--samples", "50", "--replicates", "2", "--jobs", "2"]
-    options = ["--requirement", "LOAD", "--max-probability", "0.1", *sizes]
-    command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--set", "sleep_s=0.03"]
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
-    with subprocess.Popen([*command, "--out", str(killed_run)], stderr=subprocess.DEVNULL) as process:
-        log, deadline = killed_run / "cases.sqlite-wal", time.monotonic() + 120.0
-        while not (log.exists() and log.stat().st_size > 12_000) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        os.kill(process.pid, signal.SIGKILL)
-    assert record.read(killed_run)["state"] == "running"
-    resume_result = subprocess.run(
-        [sys.executable, "-m", "marsyard", "resume", str(killed_run)], capture_output=True, text=True, check=False
-    )
+    sizes = ["--samples", "50", "--replicates", "2", "--set", "sleep_s=0.03"]
+    arguments = ["rare", str(campaign_path), "--requirement", "LOAD", "--max-probability", "0.1", *sizes]
+    resume_result = kill_and_resume(arguments, killed_run, log_bytes=12_000)
     settings = RareSettings("LOAD", 0.1, samples=50, replicates=(2,))
     reference = run_study(campaign_path, reference_run, settings, "sleep_s=0.03", max_cases=20_000)
     assert resume_result.returncode == reference.exit_code, resume_result.stderr

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,6 +23,7 @@ from marsyard.campaigns.studies.runner import Candidate, prepare_campaign
 from marsyard.campaigns.studies.search import SearchResult, SearchSettings, SearchStudy, start_search
 from tests.campaigns.fake_campaign import RecordingWatch
 from tests.campaigns.studies import limit_state
+from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.planted_defect import CAMPAIGN
 
 
@@ -105,17 +103,9 @@ def test_limit_of_cases_ends_the_search(campaign_path: Path, tmp_path: Path) -> 
 
 @pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
-    options = ["--requirement", "VELOCITY", "-n", "150", "--jobs", "2"]
-    command = [sys.executable, "-m", "marsyard", "search", str(campaign_path), *options]
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
-    with subprocess.Popen([*command, "--out", str(killed_run)], stderr=subprocess.DEVNULL) as process:
-        log, deadline = killed_run / "cases.sqlite-wal", time.monotonic() + 120.0
-        while not (log.exists() and log.stat().st_size > 20_000) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        os.kill(process.pid, signal.SIGKILL)
-    resume_result = subprocess.run(
-        [sys.executable, "-m", "marsyard", "resume", str(killed_run)], capture_output=True, text=True, check=False
-    )
+    arguments = ["search", str(campaign_path), "--requirement", "VELOCITY", "-n", "150"]
+    resume_result = kill_and_resume(arguments, killed_run, log_bytes=20_000)
     reference = run_search(campaign_path, reference_run, SearchSettings("VELOCITY", 150))
     assert resume_result.returncode == reference.exit_code == 1, resume_result.stderr
     assert record.read(killed_run)["study"]["result"] == record.read(reference_run)["study"]["result"]

@@ -1,0 +1,95 @@
+"""A fast scenario with known error sources: three normal errors, two of which interact."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import ClassVar
+
+from pydantic import BaseModel, ConfigDict
+
+from marsyard.scenarios.error_sources import ErrorSource
+from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.streams import Streams
+
+CAMPAIGN = """
+name = "error-model"
+scenario = "tests.campaigns.studies.error_model:ErrorModelScenario"
+cases = 100
+seed = 6
+
+[dispersions]
+load = { distribution = "normal", mean = 0.0, sd = 1.0 }
+unused = { distribution = "normal", mean = 0.0, sd = 1.0 }
+drift = { distribution = "uniform", low = 0.0, high = 2.0 }
+
+[[requirements]]
+id = "ERROR"
+metric = "miss"
+bound = 30.0
+probability = 0.99
+confidence = 0.9
+
+[[requirements]]
+id = "FLAG"
+metric = "is_small"
+probability = 0.99
+confidence = 0.9
+
+[[requirements]]
+id = "MARGIN"
+metric = "is_small"
+margin = "error_margin"
+probability = 0.99
+confidence = 0.9
+"""
+
+
+class ErrorModelParameters(BaseModel):
+    """Parameters of `ErrorModelScenario`; the unit of all errors is the same."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    load: float = 0.0
+    unused: float = 0.0
+    gyro_sd: float = 3.0
+    radar_sd: float = 2.0
+    drift: float = 1.0
+    interaction: float = 0.0
+    floor_sd: float = 1.0
+    fan: bool = False
+    sleep_s: float = 0.0
+    refused_fraction: float = 0.0
+
+
+class ErrorModelScenario:
+    """The column `miss` is ``load + floor f + gyro g + radar r drift + interaction gyro g radar r drift``.
+
+    f, g and r are standard normal numbers of separate streams. The mean square of the uniform drift is 4/3.
+    """
+
+    name = "error-model"
+    parameters_type = ErrorModelParameters
+    error_sources: ClassVar[tuple[ErrorSource, ...]] = (
+        ErrorSource("gyro", "gyroscope", ("gyro_sd", "gyro_of_a_custom_part")),
+        ErrorSource("radar", "radar", ("radar_sd", "drift")),
+        ErrorSource("fan", "fan", ("fan",)),
+    )
+
+    def shared_inputs(self, parameters: ErrorModelParameters) -> tuple[int, ...]:
+        return ()
+
+    def prepare(self, parameters: ErrorModelParameters, shared_input: int) -> None:
+        raise NotImplementedError
+
+    def run(self, parameters: ErrorModelParameters, streams: Streams) -> CaseResult:
+        p = parameters
+        time.sleep(p.sleep_s)
+        floor, gyro, radar = (float(streams.generator(name).standard_normal()) for name in ("floor", "gyro", "radar"))
+        gyro_error, radar_error = p.gyro_sd * gyro, p.radar_sd * radar * p.drift
+        error = p.load + p.floor_sd * floor + gyro_error + radar_error + p.interaction * gyro_error * radar_error
+        math.sqrt(p.refused_fraction)  # a negative fraction raises ValueError
+        answered = bool(streams.generator("refusal").random() >= p.refused_fraction)
+        error = error if answered else math.nan
+        row = {"miss": error, "is_small": error <= 30.0, "error_margin": 30.0 - error}
+        return CaseResult("VALID" if answered else "REFUSED", answered, row, {})

@@ -1,0 +1,207 @@
+"""Tests of error budgets: contributions and Sobol indices of a known model, continuation, replay, report and errors."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.running.replay import replay
+from marsyard.campaigns.store import record
+from marsyard.campaigns.studies import budget, runner
+from marsyard.campaigns.studies.budget import (
+    STREAMS,
+    BudgetResult,
+    BudgetSettings,
+    active_sources,
+    compute_budget,
+    start_budget,
+)
+from marsyard.reports.budget import budget_sentences, read_budget
+from marsyard.reports.campaign import write_report
+from marsyard.scenarios.error_sources import ErrorSource, error_sources
+from marsyard.scenarios.systems import scenario_names
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
+from tests.campaigns.studies.error_model import CAMPAIGN
+from tests.campaigns.studies.killing import kill_and_resume
+
+SETTINGS = BudgetSettings("ERROR", cases=200)
+
+
+@pytest.fixture
+def campaign_path(tmp_path: Path) -> Path:
+    path = tmp_path / "error-model.toml"
+    path.write_text(CAMPAIGN)
+    return path
+
+
+def run_budget(path: Path, directory: Path, settings: BudgetSettings, *overrides: str) -> BudgetResult:
+    campaign = load_campaign(str(path), overrides)
+    return start_budget(campaign, settings, directory, ExecutorConfig(1), RecordingWatch())
+
+
+def test_contributions_of_independent_errors_are_their_variances(campaign_path: Path, tmp_path: Path) -> None:
+    result = run_budget(campaign_path, tmp_path / "run", SETTINGS)
+    contents = result.budget
+    assert contents is not None
+    assert result.inactive == ("fan",)
+    contributions = {item.source: item for item in contents.contributions}
+    assert [item.source for item in contents.contributions] == ["gyro", "radar"]
+    # the relative standard deviation of a mean square of 200 normal numbers is sqrt(2 / 200)
+    assert contributions["gyro"].mean == pytest.approx(9.0, rel=0.3)
+    assert contributions["radar"].mean == pytest.approx(4.0 * 4.0 / 3.0, rel=0.4)
+    # without any source: load and floor
+    assert contents.remaining == pytest.approx(2.0, rel=0.3)
+    for item in contributions.values():
+        assert item.lower < item.mean < item.upper
+    assert contents.closure == pytest.approx(1.0, abs=1e-9)
+    assert (contents.common, result.violations, result.evaluated) == (200, 0, 200 * 6)
+
+
+def test_intervals_contain_the_variances_at_their_confidence() -> None:
+    rng = np.random.default_rng(2)
+    sources = [ErrorSource("a", "a", ()), ErrorSource("b", "b", ())]
+    hits = 0
+    for _ in range(200):
+        floor, a, b = rng.standard_normal((3, 100)) * [[1.0], [3.0], [2.0]]
+        errors = np.array([floor + a + b, floor, floor + b, floor + a, floor + a, floor + b])
+        contents = compute_budget(errors, np.arange(100), sources, is_centred=False, confidence=0.9)
+        assert contents is not None
+        hits += sum(item.lower < {"a": 9.0, "b": 4.0}[item.source] < item.upper for item in contents.contributions)
+    # 400 intervals at 90 %; percentile intervals of a bootstrap with 100 cases are slightly short
+    assert 0.85 <= hits / 400 <= 0.95
+
+
+def test_interaction_of_two_sources_is_divided_between_them(campaign_path: Path, tmp_path: Path) -> None:
+    result = run_budget(campaign_path, tmp_path / "run", SETTINGS, "interaction=0.5")
+    assert result.budget is not None
+    contributions = {item.source: item for item in result.budget.contributions}
+    # with both sources, the mean square of the interaction is 0.25 * 9 * 16/3 = 12
+    for item in contributions.values():
+        assert item.removed - item.alone == pytest.approx(12.0, rel=0.6)
+    # half of the interaction belongs to each source, and the budget remains complete
+    assert result.budget.closure == pytest.approx(1.0, abs=1e-9)
+
+
+def test_cases_without_an_error_in_a_configuration_are_excluded(campaign_path: Path, tmp_path: Path) -> None:
+    result = run_budget(campaign_path, tmp_path / "run", SETTINGS, "refused_fraction=0.25")
+    assert result.budget is not None
+    # the stream of the refusal is the same in all configurations
+    assert result.budget.common == result.budget.contributions[0].answered[0]
+    assert 120 <= result.budget.common <= 180
+    no_error = run_budget(campaign_path, tmp_path / "none", SETTINGS, "refused_fraction=1.0")
+    assert no_error.budget is None
+    assert "Fewer than 10 base cases" in no_error.reason
+    assert no_error.exit_code == 3
+
+
+def test_margin_is_centred(campaign_path: Path, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, requirement="MARGIN")
+    result = run_budget(campaign_path, tmp_path / "run", settings, "dispersions.load.mean=100.0")
+    assert (result.quantity, result.centred) == ("error_margin", True)
+    assert result.budget is not None
+    assert result.budget.remaining == pytest.approx(2.0, rel=0.3)
+
+
+def test_sobol_indices_of_a_linear_model_are_variance_fractions(campaign_path: Path, tmp_path: Path) -> None:
+    settings = BudgetSettings("MARGIN", cases=20, sobol=256)
+    overrides = ("gyro_sd=0.0", "radar_sd=0.0", "dispersions.load.sd=2.0")
+    result = run_budget(campaign_path, tmp_path / "run", settings, *overrides)
+    indices = {item.name: item for item in result.indices}
+    # the error is 2 load + floor
+    assert indices["load"].first == pytest.approx(0.8, abs=0.15)
+    assert indices["load"].total == pytest.approx(0.8, abs=0.15)
+    assert indices[STREAMS].total == pytest.approx(0.2, abs=0.08)
+    assert indices["unused"].total == 0.0
+    assert [item.name for item in result.indices][:2] == ["load", STREAMS]
+    assert result.index_samples == 256
+
+
+def test_killed_budget_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
+    killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
+    arguments = ["budget", str(campaign_path), "--requirement", "ERROR", "-n", "40", "--set", "sleep_s=0.02"]
+    resume_result = kill_and_resume(arguments, killed_run, log_bytes=12_000)
+    assert resume_result.returncode == 0, resume_result.stderr
+    run_budget(campaign_path, reference_run, BudgetSettings("ERROR", 40), "sleep_s=0.02")
+    assert record.read(killed_run)["study"]["result"] == record.read(reference_run)["study"]["result"]
+    assert "Largest contributions to the mean square: gyroscope" in resume_result.stdout
+
+
+def test_case_without_a_source_replays(campaign_path: Path, tmp_path: Path) -> None:
+    run_budget(campaign_path, tmp_path / "run", BudgetSettings("ERROR", 20))
+    rows = read_case_rows(tmp_path / "run")
+    # the first base case: all, none, without gyro, without radar, only gyro, only radar
+    errors = [row["miss"] for row in rows[:6]]
+    assert len(set(errors)) == 4
+    assert errors[2] == errors[5]
+    for case in range(6):
+        assert replay(tmp_path / "run", case).differing == ()
+
+
+def test_report_shows_the_budget(campaign_path: Path, tmp_path: Path) -> None:
+    run_budget(campaign_path, tmp_path / "run", replace(SETTINGS, sobol=16))
+    page = write_report(tmp_path / "run").read_text()
+    data = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert data["verdict"] == "NO VERDICT"
+    assert [item["source"] for item in data["sections"]["budget"]["budget"]["contributions"]] == ["gyro", "radar"]
+    for text in (
+        "Sources of error",
+        "gyroscope",
+        "images, matching and scene",
+        "Sobol indices",
+        "Not in this campaign",
+    ):
+        assert text in page
+    sentences = budget_sentences(read_budget(record.read(tmp_path / "run")))
+    assert any(sentence.startswith("The contributions add up to 100.0 % of the total") for sentence in sentences)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"requirement": "FLAG"}, "the metric 'is_small' is only true or false"),
+        ({"requirement": "ERRORS"}, "did you mean 'ERROR'"),
+        ({"cases": 5}, "--cases 5: at least 20"),
+        ({"sobol": 24}, "--sobol 24: allowed: 0, or a power of 2 from 16"),
+        ({"confidence": 1.0}, "--confidence 1.0"),
+    ],
+)
+def test_unsuitable_settings_are_rejected(
+    campaign_path: Path, tmp_path: Path, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(CampaignError, match=message):
+        run_budget(campaign_path, tmp_path / "run", BudgetSettings(**{"requirement": "ERROR", **settings}))
+    assert not (tmp_path / "run").exists()
+
+
+def test_sources_of_all_scenarios_have_valid_values() -> None:
+    """Every source of the included scenarios names at least one parameter, and its case is valid without the error."""
+    campaigns = {"descent": "dimes-offnominal", "fieldtest": "dimes-fieldtest", "landing": "hda-benign"}
+    campaigns |= {"rover": "vtt-montecarlo", "rover-drive": "vtt-straight"}
+    for scenario, name in campaigns.items():
+        campaign = load_campaign(name)
+        assert campaign.configuration.scenario == scenario
+        parameters = campaign.configuration.parameters
+        for source in error_sources(scenario):
+            exact = source.exact_values(parameters)
+            assert set(exact) == set(source.parameters), source.name
+            assert campaign.with_values(exact)
+        assert len(active_sources(campaign)[0]) >= 5
+    assert set(campaigns) == {name for name in scenario_names() if error_sources(name)}
+
+
+def test_study_ends_if_all_first_cases_crash(
+    campaign_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(budget, "_BATCH", 1)
+    monkeypatch.setattr(runner, "_MAX_FIRST_CRASHES", 5)
+    with pytest.raises(CampaignError, match=r"none of the first \d+ cases finished: ValueError: math domain error"):
+        run_budget(campaign_path, tmp_path / "run", BudgetSettings("ERROR", 20), "refused_fraction=-1.0")
+    assert record.read(tmp_path / "run")["state"] == "interrupted"
