@@ -32,8 +32,8 @@ bench: setup ## Measure speed and memory
 	$(BIN)/python -m benchmarks
 	$(BIN)/python -m benchmarks.growth
 
-validate: setup ## Compare with the papers' published results
-	@[ -e benchmarks/validation.py ] || [ -e benchmarks/validation/__main__.py ] || { echo "validate: there is no comparison with published results yet" >&2; exit 1; }
+validate: setup ## Run the slow tests, and compare with the papers' published results
+	@tools/test.sh -m slow
 	$(BIN)/python -m benchmarks.validation
 
 bench-check: setup ## Say whether hot paths are slower than when their ratios were last kept

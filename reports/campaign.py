@@ -15,6 +15,7 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from marsyard.reports import common_sections, sections
+from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences, read_budget
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
@@ -33,8 +34,8 @@ from marsyard.reports.wording import count, label, number, numbers, primary_metr
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
     common_sections.answers_section, comparison_section, common_sections.scatter_section,
-    common_sections.drivers_section, common_sections.convergence_section, common_sections.consistency_section,
-    common_sections.faults_section,
+    common_sections.drivers_section, boundary_section, common_sections.convergence_section,
+    common_sections.consistency_section, common_sections.faults_section,
 )  # fmt: skip
 
 #: Sections of a study (`marsyard rare`, `marsyard search`, `marsyard budget`).

@@ -155,8 +155,9 @@ def drivers_section(subject: Subject) -> Section | None:
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
         responses["failures"] = (~rates.success_mask(frame, metric, subject.bound)).astype(np.float64)
+    columns = driver_columns(frame, metric, MAX_CONDITIONS)
     ranked_drivers = {
-        name: drivers for name, response in responses.items() if (drivers := rank_drivers(frame, metric, response))
+        name: drivers for name, response in responses.items() if (drivers := rank_drivers(frame, columns, response))
     }
     if not ranked_drivers:
         return None
@@ -182,12 +183,12 @@ def drivers_section(subject: Subject) -> Section | None:
 RankedDrivers = Sequence[tuple[str, Driver, float]]
 
 
-def rank_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray, " n"]) -> RankedDrivers:
-    """Rank conditions by the explained variance of a response, with corrected p-values; largest first."""
+def rank_drivers(frame: pd.DataFrame, columns: Sequence[str], response: Float[np.ndarray, " n"]) -> RankedDrivers:
+    """Rank columns by the variance of a response that they explain, with corrected p-values; largest first."""
     groups = rates.terrain_groups(frame)
     drivers: Mapping[str, Driver] = {
         column: driver
-        for column in driver_columns(frame, metric, MAX_CONDITIONS)
+        for column in columns
         if (driver := estimate_driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
     }
     p_values = dict(zip(drivers, correct_holm([driver.p_value for driver in drivers.values()]), strict=True))

@@ -150,14 +150,19 @@ def _case_table(
 _NON_PARAMETER_KEYS = ("distribution", "source", "unit", "description")
 
 
+def find_dispersed_column(frame: pd.DataFrame, path: str) -> str | None:
+    """Find the column of a dispersed parameter: its path, or the end of the path joined by underscores."""
+    parts = path.split(".")
+    names = [path, *("_".join(parts[start:]) for start in range(len(parts)))]
+    return next((name for name in names if name in frame), None)
+
+
 def dispersion_grid(run: StoredRun) -> Grid:
     """Create a table of the dispersions, with the values in the rows."""
     rows, model = [], _parameters_type(run)
     for path, entry in table(run.recorded("dispersions")).items():
         dispersion, path_parts = table(entry), str(path).split(".")
-        # the column name is the path of the parameter or the end of the path
-        names = [str(path), *("_".join(path_parts[start:]) for start in range(len(path_parts)))]
-        column = next((name for name in names if name in run.frame), None)
+        column = find_dispersed_column(run.frame, str(path))
         statistics = [NOTHING] * 3
         if column is not None:
             values = pd.to_numeric(run.frame[column], errors="coerce").dropna()

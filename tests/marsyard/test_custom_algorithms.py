@@ -44,6 +44,7 @@ confidence = 0.5
 """
 
 
+@pytest.mark.slow
 def test_conformance_survives_crashes_and_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "hostile.py").write_text(HOSTILE)
     monkeypatch.chdir(tmp_path)
@@ -76,6 +77,7 @@ class StateChanging:
 """
 
 
+@pytest.mark.slow
 def test_conformance_reports_changed_process_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "state_changing.py").write_text(STATE_CHANGING)
     monkeypatch.chdir(tmp_path)

@@ -136,6 +136,7 @@ def test_existing_gallery_is_kept(
     assert (tmp_path / name).read_text() == "existing text"
 
 
+@pytest.mark.slow
 def test_gallery_shows_a_terrain_model(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tile = shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz"
     monkeypatch.setattr(gallery_command, "VIEWS", ())

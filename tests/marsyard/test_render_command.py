@@ -73,6 +73,7 @@ def test_detector_image_from_above_is_consistent(marsyard: Command, tmp_path: Pa
     assert metadata["detector"]["exposure_s"] == metadata["png"]["exposure_s"]
 
 
+@pytest.mark.slow
 def test_stereo_pair_of_radiance_is_consistent(marsyard: Command, tmp_path: Path) -> None:
     prefix = tmp_path / "pair"
     options = ("--radiance", "--sun-elevation", 25, "--east", 12, "--north", -7)

@@ -58,12 +58,14 @@ def _detect_changes(
     return find_changes(comparisons)
 
 
+@pytest.mark.slow
 def test_random_variation_is_not_reported_as_change() -> None:
     # 200 nightly runs, family-wise error rate of 1 %: P(more than 6 false alarms) = 0.4 %
     rng, pool = np.random.default_rng(1), _make_error_pool(2)
     assert sum(bool(_detect_changes(rng, pool)) for _ in range(200)) <= 6
 
 
+@pytest.mark.slow
 def test_simulated_regression_is_detected() -> None:
     # errors larger by 75 % must be detected in 95 % of 60 nightly runs of 100 cases
     rng, pool = np.random.default_rng(3), _make_error_pool(4)

@@ -56,7 +56,9 @@ def _list_campaigns(scenario: str) -> list[str]:
     return [name for name in catalogue() if load_campaign(name).configuration.scenario == scenario]
 
 
-@pytest.mark.parametrize("scenario", ["descent", "fieldtest", "rover", "rover-drive", "landing"])
+@pytest.mark.parametrize(
+    "scenario", ["descent", pytest.param("fieldtest", marks=pytest.mark.slow), "rover", "rover-drive", "landing"]
+)
 def test_requirements_use_columns_of_their_scenario(scenario: str) -> None:
     row = _run_small_case(scenario)
     for name in _list_campaigns(scenario):

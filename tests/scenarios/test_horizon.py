@@ -56,6 +56,7 @@ def gusev_image() -> RenderedImage:
     return render_images(request, detector=False, both=False)[0]
 
 
+@pytest.mark.slow
 def test_navigation_camera_sees_the_hills_of_gusev_above_the_horizon(gusev_image: RenderedImage) -> None:
     image = gusev_image
     object_ids = np.append(image.scene.objects.names, [SKY, GROUND])[image.frame.body]

@@ -29,6 +29,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.slow
 def test_cluster_rows_equal_rows_of_one_machine(
     campaign_file: Callable[..., Path], tmp_path: Path, watch: RecordingWatch
 ) -> None:

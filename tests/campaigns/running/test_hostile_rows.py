@@ -42,6 +42,8 @@ REASONS = {
     "list in a column": "column text contains a list",
 }
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def hostile_campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -100,9 +100,9 @@ def _find_marked_processes(mark: str) -> list[int]:
 @pytest.mark.parametrize(
     ("signal_number", "parameters"),
     [
-        (signal.SIGINT, ""),
-        (signal.SIGTERM, ""),
-        (signal.SIGKILL, ""),
+        pytest.param(signal.SIGINT, "", marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, "", marks=pytest.mark.slow),
+        pytest.param(signal.SIGKILL, "", marks=pytest.mark.slow),
         (signal.SIGKILL, "stopping_cases = [0, 1, 2, 3, 4, 5]"),
     ],
 )
@@ -173,6 +173,7 @@ def test_changes_of_the_worker_process_are_reported(
         assert row["case"] in (3, 5, 6) or differing_columns(row, expected_row) == ()
 
 
+@pytest.mark.slow
 def test_hostile_cases_do_not_affect_other_cases(
     failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:

@@ -124,6 +124,7 @@ def test_sobol_indices_of_a_linear_model_are_variance_fractions(campaign_path: P
     assert result.index_samples == 256
 
 
+@pytest.mark.slow
 def test_killed_budget_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
     arguments = ["budget", str(campaign_path), "--requirement", "ERROR", "-n", "40", "--set", "sleep_s=0.02"]

@@ -22,6 +22,7 @@ def test_mcnemar_p_value_agrees_with_the_binomial_test() -> None:
     assert compare_successes(first_succeeds, first_succeeds)[2] == 1.0
 
 
+@pytest.mark.slow
 def test_equal_algorithms_on_shared_terrains_have_the_nominal_false_alarm_rate() -> None:
     # Which algorithm is better depends on the terrain. 150 repetitions: standard deviation of a rate of 5 % is 1.8 %.
     rng = np.random.default_rng(1)

@@ -28,6 +28,7 @@ def _draw_values(rng: np.random.Generator, terrains: int, correlation: float) ->
 
 
 @pytest.mark.parametrize(("terrains", "correlation"), [(12, 0.3), (60, 0.9)])
+@pytest.mark.slow
 def test_intervals_of_mean_and_standard_deviation_have_nominal_coverage(terrains: int, correlation: float) -> None:
     # 200 samples at 95 %: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(1)
@@ -45,6 +46,7 @@ def test_intervals_of_mean_and_standard_deviation_have_nominal_coverage(terrains
 
 
 @pytest.mark.parametrize(("terrains", "correlation"), [(20, 0.3), (60, 0.3), (60, 0.9)])
+@pytest.mark.slow
 def test_quantile_bounds_have_nominal_coverage(terrains: int, correlation: float) -> None:
     # 400 samples at 90 %: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(2)

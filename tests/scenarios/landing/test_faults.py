@@ -22,6 +22,7 @@ from marsyard.sim.streams import Streams
 HELICOPTER = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}})
 
 
+@pytest.mark.slow
 def test_receiver_outage_covers_images_and_landing() -> None:
     """During an outage of 40 s the filter propagates without position updates, so its position errors increase."""
     position_errors_m: dict[float, list[float]] = {0.0: [], 40.0: []}

@@ -133,6 +133,7 @@ def test_touchdown_position_is_a_mean_of_rtk_solutions() -> None:
     )
 
 
+@pytest.mark.slow
 def test_receiver_error_decorrelates_after_landing() -> None:
     """Receiver errors with a correlation time of 30 s are almost equal after 2 s and independent after 300 s.
 

@@ -143,7 +143,7 @@ def _shade_heights(heights: np.ndarray, step_m: float, sun: np.ndarray) -> np.nd
     return np.where(is_shaded, 0.0, np.maximum(cosine, 0.0))
 
 
-@pytest.mark.parametrize("rms_slope_deg", [8.0, 15.0])
+@pytest.mark.parametrize("rms_slope_deg", [pytest.param(8.0, marks=pytest.mark.slow), 15.0])
 def test_shading_changes_with_the_sun_as_for_a_height_field(
     renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], rms_slope_deg: float
 ) -> None:

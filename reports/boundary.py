@@ -1,0 +1,232 @@
+"""Failure boundary: probability that a case violates a requirement as a function of two conditions.
+
+For each pair of the strongest conditions a logistic regression on spline functions is fitted (scikit-learn). It is
+validated with predictions for terrains that were not used for the fit, and drawn only if they are good.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Int
+from matplotlib.figure import Figure
+
+from marsyard.reports import rates
+from marsyard.reports.common_sections import rank_drivers
+from marsyard.reports.conditions import CONDITIONS
+from marsyard.reports.section import (
+    INK,
+    REQUIREMENT,
+    Block,
+    Grid,
+    Section,
+    Subject,
+    in_page_style,
+    new_axes,
+    svg_figure,
+)
+from marsyard.reports.sections import find_dispersed_column
+from marsyard.reports.stored import StoredRun, table
+from marsyard.reports.wording import label, number, numbers
+
+#: Minimum number of violations, and of other cases, of a requirement.
+MIN_CASES_PER_CLASS = 20
+#: Maximum number of conditions, and maximum corrected p-value of a condition.
+MAX_CONDITIONS, MAX_P_VALUE = 4, 0.05
+#: Number of parts of the cross-validation, and of bins of the calibration.
+_FOLDS, _BINS = 5, 5
+#: Maximum calibration error of a fit that is drawn.
+MAX_CALIBRATION_ERROR = 0.1
+#: Maximum number of cases of a fit: the first ones.
+_MAX_CASES = 5000
+#: Number of intervals of the spline functions, and of grid points of the figure along each axis.
+_KNOTS, _GRID_POINTS = 4, 41
+
+
+@dataclass(frozen=True)
+class BoundaryFit:
+    """Fit of the probability of a violation over two conditions, with its cross-validation.
+
+    - conditions: columns of the two conditions; cases, violations: numbers of cases with both conditions
+    - skill, skill_lower: Brier skill score: 1 - (mean square error of the predictions) / (that of the violation rate),
+      and its one-sided lower bound at 95 % (bootstrap over terrains)
+    - calibration_error: mean |predicted probability - violation rate| over bins with equal numbers of cases
+    """
+
+    conditions: tuple[str, str]
+    cases: int
+    violations: int
+    skill: float
+    skill_lower: float
+    calibration_error: float
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the fit predicts better than the violation rate, with calibrated probabilities."""
+        return self.skill_lower > 0.0 and self.calibration_error <= MAX_CALIBRATION_ERROR
+
+
+def validate_fit(
+    values: Float[np.ndarray, "n 2"],
+    is_violation: Bool[np.ndarray, " n"],
+    groups: Int[np.ndarray, " n"],
+    conditions: tuple[str, str],
+) -> BoundaryFit:
+    """Cross-validate the fit over groups of cases (terrains)."""
+    from sklearn.model_selection import GroupKFold  # imported here: slow, and few reports have a boundary
+
+    target = is_violation.astype(np.float64)
+    predicted, base_rate = np.empty(target.size), np.empty(target.size)
+    for train, test in GroupKFold(_FOLDS).split(values, groups=groups):
+        base_rate[test] = target[train].mean()
+        has_both = 0.0 < target[train].mean() < 1.0
+        predicted[test] = (
+            fit_probability(values[train], is_violation[train])(values[test]) if has_both else target[train].mean()
+        )
+    losses, base_losses = (predicted - target) ** 2, (base_rate - target) ** 2
+    weights = rates.bootstrap_weights(np.unique(groups, return_inverse=True)[1], np.random.default_rng(0))
+    skills = 1.0 - (weights @ losses) / (weights @ base_losses)
+    bins = np.array_split(np.argsort(predicted, kind="stable"), _BINS)
+    calibration_error = float(np.mean([abs(predicted[part].mean() - target[part].mean()) for part in bins]))
+    return BoundaryFit(
+        conditions,
+        target.size,
+        int(is_violation.sum()),
+        float(skills[0]),
+        float(np.quantile(skills[1:], 0.05)),
+        calibration_error,
+    )
+
+
+def fit_probability(values: Float[np.ndarray, "n 2"], is_violation: Bool[np.ndarray, " n"]) -> Any:
+    """Fit a logistic regression on products of spline functions; return the function of the violation's probability."""
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import PolynomialFeatures, QuantileTransformer, SplineTransformer
+
+    model = make_pipeline(
+        QuantileTransformer(n_quantiles=min(100, len(values)), random_state=0),
+        SplineTransformer(n_knots=_KNOTS, degree=2, include_bias=False),
+        PolynomialFeatures(2, interaction_only=True, include_bias=False),
+        LogisticRegression(C=1.0, max_iter=1000),
+    )
+    model.fit(values, is_violation)
+    return lambda points: model.predict_proba(points)[:, 1]
+
+
+def boundary_section(subject: Subject) -> Section | None:
+    """Create the section of the failure boundaries; None without enough violations or conditions."""
+    blocks: list[Block] = []
+    data: dict[str, Any] = {}
+    columns = list_conditions(subject.run)
+    for requirement in subject.run.requirements:
+        name = str(requirement.get("id"))
+        fits, figures = _fit_requirement(subject.frame.head(_MAX_CASES), requirement, columns)
+        if not fits:
+            continue
+        rows = [
+            [
+                " and ".join(label(condition) for condition in fit.conditions),
+                f"{fit.cases:,}",
+                f"{fit.violations:,}",
+                number(fit.skill),
+                number(fit.skill_lower),
+                number(fit.calibration_error),
+                "yes" if fit.is_good else "no",
+            ]
+            for fit in fits
+        ]
+        head = ["Conditions", "Cases", "Violations", "Brier skill", "Lower bound", "Calibration error", "Drawn"]
+        drawn = [
+            svg_figure(
+                figure,
+                f"boundary-{len(blocks)}-{index}",
+                f"Probability that a case violates {name}, by {' and '.join(map(label, fit.conditions))}; the other "
+                "conditions vary as in the campaign. Crosses: violations.",
+            )
+            for index, (fit, figure) in enumerate(figures)
+        ]
+        blocks.append(Block(f"Violations of {name}", figures=drawn, grid=Grid(head, rows)))
+        data[name] = [asdict(fit) | {"drawn": fit.is_good} for fit in fits]
+    if not blocks:
+        return None
+    note = (
+        f"The probability is fitted for each pair of at most {MAX_CONDITIONS} conditions with a significant influence "
+        "on the violations. Its validation uses predictions for terrains that were not used for the fit. The Brier "
+        "skill is the fraction of the mean square error of the violation rate that the fit removes. A fit is drawn if "
+        "the lower bound of its skill (95 %) is above 0 and its calibration error is at most "
+        f"{MAX_CALIBRATION_ERROR:g}."
+    )
+    return Section("boundary", "Failure boundary", "Failure boundary", [*blocks, Block(note=note)], data)
+
+
+def list_conditions(run: StoredRun) -> list[str]:
+    """List the columns of the dispersed parameters and of the measured conditions of a campaign; not the terrain."""
+    frame = run.frame
+    dispersed = (find_dispersed_column(frame, str(path)) for path in table(run.recorded("dispersions")))
+    measured = (column for column in map(str, frame.columns) if column.startswith(CONDITIONS))
+    names = dict.fromkeys(name for name in (*dispersed, *measured) if name is not None and name != "terrain")
+    return [name for name in names if pd.api.types.is_numeric_dtype(frame[name]) and frame[name].nunique() > 2]
+
+
+def _fit_requirement(
+    frame: pd.DataFrame, requirement: Mapping[str, Any], columns: Sequence[str]
+) -> tuple[list[BoundaryFit], list[tuple[BoundaryFit, Figure]]]:
+    """Fit the violations of a requirement over each pair of conditions; also draw the good fits."""
+    metric, bound = str(requirement.get("metric")), requirement.get("bound")
+    try:
+        in_population = rates.population_mask(frame, str(requirement.get("population") or "all"))
+    except ValueError:
+        return [], []
+    rows = frame[in_population].reset_index(drop=True)
+    limit = math.nan if bound is None else float(bound)
+    try:
+        is_violation = ~rates.success_mask(rows, metric, limit, float(requirement.get("scale") or 1.0))
+    except (KeyError, ValueError):
+        return [], []
+    if min(int(is_violation.sum()), int((~is_violation).sum())) < MIN_CASES_PER_CLASS:
+        return [], []
+    drivers = rank_drivers(rows, columns, is_violation.astype(np.float64))
+    conditions = [column for column, _, p_value in drivers if p_value <= MAX_P_VALUE][:MAX_CONDITIONS]
+    groups = rates.terrain_groups(rows)
+    groups = np.arange(len(rows)) if groups is None or np.unique(groups).size < 2 * _FOLDS else groups
+    fits: list[BoundaryFit] = []
+    figures: list[tuple[BoundaryFit, Figure]] = []
+    for pair in itertools.combinations(conditions, 2):
+        values = np.stack([numbers(rows, column) for column in pair], axis=1)
+        is_known = np.isfinite(values).all(axis=1)
+        known_violations = is_violation[is_known]
+        if min(int(known_violations.sum()), int((~known_violations).sum())) < MIN_CASES_PER_CLASS:
+            continue
+        fit = validate_fit(values[is_known], known_violations, groups[is_known], pair)
+        fits.append(fit)
+        if fit.is_good:
+            figures.append((fit, _draw_boundary(values[is_known], known_violations, pair)))
+    return fits, figures
+
+
+@in_page_style
+def _draw_boundary(
+    values: Float[np.ndarray, "n 2"], is_violation: Bool[np.ndarray, " n"], conditions: Sequence[str]
+) -> Figure:
+    """Draw the fitted probability as grey levels with contours, and the violations."""
+    probability = fit_probability(values, is_violation)
+    low, high = np.quantile(values, (0.01, 0.99), axis=0)
+    axes_values = np.linspace(low, high, _GRID_POINTS).T
+    x, y = np.meshgrid(*axes_values)
+    levels = probability(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
+    figure, axes = new_axes(4.6, 3.6)
+    filled = axes.contourf(x, y, levels, levels=np.linspace(0.0, 1.0, 11), cmap="Blues", alpha=0.85)
+    lines = axes.contour(x, y, levels, levels=[0.01, 0.05, 0.1, 0.25, 0.5, 0.75], colors=INK, linewidths=0.8)
+    axes.clabel(lines, fmt=lambda level: f"{level:g}", fontsize=7)
+    axes.plot(*values[is_violation].T, linestyle="none", marker="x", color=REQUIREMENT, markersize=4)
+    axes.set(xlabel=label(conditions[0]), ylabel=label(conditions[1]))
+    axes.set(xlim=axes_values[0][[0, -1]], ylim=axes_values[1][[0, -1]])
+    figure.colorbar(filled, ax=axes, label="probability of a violation")
+    return figure
