@@ -21,7 +21,7 @@ from marsyard.reports.section import (
     svg_figure,
 )
 from marsyard.reports.stored import table
-from marsyard.reports.wording import count, label, number, percent, split_unit
+from marsyard.reports.wording import count, format_fraction, label, number, split_unit
 
 #: Difference of the closure from 1 above which the contributions are not additive.
 MAX_CLOSURE_ERROR = 0.1
@@ -82,7 +82,7 @@ def _statistic(result: Mapping[str, Any]) -> str:
 
 def _closure_sentence(budget: Mapping[str, Any], confidence: float) -> str:
     bounds = f"{signed_percent(budget['closure_lower'])} to {signed_percent(budget['closure_upper'])}"
-    interval = f"{percent(confidence)} interval {bounds}"
+    interval = f"{format_fraction(confidence)} interval {bounds}"
     text = f"The contributions add up to {signed_percent(budget['closure'])} of the total ({interval})"
     if abs(budget["closure"] - 1.0) > MAX_CLOSURE_ERROR:
         return f"{text}: interactions of three or more sources matter, and the contributions are not additive."
@@ -111,8 +111,8 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
     unit, total, n_cases = split_unit(result["quantity"])[1], budget["total"], int(result["cases"])
     root_unit = f", {unit}" if unit else ""
     head = [
-        "Source of error", "Contribution", f"{percent(confidence)} interval", "Interaction", f"Alone{root_unit}",
-        f"Without{root_unit}", "Answered alone", "Answered without",
+        "Source of error", "Contribution", f"{format_fraction(confidence)} interval", "Interaction",
+        f"Alone{root_unit}", f"Without{root_unit}", f"Answered of {n_cases}",
     ]  # fmt: skip
     rows = [
         [
@@ -122,28 +122,28 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
             signed_percent(0.5 * (item["removed"] - item["alone"]) / total),
             _signed_root(item["alone"] + budget["remaining"]),
             _signed_root(total - item["removed"]),
-            f"{item['answered'][1]} of {n_cases}",
-            f"{item['answered'][0]} of {n_cases}",
+            f"{item['answered'][1]}, {item['answered'][0]}",
         ]
         for item in budget["contributions"]
     ]
     rows.append(
         [REMAINING, signed_percent(budget["remaining"] / total), "", "", _signed_root(budget["remaining"]), "", "", ""]
     )
-    statistic = _statistic(result)
+    statistic, name = _statistic(result), label(result["quantity"]).split(" (")[0]
     figure = svg_figure(
-        _draw_waterfall(budget, f"mean square of {label(result['quantity'])}, {unit}²" if unit else "mean square"),
+        _draw_waterfall(budget, f"mean square of {name}, ({unit})²" if unit else f"mean square of {name}"),
         "budget-waterfall",
-        f"Mean square of {label(result['quantity'])} without any source of error, contributions of the sources, and "
+        f"Mean square of {name} without any source of error, contributions of the sources, and "
         "mean square with all sources. Lines: intervals.",
         wide=True,
     )
     inactive = f" Not in this campaign: {'; '.join(result['inactive'])}." if result["inactive"] else ""
     note = (
-        f"Each base case runs with the same dispersions and random streams in all configurations. 'Alone' is the "
-        f"{statistic} with the source and no other source, 'Without' that with all other sources. The contribution is "
-        "the mean of two changes of the mean square: adding the source to none, and to all others. The interaction is "
-        "half of their difference. Intervals: bootstrap over terrains. "
+        "Each base case runs with the same dispersions and random streams in all configurations. 'Alone' is the "
+        f"{statistic} with the source and no other source, 'Without' that with all other sources; 'Answered' gives the "
+        "numbers of base cases with an error, alone and without. The contribution is the mean of two changes of the "
+        "mean square: adding the source to none, and to all others. The interaction is half of their difference. "
+        "Intervals: bootstrap over terrains. "
         f"{_closure_sentence(budget, confidence)}{inactive}"
     )
     return Block("Sources of error", figures=[figure], grid=Grid(head, rows), note=note)

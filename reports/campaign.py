@@ -25,7 +25,7 @@ from marsyard.reports.rare import rare_section, read_result, result_sentences
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.search import read_search, search_section, search_sentences
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
-from marsyard.reports.stored import StoredRun
+from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
@@ -110,11 +110,7 @@ def page_context(
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.recorded("description") or ""),
-        "study_sentences": [
-            *result_sentences(read_result(run.record)),
-            *search_sentences(read_search(run.record)),
-            *budget_sentences(read_budget(run.record)),
-        ],
+        "study_sentences": study_sentences(run.record),
         "overall_verdict": overall,
         "cautions": [*cautions, *sampling_cautions(run, metric)],
         "interrupted": run.recorded("state") not in (None, "finished"),
@@ -181,6 +177,26 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     return cautions
 
 
+def study_sentences(record: Mapping[str, Any]) -> list[str]:
+    """Describe the result of a study, the most important sentence first; empty for an ordinary campaign."""
+    return [
+        *result_sentences(read_result(record)),
+        *search_sentences(read_search(record)),
+        *budget_sentences(read_budget(record)),
+    ]
+
+
+def describe_study(record: Mapping[str, Any]) -> dict[str, str] | None:
+    """Return kind, requirement and main result of a study for `report.json`; None for an ordinary campaign."""
+    study, sentences = table(record.get("study")), study_sentences(record)
+    if not study:
+        return None
+    # the first sentence of a rare study is its verdict, the second the probability
+    main_sentences = sentences[1:2] if study.get("kind") == "rare" else sentences[:1]
+    sentence = "".join(main_sentences) or "The study is not finished."
+    return {"kind": str(study.get("kind")), "requirement": str(study.get("requirement")), "sentence": sentence}
+
+
 def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> dict[str, Any]:
     """Create the data of `report.json`; NaN and infinities become null."""
     run, sampling, overall_verdict = evaluation.run, evaluation.sampling, evaluation.overall_verdict
@@ -203,6 +219,7 @@ def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: 
         },
         "verdict": overall_verdict.word,
         "sentence": overall_verdict.sentence,
+        "study": describe_study(run.record),
         "exit_code": evaluation.exit_code,
         "verdicts": [
             asdict(verdict) | {name: getattr(verdict, name) for name in _VERDICT_PROPERTIES}

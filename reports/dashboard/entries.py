@@ -45,12 +45,22 @@ class RequirementVerdict:
 
 
 @dataclass(frozen=True)
+class Study:
+    """Kind (`rare`, `search`, `budget`), requirement and main result of a study."""
+
+    kind: str
+    requirement: str
+    sentence: str
+
+
+@dataclass(frozen=True)
 class Entry:
     """A stored campaign, from its record and its report; fields are empty if not recorded.
 
     - slug: name of the campaign's folder in the site: letters, digits and hyphens, with a hash of the campaign's path
     - evidence: kind of evidence of the run (`marsyard.campaigns.definition.evidence`)
     - tested: algorithms with versions, options and source hashes: those under test first, then those only compared
+    - study: main result of a study; None for an ordinary campaign
     - showcases, worst: numbers of the cases with stored products, and of the cases with the largest errors
     """
 
@@ -73,6 +83,12 @@ class Entry:
     showcases: tuple[int, ...]
     worst: tuple[str, ...]
     outcomes: Mapping[str, int]
+    study: Study | None = None
+
+    @property
+    def title(self) -> str:
+        """Name of the campaign, and kind of the study."""
+        return self.name if self.study is None else f"{self.name}, {self.study.kind}"
 
     @property
     def tested_names(self) -> str:
@@ -127,7 +143,7 @@ def _read_entry(path: Path) -> Entry:
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
     parameters = table(table(record.get("configuration")).get("parameters"))
     system = find_system(str(table(record.get("configuration")).get("scenario")))
-    name = str(report.get("campaign") or path.name)
+    name, study = str(report.get("campaign") or path.name), table(report.get("study"))
     return Entry(
         slug=make_slug(path, name),
         directory=path,
@@ -148,6 +164,7 @@ def _read_entry(path: Path) -> Entry:
         showcases=tuple(int(case) for case in report.get("showcases") or ()),
         worst=tuple(str(case) for case in report.get("worst_cases") or ()),
         outcomes={str(key): int(value) for key, value in table(report.get("outcomes")).items()},
+        study=Study(*(str(study.get(name)) for name in ("kind", "requirement", "sentence"))) if study else None,
     )
 
 
@@ -225,6 +242,7 @@ class RequirementRow:
 
     - cells: latest verdict for each campaign name
     - all_cells: verdicts of all campaigns, the latest first, unfinished campaigns last
+    - studies: latest study of each kind and campaign name
     """
 
     requirement: str
@@ -234,6 +252,7 @@ class RequirementRow:
     cells: Sequence[Cell]
     all_cells: Sequence[Cell]
     trend: Sparkline | None
+    studies: Sequence[Entry]
 
     @property
     def latest(self) -> Cell | None:
@@ -247,6 +266,8 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
     for entry in entries:
         for verdict in entry.requirements:
             cells.setdefault(verdict.requirement, []).append(Cell(entry, verdict))
+        if entry.study is not None:
+            cells.setdefault(entry.study.requirement, [])
     rows = []
     for name, unsorted_cells in cells.items():
         sorted_cells = sorted(unsorted_cells, key=lambda cell: not cell.entry.finished)
@@ -262,7 +283,12 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
         if requirement:
             statement = statement if statement.startswith(GIVEN_TRUTH) else requirement.statement
             kind, source = requirement.kind or "", requirement.source
-        rows.append(RequirementRow(name, statement, kind, source, latest, sorted_cells, sparkline(history[::-1])))
+        studies: dict[str, Entry] = {}
+        for entry in entries:
+            if entry.study is not None and entry.study.requirement == name:
+                studies.setdefault(entry.title, entry)
+        line = sparkline(history[::-1])
+        rows.append(RequirementRow(name, statement, kind, source, latest, sorted_cells, line, [*studies.values()]))
     return rows
 
 

@@ -163,6 +163,14 @@ class AlgorithmDescription(_Part):
     source_hash: str
 
 
+class StudyDescription(_Part):
+    """A study: its kind, its requirement, and its main result."""
+
+    kind: str
+    requirement: str
+    sentence: str
+
+
 class CampaignReport(_Part):
     """Content of `report.json`: the results of a campaign's report."""
 
@@ -184,6 +192,7 @@ class CampaignReport(_Part):
     evidence: Evidence
     verdict: VerdictName | Literal["NO REQUIREMENT", "NO VERDICT"]
     sentence: str
+    study: StudyDescription | None = None
     exit_code: Literal[0, 1, 3]
     verdicts: list[RequirementVerdict]
     outcomes: dict[str, int]

@@ -26,6 +26,7 @@ from marsyard.campaigns.studies.budget import (
 )
 from marsyard.reports.budget import budget_sentences, read_budget
 from marsyard.reports.campaign import write_report
+from marsyard.reports.dashboard.site import write_site
 from marsyard.scenarios.error_sources import ErrorSource, error_sources
 from marsyard.scenarios.systems import scenario_names
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
@@ -160,6 +161,10 @@ def test_report_shows_the_budget(campaign_path: Path, tmp_path: Path) -> None:
         "Not in this campaign",
     ):
         assert text in page
+    write_site(tmp_path / "site", [tmp_path / "run"])
+    index = (tmp_path / "site" / "index.html").read_text()
+    assert 'data-requirement="ERROR"' in index
+    assert "error-model, budget" in index
     sentences = budget_sentences(read_budget(record.read(tmp_path / "run")))
     assert any(sentence.startswith("The contributions add up to 100.0 % of the total") for sentence in sentences)
 
