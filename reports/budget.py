@@ -59,7 +59,7 @@ def budget_sentences(study: Mapping[str, Any]) -> list[str]:
         sentences += [
             f"{study['requirement']}: {_statistic(result)} of {label(result['quantity'])}: {number(math.sqrt(total))} "
             f"with all sources of error, {_signed_root(budget['remaining'])} without any, in "
-            f" {budget['common']} of {count(int(result['cases']), 'base case')} with an error in all configurations.",
+            f"{budget['common']} of {count(int(result['cases']), 'base case')} with an error in all configurations.",
             f"Largest contributions to the mean square: {largest}; "
             f"{REMAINING} {signed_percent(budget['remaining'] / total)}.",
             _closure_sentence(budget, float(study["confidence"])),

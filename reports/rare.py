@@ -23,7 +23,7 @@ from marsyard.reports.section import (
     svg_figure,
 )
 from marsyard.reports.stored import read_run, table
-from marsyard.reports.wording import count, percent
+from marsyard.reports.wording import count, format_fraction
 
 #: Maximum number of replicates in the figure.
 _MAX_REPLICATES = 8
@@ -58,7 +58,7 @@ def result_sentences(study: Mapping[str, Any]) -> list[str]:
     sentences = [
         f"{study['requirement']}: {result['verdict']}.",
         f"Probability of a violation per case: {probability_text(interval.get('estimate'))}, "
-        f"{percent(interval['confidence'])} interval {bounds} by {method}; the limit is {limit}.",
+        f"{format_fraction(interval['confidence'])} interval {bounds} by {method}; the limit is {limit}.",
     ]
     if result.get("reason"):
         sentences.append(str(result["reason"]))

@@ -37,6 +37,13 @@ EXPECTED_FILES = {
     "custom-dynamics": ("powered/report.html",),
     "custom-instrument": ("lidar/report.html",),
     "custom-score": ("airbags/report.html",),
+    "failure-analysis": (
+        "counted/report.html",
+        "searched/failures/nightly.toml",
+        "again/report.html",
+        "budget/report.html",
+        "rare/report.html",
+    ),
     "custom-system": ("fallen/report.html", "fallen/cases/2/altitude.png"),
 }
 #: Folder of the packages that a tutorial installs.
