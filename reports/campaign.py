@@ -45,7 +45,7 @@ STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section, budget
 _MAX_NAMES = 24
 
 #: Version of the layout of `report.json` and its JSON Schema. A removed field, or a new meaning, increases the version.
-SCHEMA = 5
+SCHEMA = 6
 SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
 #: Properties of a verdict that `report.json` contains next to its fields.
 _VERDICT_PROPERTIES = ("note", "plain_status", "confident_status", "consumer_risk", "margin")

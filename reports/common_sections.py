@@ -68,7 +68,7 @@ def answers_section(subject: Subject) -> Section | None:
         {
             "": lambda pair: pair[0],
             "Cases": lambda pair: f"{pair[1].hits:,} of {pair[1].n:,}",
-            "Fraction": lambda pair: percent(pair[1].share),
+            "Fraction": lambda pair: percent(pair[1].fraction),
             f"{format_fraction(CONFIDENCE)} interval": lambda pair: rates.range_text(pair[1].lower, pair[1].upper),
             "Interval with shared terrains": lambda pair: (
                 NOTHING if pair[1].shared_lower is None else rates.interval_text(pair[1], shared=True)
@@ -169,7 +169,7 @@ def drivers_section(subject: Subject) -> Section | None:
         rows = []
         for column, driver, p_value in drivers:
             ranks = [coefficient(driver.correlation), f"{coefficient(driver.lower)} to {coefficient(driver.upper)}"]
-            fractions = [percent(driver.share), rates.range_text(driver.share_lower, driver.share_upper)]
+            fractions = [percent(driver.fraction), rates.range_text(driver.fraction_lower, driver.fraction_upper)]
             rows.append([label(column), f"{driver.n:,}", *ranks, *fractions, p_text(p_value)])
         blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(headings, rows)))
     data = {
@@ -192,7 +192,7 @@ def rank_drivers(frame: pd.DataFrame, columns: Sequence[str], response: Float[np
         if (driver := estimate_driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
     }
     p_values = dict(zip(drivers, correct_holm([driver.p_value for driver in drivers.values()]), strict=True))
-    order = sorted(drivers, key=lambda column: (-drivers[column].share, column))
+    order = sorted(drivers, key=lambda column: (-drivers[column].fraction, column))
     return [(column, drivers[column], p_values[column]) for column in order]
 
 
@@ -324,7 +324,7 @@ def evaluate_consistency(nees: Float[np.ndarray, " n"], dimension: int = NEES_DI
     """Evaluate the consistency of estimates with their covariances from their NEES (normalised error squared).
 
     Keys: mean NEES with its 95 % band for correct covariances, fraction of errors `inside` their 95 % ellipse with its
-    90 % interval, and `word`: "consistent", "too sure" (errors larger than the covariances) or "too cautious".
+    90 % interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic".
     """
     n, mean = nees.size, float(nees.mean())
     tail = 0.5 * (1.0 - BAND_PROBABILITY)
@@ -332,7 +332,7 @@ def evaluate_consistency(nees: Float[np.ndarray, " n"], dimension: int = NEES_DI
     lower, upper = (float(stats.chi2.ppf(probability, dimension * n)) / n for probability in (tail, 1.0 - tail))
     inside = int((nees <= stats.chi2.ppf(BAND_PROBABILITY, dimension)).sum())
     low, high = proportion_interval(inside, n, CONFIDENCE)
-    word = "too sure" if mean > upper else "too cautious" if mean < lower else "consistent"
+    word = "optimistic" if mean > upper else "pessimistic" if mean < lower else "consistent"
     band = {"n": n, "mean": mean, "lower": lower, "upper": upper}
     return band | {"inside": inside / n, "inside_lower": low, "inside_upper": high, "word": word}
 
@@ -384,7 +384,7 @@ FAULT_OUTCOMES = OutcomesBySize(
     caption="Solid bars: answers within the bound. Hatched bars: no answer. Cross-hatched bars: wrong answers.",
     wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == "none" else f"{size:g}"),
     extra_columns=(
-        ("Most frequent refusal", "commonest_refusal", find_frequent_refusal, lambda text: text or NOTHING),
+        ("Most frequent refusal", "most_frequent_refusal", find_frequent_refusal, lambda text: text or NOTHING),
     ),
 )
 

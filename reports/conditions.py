@@ -63,7 +63,7 @@ def conditions_section(subject: Subject) -> Section | None:
         rows = []
         for row in terrain_rows:
             deviations = [number(row["within_sd"]), number(row["between_sd"])]
-            texts = [label(row["part"]), f"{row['terrains']:,}", *deviations, percent(row["share"])]
+            texts = [label(row["part"]), f"{row['terrains']:,}", *deviations, percent(row["fraction"])]
             rows.append([*texts, number(row["p_value"])])
         blocks.append(Block(heading="By terrain", grid=Grid(head, rows), note=_TERRAINS_NOTE))
     note = note_text("common.conditions", confidence=format_fraction(CONFIDENCE), quantile=format_fraction(QUANTILE))
@@ -101,8 +101,8 @@ _TERRAINS_NOTE = note_text("common.terrains")
 def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
     """Analyse the variance of an error column with terrains as random effects; None without repeated terrains.
 
-    Keys: `within_sd` of errors within a terrain, `between_sd` of the terrains' means, `share` of the variance between
-    terrains (intraclass correlation), `p_value` of equal means (F-test).
+    Keys: `within_sd` of errors within a terrain, `between_sd` of the terrains' means, `fraction` of the variance
+    between terrains (intraclass correlation), `p_value` of equal means (F-test).
     """
     groups = rates.terrain_groups(frame)
     values = numbers(frame, part)
@@ -127,7 +127,7 @@ def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
         "terrains": terrains,
         "within_sd": float(np.sqrt(within)),
         "between_sd": float(np.sqrt(variance_between)),
-        "share": variance_between / (variance_between + within) if variance_between + within > 0.0 else 0.0,
+        "fraction": variance_between / (variance_between + within) if variance_between + within > 0.0 else 0.0,
         "p_value": p_value,
     }
 
@@ -171,7 +171,9 @@ def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]
         answered, bound = row["answered"], row["quantile_bound"]
         last_texts = [number(bound) if np.isfinite(bound) else "too few cases", number(row["largest"])]
         interval = rates.range_text(*answered.clustered_interval)
-        rows.append([row["name"], f"{answered.n:,}", percent(answered.share), interval, *component_texts, *last_texts])
+        rows.append(
+            [row["name"], f"{answered.n:,}", percent(answered.fraction), interval, *component_texts, *last_texts]
+        )
     return Grid(head, rows)
 
 

@@ -368,7 +368,7 @@ def draw_rates(axes: Axes, lines: Sequence[RateLine], linestyle: str = "-") -> N
     """Draw rates with their intervals; rates of a paper are open markers."""
     for index, line in enumerate(lines):
         style: dict[str, Any] = {"color": SERIES[index % len(SERIES)], "marker": MARKERS[index % len(MARKERS)]}
-        fractions = np.array([rate.share for rate in line.rates])
+        fractions = np.array([rate.fraction for rate in line.rates])
         bounds = np.array([[rate.lower, rate.upper] for rate in line.rates]).reshape(-1, 2)
         error_bars = np.abs(np.nan_to_num(bounds - fractions[:, None])).T
         bars: dict[str, Any] = {"capsize": 2.5, "elinewidth": 0.9, "markersize": 5.0, "linestyle": linestyle}

@@ -156,8 +156,8 @@ class RateTable:
         for name, rate in rates_by_name.items():
             if isinstance(rate, CaseFraction) and rate.n:
                 rows.append([name, rates.fraction_text(rate), rates.interval_text(rate, shared=self.shared)])
-            elif isinstance(rate, rates.PooledRate) and rate.of:
-                fraction = f"{rate.hits:,} of {rate.of:,}: {percent(rate.share)}"
+            elif isinstance(rate, rates.PooledRate) and rate.total:
+                fraction = f"{rate.hits:,} of {rate.total:,}: {percent(rate.fraction)}"
                 rows.append([name, fraction, rates.range_text(rate.lower, rate.upper)])
         grid = Grid(["", self.cases, f"{format_fraction(CONFIDENCE)} interval"], rows)
         blocks = [Block(heading=self.heading, grid=grid, note=self.note)] if rows else []

@@ -96,16 +96,16 @@ _SEED = 2005
 
 @dataclass(frozen=True)
 class CaseFraction:
-    """A fraction of cases with its two-sided intervals at `CONFIDENCE`; `share` is NaN for no cases.
+    """A fraction of cases with its two-sided intervals at `CONFIDENCE`; `fraction` is NaN for no cases.
 
-    - n, hits, share: number of cases, number of counted cases, and their fraction
+    - n, hits, fraction: number of cases, number of counted cases, and their fraction
     - lower, upper: Clopper-Pearson interval for independent cases
     - shared_lower, shared_upper: interval that allows for shared terrains; None if no terrain is shared
     """
 
     n: int
     hits: int
-    share: float
+    fraction: float
     lower: float
     upper: float
     shared_lower: float | None = None
@@ -141,14 +141,14 @@ def flag_fraction(frame: pd.DataFrame, name: str, *, value: bool = True) -> Case
 class PooledRate:
     """A fraction of items (pixels or features, for example), pooled over cases; items of one case are correlated.
 
-    - hits, of, share: number of counted items, number of all items, and the fraction
+    - hits, total, fraction: number of counted items, number of all items, and the fraction
     - lower, upper: bootstrap interval over cases, or over shared terrains; NaN if no item is counted
     - flights, flights_hit: number of cases with items, and with counted items
     """
 
     hits: int
-    of: int
-    share: float
+    total: int
+    fraction: float
     lower: float
     upper: float
     flights: int
@@ -234,7 +234,7 @@ def group_by_size(frame: pd.DataFrame, column: str, size: str, first: str) -> It
 
 def fraction_text(fraction: CaseFraction) -> str:
     """Format hits, cases and fraction: ``19 of 20: 95.00 %``."""
-    return f"{fraction.hits:,} of {fraction.n:,}: {percent(fraction.share)}" if fraction.n else NOTHING
+    return f"{fraction.hits:,} of {fraction.n:,}: {percent(fraction.fraction)}" if fraction.n else NOTHING
 
 
 def interval_text(fraction: CaseFraction, *, shared: bool = False) -> str:
@@ -251,9 +251,9 @@ def range_text(lower: float, upper: float) -> str:
 
 def rate_text(rate: PooledRate) -> str:
     """Format a rate with its interval: ``2.0 % (1.1 % to 3.2 %)``."""
-    if rate.of == 0:
+    if rate.total == 0:
         return NOTHING
-    text = percent(rate.share)
+    text = percent(rate.fraction)
     return text if math.isnan(rate.lower) else f"{text} ({range_text(rate.lower, rate.upper)})"
 
 

@@ -73,14 +73,14 @@ def field_test_section(subject: Subject) -> Section | None:
             "Category and run": lambda cell: f"{cell['category']}: {cell['run']}",
             "Triples": lambda cell: f"{cell['valid'].n:,}",
             "Valid": lambda cell: f"{cell['valid'].hits:,}",
-            "% valid": lambda cell: percent(cell["valid"].share),
+            "% valid": lambda cell: percent(cell["valid"].fraction),
             f"{format_fraction(CONFIDENCE)} interval": lambda cell: rates.range_text(
                 cell["valid"].lower, cell["valid"].upper
             ),
             "Paper": lambda cell: NOTHING if cell["paper_percent"] is None else f"{cell['paper_percent']} %",
             "Difference": lambda cell: _difference_text(cell["difference_points"]),
             "Errors above the bound" if bound is None else f"Errors above {bound:g}": lambda cell: (
-                NOTHING if cell["beyond"] is None else f"{cell['beyond']:,}"
+                NOTHING if cell["errors_above_bound"] is None else f"{cell['errors_above_bound']:,}"
             ),
             "Largest error": lambda cell: number(cell["largest"]),
         },
@@ -112,10 +112,10 @@ def field_cells(subject: Subject) -> list[dict[str, Any]]:
                 "category": category,
                 "run": run,
                 "valid": fraction,
-                "beyond": None if subject.bound is None else int((errors > subject.bound).sum()),
+                "errors_above_bound": None if subject.bound is None else int((errors > subject.bound).sum()),
                 "largest": float(errors.max()) if errors.size else math.nan,
                 "paper_percent": paper_percent,
-                "difference_points": math.nan if paper_percent is None else 100.0 * fraction.share - paper_percent,
+                "difference_points": math.nan if paper_percent is None else 100.0 * fraction.fraction - paper_percent,
             }
         )
     return cells
@@ -258,8 +258,8 @@ def _create_speed_blocks(landings: kinds.Rows, subject: Subject, key: str) -> ki
     improved, degraded, *_ = landing_fractions(landings).values()
     data = {
         "landings": len(landings),
-        "helped": improved.share,
-        "harmed": degraded.share,
+        "reduced_fraction": improved.fraction,
+        "increased_fraction": degraded.fraction,
         "mean_with_m_s": float(columns[0].mean()),
         "mean_without_m_s": float(columns[1].mean()),
         "largest_gain_m_s": float(-change.min()),
@@ -284,7 +284,9 @@ LANDING = kinds.SectionDeclaration(
             "Fraction of landings whose horizontal speed at touchdown is above the value on the axis.",
             complementary=True,
         ),
-        kinds.RateTable(landing_fractions, cases="Landings", heading="Improved and degraded landings", data="shares"),
+        kinds.RateTable(
+            landing_fractions, cases="Landings", heading="Improved and degraded landings", data="fractions"
+        ),
         kinds.CustomBlocks(_create_speed_blocks),
     ),
 )

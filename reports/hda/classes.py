@@ -94,11 +94,11 @@ def create_class_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndDat
     caption = "Missed hazards by size: fraction classified as safe, and fraction without a detected hazard."
     figure = section.svg_figure(class_figure(classes), key, caption)
     class_grid = build_grid(
-        [item for item in classes if item.called_safe.of],
+        [item for item in classes if item.called_safe.total],
         {
             "Quantity": lambda item: item.kind,
             "Size divided by limit": lambda item: item.name,
-            "Footprints (flights)": lambda item: f"{item.called_safe.of:,} ({item.called_safe.flights:,})",
+            "Footprints (flights)": lambda item: f"{item.called_safe.total:,} ({item.called_safe.flights:,})",
             "Classified as safe": lambda item: rate_text(item.called_safe),
             "Not detected": lambda item: rate_text(item.unflagged) if item.is_hazard else NOTHING,
             "Flights with an undetected hazard": lambda item: (
@@ -106,7 +106,7 @@ def create_class_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndDat
             ),
         },
     )
-    rows = [[name, f"{item.hits:,} of {item.of:,}", rate_text(item)] for name, item in rates.items()]
+    rows = [[name, f"{item.hits:,} of {item.total:,}", rate_text(item)] for name, item in rates.items()]
     rate_grid = Grid(["Footprints", "Counted", f"Fraction ({format_fraction(CONFIDENCE)} interval)"], rows)
     blocks = [
         Block(heading="Missed hazards by roughness and slope", figures=[figure], grid=class_grid),
@@ -179,7 +179,7 @@ class TrackingCurve:
     def min_fraction_within_limit(self) -> float:
         """Minimum fraction of tracked features over all sizes up to the paper's limit."""
         # the tolerance of 0.1 % allows for rounding of the sizes
-        fractions = [point.tracked.share for point in self.points if abs(point.size) <= 1.001 * self.change["paper"]]
+        fractions = [point.tracked.fraction for point in self.points if abs(point.size) <= 1.001 * self.change["paper"]]
         return float(np.nanmin(fractions)) if fractions and not np.all(np.isnan(fractions)) else math.nan
 
 
@@ -253,7 +253,9 @@ def tracking_curves(frame: pd.DataFrame) -> list[TrackingCurve]:
 
 def find_knee(results: Sequence[SizeResult], sign: float) -> float:
     """Find the first change with a fraction below `GOOD_FRACTION`, for positive (1) or negative (-1) changes."""
-    points_by_change = sorted((sign * point.size, point.tracked.share) for point in results if sign * point.size >= 0.0)
+    points_by_change = sorted(
+        (sign * point.size, point.tracked.fraction) for point in results if sign * point.size >= 0.0
+    )
     points_by_change = [point for point in points_by_change if not math.isnan(point[1])]
     if len(points_by_change) < 2:
         return math.nan

@@ -74,7 +74,7 @@ SITES = SectionDeclaration(
     "Sites and hazards compared with the ground truth",
     rows=sections.landing_rows,
     parts=(
-        RateTable(sections.site_fractions, cases="Flights", heading="Sites", data="shares", shared=False),
+        RateTable(sections.site_fractions, cases="Flights", heading="Sites", data="fractions", shared=False),
         CustomBlocks(sections.create_outcome_blocks),
         Distribution(
             sections.hazard_distances,

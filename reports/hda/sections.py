@@ -240,7 +240,7 @@ def _create_table_2_blocks(landings: pd.DataFrame, subject: Subject, key: str) -
             )
     head = ["", "Landings", "Position error (m)", "5 % to 95 % quantiles (m)", "GPS SD north (m)", "GPS SD east (m)"]
     note, column = note_text("hda.touchdown", confidence=format_fraction(CONFIDENCE)), "touchdown_safe"
-    safe_fraction = rates.flag_fraction(landings, column).share if column in landings else math.nan
+    safe_fraction = rates.flag_fraction(landings, column).fraction if column in landings else math.nan
     data = {
         "landings": len(landings),
         "mean_m": means,
@@ -386,7 +386,7 @@ def run_times_section(subject: Subject) -> Section | None:
     for stage, median_s, p95_s in zip(stages, medians_s.tolist(), percentiles_95_s.tolist(), strict=True):
         sizes = [rates.quantile(rates.finite_values(rows_with_times, name), 0.5) for name in stage["ours"]]
         text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
-        seconds = {"paper_s": stage["seconds"], "median_s": median_s, "late_s": p95_s, "scaled_s": factor * median_s}
+        seconds = {"paper_s": stage["seconds"], "median_s": median_s, "p95_s": p95_s, "scaled_s": factor * median_s}
         data.append({"name": stage["name"], **seconds, "parameters": text})
         times = [f"{stage['seconds']:.2f}", f"{1e3 * median_s:.1f}", f"{1e3 * p95_s:.1f}", f"{factor * median_s:.2f}"]
         rows.append([stage["name"], *times, stage["parameters"], text])

@@ -88,7 +88,7 @@ def agreement_section(subject: Subject) -> Section | None:
         "cases": len(frame),
         "unmatched": int(np.count_nonzero(~np.isfinite(medians))),
         "median_of_medians_px": float(np.nanmedian(medians)) if np.isfinite(medians).any() else None,
-        "apart": {name: float(np.nanmedian(numbers(frame, name))) for name in names if name in differences},
+        "differences": {name: float(np.nanmedian(numbers(frame, name))) for name in names if name in differences},
     }
     blocks = [Block(text=_AGREEMENT_TEXT, figures=svg_figures, grid=grid, note=note)]
     return Section("agreement", "Agreement", "Images compared with measured poses", blocks, data)

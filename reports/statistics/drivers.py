@@ -26,8 +26,8 @@ class Driver:
 
     - n, effective_n: number of cases with condition and response, and the equivalent number of independent cases
     - correlation, lower, upper: Spearman's rank correlation and its interval
-    - share, share_lower, share_upper: first-order sensitivity index and its interval: the fraction (0 to 1) of the
-      variance of the response's ranks that the condition alone explains, for any form of the curve
+    - fraction, fraction_lower, fraction_upper: first-order sensitivity index and its interval: the fraction (0 to 1) of
+      the variance of the response's ranks that the condition alone explains, for any form of the curve
     - p_value: p-value of the null hypothesis that the condition has no effect
     """
 
@@ -36,9 +36,9 @@ class Driver:
     correlation: float
     lower: float
     upper: float
-    share: float
-    share_lower: float
-    share_upper: float
+    fraction: float
+    fraction_lower: float
+    fraction_upper: float
     p_value: float
 
 

@@ -174,7 +174,7 @@ class StudyDescription(_Part):
 class CampaignReport(_Part):
     """Content of `report.json`: the results of a campaign's report."""
 
-    report_schema: Literal[5] = Field(alias="schema")
+    report_schema: Literal[6] = Field(alias="schema")
     campaign: str
     state: Any = Field(description="value of campaign.json; also for seed, git_commit and the times")
     seed: Any

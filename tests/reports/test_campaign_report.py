@@ -121,7 +121,7 @@ RUNS: dict[str, Callable[[Rows], pd.DataFrame]] = {
 def test_report_is_valid_for_any_run(make_rows: Rows, make_run: MakeRun, kind: str) -> None:
     text, page, report = _write_and_read(make_run(RUNS[kind](make_rows)))
     _check_page(text, page)
-    assert report["schema"] == 5
+    assert report["schema"] == 6
     assert report["verdict"] in text
     assert len(text) < 1_000_000
 

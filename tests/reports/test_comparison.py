@@ -60,8 +60,8 @@ def test_correct_covariances_are_consistent_at_95_percent() -> None:
     # 0.95, minus 4 and plus 3 standard deviations of 1.1 %
     assert 0.91 <= verdicts.count("consistent") / 400 <= 0.985
     overconfident = evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
-    assert overconfident["word"] == "too sure"
-    assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "too cautious"
+    assert overconfident["word"] == "optimistic"
+    assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "pessimistic"
 
 
 def test_consistency_covers_all_algorithms_with_covariances() -> None:

@@ -71,7 +71,7 @@ def test_declared_section_contains_its_parts_in_order() -> None:
     low, high = section.data["by_condition"]
     assert (low["altitude_m"], low["answered"]["hits"], low["answered"]["n"]) == (400.0, 20, 20)
     assert (high["altitude_m"], high["answered"]["hits"], high["answered"]["n"]) == (800.0, 10, 20)
-    assert section.data["rates"]["answered"]["share"] == pytest.approx(0.75)
+    assert section.data["rates"]["answered"]["fraction"] == pytest.approx(0.75)
     # medians of the errors: 1 m at 400 m, 2 m at 800 m
     (effect,) = section.data["effects"]
     assert (effect["centres"], effect["medians"]) == ([400.0, 800.0], [1.0, 2.0])

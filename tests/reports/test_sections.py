@@ -109,7 +109,7 @@ def test_variance_between_terrains_is_estimated() -> None:
     frame = pd.DataFrame({"answered": True, "terrain": terrain, METRIC: error})
     variance = terrain_variance(frame, METRIC)
     assert variance is not None
-    assert variance["share"] == pytest.approx(4.0 / 13.0, abs=0.1)
+    assert variance["fraction"] == pytest.approx(4.0 / 13.0, abs=0.1)
     assert variance["within_sd"] == pytest.approx(3.0, rel=0.08)
     assert variance["between_sd"] == pytest.approx(2.0, rel=0.2)
     assert variance["p_value"] < 1e-6
@@ -145,7 +145,7 @@ def test_faults_are_grouped_by_kind_and_size() -> None:
         ("dust", 10, 1, 6, 3),
     ]
     assert [row["size"] for row in rows[1:]] == [0.1, 0.5]
-    assert (rows[0]["commonest_refusal"], rows[2]["commonest_refusal"]) == ("", "NO_VALID_TRACK")
+    assert (rows[0]["most_frequent_refusal"], rows[2]["most_frequent_refusal"]) == ("", "NO_VALID_TRACK")
     assert faults_section(make_subject(frame)) is not None
     assert faults_section(make_subject(frame, None)) is None
     assert faults_section(make_subject(frame.drop(columns="fault"))) is None
@@ -215,7 +215,11 @@ def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
     frame.loc[100] = [np.nan, np.nan]  # crashed
     section = LANDING(make_subject(frame))
     assert section is not None
-    assert (section.data["landings"], section.data["helped"], section.data["harmed"]) == (100, 0.7, 0.1)
+    assert (section.data["landings"], section.data["reduced_fraction"], section.data["increased_fraction"]) == (
+        100,
+        0.7,
+        0.1,
+    )
     assert (section.data["largest_gain_m_s"], section.data["largest_loss_m_s"]) == pytest.approx((4.0, 2.0))
     assert find_cells(section, "faster than 20 m/s")[1:] == ["5.00 %", "25.00 %"]
     assert LANDING(make_subject(frame[["touchdown_speed_corrected_m_s"]])) is None

@@ -143,7 +143,7 @@ def test_numbers_and_intervals_are_printed_with_four_digits() -> None:
 def test_rate_without_cases_has_the_interval_0_to_1() -> None:
     empty = fraction_of(np.zeros(0, dtype=np.bool_), pd.DataFrame())
     assert (empty.hits, empty.n) == (0, 0)
-    assert math.isnan(empty.share)
+    assert math.isnan(empty.fraction)
     assert empty.clustered_interval == (0.0, 1.0)
 
 

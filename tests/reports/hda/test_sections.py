@@ -37,14 +37,14 @@ def _make_subject(frame: pd.DataFrame) -> Subject:
 def test_rates_pool_footprints_over_flights() -> None:
     frame = pd.DataFrame({"hazardous": [1, 0, 3, 0], "footprints": [10, 10, 20, 0]})
     rate = pooled_rate(frame, "hazardous", "footprints")
-    assert (rate.hits, rate.of, rate.flights, rate.flights_hit) == (4, 40, 3, 2)
-    assert rate.share == pytest.approx(0.1)
+    assert (rate.hits, rate.total, rate.flights, rate.flights_hit) == (4, 40, 3, 2)
+    assert rate.fraction == pytest.approx(0.1)
     assert rate.lower < 0.1 < rate.upper
 
 
 def test_flights_with_one_footprint_are_pooled() -> None:
     rate = pooled_rate(pd.DataFrame({"hazardous": [1, 0, 1, 1], "footprints": [1, 1, 2, 0]}), "hazardous", "footprints")
-    assert (rate.hits, rate.of, rate.flights, rate.flights_hit) == (3, 4, 3, 2)
+    assert (rate.hits, rate.total, rate.flights, rate.flights_hit) == (3, 4, 3, 2)
 
 
 def test_pooled_rate_interval_covers_the_true_rate() -> None:
@@ -61,7 +61,7 @@ def test_pooled_rate_interval_covers_the_true_rate() -> None:
 
 def test_rate_of_zero_has_no_bootstrap_interval() -> None:
     rate = pooled_rate(pd.DataFrame({"hazardous": [0, 0], "footprints": [10, 10]}), "hazardous", "footprints")
-    assert rate.share == 0.0
+    assert rate.fraction == 0.0
     assert np.isnan(rate.upper)
 
 
@@ -94,7 +94,7 @@ def test_reported_sites_are_scored_against_the_truth() -> None:
     rates = site_fractions(frame)
     safe = rates["chosen sites that are truly safe"]
     assert (safe.n, safe.hits) == (frame["site_reported"].sum(), (frame["site_reported"] & frame["site_safe"]).sum())
-    assert rates["answer 'no safe site' if none exists"].share == 1.0
+    assert rates["answer 'no safe site' if none exists"].fraction == 1.0
     counts = outcome_counts(frame)
     assert sum(sum(row.values()) for row in counts.values()) == len(frame)
     assert counts["no safe site"]["'no safe site'"] == (frame["outcome"] == "NO_SAFE_SITE").sum()
@@ -114,8 +114,8 @@ def test_hazard_classes_have_their_limits_and_rates() -> None:
     assert {hazard_class.kind for hazard_class in classes[:5]} == {"roughness"}
     assert [hazard_class.low for hazard_class in classes[:5]] == [0.0, 1.0, 1.5, 2.0, 3.0]
     assert [hazard_class.high for hazard_class in classes[:5]] == [1.0, 1.5, 2.0, 3.0, float("inf")]
-    assert classes[1].called_safe.share == pytest.approx(0.03)
-    assert classes[4].unflagged.share == 0.0
+    assert classes[1].called_safe.fraction == pytest.approx(0.03)
+    assert classes[4].unflagged.fraction == 0.0
 
 
 def test_rates_are_reported_per_roughness_threshold() -> None:
@@ -124,8 +124,11 @@ def test_rates_are_reported_per_roughness_threshold() -> None:
     assert section is not None
     low, high = section.data["thresholds"]
     assert (low["max_roughness_m"], high["max_roughness_m"]) == (0.1, 0.2)
-    assert (low["false_alarms"]["share"], high["false_alarms"]["share"]) == (pytest.approx(0.2), pytest.approx(0.05))
-    assert low["missed"]["share"] == pytest.approx(8 / 400)
+    assert (low["false_alarms"]["fraction"], high["false_alarms"]["fraction"]) == (
+        pytest.approx(0.2),
+        pytest.approx(0.05),
+    )
+    assert low["missed"]["fraction"] == pytest.approx(8 / 400)
     assert THRESHOLD(_make_subject(landing_frame(40))) is None
 
 

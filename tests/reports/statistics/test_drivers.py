@@ -23,7 +23,7 @@ def test_linear_driver_has_the_expected_rank_correlation() -> None:
     # Spearman's coefficient of a normal pair with Pearson's 1 / sqrt(2): 6 / pi asin(0.7071 / 2) = 0.690
     assert result.lower < 0.690 < result.upper
     # explained variance of the ranks: square of the coefficient
-    assert result.share == pytest.approx(0.690**2, abs=0.03)
+    assert result.fraction == pytest.approx(0.690**2, abs=0.03)
     assert result.p_value < 1e-9
 
 
@@ -32,7 +32,7 @@ def test_quadratic_driver_explains_variance_without_correlation() -> None:
     condition = rng.uniform(-1.0, 1.0, 2000)
     result = _estimate_driver(condition, condition**2 + rng.normal(0.0, 0.05, 2000))
     assert abs(result.correlation) < 0.06
-    assert result.share_lower > 0.8
+    assert result.fraction_lower > 0.8
 
 
 @pytest.mark.parametrize("n", [60, 600])
@@ -43,7 +43,7 @@ def test_intervals_of_an_unrelated_condition_contain_zero(n: int) -> None:
     assert np.mean([result.lower <= 0.0 <= result.upper for result in results]) >= 0.9 - 3 * 0.021
     assert np.mean([result.p_value < 0.1 for result in results]) <= 0.1 + 3 * 0.021
     # one-sided lower bound: above zero in at most 5 % of samples
-    assert np.mean([result.share_lower > 0.0 for result in results]) <= 0.05 + 3 * 0.015
+    assert np.mean([result.fraction_lower > 0.0 for result in results]) <= 0.05 + 3 * 0.015
 
 
 def test_interval_for_a_condition_of_the_terrain_counts_terrains() -> None:
@@ -65,7 +65,7 @@ def test_interval_for_a_condition_of_the_terrain_counts_terrains() -> None:
 def test_binary_condition_has_a_significant_effect() -> None:
     condition = np.repeat([0.0, 1.0], [90, 10])
     result = _estimate_driver(condition, np.where(condition == 1.0, 5.0, 1.0) + np.linspace(0.0, 0.5, 100))
-    assert result.share > 0.2
+    assert result.fraction > 0.2
     assert result.p_value < 1e-4
 
 
@@ -79,5 +79,5 @@ def test_explained_fraction_is_1_for_constant_responses() -> None:
     condition = np.repeat([400.0, 800.0], 20)
     result = estimate_driver(condition, condition / 400.0, None, 0.9)
     assert result is not None
-    assert (result.share, result.share_lower, result.share_upper, result.p_value) == (1.0, 1.0, 1.0, 0.0)
+    assert (result.fraction, result.fraction_lower, result.fraction_upper, result.p_value) == (1.0, 1.0, 1.0, 0.0)
     assert result.correlation == pytest.approx(1.0)
