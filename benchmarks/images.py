@@ -18,7 +18,7 @@ from marsyard.algorithms.processes import used_memory
 from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
-from marsyard.scenarios.views import Eye, SiteGround, nadir_pose, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, nadir_pose, site_scene
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Scene, Sun, Texture, process_renderer
@@ -84,9 +84,9 @@ def measure_rover_images(repeats: int) -> list[Measurement]:
     )
     navcam = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
     full_frame, subframe = PixelRays.of(navcam), PixelRays.of(navcam.crop(430, 560, (161, 161)))
-    eye = np.array([50.0, 50.0, float(surface.height(50.0, 50.0)) + 1.5])
+    viewpoint = np.array([50.0, 50.0, float(surface.height(50.0, 50.0)) + 1.5])
     attitude = Rotation.from_euler("x", -18.0, degrees=True)
-    left, right = rigid(attitude, eye), rigid(attitude, eye + np.array([0.2, 0.0, 0.0]))
+    left, right = rigid(attitude, viewpoint), rigid(attitude, viewpoint + np.array([0.2, 0.0, 0.0]))
     renderer = process_renderer(default_backend())
 
     def render_pair() -> None:
@@ -118,8 +118,8 @@ def measure_memory(frames: int) -> list[Measurement]:
     for number in range(scenes):
         east = 40.0 * number
         if number % ROCKS_EVERY == ROCKS_EVERY - 1:
-            eye = Eye(east, 0.0, 1200.0, optics.rays.pixel_rad)
-            scene, ground = site_scene(rocks, eye, SUN), rocks.surface
+            viewpoint = Viewpoint(east, 0.0, 1200.0, optics.rays.pixel_rad)
+            scene, ground = site_scene(rocks, viewpoint, SUN), rocks.surface
         else:
             scene, ground = Scene(surface, (east, 0.0), SUN, Photometry()), surface
         for image in range(IMAGES_PER_SCENE):

@@ -1,7 +1,8 @@
 """Scenes of a site for cameras: ground, visible rocks, light, and camera poses.
 
-A `SiteGround` is a terrain of the bank with its rocks, an `Eye` the position and resolution of a camera; `site_scene`
-combines both into the scene for the renderer. All images near the eye can use one scene, for example a stereo pair.
+A `SiteGround` is a terrain of the bank with its rocks, a `Viewpoint` the position and resolution of a camera;
+`site_scene` combines both into the scene for the renderer. All images near the viewpoint can use one scene, for example
+a stereo pair.
 """
 
 from __future__ import annotations
@@ -32,24 +33,25 @@ Scale = Literal["descent", "ground"]
 SMALLEST_ROCK_PX = 1.5
 #: Approximate maximum number of triangles of coarse rocks in a scene; smaller rocks are omitted to satisfy it.
 ROCK_TRIANGLES = 600_000
-#: Maximum number of additional triangles of detailed rocks in the eye's sector; to satisfy it, all rocks are rendered
-#: with less detail than the camera resolves.
+#: Maximum number of additional triangles of detailed rocks in the viewpoint's sector; to satisfy it, all rocks are
+#: rendered with less detail than the camera resolves.
 DETAIL_TRIANGLES = 1_200_000
 #: Number of triangles of a coarse rock.
 _COARSE_TRIANGLES = 20
-#: Radius around the eye in which rocks outside the sector are included for their shadows: `_NEAR_HEIGHTS` times the
-#: eye's height, at least `_NEAR_M` metres.
+#: Radius around the viewpoint in which rocks outside the sector are included for their shadows: `_NEAR_HEIGHTS` times
+#: the viewpoint's height, at least `_NEAR_M` metres.
 _NEAR_HEIGHTS, _NEAR_M = 3.0, 5.0
-#: Margin of an eye's sector on each side, and depression of the image's upper edge above which the horizon is assumed
-#: visible, radians.
+#: Margin of a viewpoint's sector on each side, and depression of the image's upper edge above which the horizon is
+#: assumed visible, radians.
 _SECTOR_MARGIN_RAD, _MIN_DEPRESSION_RAD = np.radians(3.0), np.radians(5.0)
 #: Ratio of the diameters of neighbouring size classes.
 _CLASS_RATIO = float(np.sqrt(2.0))
-#: Ground mesh: spacing / height of the eye, relative growth per line, minimum extent / height of the eye, and in m.
+#: Ground mesh: spacing / height of the viewpoint, relative growth per line, minimum extent / height of the viewpoint,
+#: and in m.
 _MESH_FINEST, _MESH_GROWTH, _MESH_REACH_HEIGHTS, _MESH_REACH_M = 0.0085, 0.012, 14.0, 700.0
 #: Radius of Mars, m, for the distance of the horizon.
 _MARS_RADIUS_M = 3.39e6
-#: Maximum height of an eye, m, at which it is among the rocks (`Scene.among_objects`).
+#: Maximum height of a viewpoint, m, at which it is among the rocks (`Scene.among_objects`).
 _MAX_AMONG_ROCKS_M = 100.0
 
 
@@ -96,7 +98,7 @@ class SiteGround:
 
 
 @dataclass(frozen=True)
-class Eye:
+class Viewpoint:
     """Viewpoint of a camera: position, visible sector and resolution, which determine the detail of a scene.
 
     - east_m, north_m, height_m: position, and height above the ground
@@ -115,8 +117,8 @@ class Eye:
     reach_m: float = np.inf
 
     @classmethod
-    def of(cls, rays: PixelRays, world_from_body: RigidTransform, surface: Surface) -> Eye:
-        """Compute the eye of a camera at a pose."""
+    def of(cls, rays: PixelRays, world_from_body: RigidTransform, surface: Surface) -> Viewpoint:
+        """Compute the viewpoint of a camera at a pose."""
         east, north, up = (float(value) for value in world_from_body.apply(rays.centre))
         height = up - float(surface.height(east, north))
         axis = world_from_body.rotation.apply(rays.axis)
@@ -131,21 +133,21 @@ class Eye:
         return cls(east, north, height, rays.pixel_rad, float(np.arctan2(axis[0], axis[1])), half_width, float(reach_m))
 
 
-def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
-    """Build the scene for an eye: ground, resolved rocks, texture and light."""
+def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
+    """Build the scene for a viewpoint: ground, resolved rocks, texture and light."""
     spacing_m = ground.surface.spacing_m
-    finest_m = max(_MESH_FINEST * eye.height_m, 0.8 * spacing_m)
-    horizon_m = float(np.sqrt(2.0 * _MARS_RADIUS_M * eye.height_m))
-    reach_m = max(_MESH_REACH_HEIGHTS * eye.height_m, _MESH_REACH_M, min(horizon_m, eye.reach_m))
+    finest_m = max(_MESH_FINEST * viewpoint.height_m, 0.8 * spacing_m)
+    horizon_m = float(np.sqrt(2.0 * _MARS_RADIUS_M * viewpoint.height_m))
+    reach_m = max(_MESH_REACH_HEIGHTS * viewpoint.height_m, _MESH_REACH_M, min(horizon_m, viewpoint.reach_m))
     # line k of the mesh is at finest_m * sinh(k growth) / sinh(growth)
     half_lines = int(np.ceil(np.arcsinh(reach_m / finest_m * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
-    objects = select_rocks(ground, eye, reach_m)
-    if ground.site.hills and np.isinf(eye.reach_m) and eye.height_m < _MAX_AMONG_ROCKS_M:
+    objects = select_rocks(ground, viewpoint, reach_m)
+    if ground.site.hills and np.isinf(viewpoint.reach_m) and viewpoint.height_m < _MAX_AMONG_ROCKS_M:
         mean_m = float(ground.surface.levels[-1][..., 0].mean())
         objects = Objects.join([objects, hill_objects(ground.site.hills, mean_m, ground.terrain.albedo)])
     return Scene(
         ground.surface,
-        (eye.east_m, eye.north_m),
+        (viewpoint.east_m, viewpoint.north_m),
         sun,
         ground.photometry(sun),
         objects=objects,
@@ -155,7 +157,7 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
         mesh_finest_m=finest_m,
         mesh_reach_m=reach_m,
         mesh_lines=2 * half_lines + 1,
-        among_objects=eye.height_m < _MAX_AMONG_ROCKS_M,
+        among_objects=viewpoint.height_m < _MAX_AMONG_ROCKS_M,
     )
 
 
@@ -168,8 +170,8 @@ def micro_relief(ground: SiteGround) -> MicroRelief:
     return MicroRelief(coarsest, heights, roughness, texture, len(cover_maps) / ground.surface.period_m)
 
 
-def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Objects:
-    """Select the rocks that a camera resolves (`eye`), and near rocks for their shadows.
+def select_rocks(ground: SiteGround, viewpoint: Viewpoint, farthest_m: float = np.inf) -> Objects:
+    """Select the rocks that a camera resolves (`viewpoint`), and near rocks for their shadows.
 
     The names of the objects are the rocks' numbers in the field; each periodic copy of a rock is a body of its own. If
     rocks of `SMALLEST_ROCK_PX` need more than about `ROCK_TRIANGLES`, only larger rocks are selected. The level of
@@ -179,25 +181,30 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
     field = ground.rocks
     if field is None or len(field) == 0:
         return Objects.none()
-    smallest_rad, pixel_rad = smallest_rock_rad(field, eye), _detail_pixel_rad(field, eye)
-    reach = min(farthest_m, eye.reach_m)
+    smallest_rad, pixel_rad = smallest_rock_rad(field, viewpoint), _detail_pixel_rad(field, viewpoint)
+    reach = min(farthest_m, viewpoint.reach_m)
     smallest_m = float(field.diameter_m.min())
     size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
     meshes = []
     for number in np.unique(size_class):
         members, min_diameter_m = np.flatnonzero(size_class == number), smallest_m * _CLASS_RATIO ** int(number)
         # horizontal part of the maximum distance of this size class
-        horizontal = np.sqrt(max((min_diameter_m * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - eye.height_m**2, 0.0))
+        horizontal = np.sqrt(
+            max((min_diameter_m * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - viewpoint.height_m**2, 0.0)
+        )
         radius = float(min(horizontal, reach))
-        rock_indices = members[_find_near_rocks(field, members, eye, radius)]
+        rock_indices = members[_find_near_rocks(field, members, viewpoint, radius)]
         if rock_indices.size:
             subset = replace(field, names={}, **{name: getattr(field, name)[rock_indices] for name in ROCK_ARRAYS})
-            mesh = subset.near(eye.east_m, eye.north_m, radius, above_m=eye.height_m, pixel_rad=pixel_rad)
+            mesh = subset.near(
+                viewpoint.east_m, viewpoint.north_m, radius, above_m=viewpoint.height_m, pixel_rad=pixel_rad
+            )
             meshes.append(replace(mesh, rock_of_face=rock_indices[mesh.rock_of_face].astype(np.int32)))
     if not meshes:
         return Objects.none()
-    # keep only triangles in the eye's sector or near the eye; offsets number vertices and bodies of the joined meshes
-    masks = [_find_visible_triangles(mesh, eye) for mesh in meshes]
+    # keep only triangles in the viewpoint's sector or near the viewpoint; offsets number vertices and bodies of the
+    # joined meshes
+    masks = [_find_visible_triangles(mesh, viewpoint) for mesh in meshes]
     vertex_offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     body_offsets = np.cumsum([0] + [int(mesh.body_of_face.max(initial=-1)) + 1 for mesh in meshes])
     offsets = vertex_offsets.astype(np.int32), body_offsets.astype(np.int32)
@@ -212,21 +219,21 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
     )
 
 
-def smallest_rock_rad(field: RockField, eye: Eye) -> float:
+def smallest_rock_rad(field: RockField, viewpoint: Viewpoint) -> float:
     """Return the angular size of the smallest rocks in a scene.
 
     Rocks of diameter D are rendered up to the distance D / angle. With n rocks per square metre and a sector of half
     width w, they have ``20 w D**2 n / angle**2`` triangles. The result limits this number to `ROCK_TRIANGLES`.
     """
-    if np.isfinite(eye.reach_m):
-        return SMALLEST_ROCK_PX * eye.pixel_rad
+    if np.isfinite(viewpoint.reach_m):
+        return SMALLEST_ROCK_PX * viewpoint.pixel_rad
     squared_diameters_per_m2 = float(np.sum(field.diameter_m**2)) / field.period_m**2
-    limit_rad = np.sqrt(_COARSE_TRIANGLES * eye.half_width_rad * squared_diameters_per_m2 / ROCK_TRIANGLES)
-    return float(max(SMALLEST_ROCK_PX * eye.pixel_rad, limit_rad))
+    limit_rad = np.sqrt(_COARSE_TRIANGLES * viewpoint.half_width_rad * squared_diameters_per_m2 / ROCK_TRIANGLES)
+    return float(max(SMALLEST_ROCK_PX * viewpoint.pixel_rad, limit_rad))
 
 
-def _detail_pixel_rad(field: RockField, eye: Eye) -> float:
-    """Return the pixel angle for the detail of rocks: that of the eye, or the smallest that `DETAIL_TRIANGLES` allows.
+def _detail_pixel_rad(field: RockField, viewpoint: Viewpoint) -> float:
+    """Return the pixel angle for the detail of rocks, at least the smallest that `DETAIL_TRIANGLES` allows.
 
     Detail level k of a rock of diameter D is sufficient up to a size of p_k pixels. The additional triangles of the
     next level are therefore needed up to the distance ``D / (p_k * pixel angle)``.
@@ -234,7 +241,7 @@ def _detail_pixel_rad(field: RockField, eye: Eye) -> float:
     triangles = np.array([rock_shapes(detail).faces.shape[0] for detail in range(FINEST + 1)])
     added_triangles = (np.diff(triangles) / max_pixels() ** 2).sum(axis=1)
     per_m2 = float(np.sum(field.diameter_m**2 * added_triangles[field.shape])) / field.period_m**2
-    return float(max(eye.pixel_rad, np.sqrt(eye.half_width_rad * per_m2 / DETAIL_TRIANGLES)))
+    return float(max(viewpoint.pixel_rad, np.sqrt(viewpoint.half_width_rad * per_m2 / DETAIL_TRIANGLES)))
 
 
 @dataclass(frozen=True)
@@ -305,34 +312,36 @@ def _position_above_ground(
 
 
 def _find_near_rocks(
-    field: RockField, members: Int64[np.ndarray, "members"], eye: Eye, radius_m: float
+    field: RockField, members: Int64[np.ndarray, "members"], viewpoint: Viewpoint, radius_m: float
 ) -> Bool[np.ndarray, "members"]:
-    """Select rocks of which a copy is within a radius of the eye; the rock field repeats with its period.
+    """Select rocks of which a copy is within a radius of the viewpoint; the rock field repeats with its period.
 
     All rocks with triangles of `_find_visible_triangles` are among them.
     """
     period, is_selected = field.period_m, np.zeros(members.size, dtype=np.bool_)
     # larger than any shape on the steepest ground
     extent = field.diameter_m[members] + field.height_m[members]
-    near_m = max(_NEAR_HEIGHTS * eye.height_m, _NEAR_M)
-    eye_m = np.array([eye.east_m, eye.north_m])
+    near_m = max(_NEAR_HEIGHTS * viewpoint.height_m, _NEAR_M)
+    eye_m = np.array([viewpoint.east_m, viewpoint.north_m])
     reference_offsets = field.position_m[members, :2] + np.floor(eye_m / period) * period - eye_m
     repetitions = range(-int(np.ceil(radius_m / period)), int(np.ceil(radius_m / period)) + 1)
     for column, row in product(repetitions, repetitions):
         offsets = reference_offsets + np.array([column, row]) * period
         distance = np.hypot(*offsets.T)
-        bearing = np.abs((np.arctan2(offsets[:, 0], offsets[:, 1]) - eye.azimuth_rad + np.pi) % (2.0 * np.pi) - np.pi)
+        bearing = np.abs(
+            (np.arctan2(offsets[:, 0], offsets[:, 1]) - viewpoint.azimuth_rad + np.pi) % (2.0 * np.pi) - np.pi
+        )
         widening = np.arcsin(np.minimum(extent / np.maximum(distance, 1e-9), 1.0))
-        is_relevant = (bearing <= eye.half_width_rad + widening) | (distance <= near_m + extent)
+        is_relevant = (bearing <= viewpoint.half_width_rad + widening) | (distance <= near_m + extent)
         is_selected |= is_relevant & (distance <= radius_m)
     return is_selected
 
 
-def _find_visible_triangles(mesh: RockMesh, eye: Eye) -> Bool[np.ndarray, "triangles"]:
-    """Select the triangles whose first corner is in the eye's sector or near the eye."""
-    offsets = mesh.vertices[:, :2] - (eye.east_m, eye.north_m)
-    bearing = np.arctan2(offsets[:, 0], offsets[:, 1]) - eye.azimuth_rad
+def _find_visible_triangles(mesh: RockMesh, viewpoint: Viewpoint) -> Bool[np.ndarray, "triangles"]:
+    """Select the triangles whose first corner is in the viewpoint's sector or near the viewpoint."""
+    offsets = mesh.vertices[:, :2] - (viewpoint.east_m, viewpoint.north_m)
+    bearing = np.arctan2(offsets[:, 0], offsets[:, 1]) - viewpoint.azimuth_rad
     bearing = np.abs((bearing + np.pi) % (2.0 * np.pi) - np.pi)
-    near_m = max(_NEAR_HEIGHTS * eye.height_m, _NEAR_M)
-    is_selected = (bearing <= eye.half_width_rad) | (np.hypot(*offsets.T) <= near_m)
+    near_m = max(_NEAR_HEIGHTS * viewpoint.height_m, _NEAR_M)
+    is_selected = (bearing <= viewpoint.half_width_rad) | (np.hypot(*offsets.T) <= near_m)
     return np.asarray(is_selected[mesh.faces[:, 0]])

@@ -12,8 +12,8 @@ from marsyard.algorithms.hda import HdaEstimator, HdaOptions, TrackSeed
 from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.images import GroundTruth, World, measure, take_images
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import GroundTruth, World, measure, take_images
 from marsyard.scenarios.landing.score import map_row, motion_row
 from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
 from marsyard.sim.streams import Streams

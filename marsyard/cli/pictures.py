@@ -22,7 +22,15 @@ from jaxtyping import Bool, UInt16
 from marsyard.scenarios.exposure import add_haze
 from marsyard.scenarios.horizon import add_unresolved_rocks
 from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, load_site
-from marsyard.scenarios.views import STANCES, Eye, SiteGround, camera_pose, mast_pose, site_scene, smallest_rock_rad
+from marsyard.scenarios.views import (
+    STANCES,
+    SiteGround,
+    Viewpoint,
+    camera_pose,
+    mast_pose,
+    site_scene,
+    smallest_rock_rad,
+)
 from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
 from marsyard.sim.dynamics.rover import RoverParameters
@@ -147,9 +155,9 @@ def render_images(request: ImageRequest, *, detector: bool = True, both: bool = 
     rendered_cameras = cameras if both else cameras[:1]
     rays = [PixelRays.of(camera) for camera in rendered_cameras]
     # The baseline of a stereo pair is short: both cameras use the scene built for the left camera.
-    eye = Eye.of(rays[0], pose, ground.surface)
-    scene = _add_rover(site_scene(ground, eye, sun), request, ground)
-    smallest_rad = smallest_rock_rad(ground.rocks, eye) if ground.rocks is not None else 0.0
+    viewpoint = Viewpoint.of(rays[0], pose, ground.surface)
+    scene = _add_rover(site_scene(ground, viewpoint, sun), request, ground)
+    smallest_rad = smallest_rock_rad(ground.rocks, viewpoint) if ground.rocks is not None else 0.0
     rms_slope = math.tan(math.radians(ground.terrain.rms_slope_deg))
     images = []
     for number, camera in enumerate(rendered_cameras):

@@ -19,7 +19,7 @@ from marsyard.scenarios.descent.parameters import (
 from marsyard.scenarios.exposure import Optics, add_calibration_error, add_haze, render_state, sunlight_ratio
 from marsyard.scenarios.exposure import camera_optics as shared_optics
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
-from marsyard.scenarios.views import Eye, SiteGround, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
 from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction
@@ -78,7 +78,7 @@ class World:
             mesh_finest_m = min(MESH_FINEST_M, MESH_FINEST_FRACTION * last_height_m)
             scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry(), mesh_finest_m=mesh_finest_m)
         else:
-            scene = site_scene(self.ground, Eye(east_m, north_m, last_height_m, pixel_rad), self.sun)
+            scene = site_scene(self.ground, Viewpoint(east_m, north_m, last_height_m, pixel_rad), self.sun)
         return add_meshes(scene, self.meshes, (east_m, north_m))
 
 

@@ -57,7 +57,9 @@ class Faults(SizedFaults):
     haze: Annotated[NonNegative, Field(le=10.0, description="optical depth of dusty air over 2000 m")] = 0.0
     dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes on the whole terrain")] = 0.0
     cable_bursts: Annotated[NonNegative, Field(le=1e4, description="mean interference bursts per image")] = 0.0
-    late_s: Annotated[NonNegative, Field(le=3.0, description="delay of the second exposure after its time tag")] = 0.0
+    exposure_delay_s: Annotated[
+        NonNegative, Field(le=3.0, description="delay of the second exposure after its time tag")
+    ] = 0.0
     repeated_picture: Annotated[int, bounded_field(0, 3, "image replaced by the previous one, 2 or 3; 0: none")] = 0
     black_picture: Annotated[int, bounded_field(0, 3, "image that is delivered black, 1 to 3; 0: none")] = 0
     shield_range_m: Annotated[
@@ -95,7 +97,7 @@ def draw_clouds(faults: Faults, ground_m: float, rng: np.random.Generator) -> Cl
 
 def add_time_fault(faults: Faults, times_s: Sequence[float]) -> list[float]:
     """Return the true exposure times of images commanded at these times."""
-    return [time + faults.late_s * (index == FAULTY_IMAGE) for index, time in enumerate(times_s)]
+    return [time + faults.exposure_delay_s * (index == FAULTY_IMAGE) for index, time in enumerate(times_s)]
 
 
 def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]) -> list[AltitudeMeasurement]:

@@ -18,7 +18,7 @@ from jaxtyping import Float64, UInt16
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.exposure import add_haze, camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import CAMERA, FieldTestParameters, RunParameters
-from marsyard.scenarios.views import Eye, SiteGround, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.dynamics.helicopter import HelicopterFlight
@@ -173,5 +173,5 @@ def build_start_scene(run: FlownRun, ground: SiteGround, height_m: float | None 
     east, north, _ = run.flight.origin_m.tolist()
     lowest_m = run.key.field_test.helicopter.lowest_m
     pixel_rad = camera_optics(field_camera()).rays.pixel_rad
-    eye = Eye(east, north, lowest_m if height_m is None else height_m, pixel_rad)
-    return replace(site_scene(ground, eye, sun_at(run, 0.0)), clouds=run.clouds)
+    viewpoint = Viewpoint(east, north, lowest_m if height_m is None else height_m, pixel_rad)
+    return replace(site_scene(ground, viewpoint, sun_at(run, 0.0)), clouds=run.clouds)

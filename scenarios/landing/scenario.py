@@ -15,8 +15,8 @@ from marsyard.scenarios.conditions import hash_images, image_columns
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import Sample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.landing.images import MAX_GROUNDS, RenderedFlight, measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import MAX_GROUNDS, RenderedFlight, measure
 from marsyard.scenarios.landing.score import (
     conditions,
     landing_row,

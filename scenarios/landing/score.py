@@ -17,8 +17,8 @@ from marsyard.scenarios.conditions import contrast_columns, ground_columns, opti
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import horizontal_distance_m, land
+from marsyard.scenarios.landing.images import GroundTruth, Pair, RenderedFlight, SampledMap, count_hazards, map_errors
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
-from marsyard.scenarios.landing.pictures import GroundTruth, Pair, RenderedFlight, SampledMap, count_hazards, map_errors
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground

@@ -69,28 +69,28 @@ def ray_distances(triangles: Triangles, origin: Vector, directions: Rays) -> Flo
     return intersect_rays(triangles, origin, directions)[0]
 
 
-def triangles_near_line(triangles: Triangles, eye: Vector, point: Vector, half_angle_rad: float) -> Triangles:
+def triangles_near_line(triangles: Triangles, viewpoint: Vector, point: Vector, half_angle_rad: float) -> Triangles:
     """Select all triangles that rays within an angle of the line of sight can hit, and possibly some more."""
-    axis = (point - eye) / np.linalg.norm(point - eye)
-    centres = triangles.mean(axis=1) - eye
+    axis = (point - viewpoint) / np.linalg.norm(point - viewpoint)
+    centres = triangles.mean(axis=1) - viewpoint
     depths = centres @ axis
     offsets = np.linalg.norm(centres - depths[:, None] * axis, axis=1)
     size = np.linalg.norm(triangles[:, 1:] - triangles[:, :1], axis=2).max(axis=1)
     return np.asarray(triangles[offsets <= np.tan(half_angle_rad) * np.maximum(depths, 0.0) + size])
 
 
-def patch_normal(triangles: Triangles, eye: Vector, point: Vector, half_angle_rad: float) -> Vector:
-    """Compute the mean unit normal, towards an eye, of the surface around a point over a square grid of rays.
+def patch_normal(triangles: Triangles, viewpoint: Vector, point: Vector, half_angle_rad: float) -> Vector:
+    """Compute the mean unit normal, towards a viewpoint, of the surface around a point over a square grid of rays.
 
     `half_angle_rad` is half the side of the square. Rays that miss the rock are ignored.
     """
-    axes = sight_axes(point - eye)
+    axes = sight_axes(point - viewpoint)
     steps = np.tan(half_angle_rad) * np.linspace(-1.0, 1.0, _PATCH_RAYS)
     offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     rays = axes[0] + offsets @ axes[1:]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    candidates = triangles_near_line(triangles, eye, point, np.sqrt(2.0) * half_angle_rad)
-    _, indices = intersect_rays(candidates, eye, rays)
+    candidates = triangles_near_line(triangles, viewpoint, point, np.sqrt(2.0) * half_angle_rad)
+    _, indices = intersect_rays(candidates, viewpoint, rays)
     corners = candidates[indices[indices >= 0]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -101,27 +101,27 @@ def patch_normal(triangles: Triangles, eye: Vector, point: Vector, half_angle_ra
 
 @dataclass(frozen=True)
 class RockOutline:
-    """Outline of a rock seen from an eye, in tangents of angles to the right of and above the line to its centre."""
+    """Outline of a rock seen from a viewpoint: tangents of angles to the right of and above the line to its centre."""
 
     triangles: Triangles
-    eye: Vector
+    viewpoint: Vector
     axes: Float64[np.ndarray, "3 3"]  #: rows: forward, right and up of the view, world axes
     rows: Float64[np.ndarray, "rows 3"]  #: vertical tangent, from the foot up; left and right outline
 
     @classmethod
-    def from_triangles(cls, triangles: Triangles, eye: Vector, ground_m: float) -> RockOutline:
+    def from_triangles(cls, triangles: Triangles, viewpoint: Vector, ground_m: float) -> RockOutline:
         """Compute the outline of the part of the rock above the height `ground_m`."""
         corners = triangles.reshape(-1, 3)
         corners = corners[corners[:, 2] > ground_m]
-        axes = sight_axes(0.5 * (corners.min(axis=0) + corners.max(axis=0)) - eye)
-        view = (corners - eye) @ axes.T
+        axes = sight_axes(0.5 * (corners.min(axis=0) + corners.max(axis=0)) - viewpoint)
+        view = (corners - viewpoint) @ axes.T
         across, up = view[:, 1] / view[:, 0], view[:, 2] / view[:, 0]
         rows = []
         for low, high in pairwise(np.linspace(up.min(), up.max(), _OUTLINE_ROWS + 1)):
             row_tangents = across[(up >= low) & (up <= high)]
             if row_tangents.size:
                 rows.append((0.5 * (low + high), row_tangents.min(), row_tangents.max()))
-        return cls(triangles, eye, axes, np.array(rows))
+        return cls(triangles, viewpoint, axes, np.array(rows))
 
     def point(self, across: float, up: float) -> Vector:
         """Compute the surface point at `across` from left (-1) to right (1), and at `up` from foot (0) to top (1).
@@ -134,17 +134,17 @@ class RockOutline:
         tangent_across = 0.5 * (low + high) + 0.5 * across * (high - low)
         direction = np.array([1.0, tangent_across, tangent_up]) @ self.axes
         direction /= np.linalg.norm(direction)
-        distance = ray_distances(self.triangles, self.eye, direction[None])[0]
+        distance = ray_distances(self.triangles, self.viewpoint, direction[None])[0]
         if not np.isfinite(distance):
             raise ValueError(f"the line of sight at across {across:g}, up {up:g} misses the target's rock")
-        return np.asarray(self.eye + distance * direction)
+        return np.asarray(self.viewpoint + distance * direction)
 
 
-def find_self_occlusion(triangles: Triangles, points: Points, eye: Vector) -> Bool[np.ndarray, "points"]:
-    """Return for each point of a rock whether the rock occludes it, seen from an eye."""
-    offsets = points - eye
+def find_self_occlusion(triangles: Triangles, points: Points, viewpoint: Vector) -> Bool[np.ndarray, "points"]:
+    """Return for each point of a rock whether the rock occludes it, seen from a viewpoint."""
+    offsets = points - viewpoint
     distance = np.linalg.norm(offsets, axis=1)
-    return np.asarray(ray_distances(triangles, eye, offsets / distance[:, None]) < distance - _MIN_GAP_M)
+    return np.asarray(ray_distances(triangles, viewpoint, offsets / distance[:, None]) < distance - _MIN_GAP_M)
 
 
 def find_self_shadow(triangles: Triangles, points: Points, sun_direction: Vector) -> Bool[np.ndarray, "points"]:
@@ -155,14 +155,14 @@ def find_self_shadow(triangles: Triangles, points: Points, sun_direction: Vector
     return np.array([np.isfinite(distance) for distance in distances], dtype=bool)
 
 
-def sample_template(eye: Vector, point: Vector, half_angle_rad: float) -> Points:
+def sample_template(viewpoint: Vector, point: Vector, half_angle_rad: float) -> Points:
     """Create sample points of a template: a point, and rings around it perpendicular to the line of sight.
 
-    `half_angle_rad` is half the template's angular size, seen from the eye.
+    `half_angle_rad` is half the template's angular size, seen from the viewpoint.
     """
-    _, right, up = sight_axes(point - eye)
+    _, right, up = sight_axes(point - viewpoint)
     angles = np.linspace(0.0, 2.0 * np.pi, _RING_POINTS, endpoint=False)
-    radius_m = float(np.tan(half_angle_rad) * np.linalg.norm(point - eye))
+    radius_m = float(np.tan(half_angle_rad) * np.linalg.norm(point - viewpoint))
     ring = radius_m * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * up)
     return np.vstack([point, *(point + fraction * ring for fraction in _RING_RADII)])
 

@@ -152,15 +152,15 @@ class DriveKey:
 
 @dataclass(frozen=True)
 class SharedDrive:
-    """A drive and its images; `eye` is the position from which targets on the rock are selected.
+    """A drive and its images; `viewpoint` is the position from which targets on the rock are selected.
 
-    `eye` is the left camera at the start, or in the middle of a circle: the paper selected the targets of its circle on
-    the face that is visible from both ends of the circle.
+    `viewpoint` is the left camera at the start, or in the middle of a circle: the paper selected the targets of its
+    circle on the face that is visible from both ends of the circle.
     """
 
     run: Run
     views: tuple[View, ...]
-    eye: Float64[np.ndarray, "3"]
+    viewpoint: Float64[np.ndarray, "3"]
 
 
 def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) -> SharedDrive:
@@ -191,7 +191,7 @@ def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
     """Create a run over the drive's images and choose its target; the tracker is not called."""
     first, run, point = drive.views[0], drive.run, p.targets[p.target]
     position, head = (point.across, point.up), first.world_from_head
-    target = pick_target(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.eye)
+    target = pick_target(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.viewpoint)
     return Run.from_setup(run, target)
 
 
@@ -215,7 +215,7 @@ def evaluate_drive_visibility(drive: SharedDrive, point: PointParameters, option
     """Evaluate the visibility of a target along a drive."""
     world, rig, first = drive.run.world, drive.run.rig, drive.views[0]
     position = point.across, point.up
-    target = pick_target(world, rig, first.world_from_head, first.angles_rad, position, options, drive.eye)
+    target = pick_target(world, rig, first.world_from_head, first.angles_rad, position, options, drive.viewpoint)
     heads = [view.world_from_head for view in drive.views]
     return evaluate_visibility(world, rig, target.point_world, heads, options)
 

@@ -63,8 +63,8 @@ def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         # components along the line of sight (positive: too far) and perpendicular to it
         stop, last_error_px = run.stops[-1], errors[-1]
         error_m = stop.error_m()
-        eye = stop.stance.world_from_rover.inv().apply(stop.world_from_head.apply(run.rig.left.c.copy()))
-        line_of_sight = stop.point_rover - eye
+        viewpoint = stop.stance.world_from_rover.inv().apply(stop.world_from_head.apply(run.rig.left.c.copy()))
+        line_of_sight = stop.point_rover - viewpoint
         range_error = float(error_m @ line_of_sight / np.linalg.norm(line_of_sight))
         cross_error = float(np.sqrt(np.maximum(float(error_m @ error_m) - range_error * range_error, 0.0)))
     false_updates = int(np.count_nonzero(error_sizes_px > p.score.tracked_px))
@@ -258,8 +258,8 @@ def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
     """
     half_angle, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
     for stop, error in zip(run.stops, np.hypot(*errors_px(run).T), strict=True):
-        eye = run.rig.eyes(stop.world_from_head)[0]
-        patch = sample_template(eye, run.target.point_world, half_angle)
+        viewpoint = run.rig.eyes(stop.world_from_head)[0]
+        patch = sample_template(viewpoint, run.target.point_world, half_angle)
         sun = run.world.sun.direction(stop.time_s)
         if p.rover_shadow and rover_shades_patch(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
             return True

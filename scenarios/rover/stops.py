@@ -296,7 +296,7 @@ def pick_target(
     outline = points.RockOutline.from_triangles(triangles, eyes[0] if picking_eye is None else picking_eye, foot)
     point = outline.point(*position)
     half_rad = 0.5 * options.template_px * rig.pixel_rad
-    is_on_edge = any(_is_on_edge(triangles, foot, eye, point, half_rad) for eye in eyes)
+    is_on_edge = any(_is_on_edge(triangles, foot, viewpoint, point, half_rad) for viewpoint in eyes)
     is_lit = not bool(points.find_self_shadow(triangles, point[None], world.sun.direction(0.0))[0])
     pixel = rig.left.project(np.asarray(world_from_head.inv().apply(point.copy())))[0]
     return DesignatedTarget(point, PixelTarget(np.asarray(pixel), *angles_rad), is_on_edge, is_lit)
@@ -314,23 +314,25 @@ def evaluate_visibility(
     obliquity_deg = np.degrees(np.arccos(np.clip(to_eyes @ normal, -1.0, 1.0)))
     foot = float(world.rocks.position_m[world.target_number, 2])
 
-    def is_clear(eye: Vector) -> bool:
-        nearby = points.triangles_near_line(triangles, eye, point, half_rad)
-        is_occluded = points.find_self_occlusion(nearby, point[None], eye)[0]
-        return not is_occluded and not _is_on_edge(nearby, foot, eye, point, half_rad)
+    def is_clear(viewpoint: Vector) -> bool:
+        nearby = points.triangles_near_line(triangles, viewpoint, point, half_rad)
+        is_occluded = points.find_self_occlusion(nearby, point[None], viewpoint)[0]
+        return not is_occluded and not _is_on_edge(nearby, foot, viewpoint, point, half_rad)
 
-    in_view = all(is_clear(eye) for pair in eyes for eye in pair)
+    in_view = all(is_clear(viewpoint) for pair in eyes for viewpoint in pair)
     return Visibility(in_view, float(obliquity_deg[0]), float(obliquity_deg.max()))
 
 
-def _is_on_edge(triangles: Triangles, foot_m: float, eye: Vector, point: Vector, half_rad: float) -> bool:
+def _is_on_edge(triangles: Triangles, foot_m: float, viewpoint: Vector, point: Vector, half_rad: float) -> bool:
     """Return whether a line of sight, `half_rad` from the point, passes the rock and hits ground far behind."""
-    distance = float(np.linalg.norm(point - eye))
-    axis, right, up = points.sight_axes(point - eye)
+    distance = float(np.linalg.norm(point - viewpoint))
+    axis, right, up = points.sight_axes(point - viewpoint)
     angles = np.linspace(0.0, 2.0 * np.pi, _RING_DIRECTIONS, endpoint=False)
     ring = axis + half_rad * (np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * up)
     ring /= np.linalg.norm(ring, axis=1, keepdims=True)
     # the ground around the rock is assumed level with its foot
     descent_rates = np.maximum(-ring[:, 2], 1e-9)
-    visible_range_m = np.minimum(points.ray_distances(triangles, eye, ring), (eye[2] - foot_m) / descent_rates)
+    visible_range_m = np.minimum(
+        points.ray_distances(triangles, viewpoint, ring), (viewpoint[2] - foot_m) / descent_rates
+    )
     return bool(np.any(visible_range_m > (1.0 + BEHIND_FRACTION) * distance))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
 from marsyard.scenarios.rover.points import RockOutline
-from marsyard.scenarios.views import Eye, SiteGround, select_rocks, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, select_rocks, site_scene
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import MER, ROCKY_8, Drive, Ground, RockyGround, RoverParameters, Soil, Stance, drive, settle
 from marsyard.sim.frames import rigid
@@ -68,7 +68,7 @@ class RunWorld:
     ground: SiteGround
     rocks: RockField  #: rocks of the ground; the target's rock has the name `TARGET`, obstacles `obstacle-1`, ...
     base: Scene  #: scene at the start, without the rover
-    eye: Eye  #: position of the target and resolution of the cameras
+    viewpoint: Viewpoint  #: position of the target and resolution of the cameras
     start_distance_m: float
     sun: SunParameters
     target_number: int  #: index of the target's rock
@@ -86,13 +86,15 @@ class RunWorld:
         ground, rocks = place_rocks(p, site_ground, streams.generator("placed rocks"))
         radius = p.start.distance_m + BACKGROUND_M
         azimuth, half_angle = p.bearing_rad + np.pi, np.radians(world.background_half_deg)
-        eye = Eye(world.east_m, world.north_m, EYE_HEIGHT_M, pixel_rad, float(azimuth), float(half_angle), radius)
+        viewpoint = Viewpoint(
+            world.east_m, world.north_m, EYE_HEIGHT_M, pixel_rad, float(azimuth), float(half_angle), radius
+        )
         clouds = None
         if p.clouds is not None:
             height = float(ground.surface.height(world.east_m, world.north_m))
             clouds = CloudLayer.draw(p.clouds, streams.generator("clouds"), ground_m=height)
         scene = replace(
-            site_scene(ground, eye, p.sun.sun_in_interval(0, ground.site.environment.sun_radius_rad)),
+            site_scene(ground, viewpoint, p.sun.sun_in_interval(0, ground.site.environment.sun_radius_rad)),
             mesh_finest_m=MESH_FINEST_M,
             mesh_reach_m=radius,
             mesh_lines=_mesh_lines(radius),
@@ -104,7 +106,7 @@ class RunWorld:
         offsets = objects.spheres[bodies, :2] - rocks.position_m[number][:2]
         nearest = bodies[np.argmin(np.linalg.norm(offsets, axis=1))]
         first, end = objects.first_triangle[nearest : nearest + 2]
-        return cls(ground, rocks, scene, eye, p.start.distance_m, p.sun, number, objects.triangles[first:end])
+        return cls(ground, rocks, scene, viewpoint, p.start.distance_m, p.sun, number, objects.triangles[first:end])
 
     def face_distance_m(self, p: RoverScenarioParameters) -> float:
         """Compute the horizontal distance of the designated point from the rock's centre towards the start, metres.
@@ -113,8 +115,10 @@ class RunWorld:
         """
         bearing, foot = p.bearing_rad, self.rocks.position_m[self.target_number]
         to_start = np.array([np.sin(bearing), np.cos(bearing), 0.0])
-        eye = foot + (p.start.distance_m + 0.5 * p.target.diameter_m) * to_start + np.array([0.0, 0.0, EYE_HEIGHT_M])
-        outline = RockOutline.from_triangles(self.target_triangles, eye, float(foot[2]))
+        viewpoint = (
+            foot + (p.start.distance_m + 0.5 * p.target.diameter_m) * to_start + np.array([0.0, 0.0, EYE_HEIGHT_M])
+        )
+        outline = RockOutline.from_triangles(self.target_triangles, viewpoint, float(foot[2]))
         return float((outline.point(p.target.across, p.target.up) - foot) @ to_start)
 
     def scene(self, time_s: float) -> Scene:
@@ -127,10 +131,10 @@ class RunWorld:
 
     def navigation_scene(self, rays: PixelRays, world_from_camera: RigidTransform, time_s: float) -> Scene:
         """Build the scene for a camera anywhere on the route, with the rocks that it resolves, without the rover."""
-        eye = Eye.of(rays, world_from_camera, self.ground.surface)
-        eye = replace(eye, reach_m=min(eye.reach_m, NAVIGATION_ROCKS_M))
+        viewpoint = Viewpoint.of(rays, world_from_camera, self.ground.surface)
+        viewpoint = replace(viewpoint, reach_m=min(viewpoint.reach_m, NAVIGATION_ROCKS_M))
         return replace(
-            site_scene(self.ground, eye, self.scene(time_s).sun),
+            site_scene(self.ground, viewpoint, self.scene(time_s).sun),
             mesh_finest_m=MESH_FINEST_M,
             mesh_reach_m=NAVIGATION_REACH_M,
             mesh_lines=_mesh_lines(NAVIGATION_REACH_M),
@@ -140,10 +144,10 @@ class RunWorld:
     @cached_property
     def route_ground(self) -> RockyGround:
         """Ground with the rocks of the route, from the target to behind the start."""
-        centre = (self.eye.east_m, self.eye.north_m)
+        centre = (self.viewpoint.east_m, self.viewpoint.north_m)
         half_side_m = self.start_distance_m + ROUTE_MARGIN_M
         reach_m = float(np.sqrt(2.0)) * half_side_m
-        rocks = select_rocks(self.ground, replace(self.eye, half_width_rad=np.pi, reach_m=reach_m))
+        rocks = select_rocks(self.ground, replace(self.viewpoint, half_width_rad=np.pi, reach_m=reach_m))
         return RockyGround.of(self.ground.surface, rocks.triangles, centre, half_side_m)
 
     def brightness(self, time_s: float) -> float:

@@ -33,7 +33,7 @@ from marsyard.scenarios.fieldtest.run import Category, Run, simulate_elevation_m
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario, case_order
 from marsyard.scenarios.fieldtest.targets import Targets, detect_targets
 from marsyard.scenarios.parts import ScoredFlight
-from marsyard.scenarios.views import Eye, site_scene
+from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.dynamics import Resting
 from marsyard.sim.dynamics.helicopter import HelicopterParameters, draw_helicopter_flight
 from marsyard.sim.sensor.imu import true_increments
@@ -295,8 +295,8 @@ def test_sun_moves_while_rocks_are_fixed() -> None:
     assert late_scene.objects is early_scene.objects
     east, north, _ = run.flight.origin_m.tolist()
     pixel_rad = camera_optics(field_camera()).rays.pixel_rad
-    eye = Eye(east, north, key.field_test.helicopter.lowest_m, pixel_rad)
-    single_scene = site_scene(ground, eye, sun_at(run, time_s))
+    viewpoint = Viewpoint(east, north, key.field_test.helicopter.lowest_m, pixel_rad)
+    single_scene = site_scene(ground, viewpoint, sun_at(run, time_s))
     assert np.array_equal(late_scene.sun.direction, single_scene.sun.direction)
     assert late_scene.photometry == single_scene.photometry
     assert np.array_equal(late_scene.objects.triangles, single_scene.objects.triangles)

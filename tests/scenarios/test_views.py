@@ -12,8 +12,8 @@ from marsyard.scenarios.views import (
     ROCK_TRIANGLES,
     SMALLEST_ROCK_PX,
     STANCES,
-    Eye,
     SiteGround,
+    Viewpoint,
     camera_pose,
     mast_pose,
     nadir_pose,
@@ -81,10 +81,10 @@ def test_mast_pair_is_level_with_the_specified_baseline(ground: SiteGround) -> N
 
 
 def test_horizontal_view_covers_sector_and_nadir_view_disc(ground: SiteGround) -> None:
-    def make_eye(name: str, height: float, azimuth: float, elevation: float) -> Eye:
+    def make_eye(name: str, height: float, azimuth: float, elevation: float) -> Viewpoint:
         camera_preset = preset(name)
         pose = camera_pose(ground.surface, camera_preset.design, 1.0, 2.0, height, azimuth, elevation)
-        return Eye.of(PixelRays.of(camera_preset.cameras()[0]), pose, ground.surface)
+        return Viewpoint.of(PixelRays.of(camera_preset.cameras()[0]), pose, ground.surface)
 
     pancam_eye = make_eye("research-pancam", 1.5, 90.0, -10.0)
     assert pancam_eye.azimuth_rad == pytest.approx(np.radians(91.0), abs=0.01)  # left camera: 1 deg of toe-in
@@ -101,8 +101,8 @@ def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
     field = ground.rocks
     assert field is not None
     # The radius is less than half a terrain period, so that no rock occurs twice.
-    eye = Eye(2.0, 3.0, 1.5, pixel_rad=5e-3, reach_m=12.0)
-    objects = select_rocks(ground, eye)
+    viewpoint = Viewpoint(2.0, 3.0, 1.5, pixel_rad=5e-3, reach_m=12.0)
+    objects = select_rocks(ground, viewpoint)
     assert len(objects) > 100
     # Each body is at the horizontal position of its rock plus a multiple of the period.
     offsets_m = objects.spheres[:, :2] - field.position_m[objects.names, :2]
@@ -111,7 +111,7 @@ def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
     assert (np.hypot(*offsets_m.T) <= diameter).all()
     # Selected rocks have at least 0.8 of the minimum size; all rocks above 1.25 of the minimum size are selected.
     distance = np.hypot(np.hypot(objects.spheres[:, 0] - 2.0, objects.spheres[:, 1] - 3.0), 1.5)
-    limit = SMALLEST_ROCK_PX * eye.pixel_rad
+    limit = SMALLEST_ROCK_PX * viewpoint.pixel_rad
     assert (diameter / distance > 0.8 * limit).all()
     assert distance.max() <= 13.0
     all_rocks = field.near(2.0, 3.0, 11.9, detail=0)
@@ -123,16 +123,16 @@ def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
 
 def test_triangle_count_is_near_its_limit() -> None:
     rocky_ground = SiteGround.of(_make_small_site("pisgah", 1024), "ground")
-    eye = Eye(0.0, 0.0, 1.5, pixel_rad=3e-4, half_width_rad=np.radians(30.0))
+    viewpoint = Viewpoint(0.0, 0.0, 1.5, pixel_rad=3e-4, half_width_rad=np.radians(30.0))
     # The limits are approximate.
     max_triangles = ROCK_TRIANGLES + DETAIL_TRIANGLES
-    assert 0.25 * max_triangles < len(select_rocks(rocky_ground, eye).triangles) < 1.7 * max_triangles
+    assert 0.25 * max_triangles < len(select_rocks(rocky_ground, viewpoint).triangles) < 1.7 * max_triangles
 
 
 def test_ground_without_rocks_has_no_objects() -> None:
     ground_without_rocks = SiteGround.of(_make_small_site("ivanpah"), "ground")
     assert ground_without_rocks.rocks is None
-    assert len(select_rocks(ground_without_rocks, Eye(0.0, 0.0, 1.5, 1e-3))) == 0
+    assert len(select_rocks(ground_without_rocks, Viewpoint(0.0, 0.0, 1.5, 1e-3))) == 0
 
 
 def test_photometry_has_the_sky_radiance_of_the_environment(ground: SiteGround) -> None:
@@ -149,7 +149,7 @@ def test_scene_from_mast_and_nadir_has_the_terrain_heights(ground: SiteGround) -
     ):
         camera = Cahv.from_field_of_view(np.radians(45.0), (160, 120), axis=axis, right=(0.0, -1.0, 0.0))
         rays = PixelRays.of(camera)
-        frame = renderer.render(site_scene(ground, Eye.of(rays, pose, ground.surface), SUN), rays, pose)
+        frame = renderer.render(site_scene(ground, Viewpoint.of(rays, pose, ground.surface), SUN), rays, pose)
         # Distant ground is smoothed.
         points = frame.points_world()[(frame.body == -1) & (frame.range_m < 12.0)]
         assert len(points) > 5000
@@ -164,12 +164,12 @@ def test_scene_from_mast_and_nadir_has_the_terrain_heights(ground: SiteGround) -
 def test_sector_contains_the_rocks_of_the_full_circle(azimuth: float) -> None:
     """The sector has the same triangles as the full circle, also for rocks that repeat with the terrain period."""
     ground = SiteGround.of(_make_small_site("gusev", 512), "ground", seed=3)
-    full_eye = Eye(0.4, 1.0, 1.2, 4e-3, reach_m=1.4 * ground.surface.period_m)
-    eye = replace(full_eye, azimuth_rad=azimuth, half_width_rad=0.3)
-    full_circle, sector = (select_rocks(ground, entry) for entry in (full_eye, eye))
+    full_eye = Viewpoint(0.4, 1.0, 1.2, 4e-3, reach_m=1.4 * ground.surface.period_m)
+    viewpoint = replace(full_eye, azimuth_rad=azimuth, half_width_rad=0.3)
+    full_circle, sector = (select_rocks(ground, entry) for entry in (full_eye, viewpoint))
     offsets_m = full_circle.triangles[:, 0, :2] - (0.4, 1.0)
     angle_from_axis = np.abs((np.arctan2(offsets_m[:, 0], offsets_m[:, 1]) - azimuth + np.pi) % (2.0 * np.pi) - np.pi)
-    # Within 5 m of the eye, rocks outside the sector are included for their shadows.
+    # Within 5 m of the viewpoint, rocks outside the sector are included for their shadows.
     is_in_sector = (angle_from_axis <= 0.3) | (np.hypot(*offsets_m.T) <= 5.0)
     assert 0.05 < np.mean(is_in_sector) < 0.6
     np.testing.assert_array_equal(sector.triangles, full_circle.triangles[is_in_sector])

@@ -159,7 +159,7 @@ def test_image_faults_change_the_expected_pixels() -> None:
     assert np.ptp(dust_fractions) < 0.02
     # A binned pixel sums four rows: one defective pixel among them changes its value.
     assert compute_changed_fractions({"bad_pixels": 0.01})[0] > 0.02
-    late_fractions = compute_changed_fractions({"late_s": 0.5})
+    late_fractions = compute_changed_fractions({"exposure_delay_s": 0.5})
     assert late_fractions[0] == late_fractions[2] == 0.0 < late_fractions[1]
     shield_fractions = compute_changed_fractions({"heat_shield_deg": 5.0})
     # Shadows of clouds darken pixels; scattered light brightens others.

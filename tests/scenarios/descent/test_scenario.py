@@ -34,7 +34,11 @@ def test_each_catalogue_dispersion_is_reported() -> None:
     """The row has the value of each dispersion in a column that is named by the path or by the end of the path."""
     draws = load_campaign("dimes-gusev").draws(3)
     samples = {path: value for path, value in draws.items() if path != "location.terrain"}
-    settings: dict[str, Any] = {"location": dict(SMALL_WORLD["location"]), "faults": {"late_s": 0.25}, "site": "gusev"}
+    settings: dict[str, Any] = {
+        "location": dict(SMALL_WORLD["location"]),
+        "faults": {"exposure_delay_s": 0.25},
+        "site": "gusev",
+    }
     settings["terrain"] = dict(SMALL_WORLD["terrain"])
     for path, value in samples.items():
         *names, last = path.split(".")
@@ -47,7 +51,7 @@ def test_each_catalogue_dispersion_is_reported() -> None:
         parts = path.split(".")
         column = next(name for name in ("_".join(parts[start:]) for start in range(len(parts))) if name in row)
         assert row[column] == pytest.approx(value, rel=1e-9), path
-    assert (row["fault"], row["fault_size"], row["terrain"]) == ("late_s", 0.25, 0)
+    assert (row["fault"], row["fault_size"], row["terrain"]) == ("exposure_delay_s", 0.25, 0)
     campaigns = [load_campaign(name).configuration for name in catalogue()]
     dispersed_paths = {path for entry in campaigns if entry.scenario == "descent" for path in entry.dispersions}
     assert dispersed_paths == {*draws, "faults"}

@@ -15,8 +15,8 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.images import GroundTruth
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import GroundTruth
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.landing.score import landing_row, site_populations, site_row, stage_row
 from marsyard.sim.frames import rigid

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from marsyard.scenarios.landing.images import MAX_GROUNDS, World
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import MAX_GROUNDS, World
 from marsyard.scenarios.landing.scenario import LandingScenario
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import site

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from marsyard.scenarios.views import Eye, SiteGround, mast_pose, nadir_pose, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, mast_pose, nadir_pose, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
@@ -61,7 +61,7 @@ def test_footprint_does_not_change_images() -> None:
     ground = SiteGround.of(site("gusev").model_copy(update={"descent": ROCKY}))
     rays = PixelRays.of(preset("mer-descent-flown").cameras()[0].bin(4, 4))
     pose = nadir_pose(ground.surface, 300.0, 200.0, 400.0)
-    scene = site_scene(ground, Eye.of(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
+    scene = site_scene(ground, Viewpoint.of(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
     assert len(scene.objects) > 50
     frame = process_renderer(default_backend()).render(scene, rays, pose)
     full_scene = replace(scene)
@@ -81,8 +81,8 @@ def test_culling_does_not_change_images(elevation: float) -> None:
     rays = PixelRays.of(preset("research-navcam").cameras()[0].crop(400, 380, (161, 161)))
     pose = mast_pose(ground.surface, 12.0, 11.0, 1.5, 30.0, -14.0)
     for azimuth in (0.5, 3.0):
-        eye = Eye(12.0, 11.0, 1.5, rays.pixel_rad, azimuth_rad=0.5, half_width_rad=1.2, reach_m=25.0)
-        scene = site_scene(ground, eye, Sun(direction(azimuth, elevation)))
+        viewpoint = Viewpoint(12.0, 11.0, 1.5, rays.pixel_rad, azimuth_rad=0.5, half_width_rad=1.2, reach_m=25.0)
+        scene = site_scene(ground, viewpoint, Sun(direction(azimuth, elevation)))
         visible_scene = scene.restrict_to_cones([rays.cone(pose)])
         assert 0 < len(visible_scene.objects) < 0.5 * len(scene.objects)
         renderer = process_renderer(default_backend())

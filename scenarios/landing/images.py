@@ -18,7 +18,7 @@ from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, add_range_faults, raise_sun_deg
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
-from marsyard.scenarios.views import Eye, SiteGround, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage, LandingMeasurements
 from marsyard.sim.render import Frame, Sun
@@ -92,8 +92,10 @@ def take_images(p: LandingScenarioParameters, world: World, flight: Flight, opti
     shadow_disc_m = max(p.lander.caster_diameter_m, p.faults.vehicle_shadow_m)
     lowest = min(flight.states, key=lambda state: float(state.position_m[2]))
     # one scene for both images, with the level of detail for the lower image
-    eye = Eye.of(optics.rays, lowest.world_from_body, world.ground.surface)
-    scene = add_meshes(site_scene(world.ground, eye, world.sun), world.meshes, (eye.east_m, eye.north_m))
+    viewpoint = Viewpoint.of(optics.rays, lowest.world_from_body, world.ground.surface)
+    scene = add_meshes(
+        site_scene(world.ground, viewpoint, world.sun), world.meshes, (viewpoint.east_m, viewpoint.north_m)
+    )
     scene = replace(scene, caster_diameter_m=shadow_disc_m)
     noise = streams.generator("detector noise")
     frames_and_motions = [render_state(p.render.backend, scene, optics, state) for state in flight.states]
