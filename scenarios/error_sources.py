@@ -18,19 +18,23 @@ class ErrorSource:
 
     - name: short name, unique in its scenario; title: noun phrase for tables and figures
     - parameters: dotted paths of the parameters that cause the error
+    - remaining: factor of the numbers without the error; above 0 for errors that a filter on board assumes as well,
+      because it would trust its measurements without limit
     """
 
     name: str
     title: str
     parameters: tuple[str, ...]
+    remaining: float = 0.0
 
     def exact_values(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of the parameters without this error, by path; missing parameters are omitted.
 
-        A number becomes 0, a switch false, each number of a list 0, and a table None. Raises ValueError for a text.
+        A number, or each number of a list, is multiplied by `remaining`, a switch becomes false, and a table None.
+        Raises ValueError for a text.
         """
         values = {path: value for path in self.parameters for value in _find(parameters, path)}
-        return {path: _exact_value(path, value) for path, value in values.items()}
+        return {path: _exact_value(path, value, self.remaining) for path, value in values.items()}
 
 
 def _find(tree: Any, path: str) -> Iterator[Any]:
@@ -42,13 +46,13 @@ def _find(tree: Any, path: str) -> Iterator[Any]:
     yield tree
 
 
-def _exact_value(path: str, value: Any) -> Any:
+def _exact_value(path: str, value: Any, factor: float) -> Any:
     if isinstance(value, bool):
         return False
     if isinstance(value, int | float):
-        return type(value)(0)
+        return type(value)(factor * value)
     if isinstance(value, list | tuple):
-        return [_exact_value(path, item) for item in value]
+        return [_exact_value(path, item, factor) for item in value]
     if value is None or isinstance(value, Mapping):
         return None
     raise ValueError(f"{path}: a source of error must be a number, a switch or a table, not {value!r}")
@@ -72,7 +76,12 @@ def error_sources(scenario: str) -> tuple[ErrorSource, ...]:
         prefix = tables.get("prefix", "")
         tables = scenarios[tables["sources_of"]] if "sources_of" in tables else tables
         return tuple(
-            ErrorSource(name, str(table["title"]), tuple(f"{prefix}{path}" for path in table["parameters"]))
+            ErrorSource(
+                name,
+                str(table["title"]),
+                tuple(f"{prefix}{path}" for path in table["parameters"]),
+                float(table.get("remaining", 0.0)),
+            )
             for name, table in tables.items()
         )
     except (OSError, ValueError, LookupError, TypeError) as error:
