@@ -142,13 +142,13 @@ def boundary_section(subject: Subject) -> Section | None:
             ]
             for fit in fits
         ]
-        head = ["Conditions", "Cases", "Violations", "Brier skill", "Lower bound", "Calibration error", "Drawn"]
+        head = ["Conditions", "Cases", "Violations", "Brier skill", "Lower bound (95 %)", "Calibration error", "Figure"]
         drawn = [
             svg_figure(
                 figure,
                 f"boundary-{len(blocks)}-{index}",
                 f"Probability that a case violates {name}, by {' and '.join(map(label, fit.conditions))}; the other "
-                "conditions vary as in the campaign. Crosses: violations.",
+                "conditions vary as in the campaign. Shading and contours: fitted probability; crosses: violations.",
             )
             for index, (fit, figure) in enumerate(figures)
         ]
@@ -157,10 +157,12 @@ def boundary_section(subject: Subject) -> Section | None:
     if not blocks:
         return None
     note = (
-        f"The probability is fitted for each pair of at most {MAX_CONDITIONS} conditions with a significant influence "
-        "on the violations. Its validation uses predictions for terrains that were not used for the fit. The Brier "
-        "skill is the fraction of the mean square error of the violation rate that the fit removes. A fit is drawn if "
-        "the lower bound of its skill (95 %) is above 0 and its calibration error is at most "
+        f"The probability is fitted for each pair of the (at most {MAX_CONDITIONS}) conditions with a significant "
+        "influence on the violations, and validated on terrains that were left out of the fit. Brier skill: 1 - (mean "
+        "square error of the fitted probability) / (that of the constant violation rate); 0: no better than the rate, "
+        "1: perfect. "
+        f"Calibration error: mean difference between fitted probability and observed rate in {_BINS} groups of cases. "
+        "A fit is drawn if the lower bound of its skill is above 0 and its calibration error is at most "
         f"{MAX_CALIBRATION_ERROR:g}."
     )
     return Section("boundary", "Failure boundary", "Failure boundary", [*blocks, Block(note=note)], data)

@@ -26,7 +26,7 @@ from marsyard.reports.wording import count, format_fraction, label, number, spli
 #: Difference of the closure from 1 above which the contributions are not additive.
 MAX_CLOSURE_ERROR = 0.1
 #: Title of the mean square without any source of error.
-REMAINING = "images, matching and scene"
+REMAINING = "remaining without any source"
 #: Number of dispersions in the table of Sobol's indices.
 _MAX_INDICES = 12
 
@@ -58,8 +58,8 @@ def budget_sentences(study: Mapping[str, Any]) -> list[str]:
         )
         sentences += [
             f"{study['requirement']}: {_statistic(result)} of {label(result['quantity'])}: {number(math.sqrt(total))} "
-            f"with all sources of error, {_signed_root(budget['remaining'])} without any, in "
-            f"{budget['common']} of {count(int(result['cases']), 'base case')} with an error in all configurations.",
+            f"with all sources of error, {_signed_root(budget['remaining'])} without any, from the {budget['common']} "
+            f"of {count(int(result['cases']), 'base case')} that were answered in every configuration.",
             f"Largest contributions to the mean square: {largest}; "
             f"{REMAINING} {signed_percent(budget['remaining'] / total)}.",
             _closure_sentence(budget, float(study["confidence"])),
@@ -70,7 +70,10 @@ def budget_sentences(study: Mapping[str, Any]) -> list[str]:
             f"Largest total Sobol indices: {first}, from {count(int(result['index_samples']), 'base sample')}."
         )
     elif study["sobol"]:
-        sentences.append("Sobol indices are not available: fewer than 8 complete base samples, or equal errors.")
+        sentences.append(
+            "Sobol indices are not available: fewer than 8 base samples were answered in all their cases, or all "
+            "errors are equal."
+        )
     if result.get("reason"):
         sentences.append(str(result["reason"]))
     return [*sentences, f"The study ran {count(int(result['evaluated']), 'case')}."]
@@ -83,9 +86,9 @@ def _statistic(result: Mapping[str, Any]) -> str:
 def _closure_sentence(budget: Mapping[str, Any], confidence: float) -> str:
     bounds = f"{signed_percent(budget['closure_lower'])} to {signed_percent(budget['closure_upper'])}"
     interval = f"{format_fraction(confidence)} interval {bounds}"
-    text = f"The contributions add up to {signed_percent(budget['closure'])} of the total ({interval})"
+    text = f"Contributions and remaining part add up to {signed_percent(budget['closure'])} of the total ({interval})"
     if abs(budget["closure"] - 1.0) > MAX_CLOSURE_ERROR:
-        return f"{text}: interactions of three or more sources matter, and the contributions are not additive."
+        return f"{text}: three or more sources interact, so that the contributions do not add up."
     return f"{text}."
 
 
@@ -112,7 +115,7 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
     root_unit = f", {unit}" if unit else ""
     head = [
         "Source of error", "Contribution", f"{format_fraction(confidence)} interval", "Interaction",
-        f"Alone{root_unit}", f"Without{root_unit}", f"Answered of {n_cases}",
+        f"With it only{root_unit}", f"Without it{root_unit}", f"Answered of {n_cases}",
     ]  # fmt: skip
     rows = [
         [
@@ -134,17 +137,20 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
         _draw_waterfall(budget, f"mean square of {name}, ({unit})²" if unit else f"mean square of {name}"),
         "budget-waterfall",
         f"Mean square of {name} without any source of error, contributions of the sources, and "
-        "mean square with all sources. Lines: intervals.",
+        "mean square with all sources. Black lines: intervals.",
         wide=True,
     )
-    inactive = f" Not in this campaign: {'; '.join(result['inactive'])}." if result["inactive"] else ""
+    inactive = (
+        f" Sources that this campaign does not have: {'; '.join(result['inactive'])}." if result["inactive"] else ""
+    )
     note = (
-        "Each base case runs with the same dispersions and random streams in all configurations. 'Alone' is the "
-        f"{statistic} with the source and no other source, 'Without' that with all other sources; 'Answered' gives the "
-        "numbers of base cases with an error, alone and without. The contribution is the mean of two changes of the "
-        "mean square: adding the source to none, and to all others. The interaction is half of their difference. "
-        "Intervals: bootstrap over terrains. "
-        f"{_closure_sentence(budget, confidence)}{inactive}"
+        "Each base case runs with the same dispersions and random streams in all configurations. 'With it only' is the "
+        f"{statistic} with this source and no other, 'Without it' that with all other sources; both include the part "
+        "that remains without any source. 'Answered' is the number of answered base cases, with the source only and "
+        "without it. The contribution is the mean of two increases of the mean square: if the source is added to no "
+        "other source, and if it is added to all others. The interaction is half of the second minus the first. "
+        f"Intervals: bootstrap over terrains. {count(int(result['violations']), 'base case')} with all sources "
+        f"violate the requirement.{inactive}"
     )
     return Block("Sources of error", figures=[figure], grid=Grid(head, rows), note=note)
 
@@ -167,12 +173,12 @@ def _index_block(result: Mapping[str, Any]) -> Block:
     note = (
         f"Saltelli's design with {count(int(result['index_samples']), 'complete base sample')}. The first-order index "
         "is the fraction of the variance that a variable causes alone, the total index the fraction with all its "
-        "interactions. Correlated dispersions are represented by their independent variables. An index whose interval "
-        "contains 0 is not significant."
+        "interactions. Correlated dispersions are represented by their independent variables. The "
+        "intervals are bootstrap intervals; an index whose interval contains 0 is not significant."
     )
     return Block(
         "Sobol indices",
-        grid=Grid(["Variable", "Total", "First order"], rows, max(len(indices) - _MAX_INDICES, 0)),
+        grid=Grid(["Variable", "Total index", "First-order index"], rows, max(len(indices) - _MAX_INDICES, 0)),
         note=note,
     )
 

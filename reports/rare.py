@@ -69,8 +69,9 @@ def result_sentences(study: Mapping[str, Any]) -> list[str]:
     sentences.append(cost)
     if not all(replicate["reached"] for replicate in result["replicates"]):
         sentences.append(
-            "Some replicates reached no violation before their levels became less likely than a hundredth of the "
-            "limit. The probability of their last level is an upper limit, and the lower bound is 0."
+            "Some replicates stopped without a violation, at levels less likely than a hundredth of the limit. The "
+            "probability of their last level is used as an upper limit of their estimate; the lower bound of the "
+            "interval is 0."
         )
     additional = result.get("additional_cases")
     if additional:
@@ -102,8 +103,9 @@ def rare_section(subject: Subject) -> Section | None:
     ]
     grid = Grid(["Replicate", "Probability", "Levels", "Violation reached"], rows)
     note = (
-        "Each replicate is an independent subset simulation. Each level contains a tenth of the cases of the "
-        "previous level. The error that one replicate estimates for itself is too small. "
+        "Each replicate is an independent subset simulation. A tenth of the cases of each level "
+        "reaches the next one. The standard error within one replicate is too small, since its "
+        "cases are correlated. "
         + (
             "The interval comes from the spread of the replicates."
             if study["method"] == "subset"
@@ -113,8 +115,8 @@ def rare_section(subject: Subject) -> Section | None:
     figure = svg_figure(
         _draw_levels(replicates, float(study["max_probability"])),
         "rare-levels",
-        "Probability that a case has at most a margin. Each line is one replicate; a violation is a margin below 0. "
-        "Dashed: limit of the probability.",
+        "Probability that the margin of a case is at most the value on the horizontal axis. Each line is one "
+        "replicate; a violation is a margin below 0. Dashed: limit of the probability.",
     )
     blocks = (Block("Replicates", figures=[figure], grid=grid, note=note),)
     data = {
@@ -140,5 +142,5 @@ def _draw_levels(replicates: list[Mapping[str, Any]], max_probability: float) ->
     axes.axhline(max_probability, color=REQUIREMENT, linestyle="--", linewidth=1.0)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, _: probability_text(value))
-    axes.set(xlabel="margin, unit of the requirement", ylabel="probability of at most this margin")
+    axes.set(xlabel="margin (unit of the requirement's bound)", ylabel="probability of a margin at or below")
     return figure

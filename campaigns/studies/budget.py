@@ -128,7 +128,7 @@ class Budget:
 
     - contributions: one per source, the largest first
     - total, total_lower, total_upper: mean square with all sources, and bounds of its interval
-    - remaining: mean square without any source, caused by images, matching and scene
+    - remaining: mean square without any source, for example caused by images, matching and scene
     - closure, closure_lower, closure_upper: (remaining + sum of the means of the contributions) / total
     - common: number of base cases with an error in all configurations
     """
@@ -273,8 +273,9 @@ class _Study:
         budget = compute_budget(errors, groups, self._sources, self._is_centred, settings.confidence)
         if budget is None and n and not reason:
             reason = (
-                f"Fewer than {MIN_COMMON} base cases have an error in all configurations, or all errors are equal, so "
-                "that there is no budget."
+                f"No budget: fewer than {MIN_COMMON} base cases were answered in every configuration, or all errors "
+                "are "
+                "equal."
             )
         return BudgetResult(
             self._quantity,

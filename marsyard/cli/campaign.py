@@ -127,7 +127,7 @@ def resume(
 def append(
     directory: options.DirectoryArgument,
     cases: Annotated[
-        int, Argument(metavar="N", help="Number of cases to add; for a study of rare violations, of replicates.", min=1)
+        int, Argument(metavar="N", help="Number of cases to add; for a study of `marsyard rare`, of replicates.", min=1)
     ],
     jobs: options.JobsOption = None,
     cluster: options.ClusterOption = None,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from marsyard.campaigns.studies.rare import RareResult
     from marsyard.campaigns.studies.search import SearchResult
 
-MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Maximum number of cases of the study.")]
+MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Limit on all cases of the study.")]
 
 
 @dataclass(frozen=True)
@@ -26,15 +26,15 @@ class RareOptions:
     """Arguments and options of `marsyard rare`."""
 
     campaign: options.CampaignArgument
-    requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign whose violations are rare.")]
+    requirement: Annotated[str, Option(metavar="ID", help="Requirement whose violation probability is estimated.")]
     max_probability: Annotated[
         float, Option(metavar="P", help="Maximum probability of a violation per case, such as 1e-4.")
     ] = 1e-4
     method: Annotated[
-        str, Option(metavar="METHOD", help="subset, or importance: importance sampling after the subset simulations.")
+        str, Option(metavar="METHOD", help="subset, or importance: subset simulation followed by importance sampling.")
     ] = "subset"
     samples: Annotated[int, Option(metavar="N", help="Cases per level of a subset simulation.")] = 200
-    replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, from 2.")] = 6
+    replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, at least 2.")] = 6
     importance_cases: Annotated[int, Option(metavar="N", help="Cases of importance sampling.")] = 600
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the interval.")] = 0.9
     max_cases: MaxCasesOption = 20_000
@@ -78,9 +78,13 @@ class SearchOptions:
     """Arguments and options of `marsyard search`."""
 
     campaign: options.CampaignArgument
-    requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign to be violated.")]
-    cases: Annotated[int, Option("-n", "--cases", metavar="N", help="Number of cases to search with.")] = 300
-    restarts: Annotated[int, Option(metavar="N", help="Number of evolution strategies.")] = 3
+    requirement: Annotated[str, Option(metavar="ID", help="Requirement for which violations are searched.")]
+    cases: Annotated[
+        int, Option("-n", "--cases", metavar="N", help="Cases of the search, without those that reduce violations.")
+    ] = 300
+    restarts: Annotated[
+        int, Option(metavar="N", help="Number of optimizer (CMA-ES) runs from different starting cases.")
+    ] = 3
     failures: Annotated[int, Option(metavar="N", help="Maximum number of violations to reduce.")] = 5
     max_cases: MaxCasesOption = 5_000
     seed: options.SeedOption = None
@@ -94,7 +98,10 @@ class SearchOptions:
 @options.handle_user_errors
 @options.with_options(SearchOptions)
 def search(arguments: SearchOptions) -> None:
-    """Search for violations of a requirement, and reduce each to the few parameters that cause it."""
+    """Search for violations of a requirement, and reduce each to the few parameters that cause it.
+
+    Exit status: 1 if violations are found, otherwise 0.
+    """
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.studies.search import SearchSettings, start_search
 
@@ -115,10 +122,16 @@ class BudgetOptions:
     """Arguments and options of `marsyard budget`."""
 
     campaign: options.CampaignArgument
-    requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign whose metric is the error.")]
-    cases: Annotated[int, Option("-n", "--cases", metavar="N", help="Base cases, each in all configurations.")] = 100
+    requirement: Annotated[str, Option(metavar="ID", help="Requirement whose metric is analysed as the error.")]
+    cases: Annotated[
+        int, Option("-n", "--cases", metavar="N", help="Base cases. Each runs 2 k + 2 times for k sources of error.")
+    ] = 100
     sobol: Annotated[
-        int, Option(metavar="N", help="Base samples of Sobol indices of the dispersions, a power of 2; 0: none.")
+        int,
+        Option(
+            metavar="N",
+            help="Base samples (a power of 2) of Sobol indices of the d dispersions: N (d + 3) more cases; 0: none.",
+        ),
     ] = 0
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the intervals.")] = 0.9
     seed: options.SeedOption = None
@@ -132,7 +145,7 @@ class BudgetOptions:
 @options.handle_user_errors
 @options.with_options(BudgetOptions)
 def budget(arguments: BudgetOptions) -> None:
-    """Compute the error budget: remove each source of error, and keep each one alone, in the same cases."""
+    """Compute the error budget: run the same cases without each source of error, and with each one alone."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.studies.budget import BudgetSettings, start_budget
 
