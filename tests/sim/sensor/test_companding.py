@@ -24,8 +24,9 @@ def test_step_width_grows_with_square_root_of_signal() -> None:
     steps = np.diff(expansion_table(4095).astype(float))
     middle = expansion_table(4095)[1:-1].astype(float)
     widths = 0.5 * (steps[1:] + steps[:-1])
-    # The step is proportional to the square root of the signal plus 4.3 counts; the tolerance covers its rounding.
-    np.testing.assert_allclose(widths[100:-2], 31.9 * np.sqrt((middle[100:-2] + 4.3) / 4099.0), atol=1.5)
+    # derivative of the code's inverse: sqrt((count + b) / b), with b = 4.23 for a full scale of 4095 counts; the centre of
+    # two steps is a multiple of half a count
+    np.testing.assert_allclose(widths[100:-2], np.sqrt((middle[100:-2] + 4.23) / 4.23), atol=0.75)
 
 
 def test_small_full_scale_is_rejected() -> None:
