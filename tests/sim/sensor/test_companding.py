@@ -24,8 +24,8 @@ def test_step_width_grows_with_square_root_of_signal() -> None:
     steps = np.diff(expansion_table(4095).astype(float))
     middle = expansion_table(4095)[1:-1].astype(float)
     widths = 0.5 * (steps[1:] + steps[:-1])
-    # derivative of the inverse of the code: sqrt((count + b) / b), with b = 4.23 for a full scale of 4095 counts; the mean
-    # of two steps is a multiple of half a count
+    # derivative of the inverse of the code: sqrt((count + b) / b), with b = 4.23 for a full scale of 4095 counts;
+    # the mean of two steps is a multiple of half a count
     np.testing.assert_allclose(widths[100:-2], np.sqrt((middle[100:-2] + 4.23) / 4.23), atol=0.75)
 
 
