@@ -21,7 +21,7 @@ pytestmark = [
 
 TUTORIALS = sorted((Path(__file__).parents[2] / "docs" / "tutorials").glob("*.md"))
 CODE_BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-FILE_NAME = re.compile(r"Save it as `([\w./-]+)`:\s*\Z")
+FILE_NAME = re.compile(r"Save\s+it\s+as\s+`([\w./-]+)`:\s*\Z")
 #: Files that exist after the tutorial.
 EXPECTED_FILES = {
     "first-campaign": (
