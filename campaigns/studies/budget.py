@@ -31,6 +31,7 @@ from marsyard.campaigns.studies.runner import (
     CaseLimitError,
     PointRunner,
     StudySession,
+    check_margin,
     continue_study,
     find_requirement,
     read_study,
@@ -182,12 +183,7 @@ def start_budget(
     Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
     stored, and `continue_budget` continues.
     """
-    requirement = find_requirement(campaign, settings.requirement)
-    if requirement.bound is None and requirement.margin is None:
-        raise CampaignError(
-            f"{requirement.id}: the metric '{requirement.metric}' is only true or false. Select a requirement with a "
-            "number as metric, or give it a `margin`: a column of numbers that are negative if and only if it is false"
-        )
+    check_margin(find_requirement(campaign, settings.requirement))
     sources, _ = active_sources(campaign)
     if not sources and not settings.sobol:
         scenario = campaign.configuration.scenario

@@ -30,6 +30,7 @@ from marsyard.campaigns.studies.runner import (
     CaseLimitError,
     PointRunner,
     StudySession,
+    check_margin,
     continue_study,
     find_requirement,
     read_study,
@@ -144,12 +145,7 @@ def start_rare(
     Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
     stored, and `continue_rare` continues.
     """
-    requirement = find_requirement(campaign, settings.requirement)
-    if requirement.bound is None and requirement.margin is None:
-        raise CampaignError(
-            f"{requirement.id}: the metric '{requirement.metric}' is only true or false. Give the requirement a "
-            "`margin`: a column of numbers that are negative if and only if the metric is false"
-        )
+    check_margin(find_requirement(campaign, settings.requirement))
     session = StudySession(
         executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
     )

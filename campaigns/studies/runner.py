@@ -170,6 +170,15 @@ def find_requirement(campaign: Campaign, requirement_id: str) -> Requirement:
     return requirements[requirement_id]
 
 
+def check_margin(requirement: Requirement) -> None:
+    """Raise CampaignError for a requirement whose violations have no continuous margin."""
+    if requirement.bound is None and requirement.margin is None:
+        raise CampaignError(
+            f"{requirement.id}: the metric '{requirement.metric}' is only true or false. Select a requirement with a "
+            "number as metric, or give it a `margin`: a column of numbers that are negative if and only if it is false"
+        )
+
+
 def create_study(campaign: Campaign, directory: Path, executor: str, settings: dict[str, Any]) -> None:
     """Create the folder of a study; `settings` are stored in its record. Raises StoreError like a campaign's folder."""
     identity = create_identity(campaign.configuration)

@@ -14,6 +14,8 @@ from marsyard.cli import options
 from marsyard.cli.campaign import default_directory, make_executor, show_progress
 
 if TYPE_CHECKING:
+    from marsyard.campaigns.definition.campaign import Campaign
+    from marsyard.campaigns.execution.workers import ExecutorConfig
     from marsyard.campaigns.studies.budget import BudgetResult
     from marsyard.campaigns.studies.rare import RareResult
     from marsyard.campaigns.studies.search import SearchResult
@@ -21,12 +23,35 @@ if TYPE_CHECKING:
 MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Limit on all cases of the study.")]
 
 
-@dataclass(frozen=True)
-class RareOptions:
-    """Arguments and options of `marsyard rare`."""
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """Arguments and options of all studies."""
 
     campaign: options.CampaignArgument
-    requirement: Annotated[str, Option(metavar="ID", help="Requirement whose violation probability is estimated.")]
+    requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign that the study analyses.")]
+    seed: options.SeedOption = None
+    jobs: options.JobsOption = None
+    cluster: options.ClusterOption = None
+    out: options.OutOption = None
+    override: options.SetOption = None
+    algorithm: options.AlgorithmOption = None
+
+
+def prepare_study(arguments: StudyOptions, kind: str) -> tuple[Campaign, ExecutorConfig, Path]:
+    """Return campaign, executor and folder of a study; `kind` is part of the default folder's name."""
+    from marsyard.campaigns.definition.loading import load_campaign
+
+    campaign = load_campaign(
+        arguments.campaign, arguments.override or [], None, arguments.seed, arguments.algorithm or []
+    )
+    default = default_directory(f"{campaign.configuration.name}-{kind}")
+    return campaign, make_executor(arguments.jobs, arguments.cluster), arguments.out or default
+
+
+@dataclass(frozen=True, kw_only=True)
+class RareOptions(StudyOptions):
+    """Arguments and options of `marsyard rare`."""
+
     max_probability: Annotated[
         float, Option(metavar="P", help="Maximum probability of a violation per case, such as 1e-4.")
     ] = 1e-4
@@ -38,19 +63,12 @@ class RareOptions:
     importance_cases: Annotated[int, Option(metavar="N", help="Cases of importance sampling.")] = 600
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the interval.")] = 0.9
     max_cases: MaxCasesOption = 20_000
-    seed: options.SeedOption = None
-    jobs: options.JobsOption = None
-    cluster: options.ClusterOption = None
-    out: options.OutOption = None
-    override: options.SetOption = None
-    algorithm: options.AlgorithmOption = None
 
 
 @options.handle_user_errors
 @options.with_options(RareOptions)
 def rare(arguments: RareOptions) -> None:
     """Estimate the probability of a rare violation of a requirement by subset simulation, and compare with a limit."""
-    from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.studies.rare import RareSettings, start_rare
 
     settings = RareSettings(
@@ -62,23 +80,16 @@ def rare(arguments: RareOptions) -> None:
         arguments.importance_cases,
         arguments.confidence,
     )
-    campaign = load_campaign(
-        arguments.campaign, arguments.override or [], None, arguments.seed, arguments.algorithm or []
-    )
-    executor = make_executor(arguments.jobs, arguments.cluster)
-    name = campaign.configuration.name
-    directory = arguments.out if arguments.out is not None else default_directory(f"{name}-rare")
+    campaign, executor, directory = prepare_study(arguments, "rare")
     with show_progress(directory, f"marsyard resume {directory}") as progress:
         result = start_rare(campaign, settings, arguments.max_cases, directory, executor, progress)
     finish_rare(directory, result)
 
 
-@dataclass(frozen=True)
-class SearchOptions:
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions(StudyOptions):
     """Arguments and options of `marsyard search`."""
 
-    campaign: options.CampaignArgument
-    requirement: Annotated[str, Option(metavar="ID", help="Requirement for which violations are searched.")]
     cases: Annotated[
         int, Option("-n", "--cases", metavar="N", help="Cases of the search, without those that reduce violations.")
     ] = 300
@@ -87,12 +98,6 @@ class SearchOptions:
     ] = 3
     failures: Annotated[int, Option(metavar="N", help="Maximum number of violations to reduce.")] = 5
     max_cases: MaxCasesOption = 5_000
-    seed: options.SeedOption = None
-    jobs: options.JobsOption = None
-    cluster: options.ClusterOption = None
-    out: options.OutOption = None
-    override: options.SetOption = None
-    algorithm: options.AlgorithmOption = None
 
 
 @options.handle_user_errors
@@ -102,27 +107,19 @@ def search(arguments: SearchOptions) -> None:
 
     Exit status: 1 if violations are found, otherwise 0.
     """
-    from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.studies.search import SearchSettings, start_search
 
     settings = SearchSettings(arguments.requirement, arguments.cases, arguments.restarts, arguments.failures)
-    campaign = load_campaign(
-        arguments.campaign, arguments.override or [], None, arguments.seed, arguments.algorithm or []
-    )
-    executor = make_executor(arguments.jobs, arguments.cluster)
-    name = campaign.configuration.name
-    directory = arguments.out if arguments.out is not None else default_directory(f"{name}-search")
+    campaign, executor, directory = prepare_study(arguments, "search")
     with show_progress(directory, f"marsyard resume {directory}") as progress:
         result = start_search(campaign, settings, arguments.max_cases, directory, executor, progress)
     finish_search(directory, result)
 
 
-@dataclass(frozen=True)
-class BudgetOptions:
+@dataclass(frozen=True, kw_only=True)
+class BudgetOptions(StudyOptions):
     """Arguments and options of `marsyard budget`."""
 
-    campaign: options.CampaignArgument
-    requirement: Annotated[str, Option(metavar="ID", help="Requirement whose metric is analysed as the error.")]
     cases: Annotated[
         int, Option("-n", "--cases", metavar="N", help="Base cases. Each runs 2 k + 2 times for k sources of error.")
     ] = 100
@@ -134,28 +131,16 @@ class BudgetOptions:
         ),
     ] = 0
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the intervals.")] = 0.9
-    seed: options.SeedOption = None
-    jobs: options.JobsOption = None
-    cluster: options.ClusterOption = None
-    out: options.OutOption = None
-    override: options.SetOption = None
-    algorithm: options.AlgorithmOption = None
 
 
 @options.handle_user_errors
 @options.with_options(BudgetOptions)
 def budget(arguments: BudgetOptions) -> None:
     """Compute the error budget: run the same cases without each source of error, and with each one alone."""
-    from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.studies.budget import BudgetSettings, start_budget
 
     settings = BudgetSettings(arguments.requirement, arguments.cases, arguments.sobol, arguments.confidence)
-    campaign = load_campaign(
-        arguments.campaign, arguments.override or [], None, arguments.seed, arguments.algorithm or []
-    )
-    executor = make_executor(arguments.jobs, arguments.cluster)
-    name = campaign.configuration.name
-    directory = arguments.out if arguments.out is not None else default_directory(f"{name}-budget")
+    campaign, executor, directory = prepare_study(arguments, "budget")
     with show_progress(directory, f"marsyard resume {directory}") as progress:
         result = start_budget(campaign, settings, directory, executor, progress)
     finish_budget(directory, result)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
@@ -45,6 +47,6 @@ def test_case_of_each_system_runs_without_its_error_sources(name: str) -> None:
         result = campaign.scenario.run(parameters, campaign.streams(3))
         row = {column: value for column, value in result.row.items() if "time" not in column}
         rows.append({"outcome": str(result.outcome), "answered": result.answered, **row})
-        compute_margin(rows[-1], requirement)
+        assert not math.isnan(compute_margin(rows[-1], requirement))
     assert rows[0] == pytest.approx(rows[2], nan_ok=True)
     assert rows[0] != rows[1]
