@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol, runtime_checkable
@@ -18,6 +19,7 @@ from marsyard.sim.measurements import (
     RoverMeasurements,
     TargetDesignation,
 )
+from marsyard.sim.parameters import DeprecatedNameWarning
 
 
 class VelocityOutcome(Enum):
@@ -136,9 +138,19 @@ class TargetUpdate:
     details: object | None = None
 
     @property
-    def found(self) -> bool:
+    def tracked(self) -> bool:
         """Whether this update matched the target."""
         return self.state is TrackingState.NORMAL
+
+    @property
+    def found(self) -> bool:
+        """Former name of `tracked`, accepted until 0.2."""
+        warnings.warn(
+            "TargetUpdate.found is now TargetUpdate.tracked; the former name is accepted until 0.2",
+            DeprecatedNameWarning,
+            2,
+        )
+        return self.tracked
 
 
 class TargetTracker(Protocol):

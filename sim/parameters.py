@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import tomllib
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
 from pathlib import Path
@@ -19,17 +20,23 @@ class DeprecatedNameWarning(FutureWarning):
 
 
 @cache
-def _read_names(section: str) -> Mapping[str, str]:
-    """Read the current names by deprecated name from a section: keys, columns, options, values or streams."""
+def _read_section(section: str) -> Mapping[str, Any]:
+    """Read a section of the deprecated names: keys, columns, products, options, values or streams."""
     with Path(__file__).with_name("renamed.toml").open("rb") as file:
-        names: dict[str, str] = tomllib.load(file)[section]
+        names: dict[str, Any] = tomllib.load(file)[section]
     return names
+
+
+def _read_names(section: str) -> Mapping[str, str]:
+    """Read the current names by deprecated name from a section in which each name has one current name."""
+    return _read_section(section)
 
 
 def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[str] = ()) -> str:
     """Return the current name of a key; the name itself if it is valid, or if the input contains both names."""
-    current = _read_names("keys").get(name)
-    if current is None or name in valid_keys or current not in valid_keys or current in input_keys:
+    names = _read_section("keys").get(name, [])
+    current = next((key for key in ([names] if isinstance(names, str) else names) if key in valid_keys), None)
+    if current is None or name in valid_keys or current in input_keys:
         return name
     return _warn_deprecated(name, current)
 
@@ -37,12 +44,23 @@ def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[s
 def current_column(name: str, exists: Callable[[str], bool]) -> str:
     """Return the current name of a column; the name may have the prefix "<algorithm>." of a comparison."""
     algorithm, dot, column = name.rpartition(".")
-    for deprecated, current in _read_names("columns").items():
-        match = re.fullmatch(deprecated.replace("*", r"(\d+)"), column)
-        current_name = current.replace("*", match[1]) if match and match.groups() else current
-        if match and exists(current_name):
-            return algorithm + dot + _warn_deprecated(column, current_name)
+    for current in _match_names("columns", column):
+        if exists(current):
+            return algorithm + dot + _warn_deprecated(column, current)
     return name
+
+
+def rename_products(products: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace deprecated names of a stored case's products, without a warning."""
+    current = {name: next(_match_names("products", name), name) for name in products}
+    return {name if current[name] in products else current[name]: value for name, value in products.items()}
+
+
+def _match_names(section: str, name: str) -> Iterator[str]:
+    """Yield the current names of a deprecated name; "*" in the section stands for a number."""
+    for deprecated, current in _read_names(section).items():
+        if match := re.fullmatch(deprecated.replace("*", r"(\d+)"), name):
+            yield current.replace("*", match[1]) if match.groups() else current
 
 
 def current_options(arguments: Sequence[str]) -> list[str]:
@@ -88,12 +106,30 @@ class Parameters(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _rename_deprecated_keys(cls, values: Any) -> Any:
-        if not isinstance(values, Mapping) or cls.model_fields.keys() >= values.keys():
+        if not isinstance(values, Mapping):
             return values
-        return {
-            current_key(name, cls.model_fields, values) if isinstance(name, str) else name: value
+        if not cls.model_fields.keys() >= values.keys():
+            values = _rename_keys(values, cls.model_fields)
+        # pydantic calls no validator of this class for tables that are data classes, such as options of algorithms
+        options = {
+            name: _rename_keys(value, field_names(cls.model_fields[name].annotation))
             for name, value in values.items()
+            if isinstance(value, Mapping) and name in cls.model_fields
         }
+        return {**values, **options} if options else values
+
+
+def field_names(kind: Any) -> set[str]:
+    """Return the names of the fields of a data class; empty for any other type."""
+    return {field.name for field in fields(kind)} if is_dataclass(kind) else set()
+
+
+def _rename_keys(values: Mapping[Any, Any], valid_keys: Collection[str]) -> dict[Any, Any]:
+    """Replace deprecated keys of a table by keys in `valid_keys`, with warnings."""
+    return {
+        current_key(name, valid_keys, values) if isinstance(name, str) else name: value
+        for name, value in values.items()
+    }
 
 
 def merge_settings(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

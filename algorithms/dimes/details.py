@@ -76,12 +76,12 @@ class DimesDetails:
 
     - pairs: Both pairs of images; empty for unusable times, altitudes or attitudes
     - combinations: All combinations of valid tracks, best agreement with the IMU first
-    - chosen: The combination of the reported velocity, or None
+    - selected: The combination of the reported velocity, or None
     """
 
     pairs: tuple[PairDetails, ...]
     combinations: tuple[Combination, ...]
-    chosen: Combination | None
+    selected: Combination | None
 
     @property
     def tracks(self) -> tuple[Track, ...]:
@@ -132,10 +132,11 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
     `match_<pair>_<k>` (row, column) for every track; `overlap_<pair>` (pixels of the earlier image) and
     `zero_phase_<pair>` (pixels of both images); `gsd_<pair>` (metres); `rectified_frame_<pair>` and
     `rectified_<pair>_<side>` (see `rectified_lattice`; side 0 is the earlier image); `combinations` (first, second,
-    discrepancy_m_s) with `combinations_columns`, and `chosen` (first, second; empty for none). Widths are in rectified
-    pixels, contrasts per binned pixel, pixels (u, v) binned, ground in metres (see `Track`); `failed_...` are 0 or 1.
+    discrepancy_m_s) with `combinations_columns`, and `selected` (first, second; empty for none). Widths are in
+    rectified pixels, contrasts per binned pixel, pixels (u, v) binned, ground in metres (see `Track`); `failed_...` are
+    0 or 1.
     """
-    chosen = () if details.chosen is None else (details.chosen.first, details.chosen.second)
+    selected = () if details.selected is None else (details.selected.first, details.selected.second)
     rows = []
     for track in details.tracks:
         metrics, vectors = track.metrics, (*track.velocity_m_s, *track.ground_m)
@@ -151,7 +152,7 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
         "tracks_columns": list(TRACK_COLUMNS),
         "combinations": np.array(combination_rows, dtype=np.float64).reshape(-1, 3),
         "combinations_columns": ["first", "second", "discrepancy_m_s"],
-        "chosen": np.array(chosen, dtype=np.float64),
+        "selected": np.array(selected, dtype=np.float64),
     }
     for number, pair in enumerate(details.pairs):
         products[f"overlap_{number}"] = pair.overlap_polygon

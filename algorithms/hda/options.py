@@ -67,9 +67,9 @@ class HdaOptions:
     - grid_px: Spacing of the grid of pixels that are matched for structure
     - search_half_px: Half width of the windows compared along epipolar segments, pixels
     - min_match_correlation: Minimum correlation (Eq. 3) of a structure match
-    - max_return_px: Maximum forward-backward error, pixels: each structure match is matched back from the second image
-      to the first, and rejected if it ends farther from its start. None: no check, as in the paper. Both searches use
-      whole pixels near a line, with errors of up to 0.7 px.
+    - max_forward_backward_px: Maximum forward-backward error, pixels: each structure match is matched back from the
+      second image to the first, and rejected if it ends farther from its start. None: no check, as in the paper. Both
+      searches use whole pixels near a line, with errors of up to 0.7 px.
     - min_points: Minimum number of points for an elevation map
     - surface_frame: Source of the vertical direction
     - lander_diameter_m: Side of the lander's footprint, by which hazards are dilated (section III). Helicopter: 2 m.
@@ -109,7 +109,7 @@ class HdaOptions:
     grid_px: int = 8
     search_half_px: int = 5
     min_match_correlation: float = 0.7
-    max_return_px: float | None = None
+    max_forward_backward_px: float | None = None
     min_points: int = 100
     surface_frame: SurfaceFrame = SurfaceFrame.INCLINOMETER
     lander_diameter_m: float = 2.0
@@ -152,12 +152,18 @@ _NAMES_BY_MINIMUM = {
 }
 #: Names of the options that must be positive.
 _POSITIVE_NAMES = (
-    *("robust_px", "max_return_px", "narrowest_hazard", "max_residual_px"),
+    *("robust_px", "max_forward_backward_px", "narrowest_hazard", "max_residual_px"),
     *("lander_diameter_m", "max_slope_rad", "max_roughness_m"),
 )
 
 
 #: Options of `hda-plus` that differ from the published algorithm.
 IMPROVEMENTS: Mapping[str, Any] = MappingProxyType(
-    {"track_seed": TrackSeed.POSE, "align": True, "max_return_px": 1.5, "refine_planes": True, "check_footprints": True}
+    {
+        "track_seed": TrackSeed.POSE,
+        "align": True,
+        "max_forward_backward_px": 1.5,
+        "refine_planes": True,
+        "check_footprints": True,
+    }
 )

@@ -19,12 +19,15 @@ from marsyard.algorithms.hda.options import HdaOptions
 
 
 class MatchStatus(IntEnum):
-    """Result of a structure match: accepted, or the failed check (correlation, depth bounds, reverse match)."""
+    """Result of a structure match: accepted, or the failed check.
+
+    The checks are correlation, depth bounds and forward-backward consistency.
+    """
 
     ACCEPTED = 0
     DISSIMILAR = 1
     OUT_OF_BOUNDS = 2
-    NOT_RETURNED = 3
+    INCONSISTENT = 3
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ def match_pixels(
     The match is the minimum sum of absolute differences (Eq. 9) on the segment, refined by the biquadratic peak of the
     correlations around it. (The paper has "the maximum SAD value"; the best match is the minimum.) Pixels whose segment
     is partly outside the second image are omitted. Accepted matches pass the limits on correlation and depth and, with
-    `max_return_px`, the check of the reverse match.
+    `max_forward_backward_px`, the check of forward-backward consistency.
     """
     first, second = views
     border = options.search_half_px + 1  # one pixel more for the neighbours of the peak
@@ -130,13 +133,13 @@ def match_pixels(
     statuses = np.full(len(pixels), MatchStatus.ACCEPTED, dtype=np.uint8)
     statuses[~((depths > bounds_m[0]) & (depths < bounds_m[1]))] = MatchStatus.OUT_OF_BOUNDS
     statuses[~(correlations >= options.min_match_correlation)] = MatchStatus.DISSIMILAR
-    if options.max_return_px is not None:
+    if options.max_forward_backward_px is not None:
         indices = np.flatnonzero(statuses == MatchStatus.ACCEPTED)
         accepted_matches = (rounded[indices], matches[indices], coordinates[indices])
         errors_px = forward_backward_error(
             views, second_from_first, *accepted_matches, bounds_m, options.search_half_px
         )
-        statuses[indices[errors_px > options.max_return_px]] = MatchStatus.NOT_RETURNED
+        statuses[indices[errors_px > options.max_forward_backward_px]] = MatchStatus.INCONSISTENT
     is_accepted = statuses == MatchStatus.ACCEPTED
     points = points_at_depth(coordinates[is_accepted], depths[is_accepted])
     return Matches(pixels, starts, ends, matched_pixels, correlations, depths, statuses, points)

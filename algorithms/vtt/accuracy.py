@@ -162,7 +162,7 @@ def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration, d
     mast's elevation axis.
     """
     position = update.position_rover
-    if not update.found or position is None:
+    if not update.tracked or position is None:
         return HandOff(HandOffOutcome.NOT_TRACKED, None)
     if not goal.is_met(position):
         return HandOff(HandOffOutcome.NOT_AT_GOAL, None)

@@ -51,7 +51,7 @@ def make_noise_free_detector(camera: str) -> DetectorParameters:
 
 def draw_exact_parameters(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
     """Draw parameters of an image pair as in `hda-map`, with attitudes of a helicopter and without errors."""
-    no_errors = {"position_m": 0.0, "motion_m": 0.0, "tilt_deg": 0.0, "azimuth_deg": 0.0, "turn_deg": 0.0}
+    no_errors = {"position_m": 0.0, "motion_m": 0.0, "tilt_deg": 0.0, "azimuth_deg": 0.0, "rotation_deg": 0.0}
     east, north = rng.uniform(0.0, 102.4, 2)
     roll, pitch, yaw = rng.normal(0.0, 2.0, 3)
     return LandingScenarioParameters.model_validate(

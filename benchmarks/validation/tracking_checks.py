@@ -140,7 +140,7 @@ def _simulate_designation(number: int, camera: str) -> tuple[float, float] | Non
     row = fixed_conditions(parameters, run)
     if not row["selectable"]:
         return None
-    error = _range_error_m(run) if run.stops[0].update.found else float("nan")
+    error = _range_error_m(run) if run.stops[0].update.tracked else float("nan")
     return error, _expected_range_error_m(run, float(row["disparity_error_start_px"]))
 
 

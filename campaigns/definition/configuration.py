@@ -20,7 +20,7 @@ from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Gri
 from marsyard.scenarios.interface import Scenario
 from marsyard.scenarios.systems import UnknownScenarioError, row_columns, scenario
 from marsyard.sim.files import check_regular
-from marsyard.sim.parameters import DeprecatedNameWarning, Parameters, current_column, current_key
+from marsyard.sim.parameters import DeprecatedNameWarning, Parameters, current_column, current_key, field_names
 
 Model = TypeVar("Model", bound=BaseModel)
 #: Location of a key in nested tables and lists: names and indices.
@@ -314,6 +314,7 @@ def current_path(model: type[BaseModel], path: str) -> str:
     parts = []
     for part in path.split("."):
         fields = {name for option in _list_models(kind) for name in option.model_fields}
+        fields = fields.union(*map(field_names, _list_alternatives(kind)))
         parts.append(current_key(part, fields))
         kind = _find_inner_type(kind, int(part) if part.isdigit() else parts[-1])
     return ".".join(parts)

@@ -175,9 +175,9 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
         show_image(axes, images[0])
     limits = {"xlim": overlay_axes.get_xlim(), "ylim": overlay_axes.get_ylim()}
     if np.isfinite(maps.pixels).all():
-        known_safety = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
+        mapped_safety = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
         overlay_axes.pcolormesh(
-            maps.pixels[..., 0], maps.pixels[..., 1], known_safety, shading="nearest", alpha=0.38,
+            maps.pixels[..., 0], maps.pixels[..., 1], mapped_safety, shading="nearest", alpha=0.38,
             vmin=0, vmax=2, cmap=SAFETY_COLOURS, rasterized=True, linewidth=0.0,
         )  # fmt: skip
     overlay_axes.set(**limits)

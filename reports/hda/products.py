@@ -150,12 +150,14 @@ def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
     pixels, cell_m = check_shape(products.get("map_pixels"), *maps[0].shape, 2), _read_positive(products, "cell")
     if frames is None or pixels is None or cell_m is None or not np.all(frames[-1] > 0.0):
         return None
-    is_known = np.isfinite(pixels).all(axis=-1)
-    if not is_known.all() and is_known.sum() >= 3:
-        # extrapolate unknown pixels by an affine map fitted to the known pixels; exact for level ground
-        cells = np.concatenate([np.moveaxis(np.indices(is_known.shape), 0, -1), np.ones((*is_known.shape, 1))], axis=-1)
-        affine = np.linalg.lstsq(cells[is_known], pixels[is_known], rcond=None)[0]
-        pixels = np.where(is_known[..., None], pixels, cells @ affine)
+    is_finite = np.isfinite(pixels).all(axis=-1)
+    if not is_finite.all() and is_finite.sum() >= 3:
+        # extrapolate missing pixels by an affine map fitted to the other pixels; exact for level ground
+        cells = np.concatenate(
+            [np.moveaxis(np.indices(is_finite.shape), 0, -1), np.ones((*is_finite.shape, 1))], axis=-1
+        )
+        affine = np.linalg.lstsq(cells[is_finite], pixels[is_finite], rcond=None)[0]
+        pixels = np.where(is_finite[..., None], pixels, cells @ affine)
     (site,) = read_arrays(products, {"site": (2,)}, finite=True) or [np.full(2, np.nan)]
     names = ("elevation_m", "roughness_m", "slope_rad", "safety", "corner_m", "apriori", "surface_from_camera")
     arrays = dict(zip((*names, "world_from_surface", "limits"), (*maps, *frames), strict=True))
@@ -164,7 +166,7 @@ def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
 
 def read_ground_truth(products: Mapping[str, Any]) -> GroundTruth | None:
     """Read the ground truth; None if missing."""
-    positions = check_shape(products.get("true_places"), None, None, 2)
+    positions = check_shape(products.get("true_positions"), None, None, 2)
     heights = to_matrix(products.get("true_heights"))
     frames = read_arrays(products, {"camera_true": (4, 4), "true_corner": (2,)}, finite=True)
     spacing_m = _read_positive(products, "true_spacing")

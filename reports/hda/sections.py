@@ -69,7 +69,7 @@ THRESHOLD = kinds.SectionDeclaration(
                     kinds.pooled_fraction("footprints_called_safe_unsafe", "footprints_called_safe"),
                 ),
                 kinds.Rate(
-                    "found",
+                    "site_reported",
                     "Site reported, if a wide safe site exists",
                     kinds.flag_rate("site_reported", "wide_site_exists"),
                     False,
@@ -298,7 +298,7 @@ def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
     has_narrow_site = rates.flag_mask(frame, "safe_site_exists") & ~has_wide_site
     is_correct = is_refused | (is_reported & is_safe)
     fractions = {
-        "chosen sites that are truly safe": rates.fraction_of(is_safe[is_reported], frame[is_reported]),
+        "selected sites that are truly safe": rates.fraction_of(is_safe[is_reported], frame[is_reported]),
         "answer 'no safe site' if none exists": rates.fraction_of(
             is_refused[has_no_safe_site], frame[has_no_safe_site]
         ),

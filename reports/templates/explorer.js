@@ -103,9 +103,9 @@
   };
   const open = (k) => {
     detail.replaceChildren();
-    plot.querySelector(".chosen")?.remove();
+    plot.querySelector(".selected")?.remove();
     if (k < 0) { line(detail, "p", "No such case among the points."); return; }
-    if (place[k]) make(plot, "circle", {cx: place[k][0], cy: place[k][1], r: 9, class: "chosen"});
+    if (place[k]) make(plot, "circle", {cx: place[k][0], cy: place[k][1], r: 9, class: "selected"});
     number.value = data.cases[k];
     line(detail, "h3", `Case ${data.cases[k]}: ${data.outcomes[data.outcome[k]]}`);
     const list = document.createElement("dl");

@@ -121,7 +121,7 @@ def read_stops(products: Mapping[str, Any]) -> list[StopImages]:
         if left is None:
             return stops
         state = states[number - 1] if isinstance(states, list) and number <= len(states) else ""
-        shapes = {"corners": (2, 2), "window": (4,), "found": (2, 2), "point": (2,)}
+        shapes = {"corners": (2, 2), "window": (4,), "matches": (2, 2), "point": (2,)}
         pixels = [_read_or_nan(products.get(f"stop_{number}_{name}"), *shape) for name, shape in shapes.items()]
         stops.append(
             StopImages(
@@ -130,7 +130,7 @@ def read_stops(products: Mapping[str, Any]) -> list[StopImages]:
                 left=left,
                 right=to_matrix(products.get(f"stop_{number}_right")),
                 quantities={name: float(array[number - 1]) for name, array in arrays.items() if number <= array.size},
-                **dict(zip(("corners", "window", "matches", "point"), pixels, strict=True)),
+                **dict(zip(shapes, pixels, strict=True)),
             )
         )
     return stops
@@ -139,8 +139,8 @@ def read_stops(products: Mapping[str, Any]) -> list[StopImages]:
 def read_rover_path(products: Mapping[str, Any]) -> RoverPath | None:
     """Read the top view of the run; None if missing."""
     target = numeric_product(products.get("target_m"))
-    stops, estimated = _read_positions(products.get("rover_true_m")), _read_positions(products.get("rover_believed_m"))
-    estimates = _read_positions(products.get("target_believed_m"))
+    stops, estimated = _read_positions(products.get("rover_true_m")), _read_positions(products.get("rover_estimated_m"))
+    estimates = _read_positions(products.get("target_estimated_m"))
     if target is None or target.shape != (3,) or not stops.size or len({*map(len, (stops, estimates, estimated))}) > 1:
         return None
     path, rocks = _read_positions(products.get("path_true_m")), check_shape(products.get("rocks_m"), None, 3)

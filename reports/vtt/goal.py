@@ -40,7 +40,7 @@ def is_tracking(frame: pd.DataFrame) -> bool:
 
 def is_closed_loop(frame: pd.DataFrame) -> bool:
     """Whether the tracker guides the rover; in other campaigns, many targets are tracked in the same images."""
-    return is_tracking(frame) and "skip" not in frame
+    return is_tracking(frame) and "skipped_stops" not in frame
 
 
 def selectable_targets(frame: pd.DataFrame) -> pd.DataFrame:
@@ -74,7 +74,7 @@ def summarize_cameras(runs: Rows) -> list[dict[str, Any]]:
                 "completed": rates.fraction_of(is_completed, camera_rows),
                 "tracked": rates.flag_fraction(camera_rows, "tracked"),
                 "within": rates.fraction_of(error <= MAX_ERROR_M, completed_runs),
-                "false_tracks": rates.flag_fraction(camera_rows, "true_track", value=False),
+                "false_tracks": rates.flag_fraction(camera_rows, "no_false_track", value=False),
                 "median_m": rates.quantile(error, 0.5),
                 "quantile_m": rates.quantile(error, QUANTILE),
                 "quantile_bound_m": bound,

@@ -288,12 +288,12 @@ def _read_motion(subject: Subject) -> Mapping[str, Any] | None:
 def step_rates(subject: Subject) -> list[dict[str, Any]]:
     """Compute the rates for every line (tracker or search window) and step size; `good`: of selectable targets."""
     frame, motion = subject.frame, _read_motion(subject)
-    if motion is None or not is_tracking(frame) or "step" not in frame or "skip" not in frame:
+    if motion is None or not is_tracking(frame) or "step" not in frame or "skipped_stops" not in frame:
         return []
     cells = []
     for line, line_rows in _group_by_line(frame[frame["step"].notna()]):
         paper = motion["paper"].get(line) or motion["paper"].get("", {})
-        for _, step_rows in line_rows.groupby("skip"):
+        for _, step_rows in line_rows.groupby("skipped_stops"):
             step = float(step_rows["step"].iloc[0]) * (100.0 if motion["per_cent"] else 1.0)
             good_rows = selectable_targets(step_rows)
             cells.append(
@@ -302,7 +302,7 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
                     "step": step,
                     "good": rates.flag_fraction(good_rows, "tracked"),
                     "all_targets": rates.flag_fraction(step_rows, "tracked"),
-                    "false_tracks": rates.flag_fraction(good_rows, "true_track", value=False),
+                    "false_tracks": rates.flag_fraction(good_rows, "no_false_track", value=False),
                     "paper_percent": next(
                         (percentage for size, percentage in paper.items() if abs(step - float(size)) < 0.5), None
                     ),

@@ -222,7 +222,7 @@ def _make_scored_run(state: TrackingState) -> scores.ScoredRun:
     first = TargetUpdate(TrackingState.NORMAL, (), trackers.TARGET_M.copy())
     last = TargetUpdate(state, (), trackers.TARGET_M - 0.4 if state is TrackingState.NORMAL else None)
     return scores.ScoredRun(
-        outcome="COMPLETED" if last.found else "LOST",
+        outcome="COMPLETED" if last.tracked else "LOST",
         target_world=trackers.TARGET_M.copy(),
         world_from_rover=poses,
         point_px=np.array([[512.0, 400.0], [515.0, 398.0]]),

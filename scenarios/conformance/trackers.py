@@ -126,7 +126,7 @@ class TrackerSuite(Suite):
         update = update_tracker(tracker, pose(_STOPS * _STEP_M), blank)
         if update is None:
             return "no aim"
-        if update.found:
+        if update.tracked:
             raise BreachError(f"it finds its target in images that are {name}")
         if update.state is TrackingState.LOST and not update.losses:
             raise BreachError("it reports no reason for the lost target: losses is empty")

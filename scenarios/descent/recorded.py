@@ -34,7 +34,9 @@ class FlightFile(UserFile, RecordedAxes):
         float | None, Field(description="file's time of the first image; default: file's start + `lead_s`")
     ] = None
     lead_s: Annotated[float, bounded_field(0.2, 30.0, "navigation time before the first image")] = 5.0
-    turn_deg: Annotated[float, bounded_field(-720.0, 720.0, "rotation about the vertical, clockwise from above")] = 0.0
+    heading_offset_deg: Annotated[
+        float, bounded_field(-720.0, 720.0, "rotation of the flight about the vertical, clockwise from above")
+    ] = 0.0
 
     @classmethod
     def file_hash(cls, file: str) -> str:
@@ -72,7 +74,7 @@ class FlightFile(UserFile, RecordedAxes):
         """Transform the flight to world axes with time 0 at the first image; `ground_m` is the ground below it."""
         poses = read_poses(self.file)
         world_from_file = (
-            Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.enu_from_axes
+            Rotation.from_rotvec(np.radians(-self.heading_offset_deg) * np.array([0.0, 0.0, 1.0])) * self.enu_from_axes
         )
         attitudes = world_from_file * Rotation.from_quat(poses.quaternions)
         positions = world_from_file.apply(poses.positions_m) + self.lever_arms(attitudes)

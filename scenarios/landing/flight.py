@@ -123,7 +123,7 @@ def measure_poses(
         np.radians(deviations.tilt_deg) * rng.standard_normal(2),
         np.radians(deviations.azimuth_deg) * rng.standard_normal(),
     )
-    rotation_error = np.radians(deviations.turn_deg) * rng.standard_normal(3)
+    rotation_error = np.radians(deviations.rotation_deg) * rng.standard_normal(3)
     common_rotation = Rotation.from_rotvec(np.array([tilt[0], tilt[1], azimuth]))
     positions = (position, position + motion)
     rotations = (common_rotation, Rotation.from_rotvec(rotation_error) * common_rotation)

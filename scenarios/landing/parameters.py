@@ -137,7 +137,7 @@ class NavigationParameters(Parameters):
     motion_m: Annotated[NonNegative, Field(le=10.0, description="SD of the motion between images, m")] = 0.01
     tilt_deg: NonNegative = Field(default=0.3, le=30.0, description="SD of roll and pitch, common to both images")
     azimuth_deg: NonNegative = Field(default=1.0, le=30.0, description="SD of the azimuth, common to both images")
-    turn_deg: Annotated[NonNegative, Field(le=10.0, description="SD of the rotation between images")] = 0.1
+    rotation_deg: Annotated[NonNegative, Field(le=10.0, description="SD of the rotation between images")] = 0.1
     inclinometer_deg: NonNegative = Field(default=0.2, le=30.0, description="SD of the inclinometers' roll and pitch")
 
 

@@ -33,7 +33,7 @@ BORDER_PX = 12.0
 #: Minimum fraction of correct tracks, among the features in both images, of a well-tracked pair.
 MIN_TRACKED_FRACTION = 0.9
 #: Match statuses whose matches are dropped and counted.
-DROP_STATUSES = (MatchStatus.DISSIMILAR, MatchStatus.OUT_OF_BOUNDS, MatchStatus.NOT_RETURNED)
+DROP_STATUSES = (MatchStatus.DISSIMILAR, MatchStatus.OUT_OF_BOUNDS, MatchStatus.INCONSISTENT)
 #: Maximum changes for tracking (section II.A): rotation about the optical axis, about other axes, relative height.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_CLIMB = 10.0, 20.0, 0.2
 #: Columns of tracks, motion, structure and map.
@@ -42,7 +42,7 @@ MOTION_COLUMNS = (
     "inliers",
     "parallax_px", "rotation_error_deg", "direction_error_deg", "length_error_m", "baseline_error_fraction",
     "motion_residual_px", "points", "matched_fraction", "map_rows", "map_columns", "cell_m",
-    "matches_dissimilar", "matches_out_of_bounds", "matches_not_returned",
+    "matches_dissimilar", "matches_out_of_bounds", "matches_inconsistent",
 )  # fmt: skip
 #: Columns of the true ground under a lander; their prefix is the name of the position (`site`, `touchdown`).
 GROUND_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m", "margin")
@@ -327,9 +327,10 @@ def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
 
     - `image_1`, `image_2`: the images;
     - `true_rotation`, `true_translation`: true motion from the first to the second camera's frame;
-    - `true_places`, `true_slope`, `true_roughness`, `true_safe`, `true_covered`: the truth's sampling grid, world axes;
+    - `true_positions`, `true_slope`, `true_roughness`, `true_safe`, `true_covered`: sampling grid of the truth,
+      world axes;
     - `true_heights`, `true_corner`, `true_spacing`: exact heights, world axes (row i at y = corner[1] + i spacing);
-    - `camera_true`, `camera_believed`: body poses at the first image (4 x 4), true and estimated on board;
+    - `camera_true`, `camera_estimated`: body poses at the first image (4 x 4), true and estimated on board;
     - `limits`: the algorithm's limits of slope (radians) and roughness (metres), and the lander's diameter;
     - `site_true`: true x, y of the reported site (see `site_row`).
     """
@@ -341,7 +342,7 @@ def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
     arrays |= {
         "true_rotation": second_from_first.rotation.as_matrix(),
         "true_translation": np.array(second_from_first.translation),
-        "true_places": truth.positions,
+        "true_positions": truth.positions,
         "true_slope": truth.footprints.slope_rad,
         "true_roughness": truth.footprints.roughness_m,
         "true_safe": truth.footprints.safe,
@@ -350,7 +351,7 @@ def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
         "true_corner": np.array([truth.relief.west_m, truth.relief.south_m]),
         "true_spacing": np.array([truth.relief.spacing_m]),
         "camera_true": flight.states[0].world_from_body.as_matrix(),
-        "camera_believed": flight.poses[0].world_from_body.as_matrix(),
+        "camera_estimated": flight.poses[0].world_from_body.as_matrix(),
         "limits": np.array([p.hda.max_slope_rad, p.hda.max_roughness_m, truth.limits.diameter_m]),
     }
     site = _true_site(estimate, flight)

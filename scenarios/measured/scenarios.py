@@ -172,7 +172,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
             velocity = _get_velocity(run.answer)
             pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
             details = None if run.answer is None else run.answer.details
-            velocity_pair = details.chosen if isinstance(details, DimesDetails) else None
+            velocity_pair = details.selected if isinstance(details, DimesDetails) else None
             estimate_m_s = np.full(2, np.nan) if velocity is None else velocity
             row: dict[str, Scalar] = {
                 "velocity_estimated_x_m_s": float(estimate_m_s[0]),

@@ -241,7 +241,7 @@ def track_target(p: RoverScenarioParameters, run: Run) -> Run:
     failure = drive_legs(p, run, guide)
     if failure is not None:
         run.outcome = failure
-    elif not run.stops[-1].update.found:
+    elif not run.stops[-1].update.tracked:
         run.outcome = RunOutcome.LOST
     else:
         has_goal = not last_leg.ends_with_steps and last_leg.motion in ("approach", "back-off")

@@ -3,8 +3,8 @@
 A shared drive is open-loop tracking (paper, 5.1 to 5.3): the tracker's answers do not move the rover. The point at the
 centre of all targets is designated in images of the start; the rover and its mast follow it by odometry. At every stop,
 both cameras take subframes that contain the rock and the search windows around it. A case tracks one target over the
-images of every (skip + 1)-th stop; skipping stops makes the steps larger. A drive depends only on the parameters, the
-campaign's seed and the run's index.
+images of every (skipped_stops + 1)-th stop; skipping stops makes the steps larger. A drive depends only on the
+parameters, the campaign's seed and the run's index.
 
 The paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
@@ -77,7 +77,7 @@ class PointParameters(Parameters):
     up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
 
 
-class BandParameters(Parameters):
+class StepRangeParameters(Parameters):
     """A range of steps; requirements select cases by a boolean column with this name."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$")]
@@ -86,21 +86,26 @@ class BandParameters(Parameters):
 
 
 class SharedDriveParameters(Parameters):
-    """Drives whose images many cases use; `run`, `target`, `skip`, `drive.algorithm`, `drive.vtt` define a case."""
+    """Drives whose images many cases use; each case has its own target and step.
+
+    `run`, `target`, `skipped_stops`, `drive.algorithm` and `drive.vtt` define a case.
+    """
 
     drive: Annotated[RoverScenarioParameters, Field(description="drive with its smallest steps, and the tracker")]
     variants: Annotated[tuple[VariantParameters, ...], Field(min_length=1, description="the runs")]
     targets: Annotated[tuple[PointParameters, ...], Field(min_length=1, description="points on every run's rock")]
     run: Annotated[int, Field(ge=0, description="index of the run")] = 0
     target: Annotated[int, Field(ge=0, description="index of the target")] = 0
-    skip: Annotated[int, Field(ge=0, le=100, description="stops skipped between two updates")] = 0
+    skipped_stops: Annotated[int, Field(ge=0, le=100, description="stops skipped between two updates")] = 0
     margin_px: Annotated[float, Field(gt=0.0, description="margin around the rock in the images")] = 110.0
     steering: Annotated[
         Literal["estimate", "oracle-target"],
         Field(description="position that guides the drive: designated and propagated by odometry, or the true one"),
     ] = "estimate"
-    bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps")] = ()
-    face_deg: float | None = Field(default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`")
+    step_ranges: Annotated[tuple[StepRangeParameters, ...], Field(description="ranges of steps")] = ()
+    max_obliquity_deg: float | None = Field(
+        default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`"
+    )
 
     @model_validator(mode="after")
     def _check_numbers(self) -> SharedDriveParameters:
@@ -116,8 +121,8 @@ class SharedDriveParameters(Parameters):
         """Step between two updates: a fraction of the distance, or degrees of a turn or circle."""
         leg = self.drive.legs[0]
         if leg.motion in ("turn", "circle"):
-            return abs(leg.step_deg) * (self.skip + 1)
-        return float(1.0 - (1.0 - leg.step_fraction) ** (self.skip + 1))
+            return abs(leg.step_deg) * (self.skipped_stops + 1)
+        return float(1.0 - (1.0 - leg.step_fraction) ** (self.skipped_stops + 1))
 
 
 @dataclass(frozen=True)
@@ -200,14 +205,14 @@ def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | N
     run = prepare_shared_run(p, drive)
     parameters = p.drive.model_copy(update={"algorithm": algorithm or p.drive.algorithm})
     guide = TrackerGuide(parameters, run, drive.views[0].estimated_pose)
-    for view in drive.views[:: p.skip + 1]:
+    for view in drive.views[:: p.skipped_stops + 1]:
         guide.observe(run, view)
         if run.stops[-1].update.state is TrackingState.FAILURE:
             break
-    if not run.stops[0].update.found:
+    if not run.stops[0].update.tracked:
         run.outcome = RunOutcome.NOT_SEEDED
     else:
-        run.outcome = RunOutcome.COMPLETED if run.stops[-1].update.found else RunOutcome.LOST
+        run.outcome = RunOutcome.COMPLETED if run.stops[-1].update.tracked else RunOutcome.LOST
     return run
 
 
@@ -303,13 +308,14 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
             "target": p.target,
             "point_across": point.across,
             "point_up": point.up,
-            "skip": p.skip,
+            "skipped_stops": p.skipped_stops,
             "step": p.step,
             "with_scale": algorithm != "pure-ncc" and p.drive.vtt.scale,
             "pure_ncc": algorithm == "pure-ncc",
-            **{band.name: bool(band.min <= p.step <= band.max) for band in p.bands},
+            **{entry.name: bool(entry.min <= p.step <= entry.max) for entry in p.step_ranges},
             **asdict(visibility),
-            "on_face": visibility.in_view and (p.face_deg is None or visibility.obliquity_max_deg <= p.face_deg),
+            "on_face": visibility.in_view
+            and (p.max_obliquity_deg is None or visibility.obliquity_max_deg <= p.max_obliquity_deg),
         }
 
         def evaluate(name: str) -> CaseResult:

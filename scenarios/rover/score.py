@@ -41,7 +41,7 @@ REDUCTIONS: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
 
 
 def errors_px(run: Run) -> Float64[np.ndarray, "stops 2"]:
-    """Compute tracked minus true pixels (u, v) of the designated point at all stops; NaN if it was not found."""
+    """Compute tracked minus true pixels (u, v) of the designated point at all stops; NaN if it was not tracked."""
     errors = [stop.reported_px(run.rig.calibrated) - stop.point_px for stop in run.stops]
     return np.stack(errors) if errors else np.empty((0, 2))
 
@@ -74,7 +74,7 @@ def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     return {
         "tracked": is_tracked,
         "not_tracked": not is_tracked,
-        "true_track": false_updates == 0,
+        "no_false_track": false_updates == 0,
         "false_updates": false_updates,
         "position_error_m": float(np.linalg.norm(error_m)),
         "range_error_m": range_error,
@@ -85,7 +85,7 @@ def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "worst_error_px": _finite_max(error_sizes_px),
         "track_margin_px": p.score.tracked_px - _finite_max(error_sizes_px),
         "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
-        "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.found), NAN),
+        "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.tracked), NAN),
         "handed_over": run.handed_over,
     }
 
@@ -98,7 +98,7 @@ def _finite_max(values: Float64[np.ndarray, "n"]) -> float:
 def tracking_row(run: Run) -> dict[str, Scalar]:
     """Compute the columns of tracking: extremes of Table III's quantities, drift, and designation errors."""
     quantities = update_quantities(run)
-    tracked_stops = [stop for stop in run.stops if stop.update.found]
+    tracked_stops = [stop for stop in run.stops if stop.update.tracked]
     drift_m = designation_error = designation_3_sigma = NAN
     if tracked_stops:
         first_stop, last_stop = tracked_stops[0], tracked_stops[-1]
@@ -148,7 +148,7 @@ def update_quantities(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
             row["roll_change_deg"] = float(np.degrees(details.change.roll_rad))
         if details is not None and details.stereo is not None:
             row["stereo_score"] = details.stereo.score
-        if details is not None and not details.seeded and stop.update.found:
+        if details is not None and not details.seeded and stop.update.tracked:
             row["azimuth_change_deg"] = float(np.degrees(details.azimuth_change_rad))
         if details is not None and not details.seeded and details.match is not None:
             row["match_score"] = details.match.score
@@ -263,7 +263,7 @@ def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
         sun = run.world.sun.direction(stop.time_s)
         if p.rover_shadow and rover_shades_patch(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
             return True
-        if not error <= p.score.tracked_px:  # also for NaN: the target was not found
+        if not error <= p.score.tracked_px:  # also for NaN: the target was not tracked
             return False
     return False
 
@@ -275,15 +275,15 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     stop_N_left        counts of the left subframe of stop N (from 1); `stop_N_right`: those of the right subframe
     stop_N_corners     full-frame (u, v) of the upper left pixels of both subframes, (2, 2)
     stop_N_window      search window in the left frame: (u, v) of its upper left pixel, columns, rows; or NaN
-    stop_N_found       tracked (u, v) in the left and the right frame, (2, 2); NaN if not found
+    stop_N_matches     tracked (u, v) in the left and the right frame, (2, 2); NaN if not tracked
     stop_N_point       (u, v) of the designated point's true projection in the left frame
-    template_px        side of the template around `stop_N_found`
+    template_px        side of the template around `stop_N_matches`
     figures            arrays over the stops by name, see `update_quantities`
     states             the tracker's state at each stop
-    rover_true_m       world positions of the rover's origin, (stops, 3); `rover_believed_m`: estimated positions
+    rover_true_m       world positions of the rover's origin, (stops, 3); `rover_estimated_m`: estimated positions
     heading_deg        true azimuth of the rover at each stop, clockwise from north
-    target_m           designated point, world, (3,); `target_believed_m`: its estimated world position at each stop,
-                       (stops, 3), NaN if not found
+    target_m           designated point, world, (3,); `target_estimated_m`: its estimated world position at each stop,
+                       (stops, 3), NaN if not tracked
     path_true_m        world positions of the rover's origin along its path, (points, 2)
     rocks_m            east, north and diameter of the target's rock and the obstacles, (rocks, 3)
     ================== ================================================================================================
@@ -296,14 +296,14 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
         if details is not None and details.window is not None and details.window_corner is not None:
             window = np.array([*details.window_corner, *details.window.shape[::-1]], dtype=np.float64)
         matched_px[0] = stop.reported_px(run.rig.calibrated)
-        if details is not None and details.stereo is not None and stop.update.found:
+        if details is not None and details.stereo is not None and stop.update.tracked:
             matched_px[1] = details.stereo.pixel
         stop_arrays = {
             "left": left.counts,
             "right": right.counts,
             "corners": np.array([left.corner, right.corner], dtype=np.float64),
             "window": window,
-            "found": matched_px,
+            "matches": matched_px,
             "point": stop.point_px,
         }
         arrays |= {f"stop_{number}_{name}": values for name, values in stop_arrays.items()}
@@ -320,10 +320,10 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
         "figures": update_quantities(run),
         "states": [stop.update.state.name for stop in stops],
         "rover_true_m": np.array([stop.stance.world_from_rover.translation for stop in stops]).reshape(-1, 3),
-        "rover_believed_m": np.array([stop.estimated_pose.translation for stop in stops]).reshape(-1, 3),
+        "rover_estimated_m": np.array([stop.estimated_pose.translation for stop in stops]).reshape(-1, 3),
         "heading_deg": np.degrees(np.array([stop.stance.azimuth_rad for stop in stops])),
         "target_m": run.target.point_world,
-        "target_believed_m": np.array(estimated_targets).reshape(-1, 3),
+        "target_estimated_m": np.array(estimated_targets).reshape(-1, 3),
         "path_true_m": np.array(path).reshape(-1, 2),
         "rocks_m": np.column_stack([rocks.position_m[rock_indices, :2], rocks.diameter_m[rock_indices]]),
     }

@@ -164,7 +164,7 @@ class Stop(View):
 
     update: TargetUpdate  #: the tracker's answer
     details: VttDetails | None  #: details of the answer; None for a custom tracker
-    reported_position_rover: Float64[np.ndarray, "3"] | None  #: reported position, rover frame; None if not found
+    reported_position_rover: Float64[np.ndarray, "3"] | None  #: reported position, rover frame; None if not tracked
     track_time_s: float  #: processor time of the update
     point_px: Float64[np.ndarray, "2"]  #: true full-frame (u, v) of the target in the left image; NaN outside
     point_rover: Float64[np.ndarray, "3"]  #: the designated point in the rover's true frame, metres
@@ -180,7 +180,7 @@ class Stop(View):
             **{item.name: getattr(view, item.name) for item in fields(View)},
             update=update,
             details=update.details if isinstance(update.details, VttDetails) else None,
-            reported_position_rover=update.position_rover if update.found else None,
+            reported_position_rover=update.position_rover if update.tracked else None,
             track_time_s=track_time_s,
             point_px=np.asarray(left.project(in_head)[0]),
             point_rover=np.asarray(view.stance.world_from_rover.inv().apply(point_m.copy())),
@@ -188,7 +188,7 @@ class Stop(View):
         )
 
     def reported_px(self, mast: MastCalibration) -> Float64[np.ndarray, "2"]:
-        """Compute the reported pixel of the target in the left image; NaN if it was not found.
+        """Compute the reported pixel of the target in the left image; NaN if it was not tracked.
 
         Without details of the match the reported position is projected through the calibrated camera.
         """

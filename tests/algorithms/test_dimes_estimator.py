@@ -185,7 +185,7 @@ def test_disagreement_with_imu_rejects_the_velocity() -> None:
     velocities = inputs.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
     answer = ESTIMATOR.estimate(replace(inputs, interval_velocities_m_s=velocities))
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
-    assert get_details(answer).chosen is None
+    assert get_details(answer).selected is None
     assert get_details(answer).combinations[0].discrepancy_m_s == pytest.approx(10.0, abs=0.2)
 
 
@@ -335,12 +335,12 @@ def test_products_contain_the_keys_used_by_reports(measurements: DescentMeasurem
 
 def test_products_report_failures_and_selection(measurements: DescentMeasurements) -> None:
     details = get_details(ESTIMATOR.estimate(measurements))
-    assert details.chosen is not None
+    assert details.selected is not None
     products = dimes_products(details)
-    np.testing.assert_array_equal(products["chosen"], [details.chosen.first, details.chosen.second])
+    np.testing.assert_array_equal(products["selected"], [details.selected.first, details.selected.second])
     uniform = _change_counts(measurements, lambda number, counts: np.full_like(counts, 1000))
     products = dimes_products(get_details(ESTIMATOR.estimate(uniform)))
-    assert products["chosen"].size == 0
+    assert products["selected"].size == 0
     column = products["tracks_columns"].index("failed_contrast")
     np.testing.assert_array_equal(products["tracks"][:, column], 1.0)
 

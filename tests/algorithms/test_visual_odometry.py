@@ -62,8 +62,8 @@ START = rigid(Rotation.identity(), np.zeros(3))
 MOTION = rigid(Rotation.from_euler("ZYX", [6.0, 1.5, -1.0], degrees=True), np.array([0.5, 0.05, 0.02]))
 
 
-def _make_prediction(path_fraction: float = 1.0, turn_deg: float = 0.1) -> RigidTransform:
-    turn = Rotation.from_rotvec([0.0, 0.0, np.radians(turn_deg)])
+def _make_prediction(path_fraction: float = 1.0, yaw_error_deg: float = 0.1) -> RigidTransform:
+    turn = Rotation.from_rotvec([0.0, 0.0, np.radians(yaw_error_deg)])
     return rigid(MOTION.rotation * turn, path_fraction * MOTION.translation)
 
 
@@ -111,7 +111,7 @@ def test_ground_without_texture_is_an_expected_failure() -> None:
 
 
 def test_motion_that_contradicts_the_gyros_is_rejected() -> None:
-    result = estimate_motion(_render_pair(START), _render_pair(MOTION), _make_prediction(turn_deg=2.5))
+    result = estimate_motion(_render_pair(START), _render_pair(MOTION), _make_prediction(yaw_error_deg=2.5))
     assert result.outcome in (VisualOdometryOutcome.INCONSISTENT, VisualOdometryOutcome.TOO_FEW_FEATURES)
     assert result.first_from_second is None
 

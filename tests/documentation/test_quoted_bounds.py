@@ -71,7 +71,11 @@ def test_bound_of_landings_counts_terrains() -> None:
 
 @pytest.mark.parametrize(
     "row_start",
-    ["chosen sites truly safe", "safe sites exist, none with safe surroundings", "`no safe site` where there is none"],
+    [
+        "selected sites truly safe",
+        "safe sites exist, none with safe surroundings",
+        "`no safe site` where there is none",
+    ],
 )
 def test_quoted_bounds_of_hazardous_flights_are_correct(row_start: str) -> None:
     _, rate_cell, interval_cell = find_cells("hda.md", row_start)

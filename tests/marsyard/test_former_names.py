@@ -11,15 +11,20 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from marsyard.algorithms.interface import TargetUpdate, TrackingState
+from marsyard.campaigns.definition.configuration import update_stored_configuration
 from marsyard.campaigns.definition.identity import create_identity
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from marsyard.cli.app import main
 from marsyard.reports.stored import read_run
+from marsyard.scenarios.descent.recorded import FlightFile
+from marsyard.scenarios.landing.parameters import NavigationParameters
 from marsyard.scenarios.systems import row_columns, scenario, scenario_names
 from marsyard.sim import parameters
-from marsyard.sim.parameters import DeprecatedNameWarning
+from marsyard.sim.parameters import DeprecatedNameWarning, current_key
 
 RENAMED_NAMES = tomllib.loads(Path(parameters.__file__).with_name("renamed.toml").read_text())
 CAMPAIGN = """
@@ -81,6 +86,42 @@ def test_deprecated_value_of_an_option_sets_the_current_value() -> None:
         load_campaign("hda-benign", ["hda.track_seed=nothing"])
 
 
+def test_deprecated_options_of_an_algorithm_are_accepted() -> None:
+    with pytest.warns(DeprecatedNameWarning, match="'max_return_px' is now 'max_forward_backward_px'"):
+        campaign = load_campaign("hda-benign", ["algorithm=hda-custom", "hda.max_return_px=1.25"])
+    stored = campaign.configuration.model_dump(mode="json", round_trip=True, exclude_unset=True)
+    options = stored["parameters"]["hda"]
+    assert options["max_forward_backward_px"] == 1.25
+    options["max_return_px"] = options.pop("max_forward_backward_px")
+    assert update_stored_configuration(stored)["parameters"]["hda"]["max_forward_backward_px"] == 1.25
+
+
+def test_one_deprecated_key_has_a_current_name_in_each_table() -> None:
+    with pytest.warns(DeprecatedNameWarning, match="'turn_deg' is now 'rotation_deg'"):
+        assert NavigationParameters.model_validate({"turn_deg": 0.2}).rotation_deg == 0.2
+    with pytest.warns(DeprecatedNameWarning, match="'turn_deg' is now 'heading_offset_deg'"):
+        assert current_key("turn_deg", FlightFile.model_fields) == "heading_offset_deg"
+    assert current_key("turn_deg", {"azimuth_deg"}) == "turn_deg"
+
+
+def test_products_with_deprecated_names_are_read(tmp_path: Path) -> None:
+    products = {"true_places": 1, "stop_12_found": 2, "rover_believed_m": 3, "stop_left_found": 4}
+    save_packed(tmp_path, pack_products(products), {"case": 0})
+    assert load_products(tmp_path) == {
+        "true_positions": 1,
+        "stop_12_matches": 2,
+        "rover_estimated_m": 3,
+        "stop_left_found": 4,
+    }
+
+
+def test_deprecated_attribute_of_a_target_update_is_accepted() -> None:
+    update = TargetUpdate(TrackingState.NORMAL, (), None)
+    with pytest.warns(DeprecatedNameWarning, match=r"found is now TargetUpdate\.tracked"):
+        assert update.found
+    assert update.tracked
+
+
 def test_override_with_a_deprecated_name_sets_the_parameter(campaign_files: tuple[Path, Path]) -> None:
     with pytest.warns(DeprecatedNameWarning, match="'place' is now 'location'"):
         campaign = load_campaign(str(campaign_files[1]), ["place.terrain=1"])
@@ -128,8 +169,9 @@ def test_current_names_exist_and_deprecated_names_do_not() -> None:
     """Each current key of the table is a parameter of a scenario, and each current column a column of a scenario."""
     schemas = " ".join(json.dumps(scenario(name).parameters_type.model_json_schema()) for name in scenario_names())
     schemas += json.dumps(type(load_campaign("dimes-smoke").configuration).model_json_schema())
-    for deprecated_name, current_name in RENAMED_NAMES["keys"].items():
-        assert f'"{current_name}": {{' in schemas, current_name
+    for deprecated_name, current_names in RENAMED_NAMES["keys"].items():
+        for current_name in [current_names] if isinstance(current_names, str) else current_names:
+            assert f'"{current_name}": {{' in schemas, current_name
         assert deprecated_name in ("own", "least", "most") or f'"{deprecated_name}": {{' not in schemas, deprecated_name
     column_sets = [columns for name in scenario_names() if (columns := row_columns(name)) is not None]
     for deprecated_name, current_name in RENAMED_NAMES["columns"].items():

@@ -30,9 +30,11 @@ def _run_small_case(scenario: str) -> Row:
 
 
 def _make_short_drive() -> SharedDriveParameters:
-    """Return a drive of one step with the bands of all campaigns, because each band is a column."""
-    band_names = {
-        band["name"] for campaign in _list_campaigns("rover-drive") for band in _read_parameters(campaign)["bands"]
+    """Return a drive of one step with the step ranges of all campaigns, because each is a column."""
+    range_names = {
+        step_range["name"]
+        for campaign in _list_campaigns("rover-drive")
+        for step_range in _read_parameters(campaign)["step_ranges"]
     }
     return SharedDriveParameters.model_validate(
         {
@@ -43,7 +45,7 @@ def _make_short_drive() -> SharedDriveParameters:
             },
             "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
             "targets": [{"across": 0.0, "up": 0.5}],
-            "bands": [{"name": name, "min": 0.0, "max": 10.0} for name in sorted(band_names)],
+            "step_ranges": [{"name": name, "min": 0.0, "max": 10.0} for name in sorted(range_names)],
         }
     )
 

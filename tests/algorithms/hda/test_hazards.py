@@ -259,8 +259,8 @@ def test_out_of_range_options_are_reported() -> None:
         HdaOptions(lander_diameter_m=0.0)
     with pytest.raises(ValueError, match="max_slope_rad"):
         HdaOptions(max_slope_rad=2.0)
-    with pytest.raises(ValueError, match="max_return_px is 0"):
-        HdaOptions(max_return_px=0.0)
+    with pytest.raises(ValueError, match="max_forward_backward_px is 0"):
+        HdaOptions(max_forward_backward_px=0.0)
 
 
 # ----- footprints -----

@@ -186,7 +186,7 @@ def test_all_lengths_scale_with_the_altimeter(factor: float, scene: Pass) -> Non
     assert np.linalg.norm(motion.second_from_first.translation - expected) < 0.01 * np.linalg.norm(expected)
 
 
-def test_matches_failing_the_reverse_check_are_counted(scene: Pass, landing_scene: LandingScene) -> None:
+def test_matches_failing_the_forward_backward_check_are_counted(scene: Pass, landing_scene: LandingScene) -> None:
     # Half of the second image is unrelated, and any correlation is accepted: matches there are random.
     counts = landing_scene.views[1].counts.copy()
     counts[:, 160:] = np.random.default_rng(2).integers(500, 2500, (240, 160))
@@ -196,7 +196,7 @@ def test_matches_failing_the_reverse_check_are_counted(scene: Pass, landing_scen
             views,
             scene.second_from_first,
             (9.0, 11.0),
-            replace(OPTIONS, min_match_correlation=-1.0, max_return_px=tolerance),
+            replace(OPTIONS, min_match_correlation=-1.0, max_forward_backward_px=tolerance),
         )
         for tolerance in (None, 1.5)
     )
@@ -208,24 +208,24 @@ def test_matches_failing_the_reverse_check_are_counted(scene: Pass, landing_scen
     assert np.sum(with_check.accepted & ~is_wrong) > 0.95 * np.sum(without_check.accepted & ~is_wrong)
     # Other matches are unchanged, and each match has one outcome.
     np.testing.assert_array_equal(with_check.second, without_check.second)
-    has_failed = with_check.statuses == MatchStatus.NOT_RETURNED
+    has_failed = with_check.statuses == MatchStatus.INCONSISTENT
     np.testing.assert_array_equal(with_check.accepted | has_failed, without_check.accepted)
     statuses = np.where(has_failed, MatchStatus.ACCEPTED, with_check.statuses)
     np.testing.assert_array_equal(statuses, without_check.statuses)
     assert len(with_check.points) == with_check.accepted.sum()
 
 
-def test_correct_matches_pass_the_reverse_check(scene: Pass, landing_scene: LandingScene) -> None:
+def test_correct_matches_pass_the_forward_backward_check(scene: Pass, landing_scene: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 16, 6)
     positions = undistort(landing_scene.views[0].camera, pixels)
     _, _, is_inside = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
     pixels, positions = pixels[is_inside].astype(np.int64), positions[is_inside]
     true_pixels = np.rint(scene.camera(1).project(scene.ground(0, pixels.astype(np.float64)))[0]).astype(np.int64)
-    return_distance_px = forward_backward_error(
+    forward_backward_px = forward_backward_error(
         landing_scene.views, scene.second_from_first, pixels, true_pixels, positions, (7.0, 13.0), 5
     )
     # Both searches use whole pixels: 0.7 px each, plus the effect of relief within a window.
-    assert np.mean(return_distance_px <= 1.5) > 0.98
+    assert np.mean(forward_backward_px <= 1.5) > 0.98
 
 
 def test_segments_are_clipped_at_the_image_border() -> None:

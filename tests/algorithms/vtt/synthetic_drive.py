@@ -266,7 +266,7 @@ def drive_to_target(
         assert update is not None
         stops.append((pose(x, 0.0), update))
         distance = get_details(update).distance_m
-        if not update.found or distance < goal_m + 0.02:
+        if not update.tracked or distance < goal_m + 0.02:
             return stops
         step = min(fraction * distance, 1.3 * (distance - goal_m))
         estimated_x += step

@@ -96,8 +96,8 @@ NORMAL, LOST, FAILURE = TrackingState.NORMAL, TrackingState.LOST, TrackingState.
 def test_state_transitions_match_figure_6(limit: int, results: list[bool], expected: list[TrackingState]) -> None:
     """`results`: whether the tracker located the target in each image."""
     state, lost_count, states = NORMAL, 0, []
-    for is_found in results:
-        state, lost_count = next_state(state, lost_count, is_found, limit)
+    for is_tracked in results:
+        state, lost_count = next_state(state, lost_count, is_tracked, limit)
         states.append(state)
     assert states == expected
 

@@ -48,7 +48,7 @@ def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_bod
         drive = Drive(make_scene(make_body(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL_WINDOW))
         stops = drive_to_target(drive, target, fraction)
         true_pose, last = stops[-1]
-        assert last.found
+        assert last.tracked
         assert get_details(last).distance_m < 2.05
         drifts.append(get_pixel(last) - drive.true_pixel(true_pose, target))
         assert last.position_rover is not None
@@ -73,7 +73,7 @@ def test_published_tracker_drifts_by_a_few_pixels() -> None:
         tracker = VisualTargetTracker(replace(SMALL_WINDOW, warp="none"))
         drive = Drive(make_scene(make_boulder(seed, target), target, seed), navcam(), tracker)
         true_pose, last = drive_to_target(drive, target, 0.1)[-1]
-        assert last.found
+        assert last.tracked
         drifts.append(np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)))
     assert 0.3 < np.sqrt(np.mean(np.square(drifts))) < 10.0
 
@@ -100,7 +100,7 @@ def test_scaling_allows_larger_steps_than_pure_ncc() -> None:
     target = np.array([10.0, 0.1, 0.2])
     scene = make_scene(make_face(2, target), target, 2)
     scaled_stops = drive_to_target(Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW)), target, 0.23)
-    assert scaled_stops[-1][1].found
+    assert scaled_stops[-1][1].tracked
     assert get_details(scaled_stops[-1][1]).distance_m < 2.05
     ncc_tracker = VisualTargetTracker(replace(PURE_NCC, search_px=101))
     ncc_stops = drive_to_target(Drive(scene, navcam(), ncc_tracker), target, 0.23)
@@ -123,7 +123,7 @@ def test_tilted_rover_requires_roll_correction(roll: bool) -> None:
     assert change is not None
     assert np.degrees(change.roll_rad) == pytest.approx(-25.0, abs=4.0)
     assert update is not None
-    assert update.found == roll
+    assert update.tracked == roll
     if roll:
         np.testing.assert_allclose(get_pixel(update), drive.true_pixel(tilted_pose, target), atol=0.3)
 
@@ -136,7 +136,7 @@ def test_turn_in_place_changes_only_mast_angles() -> None:
     update = drive.stop(pose(0.0, 0.0, np.deg2rad(45.0)))
     result = get_details(update)
     assert update is not None
-    assert update.found
+    assert update.tracked
     assert result.match is not None
     assert result.match.score > 0.95
     assert result.change is not None
@@ -162,7 +162,7 @@ def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
         drive.stop(first)
         update = drive.stop(second)
         assert update is not None
-        assert update.found
+        assert update.tracked
         # The mast is ahead and to the left of the rover origin; the angle is that of the line of sight.
         assert abs(np.degrees(get_details(update).azimuth_change_rad)) == pytest.approx(step, rel=0.02)
         np.testing.assert_allclose(get_pixel(update), drive.true_pixel(second, target), atol=0.2)
@@ -181,7 +181,7 @@ def test_driving_backwards_shrinks_the_template() -> None:
         update = drive.stop(pose(x, 0.0))
         change = get_details(update).change
         assert update is not None
-        assert update.found
+        assert update.tracked
         assert change is not None
         assert 0.88 < change.magnification < 0.93
         np.testing.assert_allclose(get_pixel(update), drive.true_pixel(pose(x, 0.0), target), atol=0.15)
@@ -206,13 +206,13 @@ def test_all_three_designations_define_the_same_target() -> None:
         drive.tracker.designate(designation, start)
         update = drive.stop(start)
         assert update is not None
-        assert update.found
+        assert update.tracked
         assert update.position_rover is not None
         # A tenth of a pixel of disparity is 2 cm of range at 7 m.
         np.testing.assert_allclose(update.position_rover, target, atol=0.02)
         second_update = drive.stop(pose(0.7, 0.0))
         assert second_update is not None
-        assert second_update.found
+        assert second_update.tracked
         np.testing.assert_allclose(get_pixel(second_update), drive.true_pixel(pose(0.7, 0.0), target), atol=0.1)
 
 
@@ -247,7 +247,7 @@ def test_slip_appears_as_a_position_correction() -> None:
     drive = Drive(make_scene(make_face(7, target), target, 7), navcam(), VisualTargetTracker(SMALL_WINDOW))
     stops = drive_to_target(drive, target, 0.1, slip=0.04)
     true_pose, last = stops[-1]
-    assert last.found
+    assert last.tracked
     assert last.position_rover is not None
     np.testing.assert_allclose(last.position_rover, true_pose.inv().apply(target), atol=0.01)
     evidence = get_details(last).evidence
@@ -264,7 +264,7 @@ def test_pointing_error_does_not_change_the_match() -> None:
     drive.pointing_error_rad = (np.deg2rad(0.5), np.deg2rad(-0.3))
     update = drive.stop(pose(0.5, 0.0))
     assert update is not None
-    assert update.found
+    assert update.tracked
     result = get_details(update)
     assert result.predicted_pixel is not None
     # 0.82 mrad per pixel: pointing too far right and down moves the target left and up.
@@ -273,8 +273,8 @@ def test_pointing_error_does_not_change_the_match() -> None:
     np.testing.assert_allclose(get_pixel(update), drive.true_pixel(pose(0.5, 0.0), target), atol=0.1)
 
 
-@pytest.mark.parametrize(("row_offset_px", "is_found"), [(1.4, True), (5.0, False)])
-def test_point_stereo_tolerates_two_pixel_misalignment(row_offset_px: float, is_found: bool) -> None:
+@pytest.mark.parametrize(("row_offset_px", "is_tracked"), [(1.4, True), (5.0, False)])
+def test_point_stereo_tolerates_two_pixel_misalignment(row_offset_px: float, is_tracked: bool) -> None:
     target = np.array([6.0, 0.1, 0.2])
     mast = navcam()
     assert isinstance(mast.right, Cahvor)
@@ -285,8 +285,8 @@ def test_point_stereo_tolerates_two_pixel_misalignment(row_offset_px: float, is_
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0))
     assert update is not None
-    assert update.found == is_found
-    if is_found:
+    assert update.tracked == is_tracked
+    if is_tracked:
         # Row errors hardly affect the range: a tenth of a pixel of disparity is 1.5 cm here.
         assert np.linalg.norm(update.position_rover - target) < 0.03
     else:
@@ -310,7 +310,7 @@ def test_detector_noise_has_little_effect() -> None:
     scene = replace(make_scene(make_face(9, target), target, 9), contrast=0.08)
     drive = Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW), noise=np.random.default_rng(1))
     true_pose, last = drive_to_target(drive, target, 0.1)[-1]
-    assert last.found
+    assert last.tracked
     assert np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)) < 1.0
 
 
@@ -323,7 +323,7 @@ def test_lucas_kanade_tracks_in_the_same_loop() -> None:
     drive = Drive(make_scene(make_face(1, target), target, 1), navcam(), tracker)
     assert [tracker.state] == [TrackingState.NO_TARGET]
     true_pose, last = drive_to_target(drive, target, 0.1)[-1]
-    assert last.found
+    assert last.tracked
     assert tracker.state is TrackingState.NORMAL
     assert np.linalg.norm(get_pixel(last) - drive.true_pixel(true_pose, target)) < 2.5
 
@@ -375,7 +375,7 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
         update = drive.stop(true_pose)
         assert update is not None
         states.append(update.state)
-        if update.found:
+        if update.tracked:
             np.testing.assert_allclose(get_pixel(update), drive.true_pixel(true_pose, target), atol=0.2)
         else:
             # The predicted position is exact because the poses are exact.
@@ -387,7 +387,7 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
         drive.scene = clear_scene
         later_update = drive.stop(pose(1.0, 0.0))
         assert later_update is not None
-        assert (later_update.state, later_update.losses, later_update.found) == (TrackingState.FAILURE, (), False)
+        assert (later_update.state, later_update.losses, later_update.tracked) == (TrackingState.FAILURE, (), False)
     tracker.clear()
     assert tracker.state is TrackingState.NO_TARGET
     assert tracker.aim(pose(0.0, 0.0), navcam()) is None
@@ -417,7 +417,7 @@ def test_image_without_the_target_is_reported_as_lost() -> None:
     ):
         drive.tracker.clear()
         drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-        assert drive.tracker.update(measurements).found
+        assert drive.tracker.update(measurements).tracked
         update = drive.tracker.update(invalid)
         assert update.state is TrackingState.LOST
         assert loss in update.losses

@@ -69,7 +69,7 @@ def synthetic_products() -> dict[str, Any]:
         "world_from_surface": np.eye(3),
         "limits": np.array([np.radians(15.0), 0.2, 2.0]),
         "camera_true": camera,
-        "true_places": np.stack([true_x, true_y], axis=-1),
+        "true_positions": np.stack([true_x, true_y], axis=-1),
         "true_heights": 0.1 * np.sin(true_x - 100.0) + true_rock,
         "true_corner": np.array([true_x[0, 0], true_y[0, 0]]),
         "true_spacing": np.array([true_spacing_m]),

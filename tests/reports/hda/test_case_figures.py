@@ -138,7 +138,7 @@ def test_missing_stages_have_no_figure(hda_products: dict[str, Any], missing: tu
     assert is_hda_case(products)
 
 
-@pytest.mark.parametrize("changes", [{"image_2": None}, {"true_places": "none"}, {"camera_true": np.zeros(3)}])
+@pytest.mark.parametrize("changes", [{"image_2": None}, {"true_positions": "none"}, {"camera_true": np.zeros(3)}])
 def test_incomplete_products_are_not_a_landing(hda_products: dict[str, Any], changes: dict[str, Any]) -> None:
     assert not is_hda_case({**hda_products, **changes})
     assert not is_dimes_case(hda_products)

@@ -92,7 +92,7 @@ def test_touchdown_errors_are_compared_with_table_2() -> None:
 def test_reported_sites_are_scored_against_the_truth() -> None:
     frame = landing_frame(400)
     rates = site_fractions(frame)
-    safe = rates["chosen sites that are truly safe"]
+    safe = rates["selected sites that are truly safe"]
     assert (safe.n, safe.hits) == (frame["site_reported"].sum(), (frame["site_reported"] & frame["site_safe"]).sum())
     assert rates["answer 'no safe site' if none exists"].fraction == 1.0
     counts = outcome_counts(frame)

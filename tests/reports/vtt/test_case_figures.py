@@ -99,9 +99,9 @@ def test_figures_are_written(tmp_path: Path) -> None:
         {"figures": {"range_m": "far", "azimuth_deg": [1.0]}},
         {"states": "lost", "stop_1_right": None},
         {"stop_1_corners": None, "stop_2_window": np.zeros(3), "stop_1_point": "there"},
-        {"stop_1_left": np.zeros((161, 161)), "stop_2_found": None},
+        {"stop_1_left": np.zeros((161, 161)), "stop_2_matches": None},
         {"rocks_m": None, "heading_deg": None, "path_true_m": np.empty((0, 2))},
-        {"target_believed_m": np.full((3, 3), np.nan)},
+        {"target_estimated_m": np.full((3, 3), np.nan)},
     ],
 )
 def test_missing_products_are_tolerated(changes: dict[str, Any]) -> None:

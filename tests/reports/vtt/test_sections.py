@@ -62,17 +62,23 @@ def _make_two_tracker_rows(step_sizes: int = 5) -> pd.DataFrame:
     """
     frames = []
     for algorithm in ("vtt", "pure_ncc"):
-        for skip in range(step_sizes):
-            is_tracked = np.arange(10) < (10 if algorithm == "vtt" else 8 - skip)
+        for skipped_stops in range(step_sizes):
+            is_tracked = np.arange(10) < (10 if algorithm == "vtt" else 8 - skipped_stops)
             frames.append(
-                make_rows(10, algorithm=algorithm, skip=skip, step=1.0 - 0.95 ** (skip + 1), tracked=is_tracked)
+                make_rows(
+                    10,
+                    algorithm=algorithm,
+                    skipped_stops=skipped_stops,
+                    step=1.0 - 0.95 ** (skipped_stops + 1),
+                    tracked=is_tracked,
+                )
             )
     return pd.concat(frames, ignore_index=True)
 
 
 def test_step_rates_are_compared_with_fig_8() -> None:
     frame = _make_two_tracker_rows()
-    frame.loc[0, ["selectable", "tracked", "true_track"]] = False  # unselectable targets are excluded
+    frame.loc[0, ["selectable", "tracked", "no_false_track"]] = False  # unselectable targets are excluded
     rates = step_rates(make_subject(frame, legs=[{"motion": "approach", "step_fraction": 0.05}]))
     rate_at = {(rate["line"], round(rate["step"])): rate for rate in rates}
     assert (rate_at["vtt", 5]["good"].hits, rate_at["vtt", 5]["good"].n, rate_at["vtt", 5]["paper_percent"]) == (
@@ -92,8 +98,8 @@ def test_step_rates_are_compared_with_fig_8() -> None:
 def test_step_rates_of_circles_and_turns_are_per_degree() -> None:
     frame = pd.concat(
         [
-            make_rows(11, skip=skip, step=5.0 * (skip + 1), search_px=window_px)
-            for skip in range(3)
+            make_rows(11, skipped_stops=skipped_stops, step=5.0 * (skipped_stops + 1), search_px=window_px)
+            for skipped_stops in range(3)
             for window_px in (200, 600)
         ]
     )
@@ -112,9 +118,13 @@ def test_step_rates_of_circles_and_turns_are_per_degree() -> None:
 
 def test_oblique_targets_are_reported_separately() -> None:
     """The rate for the comparison with the paper excludes oblique targets; a separate table lists their rate."""
-    face_on = make_rows(6, skip=0, step=5.0, obliquity_max_deg=40.0, in_view=True, on_face=True)
-    oblique = make_rows(4, skip=0, step=5.0, obliquity_max_deg=72.0, in_view=True, on_face=False, tracked=False)
-    hidden = make_rows(3, skip=0, step=5.0, obliquity_max_deg=80.0, in_view=False, on_face=False, tracked=False)
+    face_on = make_rows(6, skipped_stops=0, step=5.0, obliquity_max_deg=40.0, in_view=True, on_face=True)
+    oblique = make_rows(
+        4, skipped_stops=0, step=5.0, obliquity_max_deg=72.0, in_view=True, on_face=False, tracked=False
+    )
+    hidden = make_rows(
+        3, skipped_stops=0, step=5.0, obliquity_max_deg=80.0, in_view=False, on_face=False, tracked=False
+    )
     run_subject = make_subject(pd.concat([face_on, oblique, hidden], ignore_index=True), legs=[{"motion": "circle"}])
     (cell,) = step_rates(run_subject)
     assert (cell["good"].hits, cell["good"].n, cell["all_targets"].n) == (6, 6, 13)
@@ -238,7 +248,7 @@ def test_goal_statistics_are_computed_per_camera() -> None:
     frame.loc[: n - 1, "position_error_m"] = np.linspace(0.0, 0.0399, n)
     set_values(frame, n, tracked=False, outcome="LOST", position_error_m=np.nan, drift_px=np.nan)
     set_values(frame, n, losses="MATCH_SCORE", lost_range_m=3.5)
-    frame.loc[n + 1, "true_track"] = False
+    frame.loc[n + 1, "no_false_track"] = False
     navcam, pancam = summarize_cameras(frame)
     assert navcam["within"].hits == 225  # the error of case k is 0.0399 k / 299 m: 3 cm is exceeded from k = 225 on
     assert navcam["median_m"] == pytest.approx(0.01995)

@@ -18,7 +18,7 @@ def make_rows(cases: int, **columns: Any) -> pd.DataFrame:
     defaults: dict[str, Any] = {
         "case": np.arange(cases),
         "outcome": "COMPLETED",
-        **dict.fromkeys(("answered", "tracked", "true_track", "selectable", "clear_sky"), True),
+        **dict.fromkeys(("answered", "tracked", "no_false_track", "selectable", "clear_sky"), True),
         **dict.fromkeys(("not_tracked", "visual_odometry", "autonav"), False),
         "position_error_m": 0.004,
         "range_error_m": 0.003,
@@ -77,7 +77,7 @@ def make_products(stops: int = 3) -> dict[str, Any]:
         case_products[f"stop_{number}_right"] = rng.integers(500, 3000, (105, 161)).astype(np.uint16)
         case_products[f"stop_{number}_corners"] = np.array([[400.0, 300.0], [380.0, 302.0]])
         case_products[f"stop_{number}_window"] = np.array([410.0, 310.0, 141.0, 141.0])
-        case_products[f"stop_{number}_found"] = (
+        case_products[f"stop_{number}_matches"] = (
             np.full((2, 2), np.nan) if is_lost else np.array([[480.0, 370.0], [450.0, 371.0]])
         )
         case_products[f"stop_{number}_point"] = np.array([481.5, 369.0])
@@ -95,10 +95,10 @@ def make_products(stops: int = 3) -> dict[str, Any]:
         },
         "states": ["NORMAL"] * (stops - 1) + ["LOST"],
         "rover_true_m": rover,
-        "rover_believed_m": rover + 0.05,
+        "rover_estimated_m": rover + 0.05,
         "heading_deg": np.full(stops, 90.0),
         "target_m": np.array([10.0, 0.0, 0.2]),
-        "target_believed_m": target_estimates,
+        "target_estimated_m": target_estimates,
         "path_true_m": rover[:, :2],
         "rocks_m": np.array([[10.1, 0.0, 0.4]]),
     }

@@ -77,7 +77,9 @@ def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
 
 def test_flight_is_rotated_and_moved_to_its_start(tmp_path: Path) -> None:
     file = _write_vertical_fall(tmp_path)
-    parameters = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu", "turn_deg": 90.0}})
+    parameters = DescentScenarioParameters.model_validate(
+        {"flight": {"file": file, "axes": "enu", "heading_offset_deg": 90.0}}
+    )
     assert isinstance(parameters.flight, FlightFile)
     motion = parameters.flight.motion(np.array([100.0, 200.0, 30.0]), 3.7)
     # The rotation by 90 deg turns east into south; after 5 s: 50 m south, 350 m lower.

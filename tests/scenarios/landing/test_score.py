@@ -119,5 +119,5 @@ def test_matches_are_counted_by_outcome() -> None:
         "matched_fraction": 50 / 59,
         "matches_dissimilar": 4,
         "matches_out_of_bounds": 3,
-        "matches_not_returned": 2,
+        "matches_inconsistent": 2,
     }

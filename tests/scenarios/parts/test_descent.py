@@ -71,10 +71,10 @@ class RotatedAttitude:
     quantity: ClassVar[str] = "attitude"
     random: ClassVar[bool] = False
 
-    turn_deg: float = 0.3
+    yaw_error_deg: float = 0.3
 
     def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
-        rotation = Rotation.from_euler("z", self.turn_deg, degrees=True)
+        rotation = Rotation.from_euler("z", self.yaw_error_deg, degrees=True)
         return InstrumentReadings(truth.times_s, (rotation * truth.motion.motion(truth.times_s).attitudes).as_quat())
 
 
@@ -128,7 +128,7 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
         6.0,
         f"{MODULE}OffsetAltimeter",
     )
-    assert row["attitude_source_turn_deg"] == 0.3
+    assert row["attitude_source_yaw_error_deg"] == 0.3
     # The score receives the algorithm, its answer and the truth.
     assert row["record_inputs_altitude_m"] == pytest.approx(float(row["altitude_2_m"]) + 6.0, abs=1e-6)
     assert row["record_inputs_error_m_s"] == pytest.approx(row["velocity_error_m_s"], abs=1e-9)

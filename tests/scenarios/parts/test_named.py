@@ -57,7 +57,11 @@ def find_problem(**parts: Any) -> tuple[str, str]:
             "flight",
             "': glide_ratio is 9.0; allowed: 0 to 5",
         ),
-        ({"flight": {"motion": "custom_parts:Glider", "turn_deg": 1.0}}, "flight.turn_deg", "unknown key"),
+        (
+            {"flight": {"motion": "custom_parts:Glider", "heading_offset_deg": 1.0}},
+            "flight.heading_offset_deg",
+            "unknown key",
+        ),
         (
             {"altimeter": {"instrument": "custom_parts:StarTracker"}},
             "altimeter",
