@@ -121,8 +121,11 @@ def read_stops(products: Mapping[str, Any]) -> list[StopImages]:
         if left is None:
             return stops
         state = states[number - 1] if isinstance(states, list) and number <= len(states) else ""
-        shapes = {"corners": (2, 2), "window": (4,), "found": (2, 2), "point": (2,)}
-        pixels = [_read_or_nan(products.get(f"stop_{number}_{name}"), *shape) for name, shape in shapes.items()]
+        shapes = {"corners": (2, 2), "window": (4,), "matches": (2, 2), "point": (2,)}
+        stop_products = {name: products.get(f"stop_{number}_{name}") for name in shapes}
+        if stop_products["matches"] is None:  # former name, until version 0.2
+            stop_products["matches"] = products.get(f"stop_{number}_found")
+        pixels = {name: _read_or_nan(stop_products[name], *shape) for name, shape in shapes.items()}
         stops.append(
             StopImages(
                 number=number,
@@ -130,7 +133,7 @@ def read_stops(products: Mapping[str, Any]) -> list[StopImages]:
                 left=left,
                 right=to_matrix(products.get(f"stop_{number}_right")),
                 quantities={name: float(array[number - 1]) for name, array in arrays.items() if number <= array.size},
-                **dict(zip(("corners", "window", "matches", "point"), pixels, strict=True)),
+                **pixels,
             )
         )
     return stops

@@ -275,9 +275,9 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     stop_N_left        counts of the left subframe of stop N (from 1); `stop_N_right`: those of the right subframe
     stop_N_corners     full-frame (u, v) of the upper left pixels of both subframes, (2, 2)
     stop_N_window      search window in the left frame: (u, v) of its upper left pixel, columns, rows; or NaN
-    stop_N_found       tracked (u, v) in the left and the right frame, (2, 2); NaN if not found
+    stop_N_matches     tracked (u, v) in the left and the right frame, (2, 2); NaN if not found
     stop_N_point       (u, v) of the designated point's true projection in the left frame
-    template_px        side of the template around `stop_N_found`
+    template_px        side of the template around `stop_N_matches`
     figures            arrays over the stops by name, see `update_quantities`
     states             the tracker's state at each stop
     rover_true_m       world positions of the rover's origin, (stops, 3); `rover_believed_m`: estimated positions
@@ -303,7 +303,7 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
             "right": right.counts,
             "corners": np.array([left.corner, right.corner], dtype=np.float64),
             "window": window,
-            "found": matched_px,
+            "matches": matched_px,
             "point": stop.point_px,
         }
         arrays |= {f"stop_{number}_{name}": values for name, values in stop_arrays.items()}

@@ -55,6 +55,13 @@ def test_template_around_the_match_is_enlarged() -> None:
     assert bright.max(axis=0).tolist() == [65, 65]
 
 
+def test_matches_with_the_deprecated_name_are_read() -> None:
+    case_products = make_products()
+    matches = case_products.pop("stop_1_matches")
+    stop = read_stops(case_products | {"stop_1_found": matches})[0]
+    np.testing.assert_array_equal(stop.matches, matches)
+
+
 def test_titles_contain_range_azimuth_and_match_score() -> None:
     figure = draw_stops(make_products())
     titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
@@ -99,7 +106,7 @@ def test_figures_are_written(tmp_path: Path) -> None:
         {"figures": {"range_m": "far", "azimuth_deg": [1.0]}},
         {"states": "lost", "stop_1_right": None},
         {"stop_1_corners": None, "stop_2_window": np.zeros(3), "stop_1_point": "there"},
-        {"stop_1_left": np.zeros((161, 161)), "stop_2_found": None},
+        {"stop_1_left": np.zeros((161, 161)), "stop_2_matches": None},
         {"rocks_m": None, "heading_deg": None, "path_true_m": np.empty((0, 2))},
         {"target_believed_m": np.full((3, 3), np.nan)},
     ],

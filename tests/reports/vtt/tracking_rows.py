@@ -77,7 +77,7 @@ def make_products(stops: int = 3) -> dict[str, Any]:
         case_products[f"stop_{number}_right"] = rng.integers(500, 3000, (105, 161)).astype(np.uint16)
         case_products[f"stop_{number}_corners"] = np.array([[400.0, 300.0], [380.0, 302.0]])
         case_products[f"stop_{number}_window"] = np.array([410.0, 310.0, 141.0, 141.0])
-        case_products[f"stop_{number}_found"] = (
+        case_products[f"stop_{number}_matches"] = (
             np.full((2, 2), np.nan) if is_lost else np.array([[480.0, 370.0], [450.0, 371.0]])
         )
         case_products[f"stop_{number}_point"] = np.array([481.5, 369.0])
