@@ -57,7 +57,7 @@ def store(measurements: list[Measurement]) -> None:
         "machine": {"platform": platform.platform(), "processor": processor_features(), "cores": os.cpu_count()},
         "versions": {name: version(name) for name in PACKAGES},
         "gl": process_renderer(default_backend()).description(),
-        "figures": {row.name: {"median": row.median, "asked": row.limit_text} for row in measurements},
+        "figures": {row.name: {"median": row.median, "limit": row.limit_text} for row in measurements},
     }
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps(record, indent=2) + "\n")

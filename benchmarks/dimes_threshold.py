@@ -31,15 +31,17 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
     rng = np.random.default_rng(inputs.seed)
     errors = derivation.draw_correct_track_errors(inputs, rng)
     results = derivation.discrepancies(errors, inputs.imu_sd_m_s, rng)
-    threshold = derivation.threshold_m_s(results.single, inputs.kept, inputs.step_m_s)
+    threshold = derivation.threshold_m_s(results.one_track, inputs.accepted_fraction, inputs.step_m_s)
     wrong_track_outcomes = []
     for tracks in (1, 2):
         for error_range_m_s in WRONG_TRACK_ERRORS_M_S:
             outcomes = derivation.simulate_wrong_track(
                 errors[:, :, :tracks], error_range_m_s, threshold, inputs.imu_sd_m_s, rng
             )
-            fractions = {"right": outcomes.correct, "refused": outcomes.rejected, "wrong": outcomes.wrong}
-            wrong_track_outcomes.append({"tracks_per_pair": tracks, "wrong_by_m_s": error_range_m_s, **fractions})
+            fractions = {"correct": outcomes.correct, "rejected": outcomes.rejected, "wrong": outcomes.wrong}
+            wrong_track_outcomes.append(
+                {"tracks_per_pair": tracks, "track_error_range_m_s": error_range_m_s, **fractions}
+            )
     return {
         "derivation": "benchmarks.threshold_derivation",
         "derivation_version": VERSION,
@@ -47,15 +49,15 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
         "inputs": asdict(inputs),
         "track_error_rms_m_s": float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))),
         "discrepancy_quantiles_m_s": {
-            "one right track in each pair": _quantiles(results.single),
-            "best of two right tracks in each pair": _quantiles(results.best),
+            "one correct track in each pair": _quantiles(results.one_track),
+            "best combination of two correct tracks in each pair": _quantiles(results.two_tracks),
         },
-        "kept": {
-            "one right track in each pair": float(np.mean(results.single < threshold)),
-            "best of two right tracks in each pair": float(np.mean(results.best < threshold)),
+        "accepted_fractions": {
+            "one correct track in each pair": float(np.mean(results.one_track < threshold)),
+            "best combination of two correct tracks in each pair": float(np.mean(results.two_tracks < threshold)),
         },
-        "kept_quantile_m_s": float(np.quantile(results.single, inputs.kept)),
-        "kept_quantile_90_percent_bounds_m_s": quantile_bounds(results.single, inputs.kept, 0.95),
+        "accepted_quantile_m_s": float(np.quantile(results.one_track, inputs.accepted_fraction)),
+        "accepted_quantile_90_percent_bounds_m_s": quantile_bounds(results.one_track, inputs.accepted_fraction, 0.95),
         "threshold_m_s": threshold,
         "one_wrong_track": wrong_track_outcomes,
     }

@@ -13,7 +13,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
 def write_page(record: Mapping[str, Any]) -> None:
     """Write the page; `record` is the content of `benchmarks.json`."""
     rows = ["| quantity (core-s unless another unit is given) | limit | median |", "|---|---|---|"]
-    rows += [f"| {name} | {row['asked']} | {row['median']:.3g} |" for name, row in record["figures"].items()]
+    rows += [f"| {name} | {row['limit']} | {row['median']:.3g} |" for name, row in record["figures"].items()]
     machine = record["machine"]
     conditions = f"{record['measured'][:10]}, {machine['cores']} cores of {machine['processor']}, {record['gl']}"
     text = (

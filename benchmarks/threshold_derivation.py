@@ -6,8 +6,8 @@ the measured cameras intersect its rays with the ground, and the resulting veloc
 content is modelled only as an error of the match. Errors of altitude and attitude are independent between images,
 except the common attitude error.
 
-The threshold is the smallest multiple of `step_m_s` that accepts the fraction `kept` of descents with one correct track
-in each pair, the minimum for DIMES. `benchmarks.dimes_threshold` stores the result.
+The threshold is the smallest multiple of `step_m_s` that accepts the fraction `accepted_fraction` of descents with one
+correct track in each pair, the minimum for DIMES. `benchmarks.dimes_threshold` stores the result.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ThresholdInputs:
         Velocity error of a track per axis due to the match (0.03 px with the noise of the flight camera: 0.05 m/s).
     imu_sd_m_s
         Error per axis of the velocity change of the IMU.
-    kept
+    accepted_fraction
         Fraction of descents with one correct track in each pair that must pass the check.
     step_m_s
         Step to which the threshold is rounded up.
@@ -77,7 +77,7 @@ class ThresholdInputs:
     feature_height_sd_m: float = 20.0
     match_sd_m_s: float = 0.1
     imu_sd_m_s: float = 0.05
-    kept: float = 0.995
+    accepted_fraction: float = 0.995
     step_m_s: float = 0.1
 
 
@@ -199,27 +199,29 @@ class Discrepancies:
 
     Attributes
     ----------
-    single
+    one_track
         One correct track in each pair, shape (descents,).
-    best
+    two_tracks
         Minimum of the four combinations of two correct tracks in each pair, shape (descents,).
     """
 
-    single: Float[np.ndarray, " descents"]
-    best: Float[np.ndarray, " descents"]
+    one_track: Float[np.ndarray, " descents"]
+    two_tracks: Float[np.ndarray, " descents"]
 
 
 def discrepancies(errors: TrackErrors, imu_sd_m_s: float, rng: np.random.Generator) -> Discrepancies:
     """Compute the discrepancies in DIMES' check for correct tracks with these errors."""
     imu = imu_sd_m_s * rng.standard_normal((len(errors), 1, 1, 2))
     combinations = np.linalg.norm(errors[:, 1, None, :, :] - errors[:, 0, :, None, :] - imu, axis=-1)
-    return Discrepancies(single=combinations[:, 0, 0], best=combinations.min(axis=(1, 2)))
+    return Discrepancies(one_track=combinations[:, 0, 0], two_tracks=combinations.min(axis=(1, 2)))
 
 
-def threshold_m_s(single: Float[np.ndarray, " descents"], kept: float, step_m_s: float) -> float:
-    """Return the smallest multiple of the step that exceeds the fraction `kept` of the discrepancies."""
+def threshold_m_s(
+    discrepancies_m_s: Float[np.ndarray, " descents"], accepted_fraction: float, step_m_s: float
+) -> float:
+    """Return the smallest multiple of the step that exceeds this fraction of the discrepancies."""
     # remove the rounding error of the product
-    return round(step_m_s * float(np.ceil(np.quantile(single, kept) / step_m_s)), 9)
+    return round(step_m_s * float(np.ceil(np.quantile(discrepancies_m_s, accepted_fraction) / step_m_s)), 9)
 
 
 @dataclass(frozen=True)
@@ -243,21 +245,22 @@ class WrongTrackOutcomes:
 
 def simulate_wrong_track(
     errors: Float[np.ndarray, "descents 2 templates 2"],
-    wrong_by_m_s: tuple[float, float],
+    track_error_range_m_s: tuple[float, float],
     threshold_m_s: float,
     imu_sd_m_s: float,
     rng: np.random.Generator,
     required_m_s: float = 5.0,
 ) -> WrongTrackOutcomes:
-    """Simulate the check with one wrong track, whose error has a random direction and a size within `wrong_by_m_s`.
+    """Simulate the check with one wrong track.
 
-    The wrong track is drawn at random. With one template per pair in `errors`, it is the only track of its pair.
+    Its error has a random direction and a size within `track_error_range_m_s`. The wrong track is drawn at random.
+    With one template per pair in `errors`, it is the only track of its pair.
     """
     counts = np.zeros(3)
     for tracks in errors:
         pair, template = rng.integers(2), rng.integers(tracks.shape[1])
         changed_tracks = tracks.copy()
-        changed_tracks[pair, template] += rng.uniform(*wrong_by_m_s) * _draw_direction(rng)
+        changed_tracks[pair, template] += rng.uniform(*track_error_range_m_s) * _draw_direction(rng)
         imu_change = np.zeros((2, 3))
         imu_change[1, :2] = imu_sd_m_s * rng.standard_normal(2)
         first, second = (list(enumerate(pair_tracks)) for pair_tracks in changed_tracks)

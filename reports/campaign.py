@@ -214,6 +214,8 @@ def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: 
         "sampling": {**asdict(sampling), "independent": sampling.independent, "text": sampling.text},
         "evidence": {
             **evaluation.evidence.to_table(),
+            # former key of `algorithm_confirmations`, until version 0.2
+            "of_algorithm": evaluation.evidence.algorithm_confirmations,
             "title": evaluation.evidence.title,
             "text": evaluation.evidence.text,
         },

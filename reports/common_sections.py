@@ -17,7 +17,6 @@ from scipy import stats
 from marsyard.reports import rates
 from marsyard.reports.comparison import list_compared_algorithms, select_algorithm
 from marsyard.reports.figures import ELLIPSE
-from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import (
@@ -32,6 +31,7 @@ from marsyard.reports.section import (
     new_axes,
     svg_figure,
 )
+from marsyard.reports.section_kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.statistics.changes import correct_holm
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
 from marsyard.reports.statistics.proportions import proportion_interval

@@ -144,8 +144,8 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
     verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling, from_truth, configured)
     verdicts = [withhold_verdict(verdict, evidence) for verdict in verdicts]
-    if evidence.kind is EvidenceKind.CONFIRMATION and evidence.of_algorithm > 1:
-        verdicts = _add_joint_verdicts(verdicts, run, sampling, evidence.of_algorithm)
+    if evidence.kind is EvidenceKind.CONFIRMATION and evidence.algorithm_confirmations > 1:
+        verdicts = _add_joint_verdicts(verdicts, run, sampling, evidence.algorithm_confirmations)
     overall = combine_verdicts(verdicts, run.all_cases, sampling, evidence)
     return Evaluation(run, sampling, evidence, verdicts, overall)
 
@@ -191,8 +191,8 @@ def read_evidence(record: Mapping[str, Any], *, uses_campaign_requirements: bool
 
 
 def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
-    """Replace PASS and MET BY RATE by INSUFFICIENT for evidence that allows no PASS (`Evidence.withheld`)."""
-    if not evidence.withheld or verdict.status not in (Status.PASS, Status.MET_BY_RATE):
+    """Replace PASS and MET BY RATE by INSUFFICIENT for evidence that allows no PASS (`Evidence.excludes_pass`)."""
+    if not evidence.excludes_pass or verdict.status not in (Status.PASS, Status.MET_BY_RATE):
         return verdict
     reason = f"The verdict would be {verdict.status}. {evidence.text}"
     return replace(

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.reports.kinds import Part, Rows
 from marsyard.reports.rates import all_flags, finite_values, flag_fraction, fraction_text, median_text
 from marsyard.reports.section import Block, Grid, Section, Subject
+from marsyard.reports.section_kinds import Part, Rows
 from marsyard.reports.wording import NOTHING
 
 

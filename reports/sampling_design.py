@@ -11,7 +11,7 @@ import pandas as pd
 from jaxtyping import Bool
 
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.statistics.proportions import planned_looks, spent_fraction
+from marsyard.reports.statistics.proportions import planned_looks, risk_fraction_at
 from marsyard.reports.stored import table
 from marsyard.reports.wording import count, format_fraction
 
@@ -97,7 +97,7 @@ class SamplingDesign:
 
     def risk_fraction_at(self, cases: int) -> float:
         """Fraction of the risk of a wrong verdict (1 - confidence) that a look at `cases` cases may use."""
-        return 1.0 if self.max_cases is None else spent_fraction(planned_looks(self.max_cases), cases)
+        return 1.0 if self.max_cases is None else risk_fraction_at(planned_looks(self.max_cases), cases)
 
     def mask_first_look(self, frame: pd.DataFrame, population: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
         """Create the mask of the rows of a population that an earlier first look used; None at the first look."""

@@ -12,11 +12,23 @@ from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.stored import table
 from marsyard.reports.wording import NOTHING, count, number
 
+#: Current keys of stored results by former key; accepted until version 0.2.
+_FORMER_KEYS = {"searched": "search_cases", "found_case": "original_case"}
+
 
 def read_search(record: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the settings of a search with its `result`; empty for a run that is no search, or is not finished."""
     study = table(record.get("study"))
-    return study if study.get("kind") == "search" and table(study.get("result")) else {}
+    result = table(study.get("result"))
+    if study.get("kind") != "search" or not result:
+        return {}
+    failures = [_rename_keys(failure, _FORMER_KEYS) for failure in result["failures"]]
+    return {**study, "result": {**_rename_keys(result, _FORMER_KEYS), "failures": failures}}
+
+
+def _rename_keys(values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    """Replace former keys by the current ones."""
+    return {names.get(key, key): value for key, value in values.items()}
 
 
 def search_sentences(study: Mapping[str, Any]) -> list[str]:
@@ -24,15 +36,15 @@ def search_sentences(study: Mapping[str, Any]) -> list[str]:
     if not study:
         return []
     result = table(study.get("result"))
-    searched_text = count(int(result["searched"]), "case")
+    cases_text = count(int(result["search_cases"]), "case")
     total_text = f"{count(int(result['cases']), 'case')} in all"
     if not result["violations"]:
         margin = number(float(result["min_margin"])) if result.get("min_margin") is not None else NOTHING
-        sentences = [f"{study['requirement']}: no violation in {searched_text}; the smallest margin is {margin}."]
+        sentences = [f"{study['requirement']}: no violation in {cases_text}; the smallest margin is {margin}."]
     else:
         violations, n_reduced = count(int(result["violations"]), "violation"), len(result["failures"])
         sentences = [
-            f"{study['requirement']}: {violations} in {searched_text}, the first after {result['first_violation']}; "
+            f"{study['requirement']}: {violations} in {cases_text}, the first after {result['first_violation']}; "
             f"{count(n_reduced, 'reduced violation')} after {total_text}."
         ]
     sentences += [failure_sentence(index, failure) for index, failure in enumerate(result["failures"], start=1)]

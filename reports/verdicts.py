@@ -4,7 +4,7 @@ A requirement specifies that `|metric| <= bound`, or a true column, holds for a 
 confidence. Its status follows from one-sided Clopper-Pearson bounds of the success rate. Bounds of cases on shared
 terrains allow for correlation (`marsyard.reports.statistics.proportions`). If a campaign is evaluated repeatedly, the
 probability of a wrong verdict in any evaluation is at most 1 - confidence: each planned look (evaluation) uses a
-fraction of this risk, and looks at appended cases use `LaterLook`. MET BY RATE: the requirement has
+fraction of this risk, and looks at appended cases use `SequentialTest`. MET BY RATE: the requirement has
 `decide_by = "estimate"`, and the observed rate is sufficient, but the lower bound is not. Cases that are not
 independent random samples (Latin hypercube, Sobol, grids) have no bounds; only such requirements can be decided.
 """
@@ -29,7 +29,7 @@ from marsyard.reports.statistics import proportions
 from marsyard.reports.statistics.proportions import (
     ClusteredEvidence,
     ClusterMethod,
-    LaterLook,
+    SequentialTest,
     clustered_evidence,
     confidence_at,
 )
@@ -279,8 +279,10 @@ def _confidences(
     if looks.in_first_look is None:
         level = confidence_at(confidence, looks.risk_fraction)
         return level, level
-    pass_look, fail_look = (LaterLook(limit, 1.0 - confidence, first_n) for limit in (1.0 - probability, probability))
-    return 1.0 - pass_look.risk_of_bound(n), 1.0 - fail_look.risk_of_bound(n)
+    pass_test, fail_test = (
+        SequentialTest(limit, 1.0 - confidence, first_n) for limit in (1.0 - probability, probability)
+    )
+    return 1.0 - pass_test.significance_level(n), 1.0 - fail_test.significance_level(n)
 
 
 def _cases_needed(first_n: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:
@@ -288,7 +290,7 @@ def _cases_needed(first_n: int, n: int, failures: int, probability: float, confi
     if looks.risk_fraction < 1.0:
         level = confidence_at(confidence, looks.risk_fraction)
         return n + proportions.further_cases_needed(n, failures, probability, level)
-    return LaterLook(1.0 - probability, 1.0 - confidence, first_n).cases_needed(n, failures)
+    return SequentialTest(1.0 - probability, 1.0 - confidence, first_n).cases_needed(n, failures)
 
 
 def evaluate_requirements(
@@ -351,7 +353,7 @@ def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: Sam
         text = str(error)
         return replace(verdict, reason=f"{text[:1].upper()}{text[1:]}.")
     if population.empty:
-        needed_cases = LaterLook(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
+        needed_cases = SequentialTest(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
         return replace(verdict, reason=reason, further_cases=needed_cases if sampling.independent else None)
     verdicts = (_decide(verdict, cases, sampling, frame) for cases in (population, population_and_unfinished))

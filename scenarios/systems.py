@@ -13,7 +13,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -22,6 +22,7 @@ from typing import cast
 
 from marsyard.scenarios.interface import Scenario
 from marsyard.scenarios.user_files import import_object
+from marsyard.sim.parameters import warn_deprecated
 
 #: Folder of the files that the systems of Marsyard share.
 SCENARIOS_FOLDER = Path(__file__).resolve().parent
@@ -55,12 +56,13 @@ class System:
     - columns: file of the columns of each scenario's rows, as `scenarios/columns.toml`. Without it, requirements are
       checked against the first finished case.
     - error_sources: file of the sources of error of each scenario's cases, as `scenarios/error_sources.toml`
-    - compiled_by: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small: one case of each
-      calls all numeric kernels of its scenario (`marsyard compile`)
+    - compilation_campaigns: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small. One case
+      of each calls, and so compiles, all numeric kernels of its scenario (`marsyard compile`).
     - templates: each a `marsyard.scenarios.template.CampaignTemplate`, by the values of ``marsyard new --system``
     - ingest: function that converts recorded data into cases (`marsyard ingest`). Arguments: folder of the data, folder
       for the new cases, and folder to which the new cases are moved. Returns `Ingested`.
     - report: a `marsyard.reports.presentation.Presentation`: report sections, and the figures of a case
+    - compiled_by: deprecated name of `compilation_campaigns`
     """
 
     name: str
@@ -72,10 +74,16 @@ class System:
     requirements: Path | None = None
     columns: Path | None = None
     error_sources: Path | None = None
-    compiled_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    compilation_campaigns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     templates: Mapping[str, str] = field(default_factory=dict)
     ingest: str = ""
     report: str = ""
+    compiled_by: InitVar[Mapping[str, tuple[str, ...]] | None] = None
+
+    def __post_init__(self, compiled_by: Mapping[str, tuple[str, ...]] | None) -> None:
+        if compiled_by is not None:
+            warn_deprecated("compiled_by", "compilation_campaigns")
+            object.__setattr__(self, "compilation_campaigns", compiled_by)
 
     @property
     def campaigns(self) -> Mapping[str, Path]:
@@ -119,7 +127,7 @@ BUILT_IN = (
         requirements=_REQUIREMENTS,
         columns=_COLUMNS,
         error_sources=_ERROR_SOURCES,
-        compiled_by={"dimes-smoke": ("terrain.samples=512",)},
+        compilation_campaigns={"dimes-smoke": ("terrain.samples=512",)},
         templates={"velocity": "marsyard.scenarios.template:VELOCITY"},
         report="marsyard.reports.dimes.presentation:DIMES",
     ),
@@ -147,7 +155,9 @@ BUILT_IN = (
         requirements=_REQUIREMENTS,
         columns=_COLUMNS,
         error_sources=_ERROR_SOURCES,
-        compiled_by={"vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")},
+        compilation_campaigns={
+            "vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")
+        },
         templates={"tracking": "marsyard.scenarios.template:TRACKING"},
         report="marsyard.reports.vtt.presentation:VTT",
     ),
@@ -161,7 +171,7 @@ BUILT_IN = (
         requirements=_REQUIREMENTS,
         columns=_COLUMNS,
         error_sources=_ERROR_SOURCES,
-        compiled_by={"hda-benign": ("terrain.samples=512",)},
+        compilation_campaigns={"hda-benign": ("terrain.samples=512",)},
         templates={"landing": "marsyard.scenarios.template:LANDING"},
         report="marsyard.reports.hda.presentation:HDA",
     ),

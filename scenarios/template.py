@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import InitVar, asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from marsyard.scenarios.descent.parameters import binned_size_for
 from marsyard.scenarios.systems import SCENARIOS_FOLDER
 from marsyard.sim.camera import read_camera
+from marsyard.sim.parameters import warn_deprecated
 
 #: Minimum number of terrains of a new campaign's bank, enough for cases appended later, and maximum of a bank.
 MIN_TERRAINS, MAX_TERRAINS = 10_000, 100_000
@@ -50,8 +51,9 @@ class CampaignTemplate:
     - site, bound: default site, and default bound of the requirement
     - bound_text: meaning of the bound, for the dialogue
     - max_bound: upper limit of the bound, exclusive
-    - refused: reasons why options (``camera``, ``detector``, ``flight``) are not accepted
+    - unsupported_options: why an option (``camera``, ``detector``, ``flight``) is not accepted, by option
     - values: function that returns further values for the file. Raises ValueError if a user's file is invalid.
+    - refused: deprecated name of `unsupported_options`
     """
 
     file: Path
@@ -60,14 +62,20 @@ class CampaignTemplate:
     bound: float
     bound_text: str
     max_bound: float = math.inf
-    refused: Mapping[str, str] = field(default_factory=dict)
+    unsupported_options: Mapping[str, str] = field(default_factory=dict)
     values: Callable[[Choices], Mapping[str, Any]] = lambda _: {}
+    refused: InitVar[Mapping[str, str] | None] = None
+
+    def __post_init__(self, refused: Mapping[str, str] | None) -> None:
+        if refused is not None:
+            warn_deprecated("refused", "unsupported_options")
+            object.__setattr__(self, "unsupported_options", refused)
 
     def text(self, choices: Choices) -> str:
         """Return the text of the campaign file. Raises ValueError if an option is not accepted."""
-        refusal = next((reason for option, reason in self.refused.items() if getattr(choices, option)), None)
-        if refusal is not None:
-            raise ValueError(refusal)
+        reasons = [reason for option, reason in self.unsupported_options.items() if getattr(choices, option)]
+        if reasons:
+            raise ValueError(reasons[0])
         template = toml_environment(self.file.parent, SCENARIOS_FOLDER).get_template(self.file.name)
         bank = min(MAX_TERRAINS, max(MIN_TERRAINS, choices.cases))
         return template.render(asdict(choices), bank=bank, **self.values(choices))
@@ -87,8 +95,8 @@ def toml_environment(*folders: Path) -> Environment:
     return environment
 
 
-_REFUSED_FLIGHT = "--flight: only descents accept a recorded trajectory, and {} is not a descent"
-_REFUSED_CAMERA = (
+_NO_FLIGHT_FILE = "--flight: only descents accept a recorded trajectory, and {} is not a descent"
+_NO_CAMERA_FILE = (
     "--camera and --detector: tracking uses the stereo cameras of a mast; see camera.preset and camera.custom"
 )
 
@@ -109,7 +117,7 @@ LANDING = CampaignTemplate(
     bound=0.99,
     bound_text="minimum fraction of safe sites among the selected sites",
     max_bound=1.0,
-    refused={"flight": _REFUSED_FLIGHT.format("landing")},
+    unsupported_options={"flight": _NO_FLIGHT_FILE.format("landing")},
 )
 TRACKING = CampaignTemplate(
     file=SCENARIOS_FOLDER / "rover" / "new.toml.j2",
@@ -117,5 +125,9 @@ TRACKING = CampaignTemplate(
     site="mars-yard",
     bound=0.03,
     bound_text="maximum error of the target's position at the goal, m",
-    refused={"camera": _REFUSED_CAMERA, "detector": _REFUSED_CAMERA, "flight": _REFUSED_FLIGHT.format("tracking")},
+    unsupported_options={
+        "camera": _NO_CAMERA_FILE,
+        "detector": _NO_CAMERA_FILE,
+        "flight": _NO_FLIGHT_FILE.format("tracking"),
+    },
 )

@@ -38,7 +38,7 @@ def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[s
     current = next((key for key in ([names] if isinstance(names, str) else names) if key in valid_keys), None)
     if current is None or name in valid_keys or current in input_keys:
         return name
-    return _warn_deprecated(name, current)
+    return warn_deprecated(name, current)
 
 
 def current_column(name: str, exists: Callable[[str], bool]) -> str:
@@ -46,7 +46,7 @@ def current_column(name: str, exists: Callable[[str], bool]) -> str:
     algorithm, dot, column = name.rpartition(".")
     for current in _match_names("columns", column):
         if exists(current):
-            return algorithm + dot + _warn_deprecated(column, current)
+            return algorithm + dot + warn_deprecated(column, current)
     return name
 
 
@@ -65,7 +65,7 @@ def _match_names(section: str, name: str) -> Iterator[str]:
 
 def current_options(arguments: Sequence[str]) -> list[str]:
     """Replace deprecated names of options in the arguments of a command line."""
-    return [_warn_deprecated(argument, _read_names("options").get(argument, argument)) for argument in arguments]
+    return [warn_deprecated(argument, _read_names("options").get(argument, argument)) for argument in arguments]
 
 
 class Choice(Enum):
@@ -74,7 +74,7 @@ class Choice(Enum):
     @classmethod
     def _missing_(cls, value: object) -> Choice | None:
         current = _read_names("values").get(str(value))
-        return None if current is None else cls(_warn_deprecated(str(value), current))
+        return None if current is None else cls(warn_deprecated(str(value), current))
 
 
 def stream_name(path: str) -> str:
@@ -82,7 +82,8 @@ def stream_name(path: str) -> str:
     return _read_names("streams").get(path, path)
 
 
-def _warn_deprecated(name: str, current: str) -> str:
+def warn_deprecated(name: str, current: str) -> str:
+    """Return the current name; warn if it differs from the used name."""
     if name != current:
         warnings.warn(f"'{name}' is now '{current}'; the former name is accepted until 0.2", DeprecatedNameWarning, 3)
     return current

@@ -28,8 +28,8 @@ FOCAL_PX, HALF_PX = 14.67e-3 / 48e-6, 127.5
 #: Template side, minimum distance of two templates and margin of the search window, in pixels, as in the field test
 #: paper and `DimesOptions`.
 TEMPLATE_PX, MIN_DISTANCE_PX, MARGIN_PX = 31, 31.0, 4
-#: Positions tried per pair; without two templates among them, the pair has no feasible overlap.
-TRIES = 200
+#: Number of random template positions per pair; with fewer than two usable ones, the pair has no feasible overlap.
+CANDIDATES = 200
 REQUIRED_M_S = 5.0
 
 
@@ -58,21 +58,21 @@ class Reference:
             tracks[number] = errors
         return cls(tracks, inputs.imu_sd_m_s * rng.standard_normal((descents, 2)))
 
-    def single(self) -> Float[np.ndarray, " n"]:
-        """Discrepancy of one correct track in each pair."""
+    def one_track_discrepancies_m_s(self) -> Float[np.ndarray, " n"]:
+        """Compute the discrepancy of one correct track in each pair."""
         return np.asarray(np.linalg.norm(self.tracks[:, 1, 0] - self.tracks[:, 0, 0] - self.imu, axis=-1))
 
-    def best(self) -> Float[np.ndarray, " n"]:
-        """Minimum discrepancy of two correct tracks in each pair."""
+    def two_track_discrepancies_m_s(self) -> Float[np.ndarray, " n"]:
+        """Compute the minimum discrepancy of two correct tracks in each pair."""
         return np.asarray(_discrepancies(self.tracks, self.imu).min(axis=(1, 2)))
 
     def correct_and_rejected_fractions(
-        self, templates: int, wrong_by_m_s: tuple[float, float], threshold_m_s: float, rng: np.random.Generator
+        self, templates: int, track_error_range_m_s: tuple[float, float], threshold_m_s: float, rng: np.random.Generator
     ) -> tuple[float, float]:
         """Simulate one wrong track; return the fractions of descents with a correct velocity and without a velocity."""
         tracks = self.tracks[:, :, :templates].copy()
         n = len(tracks)
-        angle, size = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(*wrong_by_m_s, n)
+        angle, size = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(*track_error_range_m_s, n)
         wrong_errors = np.column_stack([size * np.cos(angle), size * np.sin(angle)])
         tracks[np.arange(n), rng.integers(2, size=n), rng.integers(templates, size=n)] += wrong_errors
         discrepancies = _discrepancies(tracks, self.imu).reshape(n, -1)
@@ -146,8 +146,8 @@ def _draw_templates(
     attitudes: list[Rotation], heights: Float[np.ndarray, "2"], inputs: ThresholdInputs, rng: np.random.Generator
 ) -> Float[np.ndarray, "2 2"] | None:
     """Draw the slopes of two templates in the first view with feasible overlap; None if there are none."""
-    pixels = rng.uniform(-HALF_PX, HALF_PX, (TRIES, 2))
-    rays = attitudes[0].apply(np.column_stack([pixels / FOCAL_PX, -np.ones(TRIES)]))
+    pixels = rng.uniform(-HALF_PX, HALF_PX, (CANDIDATES, 2))
+    rays = attitudes[0].apply(np.column_stack([pixels / FOCAL_PX, -np.ones(CANDIDATES)]))
     down = -rays[:, 2]
     is_usable = down > np.cos(np.radians(55.0)) * np.linalg.norm(rays, axis=1)
     pixels, slopes = pixels[is_usable], rays[is_usable, :2] / down[is_usable, None]

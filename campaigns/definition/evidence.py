@@ -29,7 +29,7 @@ _MAX_RESERVED_NUMBER = 1000
 
 
 class EvidenceKind(StrEnum):
-    """Kind of evidence of a run; the results of kinds in `WITHHELD` cannot be PASS."""
+    """Kind of evidence of a run; the results of kinds in `KINDS_WITHOUT_PASS` cannot be PASS."""
 
     CONFIRMATION = "confirmation"
     REPETITION = "repetition of a confirmation"
@@ -40,7 +40,7 @@ class EvidenceKind(StrEnum):
 
 
 #: Kinds of evidence whose cases were known before the algorithm was frozen.
-WITHHELD = frozenset({EvidenceKind.CALIBRATION, EvidenceKind.REUSED_SEED, EvidenceKind.CHANGED})
+KINDS_WITHOUT_PASS = frozenset({EvidenceKind.CALIBRATION, EvidenceKind.REUSED_SEED, EvidenceKind.CHANGED})
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class Evidence:
     """Kind of evidence of a run, stored in its record.
 
     - number: number of the confirmation; 0 for other kinds
-    - of_algorithm: number of confirmations of the algorithm (by name) on this campaign, including this one
+    - algorithm_confirmations: number of confirmations of the algorithm (by name) on this campaign, including this one
     - record: file of the record of confirmations; empty for other kinds
     - changes: differences from the frozen algorithm, if the seed was reused; or the options set on these cases
     """
@@ -150,7 +150,7 @@ class Evidence:
     kind: EvidenceKind = EvidenceKind.EXPLORATION
     namespace: str = ""
     number: int = 0
-    of_algorithm: int = 0
+    algorithm_confirmations: int = 0
     record: str = ""
     changes: tuple[str, ...] = ()
 
@@ -159,7 +159,10 @@ class Evidence:
         """Read from the record of a run; runs of earlier versions are explorations."""
         if not isinstance(stored, Mapping):
             return cls()
-        values = {name: stored[name] for name in ("namespace", "number", "of_algorithm", "record") if name in stored}
+        # name of `algorithm_confirmations` in records before version 0.2
+        previous_name = {"algorithm_confirmations": stored["of_algorithm"]} if "of_algorithm" in stored else {}
+        names = ("namespace", "number", "algorithm_confirmations", "record")
+        values = previous_name | {name: stored[name] for name in names if name in stored}
         try:
             return cls(
                 EvidenceKind(str(stored.get("kind"))), changes=tuple(map(str, stored.get("changes") or ())), **values
@@ -172,9 +175,9 @@ class Evidence:
         return {**asdict(self), "kind": str(self.kind), "changes": list(self.changes)}
 
     @property
-    def withheld(self) -> bool:
-        """Whether the results cannot be PASS."""
-        return self.kind in WITHHELD
+    def excludes_pass(self) -> bool:
+        """Whether this kind of evidence allows no PASS: the cases were known before the algorithm was frozen."""
+        return self.kind in KINDS_WITHOUT_PASS
 
     @property
     def title(self) -> str:
@@ -204,11 +207,12 @@ class Evidence:
 
     def _multiplicity_text(self) -> str:
         """Describe the effect of repeated confirmations: up to n times the risk of a false PASS (union bound)."""
-        if self.of_algorithm <= 1:
+        number = self.algorithm_confirmations
+        if number <= 1:
             return "It is the first confirmation of this algorithm on this campaign."
         return (
-            f"It is confirmation {self.of_algorithm} of this algorithm on this campaign, counting all its options: "
-            f"the probability that at least one of them is wrongly PASS is up to {self.of_algorithm} times that of one."
+            f"It is confirmation {number} of this algorithm on this campaign, counting all its options: "
+            f"the probability that at least one of them is wrongly PASS is up to {number} times that of one."
         )
 
 

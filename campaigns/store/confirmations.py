@@ -109,7 +109,11 @@ def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
     ]
     kind = EvidenceKind.CONFIRMATION
     return Evidence(
-        kind, entry.namespace, number, of_algorithm=len(previous_confirmations) + 1, record=str(path.resolve())
+        kind,
+        entry.namespace,
+        number,
+        algorithm_confirmations=len(previous_confirmations) + 1,
+        record=str(path.resolve()),
     )
 
 

@@ -111,7 +111,7 @@ class RareResult:
     - effective_violations: effective number of violations of importance sampling; NaN without it
     - additional_cases: estimated number of further cases until the verdict is decided; None if decided or unknown
     - counting_cases: number of independent cases that would give an interval of the same relative width
-    - margin_text: definition of the margin; reason: reason of a withheld verdict; may be empty
+    - margin_text: definition of the margin; reason: why the verdict is INSUFFICIENT; may be empty
     """
 
     verdict: RareVerdict
@@ -221,7 +221,7 @@ class _Study:
                 )
         verdict = RareVerdict.INSUFFICIENT if reason else decide(interval, settings.max_probability)
         evidence = self._runner.evidence
-        if verdict is RareVerdict.PASS and evidence.withheld:
+        if verdict is RareVerdict.PASS and evidence.excludes_pass:
             verdict, reason = RareVerdict.INSUFFICIENT, f"The verdict would be PASS. {evidence.text}"
         additional = None
         if verdict is RareVerdict.INSUFFICIENT and not contributions:

@@ -91,7 +91,7 @@ class SearchSettings:
 class Failure:
     """A reduced violation.
 
-    - case: number of the reduced case; found_case: number of the case before the reduction
+    - case: number of the reduced case; original_case: number of the case before the reduction
     - margin: margin of the reduced case
     - values: values of the dispersions that differ from the campaign's parameters, by path
     - distance: distance of these values from the medians, standard deviations; a small distance is likely
@@ -101,7 +101,7 @@ class Failure:
     """
 
     case: int
-    found_case: int
+    original_case: int
     margin: float
     values: dict[str, Any]
     distance: float
@@ -115,13 +115,13 @@ class Failure:
 class SearchResult:
     """Result of the study: reduced violations, the most likely one first, and numbers of cases.
 
-    - searched, cases: numbers of cases before the reduction, and in all
-    - violations: number of violations among the searched cases; min_margin: their smallest margin
-    - first_violation: number of searched cases up to the first violation; None without a violation
+    - search_cases, cases: numbers of cases before the reduction, and in all
+    - violations: number of violations among the cases before the reduction; min_margin: their smallest margin
+    - first_violation: number of cases up to the first violation; None without a violation
     """
 
     failures: tuple[Failure, ...]
-    searched: int
+    search_cases: int
     cases: int
     violations: int
     min_margin: float
@@ -190,23 +190,23 @@ class SearchStudy:
         observer.begin("search", self.settings.cases)
         failures: list[Failure] = []
         reason = ""
-        searched = violations = 0
+        n_searched = violations = 0
         try:
             self._explore()
             self._evolve()
-            searched = len(self._evaluated)
+            n_searched = len(self._evaluated)
             violating_cases = [item for item in self._evaluated if item.margin < 0.0]
             violations = len(violating_cases)
             observer.begin("reduction", _REDUCTION_CASES * min(violations, self.settings.max_failures))
             self._reduce_all(violating_cases, failures)
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
-            searched = searched or len(self._evaluated)
-        searched_cases = self._evaluated[:searched]
+            n_searched = n_searched or len(self._evaluated)
+        searched_cases = self._evaluated[:n_searched]
         violation_numbers = [index + 1 for index, item in enumerate(searched_cases) if item.margin < 0.0]
         return SearchResult(
             tuple(sorted(failures, key=lambda failure: failure.distance)),
-            searched,
+            n_searched,
             self.runner.n_cases,
             violations or len(violation_numbers),
             min((item.margin for item in searched_cases), default=math.nan),

@@ -55,7 +55,9 @@ def clean(
         except OSError:  # not empty, in use, or already removed
             continue
     if as_json:
-        typer.echo(json.dumps({"kept": caches, "removed_bytes": removed_bytes}, indent=2, default=str))
+        # `kept` is the former key of `caches`, until version 0.2
+        data = {"caches": caches, "kept": caches, "removed_bytes": removed_bytes}
+        typer.echo(json.dumps(data, indent=2, default=str))
         return
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("kind", "files", "size", "limit", "folder", "contents"):
@@ -105,7 +107,7 @@ def compile_kernels() -> None:
     from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 
     limit_threads()
-    for name, settings in (item for system in systems() for item in system.compiled_by.items()):
+    for name, settings in (item for system in systems() for item in system.compilation_campaigns.items()):
         campaign = load_campaign(name, settings)
         scenario = campaign.configuration.scenario
         if kernels_are_ready(scenario):

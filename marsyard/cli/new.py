@@ -74,7 +74,9 @@ def new(arguments: NewOptions) -> None:
     if system not in paths:
         raise CampaignError(f"--system: {unknown_name_message('system', system, paths)}")
     template: CampaignTemplate = import_object(paths[system])
-    ask_camera, ask_flight = (is_interactive and option not in template.refused for option in ("camera", "flight"))
+    ask_camera, ask_flight = (
+        is_interactive and option not in template.unsupported_options for option in ("camera", "flight")
+    )
     names = [name for name, preset in sites().items() if getattr(preset, template.scale) is not None]
     site = arguments.site or _ask_user("Site", template.site, is_interactive, partial(_find_name_problem, names))
     question = "Camera file (empty: the paper's camera)"

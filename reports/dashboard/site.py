@@ -138,7 +138,7 @@ def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
                 "evidence": evidence_text(cell.verdict),
                 "finished": cell.entry.finished,
                 "rate": cell.verdict.estimate if math.isfinite(cell.verdict.estimate) else None,
-                "asked": cell.verdict.probability if math.isfinite(cell.verdict.probability) else None,
+                "required": cell.verdict.probability if math.isfinite(cell.verdict.probability) else None,
                 "rate_text": percent(cell.verdict.estimate),
                 "basis": basis_text(cell.verdict),
             }

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from scipy import stats
 
-from marsyard.reports import kinds, rates
+from marsyard.reports import rates, section_kinds
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import (
@@ -171,7 +171,7 @@ def scatter_figures(subject: Subject) -> list[SvgFigure]:
 
 
 @in_page_style
-def _draw_scatter(rows: kinds.Rows, parts: Sequence[str], subject: Subject, axis_limit: float) -> Figure:
+def _draw_scatter(rows: section_kinds.Rows, parts: Sequence[str], subject: Subject, axis_limit: float) -> Figure:
     figure, axes = new_axes(4.2, 4.4)
     runs = sorted(str(run) for run in subject.frame["run"].dropna().unique())
     for index, run in enumerate(runs):
@@ -194,17 +194,17 @@ _FIRING_NOTE = (
     "velocity and in its propagation."
 )
 #: Error of the velocity that the inertial unit propagates to thruster ignition at a height near 100 m (section I).
-FIRING = kinds.SectionDeclaration(
+FIRING = section_kinds.SectionDeclaration(
     "firing",
     "Ignition",
     "Velocity error at thruster ignition",
     rows=lambda subject: None if subject.metric == _FIRING else subject.frame,
     requires=(_FIRING,),
     parts=(
-        kinds.Statistics(_FIRING, note=_FIRING_NOTE),
-        kinds.Quantiles(
+        section_kinds.Statistics(_FIRING, note=_FIRING_NOTE),
+        section_kinds.Quantiles(
             # time available for the computation
-            [kinds.Quantity("firing_after_s")],
+            [section_kinds.Quantity("firing_after_s")],
             {"Minimum": 0.0, "Median": 0.5, "Maximum": 1.0},
             heading="Time from the last image to thruster ignition",
         ),
@@ -224,7 +224,7 @@ def _landing_rows(subject: Subject) -> pd.DataFrame | None:
     return landings if len(landings) else None
 
 
-def landing_fractions(landings: kinds.Rows) -> dict[str, rates.CaseFraction]:
+def landing_fractions(landings: section_kinds.Rows) -> dict[str, rates.CaseFraction]:
     """Compute fractions of landings with a lower and a higher speed, and of answers available before ignition."""
     change = numbers(landings, SPEED_CORRECTED) - numbers(landings, SPEED_UNCORRECTED)
     fractions = {
@@ -239,7 +239,7 @@ def landing_fractions(landings: kinds.Rows) -> dict[str, rates.CaseFraction]:
     return fractions
 
 
-def _create_speed_blocks(landings: kinds.Rows, subject: Subject, key: str) -> kinds.BlocksAndData:
+def _create_speed_blocks(landings: section_kinds.Rows, subject: Subject, key: str) -> section_kinds.BlocksAndData:
     columns = [numbers(landings, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
     groups = rates.terrain_groups(landings)
     change = columns[0] - columns[1]
@@ -272,22 +272,25 @@ def _create_speed_blocks(landings: kinds.Rows, subject: Subject, key: str) -> ki
 
 
 #: Horizontal speed at touchdown with and without the correction by the estimated velocity.
-LANDING = kinds.SectionDeclaration(
+LANDING = section_kinds.SectionDeclaration(
     "landing",
     "Landing",
     "Horizontal speed at touchdown",
     rows=_landing_rows,
     parts=(
-        kinds.Distribution(
-            [kinds.Quantity(SPEED_CORRECTED, "corrected"), kinds.Quantity(SPEED_UNCORRECTED, "uncorrected")],
+        section_kinds.Distribution(
+            [
+                section_kinds.Quantity(SPEED_CORRECTED, "corrected"),
+                section_kinds.Quantity(SPEED_UNCORRECTED, "uncorrected"),
+            ],
             ("horizontal speed at touchdown (m/s)", "fraction of landings above this speed"),
             "Fraction of landings whose horizontal speed at touchdown is above the value on the axis.",
             complementary=True,
         ),
-        kinds.RateTable(
+        section_kinds.RateTable(
             landing_fractions, cases="Landings", heading="Improved and degraded landings", data="fractions"
         ),
-        kinds.CustomBlocks(_create_speed_blocks),
+        section_kinds.CustomBlocks(_create_speed_blocks),
     ),
 )
 

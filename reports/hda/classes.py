@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from marsyard.reports import section
 from marsyard.reports.figures import RateLine, draw_rates
 from marsyard.reports.hda.sections import PAPER, landing_rows
-from marsyard.reports.kinds import BlocksAndData, Rows
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag_mask, pooled_rate, rate_text
 from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, build_grid, in_page_style
+from marsyard.reports.section_kinds import BlocksAndData, Rows
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, numbers, percent
 from marsyard.scenarios.landing.images import CLASS_BOUNDS, CLASS_NAMES
 

@@ -15,9 +15,9 @@ from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, write_hda_figures
 from marsyard.reports.hda.classes import create_class_blocks, limits_section
-from marsyard.reports.kinds import CustomBlocks, Distribution, RateTable, SectionDeclaration
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import draw_images, svg_figure
+from marsyard.reports.section_kinds import CustomBlocks, Distribution, RateTable, SectionDeclaration
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {

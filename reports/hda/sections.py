@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from marsyard.reports import kinds, rates
+from marsyard.reports import rates, section_kinds
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
@@ -49,32 +49,36 @@ def _lander_limit_m(subject: Subject) -> float:
 
 
 #: False alarms and misses against the roughness threshold, to check the paper's remark on false positives.
-THRESHOLD = kinds.SectionDeclaration(
+THRESHOLD = section_kinds.SectionDeclaration(
     "threshold",
     "Threshold",
     "False alarms and misses by roughness threshold",
     rows=_threshold_rows,
     requires=("false_alarms",),
     parts=(
-        kinds.RateByCondition(
-            by=kinds.Quantity("max_roughness_m", "Roughness threshold (m)"),
+        section_kinds.RateByCondition(
+            by=section_kinds.Quantity("max_roughness_m", "Roughness threshold (m)"),
             rates=(
-                kinds.Rate(
-                    "false_alarms", "False alarms", kinds.pooled_fraction("false_alarms", "footprints_truly_safe")
+                section_kinds.Rate(
+                    "false_alarms",
+                    "False alarms",
+                    section_kinds.pooled_fraction("false_alarms", "footprints_truly_safe"),
                 ),
-                kinds.Rate("missed", "Missed", kinds.pooled_fraction("missed", "footprints_not_safe")),
-                kinds.Rate(
+                section_kinds.Rate("missed", "Missed", section_kinds.pooled_fraction("missed", "footprints_not_safe")),
+                section_kinds.Rate(
                     "called_safe_unsafe",
                     "Classified as safe, not truly safe",
-                    kinds.pooled_fraction("footprints_called_safe_unsafe", "footprints_called_safe"),
+                    section_kinds.pooled_fraction("footprints_called_safe_unsafe", "footprints_called_safe"),
                 ),
-                kinds.Rate(
+                section_kinds.Rate(
                     "site_reported",
                     "Site reported, if a wide safe site exists",
-                    kinds.flag_rate("site_reported", "wide_site_exists"),
+                    section_kinds.flag_rate("site_reported", "wide_site_exists"),
                     False,
                 ),
-                kinds.Rate("safe", "Sites truly safe", kinds.flag_rate("site_safe", "site_reported"), False),
+                section_kinds.Rate(
+                    "safe", "Sites truly safe", section_kinds.flag_rate("site_safe", "site_reported"), False
+                ),
             ),
             cases="Flights",
             ylabel="fraction of footprints",
@@ -124,7 +128,7 @@ def _two_digits(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:.2f}"
 
 
-FAULT_OUTCOMES = kinds.OutcomesBySize(
+FAULT_OUTCOMES = section_kinds.OutcomesBySize(
     outcomes=lambda frame, _: classify_answers(frame),
     styles={
         "safe": ("safe site", "full"),
@@ -141,7 +145,9 @@ FAULT_OUTCOMES = kinds.OutcomesBySize(
     caption="Solid bars: truly safe site. Hatched: 'no safe site'. Dotted: not converged. Cross-hatched: unsafe site.",
     note=note_text("hda.faults", confidence=format_fraction(CONFIDENCE)),
 )
-FAULTS = kinds.SectionDeclaration("landing-faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), rows=landing_rows)
+FAULTS = section_kinds.SectionDeclaration(
+    "landing-faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), rows=landing_rows
+)
 
 
 def map_rows(subject: Subject) -> pd.DataFrame | None:
@@ -163,31 +169,33 @@ def map_rows(subject: Subject) -> pd.DataFrame | None:
 
 #: Errors of the map; columns of `map_rows`.
 _MAP_ERRORS = (
-    kinds.Quantity("rms_fraction", "elevation error rms (% of height)", 100.0),
-    kinds.Quantity("noise_fraction", "elevation error rms after removal of its mean plane (% of height)", 100.0),
-    kinds.Quantity("slope_error_rms_deg", "slope error rms (deg)"),
+    section_kinds.Quantity("rms_fraction", "elevation error rms (% of height)", 100.0),
+    section_kinds.Quantity(
+        "noise_fraction", "elevation error rms after removal of its mean plane (% of height)", 100.0
+    ),
+    section_kinds.Quantity("slope_error_rms_deg", "slope error rms (deg)"),
 )
 #: Dependence of the map errors on conditions.
-MAP_EFFECTS = kinds.Scatter(
+MAP_EFFECTS = section_kinds.Scatter(
     x=(
-        kinds.Quantity("baseline_fraction", "baseline / height"),
-        kinds.Quantity("texture", "texture contrast divided by its nominal value"),
-        kinds.Quantity("grid_px", "grid spacing (px)"),
-        kinds.Quantity("level_error_deg", "error of the estimated vertical (deg)"),
-        kinds.Quantity("altimeter_fraction", "altimeter error (% of range)", 100.0),
+        section_kinds.Quantity("baseline_fraction", "baseline / height"),
+        section_kinds.Quantity("texture", "texture contrast divided by its nominal value"),
+        section_kinds.Quantity("grid_px", "grid spacing (px)"),
+        section_kinds.Quantity("level_error_deg", "error of the estimated vertical (deg)"),
+        section_kinds.Quantity("altimeter_fraction", "altimeter error (% of range)", 100.0),
     ),
     y=_MAP_ERRORS,
     heading="Dependence on conditions",
     caption="Points are cases, lines are medians of bins with equal numbers of cases. The error axes are logarithmic.",
     logarithmic=True,
 )
-MAP_ERRORS = kinds.SectionDeclaration(
+MAP_ERRORS = section_kinds.SectionDeclaration(
     "map-errors",
     "Map",
     "Errors of the elevation map",
     rows=map_rows,
     parts=(
-        kinds.Quantiles(
+        section_kinds.Quantiles(
             _MAP_ERRORS,
             {"5 %": 0.05, "Median": 0.5, "95 %": 0.95},
             heading="Errors of the maps",
@@ -200,9 +208,9 @@ MAP_ERRORS = kinds.SectionDeclaration(
 
 #: Errors of the touchdown.
 TOUCHDOWN_ERRORS = (
-    kinds.Quantity("touchdown_error_gps_m", "averaged GPS as in the paper"),
-    kinds.Quantity("touchdown_error_m", "true touchdown"),
-    kinds.Quantity("touchdown_error_estimated_m", "navigation filter estimate"),
+    section_kinds.Quantity("touchdown_error_gps_m", "averaged GPS as in the paper"),
+    section_kinds.Quantity("touchdown_error_m", "true touchdown"),
+    section_kinds.Quantity("touchdown_error_estimated_m", "navigation filter estimate"),
 )
 _DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
 
@@ -212,7 +220,7 @@ def _landed_rows(subject: Subject) -> pd.DataFrame | None:
     return None if frame is None else frame[rates.flag_mask(frame, "landed")]
 
 
-def _create_table_2_blocks(landings: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
+def _create_table_2_blocks(landings: pd.DataFrame, subject: Subject, key: str) -> section_kinds.BlocksAndData:
     """Create Table II: the paper's runs and their mean, and the campaign's landings by each measure."""
     runs: Sequence[Mapping[str, float]] = PAPER["landings"]
     columns = ("error_m", "north_m", "east_m", "run_time_s")
@@ -252,27 +260,27 @@ def _create_table_2_blocks(landings: pd.DataFrame, subject: Subject, key: str) -
     return [Block(heading="Table II", grid=Grid([*head, "Run time"], rows), note=note)], data
 
 
-TOUCHDOWN = kinds.SectionDeclaration(
+TOUCHDOWN = section_kinds.SectionDeclaration(
     "touchdown",
     "Touchdown",
     "Touchdown error compared with Table II of the paper",
     rows=_landed_rows,
     requires=("touchdown_error_gps_m", "touchdown_error_m"),
     parts=(
-        kinds.Distribution(
+        section_kinds.Distribution(
             TOUCHDOWN_ERRORS,
             ("distance of the touchdown from the site (m)", "fraction of landings"),
             "Cumulative distribution of the distance from touchdown to site. Vertical lines: runs of the paper.",
             limits={"paper, runs 1, 3 and 4": [run["error_m"] for run in PAPER["landings"]]},
         ),
-        kinds.CustomBlocks(_create_table_2_blocks),
-        kinds.RateTable(
+        section_kinds.CustomBlocks(_create_table_2_blocks),
+        section_kinds.RateTable(
             (
-                kinds.Rate("touchdown", "touchdown on safe ground", kinds.flag_rate("touchdown_safe")),
-                kinds.Rate(
+                section_kinds.Rate("touchdown", "touchdown on safe ground", section_kinds.flag_rate("touchdown_safe")),
+                section_kinds.Rate(
                     "site",
                     "target of the descent (reported or a-priori site) is truly safe",
-                    kinds.flag_rate("descent_target_safe"),
+                    section_kinds.flag_rate("descent_target_safe"),
                 ),
             ),
             cases="Landings",
@@ -330,7 +338,7 @@ def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
     }
 
 
-def create_outcome_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
+def create_outcome_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> section_kinds.BlocksAndData:
     """Create the table of the outcomes of the search by class of the true ground."""
     counts = outcome_counts(frame)
     rows = [[ground, *(f"{answer_counts[name]:,}" for name in ANSWERS)] for ground, answer_counts in counts.items()]

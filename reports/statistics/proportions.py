@@ -208,10 +208,11 @@ def planned_looks(cases: int) -> tuple[Look, ...]:
     return tuple(Look(size, (size - previous) / cases) for previous, size in pairwise([0, *sizes]))
 
 
-def spent_fraction(looks: tuple[Look, ...], cases: int) -> float:
-    """Return the fraction of the risk at a number of cases: that of the first look with at least as many cases.
+def risk_fraction_at(looks: tuple[Look, ...], cases: int) -> float:
+    """Return the fraction of the risk that one look may use: the first look with at least this number of cases.
 
-    For more cases than at the last look, return the fraction of the last look.
+    It does not include the fractions of earlier looks. For more cases than at the last look, return that of the last
+    look.
     """
     return next((look.risk_fraction for look in looks if cases <= look.cases), looks[-1].risk_fraction)
 
@@ -222,8 +223,8 @@ def confidence_at(confidence: float, risk_fraction: float) -> float:
 
 
 @dataclass(frozen=True)
-class LaterLook:
-    """Test for one verdict (PASS or FAIL) on a requirement of a campaign that was evaluated with fewer cases before.
+class SequentialTest:
+    """Sequential test for one verdict (PASS or FAIL) at the looks after the first, of a campaign with appended cases.
 
     Events are failures for PASS and successes for FAIL: few events support the verdict. If the probability of an event
     is `rate`, the likelihood ratio (`_log_likelihood_ratio`) is a martingale; if it is higher, a supermartingale.
@@ -233,27 +234,27 @@ class LaterLook:
 
     - rate: probability of an event at the limit of the requirement: 1 - probability for PASS, probability for FAIL
     - risk: probability of a false verdict at all looks together: 1 - confidence
-    - first: number of cases at the first look, or of terrains if terrains are counted
+    - first_n: number of cases at the first look, or of terrains if terrains are counted
     """
 
     rate: float
     risk: float
-    first: int
+    first_n: int
 
     @cached_property
     def log_threshold(self) -> float:
         """Logarithm of the likelihood ratio that supports the verdict at a later look."""
-        events = np.arange(self.first + 1, dtype=np.float64)
-        deciding_events = events[stats.binom.cdf(events, self.first, self.rate) <= self.risk]
-        log_probability = stats.binom.logpmf(deciding_events, self.first, self.rate)
-        spent_risk = float(np.exp(log_probability).sum())
+        events = np.arange(self.first_n + 1, dtype=np.float64)
+        deciding_events = events[stats.binom.cdf(events, self.first_n, self.rate) <= self.risk]
+        log_probability = stats.binom.logpmf(deciding_events, self.first_n, self.rate)
+        first_look_risk = float(np.exp(log_probability).sum())
         # mean of the likelihood ratio over the results that do not decide at the first look; the mean over all is 1
-        log_ratio = _log_likelihood_ratio(deciding_events, self.first, self.rate)
+        log_ratio = _log_likelihood_ratio(deciding_events, self.first_n, self.rate)
         undecided_mean = 1.0 - float(np.exp(log_probability + log_ratio).sum())
-        return math.log(max(_MIN_RISK, undecided_mean) / max(_MIN_RISK, self.risk - spent_risk))
+        return math.log(max(_MIN_RISK, undecided_mean) / max(_MIN_RISK, self.risk - first_look_risk))
 
-    def risk_of_bound(self, n: float | int) -> float:
-        """Compute the risk at which the one-sided Clopper-Pearson bound of n cases supports the verdict."""
+    def significance_level(self, n: float | int) -> float:
+        """Compute the significance level at which the one-sided Clopper-Pearson bound gives the same verdict."""
         log_ratio = float(_log_likelihood_ratio(0.0, n, self.rate))
         # n cases are too few even without events: the risk (1 - rate)^n of no event, times ratio / threshold
         if log_ratio < self.log_threshold:

@@ -6,87 +6,87 @@
   const requirements = [...document.querySelectorAll(".requirements tbody tr")];
   const badges = new Map();
   for (const node of document.querySelectorAll(".badge")) badges.set(node.textContent.trim(), node);
-  const fits = (row, asked) =>
+  const matches = (row, filter) =>
     ["system", "site", "algorithm", "commit", "evidence"].every(
-      (key) => !asked[key] || row.dataset[key].split("\n").includes(asked[key])) &&
-    (!asked.from || row.dataset.date >= asked.from) && (!asked.until || row.dataset.date <= asked.until) &&
-    (!asked.text || row.dataset.text.toLowerCase().includes(asked.text.toLowerCase()));
-  const SVG = "http://www.w3.org/2000/svg", LATEST = 24, BESIDE = 7, W = 120, H = 26;
+      (key) => !filter[key] || row.dataset[key].split("\n").includes(filter[key])) &&
+    (!filter.from || row.dataset.date >= filter.from) && (!filter.until || row.dataset.date <= filter.until) &&
+    (!filter.text || row.dataset.text.toLowerCase().includes(filter.text.toLowerCase()));
+  const SVG = "http://www.w3.org/2000/svg", LATEST = 24, MAX_OTHER = 7, W = 120, H = 26;
   const add = (parent, name, attributes) => {
     const node = document.createElementNS(SVG, name);
     for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
     parent.append(node);
   };
-  // as `reports.dashboard.rows.sparkline` draws it of all campaigns
-  const spark = (found) => {
-    const known = found.filter((one) => one.finished && one.name === found[0].name && one.rate !== null && one.asked !== null);
-    const shown = known.slice(0, LATEST).reverse();
-    if (shown.length < 2) return [];
-    let low = Math.min(...shown.flatMap((one) => [one.rate, one.asked]));
+  // as `reports.dashboard.entries.sparkline`
+  const drawSparkline = (cells) => {
+    const finished = cells.filter((cell) => cell.finished && cell.name === cells[0].name && cell.rate !== null && cell.required !== null);
+    const latestCells = finished.slice(0, LATEST).reverse();
+    if (latestCells.length < 2) return [];
+    let low = Math.min(...latestCells.flatMap((cell) => [cell.rate, cell.required]));
     low -= 0.15 * (1 - low) + 1e-9;
-    const height = (rate) => 3 + (H - 6) * (1 - rate) / (1 - low), last = shown[shown.length - 1];
-    const places = shown.map((one, k) => [4 + (W - 8) / (shown.length - 1) * k, height(one.rate)]);
-    const drawn = document.createElementNS(SVG, "svg");
-    drawn.setAttribute("class", "spark");
-    drawn.setAttribute("viewBox", `0 0 ${W} ${H}`);
-    drawn.setAttribute("role", "img");
-    drawn.setAttribute("aria-label", `${shown.length} campaigns, rates ${shown[0].rate_text} to ${last.rate_text}`);
-    add(drawn, "line", {x1: 0, x2: W, y1: height(last.asked), y2: height(last.asked)});
-    add(drawn, "polyline", {points: places.map((at) => at.join()).join(" ")});
-    add(drawn, "circle", {cx: places[places.length - 1][0], cy: places[places.length - 1][1], r: 2.6});
-    return [drawn];
+    const height = (rate) => 3 + (H - 6) * (1 - rate) / (1 - low), last = latestCells[latestCells.length - 1];
+    const points = latestCells.map((cell, k) => [4 + (W - 8) / (latestCells.length - 1) * k, height(cell.rate)]);
+    const figure = document.createElementNS(SVG, "svg");
+    figure.setAttribute("class", "spark");
+    figure.setAttribute("viewBox", `0 0 ${W} ${H}`);
+    figure.setAttribute("role", "img");
+    figure.setAttribute("aria-label", `${latestCells.length} campaigns, rates ${latestCells[0].rate_text} to ${last.rate_text}`);
+    add(figure, "line", {x1: 0, x2: W, y1: height(last.required), y2: height(last.required)});
+    add(figure, "polyline", {points: points.map((at) => at.join()).join(" ")});
+    add(figure, "circle", {cx: points[points.length - 1][0], cy: points[points.length - 1][1], r: 2.6});
+    return [figure];
   };
   const statusClass = (status) => `status-${status.toLowerCase().replaceAll(" ", "-")}`;
-  const show = (row, found) => {
+  const updateRow = (row, cells) => {
     const verdict = row.querySelector(".verdict");
     if (!verdict) return;
-    const [evidence, margin, shown] = ["evidence", "margin", "shown"].map((name) => row.querySelector(`.${name}`));
-    const latest = found[0];
+    const [evidence, margin, campaignCount] = ["evidence", "margin", "campaign-count"].map((name) => row.querySelector(`.${name}`));
+    const latest = cells[0];
     verdict.className = `verdict ${statusClass(latest ? latest.status : "NO CAMPAIGN")}`;
     const badge = latest && badges.get(latest.status);
     if (badge) {
       const basis = document.createElement("span");
-      basis.className = "asked";
+      basis.className = "detail";
       basis.textContent = latest.basis;
       verdict.replaceChildren(badge.cloneNode(true), basis);
     }
     else verdict.textContent = "no campaign fits";
     const list = document.createElement("ul"), names = new Set();
-    for (const one of found) {
-      if (names.has(one.name) || names.size > BESIDE) continue;
-      names.add(one.name);
-      const [item, about, word, link, date] = ["li", "span", "b", "a", "span"].map((name) => document.createElement(name));
-      item.textContent = one.evidence;
-      about.className = "asked";
-      word.className = statusClass(one.status);
-      word.textContent = one.status;
-      link.href = `c/${one.slug}/index.html`;
-      link.textContent = one.name;
+    for (const cell of cells) {
+      if (names.has(cell.name) || names.size > MAX_OTHER) continue;
+      names.add(cell.name);
+      const [item, detail, word, link, date] = ["li", "span", "b", "a", "span"].map((name) => document.createElement(name));
+      item.textContent = cell.evidence;
+      detail.className = "detail";
+      word.className = statusClass(cell.status);
+      word.textContent = cell.status;
+      link.href = `c/${cell.slug}/index.html`;
+      link.textContent = cell.name;
       date.className = "date";
-      date.textContent = one.date;
-      about.append(...(names.size > 1 ? [word, " "] : []), link, ", ", date, one.algorithm ? `, ${one.algorithm}` : "", one.kind ? `, ${one.kind}` : "", one.finished ? "" : ", not finished");
-      item.append(about);
+      date.textContent = cell.date;
+      detail.append(...(names.size > 1 ? [word, " "] : []), link, ", ", date, cell.algorithm ? `, ${cell.algorithm}` : "", cell.kind ? `, ${cell.kind}` : "", cell.finished ? "" : ", not finished");
+      item.append(detail);
       list.append(item);
     }
     evidence.replaceChildren(...(latest ? [list] : ["\u2013"]));
-    row.querySelector(".trend").replaceChildren(...(latest ? spark(found) : []));
+    row.querySelector(".trend").replaceChildren(...(latest ? drawSparkline(cells) : []));
     margin.textContent = latest ? latest.margin : "\u2013";
-    shown.textContent = found.length.toLocaleString("en");
+    campaignCount.textContent = cells.length.toLocaleString("en");
   };
   const apply = () => {
-    const asked = Object.fromEntries(new FormData(form)), left = new Set();
+    const filter = Object.fromEntries(new FormData(form)), visible = new Set();
     for (const row of campaigns) {
-      row.hidden = !fits(row, asked);
-      if (!row.hidden) left.add(row.id);
+      row.hidden = !matches(row, filter);
+      if (!row.hidden) visible.add(row.id);
     }
     for (const row of requirements) {
-      show(row, (verdicts[row.dataset.requirement] || []).filter((one) => left.has(one.slug)));
+      updateRow(row, (verdicts[row.dataset.requirement] || []).filter((cell) => visible.has(cell.slug)));
     }
-    count.textContent = `${left.size.toLocaleString("en")} of ${campaigns.length.toLocaleString("en")} campaigns`;
+    count.textContent = `${visible.size.toLocaleString("en")} of ${campaigns.length.toLocaleString("en")} campaigns`;
   };
   form.addEventListener("input", apply);
   form.addEventListener("submit", (event) => event.preventDefault());
   form.addEventListener("reset", () => setTimeout(apply));
-  // what was chosen before a reload or a way back, or before this ran
+  // apply the filter that the browser restores after a reload or on the way back
   window.addEventListener("pageshow", apply);
 })();

@@ -38,9 +38,9 @@
   const ticks = (low, high) => {
     const raw = (high - low) / 7, power = 10 ** Math.floor(Math.log10(raw));
     const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= raw);
-    const found = [];
-    for (let v = Math.ceil(low / step) * step; v <= high + 1e-9 * step; v += step) found.push(Number(v.toPrecision(6)));
-    return found;
+    const values = [];
+    for (let v = Math.ceil(low / step) * step; v <= high + 1e-9 * step; v += step) values.push(Number(v.toPrecision(6)));
+    return values;
   };
   const span = (column) => {
     const values = data.columns[column].filter(known);
@@ -49,7 +49,7 @@
     if (low === high) { low -= 0.5; high += 0.5; }
     return [low - 0.04 * (high - low), high + 0.04 * (high - low)];
   };
-  let place = [];
+  let positions = [];
   const draw = () => {
     const x = Number(xs.value), y = Number(ys.value);
     let [x0, x1] = span(x), [y0, y1] = span(y);
@@ -79,7 +79,7 @@
       }
     }
     const dots = make(plot, "g", {});
-    place = data.cases.map((_, k) => {
+    positions = data.cases.map((_, k) => {
       const vx = data.columns[x][k], vy = data.columns[y][k], what = kind(k);
       if (!known(vx)) return null;
       const at = [px(vx), known(vy) ? py(vy) : T + 4];
@@ -93,11 +93,11 @@
   const nearest = (event) => {
     const box = plot.getBoundingClientRect();
     const x = (event.clientX - box.left) * W / box.width, y = (event.clientY - box.top) * H / box.height;
-    let best = -1, least = 400;
-    place.forEach((at, k) => {
+    let best = -1, minSquaredDistance = 400;
+    positions.forEach((at, k) => {
       if (!at) return;
       const d = (at[0] - x) ** 2 + (at[1] - y) ** 2;
-      if (d < least) { least = d; best = k; }
+      if (d < minSquaredDistance) { minSquaredDistance = d; best = k; }
     });
     return best;
   };
@@ -105,7 +105,7 @@
     detail.replaceChildren();
     plot.querySelector(".selected")?.remove();
     if (k < 0) { line(detail, "p", "No such case among the points."); return; }
-    if (place[k]) make(plot, "circle", {cx: place[k][0], cy: place[k][1], r: 9, class: "selected"});
+    if (positions[k]) make(plot, "circle", {cx: positions[k][0], cy: positions[k][1], r: 9, class: "selected"});
     number.value = data.cases[k];
     line(detail, "h3", `Case ${data.cases[k]}: ${data.outcomes[data.outcome[k]]}`);
     const list = document.createElement("dl");

@@ -14,9 +14,9 @@ import pandas as pd
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
 from marsyard.reports import rates
-from marsyard.reports.kinds import BlocksAndData, CustomBlocks, Distribution, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Subject, build_grid
+from marsyard.reports.section_kinds import BlocksAndData, CustomBlocks, Distribution, Rows, SectionDeclaration
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers
 

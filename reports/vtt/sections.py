@@ -19,10 +19,10 @@ import pandas as pd
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table_1, tracked_approach_error_m
 from marsyard.reports import rates
 from marsyard.reports.figures import RateLine, rate_figure
-from marsyard.reports.kinds import BlocksAndData, CustomBlocks, Rows
 from marsyard.reports.papers import PaperFacts, read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, svg_figure
+from marsyard.reports.section_kinds import BlocksAndData, CustomBlocks, Rows
 from marsyard.reports.stored import table
 from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, selectable_targets
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers, percent

@@ -45,29 +45,31 @@ def confirmation_errors() -> np.ndarray:
 def test_default_threshold_matches_stored_derivation() -> None:
     assert DimesOptions().imu_threshold_m_s == STORED["threshold_m_s"]
     assert json.loads(json.dumps(asdict(ThresholdInputs()))) == STORED["inputs"]
-    low, high = STORED["kept_quantile_90_percent_bounds_m_s"]
+    low, high = STORED["accepted_quantile_90_percent_bounds_m_s"]
     assert low < STORED["threshold_m_s"] < high
 
 
 def test_confirmation_seed_has_similar_availability(confirmation_errors: np.ndarray) -> None:
     result = discrepancies(confirmation_errors, ThresholdInputs().imu_sd_m_s, np.random.default_rng(2))
     # The stored derivation accepts 99.52 %: of 250 cases, 1.2 +- 1.1 fail.
-    assert np.sum(result.single >= STORED["threshold_m_s"]) <= 5
-    assert np.all(result.best <= result.single)
-    expected = STORED["discrepancy_quantiles_m_s"]["one right track in each pair"]
-    assert np.quantile(result.single, 0.5) == pytest.approx(expected["0.5"], rel=0.15)
-    assert np.quantile(result.single, 0.9) == pytest.approx(expected["0.9"], rel=0.2)
+    assert np.sum(result.one_track >= STORED["threshold_m_s"]) <= 5
+    assert np.all(result.two_tracks <= result.one_track)
+    expected = STORED["discrepancy_quantiles_m_s"]["one correct track in each pair"]
+    assert np.quantile(result.one_track, 0.5) == pytest.approx(expected["0.5"], rel=0.15)
+    assert np.quantile(result.one_track, 0.9) == pytest.approx(expected["0.9"], rel=0.2)
 
 
 @pytest.mark.parametrize("tracks_per_pair", [1, 2])
-@pytest.mark.parametrize("wrong_by_m_s", [(10.0, 10.0), (10.0, 60.0)])
+@pytest.mark.parametrize("track_error_range_m_s", [(10.0, 10.0), (10.0, 60.0)])
 def test_one_wrong_track_rarely_causes_a_wrong_velocity(
-    confirmation_errors: np.ndarray, tracks_per_pair: int, wrong_by_m_s: tuple[float, float]
+    confirmation_errors: np.ndarray, tracks_per_pair: int, track_error_range_m_s: tuple[float, float]
 ) -> None:
     # With one track wrong by at least 10 m/s, 99.5 % of cases report a correct velocity or none.
     rng = np.random.default_rng(5)
     tracks = np.concatenate([confirmation_errors[:, :, :tracks_per_pair]] * 8)
-    fractions = simulate_wrong_track(tracks, wrong_by_m_s, STORED["threshold_m_s"], ThresholdInputs().imu_sd_m_s, rng)
+    fractions = simulate_wrong_track(
+        tracks, track_error_range_m_s, STORED["threshold_m_s"], ThresholdInputs().imu_sd_m_s, rng
+    )
     assert fractions.correct + fractions.rejected >= 0.995
     assert fractions.correct + fractions.rejected + fractions.wrong == pytest.approx(1.0)
     # With a second track in the pair, the correct velocity is almost always reported.
@@ -92,7 +94,7 @@ def test_common_attitude_error_causes_apparent_drift() -> None:
     assert 0.8 * apparent_m_s < errors.std() < 1.7 * apparent_m_s
     # All tracks have the same error: the IMU check is hardly affected.
     result = discrepancies(errors, 0.0, np.random.default_rng(1))
-    assert np.median(result.single) < 0.5 * np.median(np.linalg.norm(errors[:, 1, 0], axis=-1))
+    assert np.median(result.one_track) < 0.5 * np.median(np.linalg.norm(errors[:, 1, 0], axis=-1))
 
 
 def test_threshold_is_rounded_up_to_its_step() -> None:

@@ -120,7 +120,9 @@ def test_reference_has_only_the_matching_error_without_instrument_errors() -> No
     np.testing.assert_allclose(reference.tracks.std(), inputs.match_sd_m_s, rtol=0.1)
     # The discrepancy of two tracks and the IMU has a Rayleigh distribution with the median sd sqrt(2 ln 2).
     sd = math.sqrt(2.0 * inputs.match_sd_m_s**2 + inputs.imu_sd_m_s**2)
-    assert np.median(reference.single()) == pytest.approx(sd * math.sqrt(2.0 * math.log(2.0)), rel=0.15)
+    assert np.median(reference.one_track_discrepancies_m_s()) == pytest.approx(
+        sd * math.sqrt(2.0 * math.log(2.0)), rel=0.15
+    )
 
 
 def test_profiled_stages_name_existing_functions() -> None:

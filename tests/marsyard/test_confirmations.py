@@ -127,7 +127,7 @@ def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     # the changed option needs a new confirmation seed; the output states the correction for two confirmations
     status, out, _ = marsyard(*arguments, "--confirm", "--out", folders["second"], "--jobs", 1)
     output = " ".join(out.split())
-    assert (status, _read_evidence(folders["second"]).of_algorithm) == (0, 2)
+    assert (status, _read_evidence(folders["second"]).algorithm_confirmations) == (0, 2)
     assert "up to 2 times that of one" in output
     assert "for all 2 confirmations together (each at 95.00 %): INSUFFICIENT" in output
     second = json.loads((folders["second"] / "campaign.json").read_text())
@@ -193,4 +193,4 @@ def test_interrupted_confirmation_stays_in_the_record(campaign: Path, marsyard: 
     path.write_text(path.read_text().splitlines()[0] + "\n")
     marsyard("run", campaign, "--confirm", "--out", tmp_path / "second", "--jobs", 1)
     first, second = read_confirmations(path)
-    assert (first.results, second.number, _read_evidence(tmp_path / "second").of_algorithm) == (None, 2, 2)
+    assert (first.results, second.number, _read_evidence(tmp_path / "second").algorithm_confirmations) == (None, 2, 2)

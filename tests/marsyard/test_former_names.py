@@ -6,6 +6,8 @@ import json
 import sys
 import tomllib
 import warnings
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import pandas as pd
@@ -13,16 +15,20 @@ import pytest
 
 from marsyard.algorithms.interface import TargetUpdate, TrackingState
 from marsyard.campaigns.definition.configuration import update_stored_configuration
+from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.definition.identity import create_identity
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from marsyard.cli.app import main
+from marsyard.reports.search import read_search
+from marsyard.reports.section_kinds import SectionDeclaration
 from marsyard.reports.stored import read_run
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.landing.parameters import NavigationParameters
-from marsyard.scenarios.systems import row_columns, scenario, scenario_names
+from marsyard.scenarios.systems import System, row_columns, scenario, scenario_names
+from marsyard.scenarios.template import LANDING
 from marsyard.sim import parameters
 from marsyard.sim.parameters import DeprecatedNameWarning, current_key
 
@@ -163,6 +169,32 @@ def test_deprecated_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path
         main()
     assert error_info.value.code == 2
     assert sys.argv[-1] == "--save-stages"
+
+
+def test_deprecated_arguments_of_systems_and_templates_are_accepted() -> None:
+    with pytest.warns(DeprecatedNameWarning, match="'compiled_by' is now 'compilation_campaigns'"):
+        system = System("s", "S", "", {}, compiled_by={"campaign": ("cases=1",)})
+    assert system.compilation_campaigns == {"campaign": ("cases=1",)}
+    with pytest.warns(DeprecatedNameWarning, match="'refused' is now 'unsupported_options'"):
+        template = replace(LANDING, refused={"camera": "no camera"})
+    assert template.unsupported_options == {"camera": "no camera"}
+
+
+def test_deprecated_module_of_section_kinds_is_importable() -> None:
+    sys.modules.pop("marsyard.reports.kinds", None)
+    with pytest.warns(DeprecatedNameWarning, match="'marsyard.reports.kinds' is now 'marsyard.reports.section_kinds'"):
+        module = import_module("marsyard.reports.kinds")
+    assert module.SectionDeclaration is SectionDeclaration
+
+
+def test_stored_results_with_deprecated_keys_are_read() -> None:
+    stored = Evidence(EvidenceKind.CONFIRMATION, "confirmation", 2, 3).to_table()
+    assert Evidence.read(stored).algorithm_confirmations == 3
+    stored["of_algorithm"] = stored.pop("algorithm_confirmations")
+    assert Evidence.read(stored).algorithm_confirmations == 3
+    result = {"searched": 20, "failures": [{"case": 7, "found_case": 4}]}
+    study = read_search({"study": {"kind": "search", "requirement": "V", "result": result}})
+    assert study["result"] == {"search_cases": 20, "failures": [{"case": 7, "original_case": 4}]}
 
 
 def test_current_names_exist_and_deprecated_names_do_not() -> None:

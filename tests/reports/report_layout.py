@@ -53,7 +53,8 @@ class Evidence(_Part):
     ]
     namespace: str = Field(description="namespace of the seeds of confirmations")
     number: int = Field(description="number of the confirmation; 0 for other kinds")
-    of_algorithm: int = Field(description="number of confirmations of the algorithm up to this one")
+    algorithm_confirmations: int = Field(description="number of confirmations of the algorithm up to this one")
+    of_algorithm: int = Field(description="former key of `algorithm_confirmations`, until version 0.2")
     record: str = Field(description="file of the record of confirmations")
     changes: list[str]
     title: str

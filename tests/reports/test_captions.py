@@ -12,7 +12,7 @@ import pytest
 
 from marsyard.reports.evaluation import combine_verdicts
 from marsyard.reports.hda.sections import MAP_EFFECTS, distance_grid
-from marsyard.reports.kinds import correlation_text
+from marsyard.reports.section_kinds import correlation_text
 from marsyard.reports.sections import driver_figures
 from marsyard.reports.traceability import junit_xml
 from marsyard.reports.wording import NOTHING, number

@@ -22,7 +22,7 @@ def _run_small_case(scenario: str) -> Row:
         small_campaigns = {
             load_campaign(name, settings).configuration.scenario: (name, settings)
             for system in systems()
-            for name, settings in system.compiled_by.items()
+            for name, settings in system.compilation_campaigns.items()
         }
         campaign = load_campaign(*small_campaigns.get(scenario, ("dimes-fieldtest", ())))
         result = campaign.scenario.run(campaign.parameters(0), campaign.streams(0))

@@ -83,7 +83,7 @@ def test_built_in_systems_are_complete() -> None:
             assert row_columns(name) is not None
         for name, path in system.campaigns.items():
             assert catalogue()[name] == path
-        assert set(system.compiled_by) <= set(system.campaigns)
+        assert set(system.compilation_campaigns) <= set(system.campaigns)
     # Each campaign file in the folder belongs to a system.
     folder = next(iter(catalogue().values())).parent
     assert set(catalogue()) == {path.stem for path in folder.glob("*.toml")}

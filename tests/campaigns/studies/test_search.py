@@ -44,7 +44,7 @@ def run_search(
 def assert_reduced_to_causes(result: SearchResult) -> None:
     """Assert that the search found the defect within 300 cases, and that its first failure has only the two causes."""
     assert result.first_violation is not None
-    assert result.first_violation <= result.searched <= 300
+    assert result.first_violation <= result.search_cases <= 300
     failure = result.failures[0]
     assert set(failure.values) == {"sun_deg", "yaw_deg"}
     assert 10.0 <= failure.values["sun_deg"] < 15.0

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from marsyard.reports.statistics.proportions import (
-    LaterLook,
+    SequentialTest,
     confidence_at,
     planned_looks,
     proportion_lower,
     proportion_upper,
-    spent_fraction,
+    risk_fraction_at,
 )
 
 
@@ -37,9 +37,9 @@ def test_looks_spend_the_full_risk(cases: int) -> None:
     assert looks[-1].cases == cases
 
 
-def test_spent_fraction_is_that_of_the_last_look() -> None:
+def test_risk_fraction_is_that_of_the_next_planned_look() -> None:
     looks = planned_looks(64)
-    assert [spent_fraction(looks, cases) for cases in (1, 16, 17, 64, 900)] == [0.25, 0.25, 0.25, 0.5, 0.5]
+    assert [risk_fraction_at(looks, cases) for cases in (1, 16, 17, 64, 900)] == [0.25, 0.25, 0.25, 0.5, 0.5]
     assert confidence_at(0.9, 0.25) == pytest.approx(0.975)
 
 
@@ -84,35 +84,35 @@ def test_repeated_looks_at_full_risk_pass_too_often() -> None:
     assert n_passed / 400 > 0.15
 
 
-def _append_advised_cases(
-    rng: np.random.Generator, first_cases: int, max_cases: int, pass_look: LaterLook, fail_look: LaterLook
+def _simulate_verdicts(
+    rng: np.random.Generator, first_cases: int, max_cases: int, pass_test: SequentialTest, fail_test: SequentialTest
 ) -> set[str]:
-    """Return the verdicts of a campaign that appends the advised number of cases; true and required rate are 0.99."""
+    """Return the verdicts of a campaign that appends the additional cases needed; true and required rate are 0.99."""
     cases, failures, verdicts = first_cases, int(rng.binomial(first_cases, 0.01)), set()
-    pass_risk = fail_risk = 0.1
+    pass_level = fail_level = 0.1
     while True:
-        if stats.binom.cdf(cases - failures, cases, 0.99) < fail_risk:
+        if stats.binom.cdf(cases - failures, cases, 0.99) < fail_level:
             verdicts.add("FAIL")
-        if stats.binom.cdf(failures, cases, 0.01) <= pass_risk:
+        if stats.binom.cdf(failures, cases, 0.01) <= pass_level:
             return verdicts | {"PASS"}
         if cases >= max_cases:
             return verdicts
-        cases_needed = min(max_cases, pass_look.cases_needed(cases, failures))
+        cases_needed = min(max_cases, pass_test.cases_needed(cases, failures))
         failures += int(rng.binomial(cases_needed - cases, 0.01))
         cases = cases_needed
-        pass_risk, fail_risk = pass_look.risk_of_bound(cases), fail_look.risk_of_bound(cases)
+        pass_level, fail_level = pass_test.significance_level(cases), fail_test.significance_level(cases)
 
 
 @pytest.mark.parametrize("first_cases", [24, 230])
-def test_appending_advised_cases_keeps_the_confidence(first_cases: int) -> None:
+def test_appending_the_cases_needed_keeps_the_confidence(first_cases: int) -> None:
     """Campaigns have at most 5000 cases. With uncorrected bounds at each evaluation, 38.6 % of them would pass."""
     rng = np.random.default_rng(21)
-    pass_look, fail_look = LaterLook(0.01, 0.1, first_cases), LaterLook(0.99, 0.1, first_cases)
-    # cache the methods for a fast simulation; `LaterLook` is frozen
-    for later_look in (pass_look, fail_look):
-        object.__setattr__(later_look, "risk_of_bound", cache(later_look.risk_of_bound))
-        object.__setattr__(later_look, "cases_needed", cache(later_look.cases_needed))
-    verdicts = [_append_advised_cases(rng, first_cases, 5000, pass_look, fail_look) for _ in range(1500)]
+    pass_test, fail_test = SequentialTest(0.01, 0.1, first_cases), SequentialTest(0.99, 0.1, first_cases)
+    # cache the methods for a fast simulation; `SequentialTest` is frozen
+    for sequential_test in (pass_test, fail_test):
+        object.__setattr__(sequential_test, "significance_level", cache(sequential_test.significance_level))
+        object.__setattr__(sequential_test, "cases_needed", cache(sequential_test.cases_needed))
+    verdicts = [_simulate_verdicts(rng, first_cases, 5000, pass_test, fail_test) for _ in range(1500)]
     # standard deviation of a fraction of 10 % of 1500: 0.8 %
     for verdict in ("PASS", "FAIL"):
         assert np.mean([verdict in campaign_verdicts for campaign_verdicts in verdicts]) <= 0.1 + 2 * 0.008
@@ -122,7 +122,7 @@ def test_appending_advised_cases_keeps_the_confidence(first_cases: int) -> None:
 @pytest.mark.parametrize(("rate", "confidence"), [(0.01, 0.9), (0.1, 0.95), (0.95, 0.9)])
 def test_frequent_looks_keep_the_risk(first_cases: int, rate: float, confidence: float) -> None:
     """The exact probability of a verdict is at most the risk if the campaign is evaluated after each 10 cases."""
-    risk, look = 1.0 - confidence, LaterLook(rate, 1.0 - confidence, first_cases)
+    risk, sequential_test = 1.0 - confidence, SequentialTest(rate, 1.0 - confidence, first_cases)
     counts = np.arange(first_cases + 1)
     p_undecided = stats.binom.pmf(counts, first_cases, rate)
     p_undecided[stats.binom.cdf(counts, first_cases, rate) <= risk] = 0.0
@@ -130,19 +130,21 @@ def test_frequent_looks_keep_the_risk(first_cases: int, rate: float, confidence:
     for cases in range(first_cases + 1, first_cases + 1501):
         p_undecided = np.convolve(p_undecided, [1.0 - rate, rate])
         if cases % 10 == 0:
-            is_decided = stats.binom.cdf(np.arange(cases + 1), cases, rate) <= look.risk_of_bound(cases)
+            is_decided = stats.binom.cdf(np.arange(cases + 1), cases, rate) <= sequential_test.significance_level(cases)
             p_verdict += p_undecided[is_decided].sum()
             p_undecided[is_decided] = 0.0
     assert p_verdict <= risk
 
 
 @given(st.integers(0, 400), st.integers(0, 5), st.sampled_from([0.5, 0.9, 0.99]))
-def test_advised_number_of_cases_is_the_minimum(first_cases: int, failures: int, required_rate: float) -> None:
-    look = LaterLook(1.0 - required_rate, 0.1, first_cases)
-    cases_needed = look.cases_needed(max(first_cases, failures), failures)
+def test_number_of_cases_needed_is_the_minimum(first_cases: int, failures: int, required_rate: float) -> None:
+    sequential_test = SequentialTest(1.0 - required_rate, 0.1, first_cases)
+    cases_needed = sequential_test.cases_needed(max(first_cases, failures), failures)
 
     def passes(cases: int) -> bool:
-        return proportion_lower(cases - failures, cases, 1.0 - look.risk_of_bound(cases)) >= required_rate
+        return (
+            proportion_lower(cases - failures, cases, 1.0 - sequential_test.significance_level(cases)) >= required_rate
+        )
 
     assert passes(cases_needed)
     assert cases_needed == max(first_cases, failures) or not passes(cases_needed - 1)

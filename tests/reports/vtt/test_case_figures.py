@@ -55,6 +55,13 @@ def test_template_around_the_match_is_enlarged() -> None:
     assert bright.max(axis=0).tolist() == [65, 65]
 
 
+def test_matches_with_the_deprecated_name_are_read() -> None:
+    case_products = make_products()
+    matches = case_products.pop("stop_1_matches")
+    stop = read_stops(case_products | {"stop_1_found": matches})[0]
+    np.testing.assert_array_equal(stop.matches, matches)
+
+
 def test_titles_contain_range_azimuth_and_match_score() -> None:
     figure = draw_stops(make_products())
     titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]

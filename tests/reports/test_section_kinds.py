@@ -12,7 +12,10 @@ import pytest
 from marsyard.reports import presentation
 from marsyard.reports.campaign import section_makers, write_report
 from marsyard.reports.figures import cumulative_figure
-from marsyard.reports.kinds import (
+from marsyard.reports.papers import PaperFacts
+from marsyard.reports.presentation import Presentation, presentations
+from marsyard.reports.section import Subject
+from marsyard.reports.section_kinds import (
     Distribution,
     Quantity,
     Rate,
@@ -24,9 +27,6 @@ from marsyard.reports.kinds import (
     condition_bins,
     flag_rate,
 )
-from marsyard.reports.papers import PaperFacts
-from marsyard.reports.presentation import Presentation, presentations
-from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.scenarios.systems import System
 
