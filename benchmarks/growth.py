@@ -103,7 +103,7 @@ def _measure_image_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
     points = []
     for side in sides:
         corner = (camera.size[0] - side) // 2
-        rays = PixelRays.of(camera.crop(corner, corner, (side, side)))
+        rays = PixelRays.from_camera(camera.crop(corner, corner, (side, side)))
         points.append((float(side**2), _min_core_seconds(partial(renderer.render, scene, rays, pose))))
     return points
 

@@ -60,7 +60,7 @@ def measure_rover_images(repeats: int) -> list[Measurement]:
         samples=2048, spacing_m=0.05, rms_slope_deg=4.0, slope_baseline_m=1.0, outer_scale_m=20.0, craters_per_km2=0.0
     )
     surface = synthesise(parameters, np.random.default_rng(3))
-    rocks = RockField.on(surface, RockParameters(abundance=0.1, smallest_m=0.08), np.random.default_rng(1))
+    rocks = RockField.draw(surface, RockParameters(abundance=0.1, smallest_m=0.08), np.random.default_rng(1))
     mesh = rocks.near(50.0, 50.0, 20.0, above_m=1.5)
     scene = Scene(
         surface,
@@ -71,7 +71,7 @@ def measure_rover_images(repeats: int) -> list[Measurement]:
         ground_texture=Texture(0.1, (0.06,) * 7),
         object_texture=Texture(0.2, (0.06,) * 8),
         mesh_finest_m=0.04,
-        mesh_reach_m=600.0,
+        mesh_half_width_m=600.0,
         mesh_lines=641,
         among_objects=True,
     )
@@ -83,7 +83,7 @@ def measure_rover_images(repeats: int) -> list[Measurement]:
         right=np.array([1.0, 0.0, 0.0]),
     )
     navcam = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
-    full_frame, subframe = PixelRays.of(navcam), PixelRays.of(navcam.crop(430, 560, (161, 161)))
+    full_frame, subframe = PixelRays.from_camera(navcam), PixelRays.from_camera(navcam.crop(430, 560, (161, 161)))
     viewpoint = np.array([50.0, 50.0, float(surface.height(50.0, 50.0)) + 1.5])
     attitude = Rotation.from_euler("x", -18.0, degrees=True)
     left, right = rigid(attitude, viewpoint), rigid(attitude, viewpoint + np.array([0.2, 0.0, 0.0]))
@@ -112,7 +112,7 @@ def measure_memory(frames: int) -> list[Measurement]:
     renderer = process_renderer(default_backend())
     _, surface = descent_scene()
     optics = camera_optics(CameraParameters())
-    rocks = SiteGround.of(site("pisgah"), "descent")
+    rocks = SiteGround.from_site(site("pisgah"), "descent")
     memory_gb = []
     scenes = frames // IMAGES_PER_SCENE
     for number in range(scenes):

@@ -70,7 +70,7 @@ def measure(repeats: int) -> list[Measurement]:
 def _make_descent_mesh() -> dict[str, Any]:
     """Return terrain triangles, camera pose (OpenGL axes, equal to the body axes), focal length and sun direction."""
     scene, surface = descent_scene()
-    offsets = graded_offsets(scene.mesh_reach_m, 3.0, 1025)
+    offsets = graded_offsets(scene.mesh_half_width_m, 3.0, 1025)
     mesh = ground_mesh(scene.surface, scene.centre_m[0] + offsets, scene.centre_m[1] + offsets)
     return {
         "mesh": mesh,

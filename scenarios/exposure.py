@@ -34,7 +34,7 @@ class Optics:
 @lru_cache(maxsize=8)
 def camera_optics(camera: CameraModel) -> Optics:
     """Return the cached optics of a camera in the body frame."""
-    return Optics(camera, PixelRays.of(camera), natural_fall_off(camera))
+    return Optics(camera, PixelRays.from_camera(camera), natural_fall_off(camera))
 
 
 class CalibrationParameters(Parameters):

@@ -18,6 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.horizon import hill_objects
 from marsyard.sim.frames import rigid
+from marsyard.sim.parameters import warn_deprecated
 from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
 from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.sensor import CameraDesign
@@ -46,9 +47,9 @@ _NEAR_HEIGHTS, _NEAR_M = 3.0, 5.0
 _SECTOR_MARGIN_RAD, _MIN_DEPRESSION_RAD = np.radians(3.0), np.radians(5.0)
 #: Ratio of the diameters of neighbouring size classes.
 _CLASS_RATIO = float(np.sqrt(2.0))
-#: Ground mesh: spacing / height of the viewpoint, relative growth per line, minimum extent / height of the viewpoint,
-#: and in m.
-_MESH_FINEST, _MESH_GROWTH, _MESH_REACH_HEIGHTS, _MESH_REACH_M = 0.0085, 0.012, 14.0, 700.0
+#: Ground mesh: spacing / height of the viewpoint, relative growth per line, minimum half width / height of the
+#: viewpoint, and in m.
+_MESH_FINEST, _MESH_GROWTH, _MIN_HALF_WIDTH_RATIO, _MIN_HALF_WIDTH_M = 0.0085, 0.012, 14.0, 700.0
 #: Radius of Mars, m, for the distance of the horizon.
 _MARS_RADIUS_M = 3.39e6
 #: Maximum height of a viewpoint, m, at which it is among the rocks (`Scene.among_objects`).
@@ -65,7 +66,7 @@ class SiteGround:
     rocks: RockField | None
 
     @classmethod
-    def of(cls, site: Site, scale: Scale | None = None, *, seed: int = 1, number: int = 0) -> SiteGround:
+    def from_site(cls, site: Site, scale: Scale | None = None, *, seed: int = 1, number: int = 0) -> SiteGround:
         """Load or build terrain `number` of a site's bank; by default at the site's coarsest scale.
 
         Raises ValueError if the site has no terrain at that scale.
@@ -105,7 +106,7 @@ class Viewpoint:
     - pixel_rad: angle of a pixel
     - azimuth_rad, half_width_rad: centre, clockwise from north, and half width of the visible sector; a half width of
       pi is the full circle
-    - reach_m: maximum horizontal distance of visible ground; infinite if the horizon is visible
+    - max_distance_m: maximum horizontal distance of visible ground; infinite if the horizon is visible
     """
 
     east_m: float
@@ -114,10 +115,16 @@ class Viewpoint:
     pixel_rad: float
     azimuth_rad: float = 0.0
     half_width_rad: float = np.pi
-    reach_m: float = np.inf
+    max_distance_m: float = np.inf
 
     @classmethod
     def of(cls, rays: PixelRays, world_from_body: RigidTransform, surface: Surface) -> Viewpoint:
+        """Call `from_pose`; deprecated name."""
+        warn_deprecated("Viewpoint.of", "Viewpoint.from_pose")
+        return cls.from_pose(rays, world_from_body, surface)
+
+    @classmethod
+    def from_pose(cls, rays: PixelRays, world_from_body: RigidTransform, surface: Surface) -> Viewpoint:
         """Compute the viewpoint of a camera at a pose."""
         east, north, up = (float(value) for value in world_from_body.apply(rays.centre))
         height = up - float(surface.height(east, north))
@@ -129,8 +136,10 @@ class Viewpoint:
         half_width = float(min(half_width + _SECTOR_MARGIN_RAD, np.pi))
         upper_edge = elevation + half_angle
         # twice the maximum distance on level ground, because slopes may descend; unlimited near the horizon
-        reach_m = 2.0 * height / np.tan(-upper_edge) + _NEAR_M if upper_edge < -_MIN_DEPRESSION_RAD else np.inf
-        return cls(east, north, height, rays.pixel_rad, float(np.arctan2(axis[0], axis[1])), half_width, float(reach_m))
+        max_distance_m = 2.0 * height / np.tan(-upper_edge) + _NEAR_M if upper_edge < -_MIN_DEPRESSION_RAD else np.inf
+        return cls(
+            east, north, height, rays.pixel_rad, float(np.arctan2(axis[0], axis[1])), half_width, float(max_distance_m)
+        )
 
 
 def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
@@ -138,11 +147,13 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
     spacing_m = ground.surface.spacing_m
     finest_m = max(_MESH_FINEST * viewpoint.height_m, 0.8 * spacing_m)
     horizon_m = float(np.sqrt(2.0 * _MARS_RADIUS_M * viewpoint.height_m))
-    reach_m = max(_MESH_REACH_HEIGHTS * viewpoint.height_m, _MESH_REACH_M, min(horizon_m, viewpoint.reach_m))
+    half_width_m = max(
+        _MIN_HALF_WIDTH_RATIO * viewpoint.height_m, _MIN_HALF_WIDTH_M, min(horizon_m, viewpoint.max_distance_m)
+    )
     # line k of the mesh is at finest_m * sinh(k growth) / sinh(growth)
-    half_lines = int(np.ceil(np.arcsinh(reach_m / finest_m * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
-    objects = select_rocks(ground, viewpoint, reach_m)
-    if ground.site.hills and np.isinf(viewpoint.reach_m) and viewpoint.height_m < _MAX_AMONG_ROCKS_M:
+    half_lines = int(np.ceil(np.arcsinh(half_width_m / finest_m * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
+    objects = select_rocks(ground, viewpoint, half_width_m)
+    if ground.site.hills and np.isinf(viewpoint.max_distance_m) and viewpoint.height_m < _MAX_AMONG_ROCKS_M:
         mean_m = float(ground.surface.levels[-1][..., 0].mean())
         objects = Objects.join([objects, hill_objects(ground.site.hills, mean_m, ground.terrain.albedo)])
     return Scene(
@@ -155,7 +166,7 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
         ground_texture=Texture(ground.site.ground_texture.coarsest_m, ground.site.ground_texture.amplitudes),
         object_texture=Texture(ground.site.rock_texture.coarsest_m, ground.site.rock_texture.amplitudes),
         mesh_finest_m=finest_m,
-        mesh_reach_m=reach_m,
+        mesh_half_width_m=half_width_m,
         mesh_lines=2 * half_lines + 1,
         among_objects=viewpoint.height_m < _MAX_AMONG_ROCKS_M,
     )
@@ -163,11 +174,11 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
 
 def micro_relief(ground: SiteGround) -> MicroRelief:
     """Create the relief that is finer than the samples of the surface, for the renderer."""
-    p, cover_maps = ground.terrain, ground.surface.cover
+    p, factors = ground.terrain, ground.surface.factors
     slope = float(np.radians(p.rms_slope_deg))
     coarsest, heights = octave_heights(p.hurst, slope, p.slope_baseline_m, p.outer_scale_m, p.spacing_m)
-    roughness, texture = (np.ascontiguousarray(cover_maps[..., channel]) for channel in (ROUGHNESS, TEXTURE))
-    return MicroRelief(coarsest, heights, roughness, texture, len(cover_maps) / ground.surface.period_m)
+    roughness, texture = (np.ascontiguousarray(factors[..., channel]) for channel in (ROUGHNESS, TEXTURE))
+    return MicroRelief(coarsest, heights, roughness, texture, len(factors) / ground.surface.period_m)
 
 
 def select_rocks(ground: SiteGround, viewpoint: Viewpoint, farthest_m: float = np.inf) -> Objects:
@@ -182,7 +193,7 @@ def select_rocks(ground: SiteGround, viewpoint: Viewpoint, farthest_m: float = n
     if field is None or len(field) == 0:
         return Objects.none()
     smallest_rad, pixel_rad = smallest_rock_rad(field, viewpoint), _detail_pixel_rad(field, viewpoint)
-    reach = min(farthest_m, viewpoint.reach_m)
+    max_distance = min(farthest_m, viewpoint.max_distance_m)
     smallest_m = float(field.diameter_m.min())
     size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
     meshes = []
@@ -192,7 +203,7 @@ def select_rocks(ground: SiteGround, viewpoint: Viewpoint, farthest_m: float = n
         horizontal = np.sqrt(
             max((min_diameter_m * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - viewpoint.height_m**2, 0.0)
         )
-        radius = float(min(horizontal, reach))
+        radius = float(min(horizontal, max_distance))
         rock_indices = members[_find_near_rocks(field, members, viewpoint, radius)]
         if rock_indices.size:
             subset = replace(field, names={}, **{name: getattr(field, name)[rock_indices] for name in ROCK_ARRAYS})
@@ -225,7 +236,7 @@ def smallest_rock_rad(field: RockField, viewpoint: Viewpoint) -> float:
     Rocks of diameter D are rendered up to the distance D / angle. With n rocks per square metre and a sector of half
     width w, they have ``20 w D**2 n / angle**2`` triangles. The result limits this number to `ROCK_TRIANGLES`.
     """
-    if np.isfinite(viewpoint.reach_m):
+    if np.isfinite(viewpoint.max_distance_m):
         return SMALLEST_ROCK_PX * viewpoint.pixel_rad
     squared_diameters_per_m2 = float(np.sum(field.diameter_m**2)) / field.period_m**2
     limit_rad = np.sqrt(_COARSE_TRIANGLES * viewpoint.half_width_rad * squared_diameters_per_m2 / ROCK_TRIANGLES)

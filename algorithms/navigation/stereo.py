@@ -49,7 +49,7 @@ class RectifiedPair:
     baseline_m: float
 
     @classmethod
-    def of(cls, pair: StereoMeasurement) -> RectifiedPair:
+    def from_measurement(cls, pair: StereoMeasurement) -> RectifiedPair:
         """Rectify a pair to the focal length of the left camera, with its field of view up to 55 deg from the axis."""
         left, right = pair.cameras
         baseline = right.c - left.c

@@ -97,7 +97,7 @@ def estimate_motion(
     `predicted` is the pose of the second rover frame in the first, from wheel odometry and gyros.
     """
     options = VisualOdometryOptions() if options is None else options
-    first_pair, second_pair = RectifiedPair.of(first), RectifiedPair.of(second)
+    first_pair, second_pair = RectifiedPair.from_measurement(first), RectifiedPair.from_measurement(second)
     pixels = _detect_features(first_pair, options)
     disparities, valid = first_pair.feature_disparities(pixels, options.min_range_m)
     pixels, disparities = pixels[valid], disparities[valid]

@@ -61,7 +61,7 @@ def draw_exact_parameters(site: str, rng: np.random.Generator) -> LandingScenari
             "location": {**BANK, "terrain": int(rng.integers(8)), "east_m": east, "north_m": north},
             "sun": {"azimuth_deg": rng.uniform(90.0, 270.0), "elevation_deg": rng.uniform(30.0, 65.0)},
             "detector": make_noise_free_detector("xc-55").model_dump(),
-            "flown": {
+            "image_poses": {
                 "height_m": rng.uniform(8.0, 15.0),
                 "heading_deg": rng.uniform(0.0, 360.0),
                 "tilt_deg": rng.uniform(0.0, 5.0),

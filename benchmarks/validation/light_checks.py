@@ -254,7 +254,7 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
 
 def _render_from_above(scene: Scene, camera: CameraModel, position: np.ndarray, time_s: float) -> np.ndarray:
     pose = rigid(Rotation.identity(), np.array([*position, 2000.0]))
-    return renderer().render(scene, PixelRays.of(camera), pose, time_s).radiance.astype(np.float64)
+    return renderer().render(scene, PixelRays.from_camera(camera), pose, time_s).radiance.astype(np.float64)
 
 
 def run_sun(quick: bool) -> Iterator[Measure]:
@@ -267,8 +267,8 @@ def run_sun(quick: bool) -> Iterator[Measure]:
         sun = Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)))
         law = Photometry(sky_fraction=0.3, sky=DustySky(0.5, 0.95, 0.65))
         pose = rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5]))
-        scene = Scene(_make_flat_surface(), (0.0, 0.0), sun, law, mesh_finest_m=0.5, mesh_reach_m=2000.0)
-        rays = PixelRays.of(camera)
+        scene = Scene(_make_flat_surface(), (0.0, 0.0), sun, law, mesh_finest_m=0.5, mesh_half_width_m=2000.0)
+        rays = PixelRays.from_camera(camera)
         radiance = renderer().render(scene, rays, pose).radiance.astype(np.float64)
         # only the sun's disc is brighter
         sun_radiance = np.where(radiance > 1000.0, radiance, 0.0)

@@ -101,7 +101,7 @@ def create_marked_view(camera: CameraModel, height_m: float, rng: np.random.Gene
         LAMBERTIAN,
         ground_shadows=False,
         mesh_finest_m=half_side / 250.0,
-        mesh_reach_m=4.0 * half_side,
+        mesh_half_width_m=4.0 * half_side,
     )
     return MarkedView(scene, camera, pose, expected)
 
@@ -159,7 +159,7 @@ def _locate_marker(radiance: np.ndarray, expected: np.ndarray) -> np.ndarray:
 def measure_marker_errors(renderer: Renderer, camera: CameraModel, seed: int, count: int = MARKERS) -> np.ndarray:
     """Measure the errors (u, v) of `count` markers from several poses, pixels, shape (count, 2)."""
     rng = np.random.default_rng(seed)
-    rays = PixelRays.of(camera)
+    rays = PixelRays.from_camera(camera)
     errors: list[np.ndarray] = []
     while len(errors) < count:
         # heights from a mast (1.6 m) to a parachute descent (2 km)

@@ -44,7 +44,7 @@ class View:
 
     def rays(self, camera: CameraModel) -> PixelRays:
         """Return the rays of the camera or of a part of its image."""
-        rays = PixelRays.of(camera)
+        rays = PixelRays.from_camera(camera)
         return replace(rays, pixel_angles=np.float32(self.footprint) * rays.pixel_angles)
 
 

@@ -124,7 +124,7 @@ def create_rocks(
     """Create the rocks around a position."""
     if parameters is None:
         return Objects.none()
-    field = RockField.on(surface, parameters, np.random.default_rng(SEED))
+    field = RockField.draw(surface, parameters, np.random.default_rng(SEED))
     mesh = field.near(*centre, radius_m, above_m=above_m)
     return Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=albedo)
 
@@ -150,7 +150,7 @@ def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
         Sun(direction(np.radians(110.0), np.radians(40.0))),
         Photometry(),
         mesh_finest_m=0.0085 * height_m,
-        mesh_reach_m=14.0 * height_m,
+        mesh_half_width_m=14.0 * height_m,
     )
     eye = np.array([*centre, float(surface.height(*centre)) + height_m])
     return View(scene, camera, rigid(Rotation.from_euler("xy", [4.0, -3.0], degrees=True), eye))
@@ -212,7 +212,7 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
         ground_texture=create_texture(site_parameters.ground_texture),
         object_texture=create_texture(site_parameters.rock_texture),
         mesh_finest_m=0.04,
-        mesh_reach_m=600.0,
+        mesh_half_width_m=600.0,
         mesh_lines=641,
         among_objects=True,
     )
@@ -232,7 +232,7 @@ def ground_view(name: str) -> View:
         create_photometry(site_parameters),
         ground_texture=create_texture(site_parameters.ground_texture),
         mesh_finest_m=0.04,
-        mesh_reach_m=600.0,
+        mesh_half_width_m=600.0,
         mesh_lines=641,
         among_objects=True,
     )

@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
+from marsyard.scenarios.parts import InstrumentReadings, InstrumentTruth, MotionInputs, Poses, ScoredDescent
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Glider:
         if not 0.0 <= self.glide_ratio <= 5.0:
             raise ValueError(f"glide_ratio is {self.glide_ratio}; allowed: 0 to 5")
 
-    def fly(self, place: DescentPlace, rng: np.random.Generator) -> Poses:
+    def fly(self, inputs: MotionInputs, rng: np.random.Generator) -> Poses:
         """Return the poses of one glide over the landing location."""
         heading, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
         descent_rate = self.speed_m_s / np.hypot(1.0, self.glide_ratio)
         # the glide ends at half of the firing height, or later if the images require it
-        end_s = (self.height_m - 0.5 * place.firing_height_m) / descent_rate
-        times = np.arange(place.from_s - 0.1, max(place.until_s, end_s) + 0.1, 0.05)
+        end_s = (self.height_m - 0.5 * inputs.firing_height_m) / descent_rate
+        times = np.arange(inputs.from_s - 0.1, max(inputs.until_s, end_s) + 0.1, 0.05)
         course = np.array([np.sin(heading), np.cos(heading), 0.0])
         positions = descent_rate * times[:, None] * (self.glide_ratio * course + np.array([0.0, 0.0, -1.0]))
         positions[:, 2] += self.height_m

@@ -146,16 +146,16 @@ class RenderedImage:
 def render_images(request: ImageRequest, *, detector: bool = True, both: bool = True) -> list[RenderedImage]:
     """Render the requested image. A stereo camera has two images; with `both` False, only the left one is rendered."""
     preset, site = sensor.preset(request.camera), request.site_definition
-    ground = SiteGround.of(site, "descent" if request.scale == "descent" else "ground", seed=request.seed)
+    ground = SiteGround.from_site(site, "descent" if request.scale == "descent" else "ground", seed=request.seed)
     cameras = preset.cameras()
     position = (request.east_m, request.north_m, request.altitude_m)
     pose = camera_pose(ground.surface, preset.design, *position, request.azimuth_deg, request.elevation_deg)
     sun_direction = direction(np.radians(request.sun_azimuth_deg), np.radians(request.sun_elevation_deg))
     sun = Sun(sun_direction, ground.site.environment.sun_radius_rad)
     rendered_cameras = cameras if both else cameras[:1]
-    rays = [PixelRays.of(camera) for camera in rendered_cameras]
+    rays = [PixelRays.from_camera(camera) for camera in rendered_cameras]
     # The baseline of a stereo pair is short: both cameras use the scene built for the left camera.
-    viewpoint = Viewpoint.of(rays[0], pose, ground.surface)
+    viewpoint = Viewpoint.from_pose(rays[0], pose, ground.surface)
     scene = _add_rover(site_scene(ground, viewpoint, sun), request, ground)
     smallest_rad = smallest_rock_rad(ground.rocks, viewpoint) if ground.rocks is not None else 0.0
     rms_slope = math.tan(math.radians(ground.terrain.rms_slope_deg))
@@ -291,7 +291,7 @@ def describe_image(image: RenderedImage, request: ImageRequest) -> dict[str, Any
         "world_from_body": image.frame.world_from_body.as_matrix().tolist(),
         "sun_direction": scene.sun.direction.tolist(),
         "photometry": asdict(scene.photometry),
-        "mesh": {name: getattr(scene, name) for name in ("mesh_finest_m", "mesh_reach_m", "mesh_lines")},
+        "mesh": {name: getattr(scene, name) for name in ("mesh_finest_m", "mesh_half_width_m", "mesh_lines")},
         "rocks_drawn": len(scene.objects),
         "site": request.site_definition.model_dump(mode="json"),
         "detector": None if detector is None else detector.model_dump(mode="json"),

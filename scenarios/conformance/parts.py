@@ -25,7 +25,7 @@ from marsyard.scenarios.landing.images import GroundTruth
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.parts import scores
 from marsyard.scenarios.parts.instruments import InstrumentTruth, check_readings
-from marsyard.scenarios.parts.motions import DescentPlace, Poses, check_poses
+from marsyard.scenarios.parts.motions import MotionInputs, Poses, check_poses
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, PartKind, check_columns, list_installed
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.frames import rigid
@@ -149,11 +149,11 @@ def _nearest_ground(
 
 
 @cache
-def motion_cases() -> tuple[DescentPlace, ...]:
+def motion_cases() -> tuple[MotionInputs, ...]:
     """Create the inputs of motions: three images on Mars, and five images at shorter intervals on the Moon."""
     return (
-        DescentPlace(_ground_height, _GRAVITY_M_S2, (0.0, 3.75, 7.5), -5.0, 8.0, 100.0),
-        DescentPlace(_ground_height, 1.62, (0.0, 2.0, 4.0, 6.0, 8.0), -2.0, 8.5, 50.0),
+        MotionInputs(_ground_height, _GRAVITY_M_S2, (0.0, 3.75, 7.5), -5.0, 8.0, 100.0),
+        MotionInputs(_ground_height, 1.62, (0.0, 2.0, 4.0, 6.0, 8.0), -2.0, 8.5, 50.0),
     )
 
 

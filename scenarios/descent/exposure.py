@@ -184,7 +184,7 @@ def camera_optics(parameters: CameraParameters) -> Optics:
 
 
 def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) -> CameraModel:
-    """Return the calibrated camera: the true camera of `camera_optics` with drawn calibration errors."""
+    """Return the calibrated camera: the true camera of `camera_optics` with sampled calibration errors."""
     p = parameters
     focal, column, row, distortion = rng.standard_normal(4)
     centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_time_fault
 from marsyard.scenarios.descent.recorded import END_MARGIN_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.parts.motions import CustomMotion, DescentPlace
+from marsyard.scenarios.parts.motions import CustomMotion, MotionInputs
 from marsyard.sim.dynamics import State, SwingDescent, Trajectory
 from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError
 from marsyard.sim.streams import Streams
@@ -71,7 +71,7 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
     motion: RecordedMotion
     row: Mapping[str, Scalar]
     if isinstance(p.flight, CustomMotion):
-        place = DescentPlace(
+        inputs = MotionInputs(
             ground_height=lambda east, north: float(surface.height(site_m[0] + east, site_m[1] + north) - site_m[2]),
             gravity_m_s2=gravity_m_s2(p),
             pictures_s=tuple(times),
@@ -79,7 +79,7 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
             until_s=max(times) + END_MARGIN_S,
             firing_height_m=p.descent.thruster_firing_m,
         )
-        motion, row = p.flight.compute(place, site_m, streams.generator("own motion"))
+        motion, row = p.flight.compute(inputs, site_m, streams.generator("own motion"))
         check_looks_down(p.flight.motion, motion, times)
     else:
         motion = p.flight.motion(site_m, gravity_m_s2(p))

@@ -120,7 +120,7 @@ def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]
 def add_attitude_faults(
     faults: Faults, attitudes: Sequence[AttitudeMeasurement], rng: np.random.Generator
 ) -> list[AttitudeMeasurement]:
-    """Tilt attitudes about two drawn horizontal axes: the first for all attitudes, the second for `FAULTY_IMAGE`."""
+    """Tilt attitudes about two sampled horizontal axes: the first for all attitudes, the second for `FAULTY_IMAGE`."""
     axes = [np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) for azimuth in rng.uniform(-np.pi, np.pi, 2)]
     common_tilt = Rotation.from_rotvec(np.radians(faults.attitude_error_deg) * axes[0])
     single_tilt = Rotation.from_rotvec(np.radians(faults.attitude_error_once_deg) * axes[1])

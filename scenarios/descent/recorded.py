@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
@@ -12,10 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.user_files import RecordedAxes, UserFile
 from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, read_poses
-from marsyard.sim.parameters import bounded_field
+from marsyard.sim.parameters import Choice, bounded_field
 
 #: Required duration of the flight after the last image, s.
 END_MARGIN_S = 0.5
+
+
+class FlightOrigin(Choice):
+    """Origin of the positions of a recorded flight: the case's location on the ground, or the terrain's origin."""
+
+    LOCATION = "location"
+    TERRAIN = "terrain"
 
 
 class FlightFile(UserFile, RecordedAxes):
@@ -27,9 +34,8 @@ class FlightFile(UserFile, RecordedAxes):
     """
 
     origin: Annotated[
-        Literal["place", "terrain"],
-        Field(description="origin of positions: ground below the first image, or the terrain's origin"),
-    ] = "place"
+        FlightOrigin, Field(description="origin of positions: ground below the first image, or the terrain's origin")
+    ] = FlightOrigin.LOCATION
     first_picture_s: Annotated[
         float | None, Field(description="file's time of the first image; default: file's start + `lead_s`")
     ] = None
@@ -64,10 +70,10 @@ class FlightFile(UserFile, RecordedAxes):
             )
         check_looks_down(self.file, motion, image_times_s)
         for number, position in enumerate(motion.motion(np.array(image_times_s)).positions_m, start=1):
-            if self.origin == "place" and position[2] <= 0.0:
+            if self.origin is FlightOrigin.LOCATION and position[2] <= 0.0:
                 raise TrajectoryFileError(
                     f"{self.file}: at image {number} the camera is {-position[2]:.1f} m below the ground at the "
-                    'place; allowed: above it (with origin = "terrain", heights refer to the terrain\'s origin)'
+                    'location; allowed: above it (with origin = "terrain", heights refer to the terrain\'s origin)'
                 )
 
     def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
@@ -78,7 +84,7 @@ class FlightFile(UserFile, RecordedAxes):
         )
         attitudes = world_from_file * Rotation.from_quat(poses.quaternions)
         positions = world_from_file.apply(poses.positions_m) + self.lever_arms(attitudes)
-        if self.origin == "place":
+        if self.origin is FlightOrigin.LOCATION:
             positions = positions + ground_m
         return RecordedMotion(poses.times_s - self.start_s, positions, self.body_attitudes(attitudes), gravity_m_s2)
 

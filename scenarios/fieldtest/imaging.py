@@ -68,8 +68,8 @@ class RunKey:
 
 
 @dataclass(frozen=True)
-class FlownRun:
-    """A flown run, before its processing.
+class UnprocessedRun:
+    """Flight and clouds of a run, before its data are processed.
 
     - clouds: clouds that drift with the flight's time; None for a clear sky
     - flight: the true motion
@@ -132,7 +132,12 @@ def field_camera() -> CameraModel:
 
 
 def take_image(
-    run: FlownRun, start_scene: Scene, ground: SiteGround, state: State, detector: Detector, rng: np.random.Generator
+    run: UnprocessedRun,
+    start_scene: Scene,
+    ground: SiteGround,
+    state: State,
+    detector: Detector,
+    rng: np.random.Generator,
 ) -> tuple[UInt16[np.ndarray, "rows columns"], Frame]:
     """Render and expose an image; return its counts and the rendered frame."""
     p, scene = run.key.field_test, scene_at(run, start_scene, ground, state.time_s)
@@ -144,12 +149,12 @@ def take_image(
     return detector.expose(radiance * np.float32(brightness), rng, motion), frame
 
 
-def sun_at(run: FlownRun, time_s: float) -> Sun:
+def sun_at(run: UnprocessedRun, time_s: float) -> Sun:
     """Return the sun at a run's site at a time of the flight."""
     return Sun(run.sun(time_s), site(run.parameters.site).environment.sun_radius_rad)
 
 
-def scene_at(run: FlownRun, start_scene: Scene, ground: SiteGround, time_s: float) -> Scene:
+def scene_at(run: UnprocessedRun, start_scene: Scene, ground: SiteGround, time_s: float) -> Scene:
     """Return the run's scene with the sun at a given time.
 
     The sun is updated for every image: its motion moves the shadows of clouds at 2.5 km height by 0.3 m/s.
@@ -165,7 +170,7 @@ def run_ground(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> S
     return load_ground(site(name), p.terrain(name), p.bank_seed, 0)
 
 
-def build_start_scene(run: FlownRun, ground: SiteGround, height_m: float | None = None) -> Scene:
+def build_start_scene(run: UnprocessedRun, ground: SiteGround, height_m: float | None = None) -> Scene:
     """Build a run's scene with the sun at its start; later images use the same objects with a new sun.
 
     The scene contains the rocks that are resolved from a height above the ground, by default the lowest of the passes.

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory, add_thermal_drift, solve_attitude
 from marsyard.scenarios.fieldtest.imaging import (
-    FlownRun,
     RunKey,
+    UnprocessedRun,
     build_start_scene,
     field_camera,
     run_ground,
@@ -129,7 +129,7 @@ def _pairwise_distances(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarra
 
 
 @dataclass(frozen=True)
-class Run(FlownRun):
+class Run(UnprocessedRun):
     """A simulated and processed run.
 
     - truth: true motion at the images of the passes
@@ -179,7 +179,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     clouds = None
     if run.clouds is not None:
         clouds = CloudLayer.draw(run.clouds, generator("clouds"), ground_m=float(flight.origin_m[2]))
-    flown_run = FlownRun(key, clouds, flight)
+    unprocessed_run = UnprocessedRun(key, clouds, flight)
     interval = p.pictures.interval_s
     pass_times = [np.arange(leg.start_s + 0.5 * interval, leg.end_s, interval) for leg in flight.passes]
     times = np.concatenate(pass_times)
@@ -187,7 +187,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     clock = Clock.draw(p.pictures.clock, generator("camera clock"))
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
     position = gps.measure(flight, times, generator("gps noise")).values
-    solution = _estimate_attitudes(flown_run, ground, clock, gps)
+    solution = _estimate_attitudes(unprocessed_run, ground, clock, gps)
     attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
     elevation_model = simulate_elevation_model(p.elevation, surface, horizontal, generator("elevation model"))
@@ -212,7 +212,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     )
 
 
-def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gps) -> InertialSolution:
+def _estimate_attitudes(run: UnprocessedRun, ground: SiteGround, clock: Clock, gps: Gps) -> InertialSolution:
     """Simulate both passes over the targets and the gyros, and estimate the attitude over the flight."""
     p, flight, generator = run.key.field_test, run.flight, run.key.generator
     targets = Targets.draw(p.targets, ground.surface, flight.origin_m[:2], generator("targets"))
@@ -243,7 +243,7 @@ def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gp
 
 
 def render_and_detect_targets(
-    run: FlownRun,
+    run: UnprocessedRun,
     ground: SiteGround,
     targets: Targets,
     times_s: Float64[np.ndarray, "images"],

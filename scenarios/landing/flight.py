@@ -58,8 +58,8 @@ class Flight:
         height = helicopter.transit.height_m
         start_m = np.array([p.location.east_m, p.location.north_m, ground + height])
         # azimuths are clockwise from north, angles counterclockwise from east; `heading` is that of the image's right
-        heading = -np.radians(p.flown.heading_deg)
-        course = np.pi / 2 - np.radians(p.flown.heading_deg + p.flown.course_deg)
+        heading = -np.radians(p.image_poses.heading_deg)
+        course = np.pi / 2 - np.radians(p.image_poses.heading_deg + p.image_poses.course_deg)
         gravity = p.preset.environment.gravity_m_s2
         transit = Transit.fly(helicopter, start_m, float(course), float(heading), gravity, streams)
         received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
@@ -88,8 +88,8 @@ class Flight:
 
 
 def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams) -> tuple[State, State]:
-    """Compute the body's states at the two images from `PassParameters`."""
-    pair = p.flown
+    """Compute the body's states at the two images from `ImagePoseParameters`."""
+    pair = p.image_poses
     first = nadir_pose(surface, p.location.east_m, p.location.north_m, pair.height_m, pair.heading_deg)
     tilt_azimuth = np.radians(pair.tilt_towards_deg)
     # a rotation about the horizontal axis to the right of the azimuth tilts the optical axis towards the azimuth

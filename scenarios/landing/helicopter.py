@@ -21,12 +21,12 @@ from marsyard.sim.dynamics.rotorcraft import (
     Air,
     AirParameters,
     AltimeterErrors,
-    FlownPath,
     GroundPatch,
     LandingGuidance,
     Phase,
     RotorcraftFlight,
     RotorcraftParameters,
+    SimulatedPath,
     TransitParameters,
     simulate_landing,
     simulate_transit,
@@ -81,7 +81,7 @@ class HelicopterParameters(Parameters):
 
 @dataclass(frozen=True)
 class Instruments:
-    """On-board instruments with drawn errors, and the filter configured for them."""
+    """On-board instruments with sampled errors, and the filter configured for them."""
 
     imu: Imu
     receiver: RtkReceiver
@@ -282,7 +282,7 @@ def land(
 
 
 def _interpolate_at_knots(
-    path: FlownPath, times_s: Float64[np.ndarray, "m"], values: Float64[np.ndarray, "m 9"]
+    path: SimulatedPath, times_s: Float64[np.ndarray, "m"], values: Float64[np.ndarray, "m 9"]
 ) -> Float64[np.ndarray, "knots 9"]:
     """Interpolate values linearly at a path's knots; constant before the first and after the last time."""
     return np.stack([np.interp(path.knots_s, times_s, column) for column in values.T], axis=1)

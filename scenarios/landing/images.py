@@ -92,7 +92,7 @@ def take_images(p: LandingScenarioParameters, world: World, flight: Flight, opti
     shadow_disc_m = max(p.lander.caster_diameter_m, p.faults.vehicle_shadow_m)
     lowest = min(flight.states, key=lambda state: float(state.position_m[2]))
     # one scene for both images, with the level of detail for the lower image
-    viewpoint = Viewpoint.of(optics.rays, lowest.world_from_body, world.ground.surface)
+    viewpoint = Viewpoint.from_pose(optics.rays, lowest.world_from_body, world.ground.surface)
     scene = add_meshes(
         site_scene(world.ground, viewpoint, world.sun), world.meshes, (viewpoint.east_m, viewpoint.north_m)
     )

@@ -109,7 +109,7 @@ def stuck_range_m(faults: Faults, height_m: float) -> float | None:
 Angle = Annotated[float, Field(ge=-720.0, le=720.0)]
 
 
-class PassParameters(Parameters):
+class ImagePoseParameters(Parameters):
     """Camera poses at the two images; by default level flight on a straight line.
 
     The motion between the images has components along the course, upwards, and rotations about the first image's
@@ -131,7 +131,7 @@ class PassParameters(Parameters):
 
 
 class NavigationParameters(Parameters):
-    """Standard deviations per axis of the on-board poses and of the inclinometers, drawn for a case."""
+    """Standard deviations per axis of the on-board poses and of the inclinometers, sampled for a case."""
 
     position_m: NonNegative = Field(default=0.02, le=100.0, description="SD of the position, common to both images")
     motion_m: Annotated[NonNegative, Field(le=10.0, description="SD of the motion between images, m")] = 0.01
@@ -176,7 +176,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
 
     site: Annotated[str, Field(description="preset of terrain, light, texture and rocks")] = "heli-hazardous"
     scale: Annotated[Literal["ground", "descent"], Field(description="terrain of the site")] = "ground"
-    terrain_of: str | None = Field(default=None, description="site of the terrain; set automatically from `site`")
+    terrain_site: str | None = Field(default=None, description="site of the terrain; set automatically from `site`")
     terrain: CheckedTerrain = TerrainParameters()
     location: Location = Location()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom meshes on the ground")] = ()
@@ -189,7 +189,9 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     calibration: CalibrationParameters = Field(default=CalibrationParameters(), description="camera calibration errors")
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
     exposure: Annotated[AutoExposureParameters, Field(description="exposure control")] = AutoExposureParameters()
-    flown: PassParameters = Field(default=PassParameters(), description="poses; only azimuths for a helicopter")
+    image_poses: ImagePoseParameters = Field(
+        default=ImagePoseParameters(), description="poses; only azimuths for a helicopter"
+    )
     navigation: NavigationParameters = Field(default=NavigationParameters(), description="errors without helicopter")
     helicopter: HelicopterParameters | None = Field(default=None, description="helicopter flight and landing")
     pair: PairParameters = Field(default=PairParameters(), description="choice of two images of a helicopter flight")
@@ -225,12 +227,16 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
         changes = settings.get("terrain", {})
         site_preset = sites().get(name) if isinstance(name, str) else None
         if (
-            "terrain_of" in settings
+            not {"terrain_site", "terrain_of"}.isdisjoint(settings)  # `terrain_of`: deprecated name
             or getattr(site_preset, str(scale), None) is None
             or not isinstance(changes, Mapping)
         ):
             return settings
-        return {**settings, "terrain_of": name, "terrain": site(name).terrain(scale).with_changes(changes).model_dump()}
+        return {
+            **settings,
+            "terrain_site": name,
+            "terrain": site(name).terrain(scale).with_changes(changes).model_dump(),
+        }
 
     @model_validator(mode="after")
     def _check_consistency(self) -> LandingScenarioParameters:
@@ -240,8 +246,8 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
         rows = self.optics.size[1]
         if rows % self.detector.rows_summed:
             raise ValueError(f"detector.rows_summed {self.detector.rows_summed} does not divide the {rows} camera rows")
-        if self.terrain_of != self.site:
-            raise ValueError(f"site is {self.site}, but terrain is of {self.terrain_of}; `site` cannot be dispersed")
+        if self.terrain_site != self.site:
+            raise ValueError(f"site is {self.site}, but terrain is of {self.terrain_site}; `site` cannot be dispersed")
         for name in ("lost_pictures", "gps_outage_s"):
             if getattr(self.faults, name) and self.helicopter is None:
                 raise ValueError(f"faults.{name} needs a helicopter flight; add the table helicopter")
@@ -255,7 +261,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     @property
     def height_m(self) -> float:
         """Commanded height of the images above the ground."""
-        return self.flown.height_m if self.helicopter is None else self.helicopter.transit.height_m
+        return self.image_poses.height_m if self.helicopter is None else self.helicopter.transit.height_m
 
     @property
     def preset(self) -> Site:

@@ -191,7 +191,7 @@ class _FolderReader:
         if table.number >= len(cameras):
             raise row.error(f"{camera_file}: contains {len(cameras)} cameras; camera.number is {table.number}")
         camera, rotation = cameras[table.number], row.rotation()
-        if not table.placed and rotation is not None:  # the row's attitude is that of a camera looking down
+        if not table.pose_in_file and rotation is not None:  # the row's attitude is that of a camera looking down
             camera = mount_looking_down(camera)
         product = read_pds3_product(path) if is_product else None
         counts = read_counts(path, camera.size) if product is None else product.counts

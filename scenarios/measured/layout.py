@@ -46,7 +46,7 @@ class CameraTable(Parameters):
         str | None, Field(description="camera file; not needed for PDS3 products, whose labels contain the camera")
     ] = None
     number: Annotated[int, Field(ge=0, description="index of the camera in the file, from 0")] = 0
-    placed: Annotated[
+    pose_in_file: Annotated[
         bool,
         Field(
             description="true: the file's vectors define the camera's pose in the body (`attitude_of` is then `body`); "
@@ -130,9 +130,9 @@ def read_ingest_file(folder: Path) -> IngestFile:
             message = f"{detail['msg'].removeprefix('Value error, ')}, got {detail['input']!r}"
             problems.append(f"{path}: {'.'.join(map(str, detail['loc']))}: {messages.get(detail['type'], message)}")
         raise IngestError("\n".join(problems)) from error
-    if file.camera.placed and file.poses is not None and file.poses.attitude_of != "body":
+    if file.camera.pose_in_file and file.poses is not None and file.poses.attitude_of != "body":
         raise IngestError(
-            f'{path}: camera.placed: the file contains the pose in the body: poses.attitude_of must be "body"'
+            f'{path}: camera.pose_in_file: the file contains the pose in the body: poses.attitude_of must be "body"'
         )
     return file
 

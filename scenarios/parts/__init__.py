@@ -3,8 +3,12 @@
 `motions`, `instruments` and `scores` define the inputs and outputs of parts. `named` imports and constructs parts.
 """
 
+from __future__ import annotations
+
+from typing import Any
+
 from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentTruth
-from marsyard.scenarios.parts.motions import DescentPlace, Poses
+from marsyard.scenarios.parts.motions import MotionInputs, Poses
 from marsyard.scenarios.parts.scores import (
     ScoredDescent,
     ScoredFlight,
@@ -13,8 +17,17 @@ from marsyard.scenarios.parts.scores import (
     ScoredSite,
     ScoredVelocity,
 )
+from marsyard.sim.parameters import warn_deprecated
 
 __all__ = [
-    "DescentPlace", "InstrumentReadings", "InstrumentTruth", "Poses", "ScoredDescent", "ScoredFlight",
+    "InstrumentReadings", "InstrumentTruth", "MotionInputs", "Poses", "ScoredDescent", "ScoredFlight",
     "ScoredLanding", "ScoredRun", "ScoredSite", "ScoredVelocity",
 ]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Return the class with a deprecated name."""
+    if name != "DescentPlace":
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    warn_deprecated(name, "MotionInputs")
+    return MotionInputs

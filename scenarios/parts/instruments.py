@@ -6,7 +6,7 @@ An instrument is a class with
 - ``quantity``: the measured quantity, ``"altitude"`` or ``"attitude"``;
 - ``random``: whether the readings depend on the random stream;
 - ``read(truth: InstrumentTruth, rng: numpy.random.Generator) -> InstrumentReadings``: returns all readings of one case.
-  Errors common to all readings are therefore drawn once.
+  Errors common to all readings are therefore sampled once.
 """
 
 from __future__ import annotations

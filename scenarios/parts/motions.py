@@ -4,7 +4,7 @@ A motion is a class with
 
 - options: arguments of the constructor, each with a default value;
 - ``random``: whether the poses depend on the random stream;
-- ``fly(place: DescentPlace, rng: numpy.random.Generator) -> Poses``: returns the poses of one case.
+- ``fly(inputs: MotionInputs, rng: numpy.random.Generator) -> Poses``: returns the poses of one case.
 
 Poses are interpolated as in a recorded flight (`marsyard.sim.dynamics.recorded`). Instruments measure the interpolated
 motion as they measure a simulated motion.
@@ -32,14 +32,14 @@ UNIT_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class DescentPlace:
-    """Place and times of a descent, as input of a motion.
+class MotionInputs:
+    """Ground, gravity and times of a descent: the inputs of a motion.
 
-    The place is the ground point of the case's location; positions are relative to it.
+    The origin of positions is the ground point of the case's location.
 
-    - ground_height: function that returns the height of the ground (m, relative to the place) at x metres east and y
-      metres north of the place
-    - gravity_m_s2: gravity at the place
+    - ground_height: function that returns the height of the ground (m, relative to the origin) at x metres east and
+      y metres north of the origin
+    - gravity_m_s2: gravity at the origin
     - pictures_s: nominal times of the images; the first image is at 0
     - from_s, until_s: interval that the poses must cover
     - firing_height_m: height above the ground at which the thrusters fire; they fire at the end of a motion that ends
@@ -59,8 +59,8 @@ class Poses:
     """A motion as a sequence of poses, sampled densely enough for a cubic spline.
 
     - times_s: increasing times, at least four; the first image is at time 0
-    - positions_m: positions relative to the place (`DescentPlace`), in the world axes of the key `axes` (default: east,
-      north, up)
+    - positions_m: positions relative to the origin (`MotionInputs`), in the world axes of the key `axes` (default:
+      east, north, up)
     - quaternions_xyzw: unit quaternions (x, y, z, w) of rotations to these world axes from the frame of the key
       `attitude_of` (default: OpenCV camera frame)
     - columns: further result columns, such as sampled values; the prefix `flight_` is added to their names
@@ -86,20 +86,20 @@ class CustomMotion(CustomPart, RecordedAxes):
     lead_s: Annotated[float, bounded_field(0.2, 30.0, "start of the navigation before the first image")] = 5.0
 
     def compute(
-        self, place: DescentPlace, ground_m: Float[np.ndarray, "3"], rng: np.random.Generator
+        self, inputs: MotionInputs, ground_m: Float[np.ndarray, "3"], rng: np.random.Generator
     ) -> tuple[RecordedMotion, dict[str, Scalar]]:
         """Compute the motion of a case in world axes, and its columns. Raises ValueError for invalid poses."""
-        poses = check_poses(self.spec, self.create().fly(place, rng), place)
+        poses = check_poses(self.spec, self.create().fly(inputs, rng), inputs)
         attitudes = self.enu_from_axes * Rotation.from_quat(poses.quaternions_xyzw)
         positions = self.enu_from_axes.apply(poses.positions_m) + self.lever_arms(attitudes) + ground_m
         try:
-            motion = RecordedMotion(poses.times_s, positions, self.body_attitudes(attitudes), place.gravity_m_s2)
+            motion = RecordedMotion(poses.times_s, positions, self.body_attitudes(attitudes), inputs.gravity_m_s2)
         except ValueError as error:
             raise ValueError(f"the motion of '{self.spec}' {error}") from error
         return motion, self.columns("flight", poses.columns)
 
 
-def check_poses(spec: str, poses: object, place: DescentPlace) -> Poses:
+def check_poses(spec: str, poses: object, inputs: MotionInputs) -> Poses:
     """Check a motion's poses and return them as 64-bit arrays. Raises ValueError for invalid poses."""
     if not isinstance(poses, Poses):
         raise ValueError(f"'{spec}' returns a {type(poses).__name__}; allowed: marsyard.scenarios.parts.Poses")
@@ -111,10 +111,11 @@ def check_poses(spec: str, poses: object, place: DescentPlace) -> Poses:
             raise ValueError(f"'{spec}' returns {name} of shape {array.shape}; allowed: {shape}")
         if not np.all(np.isfinite(array)):
             raise ValueError(f"'{spec}' returns {name} that are not finite")
-    if times.size == 0 or times[0] > place.from_s or times[-1] < place.until_s:
+    if times.size == 0 or times[0] > inputs.from_s or times[-1] < inputs.until_s:
         interval = f"{times[0]:.6g} to {times[-1]:.6g} s" if times.size else "no times"
         raise ValueError(
-            f"'{spec}' covers {interval}; allowed: from at most {place.from_s:.6g} s to at least {place.until_s:.6g} s"
+            f"'{spec}' covers {interval}; allowed: from at most {inputs.from_s:.6g} s "
+            f"to at least {inputs.until_s:.6g} s"
         )
     lengths = np.linalg.norm(quaternions, axis=1)
     invalid = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE)

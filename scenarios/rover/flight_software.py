@@ -128,7 +128,7 @@ class Navigator:
         self, pair: StereoMeasurement, world_from_rover: RigidTransform, ranges_m: tuple[float, float]
     ) -> None:
         """Add the points of a stereo pair, taken at an estimated pose, with depths within `ranges_m`."""
-        points = RectifiedPair.of(pair).points(*ranges_m)
+        points = RectifiedPair.from_measurement(pair).points(*ranges_m)
         # steeper points, seen from the rover, are false matches; the body cameras also see the rover
         is_ground = np.abs(points[:, 2]) <= GROUND_STEP_M + GROUND_SLOPE * np.hypot(points[:, 0], points[:, 1])
         is_ground &= (points[:, 0] > BODY_M[0]) | (np.abs(points[:, 1]) > BODY_M[1])

@@ -53,7 +53,7 @@ class _StereoPair:
         settings, rng = preset(name).detector.bin(p.navigation.binning), streams.generator(f"{name} response")
         left, right = (Detector.draw(natural_fall_off(camera), settings, rng) for camera in binned_cameras[0])
         # the exposure is metered in the binned image, which is the whole subframe
-        exposure = p.exposure.model_copy(update={"of": "subframe"})
+        exposure = p.exposure.model_copy(update={"metering": "subframe"})
         parameters = p.model_copy(update={"exposure": exposure})
         camera = StereoCamera(parameters, (left, right), streams.generator(f"{name} noise"))
         return cls(camera, binned_cameras[0], binned_cameras[1])
@@ -69,7 +69,7 @@ class _StereoPair:
     ) -> StereoMeasurement:
         """Take a pair; `mounts` are the true and the measured pose of the head or rover frame, in the rover frame."""
         world_from_mount = compose(vehicle.stance.world_from_rover, mounts[0])
-        rays = PixelRays.of(self.true[0])
+        rays = PixelRays.from_camera(self.true[0])
         scene = replace(world.navigation_scene(rays, world_from_mount, time_s), edge_rays=edge_rays)
         ahead = np.asarray(vehicle.stance.world_from_rover.apply(np.array([_SHADOW_AHEAD_M, 0.0, 0.0])))
         geometry, sun = rig.calibrated.geometry, scene.sun.direction
@@ -109,7 +109,7 @@ class NavigationCameras:
             mast = _StereoPair.draw(p, name, head, streams)
         if uses_map and any((leg.autonav or leg.maps_first) and leg.map_by == "body" for leg in p.legs):
             left, right = preset(HAZCAM).cameras()
-            # calibration errors of the body's cameras are drawn like those of a mast's cameras
+            # calibration errors of the body's cameras are sampled like those of a mast's cameras
             design = MastCalibration(rig.calibrated.geometry, left, right)
             head = StereoHead.draw(design, p.stereo, streams.generator("hazcam calibration"))
             body = _StereoPair.draw(p, HAZCAM, head, streams)

@@ -179,7 +179,9 @@ class SunParameters(Parameters):
         16.0 / 66.0
     )
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
-    held_s: Annotated[Positive, Field(description="interval in which the sun is constant in images")] = 120.0
+    update_interval_s: Annotated[Positive, Field(description="interval between updates of the sun's position, s")] = (
+        120.0
+    )
 
     def direction(self, time_s: float) -> Float64[np.ndarray, "3"]:
         """Compute the unit vector to the sun, world axes; the sun rotates westwards about the pole."""
@@ -196,8 +198,8 @@ class SunParameters(Parameters):
         return np.asarray(direction_at_time / np.linalg.norm(direction_at_time))
 
     def sun_in_interval(self, index: int, angular_radius_rad: float) -> Sun:
-        """Return the sun of all images in an interval of `held_s`: the sun at the centre of the interval."""
-        return Sun(self.direction((index + 0.5) * self.held_s), angular_radius_rad)
+        """Return the sun of all images in an interval of `update_interval_s`: the sun at the centre of the interval."""
+        return Sun(self.direction((index + 0.5) * self.update_interval_s), angular_radius_rad)
 
 
 class TimingParameters(Parameters):
@@ -212,7 +214,9 @@ class TimingParameters(Parameters):
 class ExposureParameters(Parameters):
     """Exposure of the images (section 4.5)."""
 
-    of: Literal["subframe", "full-frame", "fixed"] = Field(default="subframe", description="region of auto-exposure")
+    metering: Literal["subframe", "full-frame", "fixed"] = Field(
+        default="subframe", description="image region of auto-exposure; fixed: no auto-exposure"
+    )
     auto: AutoExposureParameters = AutoExposureParameters()
 
 

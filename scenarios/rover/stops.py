@@ -60,7 +60,7 @@ class StereoImages:
 
 @dataclass(frozen=True)
 class StereoCamera:
-    """The detectors of a stereo pair with drawn pixel responses.
+    """The detectors of a stereo pair with sampled pixel responses.
 
     Without detector noise, counts are proportional to the light and rounded. The left subframe determines the exposure.
     """
@@ -104,21 +104,21 @@ class StereoCamera:
             return np.asarray(frame.radiance * scale)
 
         pairs = zip(cameras, boxes, strict=True)
-        pixel_rays = [PixelRays.of(camera.crop(*box.corner, box.size)) for camera, box in pairs]
+        pixel_rays = [PixelRays.from_camera(camera.crop(*box.corner, box.size)) for camera, box in pairs]
         local_scene = add_rover(scene.restrict_to_cones([rays.cone(world_from_head) for rays in pixel_rays]))
         radiances, exposure_s = [render(local_scene, rays) for rays in pixel_rays], 0.0
         if p.camera.detector_noise:
             windows = [unit.window(*box.corner, box.size) for unit, box in zip(self.detectors, boxes, strict=True)]
             detector, metering_radiance = windows[0], radiances[0]
             exposure_s = detector.parameters.exposure_s
-            if p.exposure.of == "full-frame":
+            if p.exposure.metering == "full-frame":
                 # reduced full frame, and a detector of its size
-                reduced_rays = PixelRays.of(cameras[0].scale(1.0 / _BINNING))
+                reduced_rays = PixelRays.from_camera(cameras[0].scale(1.0 / _BINNING))
                 metering_radiance = render(replace(add_rover(scene), edge_rays=1), reduced_rays)
                 rows, columns = metering_radiance.shape
                 response = np.resize(detector.response[:rows, :columns], (rows, columns))
                 detector = replace(detector, response=response, hot_e_s=None)
-            if p.exposure.of != "fixed":
+            if p.exposure.metering != "fixed":
                 auto_exposure = auto_expose(detector, metering_radiance, p.exposure.auto, self.noise)
                 exposure_s = auto_exposure.detector.parameters.exposure_s
             counts = [

@@ -42,7 +42,7 @@ CLEARANCE_M = 2.0
 #: Minimum gap between the terrain's rocks and a placed rock, m.
 MIN_GAP_M = 0.05
 #: Maximum distances of rocks and of the ground in images of the navigation, m.
-NAVIGATION_ROCKS_M, NAVIGATION_REACH_M = 25.0, 60.0
+NAVIGATION_ROCKS_M, NAVIGATION_HALF_WIDTH_M = 25.0, 60.0
 #: Margin beyond the start in which wheels roll over rocks, metres.
 ROUTE_MARGIN_M = 1.5
 
@@ -96,7 +96,7 @@ class RunWorld:
         scene = replace(
             site_scene(ground, viewpoint, p.sun.sun_in_interval(0, ground.site.environment.sun_radius_rad)),
             mesh_finest_m=MESH_FINEST_M,
-            mesh_reach_m=radius,
+            mesh_half_width_m=radius,
             mesh_lines=_mesh_lines(radius),
             clouds=clouds,
         )
@@ -122,8 +122,8 @@ class RunWorld:
         return float((outline.point(p.target.across, p.target.up) - foot) @ to_start)
 
     def scene(self, time_s: float) -> Scene:
-        """Return the scene at a time of the run, without the rover; the sun is constant for `SunParameters.held_s`."""
-        interval = int(time_s // self.sun.held_s)
+        """Return the scene at a time of the run, without the rover; the sun changes every `sun.update_interval_s`."""
+        interval = int(time_s // self.sun.update_interval_s)
         if self._cached_scene is None or self._cached_scene[0] != interval:
             sun = self.sun.sun_in_interval(interval, self.ground.site.environment.sun_radius_rad)
             self._cached_scene = (interval, self.base.with_light(sun, self.ground.photometry(sun)))
@@ -131,13 +131,13 @@ class RunWorld:
 
     def navigation_scene(self, rays: PixelRays, world_from_camera: RigidTransform, time_s: float) -> Scene:
         """Build the scene for a camera anywhere on the route, with the rocks that it resolves, without the rover."""
-        viewpoint = Viewpoint.of(rays, world_from_camera, self.ground.surface)
-        viewpoint = replace(viewpoint, reach_m=min(viewpoint.reach_m, NAVIGATION_ROCKS_M))
+        viewpoint = Viewpoint.from_pose(rays, world_from_camera, self.ground.surface)
+        viewpoint = replace(viewpoint, max_distance_m=min(viewpoint.max_distance_m, NAVIGATION_ROCKS_M))
         return replace(
             site_scene(self.ground, viewpoint, self.scene(time_s).sun),
             mesh_finest_m=MESH_FINEST_M,
-            mesh_reach_m=NAVIGATION_REACH_M,
-            mesh_lines=_mesh_lines(NAVIGATION_REACH_M),
+            mesh_half_width_m=NAVIGATION_HALF_WIDTH_M,
+            mesh_lines=_mesh_lines(NAVIGATION_HALF_WIDTH_M),
             clouds=self.base.clouds,
         )
 
@@ -146,9 +146,9 @@ class RunWorld:
         """Ground with the rocks of the route, from the target to behind the start."""
         centre = (self.viewpoint.east_m, self.viewpoint.north_m)
         half_side_m = self.start_distance_m + ROUTE_MARGIN_M
-        reach_m = float(np.sqrt(2.0)) * half_side_m
-        rocks = select_rocks(self.ground, replace(self.viewpoint, half_width_rad=np.pi, reach_m=reach_m))
-        return RockyGround.of(self.ground.surface, rocks.triangles, centre, half_side_m)
+        max_distance_m = float(np.sqrt(2.0)) * half_side_m
+        rocks = select_rocks(self.ground, replace(self.viewpoint, half_width_rad=np.pi, max_distance_m=max_distance_m))
+        return RockyGround.from_triangles(self.ground.surface, rocks.triangles, centre, half_side_m)
 
     def brightness(self, time_s: float) -> float:
         """Compute the direct sunlight on the ground relative to 1 AU."""
@@ -157,12 +157,12 @@ class RunWorld:
         return air.direct_fraction(elevation) * air.solar_irradiance
 
 
-def _mesh_lines(reach_m: float) -> int:
-    """Return the number of lines of a ground mesh with a half width of `reach_m`.
+def _mesh_lines(half_width_m: float) -> int:
+    """Return the number of lines of a ground mesh with a half width of `half_width_m`.
 
     The lines are at `MESH_FINEST_M * sinh(MESH_GROWTH * i) / sinh(MESH_GROWTH)`, with i = 0 at the centre.
     """
-    return 2 * int(np.ceil(np.arcsinh(reach_m / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1
+    return 2 * int(np.ceil(np.arcsinh(half_width_m / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1
 
 
 def place_rocks(p: RoverScenarioParameters, base: SiteGround, rng: np.random.Generator) -> tuple[SiteGround, RockField]:
@@ -175,7 +175,7 @@ def place_rocks(p: RoverScenarioParameters, base: SiteGround, rng: np.random.Gen
         east, north = centre + obstacle.towards_start_m * to_start + obstacle.right_m * right
         size = obstacle.model_dump(include={"diameter_m", "height_m"})
         placed_rocks.append(PlacedRock(name=f"obstacle-{number}", east_m=float(east), north_m=float(north), **size))
-    rocks = RockField.on(base.surface, RockParameters(abundance=0.0, placed=tuple(placed_rocks)), rng)
+    rocks = RockField.draw(base.surface, RockParameters(abundance=0.0, placed=tuple(placed_rocks)), rng)
     if base.rocks is None:
         return replace(base, rocks=rocks), rocks
     is_near = _distances(base.rocks, centre) < p.start.distance_m + CLEARANCE_M
@@ -198,7 +198,7 @@ def _distances(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[
 
 @dataclass
 class Rig:
-    """The mast and its stereo pair with drawn errors: truth, calibration, and current angles."""
+    """The mast and its stereo pair with sampled errors: truth, calibration, and current angles."""
 
     head: StereoHead  #: true and calibrated stereo pair
     calibrated: MastCalibration  #: calibration known to the flight software

@@ -77,7 +77,7 @@ class RockyGround:
     above_m: Float64[np.ndarray, "rows columns"]
 
     @classmethod
-    def of(
+    def from_triangles(
         cls,
         ground: Ground,
         triangles: Float64[np.ndarray, "triangles 3 3"],

@@ -167,7 +167,7 @@ class Modes:
     hinge_damping: float
 
     @classmethod
-    def of(cls, p: SwingParameters, gravity_m_s2: float) -> Modes:
+    def from_parameters(cls, p: SwingParameters, gravity_m_s2: float) -> Modes:
         """Compute the modes. Raises ValueError unless the nodding is much faster than the coning."""
         mass, lander_moment = p._mass_kg, p.lander_mass_kg * p.mass_centre_m
         inertia = p.lander_mass_kg * p.gyration_transverse_m**2
@@ -341,7 +341,7 @@ class SwingDescent(Trajectory):
                 f"start_m is at z = {start_m[2]:.1f} m; allowed: above the thrusters' firing, {firing_m:.1f} m"
             )
         wind = Wind.draw(p, ground_height_m, rng)
-        modes = Modes.of(p, gravity_m_s2)
+        modes = Modes.from_parameters(p, gravity_m_s2)
         # with this rate at the lowest point the lander would reach the upright position
         loop_deg_s = float(np.degrees(2.0 * modes.nod_rad_s))
         if p.nod_rate_deg_s >= loop_deg_s:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rotation_matrix
+from marsyard.sim.parameters import warn_deprecated
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.kernels.structs import Rays
 from marsyard.sim.render.kernels.views import max_image_radius, min_component, pixel_angles, sum_of_vectors
@@ -81,6 +82,12 @@ class PixelRays:
 
     @classmethod
     def of(cls, camera: CameraModel) -> PixelRays:
+        """Call `from_camera`; deprecated name."""
+        warn_deprecated("PixelRays.of", "PixelRays.from_camera")
+        return cls.from_camera(camera)
+
+    @classmethod
+    def from_camera(cls, camera: CameraModel) -> PixelRays:
         """Compute the rays of a camera in the body frame. Raises RenderingError where pixels have no ray."""
         columns, rows = camera.size
         ray_origins, directions = camera.rays(camera.pixel_grid())

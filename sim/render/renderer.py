@@ -184,7 +184,9 @@ class Renderer:
         position, (low, high) = pose.position, scene.height_range_m
         descent_rates = np.minimum(directions[:, 2], -1e-9)
         plane_z = (low, max(high, position[2]))
-        end_distances = [np.clip((z - position[2]) / descent_rates, 0.0, 2.0 * scene.mesh_reach_m) for z in plane_z]
+        end_distances = [
+            np.clip((z - position[2]) / descent_rates, 0.0, 2.0 * scene.mesh_half_width_m) for z in plane_z
+        ]
         points = np.concatenate([position[:2] + distance[:, None] * directions[:, :2] for distance in end_distances])
         # between the probe rays the border of the visible ground deviates little from a straight line
         margin = 0.02 * (points.max(axis=0) - points.min(axis=0)) + 2.0 * scene.mesh_finest_m
@@ -205,7 +207,7 @@ class Renderer:
             world_from_view[:3, 3] = pose.position
             # near plane at 5 % of the height above the ground: nearer surfaces are clipped; the depth is only a first
             # guess, so its low resolution at large distances has no effect on the image
-            far = 2.0 * scene.mesh_reach_m + clearance_m
+            far = 2.0 * scene.mesh_half_width_m + clearance_m
             pictures.append(renderer.draw(world_from_view, float(focal), 0.05 * clearance_m, far))
         # a single view is not copied
         depth, ids = (maps[0][np.newaxis] if len(maps) == 1 else np.stack(maps) for maps in zip(*pictures, strict=True))

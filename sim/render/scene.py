@@ -23,8 +23,8 @@ from marsyard.sim.terrain import Surface
 #: Rounding error of a mean of heights of a few km in single precision, metres.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
-_NO_COVER = np.ones((1, 1), dtype=np.float32)
-NO_RELIEF = MicroRelief(1.0, np.empty(0), _NO_COVER, _NO_COVER, 0.0)
+_UNIFORM_FACTOR = np.ones((1, 1), dtype=np.float32)
+NO_RELIEF = MicroRelief(1.0, np.empty(0), _UNIFORM_FACTOR, _UNIFORM_FACTOR, 0.0)
 NO_CLOUDS = (no_cover(), np.zeros(5))
 #: Cone: apex in world axes, unit vector along the axis, and half angle in radians.
 Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]
@@ -57,8 +57,8 @@ class Scene:
     - caster_diameter_m: diameter of a round body at the camera that casts a shadow, such as a lander
     - ground_shadows: whether the ground casts shadows, with a penumbra; shadows of objects have hard edges
     - clouds: drifting clouds that cast shadows
-    - mesh_finest_m, mesh_reach_m, mesh_lines: spacing of the mesh at the centre, half width of the mesh, and number of
-      its lines along each axis
+    - mesh_finest_m, mesh_half_width_m, mesh_lines: spacing of the mesh at the centre, its half width, and its number of
+      lines along each axis
     - among_objects: whether the camera is among the objects, so that nearly all visible ground may be in their shadows.
       Otherwise the shaded region is computed in advance, and only its pixels are tested (`shadow_footprint`)
     - edge_rays: rays along each side of a pixel at an edge (`marsyard.sim.render.renderer`); with 1, one ray per pixel
@@ -77,7 +77,7 @@ class Scene:
     ground_shadows: bool = True
     clouds: CloudLayer | None = None
     mesh_finest_m: float = 12.0
-    mesh_reach_m: float = 20000.0
+    mesh_half_width_m: float = 20000.0
     mesh_lines: int = 513
     among_objects: bool = False
     edge_rays: int = 2
@@ -86,7 +86,7 @@ class Scene:
     @cached_property
     def mesh_offsets(self) -> Float64[np.ndarray, "lines"]:
         """Offsets of the mesh lines from the centre, metres."""
-        return graded_offsets(self.mesh_reach_m, self.mesh_finest_m, self.mesh_lines)
+        return graded_offsets(self.mesh_half_width_m, self.mesh_finest_m, self.mesh_lines)
 
     def with_objects(self, objects: Objects) -> Scene:
         """Return the scene with other objects; cached results of the ground are kept."""
@@ -117,7 +117,7 @@ class Scene:
     @property
     def extent_m(self) -> Extent:
         """Minimum and maximum x, then y, of the mesh, and maximum height of the surface, metres."""
-        (x, y), half_width = self.centre_m, self.mesh_reach_m
+        (x, y), half_width = self.centre_m, self.mesh_half_width_m
         # coarser levels are means of finer ones: none is higher, except for rounding
         return x - half_width, x + half_width, y - half_width, y + half_width, self.height_range_m[1] + ROUNDING_M
 

@@ -147,7 +147,7 @@ class ImuIncrements:
 
 @dataclass(frozen=True)
 class Imu:
-    """An inertial unit with drawn errors, which are valid in a time span; noise is drawn with the increments."""
+    """An inertial unit with sampled errors, which are valid in a time span; noise is drawn with the increments."""
 
     parameters: ImuParameters
     gyro: Triad
@@ -197,7 +197,7 @@ class Imu:
     def increments(
         self, trajectory: Trajectory, start_s: float, end_s: float, rng: np.random.Generator
     ) -> ImuIncrements:
-        """Measure a trajectory from start to end; both are true times within the time span of the drawn errors."""
+        """Measure a trajectory from start to end; both are true times within the time span of the sampled errors."""
         boundaries = self.boundaries(start_s, end_s)
         angles, velocities = true_increments(trajectory, boundaries)
         return ImuIncrements(

@@ -108,7 +108,7 @@ class GaussMarkov:
         """Interpolate the process. Raises ValueError if a time is outside the span."""
         if times_s.size and (times_s.min() < self.knots_s[0] or times_s.max() > self.knots_s[-1]):
             raise ValueError(
-                f"requested times {times_s.min():.3f} s to {times_s.max():.3f} s are outside the drawn errors, "
+                f"requested times {times_s.min():.3f} s to {times_s.max():.3f} s are outside the sampled errors, "
                 f"{self.knots_s[0]:.3f} s to {self.knots_s[-1]:.3f} s"
             )
         return np.asarray(make_interp_spline(self.knots_s, self.values, k=1)(times_s))

@@ -12,7 +12,7 @@ Position from visual odometry (paper, section 4.2: "roughly 2% of the rover trav
 motion with a separate scale error, a random walk and a constant noise; attitude comes from the inertial unit. If visual
 odometry does not converge, wheel odometry is used for that drive.
 
-Constant errors of a run are drawn once (`Odometer.draw`), the other errors with each drive. The estimate is exact at
+Constant errors of a run are sampled once (`Odometer.draw`), the other errors with each drive. The estimate is exact at
 the start by definition. It assumes flat ground between stops: climbing over rocks has the effect of slip.
 
 The paper is Kim et al., "Targeted Driving Using Visual Tracking".

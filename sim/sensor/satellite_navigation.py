@@ -48,7 +48,7 @@ POST_PROCESSED = GpsParameters(
 
 @dataclass(frozen=True)
 class Gps:
-    """A GPS receiver with drawn time-correlated errors, which are valid in a time span."""
+    """A GPS receiver with sampled time-correlated errors, which are valid in a time span."""
 
     parameters: GpsParameters
     sampling: Sampling
@@ -141,7 +141,7 @@ class RtkSolutions:
 
 @dataclass(frozen=True)
 class RtkReceiver:
-    """An RTK receiver with drawn time-correlated errors, which are valid in a time span.
+    """An RTK receiver with sampled time-correlated errors, which are valid in a time span.
 
     - starts_floating, changes_s: whether the first solution is floating, and true times of the type changes
     - reported_factor: ratio of the reported to the true standard deviation

@@ -16,7 +16,7 @@ from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine
 from marsyard.sim.terrain.landforms.ground import Ground, Spectrum, refine, substream
 from marsyard.sim.terrain.landforms.kernels import interleave_samples, stamp_craters
 from marsyard.sim.terrain.landforms.relief import EJECTA_EXTENT_RADII, draw_craters
-from marsyard.sim.terrain.landforms.units import COVER_STEP
+from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
 from marsyard.sim.terrain.surface import ROUGHNESS, SMALLEST_LEVEL, TEXTURE, UNIFORM, Surface
@@ -40,7 +40,7 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     albedo = Spectrum.power_law(p.samples, p.spacing_m, p.albedo_hurst, p.outer_scale_m)
     contrast = p.albedo_contrast * float(np.exp(p.contrast_spread * substream(rng, "contrast").standard_normal()))
     craters = draw_craters(p, substream(rng, "craters"))
-    cover = UNIFORM
+    factors = UNIFORM
     if p.units is None:
         height = relief.draw_field(substream(rng, "relief"), relief_m)
         log_albedo = albedo.draw_field(substream(rng, "albedo"), contrast)
@@ -49,9 +49,9 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
         height, fine_relief = relief.draw_split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
         log_albedo, fine_albedo = albedo.draw_split_field(substream(rng, "albedo"), contrast, p.fine_below_m)
         ground = Ground(height, log_albedo, p.spacing_m)
-        cover = p.units.apply(ground, craters, substream(rng, "units"))
-        height += fine_relief * refine(np.ascontiguousarray(cover[..., ROUGHNESS]), ground.side)
-        log_albedo += fine_albedo * refine(np.ascontiguousarray(cover[..., TEXTURE]), ground.side)
+        factors = p.units.apply(ground, craters, substream(rng, "units"))
+        height += fine_relief * refine(np.ascontiguousarray(factors[..., ROUGHNESS]), ground.side)
+        log_albedo += fine_albedo * refine(np.ascontiguousarray(factors[..., TEXTURE]), ground.side)
     dtm = None
     if p.source is not None:
         dtm = embed(p.source, ground.side, ground.spacing_m)
@@ -69,7 +69,7 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     interleave_samples(
         ground.height, relative_albedo, p.albedo / float(relative_albedo.mean(dtype=np.float64)), samples
     )
-    return Surface.from_samples(samples, ground.spacing_m, cover)
+    return Surface.from_samples(samples, ground.spacing_m, factors)
 
 
 @cache
@@ -89,8 +89,8 @@ class TerrainBank:
     """Numbered terrains of one kind, cached on disk. Wind tails of rocks are part of the surface.
 
     Terrain k is a pure function of the parameters, the seed and k. The file of a terrain is one array: all levels, then
-    the cover. Workers memory-map it and therefore share its pages. The size of the cache is limited (see
-    `marsyard.sim.cache.evict_files`).
+    the factors of the ground. Workers memory-map it and therefore share its pages. The size of the cache is limited
+    (see `marsyard.sim.cache.evict_files`).
     """
 
     parameters: TerrainParameters
@@ -104,7 +104,7 @@ class TerrainBank:
             touch(path)
         else:
             surface = self._build(number)
-            flat = np.concatenate([array.reshape(-1) for array in (*surface.levels, surface.cover)])
+            flat = np.concatenate([array.reshape(-1) for array in (*surface.levels, surface.factors)])
             try:
                 evict_files(path.parent, 4 * self._size(), set(_IN_USE))
                 flat = save_array(path, flat)
@@ -112,16 +112,16 @@ class TerrainBank:
                 warnings.warn(f"terrain {number} is not stored: {path}: {error.strerror}", CacheWarning, stacklevel=2)
                 flat.flags.writeable = False
         _IN_USE[path] = flat
-        sides, cover_side = self._sides(), self._cover_side()
-        *parts, cover = np.split(flat, np.cumsum([2 * side**2 for side in sides]))
+        sides, factor_side = self._sides(), self._factor_side()
+        *parts, factors = np.split(flat, np.cumsum([2 * side**2 for side in sides]))
         levels = tuple(part.reshape(side, side, 2) for part, side in zip(parts, sides, strict=True))
-        return Surface(levels, self.parameters.spacing_m, cover.reshape(cover_side, cover_side, 3))
+        return Surface(levels, self.parameters.spacing_m, factors.reshape(factor_side, factor_side, 3))
 
     def _build(self, number: int) -> Surface:
         surface, rocks = synthesise(self.parameters, self._rng(number)), self.parameters.rocks
         if rocks is None or rocks.tails is None:
             return surface
-        field = RockField.on(surface, rocks, substream(self._rng(number), "rocks"))
+        field = RockField.draw(surface, rocks, substream(self._rng(number), "rocks"))
         return rocks.tails.apply(surface, field, substream(self._rng(number), "wind tails"))
 
     def missing_bytes(self, number: int) -> int:
@@ -132,7 +132,7 @@ class TerrainBank:
         """Build the rocks of a terrain; they are not cached. None if the parameters have no rocks."""
         if self.parameters.rocks is None:
             return None
-        return RockField.on(self.terrain(number), self.parameters.rocks, substream(self._rng(number), "rocks"))
+        return RockField.draw(self.terrain(number), self.parameters.rocks, substream(self._rng(number), "rocks"))
 
     def _rng(self, number: int) -> np.random.Generator:
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
@@ -153,7 +153,7 @@ class TerrainBank:
 
     def _size(self) -> int:
         """Return the number of float32 values in the file of a terrain."""
-        return 2 * sum(side**2 for side in self._sides()) + 3 * self._cover_side() ** 2
+        return 2 * sum(side**2 for side in self._sides()) + 3 * self._factor_side() ** 2
 
-    def _cover_side(self) -> int:
-        return 1 if self.parameters.units is None else self.parameters.samples // COVER_STEP
+    def _factor_side(self) -> int:
+        return 1 if self.parameters.units is None else self.parameters.samples // FACTOR_STEP

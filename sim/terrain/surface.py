@@ -19,8 +19,8 @@ from marsyard.sim.terrain.kernels import block_ceilings, evaluate_field, reduce_
 HEIGHT, ALBEDO = 0, 1  #: Channels of the stored samples.
 Coordinate = Float[np.ndarray, "*batch"] | float  #: One coordinate or many, metres.
 SMALLEST_LEVEL = 16  #: Samples along each side of the coarsest level.
-ROUGHNESS, TEXTURE, ROCKS = 0, 1, 2  #: Channels of a cover.
-UNIFORM = np.ones((1, 1, 3), dtype=np.float32)  #: Cover of uniform ground.
+ROUGHNESS, TEXTURE, ROCKS = 0, 1, 2  #: Channels of the factors of the ground.
+UNIFORM = np.ones((1, 1, 3), dtype=np.float32)  #: Factors of uniform ground.
 
 
 @dataclass(frozen=True)
@@ -30,20 +30,20 @@ class Surface:
     - levels: read-only control values of height (metres) and albedo. Level l has samples every ``spacing_m * 2**l``
       metres: row i lies at y = i * spacing, column j at x = j * spacing
     - spacing_m: distance between samples at level 0
-    - cover: factors of fine relief, fine albedo contrast and rock density on a grid of the same extent; for uniform
+    - factors: factors of fine relief, fine albedo contrast and rock density on a grid of the same extent; for uniform
       ground a single sample with the factors 1
     """
 
     levels: tuple[Float32[np.ndarray, "rows columns 2"], ...]
     spacing_m: float
-    cover: Float32[np.ndarray, "side side 3"] = field(default_factory=lambda: UNIFORM)
+    factors: Float32[np.ndarray, "side side 3"] = field(default_factory=lambda: UNIFORM)
 
     @classmethod
     def from_samples(
         cls,
         samples: Float32[np.ndarray, "rows columns 2"],
         spacing_m: float,
-        cover: Float32[np.ndarray, "side side 3"] = UNIFORM,
+        factors: Float32[np.ndarray, "side side 3"] = UNIFORM,
     ) -> Surface:
         """Build the pyramid from level 0; ValueError unless level 0 is a square of 2**k samples per side, k >= 4."""
         side = samples.shape[0]
@@ -55,7 +55,7 @@ class Surface:
             levels.append(reduce_level(levels[-1]))
         for level in levels:
             level.setflags(write=False)
-        return cls(tuple(levels), spacing_m, cover)
+        return cls(tuple(levels), spacing_m, factors)
 
     @property
     def period_m(self) -> float:

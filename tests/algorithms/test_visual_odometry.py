@@ -68,7 +68,7 @@ def _make_prediction(path_fraction: float = 1.0, yaw_error_deg: float = 0.1) -> 
 
 
 def test_rectified_points_are_on_the_plane() -> None:
-    points = RectifiedPair.of(_render_pair(START)).points(1.2, 5.0)
+    points = RectifiedPair.from_measurement(_render_pair(START)).points(1.2, 5.0)
     assert len(points) > 20000
     # one pixel of disparity is 0.4 m in range at 5 m: the height error of a twentieth of a pixel is 6 mm
     assert abs(np.median(points[:, 2])) < 0.003
@@ -76,7 +76,7 @@ def test_rectified_points_are_on_the_plane() -> None:
 
 
 def test_limits_of_depth_are_respected() -> None:
-    pair = RectifiedPair.of(_render_pair(START))
+    pair = RectifiedPair.from_measurement(_render_pair(START))
     depth = (pair.points(1.2, 3.0) - pair.camera.c) @ pair.camera.a
     assert depth.max() <= 3.0 + 1e-9
     assert depth.min() > 1.2

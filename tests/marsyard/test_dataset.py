@@ -40,7 +40,7 @@ diameter_m = 1.0
 
 [dispersions]
 "location.east_m" = { distribution = "uniform", low = 0.0, high = 20.0, source = "anywhere" }
-"flown.tilt_deg" = { distribution = "uniform", low = 0.0, high = 5.0, source = "assumed" }
+"image_poses.tilt_deg" = { distribution = "uniform", low = 0.0, high = 5.0, source = "assumed" }
 """
 
 

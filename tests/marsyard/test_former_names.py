@@ -10,8 +10,10 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import TargetUpdate, TrackingState
 from marsyard.campaigns.definition.configuration import update_stored_configuration
@@ -25,12 +27,18 @@ from marsyard.cli.app import main
 from marsyard.reports.search import read_search
 from marsyard.reports.section_kinds import SectionDeclaration
 from marsyard.reports.stored import read_run
-from marsyard.scenarios.descent.recorded import FlightFile
-from marsyard.scenarios.landing.parameters import NavigationParameters
+from marsyard.scenarios import parts
+from marsyard.scenarios.descent.recorded import FlightFile, FlightOrigin
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters, NavigationParameters
+from marsyard.scenarios.measured.layout import IngestFile
 from marsyard.scenarios.systems import System, row_columns, scenario, scenario_names
 from marsyard.scenarios.template import LANDING
+from marsyard.scenarios.views import Viewpoint
 from marsyard.sim import parameters
 from marsyard.sim.parameters import DeprecatedNameWarning, current_key
+from marsyard.sim.render import PixelRays
+from marsyard.sim.sensor import preset
+from marsyard.sim.terrain import Surface
 
 RENAMED_NAMES = tomllib.loads(Path(parameters.__file__).with_name("renamed.toml").read_text())
 CAMPAIGN = """
@@ -128,6 +136,42 @@ def test_deprecated_attribute_of_a_target_update_is_accepted() -> None:
     assert update.tracked
 
 
+def test_deprecated_names_in_tables_set_the_current_parameters() -> None:
+    with pytest.warns(DeprecatedNameWarning, match="is now"):
+        campaign = load_campaign("vtt-regression", ["exposure.of=full-frame", "sun.held_s=60.0"])
+    parameters = campaign.configuration.parameters
+    assert (parameters["exposure"]["metering"], parameters["sun"]["update_interval_s"]) == ("full-frame", 60.0)
+    values = {"site": "heli-hazardous", "terrain_of": "heli-hazardous", "flown": {"height_m": 12.0}}
+    with pytest.warns(DeprecatedNameWarning, match="is now"):
+        landing = LandingScenarioParameters.model_validate(values)
+    assert (landing.terrain_site, landing.image_poses.height_m) == ("heli-hazardous", 12.0)
+    with pytest.warns(DeprecatedNameWarning, match="'place' is now 'location'"):
+        assert FlightOrigin("place") is FlightOrigin.LOCATION
+
+
+def test_deprecated_names_of_classes_are_accepted() -> None:
+    with pytest.warns(DeprecatedNameWarning, match="'DescentPlace' is now 'MotionInputs'"):
+        assert parts.DescentPlace is parts.MotionInputs
+    with pytest.raises(AttributeError):
+        _ = parts.unknown
+    camera = preset("xc-55").cameras()[0].bin(columns=16, rows=16)
+    with pytest.warns(DeprecatedNameWarning, match="from_camera"):
+        rays = PixelRays.of(camera)
+    ground = Surface.from_samples(np.zeros((16, 16, 2), dtype=np.float32), 1.0)
+    pose = RigidTransform.from_translation([3.0, 4.0, 100.0])
+    with pytest.warns(DeprecatedNameWarning, match="from_pose"):
+        viewpoint = Viewpoint.of(rays, pose, ground)
+    assert viewpoint == Viewpoint.from_pose(rays, pose, ground)
+
+
+def test_renamed_table_keeps_its_draws() -> None:
+    campaign = load_campaign("hda-mars")
+    uniform = campaign.streams(0).generator("dispersion:flown.climb_share").random()
+    assert campaign.draws(0)["image_poses.climb_fraction"] == pytest.approx(-0.15 * (1.0 - uniform), abs=1e-12)
+    uniform = campaign.streams(0).generator("dispersion:flown.tilt_deg").random()
+    assert campaign.draws(0)["image_poses.tilt_deg"] == pytest.approx(10.0 * uniform, abs=1e-12)
+
+
 def test_override_with_a_deprecated_name_sets_the_parameter(campaign_files: tuple[Path, Path]) -> None:
     with pytest.warns(DeprecatedNameWarning, match="'place' is now 'location'"):
         campaign = load_campaign(str(campaign_files[1]), ["place.terrain=1"])
@@ -205,6 +249,12 @@ def test_current_names_exist_and_deprecated_names_do_not() -> None:
         for current_name in [current_names] if isinstance(current_names, str) else current_names:
             assert f'"{current_name}": {{' in schemas, current_name
         assert deprecated_name in ("own", "least", "most") or f'"{deprecated_name}": {{' not in schemas, deprecated_name
+    schemas += json.dumps(IngestFile.model_json_schema())
+    for deprecated_name, current_name in RENAMED_NAMES["keys"].items():
+        assert f'"{current_name}": {{' in schemas, current_name
+        assert deprecated_name in ("own", "least", "most", "placed") or f'"{deprecated_name}": {{' not in schemas, (
+            deprecated_name
+        )
     column_sets = [columns for name in scenario_names() if (columns := row_columns(name)) is not None]
     for deprecated_name, current_name in RENAMED_NAMES["columns"].items():
         assert any(current_name in (*columns.flags, *columns.numbers) for columns in column_sets), current_name

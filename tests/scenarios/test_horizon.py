@@ -85,7 +85,7 @@ def test_rover_is_visible_at_the_sides_of_its_hazard_camera() -> None:
 
 def test_unresolved_rocks_occlude_distant_ground_by_their_frontal_area(gusev_image: RenderedImage) -> None:
     image = gusev_image
-    frame, ground = image.frame, SiteGround.of(site("gusev"), "ground")
+    frame, ground = image.frame, SiteGround.from_site(site("gusev"), "ground")
     rocks, limit_rad, rms_slope = ground.rocks, 1.2e-3, 0.02
     assert rocks is not None
     # With black ground and white rocks the radiance is the occluded fraction.

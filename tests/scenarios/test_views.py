@@ -39,7 +39,7 @@ def _make_small_site(name: str, samples: int = 512) -> Site:
 
 @pytest.fixture(scope="module")
 def ground() -> SiteGround:
-    return SiteGround.of(_make_small_site("gusev", 1024), "ground", seed=3)
+    return SiteGround.from_site(_make_small_site("gusev", 1024), "ground", seed=3)
 
 
 def test_each_camera_has_a_default_stance() -> None:
@@ -48,7 +48,7 @@ def test_each_camera_has_a_default_stance() -> None:
 
 def test_site_without_terrain_at_a_scale_is_rejected() -> None:
     with pytest.raises(ValueError, match="no terrain at the scale 'descent'"):
-        SiteGround.of(site("mars-yard"), "descent")
+        SiteGround.from_site(site("mars-yard"), "descent")
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
@@ -84,24 +84,24 @@ def test_horizontal_view_covers_sector_and_nadir_view_disc(ground: SiteGround) -
     def make_eye(name: str, height: float, azimuth: float, elevation: float) -> Viewpoint:
         camera_preset = preset(name)
         pose = camera_pose(ground.surface, camera_preset.design, 1.0, 2.0, height, azimuth, elevation)
-        return Viewpoint.of(PixelRays.of(camera_preset.cameras()[0]), pose, ground.surface)
+        return Viewpoint.from_pose(PixelRays.from_camera(camera_preset.cameras()[0]), pose, ground.surface)
 
     pancam_eye = make_eye("research-pancam", 1.5, 90.0, -10.0)
     assert pancam_eye.azimuth_rad == pytest.approx(np.radians(91.0), abs=0.01)  # left camera: 1 deg of toe-in
     assert pancam_eye.half_width_rad < np.radians(20.0)
-    assert np.isinf(pancam_eye.reach_m)
+    assert np.isinf(pancam_eye.max_distance_m)
     assert pancam_eye.height_m == pytest.approx(1.5, abs=0.05)
     nadir_eye = make_eye("xc-55", 10.0, 0.0, -90.0)
     assert nadir_eye.half_width_rad == np.pi
     # Half the diagonal field of view is 26 deg: 4.9 m at a height of 10 m.
-    assert 4.9 < nadir_eye.reach_m < 20.0
+    assert 4.9 < nadir_eye.max_distance_m < 20.0
 
 
 def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
     field = ground.rocks
     assert field is not None
     # The radius is less than half a terrain period, so that no rock occurs twice.
-    viewpoint = Viewpoint(2.0, 3.0, 1.5, pixel_rad=5e-3, reach_m=12.0)
+    viewpoint = Viewpoint(2.0, 3.0, 1.5, pixel_rad=5e-3, max_distance_m=12.0)
     objects = select_rocks(ground, viewpoint)
     assert len(objects) > 100
     # Each body is at the horizontal position of its rock plus a multiple of the period.
@@ -122,7 +122,7 @@ def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
 
 
 def test_triangle_count_is_near_its_limit() -> None:
-    rocky_ground = SiteGround.of(_make_small_site("pisgah", 1024), "ground")
+    rocky_ground = SiteGround.from_site(_make_small_site("pisgah", 1024), "ground")
     viewpoint = Viewpoint(0.0, 0.0, 1.5, pixel_rad=3e-4, half_width_rad=np.radians(30.0))
     # The limits are approximate.
     max_triangles = ROCK_TRIANGLES + DETAIL_TRIANGLES
@@ -130,7 +130,7 @@ def test_triangle_count_is_near_its_limit() -> None:
 
 
 def test_ground_without_rocks_has_no_objects() -> None:
-    ground_without_rocks = SiteGround.of(_make_small_site("ivanpah"), "ground")
+    ground_without_rocks = SiteGround.from_site(_make_small_site("ivanpah"), "ground")
     assert ground_without_rocks.rocks is None
     assert len(select_rocks(ground_without_rocks, Viewpoint(0.0, 0.0, 1.5, 1e-3))) == 0
 
@@ -148,8 +148,8 @@ def test_scene_from_mast_and_nadir_has_the_terrain_heights(ground: SiteGround) -
         ((0.0, 0.0, -1.0), nadir_pose(ground.surface, 5.0, 6.0, 10.0)),
     ):
         camera = Cahv.from_field_of_view(np.radians(45.0), (160, 120), axis=axis, right=(0.0, -1.0, 0.0))
-        rays = PixelRays.of(camera)
-        frame = renderer.render(site_scene(ground, Viewpoint.of(rays, pose, ground.surface), SUN), rays, pose)
+        rays = PixelRays.from_camera(camera)
+        frame = renderer.render(site_scene(ground, Viewpoint.from_pose(rays, pose, ground.surface), SUN), rays, pose)
         # Distant ground is smoothed.
         points = frame.points_world()[(frame.body == -1) & (frame.range_m < 12.0)]
         assert len(points) > 5000
@@ -163,8 +163,8 @@ def test_scene_from_mast_and_nadir_has_the_terrain_heights(ground: SiteGround) -
 @pytest.mark.parametrize("azimuth", [0.4, -2.8])
 def test_sector_contains_the_rocks_of_the_full_circle(azimuth: float) -> None:
     """The sector has the same triangles as the full circle, also for rocks that repeat with the terrain period."""
-    ground = SiteGround.of(_make_small_site("gusev", 512), "ground", seed=3)
-    full_eye = Viewpoint(0.4, 1.0, 1.2, 4e-3, reach_m=1.4 * ground.surface.period_m)
+    ground = SiteGround.from_site(_make_small_site("gusev", 512), "ground", seed=3)
+    full_eye = Viewpoint(0.4, 1.0, 1.2, 4e-3, max_distance_m=1.4 * ground.surface.period_m)
     viewpoint = replace(full_eye, azimuth_rad=azimuth, half_width_rad=0.3)
     full_circle, sector = (select_rocks(ground, entry) for entry in (full_eye, viewpoint))
     offsets_m = full_circle.triangles[:, 0, :2] - (0.4, 1.0)

@@ -160,7 +160,7 @@ class Vibration:
 
 
 @dataclass(frozen=True)
-class FlownPath(Trajectory):
+class SimulatedPath(Trajectory):
     """Simulated motion: states at equidistant times (columns: see `kernels`), interpolated exactly, plus vibration.
 
     Position and angles are twice continuously differentiable. The body frame has its origin at the camera; laser
@@ -288,7 +288,7 @@ class RotorcraftFlight:
     - heading_rad: commanded yaw, counterclockwise from east
     """
 
-    path: FlownPath
+    path: SimulatedPath
     phases: Int64[np.ndarray, "knots"]
     autopilot: Float64[np.ndarray, "4"]
     heading_rad: float
@@ -347,7 +347,7 @@ def simulate_transit(
     rows[0, kernels.ANGLE :][:3] = [heading_rad, pitch, roll]
     flight = kernels.Flight(rows, autopilot, heading_rad, air.mean_m_s, air.gusts_m_s, step)
     kernels.follow_path(flight, reference, constants)
-    path = FlownPath(-p.lead_s, step, rows, Vibration.draw(craft.vibration, rng), gravity_m_s2)
+    path = SimulatedPath(-p.lead_s, step, rows, Vibration.draw(craft.vibration, rng), gravity_m_s2)
     return RotorcraftFlight(path, np.full(count, Phase.TRANSIT.value), autopilot, heading_rad, craft)
 
 

@@ -7,7 +7,7 @@ Fifteen errors are estimated (landing paper, section IV, and its reference [12])
 constant errors of compass and inclinometers) are *considered* (Schmidt 1966): they are part of the covariance, but not
 estimated. Without them the covariance would be too small, because averaging does not remove these errors.
 
-The filter uses the standard deviations in the instruments' parameters, not the drawn errors. The receiver reports the
+The filter uses the standard deviations in the instruments' parameters, not the sampled errors. The receiver reports the
 standard deviation of its position. Each RTK solution is propagated from its time to its delivery time by inertial
 navigation. The assumed noise of inclinometers and compass grows with acceleration. Readings outside the gate and
 readings of stuck instruments are rejected. After `max_rejected_fixes` rejected solutions the filter restarts at the

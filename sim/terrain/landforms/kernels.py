@@ -164,11 +164,11 @@ def stamp_streaks(log_albedo: Grid, spacing: float, streaks: Array) -> None:
     for n in range(streaks.shape[0]):
         x, y, half_width, length, c, s, streak_log_albedo = streaks[n]
         max_half_width = 1.6 * half_width
-        reach_x = max(c * length, 0.0) + max_half_width, max(-c * length, 0.0) + max_half_width
-        reach_y = max(s * length, 0.0) + max_half_width, max(-s * length, 0.0) + max_half_width
-        for i in range(math.ceil((y - reach_y[1]) / spacing), math.floor((y + reach_y[0]) / spacing) + 1):
+        extent_x = max(c * length, 0.0) + max_half_width, max(-c * length, 0.0) + max_half_width
+        extent_y = max(s * length, 0.0) + max_half_width, max(-s * length, 0.0) + max_half_width
+        for i in range(math.ceil((y - extent_y[1]) / spacing), math.floor((y + extent_y[0]) / spacing) + 1):
             dy = i * spacing - y
-            for j in range(math.ceil((x - reach_x[1]) / spacing), math.floor((x + reach_x[0]) / spacing) + 1):
+            for j in range(math.ceil((x - extent_x[1]) / spacing), math.floor((x + extent_x[0]) / spacing) + 1):
                 dx = j * spacing - x
                 along = (c * dx + s * dy) / length
                 if along <= 0.0 or along >= 1.0:
@@ -273,11 +273,11 @@ def stamp_lobes(height: Grid, log_albedo: Grid, spacing: float, lobes: Array, wa
     mask = height.shape[0] - 1
     for n in range(lobes.shape[0]):
         x, y, half_length, half_width, thickness, c, s, lobe_log_albedo = lobes[n]
-        reach_x = 1.3 * (half_length * abs(c) + half_width * abs(s)) + 0.5 * half_width
-        reach_y = 1.3 * (half_length * abs(s) + half_width * abs(c)) + 0.5 * half_width
-        for i in range(math.ceil((y - reach_y) / spacing), math.floor((y + reach_y) / spacing) + 1):
+        extent_x = 1.3 * (half_length * abs(c) + half_width * abs(s)) + 0.5 * half_width
+        extent_y = 1.3 * (half_length * abs(s) + half_width * abs(c)) + 0.5 * half_width
+        for i in range(math.ceil((y - extent_y) / spacing), math.floor((y + extent_y) / spacing) + 1):
             row = i & mask
-            for j in range(math.ceil((x - reach_x) / spacing), math.floor((x + reach_x) / spacing) + 1):
+            for j in range(math.ceil((x - extent_x) / spacing), math.floor((x + extent_x) / spacing) + 1):
                 column = j & mask
                 dx = j * spacing - x + warp_x[row, column] * half_width
                 dy = i * spacing - y + warp_y[row, column] * half_width

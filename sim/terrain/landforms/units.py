@@ -20,8 +20,8 @@ from marsyard.sim.terrain.landforms.kernels import cut_channels, scale_roughness
 from marsyard.sim.terrain.landforms.relief import draw_channels
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS
 
-#: Samples of the terrain per sample of a cover, along each side.
-COVER_STEP = 4
+#: Samples of the terrain per sample of the factors (see `Surface`), along each side.
+FACTOR_STEP = 4
 #: Hurst exponent of the fields whose level lines bound the units: outlines have the fractal dimension 2 - H = 1.4.
 OUTLINE_HURST = 0.6
 #: Iterations of the fit of the units' areas, and maximum number of samples along each side for this fit.
@@ -33,7 +33,7 @@ class SurfaceUnit(Parameters):
 
     name: Annotated[str, Field(min_length=1, description="name of the unit")]
     fraction: Annotated[Fraction, Field(description="expected fraction of the terrain's area")]
-    tone: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of albedo divided by the terrain's mean")] = 0.0
+    log_albedo: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of albedo divided by the terrain's mean")] = 0.0
     roughness: Annotated[NonNegative, Field(description="factor of fine relief")] = 1.0
     texture: Annotated[NonNegative, Field(description="factor of fine albedo contrast")] = 1.0
     rocks: Annotated[NonNegative, Field(description="factor of rock density")] = 1.0
@@ -59,23 +59,23 @@ class SurfaceUnits(Parameters):
     ] = 8.0
 
     tracks_per_km2: Annotated[NonNegative, Field(description="tracks of dust devils per km2")] = 0.0
-    track_tone: Annotated[
+    track_log_albedo: Annotated[
         float, bounded_field(-1.0, 0.0, "logarithm of a track's albedo divided by the ground's")
     ] = -0.12
     track_width_m: Annotated[Positive, Field(description="median width of a track, m")] = 25.0
     track_length_m: Annotated[Positive, Field(description="mean length of a track, m")] = 900.0
     streak_fraction: Annotated[Fraction, Field(description="fraction of craters with a wind tail")] = 0.0
     streak_min_m: Annotated[Positive, Field(description="smallest diameter of craters with a tail, m")] = 20.0
-    streak_tone: Annotated[Fraction, Field(description="RMS of the logarithm of albedo of tails")] = 0.12
+    streak_log_albedo_rms: Annotated[Fraction, Field(description="RMS of the logarithm of albedo of tails")] = 0.12
 
     def apply(
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], rng: Generator
-    ) -> Float32[np.ndarray, "cover cover 3"]:
-        """Add the albedo of units, dust devil tracks and wind tails of craters; return the cover (see `Surface`)."""
+    ) -> Float32[np.ndarray, "side side 3"]:
+        """Add the albedo of units, dust devil tracks and wind tails of craters; return the factors (see `Surface`)."""
         units = self.kinds
         expected_areas = np.array([unit.fraction for unit in units])
         areas = rng.dirichlet(self.concentration * expected_areas / expected_areas.sum())
-        side = ground.side // COVER_STEP
+        side = ground.side // FACTOR_STEP
         spacing = ground.period_m / side
         downwind = np.radians(270.0 - self.wind_from_deg - self.wind_spread_deg * rng.standard_normal())
         spectrum = Spectrum.power_law(side, spacing, OUTLINE_HURST, self.largest_m, self.elongation, downwind)
@@ -84,7 +84,7 @@ class SurfaceUnits(Parameters):
         membership = self._compute_membership(fields, areas)
         unit_factors = np.array([(unit.roughness, unit.texture, unit.rocks) for unit in units])
         factors = np.exp(membership @ np.log(np.maximum(unit_factors, 1e-3)).astype(np.float32))
-        log_albedo = np.ascontiguousarray(membership @ np.array([unit.tone for unit in units], dtype=np.float32))
+        log_albedo = np.ascontiguousarray(membership @ np.array([unit.log_albedo for unit in units], dtype=np.float32))
         self._add_tracks(log_albedo, spacing, downwind, rng)
         ground.add(Ground(np.zeros_like(log_albedo), log_albedo, spacing))
         self._add_streaks(ground, craters, downwind, rng)
@@ -109,7 +109,7 @@ class SurfaceUnits(Parameters):
         width = np.maximum(self.track_width_m * np.exp(0.5 * rng.standard_normal(count)), 2.0 * spacing)
         length = self.track_length_m * rng.exponential(1.0, count)
         start = rng.uniform(0.0, period, (count, 2))
-        max_darkening = -self.track_tone * rng.uniform(0.3, 1.0, count)
+        max_darkening = -self.track_log_albedo * rng.uniform(0.3, 1.0, count)
         discs = draw_channels(start, heading, length, width, max_darkening, 0.12, rng)
         darkening = np.zeros_like(log_albedo)
         cut_channels(darkening, spacing, discs, 2.0)
@@ -124,7 +124,7 @@ class SurfaceUnits(Parameters):
         radius, count = sources[:, 2], len(sources)
         heading = downwind + 0.12 * rng.standard_normal(count)
         length = 2.0 * radius * rng.uniform(2.0, 7.0, count)
-        log_albedo = self.streak_tone * rng.standard_normal(count)
+        log_albedo = self.streak_log_albedo_rms * rng.standard_normal(count)
         rows = np.column_stack([sources[:, :2], radius, length, np.cos(heading), np.sin(heading), log_albedo])
         stamp_streaks(ground.log_albedo, ground.spacing_m, rows)
 

@@ -181,8 +181,8 @@ class RockField:
     names: Mapping[str, int]
 
     @classmethod
-    def on(cls, surface: Surface, parameters: RockParameters, rng: Generator) -> RockField:
-        """Draw rocks that do not overlap on a surface, with the relative density of the surface's cover.
+    def draw(cls, surface: Surface, parameters: RockParameters, rng: Generator) -> RockField:
+        """Draw rocks that do not overlap on a surface, with the relative density of the surface (`Surface.factors`).
 
         Raises ValueError if there is no free position for a rock, or if the shape of a placed rock does not exist.
         """
@@ -214,7 +214,7 @@ class RockField:
         albedo = np.concatenate([np.ones(len(placed)), np.exp(log_albedo - 0.5 * parameters.albedo_spread**2)])
         shape = np.concatenate([placed_shape, random_shape]).astype(np.int32)
         yaw = np.concatenate([placed_yaw, appearance_rng.uniform(-np.pi, np.pi, random_diameter.size)])
-        radius = rock_shapes(shapes.COARSEST).reach[shape] * diameter
+        radius = rock_shapes(shapes.COARSEST).max_radius[shape] * diameter
         xy = _draw_positions(parameters, radius, diameter, surface, substream(rng, "rock places"))
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
         # normal of the ground, averaged over about the size of the rock
@@ -314,7 +314,7 @@ def _draw_positions(
     parameters: RockParameters, radius: PerRock, diameter: PerRock, surface: Surface, rng: Generator
 ) -> Float64[np.ndarray, "rocks 2"]:
     """Return the positions of placed rocks, and draw positions without overlap for the others by decreasing size."""
-    period_m, density = surface.period_m, np.ascontiguousarray(surface.cover[..., ROCKS])
+    period_m, density = surface.period_m, np.ascontiguousarray(surface.factors[..., ROCKS])
     coordinates = [(rock.east_m, rock.north_m) for rock in parameters.placed]
     placed_positions = np.array(coordinates, dtype=np.float64).reshape(-1, 2)
     placed_positions %= period_m

@@ -97,13 +97,13 @@ class ShapeSet:
 
     - normals: normals of the smooth shape at the vertices
     - faces: vertex numbers of each triangle, counter-clockwise seen from outside
-    - reach: largest horizontal distance of each shape's surface from its origin
+    - max_radius: largest horizontal distance of each shape's surface from its origin
     """
 
     vertices: Float64[np.ndarray, "shapes vertices 3"]
     normals: Float64[np.ndarray, "shapes vertices 3"]
     faces: Int32[np.ndarray, "faces 3"]
-    reach: Float64[np.ndarray, "shapes"]
+    max_radius: Float64[np.ndarray, "shapes"]
 
 
 @cache
@@ -113,7 +113,7 @@ def rock_shapes(detail: int) -> ShapeSet:
     normals = _load_or_build(
         f"normals-{detail}", lambda: np.stack([shape.normals(directions) for shape in _all_shapes()])
     )
-    return ShapeSet(_vertices(detail), normals, faces, _reach())
+    return ShapeSet(_vertices(detail), normals, faces, _compute_max_radius())
 
 
 @cache
@@ -185,12 +185,12 @@ def _build_vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
 
 
 @cache
-def _reach() -> Float64[np.ndarray, "shapes"]:
+def _compute_max_radius() -> Float64[np.ndarray, "shapes"]:
     """Compute the maximum horizontal distance from the origin over all levels; coarse levels can be the widest."""
     levels = [np.hypot(_vertices(k)[..., 0], _vertices(k)[..., 1]).max(axis=1) for k in range(len(SUBDIVISIONS))]
-    reach: Float64[np.ndarray, "shapes"] = np.max(levels, axis=0)
-    reach.setflags(write=False)
-    return reach
+    radius: Float64[np.ndarray, "shapes"] = np.max(levels, axis=0)
+    radius.setflags(write=False)
+    return radius
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ class WindTails(Parameters):
     length_spread: Annotated[NonNegative, Field(description="SD of the logarithm of the length; assumed")] = 0.4
     height_fraction: Annotated[float, bounded_field(0.0, 1.0, "maximum height in heights of the rock; assumed")] = 0.4
     repose_deg: Annotated[float, Field(ge=5.0, le=36.0, description="slope of the ridge's sides; assumed")] = 20.0
-    tone: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of the ridge's albedo over the ground's")] = 0.0
+    log_albedo: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of the ridge's albedo over the ground's")] = 0.0
 
     def apply(self, surface: Surface, rocks: RockField, rng: Generator) -> Surface:
         """Return the surface with the tails of all rocks; tails narrower than `SAMPLES_ACROSS` samples are omitted."""
@@ -41,5 +41,7 @@ class WindTails(Parameters):
         downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
         samples = np.array(surface.levels[0])
         wide_tails = tails[width >= SAMPLES_ACROSS * surface.spacing_m]
-        stamp_tails(samples, surface.spacing_m, wide_tails, float(np.cos(downwind)), float(np.sin(downwind)), self.tone)
-        return Surface.from_samples(samples, surface.spacing_m, surface.cover)
+        stamp_tails(
+            samples, surface.spacing_m, wide_tails, float(np.cos(downwind)), float(np.sin(downwind)), self.log_albedo
+        )
+        return Surface.from_samples(samples, surface.spacing_m, surface.factors)

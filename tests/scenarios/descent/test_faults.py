@@ -43,7 +43,7 @@ SUN = Sun(direction(4.0, 0.7))
 
 def _render_level_ground(height_m: float, radiance: np.ndarray) -> Frame:
     """Return the frame of level ground for a small camera that looks straight down."""
-    rays = PixelRays.of(camera_optics(SMALL_CAMERA).camera)
+    rays = PixelRays.from_camera(camera_optics(SMALL_CAMERA).camera)
     downward_component = -rays.directions[:, 2].astype(np.float64)
     return Frame(
         radiance=radiance.astype(np.float32),

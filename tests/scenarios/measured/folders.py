@@ -90,7 +90,7 @@ def _write_campaign(
     calibration = image.calibration
     write_cahvor(image.camera, folder / "camera.cahvor")
     np.save(folder / "flat.npy", calibration.flat_field)
-    axes, attitude_frame, is_placed = ("ned", "camera", "false") if ned else ("enu", "body", "true")
+    axes, attitude_frame, is_pose_in_file = ("ned", "camera", "false") if ned else ("enu", "body", "true")
     (folder / "ingest.toml").write_text(f"""name = "test-{task}"
 task = "{task}"
 [poses]
@@ -98,7 +98,7 @@ axes = "{axes}"
 attitude_of = "{attitude_frame}"
 [camera]
 file = "camera.cahvor"
-placed = {is_placed}
+pose_in_file = {is_pose_in_file}
 [detector]
 bits = {BITS}
 offset_dn = {calibration.offset_dn!r}

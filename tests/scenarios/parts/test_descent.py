@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.scenarios.descent.exposure import World
 from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.measurement import Instruments
-from marsyard.scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
+from marsyard.scenarios.parts import InstrumentReadings, InstrumentTruth, MotionInputs, Poses, ScoredDescent
 from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import FLAT_TERRAIN, IDEAL_INSTRUMENTS, make_parameters, run_descent
@@ -31,11 +31,11 @@ class RotatingDescent:
     duration_s: float = 26.0
     defect: str = ""
 
-    def fly(self, place: DescentPlace, rng: np.random.Generator) -> Poses:
+    def fly(self, inputs: MotionInputs, rng: np.random.Generator) -> Poses:
         north = float(rng.normal(0.0, 5.0))
-        times = np.arange(place.from_s, self.duration_s, 0.05)
+        times = np.arange(inputs.from_s, self.duration_s, 0.05)
         if self.defect == "short":
-            times = np.arange(place.from_s, 3.0, 0.1)
+            times = np.arange(inputs.from_s, 3.0, 0.1)
         positions = np.column_stack([self.east_m_s * times, north * times, self.height_m - 75.0 * times])
         quaternions = Rotation.from_rotvec(np.outer(0.1 * times, [0.0, 0.0, 1.0])).as_quat()
         if self.defect == "length":

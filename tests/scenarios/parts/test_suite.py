@@ -18,8 +18,8 @@ import os
 import numpy as np
 from marsyard.scenarios.parts import InstrumentReadings, Poses, ScoredDescent, ScoredLanding, ScoredRun
 CALLS = []
-def poses(place, east=0.0):
-    times = np.arange(place.from_s, 20.0, 0.1)
+def poses(inputs, east=0.0):
+    times = np.arange(inputs.from_s, 20.0, 0.1)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (times.size, 1))
     return times, np.column_stack([east * times, 0.0 * times, 2000.0 - 50.0 * times]), upright
 """
@@ -54,44 +54,49 @@ def write_defective_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: st
 @pytest.mark.parametrize(
     ("check", "random", "lines", "problem"),
     [
-        ("answer", False, "return poses(place)", "returns a tuple; allowed: marsyard.scenarios.parts.Poses"),
-        ("answer", False, "t, x, q = poses(place)\nreturn Poses(t, x[:, :2], q)", "positions_m of shape"),
-        ("answer", False, "t, x, q = poses(place)\nreturn Poses(t[::40], x[::40], q[::40] * 0.9)", "length 0.9"),
-        ("answer", False, "t, x, q = poses(place)\nt[5] = t[4]\nreturn Poses(t, x, q)", "time does not increase after"),
+        ("answer", False, "return poses(inputs)", "returns a tuple; allowed: marsyard.scenarios.parts.Poses"),
+        ("answer", False, "t, x, q = poses(inputs)\nreturn Poses(t, x[:, :2], q)", "positions_m of shape"),
+        ("answer", False, "t, x, q = poses(inputs)\nreturn Poses(t[::40], x[::40], q[::40] * 0.9)", "length 0.9"),
         (
             "answer",
             False,
-            "t, x, q = poses(place)\nq[1::2] = [1.0, 0.0, 0.0, 0.0]\nreturn Poses(t, x, q)",
+            "t, x, q = poses(inputs)\nt[5] = t[4]\nreturn Poses(t, x, q)",
+            "time does not increase after",
+        ),
+        (
+            "answer",
+            False,
+            "t, x, q = poses(inputs)\nq[1::2] = [1.0, 0.0, 0.0, 0.0]\nreturn Poses(t, x, q)",
             "rotates by 180",
         ),
         ("answer", False, "return 1 / 0", "it raised ZeroDivisionError"),
-        ("random", True, "return Poses(*poses(place))", "its attribute random is true, but two streams give the same"),
-        ("random", False, "return Poses(*poses(place, rng.normal()))", "random is false, but two streams give"),
+        ("random", True, "return Poses(*poses(inputs))", "its attribute random is true, but two streams give the same"),
+        ("random", False, "return Poses(*poses(inputs, rng.normal()))", "random is false, but two streams give"),
         (
             "deterministic",
             True,
-            "return Poses(*poses(place, np.random.normal()))",
+            "return Poses(*poses(inputs, np.random.normal()))",
             "its answers to the same case differ between two calls",
         ),
         (
             "deterministic",
             False,
-            "self.calls = getattr(self, 'calls', 0) + 1\nreturn Poses(*poses(place, self.calls))",
+            "self.calls = getattr(self, 'calls', 0) + 1\nreturn Poses(*poses(inputs, self.calls))",
             "depends on earlier cases",
         ),
         (
             "columns",
             True,
-            "return Poses(*poses(place), {'gust' if rng.random() > 0.4 else 'calm': 1.0})",
+            "return Poses(*poses(inputs), {'gust' if rng.random() > 0.4 else 'calm': 1.0})",
             "its columns change",
         ),
-        ("columns", False, "return Poses(*poses(place), {'a b': 1.0})", "returns the invalid column name 'a b'"),
+        ("columns", False, "return Poses(*poses(inputs), {'a b': 1.0})", "returns the invalid column name 'a b'"),
     ],
 )
 def test_motion_defects_are_reported(
     check: str, random: bool, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    header = f"class Defective:\n    random = {random}\n    def fly(self, place, rng):\n"
+    header = f"class Defective:\n    random = {random}\n    def fly(self, inputs, rng):\n"
     body = header + textwrap.indent(lines, " " * 8)
     name = write_defective_part(tmp_path, monkeypatch, body)
     (result,) = run_suite(f"{name}:Defective", check).values()

@@ -28,7 +28,7 @@ def test_images_use_the_sun_direction_of_their_time() -> None:
     # One hour passes between two images. The sun direction changes in it, except with an hour angle rate of 0.
     slow_tracking = {"timing": {"track_s": 3600.0}, "camera": {"detector_noise": False}}
     fixed_sun = {"sun": {**SHORT_RUN["sun"], "hour_angle_deg_min": 0.0}, "rover_shadow": False}
-    moving_sun = {"sun": {**SHORT_RUN["sun"], "held_s": 1.0}, "rover_shadow": False}
+    moving_sun = {"sun": {**SHORT_RUN["sun"], "update_interval_s": 1.0}, "rover_shadow": False}
     fixed_sun_run, moving_sun_run = make_run(**slow_tracking, **fixed_sun), make_run(**slow_tracking, **moving_sun)
     assert fixed_sun_run.stops[1].time_s - fixed_sun_run.stops[0].time_s >= 3600.0
     moving_directions = [moving_sun_run.world.scene(stop.time_s).sun.direction for stop in moving_sun_run.stops[:2]]
@@ -45,7 +45,7 @@ def test_bright_sky_underexposes_full_frames() -> None:
     drive_east = {"start": {"distance_m": 9.0}, "legs": [{"motion": "approach", "goal_m": 8.5, "step_fraction": 0.1}]}
     sun_ahead = {"sun": {"azimuth_deg": 90.0, "elevation_deg": 30.0}}
     first_images = {
-        region: make_run(**drive_east, **sun_ahead, exposure={"of": region}).stops[0].images
+        region: make_run(**drive_east, **sun_ahead, exposure={"metering": region}).stops[0].images
         for region in ("subframe", "full-frame")
     }
     exposure_ratio = first_images["full-frame"].exposure_s / first_images["subframe"].exposure_s

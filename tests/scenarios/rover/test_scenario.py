@@ -66,7 +66,9 @@ def test_designated_point_agrees_with_rendered_pixels() -> None:
     stop = run.stops[-1]
     column, row = (round(value) for value in stop.point_px)
     camera = run.rig.left.crop(column - 4, row - 4, (9, 9))
-    frame = process_renderer(parameters.backend).render(run.world.base, PixelRays.of(camera), stop.world_from_head)
+    frame = process_renderer(parameters.backend).render(
+        run.world.base, PixelRays.from_camera(camera), stop.world_from_head
+    )
     surface_points = frame.points_world()[3:6, 3:6].reshape(-1, 3)
     # The central pixel shows an object, not ground or sky.
     assert frame.body[4, 4] >= 0

@@ -99,21 +99,21 @@ def _make_block(east: float, north: float, top: float) -> Float64[np.ndarray, "t
 
 def test_rocks_raise_the_ground() -> None:
     slope = uphill_east(5.0)
-    ground = RockyGround.of(slope, _make_block(1.0, 2.0, 0.3), (1.0, 2.0), 1.0)
+    ground = RockyGround.from_triangles(slope, _make_block(1.0, 2.0, 0.3), (1.0, 2.0), 1.0)
     x, y = np.array([1.0, 1.19, 1.25, 1.0, 9.0]), np.array([2.0, 2.19, 2.0, 1.75, 9.0])
     assert ground.height(x, y) == pytest.approx([0.3, 0.3, *slope.height(x[2:], y[2:])], abs=1e-9)
     # A rock below the sloping ground has no effect on the height.
-    assert RockyGround.of(slope, _make_block(1.0, 2.0, 0.05), (1.0, 2.0), 1.0).height(x, y) == pytest.approx(
-        slope.height(x, y), abs=1e-9
-    )
-    without_bodies = RockyGround.of(slope, np.empty((0, 3, 3)), (1.0, 2.0), 1.0)
+    assert RockyGround.from_triangles(slope, _make_block(1.0, 2.0, 0.05), (1.0, 2.0), 1.0).height(
+        x, y
+    ) == pytest.approx(slope.height(x, y), abs=1e-9)
+    without_bodies = RockyGround.from_triangles(slope, np.empty((0, 3, 3)), (1.0, 2.0), 1.0)
     assert without_bodies.height(x, y) == pytest.approx(slope.height(x, y))
 
 
 def test_block_gives_the_same_stance_as_a_mound_of_equal_height() -> None:
     # The tops of block and mound are wider than the wheel's contact.
     height_m = 0.10
-    ground = RockyGround.of(Plane(), _make_block(0.705, 0.53, height_m), (0.0, 0.0), 1.5)
+    ground = RockyGround.from_triangles(Plane(), _make_block(0.705, 0.53, height_m), (0.0, 0.0), 1.5)
     stance = settle(MER, ground, 0.0, 0.0, EAST)
     mound = settle(MER, Mounds(((0.705, 0.53, height_m),)), 0.0, 0.0, EAST)
     assert np.abs(stance.gaps_m).max() < 1e-6
@@ -123,9 +123,9 @@ def test_block_gives_the_same_stance_as_a_mound_of_equal_height() -> None:
 def test_rock_of_a_field_lifts_the_wheel() -> None:
     surface = Surface.from_samples(np.zeros((128, 128, 2), dtype=np.float32), 0.1)
     rock = PlacedRock(name="step", east_m=6.4 + 0.705, north_m=6.4 + 0.53, diameter_m=0.3, height_m=0.1)
-    field = RockField.on(surface, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
+    field = RockField.draw(surface, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
     mesh = field.rock(0, detail=0)
-    ground = RockyGround.of(surface, mesh.vertices[mesh.faces], (6.4, 6.4), 1.5)
+    ground = RockyGround.from_triangles(surface, mesh.vertices[mesh.faces], (6.4, 6.4), 1.5)
     heights = ground.height(*np.meshgrid(np.linspace(6.9, 7.3, 201), np.linspace(6.7, 7.1, 201)))
     assert heights.max() == pytest.approx(mesh.vertices[:, 2].max(), abs=0.003)
     stance = settle(MER, ground, 6.4, 6.4, EAST)

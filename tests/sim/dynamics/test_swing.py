@@ -106,7 +106,7 @@ def _draw_state(rng: np.random.Generator) -> np.ndarray:
 def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
     """The rates of energy, momentum and angular momentum equal the power, forces and torques of drag and friction."""
     parameters = SwingParameters(**(LARGE_MOTION | {"nod_damping_ratio": 0.1}))
-    chain = build_chain(parameters, Modes.of(parameters, GRAVITY), GRAVITY, 2000.0)
+    chain = build_chain(parameters, Modes.from_parameters(parameters, GRAVITY), GRAVITY, 2000.0)
     y, wind = _draw_state(np.random.default_rng(seed)), _make_calm_wind()
     rates, force = compute_derivatives(y, chain, wind), compute_aerodynamic_force(y, chain, wind)
     n, dn, e, de = y[6:18].reshape(4, 3)
@@ -141,7 +141,7 @@ def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
 
 def test_drag_and_friction_only_dissipate_energy() -> None:
     parameters = SwingParameters(**LARGE_MOTION)
-    chain = build_chain(parameters, Modes.of(parameters, GRAVITY), GRAVITY, 2000.0)
+    chain = build_chain(parameters, Modes.from_parameters(parameters, GRAVITY), GRAVITY, 2000.0)
     rng = np.random.default_rng(0)
     for _ in range(50):
         y = _draw_state(rng)
@@ -152,7 +152,7 @@ def test_drag_and_friction_only_dissipate_energy() -> None:
 def _build_linear_chain(parameters: SwingParameters) -> tuple[Chain, Modes]:
     """Build a chain that falls at a constant rate, because the air density is constant."""
     constant_density = parameters.model_copy(update={"density_scale_height_m": 1e15})
-    modes = Modes.of(constant_density, GRAVITY)
+    modes = Modes.from_parameters(constant_density, GRAVITY)
     return build_chain(constant_density, modes, GRAVITY, 2000.0), modes
 
 
@@ -301,7 +301,7 @@ def test_circular_cone_has_a_constant_angle(angle: float) -> None:
     # For wide cones the lander tilt of linear theory is inaccurate. This causes nods of one degree.
     np.testing.assert_allclose(_compute_off_nadir_deg(descent, np.linspace(-5.0, 7.5, 200)), angle, atol=0.04 * angle)
     rates = descent.motion(np.zeros(1)).body_rates_rad_s[0]
-    modes = Modes.of(descent.parameters, GRAVITY)
+    modes = Modes.from_parameters(descent.parameters, GRAVITY)
     line_tilt = np.radians(angle) / modes.lander_tilt_ratio
     # A conical pendulum rotates at omega / sqrt(cos); the lander rotates with its axis.
     expected = modes.cone_rad_s / np.sqrt(np.cos(line_tilt)) * np.sin(np.radians(angle))
@@ -326,7 +326,7 @@ def test_cone_starts_at_its_azimuth_with_its_sense_of_rotation(fraction: float) 
     np.testing.assert_allclose(camera_axes[0], [np.sin(np.radians(20.0)), 0.0, -np.cos(np.radians(20.0))], atol=1e-9)
     assert np.sign(camera_axes[1, 1]) == -np.sign(fraction)
     # A quarter of a period later it is at the smaller semi-axis.
-    quarter_period_s = 0.5 * np.pi / Modes.of(descent.parameters, GRAVITY).cone_rad_s
+    quarter_period_s = 0.5 * np.pi / Modes.from_parameters(descent.parameters, GRAVITY).cone_rad_s
     min_angle = _compute_off_nadir_deg(descent, np.linspace(quarter_period_s - 1.0, quarter_period_s + 1.0, 200)).min()
     assert min_angle == pytest.approx(10.0, abs=0.4)
 
@@ -335,7 +335,7 @@ def test_cone_starts_at_its_azimuth_with_its_sense_of_rotation(fraction: float) 
 def test_max_rate_equals_the_specified_rate(phase: float) -> None:
     parameters = VERTICAL_FALL | {"nod_rate_deg_s": 60.0, "nod_phase_deg": phase}
     descent = _fly(**parameters)
-    period = 2.0 * np.pi / Modes.of(descent.parameters, GRAVITY).nod_rad_s
+    period = 2.0 * np.pi / Modes.from_parameters(descent.parameters, GRAVITY).nod_rad_s
     motion = descent.motion(np.linspace(-0.5, 0.5, 400) * period)
     # Canopy drag reduces the rate by 2 % within a period.
     max_rate = np.degrees(np.linalg.norm(motion.body_rates_rad_s, axis=1)).max()

@@ -33,9 +33,9 @@ camera = Cahv.from_field_of_view(
 pose = rigid(Rotation.from_euler("zxy", [30.0, 20.0, 15.0], degrees=True), np.array([10.0, 20.0, 1000.0]))
 scene = Scene(surface, (10.0, 20.0), Sun(direction(1.0, 0.7)), Photometry())
 renderer = Renderer(sys.argv[1])
-frame = renderer.render(scene, PixelRays.of(camera), pose)
+frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
 camera_pose = Pose(pose.rotation.as_matrix(), pose.translation)
-depth = renderer._draw_views(scene, PixelRays.of(camera), camera_pose, 1000.0).depth
+depth = renderer._draw_views(scene, PixelRays.from_camera(camera), camera_pose, 1000.0).depth
 np.savez(sys.argv[2], radiance=frame.radiance, distance=frame.range_m, depth=depth)
 """
 

@@ -40,7 +40,7 @@ def _render_from_above(
     position_m: tuple[float, float] = (100.0, 300.0),
 ) -> Frame:
     pose = rigid(Rotation.from_euler("z", 25.0, degrees=True), np.array([*position_m, 2000.0]))
-    return renderer.render(scene, PixelRays.of(camera), pose, time_s)
+    return renderer.render(scene, PixelRays.from_camera(camera), pose, time_s)
 
 
 @pytest.mark.parametrize("cover", [0.1, 0.3, 0.6])
@@ -93,7 +93,7 @@ def test_shadows_move_with_the_wind(renderer: Renderer, descent_camera: Callable
 def test_zero_cover_is_bitwise_equal_to_no_clouds(
     renderer: Renderer, descent_camera: Callable[..., Cahvor], terrain: Surface
 ) -> None:
-    camera = PixelRays.of(descent_camera(128))
+    camera = PixelRays.from_camera(descent_camera(128))
     pose = rigid(Rotation.identity(), np.array([380.0, 200.0, 900.0]))
     clear_scene = Scene(terrain, (380.0, 200.0), SUN, Photometry())
     zero_cover_scene = replace(clear_scene, clouds=_make_layer(cover=0.0))

@@ -41,7 +41,7 @@ def rocky_view() -> View:
     )
     surface = synthesise(parameters, np.random.default_rng(5))
     target = PlacedRock(name="target", east_m=10.0, north_m=10.0, diameter_m=1.0, shape=3, yaw_deg=20.0)
-    field = RockField.on(surface, RockParameters(abundance=0.05, placed=(target,)), np.random.default_rng(1))
+    field = RockField.draw(surface, RockParameters(abundance=0.05, placed=(target,)), np.random.default_rng(1))
     eye = np.array([5.0, 10.0, float(surface.height(10.0, 10.0)) + 1.0])
     mesh = field.near(eye[0], eye[1], 9.0, above_m=1.0)
     rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.08)
@@ -52,7 +52,7 @@ def rocky_view() -> View:
         Photometry(),
         rocks,
         mesh_finest_m=0.04,
-        mesh_reach_m=3000.0,
+        mesh_half_width_m=3000.0,
         mesh_lines=801,
         among_objects=True,
     )
@@ -68,7 +68,7 @@ def reference(renderer: Renderer, rocky_view: View) -> np.ndarray:
 
 def test_subpixel_rays_are_evenly_distributed() -> None:
     camera = _make_camera((7, 5))
-    rays = PixelRays.of(camera)
+    rays = PixelRays.from_camera(camera)
     pixels = np.array([0, 17, 34])
     subpixel_rays = supersample_rays(rays, pixels, 3)
     result, _ = camera.project(subpixel_rays.directions.astype(np.float64))
@@ -130,7 +130,7 @@ def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
     samples[..., 1] = 0.2
     surface = Surface.from_samples(samples, 0.5)
     photometry = Photometry(lunar_fraction=0.0, surge_amplitude=0.0)
-    scene = Scene(surface, (0.0, 0.0), SUN, photometry, mesh_finest_m=0.04, mesh_reach_m=200.0, mesh_lines=801)
+    scene = Scene(surface, (0.0, 0.0), SUN, photometry, mesh_finest_m=0.04, mesh_half_width_m=200.0, mesh_lines=801)
     camera = _make_camera((128, 64), 8e-3)
     pose = rigid(Rotation.from_euler("x", 7.0, degrees=True), np.array([0.0, 0.0, 1.0]))
     border, _ = camera.transform(pose).project(np.array([[200.0, -30.0, 0.0], [200.0, 30.0, 0.0]]))
@@ -138,7 +138,7 @@ def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
     expected = 63.5 - np.interp(np.arange(128), *border[np.argsort(border[:, 0])].T)
     errors = []
     for edge_rays in (1, 3):
-        frame = renderer.render(replace(scene, edge_rays=edge_rays), PixelRays.of(camera), pose)
+        frame = renderer.render(replace(scene, edge_rays=edge_rays), PixelRays.from_camera(camera), pose)
         ground, sky = frame.radiance[-1].mean(), frame.radiance[0].mean()
         fraction = ((frame.radiance - sky) / (ground - sky)).sum(axis=0)
         errors.append(float(np.sqrt(np.mean((fraction - expected) ** 2))))

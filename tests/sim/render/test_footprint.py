@@ -58,10 +58,10 @@ def test_footprint_without_objects_or_sun_is_everywhere() -> None:
 
 def test_footprint_does_not_change_images() -> None:
     """The images of ground with many rocks under a low sun are bitwise equal."""
-    ground = SiteGround.of(site("gusev").model_copy(update={"descent": ROCKY}))
-    rays = PixelRays.of(preset("mer-descent-flown").cameras()[0].bin(4, 4))
+    ground = SiteGround.from_site(site("gusev").model_copy(update={"descent": ROCKY}))
+    rays = PixelRays.from_camera(preset("mer-descent-flown").cameras()[0].bin(4, 4))
     pose = nadir_pose(ground.surface, 300.0, 200.0, 400.0)
-    scene = site_scene(ground, Viewpoint.of(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
+    scene = site_scene(ground, Viewpoint.from_pose(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
     assert len(scene.objects) > 50
     frame = process_renderer(default_backend()).render(scene, rays, pose)
     full_scene = replace(scene)
@@ -77,11 +77,13 @@ def test_culling_does_not_change_images(elevation: float) -> None:
     terrain = ROCKY.model_copy(update={"spacing_m": 0.05, "rms_slope_deg": 5.0, "slope_baseline_m": 1.0})
     terrain = terrain.model_copy(update={"outer_scale_m": 10.0, "craters_per_km2": 0.0})
     rocks = RockParameters(abundance=0.1, smallest_m=0.05)
-    ground = SiteGround.of(site("gusev").model_copy(update={"descent": terrain.model_copy(update={"rocks": rocks})}))
-    rays = PixelRays.of(preset("research-navcam").cameras()[0].crop(400, 380, (161, 161)))
+    ground = SiteGround.from_site(
+        site("gusev").model_copy(update={"descent": terrain.model_copy(update={"rocks": rocks})})
+    )
+    rays = PixelRays.from_camera(preset("research-navcam").cameras()[0].crop(400, 380, (161, 161)))
     pose = mast_pose(ground.surface, 12.0, 11.0, 1.5, 30.0, -14.0)
     for azimuth in (0.5, 3.0):
-        viewpoint = Viewpoint(12.0, 11.0, 1.5, rays.pixel_rad, azimuth_rad=0.5, half_width_rad=1.2, reach_m=25.0)
+        viewpoint = Viewpoint(12.0, 11.0, 1.5, rays.pixel_rad, azimuth_rad=0.5, half_width_rad=1.2, max_distance_m=25.0)
         scene = site_scene(ground, viewpoint, Sun(direction(azimuth, elevation)))
         visible_scene = scene.restrict_to_cones([rays.cone(pose)])
         assert 0 < len(visible_scene.objects) < 0.5 * len(scene.objects)

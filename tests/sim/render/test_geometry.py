@@ -78,7 +78,7 @@ def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_ca
     camera = descent_camera(r=STRONG_DISTORTION)
     pose = rigid(ATTITUDE, np.array([300.0, 700.0, 1207.0]))
     scene = Scene(surface, (300.0, 400.0), OVERHEAD, ALBEDO_ONLY)
-    frame = renderer.render(scene, PixelRays.of(camera), pose)
+    frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
     copies = np.arange(-2, 3) * surface.period_m
     all_spots = np.concatenate([spots + np.array([dx, dy, 0.0]) for dx in copies for dy in copies])
     pixels, visible = camera.transform(pose).project(all_spots)
@@ -102,7 +102,7 @@ def test_world_points_are_on_the_plane_and_on_rays(
     surface, _ = _make_spotted_plane(height_m=-3.0)
     camera = descent_camera(r=STRONG_DISTORTION)
     pose = rigid(ATTITUDE, np.array([100.0, 50.0, height_m - 3.0]))
-    frame = renderer.render(Scene(surface, (100.0, 50.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(camera), pose)
+    frame = renderer.render(Scene(surface, (100.0, 50.0), OVERHEAD, ALBEDO_ONLY), PixelRays.from_camera(camera), pose)
     points = frame.points_world()
     assert np.isfinite(points).all()
     assert np.abs((points[..., 2] + 3.0) / frame.range_m).max() < 1e-5
@@ -133,7 +133,7 @@ def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, expected_m:
 def test_rough_ground_ranges_match_independent_ray_cast(
     renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    rays = PixelRays.of(descent_camera())
+    rays = PixelRays.from_camera(descent_camera())
     pose = rigid(ATTITUDE, np.array([380.0, 200.0, 1500.0]))
     frame = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
     rng = np.random.default_rng(8)
@@ -219,7 +219,7 @@ def test_mesh_resolution_does_not_change_the_image(
     renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     """The mesh only defines the start of the search: a mesh three times as coarse gives the same image."""
-    rays = PixelRays.of(descent_camera(256))
+    rays = PixelRays.from_camera(descent_camera(256))
     pose = rigid(ATTITUDE, np.array([380.0, 200.0, 1500.0]))
     fine = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
     coarse = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY, mesh_finest_m=36.0), rays, pose)
@@ -232,7 +232,7 @@ def test_pixels_above_the_horizon_show_the_sky(
 ) -> None:
     level_pose = rigid(Rotation.from_euler("x", 90.0, degrees=True), np.array([0.0, 0.0, 500.0]))
     frame = renderer.render(
-        Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(128)), level_pose
+        Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.from_camera(descent_camera(128)), level_pose
     )
     upper, lower = frame.range_m[:60], frame.range_m[-40:]
     assert np.isinf(upper).all()
@@ -250,7 +250,7 @@ def test_objects_out_of_view_do_not_change_the_image(
     faces = np.array([[0, 1, 2]], dtype=np.int32)
     object_above = Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (3, 1)), faces, np.zeros(1, np.int32), albedo=0.1)
     sun = Sun(direction(0.3, np.radians(5.0)))
-    rays = PixelRays.of(descent_camera(256))
+    rays = PixelRays.from_camera(descent_camera(256))
     with_object, without_objects = (
         renderer.render(
             Scene(terrain, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True),
@@ -269,13 +269,15 @@ def test_camera_below_the_ground_is_rejected(
 ) -> None:
     pose = rigid(Rotation.identity(), np.array([0.0, 0.0, -1000.0]))
     with pytest.raises(RenderingError, match="below the ground"):
-        renderer.render(Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.of(descent_camera(64)), pose)
+        renderer.render(
+            Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.from_camera(descent_camera(64)), pose
+        )
 
 
 def test_image_does_not_depend_on_earlier_images(
     renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    rays = PixelRays.of(descent_camera(256))
+    rays = PixelRays.from_camera(descent_camera(256))
     sun = Sun(direction(np.radians(100.0), np.radians(40.0)))
     pose = rigid(ATTITUDE, np.array([380.0, 200.0, 1500.0]))
     first = renderer.render(Scene(terrain, (380.0, 200.0), sun, Photometry()), rays, pose)

@@ -27,7 +27,9 @@ FLAT = _make_surface(np.zeros((256, 256)))
 def _render(
     renderer: Renderer, camera: CameraModel, surface: Surface, sun: Sun, law: Photometry, pose: RigidTransform = NADIR
 ) -> np.ndarray:
-    radiance: np.ndarray = renderer.render(Scene(surface, (0.0, 0.0), sun, law), PixelRays.of(camera), pose).radiance
+    radiance: np.ndarray = renderer.render(
+        Scene(surface, (0.0, 0.0), sun, law), PixelRays.from_camera(camera), pose
+    ).radiance
     return radiance
 
 
@@ -76,7 +78,9 @@ def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: 
     camera = descent_camera(256)
     # The ground faces the eastern sun where its height decreases with x.
     eastern_sun = Sun(direction(np.radians(90.0), np.radians(40.0)))
-    frame = renderer.render(Scene(_make_surface(heights), (0.0, 0.0), eastern_sun, law), PixelRays.of(camera), NADIR)
+    frame = renderer.render(
+        Scene(_make_surface(heights), (0.0, 0.0), eastern_sun, law), PixelRays.from_camera(camera), NADIR
+    )
     is_facing_east = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) < -0.5
     is_facing_west = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) > 0.5
     assert frame.radiance[is_facing_east].min() > frame.radiance[is_facing_west].max()

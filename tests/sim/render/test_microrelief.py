@@ -150,7 +150,7 @@ def test_shading_changes_with_the_sun_as_for_a_height_field(
     """Images under two sun azimuths 90 deg apart have the correlation of a ray-cast height field, within 0.05."""
     cell, pixels, samples_per_pixel = 0.8, 96, 6
     relief = _make_relief(cell, np.tan(np.radians(rms_slope_deg)) * cell / np.sqrt(SLOPE_VARIANCE))
-    rays = PixelRays.of(descent_camera(pixels, (0.0, 0.0, 0.0)))
+    rays = PixelRays.from_camera(descent_camera(pixels, (0.0, 0.0, 0.0)))
     suns = [direction(np.radians(azimuth), np.radians(35.0)) for azimuth in (60.0, 150.0)]
     scene = Scene(flat, (30.0, 40.0), Sun(suns[0]), LAMBERT, relief=relief)
     frames = [renderer.render(replace(scene, sun=Sun(sun)), rays, POSE) for sun in suns]
@@ -177,7 +177,7 @@ def test_shading_changes_with_the_sun_as_for_a_height_field(
 def test_relief_does_not_change_geometric_truth_and_mean_brightness(
     renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    rays = PixelRays.of(descent_camera(128))
+    rays = PixelRays.from_camera(descent_camera(128))
     without_relief = Scene(flat, (30.0, 40.0), Sun(direction(2.0, np.radians(50.0))), LAMBERT)
     with_relief = replace(without_relief, relief=_make_relief(1.2, *0.02 * 0.5 ** np.arange(8.0)))
     first, second = (renderer.render(scene, rays, POSE) for scene in (without_relief, with_relief))

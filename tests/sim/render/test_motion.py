@@ -62,7 +62,7 @@ def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer, distance_
     )
     surface = synthesise(parameters, np.random.default_rng(5))
     target = PlacedRock(name="target", east_m=10.0, north_m=10.0, diameter_m=2.0, shape=3, yaw_deg=20.0)
-    field = RockField.on(surface, RockParameters(abundance=0.05, placed=(target,)), np.random.default_rng(1))
+    field = RockField.draw(surface, RockParameters(abundance=0.05, placed=(target,)), np.random.default_rng(1))
     eye = np.array([9.2 - distance_m, 10.0, float(surface.height(10.0, 10.0)) + 1.4])
     mesh = field.near(eye[0], eye[1], distance_m + 3.0, above_m=1.4)
     rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.15)
@@ -75,7 +75,7 @@ def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer, distance_
         ground_texture=Texture(0.2, (0.05,) * 6),
         object_texture=Texture(0.2, (0.06,) * 8),
         mesh_finest_m=0.04,
-        mesh_reach_m=200.0,
+        mesh_half_width_m=200.0,
         among_objects=True,
     )
     camera = Cahv.from_focal_length(

@@ -40,7 +40,7 @@ def _render(renderer: Renderer, flat: Surface, law: Photometry, to_sun: np.ndarr
     )
     pose = rigid(Rotation.align_vectors(-to_eye[None], np.array([[0.0, 0.0, -1.0]]))[0], 100.0 * to_eye)
     scene = Scene(flat, (0.0, 0.0), Sun(to_sun), replace(law, sky_fraction=0.0, surrounding_albedo=0.0))
-    return float(renderer.render(scene, PixelRays.of(camera), pose).radiance[4, 4])
+    return float(renderer.render(scene, PixelRays.from_camera(camera), pose).radiance[4, 4])
 
 
 @with_each_law
@@ -89,7 +89,7 @@ def test_opposition_peak_is_at_the_antisolar_point(
     pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
     for antisolar_pixel in np.array([[150.3, 201.8], [330.6, 255.1]]):
         _, ray = camera.transform(pose).rays(antisolar_pixel)
-        frame = renderer.render(Scene(flat, (0.0, 0.0), Sun(-ray), law), PixelRays.of(camera), pose)
+        frame = renderer.render(Scene(flat, (0.0, 0.0), Sun(-ray), law), PixelRays.from_camera(camera), pose)
         radiance = frame.radiance.astype(np.float64)
         weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)
         v, u = np.mgrid[:512, :512]

@@ -99,7 +99,7 @@ def test_mast_shadow_is_opposite_the_sun(renderer: Renderer) -> None:
     elevation = np.radians(25.0)
     sun = Sun(direction(EAST, elevation))
     objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
-    scene = Scene(surface, (32.0, 32.0), sun, LAMBERT, objects, mesh_finest_m=0.2, mesh_reach_m=60.0, edge_rays=1)
+    scene = Scene(surface, (32.0, 32.0), sun, LAMBERT, objects, mesh_finest_m=0.2, mesh_half_width_m=60.0, edge_rays=1)
     # A point high on the mast, whose shadow is outside that of the deck: in the west at height / tan(elevation).
     mast = stance.world_from_rover.apply(np.array([*MER_MAST.base_m[:2], 0.0]))
     height_m = 1.28
@@ -108,7 +108,7 @@ def test_mast_shadow_is_opposite_the_sun(renderer: Renderer) -> None:
         horizontal_rad=0.1, size=(101, 101), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
     )
     pose = rigid(Rotation.identity(), expected + np.array([0.0, 0.0, 6.0]))
-    frame = renderer.render(scene, PixelRays.of(camera), pose)
+    frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
     points = frame.points_world()
     is_shaded = frame.radiance < 0.1 * frame.radiance.max()
     assert 0.1 < np.mean(is_shaded) < 0.5

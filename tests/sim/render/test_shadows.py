@@ -58,7 +58,7 @@ def test_low_sun_shadows_of_rough_ground_match_ray_cast(
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(12.0)))
     scene = Scene(_with_uniform_albedo(terrain), (380.0, 200.0), sun, LAMBERT, edge_rays=1)
     pose = rigid(Rotation.from_euler("zxy", [30.0, 12.0, 5.0], degrees=True), np.array([380.0, 200.0, 1500.0]))
-    frame = renderer.render(scene, PixelRays.of(descent_camera(512)), pose)
+    frame = renderer.render(scene, PixelRays.from_camera(descent_camera(512)), pose)
     agreement, shaded_fraction = _compare_with_ray_cast(frame, scene, 4000, 0.3)
     assert shaded_fraction > 0.02
     assert agreement >= MIN_AGREEMENT
@@ -69,7 +69,7 @@ def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
         samples=256, spacing_m=0.1, rms_slope_deg=2.0, slope_baseline_m=2.0, outer_scale_m=15.0, craters_per_km2=0.0
     )
     surface = _with_uniform_albedo(synthesise(parameters, np.random.default_rng(5)))
-    field = RockField.on(surface, RockParameters(abundance=0.1, smallest_m=0.15), np.random.default_rng(1))
+    field = RockField.draw(surface, RockParameters(abundance=0.1, smallest_m=0.15), np.random.default_rng(1))
     mesh = field.near(10.0, 10.0, 7.0, above_m=8.0)
     rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=ALBEDO)
     camera = Cahv.from_field_of_view(
@@ -80,9 +80,11 @@ def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
         right=np.array([1.0, 0.0, 0.0]),
     )
     sun = Sun(direction(np.radians(200.0), np.radians(35.0)))
-    scene = Scene(surface, (10.0, 10.0), sun, LAMBERT, rocks, mesh_finest_m=0.1, mesh_reach_m=100.0, edge_rays=1)
+    scene = Scene(surface, (10.0, 10.0), sun, LAMBERT, rocks, mesh_finest_m=0.1, mesh_half_width_m=100.0, edge_rays=1)
     eye = np.array([10.0, 10.0, float(surface.height(10.0, 10.0)) + 8.0])
-    frame = renderer.render(scene, PixelRays.of(camera), rigid(Rotation.from_euler("x", 15.0, degrees=True), eye))
+    frame = renderer.render(
+        scene, PixelRays.from_camera(camera), rigid(Rotation.from_euler("x", 15.0, degrees=True), eye)
+    )
     agreement, shaded_fraction = _compare_with_ray_cast(frame, scene, 3000, 0.02)
     assert shaded_fraction > 0.02
     assert agreement >= MIN_AGREEMENT
@@ -102,7 +104,9 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
     skyline = np.arctan2(crest, ground[:, None] - profile).max(axis=1)
     edge = float(np.interp(elevation, skyline[::-1], ground[::-1]))
     pose = rigid(Rotation.identity(), np.array([edge, 64.0, 8.0]))
-    frame = renderer.render(Scene(surface, (edge, 64.0), sun, LAMBERT), PixelRays.of(descent_camera(256)), pose)
+    frame = renderer.render(
+        Scene(surface, (edge, 64.0), sun, LAMBERT), PixelRays.from_camera(descent_camera(256)), pose
+    )
     x_m = frame.points_world()[..., 0].ravel()
     offset = np.clip((elevation - np.interp(x_m, ground, skyline)) / sun.angular_radius_rad, -1.0, 1.0)
     expected = 0.5 + (offset * np.sqrt(1.0 - offset**2) + np.arcsin(offset)) / np.pi

@@ -36,8 +36,8 @@ def _make_sky_camera(size: int = 200) -> Cahv:
 
 
 def _render_from_mast(renderer: Renderer, camera: Cahv, sun: Sun, photometry: Photometry) -> Frame:
-    scene = Scene(_make_flat_ground(), (0.0, 0.0), sun, photometry, mesh_finest_m=0.5, mesh_reach_m=5000.0)
-    return renderer.render(scene, PixelRays.of(camera), rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5])))
+    scene = Scene(_make_flat_ground(), (0.0, 0.0), sun, photometry, mesh_finest_m=0.5, mesh_half_width_m=5000.0)
+    return renderer.render(scene, PixelRays.from_camera(camera), rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5])))
 
 
 @pytest.mark.parametrize("elevation_deg", [15.0, 40.0, 90.0])
@@ -102,7 +102,7 @@ def test_solar_disc_contains_the_direct_irradiance(renderer: Renderer) -> None:
     sun = Sun(direction(np.radians(3.0), np.radians(14.0)))
     frame = _render_from_mast(renderer, camera, sun, DUSTY)
     is_disc = frame.radiance > 1000.0
-    solid_angle = np.square(PixelRays.of(camera).pixel_angles.reshape(is_disc.shape))
+    solid_angle = np.square(PixelRays.from_camera(camera).pixel_angles.reshape(is_disc.shape))
     # The radiance factor is pi times the radiance divided by the irradiance of a plane that faces the sun.
     assert (frame.radiance * solid_angle)[is_disc].sum() == pytest.approx(np.pi, rel=0.03)
     expected, visible = camera.project(1e9 * sun.direction)

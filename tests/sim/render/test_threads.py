@@ -41,7 +41,7 @@ def test_images_do_not_depend_on_threads(
     renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rock = PlacedRock(name="rock", east_m=380.0, north_m=205.0, diameter_m=30.0, shape=3, yaw_deg=20.0)
-    field = RockField.on(terrain, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
+    field = RockField.draw(terrain, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
     mesh = field.near(380.0, 205.0, 60.0, above_m=200.0)
     rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.15)
     sun = Sun(direction(2.0, 0.6))
@@ -54,7 +54,7 @@ def test_images_do_not_depend_on_threads(
         ground_texture=Texture(3.0, (0.03,) * 6),
         object_texture=Texture(0.5, (0.05,) * 3),
     )
-    rays = PixelRays.of(descent_camera().crop(400, 400, (161, 161)))
+    rays = PixelRays.from_camera(descent_camera().crop(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
     monkeypatch.setattr("marsyard.sim.render.renderer.run_in_parts", partial(run_in_parts, threads=1))
     one_thread = renderer.render(scene, rays, pose)

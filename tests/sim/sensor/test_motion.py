@@ -55,7 +55,7 @@ def test_rotating_camera_matches_many_renderings() -> None:
         14.67e-3, 12e-6, (size, size), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
     )
     camera = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
-    rays = PixelRays.of(camera)
+    rays = PixelRays.from_camera(camera)
     renderer = process_renderer(default_backend())
     scene = Scene(surface, (0.0, 0.0), Sun(np.array([0.6, 0.3, np.sqrt(0.55)])), Photometry())
     attitude = Rotation.from_euler("xyz", [20.0, -10.0, 30.0], degrees=True)

@@ -13,8 +13,8 @@ from marsyard.sim.dynamics.rotorcraft import (
     TAIL_S,
     Air,
     AirParameters,
-    FlownPath,
     RotorcraftParameters,
+    SimulatedPath,
     TransitParameters,
     simulate_transit,
 )
@@ -31,7 +31,7 @@ RTK, COMPASS = RtkParameters(), TiltCompassParameters()
 
 
 @cache
-def _make_path(seed: int) -> FlownPath:
+def _make_path(seed: int) -> SimulatedPath:
     rng = np.random.default_rng(seed)
     air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S, rng)
     waypoint_m, heading_rad = np.array([100.0, 50.0, 10.0]), rng.uniform(0.0, 2.0 * np.pi)
@@ -45,7 +45,7 @@ def _run_filter(
     compass_parameters: TiltCompassParameters = COMPASS,
     covariance_times_s: tuple[float, ...] = (),
     parameters: FilterParameters = FilterParameters(),  # noqa: B008 - frozen
-) -> tuple[FlownPath, Imu, NavigationSolution]:
+) -> tuple[SimulatedPath, Imu, NavigationSolution]:
     path, rng = _make_path(seed), np.random.default_rng([seed, 1])
     span = path.span_s
     imu = Imu.draw(imu_parameters, span, rng)
@@ -58,7 +58,9 @@ def _run_filter(
     return path, imu, navigation.run(start, increments, solutions, readings, np.array(covariance_times_s))
 
 
-def _compute_state_errors(path: FlownPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray) -> np.ndarray:
+def _compute_state_errors(
+    path: SimulatedPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray
+) -> np.ndarray:
     """Compute the true minus the estimated state, fifteen columns (position, velocity, attitude, two biases).
 
     Scale and misalignment errors of the accelerometer count as a bias: their product with gravity.

@@ -21,7 +21,7 @@ def test_process_is_stationary_from_the_start() -> None:
 
 def test_process_rejects_times_outside_its_span() -> None:
     process = GaussMarkov.draw(np.ones(3), 100.0, (0.0, 10.0), np.random.default_rng(0))
-    with pytest.raises(ValueError, match=r"outside the drawn errors, 0\.000 s"):
+    with pytest.raises(ValueError, match=r"outside the sampled errors, 0\.000 s"):
         process.at(np.array([-1.0]))
     with pytest.raises(ValueError, match="finite span"):
         GaussMarkov.draw(np.ones(3), 100.0, (-np.inf, 10.0), np.random.default_rng(0))

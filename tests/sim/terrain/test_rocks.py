@@ -42,7 +42,7 @@ def ground() -> Surface:
 def make_field(ground: Surface, seed: int = 1, **changes: object) -> RockField:
     values = {"abundance": 0.2, "smallest_m": 0.1, "placed": (TARGET,), **changes}
     parameters = RockParameters.model_validate(values)
-    return RockField.on(ground, parameters, np.random.default_rng(seed))
+    return RockField.draw(ground, parameters, np.random.default_rng(seed))
 
 
 def make_mesh(shapes: ShapeSet, number: int) -> trimesh.Trimesh:
@@ -65,7 +65,7 @@ def test_shapes_are_closed_and_of_unit_size(detail: int, triangles: int) -> None
         assert mesh.is_watertight
         assert mesh.volume > 0.0
         assert mesh.bounds[0, 2] < -0.02, "the lower part is buried"
-        assert np.hypot(*shapes.vertices[number, :, :2].T).max() <= shapes.reach[number] + 1e-12
+        assert np.hypot(*shapes.vertices[number, :, :2].T).max() <= shapes.max_radius[number] + 1e-12
     np.testing.assert_allclose(np.linalg.norm(shapes.normals, axis=2), 1.0, atol=1e-12)
 
 
@@ -121,7 +121,7 @@ def test_rock_sizes_follow_golombek(abundance: float) -> None:
 
 def test_no_two_rocks_overlap(field: RockField) -> None:
     """Rocks do not overlap in plan view; neighbours across the periodic border are included."""
-    radius_m = rock_shapes(COARSE).reach[field.shape] * field.diameter_m
+    radius_m = rock_shapes(COARSE).max_radius[field.shape] * field.diameter_m
     tree = cKDTree(field.position_m[:, :2], boxsize=np.full(2, field.period_m))
     pairs = tree.query_pairs(2 * radius_m.max(), output_type="ndarray")
     offsets_m = np.abs(field.position_m[pairs[:, 0], :2] - field.position_m[pairs[:, 1], :2])
@@ -280,13 +280,15 @@ def test_rock_detail_follows_camera_resolution(field: RockField) -> None:
 
 def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
-    cache_clears = [function.cache_clear for function in (rock_shapes, max_pixels, shapes._vertices, shapes._reach)]
+    cache_clears = [
+        function.cache_clear for function in (rock_shapes, max_pixels, shapes._vertices, shapes._compute_max_radius)
+    ]
     results = []
     for _ in range(2):
         for clear_cache in cache_clears:
             clear_cache()
         coarse = rock_shapes(COARSE)
-        results.append([coarse.vertices, coarse.normals, coarse.reach, max_pixels()])
+        results.append([coarse.vertices, coarse.normals, coarse.max_radius, max_pixels()])
         files = sorted((tmp_path / "terrain").glob("rocks-*.npy"))
     # The files contain vertices of five levels, normals of two levels, and the sizes in pixels.
     assert len(files) == 8

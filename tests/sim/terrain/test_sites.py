@@ -105,7 +105,7 @@ def test_site_grounds_can_be_built_with_rocks(name: str) -> None:
     surface = synthesise(parameters.model_copy(update=scale), np.random.default_rng(1))
     assert np.isfinite(surface.levels[0]).all()
     if parameters.rocks is not None:
-        field = RockField.on(surface, parameters.rocks, np.random.default_rng(1))
+        field = RockField.draw(surface, parameters.rocks, np.random.default_rng(1))
         assert len(field) > 0
 
 
@@ -203,7 +203,7 @@ def test_imported_terrain_replaces_the_relief_of_a_site(shared_data: Path) -> No
     assert np.ptp(inner_heights) == pytest.approx(-4437.883 + 4472.67, abs=1.0)
     assert surface.levels[0][..., 1].mean() == pytest.approx(0.22, rel=0.01)
     assert parameters.rocks is not None
-    assert len(RockField.on(surface, parameters.rocks, np.random.default_rng(1))) > 0
+    assert len(RockField.draw(surface, parameters.rocks, np.random.default_rng(1))) > 0
 
 
 def test_solar_disc_is_smaller_at_mars() -> None:

@@ -1,7 +1,7 @@
 """Tests of surface units, crater populations, tracks and wind tails.
 
-The tone is the natural logarithm of the albedo relative to the mean albedo. The stamping kernels define the columns of
-craters and streaks.
+`log_albedo` is the natural logarithm of the albedo relative to the mean albedo. The stamping kernels define the columns
+of craters and streaks.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS, TEXTURE
 
 KINDS: list[dict[str, Any]] = [
     {"name": "plain", "fraction": 0.5},
-    {"name": "dust", "fraction": 0.3, "tone": 0.2, "roughness": 0.3, "texture": 0.2, "rocks": 0.1},
-    {"name": "rubble", "fraction": 0.2, "tone": -0.2, "roughness": 2.0, "texture": 1.5, "rocks": 3.0},
+    {"name": "dust", "fraction": 0.3, "log_albedo": 0.2, "roughness": 0.3, "texture": 0.2, "rocks": 0.1},
+    {"name": "rubble", "fraction": 0.2, "log_albedo": -0.2, "roughness": 2.0, "texture": 1.5, "rocks": 3.0},
 ]
 PLAIN = [{"name": "plain", "fraction": 1.0}]
 NO_CRATERS = np.empty((0, 16))
@@ -46,13 +46,13 @@ def _make_parameters(**changes: Any) -> TerrainParameters:
 
 def test_units_have_the_specified_areas_factors_and_tones() -> None:
     """With sharp boundaries and fixed areas, each unit has its area, its factors and its albedo."""
-    ground, cover = _apply_units(_make_units(concentration=1e6))
+    ground, factors = _apply_units(_make_units(concentration=1e6))
     for kind in KINDS:
-        is_inside = np.isclose(cover[..., TEXTURE], kind.get("texture", 1.0), rtol=0.05)
+        is_inside = np.isclose(factors[..., TEXTURE], kind.get("texture", 1.0), rtol=0.05)
         assert is_inside.mean() == pytest.approx(kind["fraction"], abs=0.05)
-        assert np.median(cover[is_inside, ROUGHNESS]) == pytest.approx(kind.get("roughness", 1.0), rel=0.05)
-        assert np.median(ground.log_albedo[::4, ::4][is_inside]) == pytest.approx(kind.get("tone", 0.0), abs=0.02)
-    assert cover[..., ROCKS].mean() == pytest.approx(1.0, rel=1e-4)
+        assert np.median(factors[is_inside, ROUGHNESS]) == pytest.approx(kind.get("roughness", 1.0), rel=0.05)
+        assert np.median(ground.log_albedo[::4, ::4][is_inside]) == pytest.approx(kind.get("log_albedo", 0.0), abs=0.02)
+    assert factors[..., ROCKS].mean() == pytest.approx(1.0, rel=1e-4)
 
 
 def test_unit_areas_vary_between_terrains() -> None:
@@ -73,8 +73,8 @@ def test_patches_are_longer_along_the_wind() -> None:
 
 def test_units_increase_the_patchiness_of_the_albedo() -> None:
     def compute_patchiness(parameters: TerrainParameters) -> float:
-        tone = np.log(synthesise(parameters, np.random.default_rng(3)).levels[0][..., 1].astype(float))
-        blocks = tone.reshape(32, 16, 32, 16).std(axis=(1, 3))
+        log_albedo = np.log(synthesise(parameters, np.random.default_rng(3)).levels[0][..., 1].astype(float))
+        blocks = log_albedo.reshape(32, 16, 32, 16).std(axis=(1, 3))
         return float(np.percentile(blocks, 90) / np.percentile(blocks, 10))
 
     without_units = compute_patchiness(_make_parameters())
@@ -111,11 +111,11 @@ def test_crater_sizes_follow_saturation_and_production() -> None:
 
 
 def test_crater_floor_has_its_tone() -> None:
-    height, tone = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
+    height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
     crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.0, 0.0, 0.15, *np.zeros(6), 0.0]
-    stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
-    assert tone[64, 64] == pytest.approx(0.15)
-    assert not tone[np.hypot(*(np.mgrid[:128, :128] - 64.0)) > 34.0].any()
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
+    assert log_albedo[64, 64] == pytest.approx(0.15)
+    assert not log_albedo[np.hypot(*(np.mgrid[:128, :128] - 64.0)) > 34.0].any()
 
 
 def test_crater_floors_are_smoother_and_ejecta_rougher() -> None:
@@ -127,17 +127,17 @@ def test_crater_floors_are_smoother_and_ejecta_rougher() -> None:
 
 
 def test_wind_tails_lie_downwind_of_their_craters() -> None:
-    tone = np.zeros((128, 128), dtype=np.float32)
-    stamp_streaks(tone, 1.0, np.array([[30.0, 64.0, 6.0, 50.0, 1.0, 0.0, -0.2]]))
-    rows, columns = np.nonzero(tone)
+    log_albedo = np.zeros((128, 128), dtype=np.float32)
+    stamp_streaks(log_albedo, 1.0, np.array([[30.0, 64.0, 6.0, 50.0, 1.0, 0.0, -0.2]]))
+    rows, columns = np.nonzero(log_albedo)
     assert columns.min() >= 30
     assert columns.max() <= 80
     assert abs(rows - 64).max() < 12
-    assert tone.min() == pytest.approx(-0.2, abs=0.05)
+    assert log_albedo.min() == pytest.approx(-0.2, abs=0.05)
 
 
 def test_dust_devil_tracks_are_darker() -> None:
-    ground, _ = _apply_units(_make_units(kinds=PLAIN, tracks_per_km2=20.0, track_tone=-0.12))
+    ground, _ = _apply_units(_make_units(kinds=PLAIN, tracks_per_km2=20.0, track_log_albedo=-0.12))
     assert -0.3 < ground.log_albedo.min() < -0.08
     assert ground.log_albedo.max() < 1e-6
     assert 0.02 < np.mean(ground.log_albedo < -0.02) < 0.9
@@ -146,12 +146,12 @@ def test_dust_devil_tracks_are_darker() -> None:
 def test_rocks_follow_the_density_of_units_with_the_same_total() -> None:
     surface = synthesise(_make_parameters(samples=256, spacing_m=0.5, units=_make_units()), np.random.default_rng(4))
     parameters = RockParameters(abundance=0.005, smallest_m=0.02)  # Few rocks rarely overlap.
-    rocks = RockField.on(surface, parameters, np.random.default_rng(2))
-    uniform_rocks = RockField.on(Surface(surface.levels, surface.spacing_m), parameters, np.random.default_rng(2))
+    rocks = RockField.draw(surface, parameters, np.random.default_rng(2))
+    uniform_rocks = RockField.draw(Surface(surface.levels, surface.spacing_m), parameters, np.random.default_rng(2))
     assert len(rocks) == len(uniform_rocks)
-    side = len(surface.cover)
+    side = len(surface.factors)
     cell = (rocks.position_m[:, :2] / surface.period_m * side).astype(int) % side
-    density = surface.cover[..., ROCKS]
+    density = surface.factors[..., ROCKS]
     is_dense = density[cell[:, 1], cell[:, 0]] > 1.0
     expected = float(density[density > 1.0].sum() / density.sum())
     assert is_dense.mean() == pytest.approx(expected, abs=4.0 * np.sqrt(expected * (1.0 - expected) / len(rocks)))
@@ -160,7 +160,7 @@ def test_rocks_follow_the_density_of_units_with_the_same_total() -> None:
 def test_rock_forms_have_the_specified_fractions() -> None:
     surface = synthesise(_make_parameters(samples=128, spacing_m=0.5), np.random.default_rng(4))
     parameters = RockParameters(abundance=0.1, smallest_m=0.05, forms=RockForms(block=3.0, slab=1.0), albedo_spread=0.3)
-    rocks = RockField.on(surface, parameters, np.random.default_rng(2))
+    rocks = RockField.draw(surface, parameters, np.random.default_rng(2))
     # Shapes are numbered by form: blocks are form 0, slabs form 3.
     is_slab = rocks.shape // SHAPES_OF_FORM == 3
     assert set(np.unique(rocks.shape // SHAPES_OF_FORM)) == {0, 3}

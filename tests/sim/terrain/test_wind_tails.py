@@ -20,12 +20,14 @@ def _make_flat_surface() -> Surface:
 
 def _make_surface_with_tail(tails: WindTails, diameter_m: float = DIAMETER_M) -> Surface:
     rock = PlacedRock(name="rock", east_m=CENTRE_M, north_m=CENTRE_M, diameter_m=diameter_m, height_m=HEIGHT_M)
-    rocks = RockField.on(_make_flat_surface(), RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
+    rocks = RockField.draw(
+        _make_flat_surface(), RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1)
+    )
     return tails.apply(_make_flat_surface(), rocks, np.random.default_rng(2))
 
 
 def test_ridge_has_the_height_length_and_direction_of_its_parameters() -> None:
-    tails = WindTails(wind_from_deg=270.0, length_heights=4.0, length_spread=0.0, tone=0.2)
+    tails = WindTails(wind_from_deg=270.0, length_heights=4.0, length_spread=0.0, log_albedo=0.2)
     surface = _make_surface_with_tail(tails)
     # The angle of repose limits the height: half width times tan(20 deg) = 7.3 cm < 0.4 * 20 cm.
     height_m = 0.5 * DIAMETER_M * np.tan(np.radians(20.0))
