@@ -31,7 +31,7 @@ def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[s
     current = _read_names("keys").get(name)
     if current is None or name in valid_keys or current not in valid_keys or current in input_keys:
         return name
-    return _warn_deprecated(name, current)
+    return warn_deprecated(name, current)
 
 
 def current_column(name: str, exists: Callable[[str], bool]) -> str:
@@ -41,13 +41,18 @@ def current_column(name: str, exists: Callable[[str], bool]) -> str:
         match = re.fullmatch(deprecated.replace("*", r"(\d+)"), column)
         current_name = current.replace("*", match[1]) if match and match.groups() else current
         if match and exists(current_name):
-            return algorithm + dot + _warn_deprecated(column, current_name)
+            return algorithm + dot + warn_deprecated(column, current_name)
     return name
+
+
+def current_fault(name: str) -> str:
+    """Return the current name of a fault that a stored row contains; faults are keys of parameters."""
+    return _read_names("keys").get(name, name)
 
 
 def current_options(arguments: Sequence[str]) -> list[str]:
     """Replace deprecated names of options in the arguments of a command line."""
-    return [_warn_deprecated(argument, _read_names("options").get(argument, argument)) for argument in arguments]
+    return [warn_deprecated(argument, _read_names("options").get(argument, argument)) for argument in arguments]
 
 
 class Choice(Enum):
@@ -56,7 +61,7 @@ class Choice(Enum):
     @classmethod
     def _missing_(cls, value: object) -> Choice | None:
         current = _read_names("values").get(str(value))
-        return None if current is None else cls(_warn_deprecated(str(value), current))
+        return None if current is None else cls(warn_deprecated(str(value), current))
 
 
 def stream_name(path: str) -> str:
@@ -64,7 +69,8 @@ def stream_name(path: str) -> str:
     return _read_names("streams").get(path, path)
 
 
-def _warn_deprecated(name: str, current: str) -> str:
+def warn_deprecated(name: str, current: str) -> str:
+    """Warn that a name is deprecated if it differs from the current name; return the current name."""
     if name != current:
         warnings.warn(f"'{name}' is now '{current}'; the former name is accepted until 0.2", DeprecatedNameWarning, 3)
     return current
