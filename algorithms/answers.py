@@ -15,7 +15,8 @@ from jaxtyping import Float64
 
 from marsyard.algorithms import interface
 from marsyard.algorithms.interface import VelocityEstimate, VelocityStream
-from marsyard.sim.measurements import DescentMeasurements, MastCalibration
+from marsyard.sim.measurements import DescentFrame, DescentMeasurements, MastCalibration
+from marsyard.sim.parameters import warn_deprecated
 
 
 class Fault(Enum):
@@ -96,7 +97,7 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
             raise bad_answer(f"span_s is {span}; allowed: {allowed}")
     elif tags_s is not None and len(tags_s) < 2 and velocity is not None:
         raise bad_answer("one image has no last interval; allowed: a velocity with a span_s, or a failure outcome")
-    return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_pictures)
+    return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_images)
 
 
 def check_site(answer: Any) -> interface.SiteEstimate:
@@ -167,7 +168,40 @@ def _type_name(value: object) -> str:
 
 
 #: Methods of a stream, in calling order.
-STREAM_METHODS = ("start", "picture", "finish")
+STREAM_METHODS = ("start", "process_image", "finish")
+#: Former name of the method `process_image`; accepted until 0.2.
+_FORMER_IMAGE_METHOD = "picture"
+
+
+def has_stream_method(stream: object, method: str) -> bool:
+    """Return whether a class or object has a method of a stream, under its current or former name."""
+    return hasattr(stream, method) or (method == "process_image" and hasattr(stream, _FORMER_IMAGE_METHOD))
+
+
+class _FormerStream:
+    """A `VelocityStream` whose method `process_image` has its former name."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def start(self) -> None:
+        self._stream.start()
+
+    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
+        answer: VelocityEstimate | None = getattr(self._stream, _FORMER_IMAGE_METHOD)(frame)
+        return answer
+
+    def finish(self) -> VelocityEstimate:
+        answer: VelocityEstimate = self._stream.finish()
+        return answer
+
+
+def create_streamed(stream: Any) -> StreamedEstimator:
+    """Create the estimator of a stream; the former name of a method is accepted with a warning."""
+    if hasattr(stream, "process_image"):
+        return StreamedEstimator(stream)
+    warn_deprecated(_FORMER_IMAGE_METHOD, "process_image")
+    return StreamedEstimator(_FormerStream(stream))
 
 
 @dataclass(frozen=True)
@@ -182,10 +216,10 @@ class StreamedEstimator:
         self.stream.start()
         answers: list[VelocityEstimate | None] = []
         for number, frame in enumerate(measurements.frames(), start=1):
-            answer = self.stream.picture(frame)
+            answer = self.stream.process_image(frame)
             answers.append(None if answer is None else _check_stream_answer(answer, tags[:number]))
         final = _check_stream_answer(self.stream.finish(), tags)
-        return replace(final, after_pictures=tuple(answers))
+        return replace(final, after_images=tuple(answers))
 
 
 def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
@@ -201,6 +235,6 @@ def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstim
 
 def _check_stream_answer(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
     """Validate one answer of a stream. Raises the same error as `check_velocity`."""
-    if isinstance(answer, VelocityEstimate) and answer.after_pictures:
-        raise bad_answer("after_pictures is given; it must be empty: the caller sets it")
+    if isinstance(answer, VelocityEstimate) and answer.after_images:
+        raise bad_answer("after_images is given; it must be empty: the caller sets it")
     return check_and_set_span(answer, tags_s)

@@ -19,7 +19,7 @@ from marsyard.sim.measurements import (
     RoverMeasurements,
     TargetDesignation,
 )
-from marsyard.sim.parameters import DeprecatedNameWarning
+from marsyard.sim.parameters import DeprecatedNameWarning, warn_deprecated
 
 
 class VelocityOutcome(Enum):
@@ -42,7 +42,7 @@ class VelocityEstimate:
       evaluation also tests whether the errors agree with this covariance.
     - span_s: Start and end of the averaging interval, within the time tags of the images. Equal values mean the
       velocity at that instant. None: the last interval, from the second to the third of three images.
-    - after_pictures: Answers of a stream (`VelocityStream`) after each image, None for no answer; set by the caller.
+    - after_images: Answers of a stream (`VelocityStream`) after each image, None for no answer; set by the caller.
       Empty for other estimators.
     """
 
@@ -51,7 +51,13 @@ class VelocityEstimate:
     details: object | None = None
     covariance_m2_s2: Float[np.ndarray, "2 2"] | None = None
     span_s: tuple[float, float] | None = None
-    after_pictures: tuple[VelocityEstimate | None, ...] = ()
+    after_images: tuple[VelocityEstimate | None, ...] = ()
+
+    @property
+    def after_pictures(self) -> tuple[VelocityEstimate | None, ...]:
+        """Former name of `after_images`, until 0.2."""
+        warn_deprecated("after_pictures", "after_images")
+        return self.after_images
 
 
 class VelocityEstimator(Protocol):
@@ -71,7 +77,7 @@ class VelocityStream(Protocol):
     def start(self) -> None:
         """Reset the state for a new descent."""
 
-    def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
+    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
         """Process the next image; return an estimate, or None. Like `VelocityEstimator.estimate`, never raises."""
 
     def finish(self) -> VelocityEstimate:

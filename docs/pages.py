@@ -29,7 +29,7 @@ def write_pages() -> None:
     FOLDER.mkdir(exist_ok=True)
     (FOLDER / "cli.md").write_text(format_commands())
     (FOLDER / "catalogue.md").write_text(format_catalogue())
-    (FOLDER / "real-pictures.md").write_text(format_ingest_keys())
+    (FOLDER / "real-images.md").write_text(format_ingest_keys())
     for name in scenario_names():
         (FOLDER / f"parameters-{name}.md").write_text(format_parameters(name))
 
@@ -83,7 +83,7 @@ def format_ingest_keys() -> str:
         [
             "# Keys and columns of real images",
             "",
-            "Keys and columns that `marsyard ingest` reads in a folder; see [real images](../../real-pictures.md).",
+            "Keys and columns that `marsyard ingest` reads in a folder; see [real images](../../real-images.md).",
             "",
             "## `ingest.toml`",
             "",
@@ -91,7 +91,7 @@ def format_ingest_keys() -> str:
             "|---|---|---|---|",
             *keys,
             "",
-            "## `pictures.csv`",
+            "## `images.csv`",
             "",
             "| column | tasks | required | description |",
             "|---|---|---|---|",

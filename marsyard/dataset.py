@@ -112,7 +112,15 @@ def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -
     draws = campaign.draws(case)
     for number, sample in enumerate(scenario.samples(campaign.parameters(case), campaign.streams(case))):
         key = f"{case:07d}-{number}"
-        metadata = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": draws}
+        metadata = {
+            "campaign": campaign.configuration.name,
+            "case": case,
+            "image_index": number,
+            "dispersed_parameters": draws,
+            # former names of the two fields, until 0.2
+            "picture": number,
+            "drawn": draws,
+        }
         image = sample.image if bits_per_pixel is None else compress(sample.image, bits_per_pixel, 2**sample.bits - 1)
         # scale the counts to the full range of 16 bits
         yield f"{key}.image.png", _encode(image * np.uint16(2 ** (16 - sample.bits)))

@@ -10,7 +10,11 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.campaigns.definition.configuration import find_renamed_columns, update_stored_configuration
+from marsyard.campaigns.definition.configuration import (
+    find_renamed_columns,
+    update_stored_configuration,
+    update_stored_rows,
+)
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
 from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
@@ -127,9 +131,9 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
     stored_names = file.schema_arrow.names
     new_names = find_renamed_columns(stored_names, str(table(record.get("configuration")).get("scenario")))
     if file.metadata.num_rows <= MAX_FULL_CASES:
-        frame = _sort_columns(pd.read_parquet(path).rename(columns=new_names))
+        frame = _sort_columns(update_stored_rows(pd.read_parquet(path), new_names))
         return frame, frame
-    first_rows = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas().rename(columns=new_names)
+    first_rows = update_stored_rows(next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas(), new_names)
     requirement_list, names = record.get("requirements"), [new_names.get(name, name) for name in stored_names]
     requirements = (
         [requirement for requirement in requirement_list if isinstance(requirement, Mapping)]
@@ -145,7 +149,7 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
     if metric is not None:
         columns.update([metric, *axis_columns(metric, names), *driver_columns(first_rows, metric, max_columns=3)])
     all_cases = pd.read_parquet(path, columns=[name for name in stored_names if new_names.get(name, name) in columns])
-    return _sort_columns(first_rows), _sort_columns(all_cases.rename(columns=new_names))
+    return _sort_columns(first_rows), _sort_columns(update_stored_rows(all_cases, new_names))
 
 
 def _sort_columns(frame: pd.DataFrame) -> pd.DataFrame:

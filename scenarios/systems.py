@@ -34,7 +34,7 @@ class Ingested:
 
     campaign: str
     cases: int
-    pictures: int
+    images: int
     note: str = ""
 
 

@@ -69,20 +69,20 @@ def _answers_after_images(
         no_answer
         if answer is None or answer.velocity_m_s is None or answer.span_s is None
         else (answer.span_s, answer.velocity_m_s, truth(answer.span_s))
-        for answer in (estimate.after_pictures if estimate is not None else ())
+        for answer in (estimate.after_images if estimate is not None else ())
     ]
 
 
 def stream_row(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, Scalar]:
     """Return the error columns of a stream after each image, NaN without a velocity; empty for other estimators.
 
-    `pictures_before_answer` is the number of images before the first velocity, 0 if there is none.
+    `images_before_answer` is the number of images before the first velocity, 0 if there is none.
     """
     errors = [float(np.hypot(*(velocity - true))) for _, velocity, true in _answers_after_images(estimate, truth)]
     if not errors:
         return {}
     first = next((number for number, error in enumerate(errors, start=1) if not np.isnan(error)), 0)
-    row: dict[str, Scalar] = {"stream_pictures": len(errors), "pictures_before_answer": first}
+    row: dict[str, Scalar] = {"stream_images": len(errors), "images_before_answer": first}
     return row | {f"velocity_error_after_{number}_m_s": error for number, error in enumerate(errors, start=1)}
 
 

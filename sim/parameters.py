@@ -63,6 +63,12 @@ def _match_names(section: str, name: str) -> Iterator[str]:
             yield current.replace("*", match[1]) if match.groups() else current
 
 
+def current_fault(name: str) -> str:
+    """Return the current name of a fault that a stored row contains; faults are keys of parameters."""
+    names = _read_section("keys").get(name, name)
+    return names if isinstance(names, str) else names[0]
+
+
 def current_options(arguments: Sequence[str]) -> list[str]:
     """Replace deprecated names of options in the arguments of a command line."""
     return [warn_deprecated(argument, _read_names("options").get(argument, argument)) for argument in arguments]

@@ -133,7 +133,7 @@ check_rendering() {
             say "pyrender renders nothing with $backend; 'marsyard doctor' says more"
         fi
     done
-    [ -n "$works" ] || fail "no GL backend renders a picture: $either"
+    [ -n "$works" ] || fail "no GL backend renders an image: $either"
 }
 
 # Otherwise the first run of each system waits for it.

@@ -61,9 +61,10 @@ class ExecutableVelocityStream:
         if self._session.send_request("start", {}, self._read_answer) is not None:
             raise bad_answer("the answer to 'start' has an outcome; before the first image it must be null")
 
-    def picture(self, frame: DescentFrame) -> interface.VelocityEstimate | None:
+    def process_image(self, frame: DescentFrame) -> interface.VelocityEstimate | None:
         """Send the next image and return the program's estimate, or None."""
         files = {"frame": lambda folder: write_frame(folder, frame)}
+        # the exchange format defines the name of the request; a change would break existing programs
         return self._session.send_request("picture", {}, self._read_answer, files)
 
     def finish(self) -> interface.VelocityEstimate:

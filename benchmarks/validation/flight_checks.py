@@ -13,7 +13,7 @@ import numpy as np
 import marsyard
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes.details import TRACK_COLUMNS
-from marsyard.cli.pictures import ImageRequest, render_images
+from marsyard.cli.images import ImageRequest, render_images
 from marsyard.sim.image_statistics import ImageStatistics, compute_image_statistics
 
 #: Altitudes of two of Spirit's descent images, metres.

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial, reduce
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
@@ -20,7 +20,17 @@ from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Gri
 from marsyard.scenarios.interface import Scenario
 from marsyard.scenarios.systems import UnknownScenarioError, row_columns, scenario
 from marsyard.sim.files import check_regular
-from marsyard.sim.parameters import DeprecatedNameWarning, Parameters, current_column, current_key, field_names
+from marsyard.sim.parameters import (
+    DeprecatedNameWarning,
+    Parameters,
+    current_column,
+    current_fault,
+    current_key,
+    field_names,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Model = TypeVar("Model", bound=BaseModel)
 #: Location of a key in nested tables and lists: names and indices.
@@ -403,6 +413,12 @@ def find_renamed_columns(names: Iterable[str], scenario_name: str) -> dict[str, 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecatedNameWarning)
         return {name: current for name in names if (current := rename_column(name)) != name}
+
+
+def update_stored_rows(frame: pd.DataFrame, new_names: Mapping[str, str]) -> pd.DataFrame:
+    """Rename the columns of stored rows, and replace former names of faults."""
+    frame = frame.rename(columns=dict(new_names))
+    return frame.assign(fault=frame["fault"].map(current_fault, na_action="ignore")) if "fault" in frame else frame
 
 
 def _column_renamer(scenario_name: str) -> Callable[[str], str]:

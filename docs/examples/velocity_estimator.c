@@ -4,7 +4,7 @@
  *   marsyard run dimes-gusev --algorithm "exec:./velocity_estimator"            one process a case
  *   marsyard run dimes-gusev --algorithm "serve:./velocity_estimator --serve"   one process for many
  *
- * Templates of the second picture are searched for in the third around where the inertial velocity puts them, by
+ * Templates of the second image are searched for in the third around where the inertial velocity puts them, by
  * normalised correlation at whole pixels; each match gives a velocity over a level plane, and the median is reported.
  * It shows how to read a case and how to answer: it leaves out the radiometry, the lens' distortion and sub-pixel
  * places. The JSON is read by looking for its keys, which works because Marsyard writes each key of a table once.
@@ -18,7 +18,7 @@ enum { HALF_COLUMNS = 20, HALF_ROWS = 5, REACH_COLUMNS = 48, REACH_ROWS = 14, AC
 static const double LEAST_CORRELATION = 0.6;
 static const char *REFUSED = "\"outcome\": \"NO_VALID_TRACK\"";
 
-typedef struct { int columns, rows; unsigned short *counts; } Picture;
+typedef struct { int columns, rows; unsigned short *counts; } Image;
 typedef struct { double c[3], a[3], h[3], v[3]; } Camera; /* the linear part of CAHVOR */
 
 static void complain(const char *what, const char *where) { fprintf(stderr, "velocity_estimator: %s: %s\n", what, where); }
@@ -37,7 +37,7 @@ static char *contents(const char *path, long *size)
     return text;
 }
 
-static int read_picture(const char *folder, int number, Picture *picture)
+static int read_image(const char *folder, int number, Image *image)
 {
     char path[4096];
     long size;
@@ -45,20 +45,20 @@ static int read_picture(const char *folder, int number, Picture *picture)
     unsigned char *raw = (unsigned char *)contents(path, &size);
     int most, head = 0;
     if (!raw) return 0;
-    if (sscanf((char *)raw, "P5 %d %d %d%n", &picture->columns, &picture->rows, &most, &head) != 3 || most != 65535) {
+    if (sscanf((char *)raw, "P5 %d %d %d%n", &image->columns, &image->rows, &most, &head) != 3 || most != 65535) {
         complain("no PGM of 16 bits", path);
         free(raw);
         return 0;
     }
-    long count = (long)picture->columns * picture->rows;
+    long count = (long)image->columns * image->rows;
     head += 1; /* one white space ends the header */
-    if (size - head < 2 * count || !(picture->counts = malloc(2 * (size_t)count))) {
+    if (size - head < 2 * count || !(image->counts = malloc(2 * (size_t)count))) {
         complain("too short", path);
         free(raw);
         return 0;
     }
     for (long k = 0; k < count; k++) /* the more significant byte comes first */
-        picture->counts[k] = (unsigned short)(raw[head + 2 * k] << 8 | raw[head + 2 * k + 1]);
+        image->counts[k] = (unsigned short)(raw[head + 2 * k] << 8 | raw[head + 2 * k + 1]);
     free(raw);
     return 1;
 }
@@ -151,7 +151,7 @@ static int pixel(const Camera *camera, const double q[4], double altitude, const
 }
 
 /* Normalised correlation of two windows; -1 where one of them is featureless. */
-static double correlation(const Picture *a, int ac, int ar, const Picture *b, int bc, int br)
+static double correlation(const Image *a, int ac, int ar, const Image *b, int bc, int br)
 {
     double n = 0, sa = 0, sb = 0, saa = 0, sbb = 0, sab = 0;
     for (int y = -HALF_ROWS; y <= HALF_ROWS; y++)
@@ -163,9 +163,9 @@ static double correlation(const Picture *a, int ac, int ar, const Picture *b, in
     return da < n || db < n ? -1.0 : (sab - sa * sb / n) / sqrt(da * db); /* less than a count of contrast is none */
 }
 
-static int inside(const Picture *picture, int column, int row)
+static int inside(const Image *image, int column, int row)
 {
-    return column >= HALF_COLUMNS && row >= HALF_ROWS && column < picture->columns - HALF_COLUMNS && row < picture->rows - HALF_ROWS;
+    return column >= HALF_COLUMNS && row >= HALF_ROWS && column < image->columns - HALF_COLUMNS && row < image->rows - HALF_ROWS;
 }
 
 static int ascending(const void *a, const void *b) { double x = *(const double *)a, y = *(const double *)b; return (x > y) - (x < y); }
@@ -176,16 +176,16 @@ static void estimate(const char *folder, char *answer, size_t room)
 {
     char path[4096];
     long size;
-    Picture second = {0}, third = {0};
+    Image second = {0}, third = {0};
     Camera cameras[2];
     double q[2][4], altitudes[2], times[2], inertial[6], version[1];
     snprintf(path, sizeof path, "%s/case.json", folder);
     char *text = contents(path, &size);
     int fine = text && read_numbers(text, "exchange", 1, 1, version) && version[0] == 1.0;
-    for (int k = 0; fine && k < 2; k++) /* of the three pictures the second and the third */
+    for (int k = 0; fine && k < 2; k++) /* of the three images the second and the third */
         fine = read_numbers(text, "world_from_body_xyzw", k + 2, 4, q[k]) && read_numbers(text, "altitude_m", k + 2, 1, &altitudes[k]) &&
                read_numbers(strstr(text, "\"images\":"), "time_s", k + 2, 1, &times[k]) && read_camera(folder, k + 2, &cameras[k]);
-    fine = fine && read_numbers(text, "interval_velocities_m_s", 1, 6, inertial) && read_picture(folder, 2, &second) && read_picture(folder, 3, &third);
+    fine = fine && read_numbers(text, "interval_velocities_m_s", 1, 6, inertial) && read_image(folder, 2, &second) && read_image(folder, 3, &third);
     snprintf(answer, room, "%s", REFUSED);
     if (fine) {
         double east[MOST], north[MOST], dt = times[1] - times[0];

@@ -1,7 +1,7 @@
 """A velocity estimator that processes any number of images one by one; as a Python class and as a program.
 
     cd docs/examples
-    marsyard run dimes-gusev --set pictures=9 --set descent.interval_s=0.9375 \
+    marsyard run dimes-gusev --set images=9 --set descent.interval_s=0.9375 \
         --algorithm velocity_stream:ChainedShifts --algorithm dimes
     marsyard run dimes-gusev --algorithm "serve-stream:python velocity_stream.py" --algorithm dimes
 
@@ -51,7 +51,7 @@ class ChainedShifts:
         self.previous_frame: DescentFrame | None = None
         self.pairs: list[Pair] = []
 
-    def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
+    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
         """Compare an image with the previous one; return the estimate so far."""
         if self.previous_frame is not None:
             pair = compare_frames(self.previous_frame, frame)
@@ -170,7 +170,7 @@ def main() -> None:
         if request["do"] == "start":
             answer = stream.start()
         elif request["do"] == "picture":
-            answer = stream.picture(read_frame(Path(request["frame"])))
+            answer = stream.process_image(read_frame(Path(request["frame"])))
         else:
             answer = stream.finish()
         print(json.dumps({"exchange": 2, "id": request["id"], **format_answer(answer)}), flush=True)

@@ -169,9 +169,7 @@ def _find_number_problem(limit: float, answer: str) -> str:
 def ingest(
     folder: Annotated[
         Path,
-        Argument(
-            metavar="FOLDER", help="Folder with ingest.toml, pictures.csv and the images (docs/real-pictures.md)."
-        ),
+        Argument(metavar="FOLDER", help="Folder with ingest.toml, images.csv and the images (docs/real-images.md)."),
     ],
     out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
     system: Annotated[
@@ -212,7 +210,7 @@ def ingest(
     except CampaignError:  # remove a campaign that cannot be run
         shutil.rmtree(out)
         raise
-    typer.echo(f"{count(ingested.cases, 'case')} of {count(ingested.pictures, 'image')}: {out}")
+    typer.echo(f"{count(ingested.cases, 'case')} of {count(ingested.images, 'image')}: {out}")
     if ingested.note:
         typer.echo(ingested.note)
     typer.echo(f"to run the cases: marsyard run {out / CAMPAIGN_FILE}")

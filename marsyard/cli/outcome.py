@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import find_renamed_columns
+from marsyard.campaigns.definition.configuration import find_renamed_columns, update_stored_rows
 from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
@@ -125,7 +125,8 @@ def read_frame(directory: Path) -> pd.DataFrame:
         raise StoreError(f"{directory} has no {TABLE_FILE}: the campaign is not finished")
     try:
         frame = pd.read_parquet(path)
-        return frame.rename(columns=find_renamed_columns(frame.columns, stored_configuration(directory).scenario))
+        new_names = find_renamed_columns(frame.columns, stored_configuration(directory).scenario)
+        return update_stored_rows(frame, new_names)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path} is not a valid table of cases: {error}") from error
 

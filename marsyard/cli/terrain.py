@@ -65,7 +65,7 @@ def stats(
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,
     max_holes: MaxHolesOption = None,
-    picture: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir image; filled holes are red.")] = None,
+    image: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir image; filled holes are red.")] = None,
 ) -> None:
     """Print albedo, slopes, relief and image contrast of a site's terrain, and those in the DIMES field test paper."""
     import numpy as np
@@ -83,8 +83,8 @@ def stats(
         dtm = None if source is None else embed(source, parameters.samples, parameters.spacing_m)
         grid_north = None if source is None else grid_north_deg(source.dtm)
         surface = synthesise(parameters, np.random.default_rng(seed))
-        if picture is not None:
-            write_terrain_image(picture, surface, dtm)
+        if image is not None:
+            write_terrain_image(image, surface, dtm)
     except ValueError as error:
         exit_with_error(error)
     statistics = terrain_statistics(surface, None if dtm is None else dtm.real_samples(parameters.samples))
@@ -175,16 +175,16 @@ def write_terrain_image(path: Path, surface: Surface, dtm: EmbeddedDtm | None) -
     import cv2
     import numpy as np
 
-    from marsyard.sim.terrain.surface import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
+    from marsyard.sim.terrain.surface import CONTRAST_SUN_ELEVATION_DEG, render_nadir_image
 
     if path.suffix.lower() != ".png":
-        raise ValueError(f"--picture {path}: the file name must end in .png")
+        raise ValueError(f"--image {path}: the file name must end in .png")
     if path.exists():
-        raise ValueError(f"--picture {path}: exists; choose another name")
+        raise ValueError(f"--image {path}: exists; choose another name")
     side = len(surface.levels[0])
     level = max(int(np.ceil(np.log2(side / MAX_PIXELS))), 0)
     # light from the north-west, as usual for shaded relief
-    shaded = nadir_picture(surface, level, np.radians(315.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
+    shaded = render_nadir_image(surface, level, np.radians(315.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
     # scale the brightness; the brightest 0.2 % of the pixels are saturated
     grey = np.clip(255.0 * shaded / np.percentile(shaded, 99.8), 0.0, 255.0).astype(np.uint8)
     image = np.repeat(grey[..., None], 3, axis=2)
@@ -198,9 +198,9 @@ def write_terrain_image(path: Path, surface: Surface, dtm: EmbeddedDtm | None) -
     try:
         is_written = cv2.imwrite(str(path), image[::-1])
     except cv2.error as error:
-        raise ValueError(f"--picture {path}: cannot be written ({error})") from error
+        raise ValueError(f"--image {path}: cannot be written ({error})") from error
     if not is_written:
-        raise ValueError(f"--picture {path}: cannot be written")
+        raise ValueError(f"--image {path}: cannot be written")
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ def render(arguments: RenderOptions) -> None:
 
     A stereo camera adds -left and -right to PREFIX.
     """
-    from marsyard.cli.pictures import ImageRequest, check_files, render_images, write_image
+    from marsyard.cli.images import ImageRequest, check_files, render_images, write_image
 
     with report_image_errors(arguments.out):
         settings = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}

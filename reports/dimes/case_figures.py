@@ -107,10 +107,10 @@ def draw_delivered_images(products: Mapping[str, Any]) -> Figure:
 
 
 def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Write `dimes.png` into a folder, or `pictures.png` if the algorithm has no DIMES details; returns the path."""
+    """Write `dimes.png` into a folder, or `images.png` if the algorithm has no DIMES details; returns the path."""
     if "tracks" in products:
         return save_figures(directory, {"dimes": draw_dimes_case(products)})
-    return save_figures(directory, {"pictures": draw_delivered_images(products)})
+    return save_figures(directory, {"images": draw_delivered_images(products)})
 
 
 def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:

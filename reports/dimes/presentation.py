@@ -25,7 +25,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     """Create the view of a DIMES case, without templates and tracks if the algorithm provides no DIMES details."""
     if "tracks" not in products:
         images = figures.draw_delivered_images(products)
-        figure = svg_figure(images, f"{key}pictures", "The three images that the algorithm received.", wide=True)
+        figure = svg_figure(images, f"{key}images", "The three images that the algorithm received.", wide=True)
         return CaseView(_format_velocities(products), [figure], [], [], note_text("dimes.plain_legend"))
     pairs = enumerate(("first and second image", "second and third image"))
     svg_figures = []

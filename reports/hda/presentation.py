@@ -37,7 +37,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     image_pair = stages.read_images(products)
     if not names and image_pair is not None:
         caption = "The two images that the algorithm received."
-        figure = svg_figure(draw_images(image_pair), f"{key}pictures", caption, wide=True)
+        figure = svg_figure(draw_images(image_pair), f"{key}images", caption, wide=True)
         return CaseView([], [figure], *_stage_rows(products), note_text("hda.plain_legend"))
     named_figures = [(name, FIGURES[name](products)) for name in names]
     svg_figures = [svg_figure(figure, f"{key}{name[:4]}", _CAPTIONS[name], wide=True) for name, figure in named_figures]

@@ -137,7 +137,7 @@ class EstimatorSuite(Suite):
         estimator = self.make()
         estimator.stream.start()
         for frame in copy_inputs(inputs.make_noisy(measurements)).frames()[:2]:
-            estimator.stream.picture(frame)
+            estimator.stream.process_image(frame)
         if fingerprint(estimator.estimate(copy_inputs(measurements))) != expected_fingerprint:
             raise BreachError("after a restart in the middle of a descent, its answer differs")
         return ""

@@ -74,7 +74,7 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
         inputs = MotionInputs(
             ground_height=lambda east, north: float(surface.height(site_m[0] + east, site_m[1] + north) - site_m[2]),
             gravity_m_s2=gravity_m_s2(p),
-            pictures_s=tuple(times),
+            image_times_s=tuple(times),
             from_s=-p.flight.lead_s,
             until_s=max(times) + END_MARGIN_S,
             firing_height_m=p.descent.thruster_firing_m,
@@ -83,7 +83,7 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
         check_looks_down(p.flight.motion, motion, times)
     else:
         motion = p.flight.motion(site_m, gravity_m_s2(p))
-        row = {"flight_file": p.flight.file, "flight_first_picture_s": p.flight.start_s}
+        row = {"flight_file": p.flight.file, "flight_first_image_s": p.flight.start_s}
     positions = motion.motion(np.array(times)).positions_m
     heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
     invalid_indices = np.flatnonzero(heights <= 0.0)
@@ -115,7 +115,7 @@ def states_at_images(p: DescentScenarioParameters, flight: DescentFlight) -> lis
     late_numbers = [number for number, time in enumerate(times, start=1) if time > flight.firing_s]
     if late_numbers:
         raise ValueError(
-            f"image {late_numbers[0]} of {p.pictures} would be taken at {times[late_numbers[0] - 1]:.2f} s, after the "
+            f"image {late_numbers[0]} of {p.images} would be taken at {times[late_numbers[0] - 1]:.2f} s, after the "
             f"thrusters' firing at {flight.firing_s:.2f} s; allowed: fewer images, or a smaller descent.interval_s"
         )
     return [flight.motion.state(time) for time in times]

@@ -60,8 +60,8 @@ class Faults(SizedFaults):
     exposure_delay_s: Annotated[
         NonNegative, Field(le=3.0, description="delay of the second exposure after its time tag")
     ] = 0.0
-    repeated_picture: Annotated[int, bounded_field(0, 3, "image replaced by the previous one, 2 or 3; 0: none")] = 0
-    black_picture: Annotated[int, bounded_field(0, 3, "image that is delivered black, 1 to 3; 0: none")] = 0
+    repeated_image: Annotated[int, bounded_field(0, 3, "image replaced by the previous one, 2 or 3; 0: none")] = 0
+    black_image: Annotated[int, bounded_field(0, 3, "image that is delivered black, 1 to 3; 0: none")] = 0
     shield_range_m: Annotated[
         NonNegative, Field(le=2000.0, description="radar locked on the heat shield at this range in image 1; 0: none")
     ] = 0.0
@@ -249,7 +249,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     sun: SunParameters = SunParameters()
     dust_opacity: DustOpacity = None
     descent: SwingParameters = SwingParameters()
-    pictures: Annotated[int, bounded_field(2, 100, "number of images; only stream estimators use more than three")] = (
+    images: Annotated[int, bounded_field(2, 100, "number of images; only stream estimators use more than three")] = (
         TRIPLE_SIZE
     )
     #: Default: the last image and two earlier ones, at the longest possible equal intervals.
@@ -306,17 +306,17 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         if rows % self.detector.rows_summed:
             raise ValueError(f"detector.rows_summed {self.detector.rows_summed} does not divide the {rows} camera rows")
         check_binning(self.dimes.binned_size, (columns, rows // self.detector.rows_summed))
-        if self.triple is not None and not 1 <= self.triple[0] < self.triple[1] < self.triple[2] <= self.pictures:
-            raise ValueError(f"triple is {list(self.triple)}; allowed: three in ascending order, 1 to {self.pictures}")
-        if self.pictures < TRIPLE_SIZE:
+        if self.triple is not None and not 1 <= self.triple[0] < self.triple[1] < self.triple[2] <= self.images:
+            raise ValueError(f"triple is {list(self.triple)}; allowed: three in ascending order, 1 to {self.images}")
+        if self.images < TRIPLE_SIZE:
             specs = [spec for spec in self.algorithms if VELOCITY.accepts_stream(spec) is False]
             if specs:
                 raise ValueError(
-                    f"pictures is {self.pictures}, but '{specs[0]}' needs {TRIPLE_SIZE}; allowed: {TRIPLE_SIZE} to 100"
+                    f"images is {self.images}, but '{specs[0]}' needs {TRIPLE_SIZE}; allowed: {TRIPLE_SIZE} to 100"
                 )
-        faulty_image = max(self.faults.repeated_picture, self.faults.black_picture)
-        if faulty_image > self.pictures:
-            raise ValueError(f"a fault affects image {faulty_image}, but the descent has only {self.pictures} images")
+        faulty_image = max(self.faults.repeated_image, self.faults.black_image)
+        if faulty_image > self.images:
+            raise ValueError(f"a fault affects image {faulty_image}, but the descent has only {self.images} images")
         if isinstance(self.flight, FlightFile):
             self.flight.check(add_time_fault(self.faults, self.image_times_s))
         return self
@@ -324,16 +324,16 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     @property
     def image_times_s(self) -> list[float]:
         """Nominal image times relative to the first image."""
-        return [number * self.descent.interval_s for number in range(self.pictures)]
+        return [number * self.descent.interval_s for number in range(self.images)]
 
     @property
     def triple_indices(self) -> tuple[int, int, int] | None:
         """Indices of the images for estimators that process a triple; None if there are fewer than three images."""
         if self.triple is not None:
             return self.triple[0] - 1, self.triple[1] - 1, self.triple[2] - 1
-        if self.pictures < TRIPLE_SIZE:
+        if self.images < TRIPLE_SIZE:
             return None
-        last, spacing = self.pictures - 1, (self.pictures - 1) // 2
+        last, spacing = self.images - 1, (self.images - 1) // 2
         return last - 2 * spacing, last - spacing, last
 
     @property

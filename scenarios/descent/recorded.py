@@ -29,14 +29,14 @@ class FlightFile(UserFile, RecordedAxes):
     """A recorded flight: a CSV, Parquet, TUM or EuRoC file of poses, or SPICE kernels.
 
     Positions are those of the camera or, with `lever_m`, of the vehicle. The first image is taken at the file's time
-    `first_picture_s`, the next images at intervals of `descent.interval_s`. Instruments measure this motion like a
+    `first_image_s`, the next images at intervals of `descent.interval_s`. Instruments measure this motion like a
     simulated flight.
     """
 
     origin: Annotated[
         FlightOrigin, Field(description="origin of positions: ground below the first image, or the terrain's origin")
     ] = FlightOrigin.LOCATION
-    first_picture_s: Annotated[
+    first_image_s: Annotated[
         float | None, Field(description="file's time of the first image; default: file's start + `lead_s`")
     ] = None
     lead_s: Annotated[float, bounded_field(0.2, 30.0, "navigation time before the first image")] = 5.0
@@ -52,8 +52,8 @@ class FlightFile(UserFile, RecordedAxes):
     @property
     def start_s(self) -> float:
         """File's time of the first image."""
-        if self.first_picture_s is not None:
-            return self.first_picture_s
+        if self.first_image_s is not None:
+            return self.first_image_s
         return float(read_poses(self.file).times_s[0]) + self.lead_s
 
     def check(self, image_times_s: Sequence[float]) -> None:

@@ -155,7 +155,7 @@ class Descent:
         optics = camera_optics(p.camera)
         detector = draw_detector(p, optics, streams)
         exposures = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
-        images = corrupt_images(exposures, p.faults.repeated_picture, p.faults.black_picture)
+        images = corrupt_images(exposures, p.faults.repeated_image, p.faults.black_image)
         instruments = Instruments.draw(p, world, flight, streams)
         if p.exact_instruments:
             measurements = measure_exactly(p, world, states, images, detector)

@@ -74,7 +74,7 @@ class TargetParameters(Parameters):
     placed: Annotated[int, Field(ge=3, le=1000, description="targets on the ground")] = 11
     used: Annotated[int, Field(ge=3, le=1000, description="targets used for attitude")] = 9
     within_m: Annotated[Positive, Field(description="half the side length of the targets' square, m (assumed)")] = 90.0
-    pictures: Annotated[int, Field(ge=1, le=1000, description="images of a pass over the targets")] = 20
+    images: Annotated[int, Field(ge=1, le=1000, description="images of a pass over the targets")] = 20
     side_m: Annotated[Positive, Field(description="side length of a target, m")] = 1.0
     albedo: Annotated[Positive, Field(le=1.0, description="albedo of the white targets (assumed)")] = 0.8
     sightings: Annotated[
@@ -105,7 +105,7 @@ class ElevationParameters(Parameters):
     interpolation_m: Annotated[NonNegative, Field(description="standard deviation of the interpolation error, m")] = 1.0
 
 
-class PictureParameters(Parameters):
+class ImageParameters(Parameters):
     """Times of the images: the paper takes 20 images in less than 2 min (III.D.2)."""
 
     interval_s: Annotated[Positive, Field(le=60.0, description="time between images, s (assumed)")] = 2.0
@@ -144,7 +144,7 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
     gps: GpsParameters = POST_PROCESSED
     targets: TargetParameters = TargetParameters()
     elevation: ElevationParameters = ElevationParameters()
-    pictures: PictureParameters = PictureParameters()
+    images: ImageParameters = ImageParameters()
     triples: TripleParameters = TripleParameters()
     calibration: Annotated[
         CalibrationParameters, Field(description="camera calibration errors, the same in all cases")

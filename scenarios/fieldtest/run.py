@@ -180,14 +180,15 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     if run.clouds is not None:
         clouds = CloudLayer.draw(run.clouds, generator("clouds"), ground_m=float(flight.origin_m[2]))
     unprocessed_run = UnprocessedRun(key, clouds, flight)
-    interval = p.pictures.interval_s
+    interval = p.images.interval_s
     pass_times = [np.arange(leg.start_s + 0.5 * interval, leg.end_s, interval) for leg in flight.passes]
     times = np.concatenate(pass_times)
     pass_indices = np.repeat(np.arange(len(pass_times)), [times.size for times in pass_times])
-    clock = Clock.draw(p.pictures.clock, generator("camera clock"))
+    clock = Clock.draw(p.images.clock, generator("camera clock"))
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
     position = gps.measure(flight, times, generator("gps noise")).values
     solution = _estimate_attitudes(unprocessed_run, ground, clock, gps)
+    # the random stream keeps its former name, so that the random values do not change
     attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
     elevation_model = simulate_elevation_model(p.elevation, surface, horizontal, generator("elevation model"))
@@ -218,7 +219,7 @@ def _estimate_attitudes(run: UnprocessedRun, ground: SiteGround, clock: Clock, g
     targets = Targets.draw(p.targets, ground.surface, flight.origin_m[:2], generator("targets"))
     camera, noise, sightings = run.key.calibrated_camera(), generator("sightings"), []
     for start, end in flight.fly_overs_s:
-        times = np.linspace(start, end, p.targets.pictures + 2)[1:-1]
+        times = np.linspace(start, end, p.targets.images + 2)[1:-1]
         tags = clock.tags(times, noise)
         fixes = gps.measure(flight, times, noise).values
         if p.targets.sightings == "rendered":

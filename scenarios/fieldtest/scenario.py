@@ -199,7 +199,7 @@ def _conditions(
     samples = zip(case.states, measurements.attitudes, measurements.altitudes, true_altitudes, strict=True)
     for number, (state, attitude, altitude, true_altitude) in enumerate(samples, start=1):
         errors.append((attitude.world_from_body * state.attitude.inv()).as_rotvec())
-        row[f"picture_time_{number}_s"] = state.time_s
+        row[f"image_time_{number}_s"] = state.time_s
         row[f"pass_{number}"] = int(run.images.pass_number[indices[number - 1]])
         row[f"altitude_{number}_m"] = float(true_altitude)
         row[f"altitude_error_{number}_m"] = altitude.altitude_m - float(true_altitude)

@@ -56,7 +56,7 @@ class HelicopterParameters(Parameters):
     rtk: RtkParameters = RtkParameters()
     compass: TiltCompassParameters = TiltCompassParameters()
     navigation: FilterParameters = FilterParameters()
-    picture_clock: ClockParameters = Field(
+    image_clock: ClockParameters = Field(
         default=ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005), description="errors of the time tags (assumed)"
     )
     averaging_after_s: float = Field(
@@ -69,7 +69,9 @@ class HelicopterParameters(Parameters):
     @property
     def span_s(self) -> tuple[float, float]:
         """Time span from the flight's start to its latest possible end, with 1 s of margin."""
-        end = self.transit.pictures_s + self.guidance.wait_s + self.guidance.max_duration_s + self.guidance.rest_s
+        end = (
+            self.transit.imaging_duration_s + self.guidance.wait_s + self.guidance.max_duration_s + self.guidance.rest_s
+        )
         return -self.transit.lead_s, end + 1.0
 
     @property
@@ -179,9 +181,10 @@ class Transit:
         )
         instruments = Instruments.draw(p, gravity_m_s2, streams)
         navigation_leg = NavigatedLeg.simulate(flight.path, *flight.path.span_s, instruments, streams, "transit")
-        times = np.linspace(0.0, p.transit.pictures_s, p.transit.pictures)
+        times = np.linspace(0.0, p.transit.imaging_duration_s, p.transit.images)
+        # the random stream keeps its former name, so that the random values do not change
         clock_stream = streams.generator("picture clock")
-        tags = Clock.draw(p.picture_clock, clock_stream).tags(times, clock_stream)
+        tags = Clock.draw(p.image_clock, clock_stream).tags(times, clock_stream)
         return cls(p, instruments, air, flight, navigation_leg, times, tags)
 
     def state(self, number: int) -> State:

@@ -101,10 +101,11 @@ def take_images(p: LandingScenarioParameters, world: World, flight: Flight, opti
     frames_and_motions = [render_state(p.render.backend, scene, optics, state) for state in flight.states]
     frames, motions = zip(*frames_and_motions, strict=True)
     radiances = [frame.radiance * np.float32(world.brightness) for frame in frames]
+    # the random stream keeps its former name, so that the random values do not change
     detector = auto_expose(detector, radiances[0], p.exposure, streams.generator("test pictures")).detector
     counts = [detector.expose(radiance, noise, motion) for radiance, motion in zip(radiances, motions, strict=True)]
-    # the fault `repeated_picture` = 1 replaces image 2
-    delivered_images = corrupt_images(counts, 2 * p.faults.repeated_picture, p.faults.black_picture, p.faults.lost_rows)
+    # the fault `repeated_image` = 1 replaces image 2
+    delivered_images = corrupt_images(counts, 2 * p.faults.repeated_image, p.faults.black_image, p.faults.lost_rows)
     camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
     first, second = (
         DetectorImage(image, state.time_s, camera, detector.calibration)

@@ -38,10 +38,10 @@ from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 class Faults(SizedFaults):
     """Faults of a landing case; lost images and receiver outages need a helicopter flight."""
 
-    black_picture: Annotated[int, bounded_field(0, 2, "number of the black image, 1 or 2; 0: none")] = 0
-    repeated_picture: Annotated[int, bounded_field(0, 1, "1: the second image is a copy of the first")] = 0
+    black_image: Annotated[int, bounded_field(0, 2, "number of the black image, 1 or 2; 0: none")] = 0
+    repeated_image: Annotated[int, bounded_field(0, 1, "1: the second image is a copy of the first")] = 0
     lost_rows: Annotated[float, bounded_field(0.0, 1.0, "fraction of lowest rows lost in image 2")] = 0.0
-    lost_pictures: Annotated[float, bounded_field(0.0, 1.0, "fraction of images lost; two always arrive")] = 0.0
+    lost_images: Annotated[float, bounded_field(0.0, 1.0, "fraction of images lost; two always arrive")] = 0.0
     laser_silent: Annotated[int, bounded_field(0, 1, "1: the altimeter returns no range, also in the landing")] = 0
     laser_stuck: Annotated[float, bounded_field(0.0, 5.0, "relative excess of the stuck range; 0: no fault")] = 0.0
     gps_outage_s: Annotated[
@@ -87,7 +87,7 @@ def add_receiver_outage(faults: Faults, helicopter: HelicopterParameters) -> Hel
 
 def draw_received_images(faults: Faults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
     """Draw the images of a flight that arrive, at least two; return their sorted indices."""
-    received_count = max(2, count - round(faults.lost_pictures * count))
+    received_count = max(2, count - round(faults.lost_images * count))
     return np.sort(rng.permutation(count)[:received_count]).astype(np.int64)
 
 
@@ -248,7 +248,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
             raise ValueError(f"detector.rows_summed {self.detector.rows_summed} does not divide the {rows} camera rows")
         if self.terrain_site != self.site:
             raise ValueError(f"site is {self.site}, but terrain is of {self.terrain_site}; `site` cannot be dispersed")
-        for name in ("lost_pictures", "gps_outage_s"):
+        for name in ("lost_images", "gps_outage_s"):
             if getattr(self.faults, name) and self.helicopter is None:
                 raise ValueError(f"faults.{name} needs a helicopter flight; add the table helicopter")
         return self

@@ -281,7 +281,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         **{f"{axis}_deg": float(angle) for axis, angle in zip(("pitch", "yaw", "roll"), rotation_deg, strict=True)},
         "off_nadir_deg": float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0)))),
         "exposure_s": pair.images[0].calibration.exposure_s,
-        "picture_median_dn": float(np.median(pair.counts[0])),
+        "image_median_dn": float(np.median(pair.counts[0])),
         "range_m": pair.axis_range_m,
         "range_error_m": measurements.slant_range_m - pair.axis_range_m,
         **_navigation_errors(case.flight, measurements),

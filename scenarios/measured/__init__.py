@@ -1,4 +1,4 @@
-"""Real images with measured attitudes and altitudes, ingested from a user's folder (docs/real-pictures.md).
+"""Real images with measured attitudes and altitudes, ingested from a user's folder (docs/real-images.md).
 
 `layout` reads the folder, `ingest` converts it to cases, `store` reads and writes cases, and `scenarios` compares
 algorithms and images with the measured poses.

@@ -18,12 +18,12 @@ from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.layout import (
     INGEST_FILE,
     LANDING,
-    TABLE_FILE,
     VELOCITY,
     ImageRow,
     IngestError,
     IngestFile,
     SunTable,
+    find_table,
     read_counts,
     read_flat_field,
     read_header,
@@ -51,7 +51,7 @@ _DESCRIPTIONS = {
 def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
     """Write the cases of a folder, and return their campaign.
 
-    - source: folder with `ingest.toml`, `pictures.csv` and images (docs/real-pictures.md)
+    - source: folder with `ingest.toml`, `images.csv` and images (docs/real-images.md)
     - target: folder for the new cases
     - final: folder to which `target` is moved afterwards
 
@@ -67,7 +67,7 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
         )
     if stored_cases.task == VELOCITY:
         # DIMES bins delivered images, whose rows are already summed; without square bins, a bin is one pixel
-        columns, rows = stored_cases.cases[0].pictures[0].size
+        columns, rows = stored_cases.cases[0].images[0].size
         binned_size = binned_size_for(columns, rows * rows_summed)
         binned_size = binned_size if rows % binned_size[1] == 0 else (columns, rows)
     template = toml_environment(Path(__file__).parent).get_template("campaign.toml.j2")
@@ -80,7 +80,7 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
         numbers=list(range(len(stored_cases.cases))),
         velocity_is_known=any(case.truth.velocity_m_s is not None for case in stored_cases.cases),
     )
-    return Ingested(text, len(stored_cases.cases), sum(len(case.pictures) for case in stored_cases.cases), note)
+    return Ingested(text, len(stored_cases.cases), sum(len(case.images) for case in stored_cases.cases), note)
 
 
 def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
@@ -89,7 +89,7 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
     Raises IngestError if the folder is invalid: the message contains the file, and the line or key. Raises OSError if
     the cases cannot be written.
     """
-    file, table = read_ingest_file(source), source / TABLE_FILE
+    file, table = read_ingest_file(source), find_table(source)
     reader = _FolderReader(source, file, target)
     cases: list[store.StoredCase] = []
     problems: list[str] = []
@@ -177,7 +177,7 @@ class _FolderReader:
             measurements["site_m"] = self._apriori_site(images[0], measurements["slant_range_m"])
         elif len({image.position_m is None for image in images}) > 1:
             raise rows[0].error(f"case '{name}': some images have a position and some have none")
-        return store.StoredCase(name=name, pictures=tuple(stored_images), truth=truth, **measurements)
+        return store.StoredCase(name=name, images=tuple(stored_images), truth=truth, **measurements)
 
     def _read_image(self, row: ImageRow) -> _RecordedImage:
         """Read a row's image and its camera in the body frame; a PDS3 label supplies missing values of the row."""
@@ -261,7 +261,7 @@ class _FolderReader:
         return store.StoredImage(
             source=row.texts["file"],
             size=camera.size,
-            counts=store.write_file(self.target, "pictures", f"{name}.png", lambda path: write_counts(path, counts)),
+            counts=store.write_file(self.target, "images", f"{name}.png", lambda path: write_counts(path, counts)),
             camera=self.cameras[camera],
             flat_field=flat_field,
             time_s=image.time_s,

@@ -1,4 +1,4 @@
-"""Read the inputs of `marsyard ingest` (docs/real-pictures.md): `ingest.toml`, `pictures.csv`, images, flat fields.
+"""Read the inputs of `marsyard ingest` (docs/real-images.md): `ingest.toml`, `images.csv`, images, flat fields.
 
 Images are PNG, PGM and TIFF of one band with 8 or 16 bits.
 """
@@ -23,10 +23,12 @@ from scipy.spatial.transform import Rotation
 from marsyard.scenarios.user_files import RecordedAxes, check_column_groups, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular, open_regular, read_npy_header
 from marsyard.sim.frames import direction
-from marsyard.sim.parameters import Parameters, bounded_field
+from marsyard.sim.parameters import Parameters, bounded_field, warn_deprecated
 
 #: Names of the settings file and of the table of images in every folder.
-INGEST_FILE, TABLE_FILE = "ingest.toml", "pictures.csv"
+INGEST_FILE, TABLE_FILE = "ingest.toml", "images.csv"
+#: Former name of the table of images, accepted until 0.2.
+_FORMER_TABLE_FILE = "pictures.csv"
 
 VELOCITY, LANDING, MATCHING = "velocity", "landing", "matching"
 TaskName = Literal["velocity", "landing", "matching"]
@@ -124,7 +126,7 @@ def read_ingest_file(folder: Path) -> IngestFile:
     try:
         file = IngestFile.model_validate(values)
     except ValidationError as error:
-        messages = {"missing": "required, but missing", "extra_forbidden": "unknown key; see docs/real-pictures.md"}
+        messages = {"missing": "required, but missing", "extra_forbidden": "unknown key; see docs/real-images.md"}
         problems = []
         for detail in error.errors(include_url=False):
             message = f"{detail['msg'].removeprefix('Value error, ')}, got {detail['input']!r}"
@@ -138,7 +140,7 @@ def read_ingest_file(folder: Path) -> IngestFile:
 
 
 class Column(NamedTuple):
-    """A column of `pictures.csv`; `pictures.toml` describes all columns."""
+    """A column of `images.csv`; `images.toml` describes all columns."""
 
     name: str
     tasks: tuple[str, ...]
@@ -149,7 +151,7 @@ class Column(NamedTuple):
 #: All columns, in the order of the documentation.
 COLUMNS = tuple(
     Column(name, tuple(group["tasks"]), group["required"], group["description"])
-    for group in tomllib.loads(Path(__file__).with_name("pictures.toml").read_text(encoding="utf-8"))["columns"]
+    for group in tomllib.loads(Path(__file__).with_name("images.toml").read_text(encoding="utf-8"))["columns"]
     for name in group["names"].split()
 )
 _TEXT_COLUMNS = ("case", "file", "camera", "flat_field")
@@ -184,7 +186,7 @@ _ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 p
 
 @dataclass(frozen=True)
 class ImageRow:
-    """One row of `pictures.csv`: its line, and its filled cells by column."""
+    """One row of `images.csv`: its line, and its filled cells by column."""
 
     line: int
     texts: Mapping[str, str]
@@ -204,8 +206,17 @@ class ImageRow:
         return None if quaternion is None else Rotation.from_quat(quaternion)
 
 
+def find_table(folder: Path) -> Path:
+    """Return the path of the folder's table of images; a table with the former name is found with a warning."""
+    path, former_path = folder / TABLE_FILE, folder / _FORMER_TABLE_FILE
+    if path.exists() or not former_path.exists():
+        return path
+    warn_deprecated(_FORMER_TABLE_FILE, TABLE_FILE)
+    return former_path
+
+
 def read_table(path: Path, task: str) -> dict[str, list[ImageRow]]:
-    """Read the rows of `pictures.csv` by case, in the order of the cases' first rows.
+    """Read the rows of `images.csv` by case, in the order of the cases' first rows.
 
     Raises IngestError with all problems by line.
     """

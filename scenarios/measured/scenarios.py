@@ -87,7 +87,7 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
     @model_validator(mode="after")
     def _check_binning(self) -> MeasuredVelocityParameters:
         if any(name.startswith("dimes") for name in self.algorithms):
-            for image in self.case.pictures:
+            for image in self.case.images:
                 check_binning(self.dimes.binned_size, image.size)
         return self
 
@@ -124,7 +124,7 @@ class MatchingScenario(MeasuredScenario[MatchingParameters]):
         """Run one case."""
         p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
-        pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.pictures])
+        pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.images])
         has_matches = all(pair.residuals_px.size for pair in pairs)
         return CaseResult(
             outcome=MATCHED if has_matches else TOO_FEW,
@@ -214,7 +214,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
         p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
         measurements = store.landing_measurements(p.case, images)
-        pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.pictures])
+        pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.images])
         true_poses = None
         if p.case.truth.poses is not None:
             first, second = (store.body_pose(*pose) for pose in p.case.truth.poses)
@@ -258,12 +258,12 @@ def _run_algorithms(
 
 def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:
     """Return the columns of the case: name, images, and the maximum motion of the camera between two images."""
-    poses = [item.pose * camera_pose(image.camera) for item, image in zip(p.case.pictures, images, strict=True)]
+    poses = [item.pose * camera_pose(image.camera) for item, image in zip(p.case.images, images, strict=True)]
     steps = [earlier.inv() * later for earlier, later in itertools.pairwise(poses)]
-    has_positions = all(image.position_m is not None for image in p.case.pictures)
+    has_positions = all(image.position_m is not None for image in p.case.images)
     return {
         "measured_case": p.case.name,
-        "pictures": len(images),
+        "images": len(images),
         "duration_s": images[-1].time_s - images[0].time_s,
         "max_rotation_deg": max(float(np.degrees(step.rotation.magnitude())) for step in steps),
         "max_translation_m": max(float(np.linalg.norm(step.translation)) for step in steps) if has_positions else NAN,
@@ -299,7 +299,7 @@ def _descent_poses(
         velocities[:, :2] += velocity_m_s - velocities[1, :2]
     times = np.array([image.time_s for image in measurements.images])
     positions = np.concatenate([np.zeros((1, 3)), np.cumsum(velocities * np.diff(times)[:, None], axis=0)])
-    positions_m = [image.position_m for image in case.pictures]
+    positions_m = [image.position_m for image in case.images]
     if None not in positions_m:
         positions = np.array(positions_m, dtype=np.float64)
     rotations = [attitude.world_from_body for attitude in measurements.attitudes]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -31,7 +32,7 @@ from marsyard.sim.measurements import (
     LandingMeasurements,
     PoseMeasurement,
 )
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.parameters import DeprecatedNameWarning, Parameters
 
 #: Version of `cases.json`, and its name.
 SCHEMA = 1
@@ -80,7 +81,7 @@ class StoredCase(Parameters):
     """A case: its images and their measurements, and its truth."""
 
     name: str
-    pictures: tuple[StoredImage, ...]
+    images: tuple[StoredImage, ...]
     interval_velocities_m_s: tuple[Vector, ...] | None = None
     sun_direction: Vector | None = None
     slant_range_m: float | None = None
@@ -137,7 +138,10 @@ def _read(file: str, _modified_ns: int, _size: int) -> tuple[StoredCases, str]:
     """Read and check `cases.json`; modification time and size are cache keys, so that a changed file is read again."""
     try:
         contents = Path(file).read_bytes()
-        stored = StoredCases.model_validate_json(contents)
+        with warnings.catch_warnings():
+            # the user cannot rename a former key, because the hash of the file is part of a campaign's identity
+            warnings.simplefilter("ignore", DeprecatedNameWarning)
+            stored = StoredCases.model_validate_json(contents)
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror or error}") from error
     except ValidationError as error:
@@ -158,7 +162,7 @@ def write_cases(folder: Path, stored: StoredCases) -> Path:
 
 
 def write_file(folder: Path, kind: str, name: str, write: Callable[[Path], object]) -> StoredFile:
-    """Write a file next to `cases.json`, in the folder of its kind (`pictures`, `cameras`, `flat_fields`)."""
+    """Write a file next to `cases.json`, in the folder of its kind (`images`, `cameras`, `flat_fields`)."""
     path = folder / kind / name
     path.parent.mkdir(exist_ok=True)
     write(path)
@@ -187,7 +191,7 @@ def _check_unchanged(folder: Path, stored: StoredFile) -> Path:
 def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]:
     """Load the images of a case with their cameras in the body frame. Raises ValueError if a file has changed."""
     folder, images = Path(cases.file).parent, []
-    for image in case.pictures:
+    for image in case.images:
         counts = read_counts(_check_unchanged(folder, image.counts))
         flat = image.flat_field
         calibration = DetectorCalibration(
@@ -205,7 +209,7 @@ def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]
 def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> DescentMeasurements:
     """Return the inputs of a velocity estimator."""
     attitudes, altitudes = [], []
-    for item in case.pictures:
+    for item in case.images:
         attitudes.append(AttitudeMeasurement(Rotation.from_quat(np.array(item.world_from_body_xyzw)), item.time_s))
         time_s = item.time_s if item.altitude_time_s is None else item.altitude_time_s
         altitudes.append(AltitudeMeasurement(math.nan if item.altitude_m is None else item.altitude_m, time_s))
@@ -225,8 +229,8 @@ def body_pose(position_m: Vector, xyzw: Quaternion) -> RigidTransform:
 
 def landing_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> LandingMeasurements:
     """Return the inputs of an estimator of landing sites."""
-    first, second = (PoseMeasurement(image.pose, image.time_s) for image in case.pictures)
-    attitude = Rotation.from_quat(np.array(case.pictures[0].world_from_body_xyzw))
+    first, second = (PoseMeasurement(image.pose, image.time_s) for image in case.images)
+    attitude = Rotation.from_quat(np.array(case.images[0].world_from_body_xyzw))
     return LandingMeasurements(
         images=(images[0], images[1]),
         poses=(first, second),

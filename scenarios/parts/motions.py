@@ -25,7 +25,7 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, CustomPart
 from marsyard.scenarios.user_files import RecordedAxes
 from marsyard.sim.dynamics.recorded import RecordedMotion
-from marsyard.sim.parameters import bounded_field
+from marsyard.sim.parameters import bounded_field, warn_deprecated
 
 #: Maximum deviation of a quaternion's length from 1.
 UNIT_TOLERANCE = 1e-6
@@ -40,7 +40,7 @@ class MotionInputs:
     - ground_height: function that returns the height of the ground (m, relative to the origin) at x metres east and
       y metres north of the origin
     - gravity_m_s2: gravity at the origin
-    - pictures_s: nominal times of the images; the first image is at 0
+    - image_times_s: nominal times of the images; the first image is at 0
     - from_s, until_s: interval that the poses must cover
     - firing_height_m: height above the ground at which the thrusters fire; they fire at the end of a motion that ends
       above this height
@@ -48,10 +48,16 @@ class MotionInputs:
 
     ground_height: Callable[[float, float], float]
     gravity_m_s2: float
-    pictures_s: tuple[float, ...]
+    image_times_s: tuple[float, ...]
     from_s: float
     until_s: float
     firing_height_m: float
+
+    @property
+    def pictures_s(self) -> tuple[float, ...]:
+        """Former name of `image_times_s`, until 0.2."""
+        warn_deprecated("pictures_s", "image_times_s")
+        return self.image_times_s
 
 
 @dataclass(frozen=True)

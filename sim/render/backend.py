@@ -1,7 +1,7 @@
 """OpenGL rendering of pinhole views: depth and triangle numbers.
 
 pyrender creates an off-screen context through OSMesa or EGL. Its scene graph and renderer are not used: their overhead
-exceeds the drawing time of a small picture. The platform must be chosen before pyrender or PyOpenGL is first imported.
+exceeds the drawing time of a small image. The platform must be chosen before pyrender or PyOpenGL is first imported.
 A context can be used only in the process and thread that created it.
 """
 
@@ -81,7 +81,7 @@ _NUMBER_BITS, _OPAQUE = 0xFFFFFF, 0xFF000000
 class DepthRenderer:
     """Renderer of a scene's depth and triangle numbers, with one sample at the centre of each pixel.
 
-    `side_px` is the width and height of the picture. It is fixed, because resizing takes longer than drawing. Raises
+    `side_px` is the width and height of the image. It is fixed, because resizing takes longer than drawing. Raises
     RenderingError if no context can be created.
     """
 
@@ -202,7 +202,7 @@ class DepthRenderer:
         0 is the top of the view.
 
         - world_from_view: pose; the view's axes are x right, y down, z forward, its origin the centre of projection
-        - focal_px: focal length in samples of the depth picture; the principal point is the picture's centre
+        - focal_px: focal length in samples of the depth image; the principal point is the image's centre
         - near_m, far_m: depths of the clipping planes
         """
         if self._ground_vertex_count is None:

@@ -32,7 +32,7 @@ from marsyard.sim.render.kernels.edges import mark_edges, split_rays, trace_subp
 from marsyard.sim.render.kernels.primary import MAX_GRAZING_SINE, trace_primary_rays
 from marsyard.sim.render.kernels.shading import shade
 from marsyard.sim.render.kernels.strips import STRIP
-from marsyard.sim.render.kernels.structs import Array32, Extent, Ground, Hits, Light, Picture, Pose, Rays, Views
+from marsyard.sim.render.kernels.structs import Array32, Extent, Ground, Hits, Light, Pose, Rays, ShadedImage, Views
 from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull
 from marsyard.sim.render.rays import VIEW_SIDE_PX, PixelRays
 from marsyard.sim.render.scene import Scene
@@ -147,16 +147,16 @@ class Renderer:
             trace_primary_rays(ground, part_views, pose, part_rays, tree, part_hits)
 
         run_in_parts(trace_part, rows * columns)
-        picture = _shade(scene, ground, pose, rays.rays, hits, light)
-        radiance, body = picture.radiance.reshape(rows, columns), picture.body.reshape(rows, columns)
-        range_m, normal = hits.distance.reshape(rows, columns), picture.normal.reshape(rows, columns, 3)
+        image = _shade(scene, ground, pose, rays.rays, hits, light)
+        radiance, body = image.radiance.reshape(rows, columns), image.body.reshape(rows, columns)
+        range_m, normal = hits.distance.reshape(rows, columns), image.normal.reshape(rows, columns, 3)
         if scene.edge_rays > 1:
             pixels = edge_pixels(radiance, range_m, body)
             subpixel_rays = supersample_rays(rays, pixels, scene.edge_rays)
             subpixel_hits = _empty_hits(len(subpixel_rays.directions), scene)
             trace_subpixel_rays(ground, pose, tree, columns, pixels, subpixel_rays, hits, subpixel_hits)
             subpixel_radiance = _shade(scene, ground, pose, subpixel_rays, subpixel_hits, light).radiance
-            picture.radiance[pixels] = subpixel_radiance.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
+            image.radiance[pixels] = subpixel_radiance.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
         return Frame(radiance, range_m, body, normal, world_from_body, rays)
 
     def close(self) -> None:
@@ -200,7 +200,7 @@ class Renderer:
         ground = ground_mesh(scene.surface, x, y, cell_spans_in_hull(x, y, points))
         renderer = self._view_renderer(rays.view_side_px)
         renderer.load(ground, scene.objects.triangles[numbers], numbers)
-        pictures = []
+        images = []
         for view_from_body, focal in zip(rays.view_from_body, rays.focal_px, strict=True):
             world_from_view = np.eye(4)
             world_from_view[:3, :3] = pose.rotation @ view_from_body.T
@@ -208,9 +208,9 @@ class Renderer:
             # near plane at 5 % of the height above the ground: nearer surfaces are clipped; the depth is only a first
             # guess, so its low resolution at large distances has no effect on the image
             far = 2.0 * scene.mesh_half_width_m + clearance_m
-            pictures.append(renderer.draw(world_from_view, float(focal), 0.05 * clearance_m, far))
+            images.append(renderer.draw(world_from_view, float(focal), 0.05 * clearance_m, far))
         # a single view is not copied
-        depth, ids = (maps[0][np.newaxis] if len(maps) == 1 else np.stack(maps) for maps in zip(*pictures, strict=True))
+        depth, ids = (maps[0][np.newaxis] if len(maps) == 1 else np.stack(maps) for maps in zip(*images, strict=True))
         return Views(depth, ids, rays.focal_px, rays.view_from_body, rays.view_of_pixel)
 
 
@@ -223,17 +223,17 @@ def _slice_arrays(arrays: Iterable[NDArray[Any]], part: slice) -> list[NDArray[A
     return [array[part] for array in arrays]
 
 
-def _shade(scene: Scene, ground: Ground, pose: Pose, rays: Rays, hits: Hits, light: Light) -> Picture:
+def _shade(scene: Scene, ground: Ground, pose: Pose, rays: Rays, hits: Hits, light: Light) -> ShadedImage:
     count = len(rays.directions)
-    picture = Picture(np.empty(count, np.float32), np.empty(count, np.int32), np.empty((count, 3), np.float32))
+    image = ShadedImage(np.empty(count, np.float32), np.empty(count, np.int32), np.empty((count, 3), np.float32))
     occluders, materials = scene.occluders, scene.materials
 
     def shade_part(part: slice) -> None:
-        part_rays, part_hits, part_picture = (_slice_arrays(arrays, part) for arrays in (rays, hits, picture))
-        shade(ground, pose, Rays(*part_rays), Hits(*part_hits), light, occluders, materials, Picture(*part_picture))
+        part_rays, part_hits, part_image = (_slice_arrays(arrays, part) for arrays in (rays, hits, image))
+        shade(ground, pose, Rays(*part_rays), Hits(*part_hits), light, occluders, materials, ShadedImage(*part_image))
 
     run_in_parts(shade_part, count)
-    return picture
+    return image
 
 
 @cache

@@ -131,7 +131,7 @@ class AutoExposureParameters(Parameters):
     percentile: Annotated[float, Field(gt=0.0, lt=100.0, description="controlled percentile of the counts")] = 98.0
     target: Annotated[float, Field(gt=0.0, lt=1.0, description="target of the percentile / full scale")] = 0.75
     tolerance: Annotated[float, Field(gt=0.0, le=0.5, description="accepted relative deviation from the target")] = 0.05
-    pictures: Annotated[int, Field(ge=1, le=20, description="maximum number of test images")] = 5
+    images: Annotated[int, Field(ge=1, le=20, description="maximum number of test images")] = 5
     min_exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="shortest exposure, s")] = 1e-4
     max_exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="longest exposure, s")] = 1.0
 
@@ -382,6 +382,6 @@ def auto_expose(
         next_exposure = float(np.clip(exposure * factor, parameters.min_exposure_s, parameters.max_exposure_s))
         if converged or next_exposure == exposure:
             return AutoExposure(test_detector, tuple(exposures), converged)
-        if len(exposures) == parameters.pictures:
+        if len(exposures) == parameters.images:
             return AutoExposure(detector.with_exposure(next_exposure), tuple(exposures), False)
         exposure = next_exposure

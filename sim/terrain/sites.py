@@ -118,8 +118,8 @@ class Hill(Parameters):
 class Site(Parameters):
     """A site with its environment, photometry and terrain.
 
-    `descent` is the terrain for pictures of a descent (spacing of metres over kilometres). `ground` is the terrain for
-    pictures of a rover or a helicopter (spacing of centimetres over 100-200 m). A site has at least one of them.
+    `descent` is the terrain for images of a descent (spacing of metres over kilometres). `ground` is the terrain for
+    images of a rover or a helicopter (spacing of centimetres over 100-200 m). A site has at least one of them.
     """
 
     name: str

@@ -177,13 +177,13 @@ def image_contrast(surface: Surface, pixel_m: float, samples: Samples | None = N
     and a uniform sky; shadows and detector are omitted.
     """
     level = min(max(round(np.log2(pixel_m / surface.spacing_m)), 0), len(surface.levels) - 1)
-    image = nadir_picture(surface, level, np.radians(270.0), np.radians(CONTRAST_SUN_ELEVATION_DEG)).reshape(-1)
+    image = render_nadir_image(surface, level, np.radians(270.0), np.radians(CONTRAST_SUN_ELEVATION_DEG)).reshape(-1)
     if samples is not None:
         image = image[samples[:: 2**level, :: 2**level].reshape(-1)]
     return float(image.std() / image.mean()) if image.size else float("nan")
 
 
-def nadir_picture(
+def render_nadir_image(
     surface: Surface, level: int, sun_azimuth_rad: float, sun_elevation_rad: float
 ) -> Float64[np.ndarray, "rows columns"]:
     """Compute the radiance factor of one level's samples in nadir view; row 0 is the terrain's southern edge."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.answers import AlgorithmError, Fault, StreamedEstimator, check_and_set_span, check_velocity
-from marsyard.algorithms.dimes import DimesEstimator
+from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableVelocityStream,
@@ -25,7 +25,9 @@ from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.estimators import VELOCITY
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
+from marsyard.sim.parameters import DeprecatedNameWarning
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 NO_VELOCITY = VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
@@ -46,7 +48,7 @@ class RecordingStream:
     def start(self) -> None:
         self.calls.append("start")
 
-    def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
+    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
         self.calls.append(frame)
         return make_estimate() if len(self.calls) > 2 else None
 
@@ -70,7 +72,7 @@ def test_stream_receives_measurements_of_each_image() -> None:
         np.testing.assert_array_equal(frame.interval_velocity_m_s, velocity)
     assert answer.span_s == (100.5, 101.0)
     # Without a span the answer is for the last interval.
-    first, *later = answer.after_pictures
+    first, *later = answer.after_images
     assert first is None
     tags = measurements.tags_s
     assert [estimate.span_s for estimate in later if estimate is not None] == list(pairwise(tags))
@@ -124,13 +126,36 @@ def test_missing_span_defaults_to_last_interval() -> None:
         check_and_set_span(make_estimate(), (0.0,))
 
 
-def test_answer_of_a_stream_with_after_pictures_is_rejected() -> None:
-    class StreamWithAfterPictures(RecordingStream):
+def test_answer_of_a_stream_with_after_images_is_rejected() -> None:
+    class StreamWithAfterImages(RecordingStream):
         def finish(self) -> VelocityEstimate:
-            return replace(make_estimate(), after_pictures=(make_estimate(),))
+            return replace(make_estimate(), after_images=(make_estimate(),))
 
-    with pytest.raises(AlgorithmError, match="after_pictures is given"):
-        StreamedEstimator(StreamWithAfterPictures()).estimate(inputs.descent())
+    with pytest.raises(AlgorithmError, match="after_images is given"):
+        StreamedEstimator(StreamWithAfterImages()).estimate(inputs.descent())
+
+
+class FormerStream:
+    """A stream whose method `process_image` has its former name."""
+
+    def start(self) -> None:
+        pass
+
+    def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
+        return make_estimate(frame.image.time_s, frame.image.time_s)
+
+    def finish(self) -> VelocityEstimate:
+        return NO_VELOCITY
+
+
+def test_former_names_of_streams_are_accepted() -> None:
+    VELOCITY.check(f"{__name__}:FormerStream")
+    with pytest.warns(DeprecatedNameWarning, match="'picture' is now 'process_image'"):
+        estimator = VELOCITY.make(f"{__name__}:FormerStream", DimesOptions(), ExecutableLimits())
+    answer = estimator.estimate(inputs.descent(3))
+    assert len(answer.after_images) == 3
+    with pytest.warns(DeprecatedNameWarning, match="'after_pictures' is now 'after_images'"):
+        assert answer.after_pictures == answer.after_images
 
 
 @pytest.mark.parametrize("altitude_m", [1500.0, float("nan")])
@@ -191,7 +216,7 @@ def test_example_returns_equal_estimates_in_python_and_as_program(monkeypatch: p
         np.testing.assert_allclose(actual.velocity_m_s, reference.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
         np.testing.assert_allclose(actual.covariance_m2_s2, reference.covariance_m2_s2, rtol=1e-12)  # type: ignore[arg-type]
         assert actual.span_s == reference.span_s == (107.5, 107.5)
-        assert [estimate is None for estimate in actual.after_pictures] == [True, False, False, False, False]
+        assert [estimate is None for estimate in actual.after_images] == [True, False, False, False, False]
         assert isinstance(actual.details, ProgramDetails)
         assert actual.details.time_s > 0.0
     end_idle_programs()

@@ -154,7 +154,7 @@ def test_invalid_image_is_rejected(tmp_path: Path, write: WriteFile, message: st
 def test_invalid_table_is_rejected(tmp_path: Path, cells: dict[str, str], message: str) -> None:
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_text_rows(folder, [row | cells if index == 1 else row for index, row in enumerate(read_rows(folder))])
-    run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "pictures.csv", message)
+    run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "images.csv", message)
 
 
 def run_and_expect_error(arguments: list[str], path: Path, message: str) -> None:

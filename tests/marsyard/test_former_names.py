@@ -204,6 +204,20 @@ def test_stored_campaign_is_read_with_current_names(campaign_files: tuple[Path, 
     assert run.record["requirements"][0]["population"] == "valid and feasible_overlap"
 
 
+def test_former_names_of_faults_are_accepted(campaign_files: tuple[Path, Path], tmp_path: Path) -> None:
+    path = campaign_files[1]
+    dispersion = 'faults = { distribution = "grid", values = [{ black_picture = 2 }], source = "test" }'
+    path.write_text(path.read_text().replace("[dispersions]", f"[dispersions]\n{dispersion}"))
+    with pytest.warns(DeprecatedNameWarning, match="'black_picture' is now 'black_image'"):
+        campaign = load_campaign(str(path))
+    with pytest.warns(DeprecatedNameWarning, match="'black_picture' is now 'black_image'"):
+        parameters = campaign.parameters(0)
+    assert parameters.model_dump()["faults"]["black_image"] == 2
+    record.write_first_record(tmp_path, campaign.configuration, create_identity(campaign.configuration), "test")
+    pd.DataFrame({"case": [0], "fault": ["black_picture"]}).to_parquet(tmp_path / "cases.parquet")
+    assert list(read_run(tmp_path).frame["fault"]) == ["black_image"]
+
+
 def test_deprecated_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "argv", ["marsyard", "replay", str(tmp_path), "0", "--step"])
     with (

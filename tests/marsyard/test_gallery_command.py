@@ -23,7 +23,7 @@ from marsyard.cli.gallery import (
     map_to_grey,
     write_gallery,
 )
-from marsyard.cli.pictures import ImageRequest
+from marsyard.cli.images import ImageRequest
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
 

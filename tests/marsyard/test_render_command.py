@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.cli import app as cli
-from marsyard.cli.pictures import SUFFIXES
+from marsyard.cli.images import SUFFIXES
 from marsyard.sim.camera import read_cahvor
 
 Command = Callable[..., tuple[int, str]]

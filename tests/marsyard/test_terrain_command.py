@@ -63,7 +63,7 @@ def test_holes_are_rejected_or_counted_and_marked(tmp_path: Path) -> None:
     status, output = run_terrain_command("stats", str(path))
     assert status == 2
     assert "48.4% of its posts have no height; allowed: up to 5.0%" in output
-    status, output = run_terrain_command("stats", str(path), "--max-holes", "0.5", "--picture", str(figure))
+    status, output = run_terrain_command("stats", str(path), "--max-holes", "0.5", "--image", str(figure))
     assert status == 0, output
     assert "1984 posts without height (48.4%)" in " ".join(output.split())
     image = cv2.imread(str(figure))
@@ -73,7 +73,7 @@ def test_holes_are_rejected_or_counted_and_marked(tmp_path: Path) -> None:
     assert is_red.sum() == pytest.approx(31 * 64, rel=0.1)
     red_columns = np.flatnonzero(is_red.any(axis=0))
     assert red_columns[0] == pytest.approx(32, abs=1)
-    assert run_terrain_command("stats", str(path), "--max-holes", "0.5", "--picture", str(figure))[0] == 2
+    assert run_terrain_command("stats", str(path), "--max-holes", "0.5", "--image", str(figure))[0] == 2
 
 
 @pytest.mark.parametrize(

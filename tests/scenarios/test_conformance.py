@@ -103,9 +103,9 @@ STREAM_TEMPLATE = """
 class Defective:
     def start(self):
         self.frames = []
-    def picture(self, frame):
+    def process_image(self, frame):
         self.frames.append(frame)
-        {picture}
+        {image}
     def finish(self):
         {finish}
 """
@@ -113,7 +113,7 @@ VALID_AFTER_TWO_IMAGES = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if 
 
 
 @pytest.mark.parametrize(
-    ("check", "picture", "finish", "problem"),
+    ("check", "image", "finish", "problem"),
     [
         ("answer", "return 3.0", "return NO_ANSWER", "BAD_ANSWER: the answer is a float"),
         ("answer", "return None", "return None", "BAD_ANSWER: the answer is a NoneType"),
@@ -145,9 +145,9 @@ VALID_AFTER_TWO_IMAGES = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if 
     ],
 )
 def test_stream_defects_are_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, picture: str, finish: str, problem: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, image: str, finish: str, problem: str
 ) -> None:
-    body = STREAM_TEMPLATE.format(picture=picture, finish=finish)
+    body = STREAM_TEMPLATE.format(image=image, finish=finish)
     assert problem in run_suite(write_defective_module(tmp_path, monkeypatch, body), check)[check].problem
 
 
@@ -156,7 +156,7 @@ def test_stream_with_state_from_earlier_descents_is_reported(tmp_path: Path, mon
     class Defective:
         total = 0.0
         def start(self): pass
-        def picture(self, frame): self.total += frame.image.counts.mean()
+        def process_image(self, frame): self.total += frame.image.counts.mean()
         def finish(self): return VelocityEstimate(Outcome.VALID, np.full(2, self.total), span_s=(100.0, 100.0))
     """
     result = run_suite(write_defective_module(tmp_path, monkeypatch, body), "deterministic", "start", "time")

@@ -132,7 +132,7 @@ def test_normalised_error_uses_the_covariance() -> None:
     assert consistency_row(VelocityEstimate(VelocityOutcome.VALID, np.zeros(2)), np.zeros(2)) == {}
 
 
-STREAM_CLASS = "class Mine:\n    def start(self): ...\n    def picture(self, frame): ...\n"
+STREAM_CLASS = "class Mine:\n    def start(self): ...\n    def process_image(self, frame): ...\n"
 
 
 def test_stream_and_three_image_estimators_are_distinguished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

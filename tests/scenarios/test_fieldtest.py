@@ -192,7 +192,7 @@ def test_targets_are_detected_in_the_images_of_a_pass(run_index: int, monkeypatc
 
     monkeypatch.setattr(run_module, "detect_targets", record_detection)
     monkeypatch.setattr(run_module, "take_image", record_state)
-    parameters = make_parameters(drift={"change_k": 0.0}, targets={"pictures": 3})
+    parameters = make_parameters(drift={"change_k": 0.0}, targets={"images": 3})
     key = RunKey(parameters, run_index, 6, "test")
     run = simulate_run(key)
     assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
@@ -234,7 +234,7 @@ def test_no_targets_are_detected_on_bare_ground() -> None:
 def test_run_without_detected_targets_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_module, "detect_targets", lambda *_: np.full((9, 2), np.nan))
     with pytest.raises(ValueError, match="Ivanpah Run 3: 0 sightings of targets in a pass"):
-        make_ivanpah_run(targets={"pictures": 1})
+        make_ivanpah_run(targets={"images": 1})
 
 
 def test_elevation_model_has_the_error_of_its_class() -> None:

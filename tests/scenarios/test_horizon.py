@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from marsyard.cli.pictures import ImageRequest, RenderedImage, render_images
+from marsyard.cli.images import ImageRequest, RenderedImage, render_images
 from marsyard.scenarios.horizon import HILL_NAME, add_unresolved_rocks, hill_objects
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.render import Frame, Scene

@@ -112,7 +112,7 @@ def test_flat_field_size_is_checked_before_expansion(tmp_path: Path) -> None:
 
 
 READERS: dict[str, Callable[[Path], object]] = {
-    "picture.png": lambda path: read_counts(path, (8, 8)),
+    "image.png": lambda path: read_counts(path, (8, 8)),
     "camera.yaml": read_cameras,
     "sensor.toml": read_datasheet,
     "flight.csv": read_poses,
@@ -120,7 +120,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "rock.stl": lambda path: read_mesh(str(path)),
     "answers.csv": lambda path: read_answers(path, VELOCITY_FORMAT),
     "ingest.toml": lambda path: read_ingest_file(path.parent),
-    "pictures.csv": lambda path: read_table(path, VELOCITY),
+    "images.csv": lambda path: read_table(path, VELOCITY),
     "cases.json": lambda path: CasesFile.file_hash(str(path)),
 }
 

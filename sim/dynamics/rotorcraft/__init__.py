@@ -111,8 +111,10 @@ class TransitParameters(Parameters):
     settle_s: Annotated[
         NonNegative, Field(le=60.0, description="duration at constant speed before the first image, s (assumed)")
     ] = 1.5
-    pictures: Annotated[int, bounded_field(2, 1000, "number of images")] = 40
-    pictures_s: Annotated[Positive, Field(le=120.0, description="duration from the first to the last image, s")] = 5.0
+    images: Annotated[int, bounded_field(2, 1000, "number of images")] = 40
+    imaging_duration_s: Annotated[
+        Positive, Field(le=120.0, description="duration from the first to the last image, s")
+    ] = 5.0
 
     @property
     def lead_s(self) -> float:
@@ -317,7 +319,7 @@ def simulate_transit(
     end before the flight.
     """
     p, step = transit, craft.step_s
-    count = int(np.ceil((p.lead_s + p.pictures_s + TAIL_S) / step - 1e-9)) + 1
+    count = int(np.ceil((p.lead_s + p.imaging_duration_s + TAIL_S) / step - 1e-9)) + 1
     air.check_duration(count)
     times = -p.lead_s + step * np.arange(count)
     # commanded distance from the position of the first image, speed and acceleration along the course

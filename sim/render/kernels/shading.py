@@ -43,9 +43,9 @@ from marsyard.sim.render.kernels.structs import (
     Longs,
     Materials,
     MicroRelief,
-    Picture,
     Pose,
     Rays,
+    ShadedImage,
 )
 from marsyard.sim.render.kernels.sun import (
     COARSE_GRID_MARGIN,
@@ -462,7 +462,7 @@ def shade(
     light: Light,
     occluders: Occluders,
     materials: Materials,
-    picture: Picture,
+    image: ShadedImage,
 ) -> None:
     """Compute radiance factor, body and normal of every pixel: geometry, texture, illumination, then photometry."""
     sun = (light.sun[0], light.sun[1], light.sun[2])
@@ -470,7 +470,7 @@ def shade(
     centre = (pose.position[0], pose.position[1], pose.position[2])
     law = light.law
     reflectance = (law[0], law[1], law[2], law[3], law[4], law[5])
-    origins, directions, normals = rays.origins.reshape(-1), rays.directions.reshape(-1), picture.normal.reshape(-1)
+    origins, directions, normals = rays.origins.reshape(-1), rays.directions.reshape(-1), image.normal.reshape(-1)
     levels, spacing = ground.levels, ground.spacing
     finest = GroundLevel(levels[0], ground.ceilings[0], 1.0 / spacing)
     terrain = levels[occluders.shadow.level]
@@ -484,7 +484,7 @@ def shade(
     for first in range(0, count, STRIP):
         last = min(first + STRIP, count)
         width = last - first
-        angles, body, radiance = rays.pixel_angles[first:last], picture.body[first:last], picture.radiance[first:last]
+        angles, body, radiance = rays.pixel_angles[first:last], image.body[first:last], image.radiance[first:last]
         strip_hits = Hits(
             hits.distance[first:last], hits.triangle[first:last], hits.weights[first:last], hits.level[first:last]
         )

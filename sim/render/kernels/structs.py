@@ -187,7 +187,7 @@ class Materials(NamedTuple):
     albedo: Array
 
 
-class Picture(NamedTuple):
+class ShadedImage(NamedTuple):
     """Output of shading for each pixel: radiance factor, body number (or ground, sky), unit normal in world axes."""
 
     radiance: Array32

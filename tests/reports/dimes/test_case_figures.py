@@ -141,5 +141,5 @@ def test_figure_omits_empty_rows(dimes_products: dict[str, Any]) -> None:
 
 def test_images_of_a_case_without_tracks_are_written(dimes_products: dict[str, Any], tmp_path: Path) -> None:
     image_products = {name: value for name, value in dimes_products.items() if name.startswith("image_")}
-    assert write_dimes_figures(tmp_path, image_products) == [tmp_path / "pictures.png"]
-    assert (tmp_path / "pictures.png").stat().st_size > 1000
+    assert write_dimes_figures(tmp_path, image_products) == [tmp_path / "images.png"]
+    assert (tmp_path / "images.png").stat().st_size > 1000

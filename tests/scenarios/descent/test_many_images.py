@@ -15,7 +15,7 @@ from tests.scenarios.descent.settings import DESCENT, IDEAL_INSTRUMENTS, make_pa
 
 STREAM_ESTIMATOR = "tests.scenarios.descent.test_many_images:InertialEstimator"
 #: Nine images of a descent that contain the three images of a standard descent.
-NINE_IMAGES: dict[str, Any] = {"pictures": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
+NINE_IMAGES: dict[str, Any] = {"images": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
 
 
 class InertialEstimator:
@@ -24,7 +24,7 @@ class InertialEstimator:
     def start(self) -> None:
         self.frames: list[DescentFrame] = []
 
-    def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
+    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
         self.frames.append(frame)
         velocity = frame.interval_velocity_m_s
         return None if velocity is None else VelocityEstimate(VelocityOutcome.VALID, velocity[:2])
@@ -58,7 +58,7 @@ def nine_images() -> CaseResult:
 def test_true_velocity_is_averaged_over_the_span_of_the_answer(nine_images: CaseResult) -> None:
     """Each answer is compared with the true mean velocity over its own span; the inertial unit has no errors."""
     row: Any = nine_images.row
-    assert (nine_images.outcome, row["stream_pictures"], row["pictures_before_answer"]) == ("VALID", 9, 2)
+    assert (nine_images.outcome, row["stream_images"], row["images_before_answer"]) == ("VALID", 9, 2)
     assert np.isnan(row["velocity_error_after_1_m_s"])
     interval_errors = [row[f"velocity_error_after_{number}_m_s"] for number in range(2, 10)]
     # Tolerance: trapezoidal integration of 400 Hz samples of a swinging descent.
@@ -82,13 +82,13 @@ def test_three_image_estimator_receives_first_middle_and_last_image(nine_images:
         three_images["feasible_overlap_second_pair"],
     )
     assert float(nine_images.row["dimes.velocity_error_m_s"]) < 1.0
-    assert "dimes.stream_pictures" not in nine_images.row
+    assert "dimes.stream_images" not in nine_images.row
 
 
 def test_dimes_input_images_are_stored_for_figures() -> None:
     result = run_descent(compared=[STREAM_ESTIMATOR], triple=[1, 2, 3], **NINE_IMAGES)
     assert [name for name in result.products if name.startswith("image_")] == ["image_1", "image_2", "image_3"]
-    assert {"InertialEstimator.stream_pictures", "InertialEstimator.velocity_nees"} <= set(result.row)
+    assert {"InertialEstimator.stream_images", "InertialEstimator.velocity_nees"} <= set(result.row)
 
 
 def test_span_between_images_is_interpolated() -> None:
@@ -96,12 +96,9 @@ def test_span_between_images_is_interpolated() -> None:
     spec = "tests.scenarios.descent.test_many_images:LastThreeQuartersEstimator"
     first, second = (
         run_descent(
-            algorithm=spec,
-            pictures=pictures,
-            descent=DESCENT | {"interval_s": 4.0 / (pictures - 1)},
-            **IDEAL_INSTRUMENTS,
+            algorithm=spec, images=images, descent=DESCENT | {"interval_s": 4.0 / (images - 1)}, **IDEAL_INSTRUMENTS
         )
-        for pictures in (2, 9)
+        for images in (2, 9)
     )
     # Both cases have the same flight and span, but different images.
     for axis in "xy":
@@ -112,13 +109,13 @@ def test_span_between_images_is_interpolated() -> None:
 
 
 def test_many_image_case_is_deterministic() -> None:
-    parts: dict[str, Any] = {"pictures": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
+    parts: dict[str, Any] = {"images": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
     first_case, repeated_case = run_descent(**parts), run_descent(**parts)
     assert differing_columns(dict(first_case.row), dict(repeated_case.row)) == ()
 
 
 def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
-    run_descent(algorithm=f"export:{tmp_path}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
+    run_descent(algorithm=f"export:{tmp_path}", images=4, descent=DESCENT | {"interval_s": 1.0})
     exported_case = read_case(tmp_path / "cases" / "000000")
     assert isinstance(exported_case, DescentMeasurements)
     assert len(exported_case.images) == len(exported_case.attitudes) == len(exported_case.altitudes) == 4
@@ -128,8 +125,8 @@ def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
     start, end = exported_case.tags_s[0], exported_case.tags_s[2]
     answer_table = tmp_path / "answers.csv"
     answer_table.write_text(f"case,velocity_east_m_s,velocity_north_m_s,start_s,end_s\n0,1,2,{start!r},{end!r}\n")
-    scored_case = run_descent(algorithm=f"answers:{answer_table}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
-    same_span = run_descent(algorithm=STREAM_ESTIMATOR, pictures=2, descent=DESCENT | {"interval_s": 2.0})
+    scored_case = run_descent(algorithm=f"answers:{answer_table}", images=4, descent=DESCENT | {"interval_s": 1.0})
+    same_span = run_descent(algorithm=STREAM_ESTIMATOR, images=2, descent=DESCENT | {"interval_s": 2.0})
     assert [scored_case.row[f"velocity_true_{axis}_m_s"] for axis in "xy"] == pytest.approx(
         same_span.products["after_true_m_s"][1], abs=1e-9
     )
@@ -138,12 +135,12 @@ def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"pictures": 2}, "pictures is 2, but 'dimes' needs 3; allowed: 3 to 100"),
-        ({"pictures": 1}, "greater than or equal to 2"),
-        ({"pictures": 5, "triple": [1, 3, 6]}, r"triple is \[1, 3, 6\]; allowed: three in ascending order, 1 to 5"),
+        ({"images": 2}, "images is 2, but 'dimes' needs 3; allowed: 3 to 100"),
+        ({"images": 1}, "greater than or equal to 2"),
+        ({"images": 5, "triple": [1, 3, 6]}, r"triple is \[1, 3, 6\]; allowed: three in ascending order, 1 to 5"),
         ({"triple": [1, 3, 2]}, "three in ascending order, 1 to 3"),
         (
-            {"algorithm": STREAM_ESTIMATOR, "pictures": 2, "faults": {"black_picture": 3}},
+            {"algorithm": STREAM_ESTIMATOR, "images": 2, "faults": {"black_image": 3}},
             "a fault affects image 3, but the descent",
         ),
     ],
@@ -153,11 +150,11 @@ def test_invalid_image_counts_are_rejected(parts: dict[str, Any], message: str) 
         make_parameters(**parts)
 
 
-@pytest.mark.parametrize(("pictures", "positions"), [(3, (0, 1, 2)), (4, (1, 2, 3)), (5, (0, 2, 4)), (10, (1, 5, 9))])
-def test_default_image_triple_is_evenly_spaced(pictures: int, positions: tuple[int, int, int]) -> None:
-    assert make_parameters(pictures=pictures).triple_indices == positions
+@pytest.mark.parametrize(("images", "positions"), [(3, (0, 1, 2)), (4, (1, 2, 3)), (5, (0, 2, 4)), (10, (1, 5, 9))])
+def test_default_image_triple_is_evenly_spaced(images: int, positions: tuple[int, int, int]) -> None:
+    assert make_parameters(images=images).triple_indices == positions
 
 
 def test_image_times_after_thruster_ignition_are_rejected() -> None:
     with pytest.raises(ValueError, match=r"image \d of 9 would be taken at .* s, after the thrusters' firing"):
-        run_descent(pictures=9)
+        run_descent(images=9)

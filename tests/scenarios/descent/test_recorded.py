@@ -60,7 +60,7 @@ def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
         NED_FROM_ENU.apply(truth.positions_m - origin),
         NED_FROM_ENU * truth.attitudes * CAMERA_IN_BODY.inv(),
     )
-    recorded_case = run_descent(flight={"file": file, "axes": "ned", "first_picture_s": 1234.0})
+    recorded_case = run_descent(flight={"file": file, "axes": "ned", "first_image_s": 1234.0})
     assert recorded_case.outcome == simulated_case.outcome == "VALID"
     for name in ("velocity_true_x_m_s", "velocity_true_y_m_s", "altitude_1_m", "off_nadir_3_deg", "firing_after_s"):
         assert recorded_case.row[name] == pytest.approx(simulated_case.row[name], abs=1e-2), name
@@ -115,9 +115,7 @@ def test_invalid_flights_are_rejected_on_load(tmp_path: Path) -> None:
     )
     expect_error("at image 1 the camera looks up", _write_vertical_fall(tmp_path), attitude_of="body")
     expect_error(r"at image 3 the camera is 5.0 m below the ground", _write_vertical_fall(tmp_path, height_m=870.0))
-    expect_error(
-        r"covers 0.000 to 24.900 s; images from 23.000 to", _write_vertical_fall(tmp_path), first_picture_s=23.0
-    )
+    expect_error(r"covers 0.000 to 24.900 s; images from 23.000 to", _write_vertical_fall(tmp_path), first_image_s=23.0)
     expect_error("flight.axes|axes", _write_vertical_fall(tmp_path), axes="xyz")
     expect_error("not a quaternion of length 1", _write_vertical_fall(tmp_path), mounting=(0.0, 0.0, 0.0, 2.0))
     expect_error("absent.csv: cannot be read", "absent.csv")

@@ -53,13 +53,13 @@ def test_altimeter_faults_replace_all_ranges() -> None:
 def test_two_images_are_received_for_any_loss_rate() -> None:
     rng = np.random.default_rng(0)
     assert len(draw_received_images(Faults(), 40, rng)) == 40
-    image_numbers = draw_received_images(Faults(lost_pictures=0.75), 40, rng)
+    image_numbers = draw_received_images(Faults(lost_images=0.75), 40, rng)
     assert len(np.unique(image_numbers)) == 10
     assert np.all(np.diff(image_numbers) > 0)
-    assert len(draw_received_images(Faults(lost_pictures=1.0), 40, rng)) == 2
+    assert len(draw_received_images(Faults(lost_images=1.0), 40, rng)) == 2
 
 
-@pytest.mark.parametrize("fault", [{"lost_pictures": 0.5}, {"gps_outage_s": 5.0}])
+@pytest.mark.parametrize("fault", [{"lost_images": 0.5}, {"gps_outage_s": 5.0}])
 def test_flight_faults_require_a_flight(fault: dict[str, float]) -> None:
     LandingScenarioParameters.model_validate({"faults": fault, "helicopter": {}})
     with pytest.raises(ValidationError, match="helicopter"):

@@ -113,9 +113,9 @@ flat_field = "flat.npy"
 
 
 def write_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write `pictures.csv` with numbers in full precision."""
+    """Write `images.csv` with numbers in full precision."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    with (folder / "pictures.csv").open("w", newline="") as file:
+    with (folder / "images.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(
@@ -124,14 +124,14 @@ def write_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read_rows(folder: Path) -> list[dict[str, str]]:
-    """Read the rows of `pictures.csv` as text."""
-    with (folder / "pictures.csv").open(newline="") as file:
+    """Read the rows of `images.csv` as text."""
+    with (folder / "images.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 
 def write_text_rows(folder: Path, rows: Sequence[Mapping[str, str]]) -> None:
-    """Write `pictures.csv` from rows of text without changes."""
-    with (folder / "pictures.csv").open("w", newline="") as file:
+    """Write `images.csv` from rows of text without changes."""
+    with (folder / "images.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)

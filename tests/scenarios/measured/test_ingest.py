@@ -16,6 +16,7 @@ from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.layout import IngestError
 from marsyard.scenarios.measured.scenarios import MatchingScenario
 from marsyard.scenarios.measured.store import CasesFile, load_images
+from marsyard.sim.parameters import DeprecatedNameWarning
 from marsyard.sim.streams import Streams
 from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder
 
@@ -62,6 +63,17 @@ def test_invalid_tables_are_rejected(tmp_path: Path, change: Callable[[Rows], Ro
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_text_rows(folder, change(read_rows(folder)))
     assert message in ingest_and_expect_error(folder, tmp_path)
+
+
+def test_former_names_of_table_and_images_are_accepted(tmp_path: Path) -> None:
+    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
+    (folder / "images.csv").rename(folder / "pictures.csv")
+    (tmp_path / "out").mkdir()
+    with pytest.warns(DeprecatedNameWarning, match=r"'pictures\.csv' is now 'images\.csv'"):
+        path, stored_cases = ingest(folder, tmp_path / "out")
+    # cases.json of version 0.1 has the key `pictures`
+    path.write_text(path.read_text().replace('"images": [', '"pictures": ['))
+    assert CasesFile(file=str(path)).stored.cases == stored_cases.cases
 
 
 def replace_by_pipe(path: Path) -> None:
@@ -135,7 +147,7 @@ def test_opportunity_images_agree_with_the_cameras_of_their_labels(tmp_path: Pat
     hazcam = "1F483288473EFFCMUFP1214L0M1.IMG"
     (folder / "ingest.toml").write_text('name = "opportunity"\ntask = "matching"\n[detector]\nbits = 12\n')
     lines = [f"navcam,{frames}/1N491020{time}ILFCNY9P0706L0M1.IMG\n" for time in (376, 519)]
-    (folder / "pictures.csv").write_text("case,file\n" + "".join(lines))
+    (folder / "images.csv").write_text("case,file\n" + "".join(lines))
     (tmp_path / "out").mkdir()
     path, _ = ingest(folder, tmp_path / "out")
     parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(path)}})
@@ -148,7 +160,7 @@ def test_opportunity_images_agree_with_the_cameras_of_their_labels(tmp_path: Pat
     assert np.isclose(row["max_translation_m"], 0.0671, atol=1e-3)
     # The time tags of the labels differ by 143 s. A single fisheye frame is not a case.
     assert np.isclose(row["duration_s"], 143.258)
-    (folder / "pictures.csv").write_text(f"case,file\nhazcam,{frames}/{hazcam}\n")
+    (folder / "images.csv").write_text(f"case,file\nhazcam,{frames}/{hazcam}\n")
     with pytest.raises(IngestError, match="case 'hazcam' has 1 images; allowed for matching: 2 to 50"):
         ingest(folder, tmp_path / "out")
 
@@ -159,13 +171,13 @@ def test_hazcam_image_with_the_attitude_of_its_label_looks_down(tmp_path: Path, 
     folder.mkdir()
     frame = shared_data / "mer_opportunity" / "1F483288473EFFCMUFP1214L0M1.IMG"
     (folder / "ingest.toml").write_text('name = "hazcam"\ntask = "matching"\n[detector]\nbits = 12\n')
-    (folder / "pictures.csv").write_text(f"case,file,time_s\nhazcam,{frame},0\nhazcam,{frame},1\n")
+    (folder / "images.csv").write_text(f"case,file,time_s\nhazcam,{frame},0\nhazcam,{frame},1\n")
     (tmp_path / "out").mkdir()
     path, stored_cases = ingest(folder, tmp_path / "out")
-    picture = stored_cases.cases[0].pictures[0]
+    stored_image = stored_cases.cases[0].images[0]
     cases = CasesFile(file=str(path))
     image = load_images(cases, stored_cases.cases[0])[0]
-    assert picture.pose.rotation.apply(image.camera.boresight())[2] < -0.3
+    assert stored_image.pose.rotation.apply(image.camera.boresight())[2] < -0.3
     parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(path)}})
     row: dict[str, Any] = dict(MatchingScenario().run(parameters, Streams(0, "hazcam", 0)).row)
     assert row["matches"] > 500

@@ -136,7 +136,7 @@ def test_changed_image_is_rejected(tmp_path: Path) -> None:
     folder = write_landing_folder(tmp_path / "in", inputs.landing(), "matching")
     out = tmp_path / "out"
     run_ingested(folder, out)
-    image_path = out / "pictures" / "000000-2.png"
+    image_path = out / "images" / "000000-2.png"
     image_path.write_bytes(image_path.read_bytes() + b"\0")
     parameters = MatchingScenario.parameters_type.model_validate({"cases": {"file": str(out / "cases.json")}})
     with pytest.raises(ValueError, match=r"000000-2\.png: has changed since it was ingested"):

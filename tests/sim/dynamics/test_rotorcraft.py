@@ -35,7 +35,7 @@ SMOOTH = RotorcraftParameters(vibration=VibrationParameters(acceleration_m_s2=0.
 
 
 def _make_air(seed: int, **changes: float) -> Air:
-    span = TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S + GUIDANCE.wait_s + GUIDANCE.max_duration_s
+    span = TRANSIT.lead_s + TRANSIT.imaging_duration_s + TAIL_S + GUIDANCE.wait_s + GUIDANCE.max_duration_s
     return Air.draw(AirParameters.model_validate(changes), CRAFT.step_s, span, np.random.default_rng(seed))
 
 
@@ -64,7 +64,7 @@ def _fly_landing(
 
 def test_air_shorter_than_the_flight_is_rejected() -> None:
     """Otherwise the kernels would read beyond the end of the gust samples."""
-    air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s, np.random.default_rng(0))
+    air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.imaging_duration_s, np.random.default_rng(0))
     with pytest.raises(ValueError, match="the flight can have"):
         _fly_transit(air)
 
@@ -109,8 +109,8 @@ def test_pitch_balances_drag_and_wind() -> None:
         flight = simulate_transit(
             SMOOTH, TRANSIT, TRANSIT_POINT, COURSE, COURSE, GRAVITY, _make_air(0, **air), np.random.default_rng(0)
         ).path
-        attitude = flight.state(TRANSIT.pictures_s).attitude.as_euler("ZYX")
-        speed = float(flight.state(TRANSIT.pictures_s).velocity_m_s[:2] @ [np.cos(COURSE), np.sin(COURSE)])
+        attitude = flight.state(TRANSIT.imaging_duration_s).attitude.as_euler("ZYX")
+        speed = float(flight.state(TRANSIT.imaging_duration_s).velocity_m_s[:2] @ [np.cos(COURSE), np.sin(COURSE)])
         assert speed == pytest.approx(1.0, abs=0.05)
         assert np.tan(attitude[1]) == pytest.approx((speed - wind) / 5.0 / GRAVITY, abs=2e-3)
         assert attitude[2] == pytest.approx(0.0, abs=1e-6)
@@ -120,7 +120,7 @@ def test_transit_has_constant_height_and_course() -> None:
     """Forty images in five seconds at 1 m/s cover 5 m along the course. Only gusts change the height."""
     displacements, height_ranges, attitude_deviations_deg = [], [], []
     for seed in range(20):
-        motion = _fly_transit(_make_air(seed)).path.motion(np.linspace(0.0, TRANSIT.pictures_s, TRANSIT.pictures))
+        motion = _fly_transit(_make_air(seed)).path.motion(np.linspace(0.0, TRANSIT.imaging_duration_s, TRANSIT.images))
         displacements.append(motion.positions_m[-1] - motion.positions_m[0])
         height_ranges.append(np.ptp(motion.positions_m[:, 2]))
         attitude_deviations_deg.append(motion.attitudes.as_euler("ZYX", degrees=True).std(axis=0))
@@ -165,7 +165,7 @@ def test_phases_start_at_the_heights_of_the_paper() -> None:
     flight = _fly_landing(slope=0.1, craft=SMOOTH, **CALM)
     state = {phase: flight.path.state(time) for phase in Phase if (time := flight.phase_start_s(phase)) is not None}
     assert list(state) == list(Phase)
-    assert state[Phase.APPROACH].time_s - TRANSIT.pictures_s == pytest.approx(GUIDANCE.wait_s, abs=0.05)
+    assert state[Phase.APPROACH].time_s - TRANSIT.imaging_duration_s == pytest.approx(GUIDANCE.wait_s, abs=0.05)
     # Commands use the state 0.1 s earlier. This is 0.2 m at 2 m/s, and 0.07 m at the descent rate of 0.7 m/s.
     assert np.hypot(*(state[Phase.DESCENT].position_m[:2] - SITE_XY)) == pytest.approx(2.0, abs=0.25)
     flare_start = state[Phase.FLARE].position_m

@@ -46,7 +46,7 @@ def test_unreachable_exposure_is_reported() -> None:
     result = auto_expose(_make_detector(0.001), GROUND, short_exposure, np.random.default_rng(2))
     assert not result.converged
     assert result.exposures_s == (0.001,)
-    one_image = auto_expose(_make_detector(0.5), GROUND, AutoExposureParameters(pictures=1), np.random.default_rng(2))
+    one_image = auto_expose(_make_detector(0.5), GROUND, AutoExposureParameters(images=1), np.random.default_rng(2))
     assert not one_image.converged
     assert one_image.detector.parameters.exposure_s < 0.5
 

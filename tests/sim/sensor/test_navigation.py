@@ -33,7 +33,7 @@ RTK, COMPASS = RtkParameters(), TiltCompassParameters()
 @cache
 def _make_path(seed: int) -> SimulatedPath:
     rng = np.random.default_rng(seed)
-    air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S, rng)
+    air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.imaging_duration_s + TAIL_S, rng)
     waypoint_m, heading_rad = np.array([100.0, 50.0, 10.0]), rng.uniform(0.0, 2.0 * np.pi)
     return simulate_transit(CRAFT, TRANSIT, waypoint_m, 0.3, heading_rad, GRAVITY, air, rng).path
 

@@ -210,6 +210,7 @@ def _expose(
     height = float(position[2]) - float(ground.surface.height(*position[:2]))
     hazy_radiance = add_haze(frame, environment, sun, environment.mean_extinction_m(height))
     radiance = hazy_radiance * np.float32(environment.direct_fraction(math.radians(request.sun_elevation_deg)))
+    # the random stream keeps its former name, so that the random values do not change
     auto_exposure = sensor.auto_expose(
         detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
     )
@@ -277,7 +278,8 @@ def describe_image(image: RenderedImage, request: ImageRequest) -> dict[str, Any
     return {
         "marsyard": version("marsyard"),
         "shot": asdict(request),
-        "picture": image.suffix.lstrip("-") or "single",
+        "image": image.suffix.lstrip("-") or "single",
+        "picture": image.suffix.lstrip("-") or "single",  # former name of `image`, until 0.2
         "size": {"columns": columns, "rows": rows},
         "png": png,
         "npz": {
