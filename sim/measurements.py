@@ -74,6 +74,22 @@ class AltitudeMeasurement:
 
 
 @dataclass(frozen=True)
+class ImuIncrements:
+    """Increments measured by an inertial unit.
+
+    - times_s: time tags of the sample boundaries, non-decreasing; one more than samples
+    - period_s: nominal time between boundaries
+    - delta_angles_rad: rotation vectors from the body axes at the start of each interval to the body axes at its end
+    - delta_velocities_m_s: integrals of specific force over each interval, body axes at the start of the interval
+    """
+
+    times_s: Float[np.ndarray, "m"]
+    period_s: float
+    delta_angles_rad: Float[np.ndarray, "n 3"]
+    delta_velocities_m_s: Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True)
 class DescentFrame:
     """Measurements available to the lander's computer when one descent image is taken.
 

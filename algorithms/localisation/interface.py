@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage
-from marsyard.sim.sensor.imu import ImuIncrements
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ from marsyard.scenarios.fieldtest.parameters import DriftParameters
 from marsyard.scenarios.fieldtest.targets import Sightings
 from marsyard.sim.dynamics import Motion, Trajectory
 from marsyard.sim.dynamics.helicopter import HelicopterFlight
-from marsyard.sim.sensor.imu import DEG_H, ImuIncrements
+from marsyard.sim.measurements import ImuIncrements
+from marsyard.sim.sensor.imu import DEG_H
 from marsyard.sim.sensor.inertial import InertialSolution
 
 #: Rotation rate of the Earth, rad/s (WGS 84).

@@ -1,7 +1,8 @@
 """Instrument models: cameras, inertial and navigation sensors that measure the true state with errors."""
 
+from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.sensor.detector import AutoExposure, AutoExposureParameters, Detector, DetectorParameters, auto_expose
-from marsyard.sim.sensor.imu import Imu, ImuIncrements, ImuParameters, WarmUp
+from marsyard.sim.sensor.imu import Imu, ImuParameters, WarmUp
 from marsyard.sim.sensor.inertial import Approach, ApproachParameters, InertialSolution, NavigationErrors
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling
 from marsyard.sim.sensor.mast import (

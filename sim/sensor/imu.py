@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Times
 
@@ -127,22 +128,6 @@ class Triad:
             return measured
         counts = np.rint(np.cumsum(measured, axis=0) / self.count)
         return self.count * np.diff(counts, axis=0, prepend=0.0)
-
-
-@dataclass(frozen=True)
-class ImuIncrements:
-    """Increments measured by an inertial unit.
-
-    - times_s: time tags of the sample boundaries, non-decreasing; one more than samples
-    - period_s: nominal time between boundaries
-    - delta_angles_rad: rotation vectors from the body axes at the start of each interval to the body axes at its end
-    - delta_velocities_m_s: integrals of specific force over each interval, body axes at the start of the interval
-    """
-
-    times_s: Boundaries
-    period_s: float
-    delta_angles_rad: Vectors
-    delta_velocities_m_s: Vectors
 
 
 @dataclass(frozen=True)

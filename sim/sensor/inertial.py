@@ -22,8 +22,9 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
-from marsyard.sim.sensor.imu import Imu, ImuIncrements, Vector, Vectors, accumulate_quaternions, multiply_quaternions
+from marsyard.sim.sensor.imu import Imu, Vector, Vectors, accumulate_quaternions, multiply_quaternions
 from marsyard.sim.sensor.instrument import Times
 
 #: Propagation steps per second: at 2 rpm the relative error of the midpoint rule over the spin is 5e-5.
