@@ -68,22 +68,18 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
     `tags_s` are the images' time tags, None if unknown; `span_s` must lie between the first and the last tag. Raises
     AlgorithmError (BAD_ANSWER) with the reason.
     """
-    _check_type("the answer", answer, VelocityEstimate)
-    _check_type("outcome", answer.outcome, interface.VelocityOutcome)
+    check_type("the answer", answer, VelocityEstimate)
+    check_type("outcome", answer.outcome, interface.VelocityOutcome)
     if (answer.outcome is interface.VelocityOutcome.VALID) != (answer.velocity_m_s is not None):
         problem = "is missing" if answer.velocity_m_s is None else "is given"
         allowed = "a velocity if and only if the outcome is VALID"
         raise bad_answer(f"outcome is {answer.outcome.name}, but velocity_m_s {problem}; allowed: {allowed}")
-    velocity = _check_numbers("velocity_m_s", answer.velocity_m_s, (2,))
+    velocity = check_numbers("velocity_m_s", answer.velocity_m_s, (2,))
     if answer.covariance_m2_s2 is not None and velocity is None:
         raise bad_answer("covariance_m2_s2 is given without a velocity")
-    covariance = _check_numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
+    covariance = check_numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
     if covariance is not None:
-        scale = float(np.abs(covariance).max())
-        if not np.allclose(covariance, covariance.T, rtol=0.0, atol=_MAX_ASYMMETRY * scale):
-            raise bad_answer(f"covariance_m2_s2 is not symmetric: {covariance.tolist()}")
-        if scale == 0.0 or float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
-            raise bad_answer(f"covariance_m2_s2 is not positive definite: {covariance.tolist()}")
+        check_covariance("covariance_m2_s2", covariance)
     span, answer_span = None, answer.span_s
     if answer_span is not None:
         is_pair = isinstance(answer_span, tuple) and len(answer_span) == 2
@@ -102,20 +98,20 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
 
 def check_site(answer: Any) -> interface.SiteEstimate:
     """Validate a `SiteEstimate`; return a copy with plain arrays. Raises the same error as `check_velocity`."""
-    _check_type("the answer", answer, interface.SiteEstimate)
-    _check_type("outcome", answer.outcome, interface.SiteOutcome)
+    check_type("the answer", answer, interface.SiteEstimate)
+    check_type("outcome", answer.outcome, interface.SiteOutcome)
     if (answer.outcome is interface.SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
         problem = "is missing" if answer.site_world is None else "is given"
         allowed = "None if and only if the outcome is NO_SAFE_SITE"
         raise bad_answer(f"outcome is {answer.outcome.name}, but site_world {problem}; allowed: {allowed}")
-    return interface.SiteEstimate(answer.outcome, _check_numbers("site_world", answer.site_world, (3,)), answer.details)
+    return interface.SiteEstimate(answer.outcome, check_numbers("site_world", answer.site_world, (3,)), answer.details)
 
 
 def check_update(answer: Any) -> interface.TargetUpdate:
     """Validate a `TargetUpdate`; return a copy with plain arrays. Raises the same error as `check_velocity`."""
-    _check_type("the answer", answer, interface.TargetUpdate)
-    _check_type("state", answer.state, interface.TrackingState)
-    position = _check_numbers("position_rover", answer.position_rover, (3,))
+    check_type("the answer", answer, interface.TargetUpdate)
+    check_type("state", answer.state, interface.TrackingState)
+    position = check_numbers("position_rover", answer.position_rover, (3,))
     if answer.state is interface.TrackingState.NORMAL and position is None:
         raise bad_answer("state is NORMAL, but position_rover is None")
     return interface.TargetUpdate(answer.state, answer.losses, position, answer.details)
@@ -143,7 +139,16 @@ def check_aim(answer: Any, mast: MastCalibration) -> interface.MastAim | None:
     return interface.MastAim(float(answer.azimuth_rad), float(answer.elevation_rad), answer.left, answer.right)
 
 
-def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."] | None:
+def check_covariance(name: str, covariance: Float64[np.ndarray, "n n"]) -> None:
+    """Raise AlgorithmError (BAD_ANSWER) unless a covariance is symmetric and positive definite."""
+    scale = float(np.abs(covariance).max())
+    if not np.allclose(covariance, covariance.T, rtol=0.0, atol=_MAX_ASYMMETRY * scale):
+        raise bad_answer(f"{name} is not symmetric: {covariance.tolist()}")
+    if scale == 0.0 or float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
+        raise bad_answer(f"{name} is not positive definite: {covariance.tolist()}")
+
+
+def check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."] | None:
     """Validate an array of finite floats of this shape; return a plain ndarray copy. None stays None."""
     if value is None:
         return None
@@ -158,7 +163,7 @@ def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.
     return numbers
 
 
-def _check_type(name: str, value: Any, kind: type) -> None:
+def check_type(name: str, value: Any, kind: type) -> None:
     if not isinstance(value, kind):
         raise bad_answer(f"{name} is a {_type_name(value)}; allowed: a {kind.__name__}")
 
