@@ -1,0 +1,82 @@
+"""World of a localisation case: the terrain of a site, its atmosphere and the sun of the landing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from marsyard.scenarios.exposure import sunlight_ratio
+from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Scene, Sun
+from marsyard.sim.sensor import DetectorParameters
+from marsyard.sim.terrain import Environment, Site, Surface, TerrainParameters
+
+
+@dataclass(frozen=True)
+class LocalisationWorld:
+    """Terrain and light of a landing.
+
+    - ground: terrain of the site, with the reflectance and the atmosphere of the landing
+    - sun: sun of the landing
+    - brightness: sunlight at the ground divided by the reference sunlight of the detector's responsivity
+    """
+
+    ground: SiteGround
+    sun: Sun
+    brightness: float = 1.0
+
+    @property
+    def air(self) -> Environment:
+        """Atmosphere of the landing."""
+        return self.ground.site.environment
+
+    @property
+    def surface(self) -> Surface:
+        """Surface of the ground; it is periodic."""
+        return self.ground.surface
+
+    @classmethod
+    def from_parameters(
+        cls,
+        site: Site,
+        terrain: TerrainParameters,
+        *,
+        bank_seed: int,
+        terrain_number: int,
+        sun_azimuth_deg: float,
+        sun_elevation_deg: float,
+        optical_depth: float | None = None,
+        detector: DetectorParameters | None = None,
+    ) -> LocalisationWorld:
+        """Create the world of a case; read its terrain from the bank's cache or build it.
+
+        - sun_azimuth_deg, sun_elevation_deg: azimuth clockwise from north, and elevation
+        - optical_depth: of the dusty atmosphere during the landing; None for that of the site
+        - detector: detector of the descent camera, for the brightness; without it the brightness is 1
+        """
+        ground = SiteGround.from_bank(site.with_dust(optical_depth), terrain, bank_seed, terrain_number)
+        air = ground.site.environment
+        sun = sun_at(air, sun_azimuth_deg, sun_elevation_deg)
+        brightness = 1.0 if detector is None else sunlight_ratio(air, float(np.radians(sun_elevation_deg)), detector)
+        return cls(ground, sun, brightness)
+
+    def scene(self, east_m: float, north_m: float, height_m: float, pixel_rad: float) -> Scene:
+        """Create the scene for a camera at or above a height above the ground.
+
+        One scene serves a whole descent: its mesh only gives first guesses, which are refined on the exact surface.
+        Angles up to 66 deg from nadir do not depend on it at all except at hidden slopes; flatter rays are traced
+        without it. The mesh is dense below (east_m, north_m) and reaches the horizon.
+
+        - east_m, north_m: position below the first image
+        - height_m: height above the ground at which the mesh resolves the samples of the terrain; the time of an image
+          from a greater height grows with height / height_m
+        - pixel_rad: angle of a pixel
+        """
+        return site_scene(self.ground, Viewpoint(east_m, north_m, height_m, pixel_rad), self.sun)
+
+
+def sun_at(air: Environment, azimuth_deg: float, elevation_deg: float) -> Sun:
+    """Return the sun over a site; azimuth clockwise from north."""
+    return Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)), air.sun_radius_rad)
