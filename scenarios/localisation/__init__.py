@@ -1,0 +1,1 @@
+"""Localisation of a lander on a map: flight, instruments and measurement stream of the scenario."""
