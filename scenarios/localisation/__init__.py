@@ -1,1 +1,1 @@
-"""Localisation scenario: a lander estimates its position on a map made from orbital images."""
+"""Localisation of a lander on a map: sites, map product, flight, instruments, scenario and scoring."""

@@ -1,0 +1,221 @@
+"""Instruments of localisation: camera and detector, inertial units, radar, image clock, and the initial state.
+
+Camera and inertial unit are at the origin of the body frame; the camera looks along -z and its columns increase along
+x. Facts of the camera: Maki et al. 2020 (Space Science Reviews) and Johnson et al. 2017, 2022, as listed for this
+project; other values are assumed and marked so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import Field, model_validator
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from marsyard.algorithms.localisation.interface import InitialState
+from marsyard.scenarios.exposure import CalibrationParameters
+from marsyard.sim.camera import Cahv, Cahvore, CameraModel
+from marsyard.sim.dynamics import State, Trajectory
+from marsyard.sim.measurements import AltitudeMeasurement
+from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
+from marsyard.sim.sensor import ClockParameters, DetectorParameters, ImuParameters, RadarAltimeter, RadarParameters
+from marsyard.sim.sensor.optics import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath, OpticsParameters
+
+
+class CameraParameters(Parameters):
+    """The lander's camera: a fisheye (CAHVORE type 2) of 1024 x 1024 pixels, 90 x 90 deg, and 1.67 mrad on the axis.
+
+    With the angle theta from the axis, the focal length f in pixels (1 / 1.67 mrad) and half the field theta_h, the
+    radius in the image is f (theta + rho1 theta^3). rho1 is such that theta_h is at the edge: pixels of 1.67 mrad over
+    the whole field would cover 98 deg.
+    """
+
+    pixels: Annotated[int, Field(ge=64, le=4096, description="columns and rows of the image")] = 1024
+    pixel_mrad: Annotated[float, Field(gt=0.1, le=40.0, description="angle of a pixel on the axis, mrad")] = 1.67
+    field_deg: Annotated[float, Field(gt=10.0, le=120.0, description="field of view from edge to edge")] = 90.0
+    focal_length_mm: Annotated[float, Field(gt=1.0, le=100.0, description="focal length; sets the pixel pitch")] = 5.8
+    alignment_error_deg: Annotated[
+        float, bounded_field(0.0, 10.0, "RMS error of the calibrated mounting per axis (assumed)")
+    ] = 0.02
+    calibration: Annotated[CalibrationParameters, Field(description="errors of the calibrated lens (assumed)")] = (
+        CalibrationParameters()
+    )
+
+    @model_validator(mode="after")
+    def _check_field(self) -> CameraParameters:
+        if not np.all(np.isfinite(true_camera(self).corner_rays[1])):
+            raise ValueError(
+                f"field_deg of {self.field_deg:.6g} with {self.pixels} pixels of {self.pixel_mrad:.6g} mrad is not a "
+                f"one-to-one image; allowed: a field close to pixels x pixel_mrad"
+            )
+        return self
+
+    @property
+    def pixel_pitch_um(self) -> float:
+        """Pitch of the delivered pixels, micrometres."""
+        return self.focal_length_mm * self.pixel_mrad
+
+
+def true_camera(p: CameraParameters) -> Cahvore:
+    """Create the true camera in the body frame."""
+    focal_px, half_field = 1e3 / p.pixel_mrad, 0.5 * np.radians(p.field_deg)
+    pinhole = Cahv.from_axes(
+        (focal_px, focal_px), (p.pixels, p.pixels), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
+    )
+    cubic = (0.5 * p.pixels / focal_px - half_field) / half_field**3
+    return Cahvore.from_cahv(pinhole, r=np.array([0.0, cubic, 0.0]), linearity=0.0)
+
+
+def draw_calibrated_camera(p: CameraParameters, rng: np.random.Generator) -> CameraModel:
+    """Return the calibrated camera: the true one with normally distributed errors of lens and mounting.
+
+    The error of the distortion moves a pixel at the angle theta outwards in proportion to theta^3.
+    """
+    focal, column, row, distortion = rng.standard_normal(4)
+    tilt = Rotation.from_rotvec(np.radians(p.alignment_error_deg) * rng.standard_normal(3))
+    camera, errors = true_camera(p), p.calibration
+    corner_ray = camera.corner_rays[1][0]
+    corner = float(np.arccos(corner_ray @ camera.o / np.linalg.norm(corner_ray)))
+    cubic = errors.distortion_error_px * float(distortion) * 1e-3 * p.pixel_mrad / corner**3
+    camera = replace(camera, r=camera.r + np.array([0.0, cubic, 0.0]))
+    camera = camera.magnify(1.0 + errors.focal_error * float(focal))
+    camera = camera.recentre(errors.centre_error_px * float(column), errors.centre_error_px * float(row))
+    return camera.transform(RigidTransform.from_rotation(tilt))
+
+
+#: Distance of Mars from the sun at the landing on 2021-02-18: heliocentric longitude Ls = 5 deg on the orbit of Mars.
+LANDING_AU = 1.57
+#: Signal-to-noise ratio of a pixel of `LANDER_DETECTOR` at half of its full well.
+HALF_WELL_SNR = 80.0
+#: Noise of reading a summed pixel, electrons (assumed).
+_READ_NOISE_E = 10.0
+_EXPOSURE_S = 150e-6
+_BITS = 8
+
+
+def _full_well_e() -> float:
+    """Solve S / sqrt(S + r^2 + q^2) = SNR for the full well 2 S; q is the error of rounding to counts of 2 S / 2^b.
+
+    With q^2 = c S^2, c = (2 / 2^b)^2 / 12, this is (1 - c SNR^2) S^2 - SNR^2 S - SNR^2 r^2 = 0.
+    """
+    square = HALF_WELL_SNR**2
+    quadratic = 1.0 - square * (2.0 / 2**_BITS) ** 2 / 12.0
+    half = (square + np.sqrt(square**2 + 4.0 * quadratic * square * _READ_NOISE_E**2)) / (2.0 * quadratic)
+    return float(2.0 * half)
+
+
+def _create_detector() -> DetectorParameters:
+    full_well = _full_well_e()
+    light = LightPath(2.7, CameraParameters().pixel_pitch_um, (400.0, 900.0))
+    return DetectorParameters(
+        exposure_s=_EXPOSURE_S,
+        responsivity_e_s=BRIGHT_FILL * full_well / (BRIGHT_RADIANCE_FACTOR * _EXPOSURE_S),
+        sun_au=LANDING_AU,
+        rows_summed=1,
+        transfer_row_s=0.0,
+        clear_row_s=0.0,
+        readout_row_s=1e-4,
+        full_well_e=full_well,
+        gain_e_dn=full_well / 2**_BITS,
+        read_noise_e=_READ_NOISE_E,
+        offset_dn=2.0,
+        bits=_BITS,
+        temperature_c=0.0,
+        dark_e_s=2000.0,
+        optics=OpticsParameters(diffraction_px=light.diffraction_px(), diffusion_px=0.25),
+    )
+
+
+#: Detector of the lander's camera: global shutter, 8 bits, 150 us, SNR 80 at half full well, f/2.7. Pixels are sums of
+#: 2 x 2. Assumed: read noise, offset, dark current (0.3 electrons in an exposure), readout, passband, blur; and the
+#: responsivity, which fills 60 % of the full well at the radiance factor 0.3 (the other presets' exposure). It is 35 %
+#: of that of an f/2.7 lens on a CCD of the same pitch: the rest is lost in the fill factor of a global shutter.
+LANDER_DETECTOR = _create_detector()
+
+#: Northrop Grumman's LN-200, the unit of Mars 2020; sources of the values: `ImuParameters`.
+LN200 = ImuParameters()
+
+#: Safran Sensonor's STIM300, a small silicon unit. Data sheet TS1524: random walks (0.15 deg/sqrt(h),
+#: 0.07 m/s/sqrt(h)), bias instability (0.5 deg/h, 0.05 mg), scale factors (500 ppm, 300 ppm), misalignment (1 mrad),
+#: accelerometer bias over temperature (2 mg). Gyro bias 4 deg/h: repeatability in a paper of ION Navigation. Assumed:
+#: rate, correlation times, and negligible rounding.
+MEMS = ImuParameters(
+    rate_hz=400.0, gyro_bias_deg_h=4.0, gyro_wander_deg_h=0.5, gyro_bias_deg_h_k=0.0,
+    angular_random_walk_deg_sqrt_h=0.15, gyro_scale_ppm=500.0, gyro_misalignment_mrad=1.0, gyro_count_rad=0.0,
+    accelerometer_bias_mg=2.0, accelerometer_wander_mg=0.05, accelerometer_bias_mg_k=0.0,
+    velocity_random_walk_ug_sqrt_hz=119.0, accelerometer_scale_ppm=300.0, accelerometer_misalignment_mrad=1.0,
+    accelerometer_count_m_s=0.0,
+)  # fmt: skip
+
+#: Radar altimeter: errors of the MER altimeter; a beam of 30 deg includes nadir at tilts up to 15 deg (assumed).
+RADAR = RadarParameters(rate_hz=2.0, beam_deg=30.0, max_range_m=8000.0)
+
+#: Clock of the image time tags, relative to the true time; that of the inertial unit is in `ImuParameters` (assumed).
+IMAGE_CLOCK = ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005)
+
+
+def measure_altitudes(
+    radar: RadarAltimeter, flight: Trajectory, span_s: tuple[float, float], rng: np.random.Generator
+) -> list[AltitudeMeasurement]:
+    """Measure the altitude at all samples of the radar in a span of true times; missing readings are omitted.
+
+    The altitude is the range to the nearest ground in the radar's beam.
+    """
+    readings = radar.measure(flight, radar.sampling.within(*span_s), rng)
+    return [
+        AltitudeMeasurement(float(value), float(tag))
+        for value, tag in zip(readings.values, readings.times_s, strict=True)
+        if np.isfinite(value)
+    ]
+
+
+class InitialErrors(Parameters):
+    """Errors of inertial navigation at the start of localisation; all are normally distributed.
+
+    The horizontal position error is truncated at `horizontal_max_m` (3.2 km, Mars 2020). The attitude is that of the
+    star tracker, propagated through entry. Standard deviations are assumed. Errors of the initial state are independent
+    of each other and of the inertial unit's errors.
+    """
+
+    horizontal_sd_m: Annotated[NonNegative, Field(description="sd per axis before truncation, m (assumed)")] = 1000.0
+    horizontal_max_m: Annotated[float, Field(gt=0.0, description="largest horizontal position error, m")] = 3200.0
+    vertical_sd_m: Annotated[NonNegative, Field(description="sd of the height, m (assumed)")] = 100.0
+    velocity_sd_m_s: Annotated[NonNegative, Field(description="sd per axis, m/s (assumed)")] = 1.0
+    attitude_sd_deg: Annotated[NonNegative, Field(description="sd per axis, deg (assumed)")] = 0.1
+
+    def covariance(self) -> Float64[np.ndarray, "9 9"]:
+        """Compute the covariance of position (m), velocity (m/s) and attitude (rad) as drawn, with the truncation."""
+        horizontal = self.horizontal_sd_m**2 * self._truncated_variance()
+        attitude = np.radians(self.attitude_sd_deg) ** 2
+        position = [horizontal, horizontal, self.vertical_sd_m**2]
+        return np.diag([*position, *[self.velocity_sd_m_s**2] * 3, *[attitude] * 3])
+
+    def draw(self, truth: State, time_s: float, gravity_m_s2: float, rng: np.random.Generator) -> InitialState:
+        """Draw the initial state; `time_s` is the time of the true state on the clock of the inertial unit."""
+        position, velocity, attitude = rng.standard_normal((3, 3))
+        angle, quantile = 2.0 * np.pi * rng.random(), rng.random()
+        # inverse of the distribution of the radius, 1 - exp(-r^2 / (2 sd^2)), truncated
+        radius = self.horizontal_sd_m * np.sqrt(-2.0 * np.log1p(quantile * np.expm1(-self._truncation())))
+        error = np.array([radius * np.cos(angle), radius * np.sin(angle), self.vertical_sd_m * position[2]])
+        rotation = Rotation.from_rotvec(np.radians(self.attitude_sd_deg) * attitude)
+        return InitialState(
+            time_s=time_s,
+            position_m=truth.position_m - error,
+            velocity_m_s=truth.velocity_m_s - self.velocity_sd_m_s * velocity,
+            # the error e is defined by true attitude = exp(e) estimated attitude
+            world_from_body=rotation.inv() * truth.attitude,
+            covariance=self.covariance(),
+            gravity_m_s2=gravity_m_s2,
+        )
+
+    def _truncation(self) -> float:
+        """Return k = (maximum / sd)^2 / 2; the radius^2 / (2 sd^2) is exponentially distributed up to k."""
+        return 0.5 * (self.horizontal_max_m / max(self.horizontal_sd_m, 1e-6 * self.horizontal_max_m)) ** 2
+
+    def _truncated_variance(self) -> float:
+        """Compute the mean of an exponential distribution truncated at k, 1 - k / (e^k - 1): variance / sd^2."""
+        k = min(self._truncation(), 700.0)
+        return float(1.0 - k / np.expm1(k))

@@ -1,0 +1,155 @@
+"""Measurement stream of a descent in the order of arrival, and the run of a position estimator over it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import Field
+
+from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionEstimator
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage
+from marsyard.sim.parameters import Parameters, bounded_field
+from marsyard.sim.sensor.imu import ImuIncrements
+
+#: One event of the stream.
+Event = ImuIncrements | AltitudeMeasurement | DetectorImage
+Data = TypeVar("Data")
+Result = TypeVar("Result")
+
+
+class ImageSchedule(Parameters):
+    """Times of the images: those of the coarse stage first (0.3 Hz, Mars 2020), then those of the fine stage.
+
+    The cameras of Mars 2020 took pictures at up to 1 Hz; the default of half of it is assumed.
+    """
+
+    first_s: Annotated[float, bounded_field(0.05, 60.0, "first image, after the start")] = 0.5
+    coarse_images: Annotated[int, Field(ge=0, le=100, description="images of the coarse stage")] = 3
+    coarse_interval_s: Annotated[float, bounded_field(0.1, 60.0, "time after each image of the coarse stage")] = 3.3
+    interval_s: Annotated[float, bounded_field(0.1, 60.0, "time between images of the fine stage")] = 2.0
+
+    def times(self, start_s: float, end_s: float) -> Float64[np.ndarray, "images"]:
+        """Compute the nominal times of the images from start to end (included)."""
+        first, coarse = start_s + self.first_s, self.coarse_interval_s * np.arange(self.coarse_images + 1)
+        count = max(int((end_s - first - coarse[-1]) / self.interval_s) + 1, 0)
+        times = np.concatenate([first + coarse[:-1], first + coarse[-1] + self.interval_s * np.arange(count)])
+        return np.asarray(times[times <= end_s])
+
+
+def merge(
+    increments: ImuIncrements, altitudes: Sequence[AltitudeMeasurement], images: Sequence[DetectorImage]
+) -> list[Event]:
+    """Merge measurements into the order of their time tags, with the increments split at each altitude and image.
+
+    The last boundary before an altitude or an image is the first boundary that is not earlier than its time tag. A
+    part of the increments begins with the last boundary of the previous part, and is not empty. Raises ValueError for a
+    time tag outside the increments.
+    """
+    tags = increments.times_s
+    measurements: list[AltitudeMeasurement | DetectorImage] = sorted([*altitudes, *images], key=lambda m: m.time_s)
+    outside = [m.time_s for m in measurements if not tags[0] <= m.time_s <= tags[-1]]
+    if outside:
+        raise ValueError(
+            f"the time tag {outside[0]:.6f} s is outside of the increments; allowed: {tags[0]:.6f} to {tags[-1]:.6f} s"
+        )
+    events: list[Event] = []
+    first = 0
+    for measurement in measurements:
+        last = int(np.searchsorted(tags, measurement.time_s, side="left"))
+        if last > first:
+            events.append(_part(increments, first, last))
+            first = last
+        events.append(measurement)
+    if first < tags.size - 1:
+        events.append(_part(increments, first, tags.size - 1))
+    return events
+
+
+def _part(increments: ImuIncrements, first: int, last: int) -> ImuIncrements:
+    """Return the increments between two boundaries."""
+    return ImuIncrements(
+        times_s=increments.times_s[first : last + 1],
+        period_s=increments.period_s,
+        delta_angles_rad=increments.delta_angles_rad[first:last],
+        delta_velocities_m_s=increments.delta_velocities_m_s[first:last],
+    )
+
+
+@dataclass(frozen=True)
+class ProcessorTimes:
+    """Processor time of each call of an estimator, s; one value per call of `imu`, `altitude` and `image`."""
+
+    start_s: float
+    imu_s: tuple[float, ...]
+    altitude_s: tuple[float, ...]
+    image_s: tuple[float, ...]
+    finish_s: float
+
+    @property
+    def total_s(self) -> float:
+        """Processor time of all calls."""
+        return self.start_s + sum(self.imu_s) + sum(self.altitude_s) + sum(self.image_s) + self.finish_s
+
+
+@dataclass(frozen=True)
+class StreamAnswers:
+    """Answers of an estimator to a stream.
+
+    - estimates: one per image, in the order of arrival, and the final one
+    - processor_times: of the calls
+    """
+
+    estimates: tuple[PositionEstimate, ...]
+    processor_times: ProcessorTimes
+
+
+def feed(
+    estimator: PositionEstimator, initial: InitialState, map_product: MapProduct, events: Sequence[Event]
+) -> StreamAnswers:
+    """Run an estimator over a stream; it receives read-only arrays. Its exceptions are not handled."""
+    _, start_s = _measure_time(lambda: estimator.start(_read_only(initial), _read_only(map_product)))
+    estimates: list[PositionEstimate] = []
+    imu_s: list[float] = []
+    altitude_s: list[float] = []
+    image_s: list[float] = []
+    for event in events:
+        data = _read_only(event)
+        if isinstance(data, ImuIncrements):
+            imu_s.append(_measure_time(lambda data=data: estimator.imu(data))[1])  # type: ignore[misc]
+        elif isinstance(data, AltitudeMeasurement):
+            altitude_s.append(_measure_time(lambda data=data: estimator.altitude(data))[1])  # type: ignore[misc]
+        else:
+            estimate, elapsed_s = _measure_time(lambda data=data: estimator.image(data))  # type: ignore[misc]
+            estimates.append(estimate)
+            image_s.append(elapsed_s)
+    final, finish_s = _measure_time(estimator.finish)
+    times = ProcessorTimes(start_s, tuple(imu_s), tuple(altitude_s), tuple(image_s), finish_s)
+    return StreamAnswers((*estimates, final), times)
+
+
+def _measure_time(call: Callable[[], Result]) -> tuple[Result, float]:
+    """Return the result of a call, and its processor time, s."""
+    start_s = time.process_time()
+    result = call()
+    return result, time.process_time() - start_s
+
+
+def _read_only(data: Data) -> Data:
+    """Return a copy of a data class whose arrays are read-only views, also those of data classes in its fields.
+
+    Arrays of camera models are always read-only.
+    """
+    changes: dict[str, Any] = {}
+    for field in fields(data):  # type: ignore[arg-type]
+        value = getattr(data, field.name)
+        if isinstance(value, np.ndarray):
+            changes[field.name] = value.view()
+            changes[field.name].setflags(write=False)
+        elif field.name == "calibration" and is_dataclass(value):
+            changes[field.name] = _read_only(value)
+    return replace(data, **changes)  # type: ignore[type-var]
