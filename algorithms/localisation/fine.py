@@ -109,7 +109,8 @@ def match_landmarks(
     )
     half_px = options.search_sigmas_fine * float(sigma_px) / factor
     corrected, coarser = image, _acquisition_factor(image, factor, half_px, options)
-    if coarser > 1:
+    if half_px > options.min_half_width_px:
+        # templates from a wrong position are distorted and biased: the pose is corrected first, also at full scale
         half = min(int(np.ceil(half_px / coarser)) + 1, 2 * options.max_half_width_px)
         search = _search_landmarks(corrected, landmarks, map_product, factor * coarser, half, True, options)
         fit = _fit(corrected, landmarks, search, prior_sd, _ACQUISITION_TOLERANCE, options)
@@ -155,7 +156,7 @@ def _search_landmarks(
     )
     corners = np.rint(predicted).astype(np.int64) - options.template_px // 2
     points = landmarks.points_m[indices]
-    templates, inside = render_templates(camera, corners, points[:, 2], map_product, options.template_px, acquisition)
+    templates, inside = render_templates(camera, corners, points[:, 2], map_product, options.template_px)
     displacements = np.zeros((len(indices), 2))
     scores = np.full(len(indices), -1.0)
     for k in np.flatnonzero(inside):
@@ -171,14 +172,12 @@ def render_templates(
     elevations_m: Vector,
     map_product: MapProduct,
     side: int,
-    smooth: bool = False,
 ) -> tuple[Float32[np.ndarray, "n side side"], Bool[np.ndarray, "n"]]:
     """Render squares of image pixels from the map; also return whether all their ground lies inside the map.
 
     - camera: camera model in the world frame
     - corners: pixels (column, row) of the squares' upper left pixels
     - elevations_m: elevation of the ground in each square, where the intersection with the rays starts
-    - smooth: whether a pixel covers so many map pixels that the map has to be averaged before it is sampled
     """
     steps = np.arange(side, dtype=np.float64)
     pixels = corners[:, np.newaxis, np.newaxis, :] + np.stack(np.meshgrid(steps, steps), axis=-1)
@@ -186,13 +185,12 @@ def render_templates(
     ground = intersect_elevation(map_product, origins, directions, elevations_m[:, np.newaxis])
     inside = np.asarray(np.all(inside_map(map_product, ground), axis=1))
     positions = map_pixels(map_product, ground).reshape(len(corners), side, side, 2)
-    appearance, size = map_product.appearance, 1
-    if smooth and len(corners):
+    appearance = map_product.appearance
+    if len(corners):
         cells = np.abs(np.diff(positions, axis=2)).max(axis=-1)
-        # side of the box, odd; four samples average over the rest of the cell
+        # large cells: the map is averaged over a box, of odd side; the four samples average over the rest of the cell
         size = 2 * int(float(np.median(cells)) / 4.0) + 1
-    if size > 1:
-        appearance = cv2.blur(appearance, (size, size))
+        appearance = cv2.blur(appearance, (size, size)) if size > 1 else appearance
     return sample_averages(appearance, positions), inside
 
 
