@@ -1,0 +1,367 @@
+"""Coarse stage: horizontal position of the lander by matching large patches of a few images over the whole map.
+
+The error of the inertial position is constant over the few seconds between the images. Each patch is rectified with
+the estimated attitude and the altimeter's height, and correlated with the map at every offset of the position:
+
+1. Patches on a horizontal plane give surfaces of correlation over the offset. Candidates are maxima of the sum of the
+   surfaces, each replaced by its maximum within a tolerance, because relief shifts patches differently.
+2. For each candidate, the patches are rectified again onto the map's elevation there, and matched near the candidate.
+   Patches whose offsets agree within a small tolerance are consistent. The candidate with the largest support is
+   accepted if it has enough consistent patches and no other candidate has a similar support.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int
+
+from marsyard.algorithms.arrays import Flags, Points2, Raster, Vector, Vector2
+from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak
+from marsyard.algorithms.image.interest import harris_interest, structure_tensor
+from marsyard.algorithms.localisation.interface import MapProduct
+from marsyard.algorithms.localisation.options import LvsOptions
+from marsyard.algorithms.localisation.posed_image import PosedImage
+from marsyard.algorithms.localisation.rectification import (
+    GroundView,
+    RectifiedImage,
+    bin_map,
+    rectify_patches,
+    rectify_to_plane,
+    view_ground,
+)
+
+#: Support of the structure tensor for the contrast of a patch, coarse pixels, and spacing of candidate patches.
+_CONTRAST_SUPPORT_PX = 5
+_PATCH_STEP_PX = 8
+#: Minimum distance of two patches of an image, and fraction of a small footprint's side for one patch.
+_PATCH_SPACING = 0.75
+_FOOTPRINT_FRACTION = 0.4
+#: Minimum standard deviation of a patch relative to its mean: below it, only noise and rounding remain (assumed).
+_MIN_PATCH_CONTRAST = 1e-3
+
+
+class CoarseRefusal(Enum):
+    """Reasons why the coarse stage reports no position; expected refusals."""
+
+    TOO_FEW_PATCHES = "the images have too few patches with contrast on the map"
+    NO_CONSENSUS = "too few patches agree on an offset of the position"
+    AMBIGUOUS = "another offset of the position has a similar support"
+    BORDER = "the offset lies at the border of the search area"
+
+
+@dataclass(frozen=True)
+class CoarseMatches:
+    """Matches of the patches at the accepted offset, for figures. Positions are horizontal, in the world frame.
+
+    - images: index of each patch's image
+    - predicted_m: centres of the patches for the estimated position
+    - map_m: positions where they were found on the map
+    - scores: normalised correlations
+    - consistent: patches that agree with the accepted offset
+    - side_m: side of a patch
+    """
+
+    images: Int[np.ndarray, "n"]
+    predicted_m: Points2
+    map_m: Points2
+    scores: Vector
+    consistent: Flags
+    side_m: Float[np.ndarray, "n"]
+
+
+@dataclass(frozen=True)
+class CoarseFix:
+    """Horizontal offset of the true position from the estimated one, the same for all images.
+
+    - offset_m: true minus estimated position (east, north)
+    - covariance: of the offset, m^2: the scatter of the patches, the attitude error that is common to them, and the map's
+      registration and distortion
+    - matches: the patches' matches
+    - support, second_support: sums of the scores of the consistent patches of the best and of the second candidate
+    """
+
+    offset_m: Vector2
+    covariance: Float[np.ndarray, "2 2"]
+    matches: CoarseMatches
+    support: float
+    second_support: float
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """Patch of a rectified image: corner (column, row) on the map's grid, values, number of its image."""
+
+    corner: tuple[int, int]
+    values: Raster
+    image: int
+
+    @property
+    def side(self) -> int:
+        return len(self.values)
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """Verified candidate: mean offset, and offset, score and consistency of each patch."""
+
+    offset_m: Vector2
+    offsets_m: Points2
+    scores: Vector
+    consistent: Flags
+
+    @property
+    def count(self) -> int:
+        return int(np.count_nonzero(self.consistent))
+
+    @property
+    def support(self) -> float:
+        return float(self.scores[self.consistent].sum())
+
+
+def find_coarse_position(
+    images: Sequence[PosedImage],
+    height_above_ground_m: Sequence[float],
+    map_product: MapProduct,
+    sd_m: float,
+    options: LvsOptions,
+) -> CoarseFix | CoarseRefusal:
+    """Find the common horizontal offset of the images' estimated positions by matching large patches to the map.
+
+    - height_above_ground_m: height of the body's origin above the ground below it at each image, from the altimeter
+    - sd_m: standard deviation of the horizontal position per axis
+    """
+    grid = bin_map(map_product, options.coarse_binning)
+    views = [
+        view_ground(image, float(height), grid.pixel_m)
+        for image, height in zip(images, height_above_ground_m, strict=True)
+        if height > 0.0
+    ]
+    patches: list[_Patch] = []
+    for number, view in enumerate(views):
+        rectified = rectify_to_plane(view, grid, options.max_off_nadir_rad)
+        patches += _select_patches(rectified, grid, number, options)
+    if len(patches) < options.min_consistent_patches:
+        return CoarseRefusal.TOO_FEW_PATCHES
+    appearance = _filter(grid.appearance, options)
+    radius = int(np.ceil(min(options.search_radius_m, options.search_sigmas * sd_m) / grid.pixel_m))
+    surfaces = np.stack([_correlate(patch, appearance, radius) for patch in patches])
+    peaks = _candidate_offsets(surfaces, radius, grid.pixel_m, options)
+    candidates = [_verify(peak, patches, views, grid, appearance, options) for peak in peaks]
+    return _decide(candidates, patches, views, grid, radius, options)
+
+
+def _filter(raster: Raster, options: LvsOptions) -> Raster:
+    """Subtract the mean, or the local mean if the option is set."""
+    side = options.coarse_high_pass_px
+    return np.asarray(raster - (cv2.blur(raster, (side, side)) if side else raster.mean()))
+
+
+def _select_patches(rectified: RectifiedImage, grid: MapProduct, number: int, options: LvsOptions) -> list[_Patch]:
+    """Select the patches with the highest contrast, apart from each other, inside image and map."""
+    extent = float(np.sqrt(np.count_nonzero(rectified.valid)))
+    side = min(options.patch_px, int(_FOOTPRINT_FRACTION * extent))
+    if side < options.min_patch_px:
+        return []
+    mean = float(rectified.values[rectified.valid].mean())
+    if not mean > 0.0:
+        return []
+    values = _filter(np.where(rectified.valid, rectified.values, np.float32(mean)), options)
+    interest = harris_interest(*structure_tensor(values, _CONTRAST_SUPPORT_PX))
+    contrasts = cv2.boxFilter(interest.astype(np.float32), cv2.CV_32F, (side, side), anchor=(0, 0))
+    filled = cv2.boxFilter(rectified.valid.astype(np.float32), cv2.CV_32F, (side, side), anchor=(0, 0)) > 0.9999
+    rows = np.arange(0, values.shape[0] - side + 1, _PATCH_STEP_PX)
+    columns = np.arange(0, values.shape[1] - side + 1, _PATCH_STEP_PX)
+    map_columns, map_rows = columns + rectified.corner[0], rows + rectified.corner[1]
+    on_map_columns = (map_columns >= 0) & (map_columns + side <= grid.appearance.shape[1])
+    on_map_rows = (map_rows >= 0) & (map_rows + side <= grid.appearance.shape[0])
+    lattice = np.ix_(rows, columns)
+    scores = np.where(filled[lattice] & on_map_rows[:, np.newaxis] & on_map_columns, contrasts[lattice], -1.0)
+    patches: list[_Patch] = []
+    while len(patches) < options.patches_per_image and scores.max(initial=-1.0) > 0.0:
+        i, j = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        row, column = int(rows[i]), int(columns[j])
+        part = values[row : row + side, column : column + side]
+        if part.std() >= _MIN_PATCH_CONTRAST * mean:
+            patches.append(_Patch((int(map_columns[j]), int(map_rows[i])), part, number))
+        near_rows = np.abs(rows - row) < _PATCH_SPACING * side
+        near_columns = np.abs(columns - column) < _PATCH_SPACING * side
+        scores[near_rows[:, np.newaxis] & near_columns] = -1.0
+    return patches
+
+
+def _correlate(patch: _Patch, appearance: Raster, radius: int) -> Float[np.ndarray, "n n"]:
+    """Normalised correlation of a patch at all offsets up to `radius` (rows, columns); -1 outside map and circle."""
+    column, row = patch.corner
+    rows, columns = appearance.shape
+    side, full = patch.side, 2 * radius + 1
+    low_row, low_column = max(row - radius, 0), max(column - radius, 0)
+    high_row, high_column = min(row + side + radius, rows), min(column + side + radius, columns)
+    surface = np.full((full, full), -1.0, np.float32)
+    window = np.ascontiguousarray(appearance[low_row:high_row, low_column:high_column], dtype=np.float32)
+    template = (patch.values - patch.values.mean()).astype(np.float32)
+    values = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
+    first_row, first_column = low_row - row + radius, low_column - column + radius
+    surface[first_row : first_row + values.shape[0], first_column : first_column + values.shape[1]] = values
+    steps = np.arange(-radius, radius + 1)
+    surface[steps[:, np.newaxis] ** 2 + steps**2 > radius**2] = -1.0
+    return np.where(np.isfinite(surface), surface, np.float32(-1.0))
+
+
+def _candidate_offsets(
+    surfaces: Float[np.ndarray, "patches n n"], radius: int, pixel_m: float, options: LvsOptions
+) -> list[Vector2]:
+    """Offsets (east, north) with the largest support of the patches' surfaces, at most `coarse_candidates`, metres.
+
+    A patch supports an offset by its highest correlation within the tolerance, if this is close to its maximum over the
+    search area.
+    """
+    tolerance = max(int(np.ceil(options.coarse_tolerance_m / pixel_m)), 1)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * tolerance + 1, 2 * tolerance + 1))
+    support = np.zeros(surfaces.shape[1:], np.float32)
+    for surface in surfaces:
+        limit = max(options.coarse_min_score, options.alternative_score * float(surface.max()))
+        values = cv2.dilate(surface, kernel)
+        support += np.where(values >= limit, values, np.float32(0.0))
+    # equal support over an area: its centre has the highest mean
+    smooth = support + 1e-3 * cv2.blur(support, (2 * tolerance + 1, 2 * tolerance + 1))
+    offsets: list[Vector2] = []
+    rows, columns = np.mgrid[: smooth.shape[0], : smooth.shape[1]]
+    while len(offsets) < options.coarse_candidates and float(smooth.max()) > 0.0:
+        row, column = (int(i) for i in np.unravel_index(int(np.argmax(smooth)), smooth.shape))
+        offsets.append(pixel_m * np.array([column - radius, row - radius], dtype=np.float64))
+        smooth[(rows - row) ** 2 + (columns - column) ** 2 <= (2 * tolerance) ** 2] = 0.0
+    return offsets
+
+
+def _verify(
+    offset_m: Vector2,
+    patches: Sequence[_Patch],
+    views: Sequence[GroundView],
+    grid: MapProduct,
+    appearance: Raster,
+    options: LvsOptions,
+) -> _Candidate:
+    """Match all patches near a candidate, rectified to the map's elevation there; repeated at the improved offset."""
+    tolerance = max(int(np.ceil(options.coarse_tolerance_m / grid.pixel_m)), 1)
+    candidate = _Candidate(
+        offset_m, np.zeros((len(patches), 2)), np.zeros(len(patches)), np.zeros(len(patches), dtype=bool)
+    )
+    for half in (2 * tolerance, tolerance):
+        offsets, scores = np.zeros((len(patches), 2)), np.full(len(patches), -1.0)
+        for number, view in enumerate(views):
+            rows = [k for k, patch in enumerate(patches) if patch.image == number]
+            if rows:
+                members = [patches[k] for k in rows]
+                offsets[rows], scores[rows] = _match_near(candidate.offset_m, members, view, grid, appearance, half, options)
+        candidate = _find_consensus(candidate.offset_m, offsets, scores, options)
+        if not candidate.count:
+            break
+    return candidate
+
+
+def _match_near(
+    offset_m: Vector2,
+    patches: Sequence[_Patch],
+    view: GroundView,
+    grid: MapProduct,
+    appearance: Raster,
+    half: int,
+    options: LvsOptions,
+) -> tuple[Points2, Vector]:
+    """Offsets (east, north) and scores of one image's patches near an offset; the score is -1 if there is no match."""
+    shift = np.rint(offset_m / grid.pixel_m)
+    corners = np.array([patch.corner for patch in patches]) + shift
+    values, inside = rectify_patches(view, grid, corners, patches[0].side, offset_m)
+    offsets, scores = np.zeros((len(patches), 2)), np.full(len(patches), -1.0)
+    side = patches[0].side
+    for k in np.flatnonzero(inside):
+        template = _filter(values[k], options)
+        column, row = (int(i) for i in corners[k])
+        low_column, low_row = max(column - half, 0), max(row - half, 0)
+        window = np.ascontiguousarray(
+            appearance[low_row : row + side + half, low_column : column + side + half], dtype=np.float32
+        )
+        surface = cv2.matchTemplate(window, template.astype(np.float32), cv2.TM_CCOEFF_NORMED).astype(np.float64)
+        peak = highest_peak(surface)
+        if peak.on_border or not np.isfinite(peak.value):
+            continue
+        found = np.array([peak.row, peak.column]) + biquadratic_offset(surface, peak)
+        offsets[k] = offset_m + grid.pixel_m * np.array([low_column + found[1] - column, low_row + found[0] - row])
+        scores[k] = peak.value
+    return offsets, scores
+
+
+def _find_consensus(start_m: Vector2, offsets_m: Points2, scores: Vector, options: LvsOptions) -> _Candidate:
+    """Find the largest group of patches within the tolerance of one of them, and its mean weighted by the scores."""
+    accepted = scores >= options.coarse_min_score
+    distances = np.linalg.norm(offsets_m[:, np.newaxis] - offsets_m, axis=-1)
+    near = (distances <= options.relief_tolerance_m) & accepted & accepted[:, np.newaxis]
+    support = near @ np.maximum(scores, 0.0)
+    if not np.any(accepted):
+        return _Candidate(start_m, offsets_m, scores, np.zeros(len(scores), dtype=bool))
+    members = near[int(np.argmax(support))]
+    mean = np.average(offsets_m[members], axis=0, weights=scores[members])
+    consistent = accepted & (np.linalg.norm(offsets_m - mean, axis=1) <= options.relief_tolerance_m)
+    return _Candidate(mean, offsets_m, scores, consistent)
+
+
+def _decide(
+    candidates: list[_Candidate],
+    patches: Sequence[_Patch],
+    views: Sequence[GroundView],
+    grid: MapProduct,
+    radius: int,
+    options: LvsOptions,
+) -> CoarseFix | CoarseRefusal:
+    """Accept the candidate with the largest support, or state why there is none."""
+    ranked = sorted(candidates, key=lambda candidate: candidate.support, reverse=True)
+    if not ranked or ranked[0].count < max(options.min_consistent_patches, 1):
+        return CoarseRefusal.NO_CONSENSUS
+    best = ranked[0]
+    distances = [float(np.linalg.norm(other.offset_m - best.offset_m)) for other in ranked]
+    # a candidate that moved to the same offset is no alternative
+    others = [c.support for c, d in zip(ranked, distances, strict=True) if d > 2.0 * options.relief_tolerance_m]
+    second = max(others, default=0.0)
+    if second > options.max_second_support * best.support:
+        return CoarseRefusal.AMBIGUOUS
+    if np.linalg.norm(best.offset_m) > radius * grid.pixel_m - options.relief_tolerance_m:
+        return CoarseRefusal.BORDER
+    return CoarseFix(
+        offset_m=best.offset_m,
+        covariance=_covariance(best, patches, views, grid, options),
+        matches=_collect_matches(best, patches, grid),
+        support=best.support,
+        second_support=second,
+    )
+
+
+def _covariance(
+    best: _Candidate, patches: Sequence[_Patch], views: Sequence[GroundView], grid: MapProduct, options: LvsOptions
+) -> Float[np.ndarray, "2 2"]:
+    """Covariance of the offset. Patches of different images show the same ground: images are not independent."""
+    offsets = best.offsets_m[best.consistent]
+    scatter = np.cov(offsets.T) if len(offsets) > 2 else np.eye(2) * options.relief_tolerance_m**2
+    independent = max(len(offsets) / max(len(views), 1), 1.0)
+    height = float(np.mean([view.camera.c[2] for view in views]))
+    common = (options.attitude_sd_rad * height) ** 2 + grid.registration_sd_m**2 + grid.distortion_sd_m**2
+    quantisation = grid.pixel_m**2 / 12.0
+    return np.asarray(scatter / independent + (common + quantisation) * np.eye(2))
+
+
+def _collect_matches(best: _Candidate, patches: Sequence[_Patch], grid: MapProduct) -> CoarseMatches:
+    corners = np.array([patch.corner for patch in patches], dtype=np.float64)
+    sides = np.array([patch.side for patch in patches], dtype=np.float64)
+    predicted = grid.origin_m + grid.pixel_m * (corners + 0.5 * (sides[:, np.newaxis] - 1.0))
+    return CoarseMatches(
+        images=np.array([patch.image for patch in patches]),
+        predicted_m=predicted,
+        map_m=predicted + best.offsets_m,
+        scores=best.scores,
+        consistent=best.consistent,
+        side_m=sides * grid.pixel_m,
+    )

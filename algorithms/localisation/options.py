@@ -1,0 +1,109 @@
+"""Options of map-relative localisation's image matching (coarse and fine stage), with the sources of their defaults."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class LvsOptions:
+    """Options of the coarse and the fine matching stage.
+
+    Sources: "published" is Johnson et al., "The Lander Vision System for Mars 2020 Entry Descent and Landing" (AAS GNC
+    2017); other values are assumed, or derived as stated.
+
+    Both stages:
+
+    - max_off_nadir_rad: Ground at larger off-nadir angles is not used (assumed). At 55 deg a pixel covers three times
+      as much ground along the line of sight as at the nadir.
+    - attitude_sd_rad: Standard deviation of the attitude error per axis, for search ranges and priors (assumed)
+
+    Coarse stage:
+
+    - coarse_binning: Map pixels per coarse pixel (published: 6 m to 12 m)
+    - coarse_images: Number of images (published: 3)
+    - patches_per_image: Number of large patches in each image (published: 5)
+    - patch_px: Side of a patch, coarse pixels (assumed: 1.15 km); reduced if the footprint is small
+    - min_patch_px: Smallest side of a patch (assumed)
+    - search_radius_m: Largest horizontal offset searched (published: 3.2 km)
+    - search_sigmas: Search radius in standard deviations of the position, up to `search_radius_m` (assumed)
+    - coarse_high_pass_px: Side of the square whose mean is subtracted from image and map, coarse pixels; 0: none
+      (published: normalised correlation without filter)
+    - coarse_min_score: Minimum normalised correlation of a consistent patch (assumed)
+    - coarse_tolerance_m: Largest difference of a patch's offset from the candidate when patches are rectified to a
+      plane (assumed). Relief of 200 m at 35 deg off nadir shifts a patch by 140 m.
+    - relief_tolerance_m: The same when patches are rectified to the map's elevation (assumed)
+    - coarse_candidates: Number of candidate offsets that are verified with the map's elevation (assumed)
+    - alternative_score: A patch supports a candidate if its correlation there is at least this fraction of its maximum
+      over the search area (assumed)
+    - min_consistent_patches: Minimum number of consistent patches. The same ground is matched once per image, so that
+      seven of 15 patches cover at least three areas: one coincidence gives three, two give six.
+    - max_second_support: Largest ratio of the support of the second candidate to that of the first; the support is the
+      sum of the scores of the consistent patches (assumed)
+
+    Fine stage:
+
+    - max_landmarks: Landmarks matched in one image (published: up to 150)
+    - acquisition_landmarks: Landmarks in an acquisition step at reduced scale (assumed)
+    - landmark_spacing_px: Side of the cells with one landmark each, map pixels (assumed)
+    - landmark_support_px: Side of the square over which a landmark's interest is computed, map pixels (assumed)
+    - min_interest: Minimum Harris interest of a landmark divided by the map's mean, per map pixel (assumed)
+    - template_px: Side of a template, odd, pixels of the working scale, which are about one map pixel (assumed)
+    - search_sigmas_fine: Search half width in standard deviations of the predicted pixel (assumed)
+    - min_half_width_px, max_half_width_px: Limits of the search half width, working pixels. Above the maximum an
+      acquisition step at a reduced scale comes first (assumed)
+    - min_working_px: Smallest side of a working image in the acquisition step (assumed)
+    - min_score: Minimum normalised correlation of a landmark (assumed)
+    - max_residual_px: Largest residual from the common correction of position and attitude, working pixels (assumed:
+      a map distortion of about one pixel)
+    - min_matches: Minimum number of consistent landmarks; with fewer, no match is reported. The correction has six
+      unknowns, and wrong matches are within the tolerance by chance (assumed)
+    - min_inlier_fraction: Minimum fraction of consistent landmarks of those with an accepted score. Of wrong matches,
+      uniform over a window of half width 5 px, 8 % are consistent with a given correction (assumed)
+    """
+
+    max_off_nadir_rad: float = float(np.deg2rad(55.0))
+    attitude_sd_rad: float = 2e-3
+
+    coarse_binning: int = 2
+    coarse_images: int = 3
+    patches_per_image: int = 5
+    patch_px: int = 96
+    min_patch_px: int = 32
+    search_radius_m: float = 3200.0
+    search_sigmas: float = 3.5
+    coarse_high_pass_px: int = 0
+    coarse_min_score: float = 0.4
+    coarse_tolerance_m: float = 150.0
+    relief_tolerance_m: float = 60.0
+    coarse_candidates: int = 4
+    alternative_score: float = 0.9
+    min_consistent_patches: int = 7
+    max_second_support: float = 0.6
+
+    max_landmarks: int = 150
+    acquisition_landmarks: int = 60
+    landmark_spacing_px: int = 8
+    landmark_support_px: int = 11
+    min_interest: float = 0.002
+    template_px: int = 17
+    search_sigmas_fine: float = 3.5
+    min_half_width_px: int = 4
+    max_half_width_px: int = 12
+    min_working_px: int = 96
+    min_score: float = 0.5
+    max_residual_px: float = 1.2
+    min_matches: int = 12
+    min_inlier_fraction: float = 0.4
+
+    def __post_init__(self) -> None:
+        if self.template_px < 5 or self.template_px % 2 == 0:
+            raise ValueError(f"template_px is {self.template_px}; it must be odd and at least 5")
+        if not 0.0 < self.max_off_nadir_rad < np.pi / 2:
+            raise ValueError(f"max_off_nadir_rad is {self.max_off_nadir_rad}; it must lie between 0 and pi/2")
+        counts = ("coarse_binning", "coarse_images", "patches_per_image", "max_landmarks", "landmark_spacing_px")
+        for name in counts:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
