@@ -257,7 +257,9 @@ def _verify(
             rows = [k for k, patch in enumerate(patches) if patch.image == number]
             if rows:
                 members = [patches[k] for k in rows]
-                offsets[rows], scores[rows] = _match_near(candidate.offset_m, members, view, grid, appearance, half, options)
+                offsets[rows], scores[rows] = _match_near(
+                    candidate.offset_m, members, view, grid, appearance, half, options
+                )
         candidate = _find_consensus(candidate.offset_m, offsets, scores, options)
         if not candidate.count:
             break

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+
+from marsyard.algorithms.localisation.inertial_state import ImuErrorModel
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,18 @@ class LvsOptions:
       unknowns, and wrong matches are within the tolerance by chance (assumed)
     - min_inlier_fraction: Minimum fraction of consistent landmarks of those with an accepted score. Of wrong matches,
       uniform over a window of half width 5 px, 8 % are consistent with a given correction (assumed)
+
+    Navigation (assumed):
+
+    - coarse_altitudes: Number of last altitudes that update the state after the coarse stage
+    - imu: Errors of the inertial unit, for the filter
+    - landmark_sd_px: Standard deviation of a landmark per axis, working pixels
+    - common_fraction: Common part of the map's distortion and elevation error in one image / its standard deviation
+    - altitude_sd: Relative standard deviation of an altitude
+    - max_failures: Number of successive images without an update after which the coarse stage is repeated
+    - max_position_sd_m: Largest standard deviation of a reported horizontal position
+    - sift_map_features, sift_sd_m: Number of features of the map, and standard deviation of a position, of the baseline
+      `marsyard.algorithms.localisation.baselines.FeatureEstimator`
     """
 
     max_off_nadir_rad: float = float(np.deg2rad(55.0))
@@ -97,6 +111,16 @@ class LvsOptions:
     max_residual_px: float = 1.2
     min_matches: int = 12
     min_inlier_fraction: float = 0.4
+
+    coarse_altitudes: int = 8
+    imu: ImuErrorModel = field(default_factory=ImuErrorModel)
+    landmark_sd_px: float = 0.3
+    common_fraction: float = 0.5
+    altitude_sd: float = 0.02
+    max_failures: int = 3
+    max_position_sd_m: float = 15.0
+    sift_map_features: int = 20000
+    sift_sd_m: float = 20.0
 
     def __post_init__(self) -> None:
         if self.template_px < 5 or self.template_px % 2 == 0:

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Float64
 from numpy.random import Generator
 from pydantic import Field
 from scipy.interpolate import RectBivariateSpline
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.scenarios.exposure import add_haze
@@ -82,9 +82,9 @@ class MapParameters(Parameters):
     distortion_sd_m: Annotated[
         NonNegative, Field(description="SD of the distortion, per axis, m; assumed: one pixel")
     ] = 6.0
-    distortion_length_m: Annotated[
-        Positive, Field(description="correlation length of the distortion, m; assumed")
-    ] = 1500.0
+    distortion_length_m: Annotated[Positive, Field(description="correlation length of the distortion, m; assumed")] = (
+        1500.0
+    )
     elevation_sd_m: Annotated[NonNegative, Field(description="SD of the elevation error, m; assumed")] = 5.0
     elevation_length_m: Annotated[
         Positive, Field(description="correlation length of the elevation error, m; assumed")
@@ -117,7 +117,8 @@ class MapTruth:
 
     def world_position(self, map_m: Float[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
         """Return the world x, y of the surface point that appears at a map position; an error of the map is
-        ``map_m - world_position(map_m)``."""
+        ``map_m - world_position(map_m)``.
+        """
         return np.asarray(map_m - self.shift_m - self.distortion(map_m))
 
     def map_position(self, world_m: Float[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
@@ -298,7 +299,7 @@ def _map_scene(
         relief=micro_relief(ground),
         ground_texture=Texture(texture.coarsest_m, texture.amplitudes),
         mesh_finest_m=MESH_M,
-        mesh_reach_m=reach_m,
+        mesh_half_width_m=reach_m,
         mesh_lines=2 * int(0.9 * reach_m / MESH_M) + 1,
         visible_m=bounds,
     )

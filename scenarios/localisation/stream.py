@@ -11,10 +11,15 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionEstimator
-from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage
+from marsyard.algorithms.localisation.interface import (
+    InitialState,
+    MapProduct,
+    PositionEstimate,
+    PositionEstimator,
+    PositionOutcome,
+)
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from marsyard.sim.parameters import Parameters, bounded_field
-from marsyard.sim.sensor.imu import ImuIncrements
 
 #: One event of the stream.
 Event = ImuIncrements | AltitudeMeasurement | DetectorImage
@@ -106,6 +111,11 @@ class StreamAnswers:
 
     estimates: tuple[PositionEstimate, ...]
     processor_times: ProcessorTimes
+
+    @property
+    def outcome(self) -> PositionOutcome:
+        """Outcome of the final estimate."""
+        return self.estimates[-1].outcome
 
 
 def feed(

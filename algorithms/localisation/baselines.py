@@ -1,0 +1,130 @@
+"""Baselines of localisation: inertial navigation alone, and OpenCV's feature matching with a perspective-n-point pose."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from marsyard.algorithms.localisation.details import LocalisationDetails
+from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
+from marsyard.algorithms.localisation.map_sampling import sample_raster
+from marsyard.algorithms.localisation.navigation_filter import FilterOptions, NavigationFilter
+from marsyard.algorithms.localisation.options import LvsOptions
+from marsyard.algorithms.localisation.posed_image import PosedImage, binning_factor
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
+
+
+class InertialEstimator:
+    """`PositionEstimator` that only propagates the initial state; always VALID."""
+
+    def __init__(self, options: LvsOptions | None = None) -> None:
+        self.options = LvsOptions() if options is None else options
+
+    def start(self, initial: InitialState, map_product: MapProduct) -> None:
+        """Reset the state for a new descent."""
+        self._map = map_product
+        self._filter = NavigationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
+
+    def imu(self, increments: ImuIncrements) -> None:
+        """Propagate the state by inertial increments."""
+        self._filter.propagate(increments)
+
+    def altitude(self, measurement: AltitudeMeasurement) -> None:
+        """Ignore altitudes."""
+
+    def image(self, image: DetectorImage) -> PositionEstimate:
+        """Return the state at the time of the image."""
+        return self._answer(image.time_s)
+
+    def finish(self) -> PositionEstimate:
+        """Return the state at the time of the last increment."""
+        return self._answer(self._filter.time_s)
+
+    def _answer(self, time_s: float) -> PositionEstimate:
+        return PositionEstimate(PositionOutcome.VALID, time_s, *self._filter.estimate(time_s))
+
+
+class FeatureEstimator(InertialEstimator):
+    """`PositionEstimator` that matches SIFT features of each image with those of the map.
+
+    The pose is that of OpenCV's RANSAC for the perspective-n-point problem with the map's elevations. Its position
+    updates the state of inertial navigation; its attitude is not used.
+    """
+
+    def start(self, initial: InitialState, map_product: MapProduct) -> None:
+        """Reset the state, and extract the features of the map."""
+        super().start(initial, map_product)
+        self._sift = cv2.SIFT_create(nfeatures=self.options.sift_map_features)
+        keypoints, self._descriptors = self._sift.detectAndCompute(_to_bytes(map_product.appearance), None)
+        pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2)
+        heights = sample_raster(map_product.elevation_m, pixels)
+        self._points = np.column_stack([map_product.origin_m + map_product.pixel_m * pixels, heights])
+        self._is_valid = False
+        self._altitude_m: float | None = None
+
+    def altitude(self, measurement: AltitudeMeasurement) -> None:
+        """Store the altitude, which determines the scale at which an image is matched."""
+        self._altitude_m = measurement.altitude_m
+
+    def image(self, image: DetectorImage) -> PositionEstimate:
+        """Estimate the pose from features, and update the position."""
+        state = self._filter.state_at(image.time_s)
+        posed = PosedImage.from_detector(image, state.position_m, state.world_from_body)
+        solution = None if self._altitude_m is None else self._solve(posed, self._altitude_m)
+        if solution is None:
+            return self._answer(image.time_s)
+        position, inliers = solution
+        variance = self.options.sift_sd_m**2
+        self._filter.update_position(image.time_s, position[:2], variance * np.eye(2))
+        self._is_valid = True
+        return self._answer(image.time_s, LocalisationDetails("fine", inliers=inliers))
+
+    def _solve(self, image: PosedImage, altitude_m: float) -> tuple[Float[np.ndarray, "3"], int] | None:
+        """Solve the camera's position from matched features; None if there are too few of them."""
+        scaled = image.bin(binning_factor(image, altitude_m, self._map.pixel_m))
+        # columns of an image that looks down increase to the east and rows to the south; rows of the map to the north
+        keypoints, descriptors = self._sift.detectAndCompute(_to_bytes(scaled.radiance[::-1]), None)
+        if descriptors is None or self._descriptors is None or len(keypoints) < self.options.min_matches:
+            return None
+        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors, self._descriptors, k=2)
+        good = [
+            first
+            for first, second in (pair for pair in pairs if len(pair) == 2)
+            if first.distance < 0.8 * second.distance
+        ]
+        if len(good) < self.options.min_matches:
+            return None
+        pixels = np.array([keypoints[match.queryIdx].pt for match in good], dtype=np.float64)
+        pixels[:, 1] = scaled.camera.size[1] - 1 - pixels[:, 1]
+        points = self._points[[match.trainIdx for match in good]]
+        _, directions = scaled.camera.rays(pixels)
+        # a pinhole camera along -z of the body with axes x, -y, -z
+        forward = -directions[:, 2]
+        normalised = np.column_stack([directions[:, 0] / forward, -directions[:, 1] / forward])
+        origin = points.mean(axis=0)
+        found, rotation, translation, inliers = cv2.solvePnPRansac(
+            points - origin,
+            normalised,
+            np.eye(3),
+            None,
+            reprojectionError=2.0 * image.pixel_angle_rad * image.camera.size[0] / scaled.camera.size[0],
+            iterationsCount=2000,
+            confidence=0.999,
+        )
+        if not found or inliers is None or len(inliers) < self.options.min_matches:
+            return None
+        matrix, _ = cv2.Rodrigues(rotation)
+        return origin - (matrix.T @ translation).ravel(), len(inliers)
+
+    def _answer(self, time_s: float, details: LocalisationDetails | None = None) -> PositionEstimate:
+        if not self._is_valid:
+            return PositionEstimate(PositionOutcome.NO_COARSE_FIX, time_s, details=details)
+        return PositionEstimate(PositionOutcome.VALID, time_s, *self._filter.estimate(time_s), details=details)
+
+
+def _to_bytes(raster: Float[np.ndarray, "rows columns"]) -> np.ndarray:
+    """Scale a raster to 8 bits between its 1 % and 99 % quantiles."""
+    low, high = np.quantile(raster, (0.01, 0.99))
+    scaled = np.clip(255.0 * (raster - low) / max(float(high - low), 1e-9), 0.0, 255.0)
+    return np.ascontiguousarray(scaled.astype(np.uint8))

@@ -1,0 +1,182 @@
+"""Map-relative localisation as in the Lander Vision System of Mars 2020: coarse stage, fine stage, navigation filter.
+
+1. Inertial data propagate the state from the start.
+2. The coarse stage matches large patches of the first images over the whole uncertainty of the position.
+3. The fine stage matches landmarks of the map in each further image; they update the filter.
+
+The sources of the steps and of the options are in `marsyard.algorithms.localisation.options`. After a coarse fix whose
+landmarks are inconsistent in several images, the state of inertial navigation returns and the coarse stage is repeated.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+from jaxtyping import Float
+
+from marsyard.algorithms.localisation.coarse import CoarseFix, find_coarse_position
+from marsyard.algorithms.localisation.details import LocalisationDetails
+from marsyard.algorithms.localisation.fine import match_landmarks
+from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
+from marsyard.algorithms.localisation.landmarks import Landmarks, select_landmarks
+from marsyard.algorithms.localisation.map_sampling import elevation_at
+from marsyard.algorithms.localisation.navigation_filter import FilterOptions, NavigationFilter
+from marsyard.algorithms.localisation.options import LvsOptions
+from marsyard.algorithms.localisation.posed_image import PosedImage
+from marsyard.algorithms.localisation.state_updates import GroundHeight, UpdateOutcome
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
+
+#: Distance over which the slope of the map's elevation is measured, map pixels.
+_SLOPE_PX = 4.0
+
+
+class MapRelativeEstimator:
+    """`PositionEstimator` with a coarse and a fine stage."""
+
+    def __init__(self, options: LvsOptions | None = None) -> None:
+        self.options = LvsOptions() if options is None else options
+
+    def start(self, initial: InitialState, map_product: MapProduct) -> None:
+        """Reset the state for a new descent, and select the landmarks of the map."""
+        self._map = map_product
+        self._landmarks: Landmarks = select_landmarks(map_product, self.options)
+        # without updates by images: the state to which a wrong coarse fix returns
+        self._inertial = NavigationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
+        self._filter = self._inertial
+        self._has_fix = False
+        self._coarse_images: list[tuple[PosedImage, float]] = []
+        self._altitudes: list[AltitudeMeasurement] = []
+        self._failures = 0
+        self._outcome = PositionOutcome.NO_COARSE_FIX
+
+    def imu(self, increments: ImuIncrements) -> None:
+        """Propagate the state by inertial increments."""
+        self._inertial.propagate(increments)
+        if self._has_fix:
+            self._filter.propagate(increments)
+
+    def altitude(self, measurement: AltitudeMeasurement) -> None:
+        """Update the state by an altitude, if the position on the map is known; store it otherwise."""
+        self._altitudes = [*self._altitudes, measurement][-self.options.coarse_altitudes :]
+        if self._has_fix:
+            self._update_altitude(measurement)
+
+    def image(self, image: DetectorImage) -> PositionEstimate:
+        """Match an image with the map, and return the state at its time."""
+        state = self._filter.state_at(image.time_s)
+        posed = PosedImage.from_detector(image, state.position_m, state.world_from_body)
+        coarse_offset = None
+        if not self._has_fix:
+            coarse_offset = self._run_coarse_stage(posed)
+            if coarse_offset is None:
+                return self._answer(image.time_s, LocalisationDetails("coarse"))
+            state = self._filter.state_at(image.time_s)
+            posed = PosedImage.from_detector(image, state.position_m, state.world_from_body)
+        return self._run_fine_stage(image, posed, coarse_offset)
+
+    def finish(self) -> PositionEstimate:
+        """Return the state at the time of the last increment."""
+        return self._answer(self._filter.time_s, None)
+
+    def _run_coarse_stage(self, image: PosedImage) -> Float[np.ndarray, "2"] | None:
+        """Collect images; with enough of them, search the map. Returns the correction of the position."""
+        height = self._height_above_ground(image.time_s)
+        if height is None:
+            return None
+        self._coarse_images = [*self._coarse_images, (image, height)][-self.options.coarse_images :]
+        if len(self._coarse_images) < self.options.coarse_images:
+            return None
+        state = self._inertial.state_at(image.time_s)
+        sd_m = float(np.sqrt(max(state.covariance[0, 0], state.covariance[1, 1])))
+        images, heights = zip(*self._coarse_images, strict=True)
+        fix = find_coarse_position(images, heights, self._map, sd_m, self.options)
+        if not isinstance(fix, CoarseFix):
+            return None
+        self._filter = copy.deepcopy(self._inertial)
+        result = self._filter.update_position(image.time_s, state.position_m[:2] + fix.offset_m, fix.covariance)
+        if result.outcome is not UpdateOutcome.APPLIED:
+            return None
+        self._has_fix, self._failures = True, 0
+        self._outcome = PositionOutcome.UNCERTAIN
+        for altitude in self._altitudes:
+            self._update_altitude(altitude)
+        return fix.offset_m
+
+    def _run_fine_stage(
+        self, image: DetectorImage, posed: PosedImage, coarse_offset: Float[np.ndarray, "2"] | None
+    ) -> PositionEstimate:
+        """Match landmarks and update the state; after several failures the coarse stage is repeated."""
+        options, covariance = self.options, self._filter.state_at(image.time_s).covariance
+        position_sd_m = np.sqrt(np.diag(covariance)[:3])
+        matches = match_landmarks(posed, self._landmarks, self._map, position_sd_m, options)
+        if len(matches) == 0:
+            return self._fail(image.time_s, LocalisationDetails("fine", coarse_offset))
+        point_sd_m = np.array([self._map.distortion_sd_m, self._map.distortion_sd_m, self._map.elevation_sd_m])
+        result = self._filter.update_landmarks(
+            image.time_s,
+            image.camera,
+            matches.points_m,
+            matches.measured_px,
+            pixel_sd=options.landmark_sd_px * matches.working_pixel,
+            point_sd_m=point_sd_m,
+            common_sd_m=options.common_fraction * point_sd_m,
+        )
+        details = LocalisationDetails(
+            "fine",
+            coarse_offset,
+            int(np.count_nonzero(result.inliers)),
+            matches.measured_px,
+            matches.residuals_px,
+            result.inliers,
+        )
+        if result.outcome is not UpdateOutcome.APPLIED:
+            return self._fail(image.time_s, details)
+        self._failures = 0
+        self._outcome = PositionOutcome.VALID
+        return self._answer(image.time_s, details)
+
+    def _fail(self, time_s: float, details: LocalisationDetails) -> PositionEstimate:
+        """Answer to an image without an update: after several of them, the fix is given up."""
+        self._failures += 1
+        if self._failures >= self.options.max_failures:
+            self._outcome = PositionOutcome.INCONSISTENT
+            answer = self._answer(time_s, details)
+            self._has_fix, self._filter, self._coarse_images = False, self._inertial, []
+            self._outcome = PositionOutcome.NO_COARSE_FIX
+            return answer
+        return self._answer(time_s, details)
+
+    def _answer(self, time_s: float, details: LocalisationDetails | None) -> PositionEstimate:
+        """Return the state at a time if the last outcome is VALID and the position is certain enough."""
+        if self._outcome is not PositionOutcome.VALID:
+            return PositionEstimate(self._outcome, time_s, details=details)
+        position, velocity, attitude, covariance = self._filter.estimate(time_s)
+        if float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])) > self.options.max_position_sd_m:
+            return PositionEstimate(PositionOutcome.UNCERTAIN, time_s, details=details)
+        return PositionEstimate(
+            PositionOutcome.VALID, time_s, position, velocity, attitude, covariance, details=details
+        )
+
+    def _height_above_ground(self, time_s: float) -> float | None:
+        """Height above the ground at a time, from the last altitude and the inertial vertical velocity."""
+        if not self._altitudes:
+            return None
+        last = self._altitudes[-1]
+        velocity = self._inertial.state_at(time_s).velocity_m_s
+        return last.altitude_m + float(velocity[2]) * (time_s - last.time_s)
+
+    def _update_altitude(self, measurement: AltitudeMeasurement) -> None:
+        """Update the state by an altitude above the map's elevation."""
+        sd_m = float(np.hypot(self.options.altitude_sd * measurement.altitude_m, self._map.elevation_sd_m))
+        self._filter.update_altitude(measurement.time_s, measurement.altitude_m, self._ground, sd_m)
+
+    def _ground(self, position_m: Float[np.ndarray, "2"]) -> GroundHeight:
+        """Elevation of the map and its slope (east, north) at a position."""
+        step = _SLOPE_PX * self._map.pixel_m
+        height = elevation_at(self._map, position_m)
+        slope = [
+            (elevation_at(self._map, position_m + offset) - elevation_at(self._map, position_m - offset)) / (2.0 * step)
+            for offset in step * np.eye(2)
+        ]
+        return height, np.array(slope)

@@ -1,0 +1,1 @@
+"""Report of localisation on a map: sections, and views of cases."""

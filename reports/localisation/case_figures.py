@@ -1,0 +1,83 @@
+"""Figures of a localisation case: errors over time, the map with the track, and the landmarks of the last image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from marsyard.reports.presentation import check_shape, to_matrix
+from marsyard.reports.section import INK, MUTED, REQUIREMENT, SERIES, in_page_style, show_image
+
+_AXES = ("east", "north", "up")
+#: Enlargement of the landmarks' residuals.
+_RESIDUAL_SCALE = 20.0
+
+
+def is_localisation_case(products: Mapping[str, Any]) -> bool:
+    """Return whether products contain the track of a localisation case."""
+    return check_shape(products.get("track"), None, 7) is not None and to_matrix(products.get("map")) is not None
+
+
+def read_track(products: Mapping[str, Any]) -> Float[np.ndarray, "n 7"]:
+    """Read the track: time, errors east, north, up, and their standard deviations; NaN for a refusal."""
+    track = check_shape(products.get("track"), None, 7)
+    if track is None:
+        raise ValueError("the products contain no track of a localisation case")
+    return track
+
+
+@in_page_style
+def draw_errors(products: Mapping[str, Any]) -> Figure:
+    """Draw the position error of each component over time, with bands of three standard deviations."""
+    track = read_track(products)
+    valid = track[np.isfinite(track[:, 0])]
+    figure = Figure(figsize=(12.0, 3.2), layout="constrained")
+    for component, (name, axes) in enumerate(zip(_AXES, figure.subplots(1, 3), strict=True)):
+        band = 3.0 * valid[:, 4 + component]
+        axes.fill_between(valid[:, 0], -band, band, color=MUTED, alpha=0.25, linewidth=0.0)
+        axes.axhline(0.0, color=INK, linewidth=0.8)
+        axes.plot(valid[:, 0], valid[:, 1 + component], marker="o", color=SERIES[component])
+        axes.set(xlabel="Time after the start (s)", ylabel=f"Position error {name} (m)")
+    return figure
+
+
+@in_page_style
+def draw_map(products: Mapping[str, Any]) -> Figure:
+    """Draw the map with true and estimated positions."""
+    figure = Figure(figsize=(6.0, 6.0), layout="constrained")
+    axes = figure.add_subplot()
+    extent = np.asarray(products["map_extent_m"], dtype=np.float64) / 1e3
+    axes.imshow(products["map"], cmap="gray", origin="lower", extent=tuple(extent), interpolation="antialiased")
+    true, estimated = (np.asarray(products[name], dtype=np.float64) / 1e3 for name in ("true_xy_m", "estimated_xy_m"))
+    axes.plot(*true.T, color=SERIES[0], linewidth=2.0, label="true")
+    axes.plot(*estimated.T, marker="o", color=SERIES[1], linestyle="none", markersize=4.0, label="estimated")
+    axes.set(xlabel="East (km)", ylabel="North (km)")
+    axes.legend()
+    return figure
+
+
+@in_page_style
+def draw_landmarks(products: Mapping[str, Any]) -> Figure | None:
+    """Draw the last image with its landmarks and their residuals; None without landmarks."""
+    pixels, residuals = (check_shape(products.get(f"landmarks_{name}"), None, 2) for name in ("px", "residual_px"))
+    image = to_matrix(products.get("image_2"))
+    if pixels is None or residuals is None or image is None or len(pixels) != len(residuals):
+        return None
+    used = np.asarray(products["landmarks_used"], dtype=bool)
+    figure = Figure(figsize=(6.0, 6.0), layout="constrained")
+    axes = figure.add_subplot()
+    show_image(axes, image)
+    for mask, colour, marker in ((used, SERIES[2], "o"), (~used, REQUIREMENT, "x")):
+        axes.plot(*pixels[mask].T, marker=marker, color=colour, linestyle="none", markersize=4.0, fillstyle="none")
+        ends = pixels[mask] + _RESIDUAL_SCALE * residuals[mask]
+        axes.plot(
+            np.stack([pixels[mask, 0], ends[:, 0]]),
+            np.stack([pixels[mask, 1], ends[:, 1]]),
+            color=colour,
+            linewidth=0.8,
+        )
+    return figure

@@ -1,0 +1,44 @@
+"""Consistency of the reported position covariance with the errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from marsyard.reports.rates import finite_values
+from marsyard.reports.section import Block, Grid, Subject
+from marsyard.reports.wording import number
+
+#: Components of the horizontal position.
+_FREEDOM = 2
+_CONFIDENCE = 0.9
+
+
+def create_consistency_blocks(
+    frame: pd.DataFrame, _subject: Subject, _key: str
+) -> tuple[Sequence[Block], Mapping[str, Any]]:
+    """Compare the normalised squared errors with the chi-square distribution with two degrees of freedom."""
+    nees = finite_values(frame, "position_nees")
+    if nees.size == 0:
+        return [], {}
+    tail = 0.5 * (1.0 - _CONFIDENCE)
+    low, high = stats.chi2.ppf([tail, 1.0 - tail], _FREEDOM * nees.size) / nees.size
+    inside = float(np.mean(nees <= stats.chi2.ppf(_CONFIDENCE, _FREEDOM)))
+    rows = [
+        ["Descents with a final position", f"{nees.size:,}"],
+        ["Mean of the normalised squared error", number(float(nees.mean()))],
+        [f"{100 * _CONFIDENCE:.0f} % interval of this mean for a correct covariance", f"{low:.2f} to {high:.2f}"],
+        [f"Errors within the {100 * _CONFIDENCE:.0f} % ellipse", f"{100.0 * inside:.1f} %"],
+    ]
+    note = (
+        "The normalised squared error is e' P^-1 e with the horizontal error e and its reported covariance P. Its mean "
+        "is 2 for a correct covariance; larger values mean that the errors are larger than reported. The interval "
+        "assumes independent descents."
+    )
+    block = Block(heading="Consistency of the covariance", grid=Grid(["", ""], rows), note=note)
+    data = {"nees": {"n": int(nees.size), "mean": float(nees.mean()), "lower": low, "upper": high, "inside": inside}}
+    return [block], data

@@ -1,0 +1,138 @@
+"""Presentation of localisation on a map: report sections, and views of cases."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from marsyard.algorithms.localisation.interface import PositionOutcome
+from marsyard.reports.localisation import case_figures as figures
+from marsyard.reports.localisation.consistency import create_consistency_blocks
+from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow, save_figures
+from marsyard.reports.section import svg_figure
+from marsyard.reports.section_kinds import (
+    CustomBlocks,
+    Distribution,
+    Quantiles,
+    Quantity,
+    Rate,
+    RateByCondition,
+    RateTable,
+    Scatter,
+    SectionDeclaration,
+    flag_rate,
+)
+from marsyard.reports.wording import number
+
+_LEGEND = "The grey lines are the true positions; the bands are three standard deviations that the algorithm reports."
+_REQUIRED_M = 40.0
+
+
+def view(products: Mapping[str, Any], key: str) -> CaseView:
+    """Create the view of a localisation case: error over time, map, landmarks, and a table of the estimates."""
+    svg_figures = [
+        svg_figure(figures.draw_errors(products), f"{key}errors", "Position error over time.", wide=True),
+        svg_figure(figures.draw_map(products), f"{key}map", "True and estimated positions on the map."),
+    ]
+    landmarks = figures.draw_landmarks(products)
+    if landmarks is not None:
+        caption = "Landmarks in the last image: used (green), rejected (red); residuals enlarged twenty times."
+        svg_figures.append(svg_figure(landmarks, f"{key}landmarks", caption))
+    rows = []
+    track, outcomes, inliers = figures.read_track(products), products["outcomes"], products["inliers"]
+    for index, (values, outcome) in enumerate(zip(track, outcomes, strict=True)):
+        is_valid = bool(np.isfinite(values[0]))
+        name = f"image {index + 1}" if index < len(track) - 1 else "end"
+        used = "" if not np.isfinite(inliers[index]) else f"{inliers[index]:.0f}"
+        text = PositionOutcome[str(outcome)].value
+        errors = [number(float(value)) if is_valid else "" for value in (*values[1:4], np.hypot(*values[4:6]))]
+        rows.append(TableRow([name, text, used, *errors], is_valid))
+    head = ["Estimate", "Outcome", "Landmarks used", "Error east (m)", "north (m)", "up (m)", "Reported sd (m)"]
+    return CaseView([], svg_figures, head, rows)
+
+
+def write_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
+    """Write the figures of a case into a folder."""
+    drawn = {"errors": figures.draw_errors(products), "map": figures.draw_map(products)}
+    landmarks = figures.draw_landmarks(products)
+    return save_figures(directory, drawn if landmarks is None else {**drawn, "landmarks": landmarks})
+
+
+_FIXED = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
+_FALSE = Rate("false_fix", "A reported position is wrong by more than 40 m", flag_rate("false_fix"))
+
+POSITION = SectionDeclaration(
+    "localisation",
+    "Localisation",
+    "Position on the map",
+    requires=("fix_after_s",),
+    parts=(
+        RateTable((_FIXED, _FALSE), cases="Descents", heading="Positions"),
+        Distribution(
+            (
+                Quantity("position_error_at_10_s_m", "after 10 s"),
+                Quantity("position_error_m", "last"),
+                Quantity("position_error_world_m", "last, relative to the world"),
+            ),
+            ("horizontal position error (m)", "fraction of reported positions"),
+            "Cumulative distribution of the horizontal position error. The error relative to the world contains the "
+            "map's registration and distortion.",
+            heading="Position error",
+            bound=_REQUIRED_M,
+        ),
+        Quantiles(
+            (
+                Quantity("position_error_at_10_s_m", "horizontal position error after 10 s (m)"),
+                Quantity("position_error_m", "last horizontal position error (m)"),
+                Quantity("position_error_up_m", "last error of the height (m)"),
+                Quantity("velocity_error_m_s", "last velocity error (m/s)"),
+                Quantity("attitude_error_deg", "last attitude error (deg)"),
+                Quantity("fix_after_s", "time of the first reported position (s)"),
+                Quantity("inliers_median", "landmarks used in an image (median)"),
+                Quantity("inliers_min", "landmarks used in an image (minimum)"),
+                Quantity("image_time_max_s", "processor time of the slowest image (s)"),
+                Quantity("image_time_median_s", "processor time of an image (s, median)"),
+            ),
+            {"5 %": 0.05, "Median": 0.5, "95 %": 0.95, "99 %": 0.99},
+            heading="Distributions",
+        ),
+        CustomBlocks(create_consistency_blocks),
+    ),
+)
+CONDITIONS = SectionDeclaration(
+    "localisation-conditions",
+    "Light",
+    "Light and texture",
+    requires=("sun_difference_deg", "fix_after_s"),
+    parts=(
+        RateByCondition(
+            Quantity("sun_difference_deg", "Angle between the suns of map and landing (deg)"),
+            (_FIXED, Rate("answered", "Position reported at the end", flag_rate("answered"))),
+            cases="Descents",
+            ylabel="fraction of descents",
+            caption="Descents with a reported position against the angle between the suns of map and landing.",
+        ),
+        Scatter(
+            (
+                Quantity("sun_difference_deg", "angle between the suns (deg)"),
+                Quantity("image_contrast", "contrast of the first image"),
+                Quantity("initial_error_m", "initial position error (m)"),
+            ),
+            (
+                Quantity("position_error_m", "last horizontal position error (m)"),
+                Quantity("inliers_median", "landmarks used in an image"),
+            ),
+            "Position error and number of landmarks against the conditions.",
+            heading="Causes",
+        ),
+    ),
+)
+LOCALISATION = Presentation(
+    cases=(CaseKind(figures.is_localisation_case, view, write_figures, _LEGEND),),
+    first=(POSITION,),
+    sections=(CONDITIONS,),
+    outcomes=(PositionOutcome,),
+)

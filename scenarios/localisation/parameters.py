@@ -1,0 +1,130 @@
+"""Parameters of the localisation scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from marsyard.algorithms.localisation.options import LvsOptions
+from marsyard.scenarios.algorithm_run import AlgorithmSelection
+from marsyard.scenarios.conditions import SizedFaults
+from marsyard.scenarios.descent.parameters import DustOpacity, Location, RenderParameters, SunParameters
+from marsyard.scenarios.localisation.flight import ProfileParameters
+from marsyard.scenarios.localisation.instruments import (
+    IMAGE_CLOCK,
+    LANDER_DETECTOR,
+    LN200,
+    MEMS,
+    RADAR,
+    CameraParameters,
+    InitialErrors,
+)
+from marsyard.scenarios.localisation.map_product import MapParameters
+from marsyard.scenarios.localisation.sites import localisation_site
+from marsyard.scenarios.localisation.stream import ImageSchedule
+from marsyard.scenarios.localisation.task import LOCALISATION
+from marsyard.scenarios.terrain_files import CheckedTerrain
+from marsyard.sim.parameters import NonNegative, bounded_field, merge_settings
+from marsyard.sim.sensor import ClockParameters, DetectorParameters, ImuParameters, RadarParameters
+from marsyard.sim.terrain import Site, TerrainParameters
+
+#: Inertial units by name.
+IMUS: Mapping[str, ImuParameters] = {"ln-200": LN200, "mems": MEMS}
+
+
+class LocalisationFaults(SizedFaults):
+    """Faults of a descent with localisation."""
+
+    heat_shield_deg: Annotated[
+        NonNegative, Field(le=60.0, description="angular diameter of the falling heat shield in the first image")
+    ] = 0.0
+    haze: Annotated[NonNegative, Field(le=10.0, description="optical depth of dusty air over 2000 m")] = 0.0
+    lost_images: Annotated[NonNegative, Field(le=1.0, description="fraction of images that is not delivered")] = 0.0
+    black_image: Annotated[int, bounded_field(0, 100, "image that is delivered black, from 1; 0: none")] = 0
+    altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0
+    attitude_error_deg: Annotated[
+        NonNegative, Field(le=30.0, description="additional tilt error of the initial attitude")
+    ] = 0.0
+    wrong_map: Annotated[int, bounded_field(0, 1, "1: the map shows another terrain of the same site")] = 0
+
+
+class LocalisationScenarioParameters(AlgorithmSelection):
+    """Parameters of a localisation campaign.
+
+    `location` is the terrain and the centre of the map; the descent begins at `start_east_m`, `start_north_m` from it.
+    Keys of the table `terrain` override the terrain of the site.
+    """
+
+    task = LOCALISATION
+
+    site: Annotated[str, Field(description="preset of terrain, light and gravity")] = "crater-floor"
+    terrain_site: Annotated[str, Field(description="site of the terrain; set automatically from `site`")] = (
+        "crater-floor"
+    )
+    location: Location = Location()
+    terrain: CheckedTerrain
+    start_east_m: Annotated[float, bounded_field(-3000.0, 3000.0, "start, east of the map's centre")] = 0.0
+    start_north_m: Annotated[float, bounded_field(-3000.0, 3000.0, "start, north of the map's centre")] = 0.0
+    sun: Annotated[SunParameters, Field(description="sun at the landing")] = SunParameters()
+    dust_opacity: DustOpacity = None
+    map: MapParameters = MapParameters()
+    flight: ProfileParameters = ProfileParameters()
+    images: ImageSchedule = ImageSchedule()
+    camera: CameraParameters = CameraParameters()
+    detector: DetectorParameters = LANDER_DETECTOR
+    imu_class: Annotated[Literal["ln-200", "mems"], Field(description="class of the inertial unit")] = "ln-200"
+    initial: InitialErrors = InitialErrors()
+    altimeter: RadarParameters = RADAR
+    clock: Annotated[ClockParameters, Field(description="clock of the images' time tags")] = IMAGE_CLOCK
+    exact_instruments: Annotated[
+        bool, Field(description="estimators receive exact attitudes, altitudes, times, inertial data and camera")
+    ] = False
+    faults: LocalisationFaults = LocalisationFaults()
+    algorithm: Annotated[str, Field(description="lvs, sift, inertial, or custom")] = "lvs"
+    lvs: Annotated[LvsOptions, Field(description="options of the published algorithm")] = LvsOptions()
+    render: RenderParameters = Field(default_factory=RenderParameters)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete_terrain(cls, settings: Any) -> Any:
+        """Merge the table `terrain` into the terrain of the site."""
+        if not isinstance(settings, Mapping):
+            return settings
+        name, changes = settings.get("site", cls.model_fields["site"].default), settings.get("terrain", {})
+        if not isinstance(name, str) or not isinstance(changes, Mapping):
+            return settings
+        try:
+            terrain = localisation_site(name).terrain("descent")
+        except ValueError:
+            return {"terrain": TerrainParameters(), **settings}  # the check of `site` reports the error
+        return {"terrain_site": name, **settings, "terrain": merge_settings(terrain.model_dump(), changes)}
+
+    @field_validator("site")
+    @classmethod
+    def _check_site(cls, name: str) -> str:
+        localisation_site(name)
+        return name
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> LocalisationScenarioParameters:
+        if self.terrain_site != self.site:
+            raise ValueError(f"site is {self.site}, but terrain is of {self.terrain_site}; `site` cannot be dispersed")
+        period_m = self.terrain.samples * self.terrain.spacing_m
+        side_m = self.map.side_px * self.map.pixel_m
+        if side_m > period_m:
+            raise ValueError(
+                f"the map of {side_m:.6g} m is larger than the terrain, which repeats after {period_m:.6g} m"
+            )
+        return self
+
+    @property
+    def preset(self) -> Site:
+        """The site, with the optical depth of the case."""
+        return localisation_site(self.site).with_dust(self.dust_opacity)
+
+    @property
+    def imu(self) -> ImuParameters:
+        """Parameters of the inertial unit."""
+        return IMUS[self.imu_class]

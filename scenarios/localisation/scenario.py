@@ -1,0 +1,251 @@
+"""Localisation scenario: simulate a descent, its map and its measurements, run the algorithms, and score them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import UInt16
+from pydantic import BaseModel
+from scipy.spatial.transform import Rotation
+
+from marsyard.algorithms.localisation.answers import check_estimate
+from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
+from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
+from marsyard.scenarios.base import TerrainScenario, algorithm_result
+from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
+from marsyard.scenarios.descent.exposure import HAZE_PATH_M, HeatShield
+from marsyard.scenarios.exposure import add_haze, camera_optics, render_state
+from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.localisation import score
+from marsyard.scenarios.localisation.flight import LanderFlight
+from marsyard.scenarios.localisation.instruments import draw_calibrated_camera, measure_altitudes, true_camera
+from marsyard.scenarios.localisation.map_product import MapParameters, MapTruth, make_map
+from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
+from marsyard.scenarios.localisation.stream import Event, StreamAnswers, feed, merge
+from marsyard.scenarios.localisation.task import LOCALISATION
+from marsyard.scenarios.localisation.world import LocalisationWorld
+from marsyard.scenarios.parts.named import PartKind
+from marsyard.sim.dynamics import State
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
+from marsyard.sim.sensor import Detector, Imu
+from marsyard.sim.sensor.imu import true_increments
+from marsyard.sim.sensor.instrument import Clock
+from marsyard.sim.sensor.ranging import RadarAltimeter
+from marsyard.sim.streams import Streams
+from marsyard.sim.terrain import TerrainBank
+
+#: Time between the start of the inertial data and the start of localisation, s, and after the last image.
+LEAD_S, MARGIN_S = 0.2, 0.2
+#: Index of the terrain on a wrong map, relative to that of the case.
+_WRONG_TERRAIN = 1
+
+
+class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
+    """Descent to a mapped site with images, inertial data and altitudes for a position estimator."""
+
+    name = "localisation"
+    parameters_type = LocalisationScenarioParameters
+    task = LOCALISATION
+    part_keys: Mapping[str, PartKind] = {}
+
+    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
+        """Return the indices of the terrains in the terrain bank."""
+        return tuple(range(self.check_parameters(parameters).location.bank))
+
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """Return the index of the terrain below the descent."""
+        return (self.check_parameters(parameters).location.terrain,)
+
+    def input_terrain(self, p: LocalisationScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
+        """Return the terrain bank and the index of a terrain in it."""
+        return TerrainBank(p.terrain, p.location.bank_seed), shared_input
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """Simulate one descent and score all algorithms."""
+        descent = LocalisedDescent.simulate(self.check_parameters(parameters), streams)
+        p = descent.p
+        shared = {
+            **score.conditions(descent),
+            **image_columns(p.render.backend, hash_images(image.counts for image in descent.images)),
+        }
+
+        def evaluate(algorithm: str) -> CaseResult:
+            measurements = descent.measurements
+            span_s = (float(descent.increments.times_s[0]), float(descent.increments.times_s[-1]))
+            algorithm_run = run_algorithm_on_copy(
+                lambda inputs: feed(
+                    LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case),
+                    inputs.initial,
+                    inputs.map_product,
+                    inputs.events,
+                ),
+                lambda answers: _check_answers(answers, span_s),
+                measurements,
+            )
+            answers = algorithm_run.answer
+            row = {**algorithm_run.row, **({} if answers is None else score.answer_row(descent, answers))}
+            products = {} if answers is None else score.products(descent, answers)
+            is_answered = answers is not None and answers.outcome is PositionOutcome.VALID
+            return algorithm_result(algorithm_run, is_answered, row, products)
+
+        return case_result(p.algorithms, evaluate, shared)
+
+
+def _check_answers(answers: object, span_s: tuple[float, float]) -> StreamAnswers:
+    """Validate the answers of a stream. Raises AlgorithmError."""
+    assert isinstance(answers, StreamAnswers)
+    return replace(answers, estimates=tuple(check_estimate(answer, span_s) for answer in answers.estimates))
+
+
+@dataclass(frozen=True)
+class LocalisationMeasurements:
+    """Measurements of a descent in the order of their arrival, with the initial state and the map."""
+
+    initial: InitialState
+    map_product: MapProduct
+    events: tuple[Event, ...]
+
+
+@dataclass(frozen=True)
+class LocalisedDescent:
+    """A simulated descent, its map and its measurements, which all algorithms of a case use.
+
+    - states: true states at the images
+    - images: delivered images
+    - increments: measured inertial increments of the whole descent
+    """
+
+    p: LocalisationScenarioParameters
+    world: LocalisationWorld
+    flight: LanderFlight
+    states: tuple[State, ...]
+    map_truth: MapTruth
+    images: tuple[DetectorImage, ...]
+    increments: ImuIncrements
+    measurements: LocalisationMeasurements
+
+    @classmethod
+    def simulate(cls, p: LocalisationScenarioParameters, streams: Streams) -> LocalisedDescent:
+        """Simulate the descent of a case, its map and its measurements."""
+        world = _create_world(p, p.location.terrain)
+        gravity = world.air.gravity_m_s2
+        centre = np.array([p.location.east_m, p.location.north_m])
+        start_xy = centre + np.array([p.start_east_m, p.start_north_m])
+        ground_m = float(world.surface.height(*start_xy))
+        start = np.array([*start_xy, ground_m + p.flight.altitude_start_m])
+        flight = LanderFlight.simulate(
+            p.flight, start, streams.generator("flight"), ground_height_m=ground_m, gravity_m_s2=gravity
+        )
+        mapped = world
+        if p.faults.wrong_map:
+            mapped = _create_world(p, (p.location.terrain + _WRONG_TERRAIN) % p.location.bank)
+        map_product, map_truth = make_map(mapped, p.map, centre, streams.generator("map"), p.render.backend)
+        times = p.images.times(0.0, flight.end_s)
+        states = tuple(flight.motion(times).state(row) for row in range(times.size))
+        images = _take_images(p, world, states, streams)
+        increments, initial = _measure_inertially(p, flight, float(times[-1]), gravity, streams)
+        altitudes = _measure_altitudes(p, world, flight, float(times[-1]), streams)
+        events = merge(increments, altitudes, images)
+        measurements = LocalisationMeasurements(initial, map_product, tuple(events))
+        return cls(p, world, flight, states, map_truth, tuple(images), increments, measurements)
+
+    @property
+    def map(self) -> MapParameters:
+        """Parameters of the map."""
+        return self.p.map
+
+
+def _create_world(p: LocalisationScenarioParameters, number: int) -> LocalisationWorld:
+    return LocalisationWorld.from_parameters(
+        p.preset,
+        p.terrain,
+        bank_seed=p.location.bank_seed,
+        terrain_number=number,
+        sun_azimuth_deg=p.sun.azimuth_deg,
+        sun_elevation_deg=p.sun.elevation_deg,
+        optical_depth=p.dust_opacity,
+        detector=p.detector,
+    )
+
+
+def _take_images(
+    p: LocalisationScenarioParameters, world: LocalisationWorld, states: Sequence[State], streams: Streams
+) -> list[DetectorImage]:
+    """Render and expose the images; lost images are omitted."""
+    optics = camera_optics(true_camera(p.camera))
+    calibrated = (
+        optics.camera if p.exact_instruments else draw_calibrated_camera(p.camera, streams.generator("calibration"))
+    )
+    detector = Detector.draw(
+        optics.fall_off, add_detector_faults(p.faults, p.detector), streams.generator("detector response")
+    )
+    clock = Clock.draw(p.clock, streams.generator("image clock"))
+    times = np.array([state.time_s for state in states])
+    tags = times if p.exact_instruments else clock.tags(times, streams.generator("image tags"))
+    first, last = states[0].position_m, states[-1].position_m
+    height_m = max(float(last[2] - world.surface.height(last[0], last[1])), 50.0)
+    scene = world.scene(float(first[0]), float(first[1]), height_m, optics.rays.pixel_rad)
+    shield = None
+    if p.faults.heat_shield_deg:
+        angle = float(np.radians(p.faults.heat_shield_deg))
+        shield = HeatShield.draw(states[0], angle, streams.generator("heat shield"))
+    noise, losses = streams.generator("detector noise"), streams.generator("lost images")
+    images: list[DetectorImage] = []
+    for number, (state, tag) in enumerate(zip(states, tags, strict=True), start=1):
+        frame, motion = render_state(p.render.backend, scene, optics, state)
+        height = float(state.position_m[2] - world.surface.height(*state.position_m[:2]))
+        extinction = world.air.mean_extinction_m(height) + p.faults.haze / HAZE_PATH_M
+        radiance = add_haze(frame, world.air, world.sun, extinction)
+        if shield is not None:
+            radiance = shield.paint_over(radiance, frame, world.sun, state.time_s)
+        counts: UInt16[np.ndarray, "rows columns"] = detector.expose(
+            radiance * np.float32(world.brightness), noise, motion
+        )
+        if number == p.faults.black_image:
+            counts = np.zeros_like(counts)
+        if losses.random() >= p.faults.lost_images:
+            images.append(DetectorImage(counts, float(tag), calibrated, detector.calibration))
+    return images
+
+
+def _measure_inertially(
+    p: LocalisationScenarioParameters, flight: LanderFlight, last_s: float, gravity_m_s2: float, streams: Streams
+) -> tuple[ImuIncrements, InitialState]:
+    """Measure the inertial increments of the descent, and draw the state at their beginning."""
+    start_s, end_s = -LEAD_S, last_s + MARGIN_S
+    imu = Imu.draw(p.imu, (start_s, end_s), streams.generator("imu"))
+    if p.exact_instruments:
+        boundaries = imu.boundaries(start_s, end_s)
+        increments = ImuIncrements(boundaries, 1.0 / p.imu.rate_hz, *true_increments(flight, boundaries))
+    else:
+        increments = imu.increments(flight, start_s, end_s, streams.generator("imu noise"))
+    truth = flight.state(start_s)
+    rng = streams.generator("initial state")
+    initial = p.initial.draw(truth, float(increments.times_s[0]), gravity_m_s2, rng)
+    azimuth = rng.uniform(-np.pi, np.pi)
+    if p.exact_instruments:
+        return increments, replace(initial, world_from_body=truth.attitude, velocity_m_s=truth.velocity_m_s)
+    tilt = np.radians(p.faults.attitude_error_deg) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    return increments, replace(initial, world_from_body=Rotation.from_rotvec(tilt) * initial.world_from_body)
+
+
+def _measure_altitudes(
+    p: LocalisationScenarioParameters, world: LocalisationWorld, flight: LanderFlight, last_s: float, streams: Streams
+) -> list[AltitudeMeasurement]:
+    """Measure the altitudes from start to end, or compute the true altitudes at the same times."""
+    radar = RadarAltimeter.draw(p.altimeter, world.surface, streams.generator("altimeter"))
+    readings = measure_altitudes(radar, flight, (0.0, last_s), streams.generator("altimeter noise"))
+    if p.exact_instruments:
+        times = np.array([reading.time_s for reading in readings])
+        positions = flight.motion(times).positions_m
+        heights = positions[:, 2] - world.surface.height(positions[:, 0], positions[:, 1])
+        return [AltitudeMeasurement(float(height), float(tag)) for height, tag in zip(heights, times, strict=True)]
+    factor = 1.0 + p.faults.altitude_error
+    return [AltitudeMeasurement(factor * reading.altitude_m, reading.time_s) for reading in readings]
+
+
+def final_estimate(answers: StreamAnswers) -> PositionEstimate:
+    """Return the final estimate of a stream."""
+    return answers.estimates[-1]

@@ -1,0 +1,242 @@
+"""Columns and products of a localisation case: conditions, errors of the estimates, covariance consistency, times.
+
+Horizontal errors are relative to the map: the reference is the map position below which the lander truly is. The error
+relative to the world also contains the map's registration and distortion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from marsyard.algorithms.localisation.details import LocalisationDetails
+from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
+from marsyard.scenarios.conditions import (
+    attitude_rate_deg_s,
+    contrast_columns,
+    ground_columns,
+    off_nadir_deg,
+    optics_columns,
+    sun_columns,
+)
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.localisation.map_product import MapTruth
+from marsyard.scenarios.localisation.stream import StreamAnswers
+from marsyard.scenarios.localisation.world import sun_at
+from marsyard.sim.dynamics import State
+
+if TYPE_CHECKING:
+    from marsyard.scenarios.localisation.scenario import LocalisedDescent
+
+#: Required horizontal accuracy, m, and time after the start in which it is required, s (Mars 2020).
+REQUIRED_M, REQUIRED_S = 40.0, 10.0
+#: Side of the stored map, pixels.
+_THUMBNAIL_PX = 512
+_NAN = float("nan")
+
+
+def conditions(descent: LocalisedDescent) -> dict[str, Scalar]:
+    """Return the columns of a case that do not depend on an algorithm."""
+    p, world, states = descent.p, descent.world, descent.states
+    map_sun = sun_at(world.air, p.map.sun_azimuth_deg, p.map.sun_elevation_deg)
+    cosine = float(np.clip(map_sun.direction @ world.sun.direction, -1.0, 1.0))
+    initial, shift = descent.measurements.initial, descent.map_truth.shift_m
+    reference = descent.map_truth.map_position(descent.flight.state(initial.time_s).position_m[:2])
+    images = descent.images
+    return {
+        "site": p.site,
+        "terrain": p.location.terrain,
+        "location_east_m": p.location.east_m,
+        "location_north_m": p.location.north_m,
+        "start_east_m": p.start_east_m,
+        "start_north_m": p.start_north_m,
+        **sun_columns(world.sun.direction),
+        "map_sun_azimuth_deg": p.map.sun_azimuth_deg,
+        "map_sun_elevation_deg": p.map.sun_elevation_deg,
+        "sun_difference_deg": float(np.degrees(np.arccos(cosine))),
+        **ground_columns(world.ground),
+        **(contrast_columns(images[0].counts, p.detector) if images else {}),
+        **optics_columns(p.detector.optics),
+        "images": len(images),
+        "map_shift_m": float(np.hypot(*shift)),
+        "initial_error_m": float(np.hypot(*(initial.position_m[:2] - reference))),
+        "initial_attitude_error_deg": _attitude_error_deg(
+            initial.world_from_body, descent.flight.state(initial.time_s)
+        ),
+        "off_nadir_max_deg": max(off_nadir_deg(state) for state in states),
+        "attitude_rate_max_deg_s": max(attitude_rate_deg_s(state) for state in states),
+        "altitude_last_m": float(states[-1].position_m[2] - world.surface.height(*states[-1].position_m[:2])),
+        **p.faults.columns,
+    }
+
+
+def _attitude_error_deg(estimate: Rotation, truth: State) -> float:
+    return float(np.degrees((truth.attitude * estimate.inv()).magnitude()))
+
+
+@dataclass(frozen=True)
+class EstimateErrors:
+    """Errors of one valid estimate, estimate minus truth: position relative to the map (east, north, up), and others.
+
+    - position_m, world_m: errors relative to the map and to the world (horizontal)
+    - sd_m: standard deviations of the position according to the estimator
+    - nees: normalised squared error of the horizontal position, chi-square with 2 degrees of freedom if consistent
+    """
+
+    time_s: float
+    position_m: Float64[np.ndarray, "3"]
+    world_m: Float64[np.ndarray, "2"]
+    velocity_m_s: float
+    attitude_deg: float
+    sd_m: Float64[np.ndarray, "3"]
+    nees: float
+
+    @property
+    def horizontal_m(self) -> float:
+        """Horizontal error relative to the map."""
+        return float(np.hypot(*self.position_m[:2]))
+
+    @classmethod
+    def from_estimate(cls, estimate: PositionEstimate, truth: State, map_truth: MapTruth) -> EstimateErrors:
+        """Compute the errors of a valid estimate from the true state at its time tag."""
+        assert estimate.position_m is not None
+        assert estimate.velocity_m_s is not None
+        assert estimate.world_from_body is not None
+        assert estimate.covariance is not None
+        reference = np.append(map_truth.map_position(truth.position_m[:2]), truth.position_m[2])
+        error = estimate.position_m - reference
+        horizontal = estimate.covariance[:2, :2]
+        return cls(
+            time_s=estimate.time_s,
+            position_m=error,
+            world_m=estimate.position_m[:2] - truth.position_m[:2],
+            velocity_m_s=float(np.linalg.norm(estimate.velocity_m_s - truth.velocity_m_s)),
+            attitude_deg=_attitude_error_deg(estimate.world_from_body, truth),
+            sd_m=np.sqrt(np.diag(estimate.covariance)[:3]),
+            nees=float(error[:2] @ np.linalg.solve(horizontal, error[:2])),
+        )
+
+
+def compute_errors(descent: LocalisedDescent, answers: StreamAnswers) -> list[EstimateErrors | None]:
+    """Compute the errors of each estimate, None for a refusal."""
+    first, last = descent.flight.span_s
+    return [
+        EstimateErrors.from_estimate(
+            estimate, descent.flight.state(float(np.clip(estimate.time_s, first, last))), descent.map_truth
+        )
+        if estimate.outcome is PositionOutcome.VALID
+        else None
+        for estimate in answers.estimates
+    ]
+
+
+def answer_row(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, Scalar]:
+    """Return the columns of one algorithm's answers."""
+    errors = compute_errors(descent, answers)
+    valid = [error for error in errors if error is not None]
+    final = errors[-1]
+    early = [error for error in valid if error.time_s <= REQUIRED_S]
+    times = answers.processor_times
+    details = [estimate.details for estimate in answers.estimates[:-1]]
+    inliers = [item.inliers for item in details if isinstance(item, LocalisationDetails) and item.inliers is not None]
+    horizontal = [error.horizontal_m for error in valid]
+    return {
+        "fix_after_s": valid[0].time_s if valid else _NAN,
+        "fixed_in_time": bool(early),
+        "position_error_at_10_s_m": early[-1].horizontal_m if early else _NAN,
+        "position_error_m": _NAN if final is None else final.horizontal_m,
+        "position_error_max_m": max(horizontal, default=_NAN),
+        "false_fix": any(error > REQUIRED_M for error in horizontal),
+        "valid_images": sum(error is not None for error in errors[:-1]),
+        **_final_columns(final),
+        "inliers_median": float(np.median(inliers)) if inliers else _NAN,
+        "inliers_min": float(min(inliers)) if inliers else _NAN,
+        "image_time_max_s": max(times.image_s, default=0.0),
+        "image_time_median_s": float(np.median(times.image_s)) if times.image_s else 0.0,
+    }
+
+
+def _final_columns(error: EstimateErrors | None) -> dict[str, Scalar]:
+    """Return components and consistency of the final error; NaN without a valid estimate."""
+    if error is None:
+        names = ("east", "north", "up")
+        row: dict[str, Scalar] = {f"position_error_{name}_m": _NAN for name in names}
+        row |= {f"position_sd_{name}_m": _NAN for name in names}
+        return row | dict.fromkeys(
+            ("position_error_world_m", "velocity_error_m_s", "attitude_error_deg", "position_nees"), _NAN
+        )
+    row = {
+        f"position_error_{name}_m": float(value)
+        for name, value in zip(("east", "north", "up"), error.position_m, strict=True)
+    }
+    row |= {
+        f"position_sd_{name}_m": float(value) for name, value in zip(("east", "north", "up"), error.sd_m, strict=True)
+    }
+    return row | {
+        "position_error_world_m": float(np.hypot(*error.world_m)),
+        "velocity_error_m_s": error.velocity_m_s,
+        "attitude_error_deg": error.attitude_deg,
+        "position_nees": error.nees,
+    }
+
+
+def products(descent: LocalisedDescent, answers: StreamAnswers) -> Mapping[str, Any]:
+    """Return the arrays for a case's figures.
+
+    ::
+
+        track               per estimate: time, error east, north, up, sd east, north, up (m); NaN for a refusal
+        outcomes            outcome of each estimate
+        inliers             landmarks used in each image; NaN without a match
+        true_xy_m           true positions on the map at the images; estimated_xy_m: estimates, NaN for a refusal
+        map                 appearance of the map, reduced; map_extent_m: west, east, south, north
+        image_1, image_2    first and last image
+        landmarks_px        measured pixels of the landmarks in the last image; landmarks_residual_px, landmarks_used
+    """
+    errors = compute_errors(descent, answers)
+    nothing = np.full(7, np.nan)
+    track = np.stack(
+        [nothing if error is None else np.array([error.time_s, *error.position_m, *error.sd_m]) for error in errors]
+    )
+    estimates = answers.estimates
+    details = [estimate.details for estimate in estimates]
+    estimated = [np.full(2, np.nan) if item.position_m is None else item.position_m[:2] for item in estimates]
+    map_product = descent.measurements.map_product
+    side_px = min(_THUMBNAIL_PX, *map_product.appearance.shape)
+    low, high = np.quantile(map_product.appearance, (0.005, 0.995))
+    scaled = np.clip(255.0 * (map_product.appearance - low) / max(float(high - low), 1e-9), 0.0, 255.0)
+    thumbnail = cv2.resize(scaled.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_AREA)
+    west, south = map_product.origin_m - 0.5 * map_product.pixel_m
+    rows, columns = map_product.appearance.shape
+    values: dict[str, Any] = {
+        "track": track,
+        "outcomes": [estimate.outcome.name for estimate in estimates],
+        "inliers": np.array(
+            [
+                _NAN if not isinstance(item, LocalisationDetails) or item.inliers is None else float(item.inliers)
+                for item in details
+            ]
+        ),
+        "true_xy_m": np.array([descent.map_truth.map_position(state.position_m[:2]) for state in descent.states]),
+        "estimated_xy_m": np.stack(estimated),
+        "map": thumbnail.astype(np.uint8),
+        "map_extent_m": np.array(
+            [west, west + columns * map_product.pixel_m, south, south + rows * map_product.pixel_m]
+        ),
+    }
+    if descent.images:
+        values |= {"image_1": descent.images[0].counts, "image_2": descent.images[-1].counts}
+    last = details[-2] if len(details) > 1 else None
+    if isinstance(last, LocalisationDetails) and last.measured_px is not None:
+        values |= {
+            "landmarks_px": last.measured_px,
+            "landmarks_residual_px": last.residuals_px,
+            "landmarks_used": last.used,
+        }
+    return values

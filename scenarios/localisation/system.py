@@ -1,0 +1,23 @@
+"""Localisation of a lander on a map as a system of Marsyard: an entry point of the group `marsyard.systems`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from marsyard.scenarios.systems import System
+
+_FOLDER = Path(__file__).resolve().parent
+
+SYSTEM = System(
+    name="localisation",
+    title="Localisation on a map",
+    summary="Position of a lander on a map, from descent images and inertial data.",
+    scenarios={"localisation": "marsyard.scenarios.localisation.scenario:LocalisationScenario"},
+    tasks=("marsyard.scenarios.localisation.task:LOCALISATION",),
+    catalogue=_FOLDER / "catalogue" / "loc-*.toml",
+    requirements=_FOLDER / "requirements.toml",
+    columns=_FOLDER / "columns.toml",
+    error_sources=_FOLDER / "error_sources.toml",
+    compilation_campaigns={"loc-smoke": ("terrain.samples=512", "map.side_px=256", "camera.pixels=128")},
+    report="marsyard.reports.localisation.presentation:LOCALISATION",
+)

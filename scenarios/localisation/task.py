@@ -1,0 +1,23 @@
+"""Task of the position estimators: names, options and creation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from marsyard.algorithms.localisation.baselines import FeatureEstimator, InertialEstimator
+from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
+from marsyard.algorithms.localisation.interface import PositionEstimator
+from marsyard.algorithms.localisation.options import LvsOptions
+from marsyard.scenarios.estimators import Task
+
+LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
+    name="localisation",
+    what="position estimator",
+    methods=("start", "imu", "altitude", "image", "finish"),
+    shipped={
+        "lvs": lambda options: MapRelativeEstimator(options),
+        "sift": lambda options: FeatureEstimator(options),
+        "inertial": lambda options: InertialEstimator(replace(options)),
+    },
+    options=LvsOptions,
+)
