@@ -46,7 +46,7 @@ class CameraParameters(Parameters):
 
     @model_validator(mode="after")
     def _check_field(self) -> CameraParameters:
-        if not np.all(np.isfinite(true_camera(self).corner_rays[1])):
+        if not np.all(np.isfinite(true_camera(self).corner_rays()[1])):
             raise ValueError(
                 f"field_deg of {self.field_deg:.6g} with {self.pixels} pixels of {self.pixel_mrad:.6g} mrad is not a "
                 f"one-to-one image; allowed: a field close to pixels x pixel_mrad"
@@ -77,7 +77,7 @@ def draw_calibrated_camera(p: CameraParameters, rng: np.random.Generator) -> Cam
     focal, column, row, distortion = rng.standard_normal(4)
     tilt = Rotation.from_rotvec(np.radians(p.alignment_error_deg) * rng.standard_normal(3))
     camera, errors = true_camera(p), p.calibration
-    corner_ray = camera.corner_rays[1][0]
+    corner_ray = camera.corner_rays()[1][0]
     corner = float(np.arccos(corner_ray @ camera.o / np.linalg.norm(corner_ray)))
     cubic = errors.distortion_error_px * float(distortion) * 1e-3 * p.pixel_mrad / corner**3
     camera = replace(camera, r=camera.r + np.array([0.0, cubic, 0.0]))
