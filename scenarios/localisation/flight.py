@@ -20,6 +20,8 @@ exact derivatives, also across the separation.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -36,8 +38,9 @@ from marsyard.sim.dynamics.trajectory import Motion, Trajectory
 from marsyard.sim.parameters import Parameters, bounded_field
 
 Vector = Float64[np.ndarray, "3"]
+Quaternion = Float64[np.ndarray, "4"]  #: In the order x, y, z, w.
 
-#: Time between the poses of the spline, s: the splined parachute descent deviates by less than 1e-6 m and 1e-6 m/s.
+#: Time between the poses of the spline, s: the splined parachute descent deviates by less than 1e-8 m and 1e-5 m/s.
 KNOT_STEP_S = 0.01
 #: Duration of the flight before the start at time 0, s.
 LEAD_S = 2.0
@@ -52,6 +55,8 @@ _CYCLE_RATIOS = np.array([1.0, 1.13, 1.47])
 #: Limit of the powered descent's duration: descent from separation at this fraction of the final speed.
 _MIN_SPEED_FRACTION = 0.5
 _UP = np.array([0.0, 0.0, 1.0])
+#: Signs of the conjugate of a quaternion.
+_CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 
 #: Mars 2020 under its parachute, a rigid vehicle with its backshell: coning with the parachute, and nodding about the
 #: confluence of the bridles. Parachute: 50 m long with its lines, 82 kg (public summaries of NASA); all other values
@@ -205,7 +210,7 @@ def _fly_powered(
     jerk = (accelerations[2] - accelerations[0]) / (2.0 * _JERK_STEP_S)
     initial = around.state(1)
     attitude = initial.attitude
-    heading = _tilt_to(attitude.apply(_UP)).inv() * attitude
+    heading = _multiply(_tilt_to(attitude.apply(_UP)) * _CONJUGATE, attitude.as_quat())
     max_rate = np.radians(p.max_rate_deg_s)
     last_height_m = ground_height_m + p.altitude_end_m - BELOW_END_M
 
@@ -218,11 +223,10 @@ def _fly_powered(
         weight = _smooth_step((time_s - separation_s - p.free_fall_s) / p.start_up_s)
         command = weight * guidance - (1.0 - weight) * gravity_m_s2 * _UP
         snap = p.thrust_lag_rad_s**2 * (command - acceleration) - 2.0 * p.thrust_lag_rad_s * jerk
-        thrust = np.array([acceleration[0], acceleration[1], gravity_m_s2])
-        error = (Rotation.from_quat(quaternion).inv() * _tilt_to(thrust) * heading).as_rotvec()
+        commanded = _multiply(_tilt_to((acceleration[0], acceleration[1], gravity_m_s2)), heading)
+        error = _rotation_vector(_multiply(quaternion * _CONJUGATE, commanded))
         rate_slope = p.rate_gain_per_s * (_limit(p.attitude_gain_per_s * error, max_rate) - rate)
-        vector, scalar = quaternion[:3], quaternion[3]
-        turn = 0.5 * np.append(scalar * rate + np.cross(vector, rate), -vector @ rate)
+        turn = 0.5 * _multiply(quaternion, (*rate, 0.0))
         return np.concatenate([velocity, acceleration, jerk, snap, turn, rate_slope])
 
     def height_left(_time_s: float, y: Float64[np.ndarray, "19"]) -> float:
@@ -259,20 +263,42 @@ def _fly_powered(
 
 def _limit(values: Float64[np.ndarray, "k"], maximum: float) -> Float64[np.ndarray, "k"]:
     """Shorten a vector smoothly to less than a maximum length, without changing its direction."""
-    ratio = float(np.linalg.norm(values)) / maximum
-    return values * (np.tanh(ratio) / ratio if ratio > 0.0 else 1.0)
+    ratio = math.sqrt(values @ values) / maximum
+    return values * (math.tanh(ratio) / ratio if ratio > 0.0 else 1.0)
 
 
 def _smooth_step(fraction: float | Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
     """Rise from 0 to 1 between 0 and 1, with continuous second derivative."""
-    x = np.clip(fraction, 0.0, 1.0)
+    x = np.minimum(np.maximum(fraction, 0.0), 1.0)
     return np.asarray(x**3 * (10.0 + x * (6.0 * x - 15.0)))
 
 
-def _tilt_to(direction: Vector) -> Rotation:
+def _multiply(left: Sequence[float] | Quaternion, right: Sequence[float] | Quaternion) -> Quaternion:
+    """Multiply two quaternions; for single ones, plain numbers are faster than `Rotation`."""
+    ax, ay, az, aw = left
+    bx, by, bz, bw = right
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by + ay * bw + az * bx - ax * bz
+    z = aw * bz + az * bw + ax * by - ay * bx
+    return np.array([x, y, z, aw * bw - ax * bx - ay * by - az * bz])
+
+
+def _rotation_vector(quaternion: Quaternion) -> Vector:
+    """Compute the rotation vector of a quaternion of any length, with an angle of at most 180 deg."""
+    x, y, z, w = quaternion
+    sine = math.sqrt(x * x + y * y + z * z)
+    if sine == 0.0:
+        return np.zeros(3)
+    return quaternion[:3] * (math.copysign(2.0, w) * math.atan2(sine, abs(w)) / sine)
+
+
+def _tilt_to(direction: Sequence[float] | Vector) -> Quaternion:
     """Compute the smallest rotation from the vertical to an upward direction."""
-    unit = direction / np.linalg.norm(direction)
-    return Rotation.from_quat(np.append(np.cross(_UP, unit), 1.0 + unit[2]))
+    x, y, z = direction
+    # the rotation axis is (0, 0, 1) x direction; the length of the quaternion is 1 after division by the norm
+    w = math.sqrt(x * x + y * y + z * z) + z
+    norm = math.sqrt(x * x + y * y + w * w)
+    return np.array([-y / norm, x / norm, 0.0, w / norm])
 
 
 def _time_of_height(motion: RecordedMotion, height_m: float) -> float:

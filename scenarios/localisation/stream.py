@@ -21,6 +21,9 @@ from marsyard.algorithms.localisation.interface import (
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from marsyard.sim.parameters import Parameters, bounded_field
 
+#: Margin of the inertial increments after the end of the flight, s: time tags of other clocks are up to 10 ms late.
+#: The first altitude and the first image are at least as long after the start.
+INERTIAL_MARGIN_S = 0.05
 #: One event of the stream.
 Event = ImuIncrements | AltitudeMeasurement | DetectorImage
 Data = TypeVar("Data")
@@ -33,7 +36,7 @@ class ImageSchedule(Parameters):
     The cameras of Mars 2020 took pictures at up to 1 Hz; the default of half of it is assumed.
     """
 
-    first_s: Annotated[float, bounded_field(0.05, 60.0, "first image, after the start")] = 0.5
+    first_s: Annotated[float, bounded_field(INERTIAL_MARGIN_S, 60.0, "first image, after the start")] = 0.5
     coarse_images: Annotated[int, Field(ge=0, le=100, description="images of the coarse stage")] = 3
     coarse_interval_s: Annotated[float, bounded_field(0.1, 60.0, "time after each image of the coarse stage")] = 3.3
     interval_s: Annotated[float, bounded_field(0.1, 60.0, "time between images of the fine stage")] = 2.0

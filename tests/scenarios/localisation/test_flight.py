@@ -1,0 +1,158 @@
+"""Tests of the lander's flight: profile, exact derivatives, and inertial navigation along it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from marsyard.scenarios.localisation.flight import BELOW_END_M, LEAD_S, LanderFlight, ProfileParameters
+from marsyard.scenarios.localisation.instruments import LN200
+from marsyard.sim.sensor import Imu, InertialSolution
+from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, MILLI_G, ImuIncrements, true_increments
+
+GROUND_M = -100.0
+GRAVITY_M_S2 = 3.72
+
+
+def test_flight_follows_the_simulated_parachute_descent(flight: LanderFlight) -> None:
+    """The spline equals the solution of the equations of motion until separation."""
+    times = np.linspace(-0.99 * LEAD_S, flight.separation_s - 1e-6, 5003)
+    spline, simulated = flight.motion(times), flight.parachute.motion(times)
+    np.testing.assert_allclose(spline.positions_m, simulated.positions_m, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(spline.velocities_m_s, simulated.velocities_m_s, rtol=0.0, atol=1e-5)
+    assert (spline.attitudes.inv() * simulated.attitudes).magnitude().max() < 1e-5
+    # the angular acceleration is free at the start of the spline, and steps at separation
+    inner = (times > -LEAD_S + 0.1) & (times < flight.separation_s - 0.1)
+    np.testing.assert_allclose(spline.body_rates_rad_s[inner], simulated.body_rates_rad_s[inner], rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(
+        spline.specific_forces_m_s2[inner], simulated.specific_forces_m_s2[inner], rtol=0.0, atol=1e-3
+    )
+
+
+def test_velocity_rate_and_force_are_derivatives(flight: LanderFlight) -> None:
+    """Difference quotients of position, attitude and velocity equal velocity, body rate and specific force."""
+    step = 1e-4
+    times = np.sort(
+        np.concatenate(
+            [np.linspace(-1.0, flight.span_s[1] - 1.0, 1999), flight.separation_s + np.linspace(-0.1, 1.5, 101)]
+        )
+    )
+    before, middle, after = (flight.motion(times + offset) for offset in (-step, 0.0, step))
+    # second-order differences: acceleration and jerk x step^2 are below 1e-6; rounding of 4 km / step is 1e-8
+    velocities = (after.positions_m - before.positions_m) / (2.0 * step)
+    np.testing.assert_allclose(velocities, middle.velocities_m_s, rtol=0.0, atol=1e-6)
+    rates = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2.0 * step)
+    np.testing.assert_allclose(rates, middle.body_rates_rad_s, rtol=0.0, atol=1e-5)
+    # the jerk of a cubic spline steps at its knots, by up to 1 m/s^3
+    accelerations = (after.velocities_m_s - before.velocities_m_s) / (2.0 * step)
+    forces = middle.attitudes.inv().apply(accelerations + np.array([0.0, 0.0, GRAVITY_M_S2]))
+    np.testing.assert_allclose(forces, middle.specific_forces_m_s2, rtol=0.0, atol=2e-4)
+
+
+def test_motion_is_continuous_at_separation(flight: LanderFlight) -> None:
+    """Acceleration and body rate change by no more than jerk and angular acceleration x time at separation."""
+    first, second = (flight.state(flight.separation_s + offset) for offset in (-1e-4, 1e-4))
+    change = second.attitude.apply(second.specific_force_m_s2) - first.attitude.apply(first.specific_force_m_s2)
+    assert np.linalg.norm(change) < 0.02
+    assert np.linalg.norm(second.body_rate_rad_s - first.body_rate_rad_s) < 1e-3
+
+
+def test_profile_has_the_altitudes_and_speeds_of_the_parameters(flight: LanderFlight) -> None:
+    """Altitudes of start, separation and end; speeds under the parachute and on the thrusters."""
+    p = flight.parameters
+    start, separation, end = (flight.state(time) for time in (0.0, flight.separation_s, flight.end_s))
+    np.testing.assert_allclose(start.position_m, [300.0, -200.0, GROUND_M + 4200.0], rtol=0.0, atol=1e-6)
+    assert separation.position_m[2] - GROUND_M == pytest.approx(p.altitude_separation_m, abs=1e-6)
+    assert end.position_m[2] - GROUND_M == pytest.approx(p.altitude_end_m, abs=1e-6)
+    assert flight.time_of_altitude(500.0) == pytest.approx(flight.end_s, abs=1e-9)
+    assert flight.state(flight.span_s[1]).position_m[2] - GROUND_M == pytest.approx(500.0 - BELOW_END_M, abs=1e-3)
+    assert -start.velocity_m_s[2] == pytest.approx(90.0, abs=1.5)
+    # equilibrium speed in air whose density has grown by exp(2100 / 11200): 82 m/s
+    assert -separation.velocity_m_s[2] == pytest.approx(82.0, abs=3.0)
+    np.testing.assert_allclose(end.velocity_m_s, [0.0, 0.0, -p.descent_speed_m_s], rtol=0.0, atol=0.3)
+
+
+def test_powered_descent_keeps_its_limits(flight: LanderFlight) -> None:
+    """Accelerations, tilt and body rate are within the limits once the thrusters have replaced the parachute."""
+    p = flight.parameters
+    motion = flight.motion(np.arange(flight.separation_s + 2.5, flight.end_s, 0.02))
+    accelerations = motion.attitudes.apply(motion.specific_forces_m_s2) - np.array([0.0, 0.0, GRAVITY_M_S2])
+    assert np.linalg.norm(accelerations[:, :2], axis=1).max() < p.max_horizontal_m_s2
+    assert np.abs(accelerations[:, 2]).max() < 1.05 * p.max_vertical_m_s2
+    cycle_rate = 2.0 * np.pi * np.sqrt(3.0) * p.limit_cycle_deg / p.limit_cycle_s
+    assert np.degrees(np.linalg.norm(motion.body_rates_rad_s, axis=1)).max() < p.max_rate_deg_s + cycle_rate
+    tilt_deg = np.degrees(np.arccos(motion.attitudes.as_matrix()[:, 2, 2]))
+    assert tilt_deg.max() < 20.0
+    # upright with the limit cycle only, once the horizontal velocity is zero
+    assert tilt_deg[-50:].max() < np.sqrt(2.0) * p.limit_cycle_deg + 0.05
+
+
+def test_errors_name_the_allowed_values(flight: LanderFlight) -> None:
+    """Invalid altitudes are reported."""
+    with pytest.raises(ValueError, match="allowed: decreasing"):
+        ProfileParameters(altitude_separation_m=5000.0)
+    with pytest.raises(ValueError, match="is not passed; allowed"):
+        flight.time_of_altitude(100.0)
+    with pytest.raises(ValueError, match="allowed: above the separation"):
+        LanderFlight.simulate(
+            flight.parameters, np.zeros(3), np.random.default_rng(0), ground_height_m=0.0, gravity_m_s2=GRAVITY_M_S2
+        )
+
+
+def _navigate(flight: LanderFlight, increments: ImuIncrements) -> np.ndarray:
+    """Propagate the exact initial state; return the position at the last boundary."""
+    start = flight.state(0.0)
+    solution = InertialSolution.propagate(increments, start.attitude, start.velocity_m_s, GRAVITY_M_S2)
+    position: np.ndarray = start.position_m + solution.displacements_m[-1]
+    return position
+
+
+def test_perfect_inertial_navigation_reproduces_the_flight(flight: LanderFlight) -> None:
+    """The exact increments lead to the exact position: to a millimetre after 50 s."""
+    boundaries = np.arange(0.0, flight.end_s, 1.0 / 400.0)
+    angles, velocities = true_increments(flight, boundaries)
+    position = _navigate(flight, ImuIncrements(boundaries, 1.0 / 400.0, angles, velocities))
+    np.testing.assert_allclose(position, flight.state(float(boundaries[-1])).position_m, rtol=0.0, atol=1e-3)
+
+
+def test_inertial_navigation_errors_have_the_predicted_size(flight: LanderFlight) -> None:
+    """The horizontal position error of an LN-200 has the standard deviation of the linear theory.
+
+    After T = 51 s with the specific force f: accelerometer bias b T^2 / 2; misalignment m f T^2 / 2; gyro bias
+    f w T^3 / 6; angular random walk f n sqrt(T^5 / 20); velocity random walk n sqrt(T^3 / 3).
+    """
+    units, duration, force = 10, flight.end_s, 4.5
+    p = LN200
+    terms = [
+        0.5 * np.hypot(p.accelerometer_bias_mg, p.accelerometer_wander_mg) * MILLI_G * duration**2,
+        0.5e-3 * p.accelerometer_misalignment_mrad * force * duration**2,
+        np.hypot(p.gyro_bias_deg_h, p.gyro_wander_deg_h) * DEG_H * force * duration**3 / 6.0,
+        p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H * force * np.sqrt(duration**5 / 20.0),
+        1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G * np.sqrt(duration**3 / 3.0),
+    ]
+    expected = float(np.linalg.norm(terms))
+    assert expected == pytest.approx(4.0, abs=0.5)
+    errors = np.empty((units, 2))
+    for unit in range(units):
+        rng = np.random.default_rng(unit)
+        imu = Imu.draw(p, (0.0, duration), rng)
+        increments = imu.increments(flight, 0.0, duration, rng)
+        last = float(imu.boundaries(0.0, duration)[-1])
+        errors[unit] = (_navigate(flight, increments) - flight.state(last).position_m)[:2]
+    # 99.9 % interval of the sum of squares of 20 normal errors, and 10 % for the simplified theory
+    low, high = chi2.ppf([5e-4, 1.0 - 5e-4], errors.size)
+    square_sum = float(np.sum(errors**2)) / expected**2
+    assert 0.8 * low < square_sum < 1.2 * high
+
+
+def test_attitudes_are_rotations_of_small_steps(flight: LanderFlight) -> None:
+    """The heading at the end is the heading at separation: the guidance does not turn the lander."""
+    headings = []
+    for time in (flight.separation_s, flight.end_s):
+        attitude = flight.state(time).attitude
+        up = attitude.apply([0.0, 0.0, 1.0])
+        tilt = Rotation.from_quat(np.append(np.cross([0.0, 0.0, 1.0], up), 1.0 + up[2]))
+        headings.append((tilt.inv() * attitude).as_rotvec()[2])
+    assert headings[1] == pytest.approx(headings[0], abs=np.radians(0.35))

@@ -1,0 +1,207 @@
+"""Tests of the measurement stream: order of events, time tags, read-only data, and the run of an estimator."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from marsyard.algorithms.localisation.interface import (
+    InitialState,
+    MapProduct,
+    PositionEstimate,
+    PositionEstimator,
+    PositionOutcome,
+)
+from marsyard.scenarios.localisation.flight import LanderFlight
+from marsyard.scenarios.localisation.instruments import (
+    IMAGE_CLOCK,
+    LN200,
+    RADAR,
+    CameraParameters,
+    InitialErrors,
+    measure_altitudes,
+    true_camera,
+)
+from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, ImageSchedule, StreamAnswers, feed, merge
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage
+from marsyard.sim.sensor import Clock, Imu, RadarAltimeter
+from marsyard.sim.sensor.imu import ImuIncrements, true_increments
+from marsyard.sim.terrain import Surface
+
+SPAN_S = (0.0, 6.0)
+CAMERA = true_camera(CameraParameters(pixels=64, pixel_mrad=26.0))
+
+
+def _make_image(tag_s: float) -> DetectorImage:
+    calibration = DetectorCalibration(np.ones((64, 64)), 150e-6, 0.0, 0.0, 1, 2.0, 255)
+    return DetectorImage(np.zeros((64, 64), dtype=np.uint16), tag_s, CAMERA, calibration)
+
+
+@pytest.fixture(scope="module")
+def increments(flight: LanderFlight) -> ImuIncrements:
+    """Return the increments of an LN-200 over six seconds of the flight."""
+    rng = np.random.default_rng(4)
+    return Imu.draw(LN200, SPAN_S, rng).increments(flight, *SPAN_S, rng)
+
+
+INITIAL = InitialState(0.0, np.zeros(3), np.zeros(3), Rotation.identity(), np.eye(9), 3.72)
+MAP = MapProduct(
+    np.zeros((2, 2), dtype=np.float32), np.zeros((2, 2), dtype=np.float32), np.zeros(2), 6.0, 1.0, 1.0, 1.0
+)
+
+
+class Recorder(PositionEstimator):
+    """An estimator that records its measurements, and checks that all arrays are read-only."""
+
+    def __init__(self) -> None:
+        self.calls: list[object] = []
+
+    def _record(self, data: object) -> None:
+        self._check(data)
+        self.calls.append(data)
+
+    def _check(self, data: object) -> None:
+        for field in fields(data):  # type: ignore[arg-type]
+            value = getattr(data, field.name)
+            if isinstance(value, np.ndarray):
+                with pytest.raises(ValueError, match="read-only"):
+                    value[...] = 0
+            elif is_dataclass(value):
+                self._check(value)
+
+    def start(self, initial: InitialState, map_product: MapProduct) -> None:
+        """Record both."""
+        self._record(initial)
+        self._record(map_product)
+
+    def imu(self, increments: ImuIncrements) -> None:
+        """Record increments."""
+        self._record(increments)
+
+    def altitude(self, measurement: AltitudeMeasurement) -> None:
+        """Record an altitude."""
+        self._record(measurement)
+
+    def image(self, image: DetectorImage) -> PositionEstimate:
+        """Record an image; answer without a position."""
+        self._record(image)
+        return PositionEstimate(PositionOutcome.NO_COARSE_FIX, image.time_s)
+
+    def finish(self) -> PositionEstimate:
+        """Answer without a position, at the time of the last increment."""
+        last = [call for call in self.calls if isinstance(call, ImuIncrements)][-1]
+        return PositionEstimate(PositionOutcome.NO_COARSE_FIX, float(last.times_s[-1]))
+
+
+@pytest.fixture(scope="module")
+def run(increments: ImuIncrements) -> tuple[Recorder, StreamAnswers]:
+    """Feed a stream with 10 altitudes per second, two of them at one time, and three images."""
+    altitudes = [AltitudeMeasurement(4000.0, 0.1 * number + 0.03) for number in range(59)]
+    altitudes.append(AltitudeMeasurement(4000.0, 1.03))
+    images = [_make_image(tag) for tag in (4.5001, 0.5002, 1.03)]
+    recorder = Recorder()
+    return recorder, feed(recorder, INITIAL, MAP, merge(increments, altitudes, images))
+
+
+def test_increments_until_a_measurement_arrive_before_it(
+    run: tuple[Recorder, StreamAnswers], increments: ImuIncrements
+) -> None:
+    """The last boundary is the first one that is not before the measurement; no increment is lost or repeated."""
+    calls = run[0].calls[2:]
+    parts: list[ImuIncrements] = []
+    latest = -np.inf
+    for call in calls:
+        if isinstance(call, ImuIncrements):
+            assert call.times_s.size == len(call.delta_angles_rad) + 1 == len(call.delta_velocities_m_s) + 1 > 1
+            if parts:
+                assert call.times_s[0] == parts[-1].times_s[-1]
+            parts.append(call)
+        else:
+            assert isinstance(call, AltitudeMeasurement | DetectorImage)
+            assert call.time_s >= latest
+            latest = call.time_s
+            assert parts[-1].times_s[-2] < call.time_s <= parts[-1].times_s[-1]
+    np.testing.assert_array_equal(
+        np.concatenate([part.delta_angles_rad for part in parts]), increments.delta_angles_rad
+    )
+    np.testing.assert_array_equal(
+        np.concatenate([part.delta_velocities_m_s for part in parts]), increments.delta_velocities_m_s
+    )
+    assert parts[-1].times_s[-1] == increments.times_s[-1]
+
+
+def test_each_image_has_an_answer(run: tuple[Recorder, StreamAnswers], increments: ImuIncrements) -> None:
+    """One estimate per image in the order of time, and the final one; each call's processor time is measured."""
+    recorder, answers = run
+    expected = [0.5002, 1.03, 4.5001, float(increments.times_s[-1])]
+    assert [estimate.time_s for estimate in answers.estimates] == expected
+    times = answers.processor_times
+    assert (len(times.image_s), len(times.altitude_s)) == (3, 60)
+    assert len(times.imu_s) == sum(isinstance(call, ImuIncrements) for call in recorder.calls)
+    assert min(*times.imu_s, *times.altitude_s, *times.image_s) >= 0.0
+    assert times.total_s > 0.0
+
+
+def test_arrays_of_the_caller_stay_writable(run: tuple[Recorder, StreamAnswers], increments: ImuIncrements) -> None:
+    """The estimator receives read-only views."""
+    assert run
+    assert increments.delta_angles_rad.flags.writeable
+    assert INITIAL.covariance.flags.writeable
+
+
+def test_measurement_outside_of_the_increments_is_refused(increments: ImuIncrements) -> None:
+    """A time tag after the last increment is an error of the caller."""
+    with pytest.raises(ValueError, match="outside of the increments; allowed"):
+        merge(increments, [], [_make_image(6.5)])
+
+
+def test_images_follow_the_schedule(flight: LanderFlight) -> None:
+    """Three images at 0.3 Hz, then images at equal intervals: 20 to 27 until the end, none after it."""
+    schedule = ImageSchedule()
+    times = schedule.times(0.0, flight.end_s)
+    assert 20 <= times.size <= 27
+    np.testing.assert_allclose(np.diff(times[:4]), schedule.coarse_interval_s)
+    np.testing.assert_allclose(np.diff(times[3:]), schedule.interval_s)
+    assert times[-1] <= flight.end_s < times[-1] + schedule.interval_s
+    np.testing.assert_array_equal(ImageSchedule(first_s=1.0).times(2.0, 8.0), [3.0, 6.3])
+    assert ImageSchedule().times(0.0, 0.1).size == 0
+
+
+def test_measurements_contain_no_truth(flight: LanderFlight, increments: ImuIncrements) -> None:
+    """Time tags of increments and images have the errors of their clocks; no increment equals its true value."""
+    rng = np.random.default_rng(8)
+    true_times = ImageSchedule().times(0.0, flight.end_s)
+    assert np.all(Clock.draw(IMAGE_CLOCK, rng).tags(true_times, rng) != true_times)
+    # the constant offset of this unit's clock, from its drawn errors
+    unit = Imu.draw(LN200, SPAN_S, np.random.default_rng(4))
+    boundaries = unit.boundaries(*SPAN_S)
+    errors = increments.times_s - boundaries
+    assert unit.clock.offset_s != 0.0
+    assert errors.mean() == pytest.approx(unit.clock.offset_s, abs=4.0 * LN200.clock.jitter_sd_s / np.sqrt(errors.size))
+    assert errors.std() == pytest.approx(LN200.clock.jitter_sd_s, rel=0.1)
+    angles, velocities = true_increments(flight, boundaries)
+    assert np.all(increments.delta_angles_rad != angles)
+    assert np.all(increments.delta_velocities_m_s != velocities)
+
+
+def test_complete_descent_reaches_the_estimator(flight: LanderFlight) -> None:
+    """All images of a descent with drawn instruments are answered; the last estimate is at the end of the flight."""
+    rng = np.random.default_rng(12)
+    span = (0.0, flight.end_s + INERTIAL_MARGIN_S)
+    imu, clock = Imu.draw(LN200, span, rng), Clock.draw(IMAGE_CLOCK, rng)
+    samples = np.zeros((16, 16, 2), dtype=np.float32)
+    surface = Surface.from_samples(samples - np.float32(100.0), 2000.0)
+    radar = RadarAltimeter.draw(RADAR.model_copy(update={"rate_hz": 0.5}), surface, rng)
+    measured = imu.increments(flight, *span, rng)
+    altitudes = measure_altitudes(radar, flight, (INERTIAL_MARGIN_S, flight.end_s), rng)
+    times = ImageSchedule().times(0.0, flight.end_s)
+    images = [_make_image(float(tag)) for tag in clock.tags(times, rng)]
+    initial = InitialErrors().draw(flight.state(0.0), float(measured.times_s[0]), 3.72, rng)
+    recorder = Recorder()
+    answers = feed(recorder, initial, MAP, merge(measured, altitudes, images))
+    assert len(answers.estimates) == times.size + 1
+    np.testing.assert_allclose([estimate.time_s for estimate in answers.estimates[:-1]], times, rtol=0.0, atol=0.01)
+    assert answers.estimates[-1].time_s == pytest.approx(span[1], abs=0.005)
