@@ -1,0 +1,293 @@
+"""Navigation filter for localisation on a map: an error-state extended Kalman filter with delayed measurements.
+
+Inertial increments propagate the state (`inertial_state`); positions, altitudes above ground and landmarks in images
+update it (`state_updates`). Positions are relative to the map: the error of the map's registration is not contained in
+the covariance.
+
+The result of an image is available up to a second after its exposure. An update refers to the time tag of its
+measurement: the filter goes back to the stored state before that time, and repeats all later increments and updates.
+Hence the order in which measurements arrive has no effect on the result. Covariances are propagated between the lines
+of a fixed grid of times and the times of updates, therefore the division of increments into calls has no effect either.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from marsyard.algorithms.localisation import state_updates as updates
+from marsyard.algorithms.localisation.inertial_state import (
+    ERRORS,
+    GYRO_BIAS,
+    ImuErrorModel,
+    IncrementHistory,
+    NavigationState,
+    propagate_states,
+)
+from marsyard.algorithms.localisation.interface import InitialState
+from marsyard.algorithms.localisation.state_updates import (
+    GateOptions,
+    GroundModel,
+    LandmarkMeasurement,
+    LandmarkResult,
+    UpdateOutcome,
+    UpdateResult,
+)
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.sensor.imu import ImuIncrements
+
+Result = TypeVar("Result", UpdateResult, LandmarkResult)
+#: Minimum time between two tags: equal tags are separated by it, far below the tags' jitter.
+_MIN_INTERVAL_S = 1e-9
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """Options of the navigation filter; the values are assumed except for those of the inertial unit.
+
+    - imu: errors of the inertial unit
+    - gates: limits of the updates
+    - altitude_sd_m: standard deviation of an altitude including the map's elevation, if the call gives none
+    - pixel_sd: standard deviation of a landmark's pixel per axis, if the call gives none
+    - step_s: time between the lines of the grid on which the covariance is propagated. At 0.5 rad/s a step of 0.1 s
+      neglects rotations of 0.05 rad in the small terms that `compute_transition` names.
+    - memory_s: time for which states and increments are stored for delayed updates
+    - max_extrapolation_s: maximum time of a measurement after the last increment, or of an increment's tag from the end
+      of the previous ones; a few sample intervals
+    """
+
+    imu: ImuErrorModel = field(default_factory=ImuErrorModel)
+    gates: GateOptions = field(default_factory=GateOptions)
+    altitude_sd_m: float = 10.0
+    pixel_sd: float = 0.5
+    step_s: float = 0.1
+    memory_s: float = 5.0
+    max_extrapolation_s: float = 0.02
+
+
+@dataclass(frozen=True)
+class _Checkpoint:
+    """A stored state and the number of updates that it contains."""
+
+    state: NavigationState
+    updates: int
+
+
+class NavigationFilter:
+    """Error-state extended Kalman filter of 15 errors for map-relative localisation.
+
+    Updates return a result with an outcome; a measurement that is rejected, not finite or outside the stored history
+    does not change the state. A rejected update is stored: if an earlier measurement arrives later, it is tested again.
+    """
+
+    def __init__(self, state: NavigationState, gravity_m_s2: float, options: FilterOptions) -> None:
+        self._gravity_m_s2, self._options = gravity_m_s2, options
+        self._start_s = state.time_s
+        self._checkpoints = [_Checkpoint(state, 0)]
+        self._history: IncrementHistory | None = None
+        self._update_times_s: list[float] = []
+        self._updates: list[Callable[[NavigationState], NavigationState]] = []
+
+    @classmethod
+    def from_initial(cls, initial: InitialState, options: FilterOptions | None = None) -> NavigationFilter:
+        """Create the filter from a state of inertial navigation, with biases of zero."""
+        options = FilterOptions() if options is None else options
+        covariance = np.zeros((ERRORS, ERRORS))
+        covariance[: GYRO_BIAS.start, : GYRO_BIAS.start] = initial.covariance
+        covariance[GYRO_BIAS.start :, GYRO_BIAS.start :] = np.diag(options.imu.initial_bias_variances)
+        position, velocity = initial.position_m, initial.velocity_m_s
+        zero, attitude = np.zeros(3), initial.world_from_body
+        state = NavigationState(initial.time_s, position, velocity, attitude, zero, zero, covariance)
+        return cls(state, initial.gravity_m_s2, options)
+
+    @property
+    def time_s(self) -> float:
+        """Time tag of the last increment; the initial time before the first."""
+        return self._start_s if self._history is None else float(self._history.times_s[-1])
+
+    @property
+    def memory_start_s(self) -> float:
+        """Time of the first stored state: measurements before it cannot be processed."""
+        return self._checkpoints[0].state.time_s
+
+    def propagate(self, increments: ImuIncrements) -> None:
+        """Propagate by increments; their first boundary is the last one of the previous call.
+
+        Raises ValueError if it is not, apart from jitter of the tags up to `max_extrapolation_s`.
+        """
+        if len(increments.delta_angles_rad) == 0:
+            return
+        gap = float(increments.times_s[0]) - self.time_s
+        if abs(gap) > self._options.max_extrapolation_s:
+            raise ValueError(f"increments begin {gap:+.6f} s from the end of the previous ones; allowed: consecutive")
+        previous = self._history
+        if previous is None:
+            tags, angles = increments.times_s, increments.delta_angles_rad
+            velocities = increments.delta_velocities_m_s
+        else:
+            tags = np.concatenate([previous.times_s, increments.times_s[1:]])
+            angles = np.concatenate([previous.delta_angles_rad, increments.delta_angles_rad])
+            velocities = np.concatenate([previous.delta_velocities_m_s, increments.delta_velocities_m_s])
+        if np.diff(tags).min() < _MIN_INTERVAL_S:
+            ramp = _MIN_INTERVAL_S * np.arange(len(tags))
+            tags = np.maximum.accumulate(tags - ramp) + ramp
+        self._history = IncrementHistory(tags, increments.period_s, angles, velocities)
+        self._advance()
+        self._forget()
+
+    def state_at(self, time_s: float) -> NavigationState:
+        """Compute the state at a time in the stored history, including all updates up to that time.
+
+        Raises ValueError for a time outside the history.
+        """
+        if not self._is_stored(time_s):
+            allowed = f"{self.memory_start_s:.4f} s to {self.time_s:.4f} s"
+            raise ValueError(f"time {time_s:.4f} s is outside of the stored history; allowed: {allowed}")
+        return self._run(self._checkpoints[self._last_before(time_s)], time_s)[-1].state
+
+    def estimate(
+        self, time_s: float
+    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Rotation, Float[np.ndarray, "9 9"]]:
+        """Compute position, velocity, attitude, and the covariance of their errors; ValueError as `state_at`."""
+        state = self.state_at(time_s)
+        covariance = state.covariance[: GYRO_BIAS.start, : GYRO_BIAS.start]
+        return state.position_m, state.velocity_m_s, state.world_from_body, covariance
+
+    def update_position(
+        self, time_s: float, horizontal_position_m: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"]
+    ) -> UpdateResult:
+        """Update by a horizontal position on the map (east, north), for example a coarse fix."""
+        update = partial(
+            updates.update_position,
+            horizontal_position_m=horizontal_position_m,
+            covariance=covariance,
+            options=self._options.gates,
+        )
+        return self._update(time_s, update, UpdateResult(UpdateOutcome.OUTSIDE_HISTORY))
+
+    def update_altitude(
+        self, time_s: float, altitude_m: float, ground_height: GroundModel, sd_m: float | None = None
+    ) -> UpdateResult:
+        """Update by an altitude above the ground below the body frame's origin.
+
+        `ground_height` is the map's height at the estimated position with its slope (east, north), or a function that
+        returns both for a position (x, y), NaN outside the map. `sd_m` contains the map's error of elevation.
+        """
+        update = partial(
+            updates.update_altitude,
+            altitude_m=altitude_m,
+            ground=ground_height,
+            sd_m=self._options.altitude_sd_m if sd_m is None else sd_m,
+            options=self._options.gates,
+        )
+        return self._update(time_s, update, UpdateResult(UpdateOutcome.OUTSIDE_HISTORY))
+
+    def update_landmarks(
+        self,
+        time_s: float,
+        camera: CameraModel,
+        points_world: Float[np.ndarray, "n 3"],
+        pixels: Float[np.ndarray, "n 2"],
+        pixel_sd: float | Float[np.ndarray, "n"] | None = None,
+        point_sd_m: float | Float[np.ndarray, "3"] = 0.0,
+        common_sd_m: float | Float[np.ndarray, "3"] = 0.0,
+    ) -> LandmarkResult:
+        """Update by landmarks in an image, with rejection of outliers (`state_updates.update_landmarks`).
+
+        - camera: camera model in the body frame
+        - points_world, pixels: positions from the map, metres, and measured pixels
+        - pixel_sd: of the measured pixels per axis; one value or one per landmark
+        - point_sd_m: of the points' independent errors; one value or (east, north, up)
+        - common_sd_m: of the error that all points of the image have in common; one value or (east, north, up). It is
+          considered as independent between images.
+        """
+        count = len(pixels)
+        measurement = LandmarkMeasurement(
+            camera=camera,
+            points_world=points_world,
+            pixels=pixels,
+            pixel_sd=np.full(count, self._options.pixel_sd if pixel_sd is None else pixel_sd, dtype=np.float64),
+            point_sd_m=np.full(3, point_sd_m, dtype=np.float64),
+            common_sd_m=np.full(3, common_sd_m, dtype=np.float64),
+        )
+        update = partial(updates.update_landmarks, measurement=measurement, options=self._options.gates)
+        outside = LandmarkResult(UpdateOutcome.OUTSIDE_HISTORY, np.zeros(count, bool), np.full((count, 2), np.nan))
+        return self._update(time_s, update, outside)
+
+    def _update(
+        self, time_s: float, update: Callable[[NavigationState], tuple[NavigationState, Result]], outside: Result
+    ) -> Result:
+        """Apply an update at its time, then repeat all later increments and updates."""
+        if not self._is_stored(time_s):
+            return outside
+        state, result = update(self.state_at(time_s))
+        if result.outcome is UpdateOutcome.INVALID:
+            return result
+        index = bisect_right(self._update_times_s, time_s)
+        self._update_times_s.insert(index, time_s)
+        self._updates.insert(index, lambda prior: update(prior)[0])
+        self._checkpoints = [checkpoint for checkpoint in self._checkpoints if checkpoint.state.time_s <= time_s]
+        if time_s <= self.time_s:
+            self._checkpoints.append(_Checkpoint(state, index + 1))
+            self._advance()
+        return result
+
+    def _is_stored(self, time_s: float) -> bool:
+        extrapolation = 0.0 if self._history is None else self._options.max_extrapolation_s
+        return self.memory_start_s <= time_s <= self.time_s + extrapolation
+
+    def _last_before(self, time_s: float) -> int:
+        """Return the index of the last checkpoint at or before a time."""
+        return bisect_right([checkpoint.state.time_s for checkpoint in self._checkpoints], time_s) - 1
+
+    def _advance(self) -> None:
+        """Store checkpoints up to the last line of the grid and the last update within the increments."""
+        options, last = self._options, self._checkpoints[-1]
+        pending = self._update_times_s[last.updates : bisect_right(self._update_times_s, self.time_s)]
+        line_s = self._start_s + options.step_s * np.floor((self.time_s - self._start_s) / options.step_s)
+        end_s = max([float(line_s), *pending])
+        if end_s > last.state.time_s:
+            self._checkpoints += self._run(last, end_s)
+
+    def _run(self, checkpoint: _Checkpoint, end_s: float) -> list[_Checkpoint]:
+        """Propagate from a checkpoint to a time and apply the updates up to it; return the checkpoints on the way.
+
+        The last one is at the end time. If nothing is to be done, it is the given checkpoint.
+        """
+        state, count = checkpoint.state, checkpoint.updates
+        results = [checkpoint]
+        for index in range(count, bisect_right(self._update_times_s, end_s)):
+            for propagated in self._propagate(state, self._update_times_s[index]):
+                results.append(_Checkpoint(propagated, index))
+                state = propagated
+            state = self._updates[index](state)
+            results.append(_Checkpoint(state, index + 1))
+        results += [_Checkpoint(propagated, results[-1].updates) for propagated in self._propagate(state, end_s)]
+        return results[1:] if len(results) > 1 else results
+
+    def _propagate(self, state: NavigationState, end_s: float) -> list[NavigationState]:
+        """Propagate a state to the lines of the grid before a time, and to that time."""
+        if self._history is None or end_s <= state.time_s:
+            return []
+        first, last = ((time_s - self._start_s) / self._options.step_s for time_s in (state.time_s, end_s))
+        lines = self._start_s + self._options.step_s * np.arange(np.floor(first), np.ceil(last) + 1.0)
+        times = np.append(lines[(lines > state.time_s) & (lines < end_s)], end_s)
+        return propagate_states(state, self._history, times, self._gravity_m_s2, self._options.imu)
+
+    def _forget(self) -> None:
+        """Remove states and increments that are older than the memory."""
+        history = self._history
+        first_s = max(self.time_s - self._options.memory_s, self.memory_start_s)
+        self._checkpoints = self._checkpoints[self._last_before(first_s) :]
+        if history is not None:
+            interval = int(np.searchsorted(history.times_s, self.memory_start_s, side="right")) - 1
+            start = min(max(interval, 0), len(history.delta_angles_rad) - 1)
+            angles, velocities = history.delta_angles_rad[start:], history.delta_velocities_m_s[start:]
+            self._history = IncrementHistory(history.times_s[start:], history.period_s, angles, velocities)
