@@ -41,7 +41,7 @@ from marsyard.algorithms.localisation.state_updates import (
     UpdateResult,
 )
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.sensor.imu import ImuIncrements
+from marsyard.sim.measurements import ImuIncrements
 
 Result = TypeVar("Result", UpdateResult, LandmarkResult)
 #: Minimum time between two tags: equal tags are separated by it, far below the tags' jitter.

@@ -11,7 +11,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-from scipy import fft, ndimage
+from scipy import fft
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import MapProduct
