@@ -58,7 +58,7 @@ def budget_sentences(study: Mapping[str, Any]) -> list[str]:
         )
         sentences += [
             f"{study['requirement']}: {_statistic(result)} of {label(result['quantity'])}: {number(math.sqrt(total))} "
-            f"with all sources of error, {_signed_root(budget['remaining'])} without any, from the {budget['common']} "
+            f"with all sources of error, {_format_root(budget['remaining'])} without any, from the {budget['common']} "
             f"of {count(int(result['cases']), 'base case')} that were answered in every configuration.",
             f"Largest contributions to the mean square: {largest}; "
             f"{REMAINING} {signed_percent(budget['remaining'] / total)}.",
@@ -123,14 +123,14 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
             signed_percent(item["mean"] / total),
             f"{signed_percent(item['lower'] / total)} to {signed_percent(item['upper'] / total)}",
             signed_percent(0.5 * (item["removed"] - item["alone"]) / total),
-            _signed_root(item["alone"] + budget["remaining"]),
-            _signed_root(total - item["removed"]),
+            _format_root(item["alone"] + budget["remaining"]),
+            _format_root(total - item["removed"]),
             f"{item['answered'][1]}, {item['answered'][0]}",
         ]
         for item in budget["contributions"]
     ]
     rows.append(
-        [REMAINING, signed_percent(budget["remaining"] / total), "", "", _signed_root(budget["remaining"]), "", "", ""]
+        [REMAINING, signed_percent(budget["remaining"] / total), "", "", _format_root(budget["remaining"]), "", "", ""]
     )
     statistic, name = _statistic(result), label(result["quantity"]).split(" (")[0]
     figure = svg_figure(
@@ -155,8 +155,8 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
     return Block("Sources of error", figures=[figure], grid=Grid(head, rows), note=note)
 
 
-def _signed_root(square: float) -> str:
-    """Format the root of a mean square; rounding may make it slightly negative."""
+def _format_root(square: float) -> str:
+    """Format the root of a mean square; 0 for a difference of mean squares that is negative by rounding."""
     return number(math.sqrt(max(square, 0.0)))
 
 

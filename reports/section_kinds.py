@@ -234,16 +234,16 @@ def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _MAX_BINS)
 
 @dataclass(frozen=True)
 class OutcomesBySize:
-    """Outcomes of cases by type and severity of their fault: a table and stacked bars.
+    """Outcomes of cases by type and size (severity) of their fault: a table and stacked bars.
 
     - outcomes: function that returns a mask of the rows for each outcome, by its key in `report.json`; the table shows
       a confidence interval for the last outcome
     - styles: for each outcome, its label and the style of its bars (`marsyard.reports.section.BARS`), in order
     - cases: heading of the number of rows
-    - wording: function that returns fault type and severity in words; an unknown severity is empty
+    - wording: function that returns fault type and size in words; an unknown size is empty
     - extra_columns: further columns of the table, each with its heading, its key in `report.json`, a function that
       computes its value from the rows, and a function that formats the value
-    - kind, size: columns of the rows with fault type and severity; none: fault type of cases without a fault
+    - kind, size: columns of the rows with fault type and size; none: fault type of cases without a fault
     """
 
     outcomes: Callable[[Rows, Subject], Mapping[str, Bool[np.ndarray, " n"]]]
@@ -258,7 +258,7 @@ class OutcomesBySize:
     caption: str = ""
 
     def records(self, frame: Rows, subject: Subject) -> list[dict[str, Any]]:
-        """Count the outcomes for each fault type and severity; cases without a fault come first."""
+        """Count the outcomes for each fault type and size; cases without a fault come first."""
         records = []
         for kind, size, rows in rates.group_by_size(frame, self.kind, self.size, self.none):
             masks = self.outcomes(rows, subject)

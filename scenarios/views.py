@@ -28,6 +28,7 @@ from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS
 from marsyard.sim.terrain.rocks.shapes import FINEST, max_pixels, rock_shapes
 from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE
 
+#: Scales of a site's terrains: kilometres for descents, or tens of metres for rovers and helicopters.
 Scale = Literal["descent", "ground"]
 
 #: Smallest rendered rocks, pixels.
@@ -45,7 +46,7 @@ _NEAR_HEIGHTS, _NEAR_M = 3.0, 5.0
 #: Margin of a viewpoint's sector on each side, and depression of the image's upper edge above which the horizon is
 #: assumed visible, radians.
 _SECTOR_MARGIN_RAD, _MIN_DEPRESSION_RAD = np.radians(3.0), np.radians(5.0)
-#: Ratio of the diameters of neighbouring size classes.
+#: Ratio of the diameters of neighbouring size classes of rocks; rocks of one class are selected up to one distance.
 _CLASS_RATIO = float(np.sqrt(2.0))
 #: Ground mesh: spacing / height of the viewpoint, relative growth per line, minimum half width / height of the
 #: viewpoint, and in m.
@@ -256,7 +257,7 @@ def _detail_pixel_rad(field: RockField, viewpoint: Viewpoint) -> float:
 
 
 @dataclass(frozen=True)
-class Stance:
+class CameraMounting:
     """Typical mounting of a camera: terrain scale, height above the ground, and elevation of the optical axis.
 
     `on_rover_m` is the position x, y, z of a camera that is fixed to a rover's body, in the rover's frame; None for
@@ -271,14 +272,14 @@ class Stance:
 
 #: Typical mountings of the cameras of `marsyard.sim.sensor.PRESETS`: first image of a descent, masts of 1.5 m, MER's
 #: hazcams 0.53 m above the ground (Maki et al. 2003) at the front of the body, a helicopter at 10 m.
-STANCES: Mapping[str, Stance] = {
-    "mer-descent-flown": Stance("descent", 2000.0, -90.0),
-    "mer-descent-field": Stance("descent", 2000.0, -90.0),
-    "mer-navcam": Stance("ground", 1.5, -18.0),
-    "mer-hazcam": Stance("ground", 0.53, -40.0, (0.55, 0.0, 0.53)),
-    "research-navcam": Stance("ground", 1.5, -13.0),
-    "research-pancam": Stance("ground", 1.5, -5.0),
-    "xc-55": Stance("ground", 10.0, -90.0),
+CAMERA_MOUNTINGS: Mapping[str, CameraMounting] = {
+    "mer-descent-flown": CameraMounting("descent", 2000.0, -90.0),
+    "mer-descent-field": CameraMounting("descent", 2000.0, -90.0),
+    "mer-navcam": CameraMounting("ground", 1.5, -18.0),
+    "mer-hazcam": CameraMounting("ground", 0.53, -40.0, (0.55, 0.0, 0.53)),
+    "research-navcam": CameraMounting("ground", 1.5, -13.0),
+    "research-pancam": CameraMounting("ground", 1.5, -5.0),
+    "xc-55": CameraMounting("ground", 10.0, -90.0),
 }
 
 

@@ -105,7 +105,6 @@ def propagate_velocity(
     """Propagate a horizontal velocity by the IMU, for example to thruster firing near 100 m (section I), m/s.
 
     `inertial_at_estimate_m_s` is the mean inertial velocity over the interval of the estimate (second pair),
-    `inertial_at_end_m_s` the inertial velocity at the end of the propagation. An error
-    common to both has no effect on their difference.
+    `inertial_at_end_m_s` the inertial velocity at the end of the propagation. An error common to both has no effect.
     """
     return np.asarray(velocity_m_s + (inertial_at_end_m_s - inertial_at_estimate_m_s))

@@ -149,14 +149,14 @@ def refine_match(
     start = np.maximum(corner.astype(int) - MARGIN_PX - 2, 0)
     end = corner.astype(int) + len(template) + MARGIN_PX + 2
     region = image.counts[start[0] : end[0], start[1] : end[1]].astype(np.float64)
-    part = build_spline(region, corner + offset - start, len(template))
-    shift_match = register_template(template, part, corner + offset - start, "shift")
+    spline = build_spline(region, corner + offset - start, len(template))
+    shift_match = register_template(template, spline, corner + offset - start, "shift")
     if shift_match is None:
         return peak_fit
     best = shift_match
     for warp in _WARPS_BY_OPTION[options.warp]:
-        part = build_spline(region, best.corner, len(template), previous=part)
-        warp_match = register_template(template, part, best.corner, warp)
+        spline = build_spline(region, best.corner, len(template), previous=spline)
+        warp_match = register_template(template, spline, best.corner, warp)
         if warp_match is None:
             break
         best = warp_match

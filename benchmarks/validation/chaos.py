@@ -14,6 +14,8 @@ from marsyard.sim.streams import Streams
 
 
 class ChaosParameters(BaseModel):
+    """Parameters of the fault injection."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     work_s: float = Field(default=0.05, ge=0.0, description="processor time of a case")

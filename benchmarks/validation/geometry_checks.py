@@ -32,8 +32,9 @@ from marsyard.sim.render import Scene
 from marsyard.sim.terrain import Surface
 
 LIBRARIES = {"osmesa": "libOSMesa.so.8", "egl": "libEGL.so.1"}
-#: Maximum relative difference of a pixel's range from the mean of its neighbours; larger values mark silhouettes.
-#: Smooth ground seen from a mast at 3 deg differs by less.
+#: Maximum second difference of the ranges of a pixel and two opposite neighbours, divided by the range; larger values
+#: mark silhouettes.
+#: For smooth ground seen from a mast at 3 deg it is smaller.
 MAX_RANGE_CURVATURE = 0.003
 #: Maximum number of terrain samples per pixel along the line of sight; above it the renderer smooths the ground.
 MAX_SAMPLES_PER_PIXEL = 8.0

@@ -15,7 +15,8 @@ from benchmarks.validation.scenes import descent_view, renderer, rock_view, tile
 from marsyard.sim.render.renderer import edge_pixels
 from marsyard.sim.terrain.sites import sites
 
-#: Limit of the quick control, whose images have 16 samples per pixel and are less accurate than with 256.
+#: Limit of the control (bias of the estimator itself, `run_control`) with the option --quick: images of 16 samples per
+#: pixel are less accurate than images of 256.
 QUICK_CONTROL_LIMIT_PX = 0.005
 DESCENT_HEIGHT_M = 2000.0
 #: Height at which a pixel of the descent camera is 0.25 m; the orthoimage has 0.5 m.
@@ -46,11 +47,11 @@ def max_standard_error(errors: Sequence[np.ndarray]) -> float:
 
 def _measure_bias(claim: str, errors: Sequence[np.ndarray], steps: np.ndarray, limit: float | None = None) -> Measure:
     """Measure a bias; the default limit is that of `limits`."""
-    scatter = max(error.std(axis=0, ddof=1).max() for error in errors)
+    deviation = max(error.std(axis=0, ddof=1).max() for error in errors)
     patches = min(len(error) for error in errors)
     how = (
         f"{patches} patches, {len(steps)} steps from {steps[0]:.2g} to {steps[-1]:.2g} px; "
-        f"standard deviation of one patch {scatter:.2g} px, of the mean {max_standard_error(errors):.1g} px"
+        f"standard deviation of one patch {deviation:.2g} px, of the mean {max_standard_error(errors):.1g} px"
     )
     return Measure(claim, max_bias(errors), "px", find_limit(claim) if limit is None else limit, how)
 

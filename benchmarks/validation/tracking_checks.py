@@ -21,7 +21,7 @@ from marsyard.sim.streams import Streams
 
 SEED = 20061108
 #: Limits of the drift (rms, maximum), and of the relative deviation of the range error from Eq. 1.
-DRIFT_RMS_LIMIT_PX, DRIFT_WORST_LIMIT_PX, RANGE_LIMIT = 1.0, 2.5, 0.15
+DRIFT_RMS_LIMIT_PX, DRIFT_MAX_LIMIT_PX, RANGE_LIMIT = 1.0, 2.5, 0.15
 #: Maximum fraction of lost targets: 2 of 100 were lost; three standard deviations of this number are 4.
 LOST_LIMIT = 0.06
 CAMERAS = ("research-navcam", "research-pancam")
@@ -86,7 +86,7 @@ def _measure_drifts(rows: list[dict[str, Scalar]], name: str, *, has_limit: bool
     rms, maximum = float(np.sqrt(np.mean(tracked_px**2))), float(tracked_px.max())
     yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_LIMIT_PX if has_limit else None, how)
     yield Measure(
-        f"drift of the tracked point, maximum: {name}", maximum, "px", DRIFT_WORST_LIMIT_PX if has_limit else None, how
+        f"drift of the tracked point, maximum: {name}", maximum, "px", DRIFT_MAX_LIMIT_PX if has_limit else None, how
     )
 
 

@@ -109,7 +109,7 @@ def _set_opencv(saved: tuple[bool, int]) -> None:
 def _read_arithmetic() -> tuple[bool, ...]:
     """Determine the rounding mode of floating-point numbers, and whether subnormal numbers are flushed to zero."""
     # the rounding mode determines whether adding less than half the distance to the next float changes the number 1;
-    # `float("1")` is no constant, so that the compiler cannot compute the sums
+    # `float("1")` prevents the compiler from computing the sums
     unit, increment, min_normal = float("1"), 2.0**-60, sys.float_info.min
     return unit + increment == unit, -unit - increment == -unit, unit - increment == unit, min_normal * 0.5 > 0.0
 
@@ -245,19 +245,19 @@ def _list_child_processes() -> list[str]:
     return names
 
 
-def seed_generators(item: int) -> None:
-    """Seed the global random generators, so that a case does not depend on the cases before it."""
-    random.seed(item)
-    np.random.seed(item % 2**32)  # noqa: NPY002 (for cases, not for the engine)
+def seed_generators(seed: int) -> None:
+    """Seed the global random generators with a case number, so that a case does not depend on earlier cases."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002 (for cases, not for the engine)
     if "cv2" in sys.modules:
         # OpenCV's initial state
         sys.modules["cv2"].setRNGSeed(0)
 
 
-def generators_were_used(item: int) -> bool:
-    """Whether Python's or NumPy's generator was used after seeding; the generators are seeded again."""
+def generators_were_used(seed: int) -> bool:
+    """Whether Python's or NumPy's generator was used after seeding with `seed`; the generators are seeded again."""
     numbers = random.random(), np.random.random_sample()  # noqa: NPY002, S311
-    seed_generators(item)
+    seed_generators(seed)
     return numbers != (random.random(), np.random.random_sample())  # noqa: NPY002, S311
 
 

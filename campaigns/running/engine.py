@@ -66,6 +66,7 @@ def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, 
     """
     record.claim_folder(directory)
     with folder_lock(directory):
+        # again, because another process may have started a campaign in the folder before the lock
         record.claim_folder(directory)
         identity = create_identity(campaign.configuration)
         algorithms = describe_algorithms(campaign)

@@ -48,7 +48,7 @@ STREAMS = "random streams"
 _RESAMPLES = 2000
 #: Number of base cases that are evaluated together.
 _BATCH = 8
-#: Minimum number of base cases with an error in all configurations.
+#: Minimum number of base cases whose error has a value in all configurations.
 MIN_COMMON = 10
 
 
@@ -81,9 +81,9 @@ class BudgetSettings:
 
 @dataclass(frozen=True)
 class Configuration:
-    """A set of sources that the cases have.
+    """A configuration of the base cases: the sources of error that act in them.
 
-    - name: `all`, `none`, `without SOURCE`, or `only SOURCE`; removed: names of the sources that the cases do not have
+    - name: `all`, `none`, `without SOURCE`, or `only SOURCE`; removed: names of the sources that do not act
     """
 
     name: str
@@ -99,7 +99,7 @@ class Contribution:
     - removed: mean square with all sources, minus that without this one
     - mean, lower, upper: mean of `alone` and `removed`, and bounds of its interval; without interactions of more than
       two sources, these means and the mean square without any source add up to the mean square with all sources
-    - answered: numbers of base cases with an error, without the source and with the source alone
+    - answered: numbers of base cases whose error has a value, without the source and with the source alone
     """
 
     source: str
@@ -125,13 +125,13 @@ class SobolIndex:
 
 @dataclass(frozen=True)
 class Budget:
-    """An error budget: mean squares of the error over the base cases that have an error in all configurations.
+    """An error budget: mean squares of the error over the base cases whose error has a value in all configurations.
 
     - contributions: one per source, the largest first
     - total, total_lower, total_upper: mean square with all sources, and bounds of its interval
     - remaining: mean square without any source, for example caused by images, matching and scene
     - closure, closure_lower, closure_upper: (remaining + sum of the means of the contributions) / total
-    - common: number of base cases with an error in all configurations
+    - common: number of these base cases
     """
 
     contributions: tuple[Contribution, ...]
@@ -150,7 +150,7 @@ class BudgetResult:
     """Result of the study.
 
     - quantity: metric or margin that is the error; centred: whether its mean square is taken about the mean
-    - inactive: titles of the sources that the campaign does not have
+    - inactive: titles of the sources that act in no case of the campaign
     - budget: error budget; None for a campaign without sources, or with too few common cases
     - cases, violations: number of base cases, and of violations of the requirement among them with all sources
     - indices: Sobol indices, the largest total index first; index_samples: complete base samples
@@ -212,17 +212,17 @@ def continue_budget(directory: Path, executor: ExecutorConfig, observer: Progres
 
 
 def active_sources(campaign: Campaign) -> tuple[tuple[ErrorSource, ...], tuple[str, ...]]:
-    """Return the sources of error that the campaign has, and the titles of those that it does not have.
+    """Return the sources of error that act in the campaign, and the titles of the other sources.
 
-    A campaign has a source if a parameter of the source is dispersed, or differs from its value without the error.
+    A source acts if one of its parameters is dispersed, or differs from its value without the error.
     """
     parameters, dispersed = campaign.configuration.parameters, campaign.configuration.dispersions
     active: list[ErrorSource] = []
     inactive: list[str] = []
     for source in error_sources(campaign.configuration.scenario):
         exact = source.exact_values(parameters)
-        has_source = any(path in dispersed or value_at(parameters, path) != value for path, value in exact.items())
-        if has_source:
+        is_active = any(path in dispersed or value_at(parameters, path) != value for path, value in exact.items())
+        if is_active:
             active.append(source)
         else:
             inactive.append(source.title)
@@ -270,8 +270,7 @@ class _Study:
         if budget is None and n and not reason:
             reason = (
                 f"No budget: fewer than {MIN_COMMON} base cases were answered in every configuration, or all errors "
-                "are "
-                "equal."
+                "are equal."
             )
         return BudgetResult(
             self._quantity,
@@ -357,13 +356,12 @@ def compute_budget(
     is_centred: bool,
     confidence: float,
 ) -> Budget | None:
-    """Compute the contributions from the base cases with an error in all configurations.
+    """Compute the contributions from the base cases whose error has a value in all configurations.
 
-    None for too few of these cases, or for equal errors.
+    None for too few of these cases, or if all errors are equal. The intervals are percentiles of a bootstrap over
+    groups of cases (terrains).
 
-    The intervals are percentiles of a bootstrap over groups of cases (terrains).
-
-    - errors: errors of each configuration of `list_configurations`, NaN if missing
+    - errors: error of each case in each configuration of `list_configurations`; NaN without a value
     - groups: number of the group of each case
     """
     has_error = np.isfinite(errors)
@@ -372,24 +370,24 @@ def compute_budget(
     if not n_sources or is_common.sum() < MIN_COMMON:
         return None
     values = errors[:, is_common]
-    codes = np.unique(groups[is_common], return_inverse=True)[1]
-    n_groups = int(codes.max()) + 1
+    group_numbers = np.unique(groups[is_common], return_inverse=True)[1]
+    n_groups = int(group_numbers.max()) + 1
     rng = np.random.default_rng(0)
     resampled = rng.multinomial(n_groups, np.full(n_groups, 1.0 / n_groups), size=_RESAMPLES)
-    weights = np.concatenate([np.ones((1, codes.size)), resampled[:, codes]])
+    weights = np.concatenate([np.ones((1, group_numbers.size)), resampled[:, group_numbers]])
     weights /= weights.sum(axis=1, keepdims=True)
     squares = weights @ (values**2).T
     if is_centred:
         squares = squares - (weights @ values.T) ** 2
     if squares[:, 0].min() <= 0.0:
         return None
-    total, none = squares[:, 0], squares[:, 1]
+    total, without_sources = squares[:, 0], squares[:, 1]
     removed = total[:, None] - squares[:, 2 : 2 + n_sources]
-    alone = squares[:, 2 + n_sources :] - none[:, None]
+    alone = squares[:, 2 + n_sources :] - without_sources[:, None]
     mean = 0.5 * (removed + alone)
-    closure = (none + mean.sum(axis=1)) / total
-    risk = 50.0 * (1.0 - confidence)
-    bounds = (risk, 100.0 - risk)
+    closure = (without_sources + mean.sum(axis=1)) / total
+    tail_percent = 50.0 * (1.0 - confidence)
+    bounds = (tail_percent, 100.0 - tail_percent)
     lower, upper = np.percentile(mean, bounds, axis=0)
     counts = has_error.sum(axis=1)
     contributions = [
@@ -411,7 +409,7 @@ def compute_budget(
         total=float(total[0]),
         total_lower=float(total_bounds[0]),
         total_upper=float(total_bounds[1]),
-        remaining=float(none[0]),
+        remaining=float(without_sources[0]),
         closure=float(closure[0]),
         closure_lower=float(closure_bounds[0]),
         closure_upper=float(closure_bounds[1]),

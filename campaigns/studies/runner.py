@@ -1,7 +1,7 @@
-"""Evaluation of chosen points by rendered cases: rows are stored, so that an interrupted study can continue.
+"""Run and continue studies, which choose their cases: points in standard normal space (`sampling.points`).
 
-A study is a deterministic function of its settings and of the rows of its cases. It continues by running again from its
-start: cases with a stored row are not run again.
+A study is a deterministic function of its settings and of the rows of its cases. To continue an interrupted study, it
+is run again from its start. Cases with a stored row are not run again: their rows are read.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
 from marsyard.sim.kernel_cache import mark_ready
 
-#: Number of first cases after which a study without a finished case ends.
+#: A study is stopped with an error if none of this number of first cases has finished.
 _MAX_FIRST_CRASHES = 20
 #: Key of a study's settings and results in the record of its folder.
 STUDY_KEY = "study"
@@ -54,7 +54,7 @@ Result = TypeVar("Result", bound=StudyResult)
 
 @dataclass(frozen=True)
 class StudySession(Generic[Result]):
-    """Workers and progress of a study, and the function that runs it."""
+    """Configuration of the workers, receiver of progress reports, and the function that runs the study."""
 
     executor: ExecutorConfig
     observer: ProgressObserver
@@ -67,7 +67,13 @@ class CaseLimitError(Exception):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A point to be evaluated; without a `stream` it gets new random streams."""
+    """A point to be evaluated by one case (see `marsyard.campaigns.sampling.points.Point`).
+
+    - coordinates: standard normal numbers of the random dispersions
+    - stream: number of the case's random streams; None for new streams
+    - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
+    - removed: names of the sources of error that the case does not have
+    """
 
     coordinates: tuple[float, ...]
     stream: int | None = None
@@ -201,18 +207,19 @@ def start_study(
 ) -> Result:
     """Create the folder of a study, and run it. Raises CampaignError for an unsuitable campaign or folder.
 
-    settings: settings of the study with its `kind`, as JSON types
+    `settings` are the settings of the study with its `kind`, as JSON types.
     """
     study_campaign = prepare_campaign(campaign, max_cases)
     record.claim_folder(directory)
     with record.folder_lock(directory):
+        # again, because another process may have started a campaign in the folder before the lock
         record.claim_folder(directory)
         create_study(study_campaign, directory, session.executor.describe(), dict(settings))
         return _run_study(study_campaign, directory, session, settings)
 
 
 def continue_study(directory: Path, session: StudySession[Result], settings: Mapping[str, Any]) -> Result:
-    """Continue a stored study with its settings or changed ones. Raises CampaignError if the program has changed."""
+    """Continue a stored study; `settings` replace the stored ones. Raises CampaignError if the program has changed."""
     with record.folder_lock(directory):
         campaign = load_stored_campaign(directory, record.stored_configuration(directory))
         check_identity(campaign, directory)

@@ -23,7 +23,7 @@ from marsyard.scenarios.exposure import add_haze
 from marsyard.scenarios.horizon import add_unresolved_rocks
 from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, load_site
 from marsyard.scenarios.views import (
-    STANCES,
+    CAMERA_MOUNTINGS,
     SiteGround,
     Viewpoint,
     camera_pose,
@@ -33,8 +33,7 @@ from marsyard.scenarios.views import (
 )
 from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
-from marsyard.sim.dynamics.rover import RoverParameters
-from marsyard.sim.dynamics.rover import Stance as RoverStance
+from marsyard.sim.dynamics.rover import RoverParameters, Stance
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, PixelRays, Scene, Sun, process_renderer, rover_objects
 from marsyard.sim.render.backend import default_backend
@@ -75,8 +74,8 @@ class ImageRequest:
         if not is_terrain_file(site):
             _check_name("site", site, sites())
         _check_name("camera", camera, sensor.PRESETS)
-        pose = STANCES[camera]
-        defaults = {"scale": pose.scale, "altitude_m": pose.height_m, "elevation_deg": pose.elevation_deg}
+        mounting = CAMERA_MOUNTINGS[camera]
+        defaults = {"scale": mounting.scale, "altitude_m": mounting.height_m, "elevation_deg": mounting.elevation_deg}
         defaults |= dict.fromkeys(("east_m", "north_m", "azimuth_deg"), 0.0)
         defaults |= {"sun_azimuth_deg": 250.0, "sun_elevation_deg": 35.0}
         defaults |= {"seed": 1, "max_hole_fraction": MAX_HOLE_FRACTION}
@@ -172,11 +171,11 @@ def render_images(request: ImageRequest, *, detector: bool = True, both: bool = 
 
 def _add_rover(scene: Scene, request: ImageRequest, ground: SiteGround) -> Scene:
     """Add the rover on which the camera is mounted: level, with its mounting point at the camera's position."""
-    mount = STANCES[request.camera].on_rover_m
-    if mount is None:
+    position_on_rover = CAMERA_MOUNTINGS[request.camera].on_rover_m
+    if position_on_rover is None:
         return scene
     camera = mast_pose(ground.surface, request.east_m, request.north_m, request.altitude_m, request.azimuth_deg, 0.0)
-    stance = RoverStance(rigid(camera.rotation, camera.apply(-np.array(mount))), 0.0, (0.0, 0.0), np.zeros(6))
+    stance = Stance(rigid(camera.rotation, camera.apply(-np.array(position_on_rover))), 0.0, (0.0, 0.0), np.zeros(6))
     rover = rover_objects(RoverParameters(), stance, MER_MAST, 0.0, 0.0)
     return scene.with_objects(Objects.join([scene.objects, rover]))
 

@@ -1,7 +1,7 @@
 """Flight software that drives the rover: steps towards the target, terrain map, and path planning (Fig. 12).
 
-It receives estimated poses, the tracker's target position and stereo measurements only; an import contract excludes the
-modules of the simulated truth. A leg's parameters are the operators' commands.
+Its inputs are estimated poses, the tracker's target position, and stereo measurements. An import contract forbids
+imports of the modules with the simulated truth. The parameters of a leg are the operators' commands.
 
 Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
@@ -25,16 +25,16 @@ from marsyard.sim.measurements import DriveCommand, StereoMeasurement
 GOAL_TOLERANCE_M = 0.03
 #: Maximum angle of the goal from straight ahead for an arc, radians. For a larger angle the rover first turns in place.
 MAX_ARC_RAD = np.radians(15.0)
-#: Radius around the target without hazards, if the navigator ignores the target's rock, metres.
+#: Radius around the target in which hazards are ignored, if the navigator ignores the target's rock, metres.
 TARGET_RADIUS_M = 1.0
-#: Maximum height of mapped points above or below the plane of the wheels: GROUND_STEP_M + GROUND_SLOPE * distance.
+#: Points are mapped up to the height GROUND_STEP_M + GROUND_SLOPE * distance above or below the plane of the wheels.
 GROUND_STEP_M, GROUND_SLOPE = 0.3, 0.5
 #: Maximum x and maximum |y| of the rover's body and wheels in the rover frame, metres.
 BODY_M = (0.95, 1.2)
-#: Width of the known ground around the rover at the start, metres.
+#: Margin around the rover within which the ground at the start is assumed to be a plane, metres.
 START_MARGIN_M = 0.3
-#: Parameters of the planner by the cameras of its map (not published; assumed): the swept disc contains the wheels of a
-#: MER without its panels; the body cameras map less ground ahead.
+#: Parameters of the planner for maps from mast cameras and from body cameras (assumed). The disc swept by the rover is
+#: sized for the wheels of a MER, without its solar panels. The range of the body cameras allows a short lookahead only.
 NAVIGATION_OPTIONS = {
     "mast": NavigationOptions(half_width_m=0.6),
     "body": NavigationOptions(half_width_m=0.6, lookahead_m=2.0),
@@ -83,6 +83,7 @@ def plan_step(leg: LegParameters, step_count: int, target: TargetEstimate) -> It
     if leg.motion == "turn":
         yield DriveCommand(turn_left_rad=-float(np.radians(leg.step_deg)))
         if leg.shuffle_m:
+            # a short drive after each turn, alternately forward and back
             yield DriveCommand(forward_m=leg.shuffle_m if step_count % 2 == 0 else -leg.shuffle_m)
     elif leg.motion == "circle":
         # a rotation about the target moves the origin perpendicular to the line to the target
@@ -118,7 +119,7 @@ class Navigator:
     terrain: TerrainMap | None = None
 
     def map_start(self, world_from_rover: RigidTransform, radius_m: float) -> None:
-        """Create the map at its first update: a plane under the wheels, within `radius_m` and a margin."""
+        """Create the map if there is none: the plane of the wheels, within `radius_m` and a margin of the rover."""
         if self.terrain is None:
             origin, up = world_from_rover.translation, world_from_rover.rotation.as_matrix()[:, 2]
             terrain = TerrainMap.empty(np.asarray(origin[:2]))

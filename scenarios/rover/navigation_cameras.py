@@ -13,7 +13,7 @@ from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import build_shadow_caster
 from marsyard.scenarios.rover.stops import StereoCamera
 from marsyard.scenarios.rover.world import Rig, RunWorld, Vehicle
-from marsyard.scenarios.views import STANCES
+from marsyard.scenarios.views import CAMERA_MOUNTINGS
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import compose, rigid
 from marsyard.sim.measurements import MastCalibration, StereoMeasurement
@@ -113,7 +113,7 @@ class NavigationCameras:
             design = MastCalibration(rig.calibrated.geometry, left, right)
             head = StereoHead.draw(design, p.stereo, streams.generator("hazcam calibration"))
             body = _StereoPair.draw(p, HAZCAM, head, streams)
-        mounting = STANCES[HAZCAM]
+        mounting = CAMERA_MOUNTINGS[HAZCAM]
         tilt = Rotation.from_rotvec([0.0, -np.radians(mounting.elevation_deg), 0.0])
         return cls(mast, body, rigid(tilt, np.array(mounting.on_rover_m)))
 

@@ -1,8 +1,9 @@
 """Satellite navigation receivers: GPS (positions), and RTK (positions, velocities, reported standard deviations).
 
 An RTK (real-time kinematic) receiver compares carrier phases with a base station. Its solution is *fixed* while the
-integer phase ambiguities are resolved, and *floating* otherwise; each type has its own time-correlated and white
-errors. The type changes at random times. There are no solutions during an outage. Antennas are at the body's origin.
+integer phase ambiguities are resolved, and *floating* otherwise; each type has its own time-correlated errors
+("wander") and white errors. The type changes at random times. There are no solutions during an outage. Antennas are at
+the body's origin.
 
 The landing paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """

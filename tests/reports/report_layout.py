@@ -10,7 +10,7 @@ VerdictName = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
 
 
 class _Part(BaseModel):
-    """Part of the report without further keys; null represents NaN and infinities."""
+    """Base class of the parts of the report; undeclared keys are rejected, and null represents NaN and infinities."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -37,7 +37,9 @@ class AllCases(_Part):
     estimate: float | None
     lower: float | None
     upper: float | None
-    configured: list[str] = Field(description="conditions that remain: columns that the configuration determines")
+    configured: list[str] = Field(
+        description="columns of the population that remain conditions, because a case's configuration determines them"
+    )
 
 
 class Evidence(_Part):
@@ -87,7 +89,9 @@ class RequirementVerdict(_Part):
     upper_confidence: float | None
     plain_lower: float | None
     plain_upper: float | None
-    consumer_risk: float | None = Field(description="probability of equally good evidence at exactly the required rate")
+    consumer_risk: float | None = Field(
+        description="probability of evidence at least as good if the success rate equals the required rate"
+    )
     margin: float | None = Field(description="deciding bound or estimate, minus the required rate")
     further_cases: int | None = Field(description="additional cases that lead to PASS if none of them fails")
     terrains: int | None
@@ -96,11 +100,15 @@ class RequirementVerdict(_Part):
     advice: str = Field(description="reason why more cases do not help, and the necessary change")
     accept_rate: bool = Field(description="true if MET BY RATE has exit status 0")
     withheld_status: VerdictName | None = Field(
-        description="status without regard to the kind of evidence, if it was replaced by INSUFFICIENT"
+        description="status by the numbers alone; null unless the kind of evidence changed it to INSUFFICIENT"
     )
     all_cases: AllCases | None = Field(description="the requirement on all cases; null if its population is all cases")
-    definitions: str = Field(description="definitions of columns that the flight system cannot know; may be empty")
-    joint_text: str = Field(description="verdict at the confidence of all confirmations of the algorithm together")
+    definitions: str = Field(
+        description="definitions of the population's columns that the flight system cannot know; may be empty"
+    )
+    joint_text: str = Field(
+        description="sentence: verdict if the confidence applies to all confirmations of the algorithm; may be empty"
+    )
     note: str
 
 
@@ -136,20 +144,22 @@ class TerrainBank(_Part):
     """The terrains that cases can use."""
 
     terrains: int
-    key: str = Field(description="parameter that sets their number")
-    in_turn: bool
+    key: str = Field(description="parameter that sets the number of terrains")
+    in_turn: bool = Field(description="true: the cases use the terrains in turn; false: terrains are drawn at random")
 
 
 class SamplingDescription(_Part):
     """Sampling design of the cases."""
 
-    design: str
-    grids: list[str]
-    nominal: bool
-    max_cases: int | None
-    first_look: int | None = Field(description="cases at the first verdict if cases were appended later")
+    design: str = Field(description="`random`, `latin-hypercube` or `sobol`")
+    grids: list[str] = Field(description="paths of the parameters that were swept as a grid")
+    nominal: bool = Field(description="whether case 0 has the nominal parameters instead of sampled ones")
+    max_cases: int | None = Field(
+        description="cases at the last planned evaluation; null unless the campaign stops when its verdicts are decided"
+    )
+    first_look: int | None = Field(description="cases at the first verdict; null unless cases were appended after it")
     terrains: TerrainBank | None
-    independent: bool
+    independent: bool = Field(description="whether the cases, except the nominal one, are independent random samples")
     text: str
 
 
@@ -177,15 +187,15 @@ class CampaignReport(_Part):
 
     report_schema: Literal[6] = Field(alias="schema")
     campaign: str
-    state: Any = Field(description="value of campaign.json; also for seed, git_commit and the times")
+    state: Any = Field(description="as in `campaign.json`, like seed, git_commit and both times")
     seed: Any
     git_commit: Any
     started_utc: Any
     finished_utc: Any
     cases: int
     crashed: int
-    sites: list[str] = Field(description="names in the rows, at most 24; also for `algorithms`")
-    algorithms: list[str]
+    sites: list[str] = Field(description="sites in the rows, at most 24")
+    algorithms: list[str] = Field(description="algorithms in the rows, at most 24")
     algorithm_details: list[AlgorithmDescription] = Field(
         default=[], description="from campaign.json, the algorithm under test first"
     )

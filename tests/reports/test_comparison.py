@@ -21,7 +21,7 @@ def make_paired_rows(first_errors: list[float], other_errors: list[float]) -> pd
     return pd.DataFrame({**frame, "other.velocity_error_m_s": other_errors, "altitude_m": 1.0})
 
 
-def test_paired_comparison_counts_and_mean_difference() -> None:
+def test_paired_comparison_averages_the_cases_that_both_algorithms_answer() -> None:
     nan = float("nan")
     algorithms, (difference,) = compare_algorithms(
         make_paired_rows([1, 2, 3, 9], [2, 3, nan, 4]), "velocity_error_m_s", 5.0

@@ -71,7 +71,7 @@ def test_labels_are_unique_column_names() -> None:
     ("task", "name", "key", "improved_value"),
     [(VELOCITY, "dimes", "align", True), (TRACKING, "vtt", "warp", "bend"), (LANDING, "hda", "check_footprints", True)],
 )
-def test_published_improved_and_custom_configurations(
+def test_only_the_custom_configuration_accepts_an_improvement(
     task: Task[Any, Any], name: str, key: str, improved_value: Any
 ) -> None:
     defaults = task.options()

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from marsyard.scenarios.views import (
+    CAMERA_MOUNTINGS,
     DETAIL_TRIANGLES,
     ROCK_TRIANGLES,
     SMALLEST_ROCK_PX,
-    STANCES,
     SiteGround,
     Viewpoint,
     camera_pose,
@@ -42,8 +42,8 @@ def ground() -> SiteGround:
     return SiteGround.from_site(_make_small_site("gusev", 1024), "ground", seed=3)
 
 
-def test_each_camera_has_a_default_stance() -> None:
-    assert set(STANCES) == set(PRESETS)
+def test_each_camera_has_a_default_mounting() -> None:
+    assert set(CAMERA_MOUNTINGS) == set(PRESETS)
 
 
 def test_site_without_terrain_at_a_scale_is_rejected() -> None:

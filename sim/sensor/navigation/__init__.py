@@ -178,7 +178,7 @@ class NavigationFilter:
             angles=increments.delta_angles_rad,
             velocities=increments.delta_velocities_m_s,
             gps=self._convert_solutions(solutions),
-            tilts=self._convert_readings(readings),
+            compass=self._convert_readings(readings),
             covariance_indices=indices,
         )
         tuning = self._create_tuning(increments.period_s)

@@ -26,7 +26,8 @@ ERRORS = 24
 QUATERNION, STATE_GYRO_BIAS, STATE_ACCELEROMETER_BIAS, STATE = 6, 10, 13, 16
 #: First columns in a receiver row: time tag, delivery time, solution, deviations of wander and noise, whether fixed.
 TAG, DELIVERY, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED = 0, 1, 2, 5, 8, 11, 14
-#: Columns of a compass row after the time tag; yaw is counterclockwise from east.
+#: First columns in a row of the tilt compass after the time tag: up direction (body axes), and yaw from the heading,
+#: counterclockwise from east.
 UP, YAW = 1, 4
 #: Types of innovations.
 POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
@@ -37,7 +38,18 @@ INNOVATION = 5  #: Number of columns of an innovation: time, type, axis, normali
 
 
 class Tuning(NamedTuple):
-    """Parameters of the filter in SI units, see `FilterParameters`; a decay is the factor of an error over one step."""
+    """Parameters of the filter in SI units; `FilterParameters` and the parameters of the instruments define them.
+
+    - ..._density: noise densities of the random walks of attitude, velocity and biases
+    - ..._decay: factor of a time-correlated error (wander) over one step
+    - velocity_wander_m_s, velocity_noise_m_s, tilt_noise_rad, heading_noise_rad: standard deviations of the instruments
+    - tan_dip: tangent of the dip of the magnetic field
+    - lag_s: time constant of the inclinometers
+    - disturbance: tilt error of the inclinometers in an acceleration, divided by acceleration / gravity
+    - gate: maximum absolute normalised innovation of an accepted measurement
+    - max_rejected_fixes: number of consecutive rejected solutions before a restart
+    - first_position_m, first_velocity_m_s, first_tilt_rad: standard deviations at the start and after a restart
+    """
 
     gravity_m_s2: float
     attitude_density: float
@@ -66,7 +78,7 @@ class Inputs(NamedTuple):
     """Inputs of a run.
 
     - times, step, angles, velocities: boundaries, nominal period and increments of the inertial samples
-    - gps, tilts: receiver rows and compass rows
+    - gps, compass: rows of the receiver and of the tilt compass
     - covariance_indices: boundaries with stored covariances, ascending
     """
 
@@ -75,7 +87,7 @@ class Inputs(NamedTuple):
     angles: Array
     velocities: Array
     gps: Array
-    tilts: Array
+    compass: Array
     covariance_indices: NDArray[np.int64]
 
 
@@ -286,7 +298,7 @@ def update_tilt(
 def update_heading(
     row: Array, estimate: Estimate, disturbance_rad: float, time: float, tuning: Tuning, log: Array
 ) -> None:
-    """Update with the compass; write one innovation."""
+    """Update with the yaw of the compass; write one innovation."""
     h, matrix = np.zeros(ERRORS), np.empty((3, 3))
     write_rotation_matrix(estimate.state[QUATERNION:], matrix)
     horizontal = matrix[0, 0] ** 2 + matrix[1, 0] ** 2
@@ -321,13 +333,13 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
 
     `memory` and the covariance `p` are updated in place. Readings with tags before the first boundary are ignored.
     """
-    times, gps, tilts, indices = inputs.times, inputs.gps, inputs.tilts, inputs.covariance_indices
+    times, gps, compass, indices = inputs.times, inputs.gps, inputs.compass, inputs.covariance_indices
     states = np.empty((times.size, STATE))
     # position and velocity change since the start of the run, from the inertial unit only
     inertial = np.zeros((times.size, 6))
     deviations, covariances = np.empty((times.size, ESTIMATED)), np.empty((indices.size, ESTIMATED, ESTIMATED))
-    log = np.empty((6 * gps.shape[0] + 3 * tilts.shape[0], INNOVATION))
-    log_count = next_fix = next_tilt = covariance_count = 0
+    log = np.empty((6 * gps.shape[0] + 3 * compass.shape[0], INNOVATION))
+    log_count = next_fix = next_reading = covariance_count = 0
     states[0] = start
     for k in range(times.size):
         state = states[k]
@@ -356,9 +368,9 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
         east, north = memory[FILTERED_ACCELERATION], memory[FILTERED_ACCELERATION + 1]
         acceleration = math.sqrt(east**2 + north**2 + tuning.unmodelled_acceleration_m_s2**2)
         disturbance_rad = tuning.disturbance * acceleration / tuning.gravity_m_s2
-        while next_tilt < tilts.shape[0] and tilts[next_tilt, TAG] <= times[k]:
-            row = tilts[next_tilt]
-            next_tilt += 1
+        while next_reading < compass.shape[0] and compass[next_reading, TAG] <= times[k]:
+            row = compass[next_reading]
+            next_reading += 1
             if row[TAG] < times[0]:
                 continue
             if not math.isnan(row[UP]):

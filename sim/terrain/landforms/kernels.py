@@ -21,14 +21,14 @@ class Bedforms(NamedTuple):
     """A train of dunes.
 
     - wave_x, wave_y: wavenumbers of the plane wave, rad/m
-    - crest_m: RMS crest-to-trough height, metres
+    - height_m: RMS height of the crests above the troughs, metres
     - slip_face_slope: slope of the slip face, metres per metre
     - contrast: natural logarithm of the albedo of crests divided by that of troughs
     """
 
     wave_x: float
     wave_y: float
-    crest_m: float
+    height_m: float
     slip_face_slope: float
     contrast: float
 
@@ -156,9 +156,10 @@ def scale_roughness(factors: Grid, spacing: float, craters: Array, max_r: float)
 
 @njit(cache=True)
 def stamp_streaks(log_albedo: Grid, spacing: float, streaks: Array) -> None:
-    """Add wind tails to the logarithm of albedo: rows (x, y, half width, length, cosine and sine downwind, log_albedo).
+    """Add wind tails (streaks) of craters to the logarithm of albedo.
 
-    A tail begins at (x, y), widens downwind from 0.8 to 1.6 half widths, and fades to its end and its sides.
+    `streaks` has rows (x, y, half width, length, cosine and sine of the downwind direction, logarithm of albedo). A
+    tail begins at (x, y), widens downwind from 0.8 to 1.6 half widths, and fades towards its end and sides.
     """
     mask = log_albedo.shape[0] - 1
     for n in range(streaks.shape[0]):
@@ -210,14 +211,14 @@ def _add_row_of_dunes(
     dunes: Bedforms,
 ) -> None:
     """Add dunes along a row from the complex modulation at its samples and the plane wave's phase at the first one."""
-    phase_step, crest, contrast = dunes.wave_x * spacing, dunes.crest_m, dunes.contrast
+    phase_step, rms_height, contrast = dunes.wave_x * spacing, dunes.height_m, dunes.contrast
     wave = math.sqrt(dunes.wave_x * dunes.wave_x + dunes.wave_y * dunes.wave_y)
     # the upper half of the slip face is plane, the lower half concave: it is 4/3 as long as a plane face;
     # the length of the slip face is expressed as a fraction of the wavelength
     slip_per_height = 4.0 / 3.0 * wave / (2.0 * math.pi * dunes.slip_face_slope)
     for j in range(height.shape[0]):
         strength = math.sqrt(real[j] * real[j] + imaginary[j] * imaginary[j])
-        crest_height = crest * min(strength, 1.6)
+        crest_height = rms_height * min(strength, 1.6)
         cycles = (first_phase + j * phase_step + _arctan2(real[j], imaginary[j])) / (2.0 * math.pi)
         # position in the wavelength, 0 and 1 at the troughs; v and w: position on the stoss slope and on the slip face
         u = cycles - np.floor(cycles)

@@ -216,7 +216,8 @@ def test_all_three_designations_define_the_same_target() -> None:
         np.testing.assert_allclose(get_pixel(second_update), drive.true_pixel(pose(0.7, 0.0), target), atol=0.1)
 
 
-def test_near_target_range_uses_pair_centred_pointing() -> None:
+def test_range_of_a_near_target_is_accurate_if_the_mast_centres_both_images() -> None:
+    """With `aim_pair` the target is between the centres of both images, so that both contain a target at 2.2 m."""
     target = np.array([2.2, -0.1, 0.3])
     options = replace(SMALL_WINDOW, aim_pair=True)
     drive = Drive(make_scene(make_face(6, target), target, 6), pancam(), VisualTargetTracker(options))
@@ -227,8 +228,8 @@ def test_near_target_range_uses_pair_centred_pointing() -> None:
     np.testing.assert_allclose(update.position_rover, target, atol=0.001)
 
 
-def test_slanted_face_score_includes_second_camera_view() -> None:
-    """At 66 deg and 3 m, a baseline of 0.2 m changes the face width by 15 % in the right image."""
+def test_warp_increases_the_stereo_score_of_a_slanted_face() -> None:
+    """At 66 deg and 3 m, a baseline of 0.2 m changes the width of the face in the right image by 15 %."""
     target, slant = np.array([3.0, 0.0, 0.5]), np.radians(66.0)
     face = Plane(target, np.array([-np.cos(slant), np.sin(slant), 0.0]))
     scores = {}
@@ -274,7 +275,8 @@ def test_pointing_error_does_not_change_the_match() -> None:
 
 
 @pytest.mark.parametrize(("row_offset_px", "is_tracked"), [(1.4, True), (5.0, False)])
-def test_point_stereo_tolerates_two_pixel_misalignment(row_offset_px: float, is_tracked: bool) -> None:
+def test_stereo_tolerates_row_offsets_within_the_epipolar_tolerance(row_offset_px: float, is_tracked: bool) -> None:
+    """The epipolar tolerance of the options is 2 px."""
     target = np.array([6.0, 0.1, 0.2])
     mast = navcam()
     assert isinstance(mast.right, Cahvor)
@@ -317,10 +319,11 @@ def test_detector_noise_has_little_effect() -> None:
 # ----- another tracker with the same interface -----
 
 
-def test_lucas_kanade_tracks_in_the_same_loop() -> None:
+def test_lucas_kanade_tracker_follows_the_target_in_the_same_loop() -> None:
     target = np.array([6.0, 0.1, 0.2])
     tracker: TargetTracker = lucas_kanade_tracker(SMALL_WINDOW)
     drive = Drive(make_scene(make_face(1, target), target, 1), navcam(), tracker)
+    # compared as lists, because mypy would otherwise assume that the state does not change
     assert [tracker.state] == [TrackingState.NO_TARGET]
     true_pose, last = drive_to_target(drive, target, 0.1)[-1]
     assert last.tracked

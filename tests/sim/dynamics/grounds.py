@@ -1,4 +1,4 @@
-"""Analytic grounds for rover tests, on which the stance of a rover has a closed form: planes and mounds."""
+"""Analytic grounds for rover tests, on which the pose of a rover at rest has a closed form: planes and mounds."""
 
 from __future__ import annotations
 

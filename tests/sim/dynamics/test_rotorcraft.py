@@ -31,7 +31,7 @@ TRANSIT_POINT, SITE_XY = np.array([100.0, 50.0, 12.0]), np.array([103.0, 52.0])
 CRAFT, TRANSIT, GUIDANCE = RotorcraftParameters(), TransitParameters(), LandingGuidance()
 CALM: dict[str, Any] = {"east_m_s": 0.0, "north_m_s": 0.0, "gust_m_s": 0.0, "vertical_gust_m_s": 0.0}
 #: A craft without vibration.
-SMOOTH = RotorcraftParameters(vibration=VibrationParameters(acceleration_m_s2=0.0, angle_deg=0.0))
+NO_VIBRATION = RotorcraftParameters(vibration=VibrationParameters(acceleration_m_s2=0.0, angle_deg=0.0))
 
 
 def _make_air(seed: int, **changes: float) -> Air:
@@ -94,9 +94,9 @@ def test_velocity_rate_and_force_are_derivatives() -> None:
 
 def test_specific_force_is_rotor_thrust_plus_drag() -> None:
     """In calm air the force perpendicular to the rotor axis is drag."""
-    flight = _fly_transit(_make_air(0, **CALM), SMOOTH).path
+    flight = _fly_transit(_make_air(0, **CALM), NO_VIBRATION).path
     motion = flight.motion(flight.knots_s[1:])
-    drag = motion.attitudes.inv().apply(-motion.velocities_m_s / SMOOTH.drag_s)
+    drag = motion.attitudes.inv().apply(-motion.velocities_m_s / NO_VIBRATION.drag_s)
     # Thrust angles are predicted one step h ahead. A command jump of 1 m/s2 causes a prediction error of
     # (omega h)^2 / (6 g) = 2e-4 rad.
     np.testing.assert_allclose(motion.specific_forces_m_s2[:, :2], drag[:, :2], atol=3e-3)
@@ -107,7 +107,7 @@ def test_pitch_balances_drag_and_wind() -> None:
     for wind in (0.0, -3.0):
         air = CALM | {"east_m_s": wind * np.cos(COURSE), "north_m_s": wind * np.sin(COURSE)}
         flight = simulate_transit(
-            SMOOTH, TRANSIT, TRANSIT_POINT, COURSE, COURSE, GRAVITY, _make_air(0, **air), np.random.default_rng(0)
+            NO_VIBRATION, TRANSIT, TRANSIT_POINT, COURSE, COURSE, GRAVITY, _make_air(0, **air), np.random.default_rng(0)
         ).path
         attitude = flight.state(TRANSIT.imaging_duration_s).attitude.as_euler("ZYX")
         speed = float(flight.state(TRANSIT.imaging_duration_s).velocity_m_s[:2] @ [np.cos(COURSE), np.sin(COURSE)])
@@ -133,7 +133,7 @@ def test_transit_has_constant_height_and_course() -> None:
 
 
 def test_vibration_has_the_specified_frequency() -> None:
-    vibrating, without_vibration = (_fly_transit(_make_air(1), craft).path for craft in (CRAFT, SMOOTH))
+    vibrating, without_vibration = (_fly_transit(_make_air(1), craft).path for craft in (CRAFT, NO_VIBRATION))
     times = np.arange(0.0, 5.0, 1e-3)
     motions = [flight.motion(times) for flight in (vibrating, without_vibration)]
     specific_force = [motion.attitudes.apply(motion.specific_forces_m_s2) for motion in motions]
@@ -162,7 +162,7 @@ def test_touchdown_error_is_proportional_to_gusts() -> None:
 
 def test_phases_start_at_the_heights_of_the_paper() -> None:
     # The ground height is 2 m + 0.1 times the distance east of the site.
-    flight = _fly_landing(slope=0.1, craft=SMOOTH, **CALM)
+    flight = _fly_landing(slope=0.1, craft=NO_VIBRATION, **CALM)
     state = {phase: flight.path.state(time) for phase in Phase if (time := flight.phase_start_s(phase)) is not None}
     assert list(state) == list(Phase)
     assert state[Phase.APPROACH].time_s - TRANSIT.imaging_duration_s == pytest.approx(GUIDANCE.wait_s, abs=0.05)

@@ -109,7 +109,7 @@ def test_site_grounds_can_be_built_with_rocks(name: str) -> None:
         assert len(field) > 0
 
 
-def test_mean_slope_of_a_sine_wave_and_of_a_part_of_it() -> None:
+def test_mean_slope_of_a_sine_wave_equals_its_closed_form() -> None:
     side, spacing = 256, 2.0
     samples = np.full((side, side, 2), 0.2, dtype=np.float32)
     phase = 2 * np.pi * np.arange(side) / side
@@ -127,7 +127,7 @@ def test_mean_slope_of_a_sine_wave_and_of_a_part_of_it() -> None:
     assert np.isnan(mean_slope_deg(surface, 300.0))
 
 
-def test_contrast_of_checkered_level_ground_equals_albedo_contrast() -> None:
+def test_contrast_of_level_ground_with_two_albedos_equals_their_contrast() -> None:
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = 0.2
     samples[:, :32, 1] = 0.1

@@ -1,7 +1,6 @@
-"""Tests of surface units, crater populations, tracks and wind tails.
+"""Tests of surface units, crater populations, tracks of dust devils, wind tails of craters, and rocks of the units.
 
-`log_albedo` is the natural logarithm of the albedo relative to the mean albedo. The stamping kernels define the columns
-of craters and streaks.
+`log_albedo` is the natural logarithm of the albedo divided by the mean albedo.
 """
 
 from __future__ import annotations
@@ -35,6 +34,7 @@ def _make_units(**changes: Any) -> SurfaceUnits:
 
 
 def _apply_units(units: SurfaceUnits, seed: int = 1, side: int = 1024) -> tuple[Ground, np.ndarray]:
+    """Apply units to level ground without craters; return the ground, and the factors of the units at each cell."""
     ground = Ground(np.zeros((side, side), dtype=np.float32), np.zeros((side, side), dtype=np.float32), 2.0)
     return ground, units.apply(ground, NO_CRATERS, np.random.default_rng(seed))
 
@@ -44,7 +44,7 @@ def _make_parameters(**changes: Any) -> TerrainParameters:
     return TerrainParameters.model_validate({**settings, **changes})
 
 
-def test_units_have_the_specified_areas_factors_and_tones() -> None:
+def test_units_have_the_specified_areas_factors_and_albedos() -> None:
     """With sharp boundaries and fixed areas, each unit has its area, its factors and its albedo."""
     ground, factors = _apply_units(_make_units(concentration=1e6))
     for kind in KINDS:
@@ -110,8 +110,9 @@ def test_crater_sizes_follow_saturation_and_production() -> None:
     assert np.log2(counts[64.0] / counts[128.0]) == pytest.approx(3.2, abs=0.25)
 
 
-def test_crater_floor_has_its_tone() -> None:
+def test_crater_floor_has_the_specified_albedo() -> None:
     height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
+    # x, y, radius, depth, rim height, rim width; filled fraction; albedo of ejecta and floor; circular outline; phase
     crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.0, 0.0, 0.15, *np.zeros(6), 0.0]
     stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
     assert log_albedo[64, 64] == pytest.approx(0.15)
@@ -120,6 +121,7 @@ def test_crater_floor_has_its_tone() -> None:
 
 def test_crater_floors_are_smoother_and_ejecta_rougher() -> None:
     factors = np.ones((64, 64), dtype=np.float32)
+    # x, y, radius, factor on the floor, factor on the ejecta
     scale_roughness(factors, 1.0, np.array([[32.0, 32.0, 10.0, 0.4, 1.8]]), 2.0)
     assert factors[32, 32] == pytest.approx(0.4)
     assert factors[32, 43] > 1.6
@@ -128,6 +130,7 @@ def test_crater_floors_are_smoother_and_ejecta_rougher() -> None:
 
 def test_wind_tails_lie_downwind_of_their_craters() -> None:
     log_albedo = np.zeros((128, 128), dtype=np.float32)
+    # x, y, half width, length, cosine and sine of the downwind direction (east), log_albedo
     stamp_streaks(log_albedo, 1.0, np.array([[30.0, 64.0, 6.0, 50.0, 1.0, 0.0, -0.2]]))
     rows, columns = np.nonzero(log_albedo)
     assert columns.min() >= 30
@@ -145,7 +148,7 @@ def test_dust_devil_tracks_are_darker() -> None:
 
 def test_rocks_follow_the_density_of_units_with_the_same_total() -> None:
     surface = synthesise(_make_parameters(samples=256, spacing_m=0.5, units=_make_units()), np.random.default_rng(4))
-    parameters = RockParameters(abundance=0.005, smallest_m=0.02)  # Few rocks rarely overlap.
+    parameters = RockParameters(abundance=0.005, smallest_m=0.02)  # few rocks, so that overlaps are rare
     rocks = RockField.draw(surface, parameters, np.random.default_rng(2))
     uniform_rocks = RockField.draw(Surface(surface.levels, surface.spacing_m), parameters, np.random.default_rng(2))
     assert len(rocks) == len(uniform_rocks)
