@@ -1,4 +1,4 @@
-"""Populations of stored rows; rates with intervals, and their texts."""
+"""Masks of the populations of stored rows; rates with their intervals, and their texts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENGINE_FAILURES = errors.ENGINE_FAILURES
 def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
     """Create the mask of the cases with |scale * metric| <= bound, or with a true metric if the bound is NaN.
 
-    Missing values and unfinished cases are no successes. A metric may be a sum of columns, joined by " + ".
+    Cases with a missing value and unfinished cases are failures. A metric may be a sum of columns, joined by " + ".
     """
     is_finished = ~engine_failed(frame)
     if math.isnan(bound):
@@ -99,8 +99,8 @@ class CaseFraction:
     """A fraction of cases with its two-sided intervals at `CONFIDENCE`; `fraction` is NaN for no cases.
 
     - n, hits, fraction: number of cases, number of counted cases, and their fraction
-    - lower, upper: Clopper-Pearson interval for independent cases
-    - shared_lower, shared_upper: interval that allows for shared terrains; None if no terrain is shared
+    - lower, upper: bounds of the Clopper-Pearson interval, for independent cases
+    - shared_lower, shared_upper: bounds of the interval that allows for shared terrains; None if no terrain is shared
     """
 
     n: int
@@ -113,7 +113,7 @@ class CaseFraction:
 
     @property
     def clustered_interval(self) -> tuple[float, float]:
-        """The interval that allows for shared terrains."""
+        """The interval that allows for shared terrains; that for independent cases if no terrain is shared."""
         if self.shared_lower is None or self.shared_upper is None:
             return self.lower, self.upper
         return self.shared_lower, self.shared_upper
@@ -143,7 +143,7 @@ class PooledRate:
 
     - hits, total, fraction: number of counted items, number of all items, and the fraction
     - lower, upper: bootstrap interval over cases, or over shared terrains; NaN if no item is counted
-    - flights, flights_hit: number of cases with items, and with counted items
+    - flights, flights_hit: number of cases (flights) with at least one item, and with at least one counted item
     """
 
     hits: int
@@ -156,7 +156,10 @@ class PooledRate:
 
 
 def pooled_rate(frame: pd.DataFrame, hits: str, of: str) -> PooledRate:
-    """Divide the sums of two columns of counts over the cases; missing counts are 0."""
+    """Compute the fraction of items that are counted: the sum of the column `hits` / the sum of the column `of`.
+
+    Each column contains a number of items per case; missing numbers are 0.
+    """
     hit_counts, item_counts = (np.nan_to_num(numbers(frame, name)) for name in (hits, of))
     has_items = item_counts > 0
     cases, cases_hit = int(has_items.sum()), int((has_items & (hit_counts > 0)).sum())
@@ -223,7 +226,10 @@ def quantile(values: Float[np.ndarray, " n"], probability: float) -> float:
 
 
 def group_by_size(frame: pd.DataFrame, column: str, size: str, first: str) -> Iterator[tuple[str, float, pd.DataFrame]]:
-    """Group rows by the columns of kind and size, in sorted order; the kind named `first` comes first."""
+    """Group rows by kind (values of `column`) and by the numbers in the column `size`; yield kind, size and rows.
+
+    The groups are sorted by kind, then by size; the kind named `first` precedes all others.
+    """
     sizes = numbers(frame, size)
     for kind in sorted(frame[column].dropna().unique(), key=lambda name: (name != first, str(name))):
         has_kind = frame[column].eq(kind).fillna(False).to_numpy(dtype=np.bool_)

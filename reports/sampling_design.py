@@ -32,7 +32,7 @@ class TerrainSupply:
     in_turn: bool = False
 
     def advice(self, min_terrains: int, probability: float, confidence: float) -> str:
-        """Explain that the campaign needs more terrains (`needed`), not more cases, and how to configure them."""
+        """Explain that the campaign needs at least `min_terrains` terrains, not more cases; state the settings."""
         requirement = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
         supply_text = f"{count(self.terrains, 'stored terrain')} ({self.key} = {self.terrains})"
         shortage = f"The campaign has only {supply_text}."
@@ -85,7 +85,7 @@ class SamplingDesign:
 
     @property
     def no_probability(self) -> str:
-        """Explain why the cases allow no probability statement; empty for independent random samples."""
+        """Explanation why the cases allow no probability statement; empty for independent random samples."""
         if self.independent:
             return ""
         steps = [] if self.design == RANDOM else ['set design.kind = "random"']
@@ -117,7 +117,7 @@ INDEPENDENT = SamplingDesign()
 
 
 def read_sampling_design(configuration: Mapping[str, Any]) -> SamplingDesign:
-    """Read the sampling design from a configuration; invalid values are treated as missing."""
+    """Read the sampling design from the configuration of a campaign; invalid values are treated as missing."""
     design = table(configuration.get("design"))
     dispersions = table(configuration.get("dispersions"))
     grids = tuple(str(path) for path, value in dispersions.items() if table(value).get("distribution") == "grid")

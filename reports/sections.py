@@ -1,4 +1,7 @@
-"""Contents of the report's page: rows of tables, figures with captions, and points of the interactive scatter plot."""
+"""Contents of the report's page: rows of tables, figures with captions, and data of the explorer.
+
+The explorer is the interactive scatter plot of the page. A driver is a condition that may affect the metric.
+"""
 
 from __future__ import annotations
 
@@ -74,8 +77,12 @@ class CaseTable:
 
 
 def verdict_row(verdict: Verdict) -> dict[str, Any]:
-    """Format a verdict for the page; `strip` contains its bounds and rates in per cent of the width of a scale."""
-    bounds_text, strip = f"{percent(verdict.lower)} to {percent(verdict.upper)}", None
+    """Format a verdict for the page.
+
+    `strip` contains the data of the small diagram of rate, bounds and required rate: positions on its horizontal axis,
+    in per cent of the length of the axis, and the label of its left end (`left`). None without bounds.
+    """
+    bounds_text, diagram = f"{percent(verdict.lower)} to {percent(verdict.upper)}", None
     if math.isnan(verdict.lower):
         bounds_text = NOTHING if math.isnan(verdict.estimate) else f"{percent(verdict.estimate)} observed"
     else:
@@ -85,7 +92,7 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
         rates = {"estimate": verdict.estimate, "required": verdict.probability}
         rates |= {"lower": verdict.lower, "upper": verdict.upper}
         scale = 100.0 / max(1.0 - scale_start, 1e-12)
-        strip = {"left": f"{100.0 * scale_start:.3g} %"} | {
+        diagram = {"left": f"{100.0 * scale_start:.3g} %"} | {
             name: scale * (rate - scale_start) for name, rate in rates.items()
         }
     return {
@@ -95,7 +102,7 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
         "bounds": bounds_text,
         "risk": "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}",
         "further": NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}",
-        "strip": strip,
+        "strip": diagram,
     }
 
 
@@ -158,7 +165,7 @@ def find_dispersed_column(frame: pd.DataFrame, path: str) -> str | None:
 
 
 def dispersion_grid(run: StoredRun) -> Grid:
-    """Create a table of the dispersions, with the values in the rows."""
+    """Create a table of the dispersions, with the minimum, mean and maximum of the stored values."""
     rows, model = [], _parameters_type(run)
     for path, entry in table(run.recorded("dispersions")).items():
         dispersion, path_parts = table(entry), str(path).split(".")
@@ -283,7 +290,7 @@ def _distinct_values(frame: pd.DataFrame, column: str) -> str | None:
 
 
 def error_figures(frame: pd.DataFrame, all_cases: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
-    """Draw a scatter plot of a metric for `frame`, and its histogram and distribution for `all_cases`."""
+    """Draw a scatter plot of a metric for the cases in `frame`; histogram and distribution for those in `all_cases`."""
     scatter = "Error of each case. The dashed circle is the requirement. Hollow marks are cases beyond the axes."
     histogram = "Histogram of the error magnitude. The hatched bar counts values beyond the axis."
     entries: list[tuple[str, Figure | None, str]] = [("scatter", figures.error_scatter(frame, metric, bound), scatter)]
@@ -297,7 +304,7 @@ def error_figures(frame: pd.DataFrame, all_cases: pd.DataFrame, metric: str, bou
 
 
 def driver_figures(frame: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
-    """Draw a metric against the conditions that may affect it, with rank correlations."""
+    """Draw a metric against each of its drivers, with rank correlations."""
     entries, magnitude, groups = [], np.abs(numbers(frame, metric)), terrain_groups(frame)
     for index, column in enumerate(driver_columns(frame, metric)):
         driver = estimate_driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
@@ -328,7 +335,8 @@ def _svg_figures(entries: Sequence[tuple[str, Figure | None, str]]) -> list[SvgF
     return [svg_figure(figure, key, caption) for key, figure, caption in entries if figure is not None]
 
 
-#: Maximum number of points of the explorer, and of notable cases per kind (largest errors, no answer, crashed).
+#: Maximum number of points of the explorer. Maximum number of notable cases of each kind: largest errors, no answer,
+#: crashed.
 MAX_POINTS, MAX_NOTABLE = 2000, 150
 _SCRIPT = Path(__file__).parent / "templates" / "explorer.js"
 

@@ -6,7 +6,8 @@ terrains allow for correlation (`marsyard.reports.statistics.proportions`). If a
 probability of a wrong verdict in any evaluation is at most 1 - confidence: each planned look (evaluation) uses a
 fraction of this risk, and looks at appended cases use `SequentialTest`. MET BY RATE: the requirement has
 `decide_by = "estimate"`, and the observed rate is sufficient, but the lower bound is not. Cases that are not
-independent random samples (Latin hypercube, Sobol, grids) have no bounds; only such requirements can be decided.
+independent random samples (Latin hypercube, Sobol, grids) have no bounds; requirements with `decide_by = "estimate"`
+can still be decided.
 """
 
 from __future__ import annotations
@@ -52,10 +53,10 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class AllCases:
-    """The same requirement on all cases instead of its population; numbers as in `Verdict`.
+    """Result of a requirement on all cases instead of its population; the numbers are defined as in `Verdict`.
 
-    Cases without the metric are failures. `configured` are the conditions that remain, because the configuration of a
-    case determines them; empty for all cases of the campaign.
+    Cases without a value of the metric are failures. `configured` are the conditions that remain, because the
+    configuration of a case determines them; empty for all cases of the campaign.
     """
 
     status: Status
@@ -165,7 +166,7 @@ class Verdict:
 
     @property
     def note(self) -> str:
-        """Limits of the verdict in words; may be empty."""
+        """Explanation of the verdict and of its limitations, in sentences; may be empty."""
         all_cases_text = "" if self.all_cases is None or self.all_cases.n == self.n else self.all_cases.text
         definitions = f"{self.definitions}." if self.definitions else ""
         texts: tuple[str, ...] = (definitions, self.reason, all_cases_text)
@@ -218,9 +219,8 @@ class Verdict:
         )
 
 
-#: Mask of the successful cases, and terrain number of each case.
-Success = Bool[np.ndarray, " n"]
-Groups = Int[np.ndarray, " n"]
+Success = Bool[np.ndarray, " n"]  #: Whether each case is a success.
+Groups = Int[np.ndarray, " n"]  #: Index of each case's terrain, from 0.
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ class RareSettings:
 
 @dataclass(frozen=True)
 class Replicate:
-    """One subset simulation: estimated probability, whether a violation was reached, and margins of its levels."""
+    """One subset simulation: estimated probability, whether a violation was reached, and margin threshold per level."""
 
     probability: float
     reached: bool
@@ -187,15 +187,15 @@ class _Study:
         """Run all replicates and the importance sampling; estimate the probability and decide."""
         settings = self._settings
         results: list[SubsetResult] = []
-        reason, contributions = "", list[float]()
+        reason, violation_weights = "", list[float]()
         try:
             for block in settings.replicates:
                 observer.begin("cases", self._max_cases(block))
                 results += self._run_replicates(range(len(results), len(results) + block))
             if settings.method == "importance":
                 observer.begin("cases", settings.importance_cases)
-                contributions = self._run_importance(results)
-                if not contributions:
+                violation_weights = self._run_importance(results)
+                if not violation_weights:
                     reason = "The replicates found too few violations to fit a density for importance sampling."
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
@@ -209,14 +209,14 @@ class _Study:
         # the first, so each one-sided bound has at most the risk 1 - confidence over all evaluations
         confidence = 1.0 - (1.0 - settings.confidence) / 2.0 ** (len(settings.replicates) - 1)
         subset_interval = replicate_interval(estimates, reached, confidence)
-        interval, effective = subset_interval, math.nan
-        if contributions:
-            squares = sum(value**2 for value in contributions)
-            effective = sum(contributions) ** 2 / squares if squares else 0.0
-            interval = weighted_interval(contributions, settings.confidence)
-            if effective < MIN_EFFECTIVE_VIOLATIONS:
+        interval, n_effective = subset_interval, math.nan
+        if violation_weights:
+            squares = sum(value**2 for value in violation_weights)
+            n_effective = sum(violation_weights) ** 2 / squares if squares else 0.0
+            interval = weighted_interval(violation_weights, settings.confidence)
+            if n_effective < MIN_EFFECTIVE_VIOLATIONS:
                 reason = (
-                    f"Importance sampling has only {effective:.0f} effective violations, fewer than "
+                    f"Importance sampling has only {n_effective:.0f} effective violations, fewer than "
                     f"{MIN_EFFECTIVE_VIOLATIONS:.0f}: its interval is not reliable. Use more cases, or --method subset."
                 )
         verdict = RareVerdict.INSUFFICIENT if reason else decide(interval, settings.max_probability)
@@ -224,12 +224,12 @@ class _Study:
         if verdict is RareVerdict.PASS and evidence.excludes_pass:
             verdict, reason = RareVerdict.INSUFFICIENT, f"The verdict would be PASS. {evidence.text}"
         additional = None
-        if verdict is RareVerdict.INSUFFICIENT and not contributions:
+        if verdict is RareVerdict.INSUFFICIENT and not violation_weights:
             next_interval = replace(subset_interval, confidence=0.5 * (1.0 + confidence))
             replicates_needed = additional_replicates(next_interval, len(results), settings.max_probability)
             cases_per_replicate = self._runner.n_cases / len(results)
             additional = None if replicates_needed is None else math.ceil(replicates_needed * cases_per_replicate)
-        return self._finish(verdict, interval, results, subset_interval, effective, additional, reason)
+        return self._finish(verdict, interval, results, subset_interval, n_effective, additional, reason)
 
     def _finish(
         self,
@@ -237,7 +237,7 @@ class _Study:
         interval: ProbabilityInterval,
         results: Sequence[SubsetResult],
         subset_interval: ProbabilityInterval,
-        effective: float,
+        n_effective: float,
         additional: int | None,
         reason: str,
     ) -> RareResult:
@@ -255,7 +255,7 @@ class _Study:
             self._violations,
             replicates,
             subset_interval,
-            effective,
+            n_effective,
             additional,
             counting_cases,
             describe_margin(self._requirement),
@@ -285,11 +285,11 @@ class _Study:
         pending = {number: next(simulation) for number, simulation in simulations.items()}
         results: dict[int, SubsetResult] = {}
         while pending:
-            answers = self._evaluate(list(pending.values()))
+            evaluated_groups = self._evaluate(list(pending.values()))
             next_pending: dict[int, Proposals] = {}
-            for number, answer in zip(pending, answers, strict=True):
+            for number, evaluated in zip(pending, evaluated_groups, strict=True):
                 try:
-                    next_pending[number] = simulations[number].send(answer)
+                    next_pending[number] = simulations[number].send(evaluated)
                 except StopIteration as stop:
                     results[number] = stop.value
             pending = next_pending
@@ -313,16 +313,21 @@ class _Study:
             yield Evaluated(streams[start:end], margins[start:end])
 
     def _run_importance(self, results: Sequence[SubsetResult]) -> list[float]:
-        """Sample around the violations of the replicates; return the weight of each violation, 0 for other cases."""
+        """Sample cases around the violations of the replicates, from a fitted density.
+
+        Returns the importance weight of each case that is a violation, and 0 for each other case. The mean of these
+        numbers estimates the probability of a violation. The list is empty if there are too few violations to fit the
+        density.
+        """
         density = fit_density(np.concatenate([result.violations for result in results]))
         if density is None:
             return []
         case_count = self._settings.importance_cases
         coordinates, weights = density.draw(case_count, self._generator("importance sampling"))
-        contributions: list[float] = []
+        violation_weights: list[float] = []
         for first in range(0, case_count, _IMPORTANCE_BATCH):
             batch = slice(first, first + _IMPORTANCE_BATCH)
             proposal = Proposals(coordinates[batch], np.full(len(coordinates[batch]), NEW_STREAM))
             (evaluated,) = self._evaluate([proposal])
-            contributions += (weights[batch] * (evaluated.margins < 0.0)).tolist()
-        return contributions
+            violation_weights += (weights[batch] * (evaluated.margins < 0.0)).tolist()
+        return violation_weights

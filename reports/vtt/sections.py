@@ -1,5 +1,7 @@
 """Sections about visual target tracking: comparisons with the paper's tables and runs, and tracking by step size.
 
+A step is the motion of the rover from one image to the next: an angle, or a fraction of the distance to the target.
+
 The paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
@@ -171,7 +173,7 @@ def _create_mode_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndDat
 #: Comparison of the paper's single runs with the campaigns that repeat them.
 SINGLE_RUNS = PaperFacts(_PAPER_FILE, extra_parts={CHECKOUT_3: CustomBlocks(_create_mode_blocks)})
 
-#: Quantities of an update in the table: heading, suffix of the column, digits.
+#: Quantities of an update in the table: heading, suffix of the column `update_<number>_<suffix>`, digits.
 QUANTITIES: tuple[tuple[str, str, int], ...] = (
     ("Distance (m)", "range_m", 2), ("Magnification", "magnification", 2), ("Roll change (deg)", "roll_change_deg", 2),
     ("Azimuth change (deg)", "azimuth_change_deg", 2), ("NCC score", "match_score", 2),
@@ -186,9 +188,9 @@ def updates_section(subject: Subject) -> Section | None:
     updates = sorted(int(match[1]) for match in matches if match)
     if not is_tracking(frame) or not updates:
         return None
-    endings = [suffix for _, suffix, _ in QUANTITIES]
+    suffixes = [suffix for _, suffix, _ in QUANTITIES]
     values = {
-        update_number: {name: rates.finite_values(frame, f"update_{update_number}_{name}") for name in endings}
+        update_number: {name: rates.finite_values(frame, f"update_{update_number}_{name}") for name in suffixes}
         for update_number in updates
     }
     rows = [
@@ -231,7 +233,8 @@ def updates_section(subject: Subject) -> Section | None:
     return Section("updates", "Updates", title, blocks, {"updates": data})
 
 
-#: Columns by which the figure of steps is divided into lines; the first of them that varies is used.
+#: Columns that distinguish the lines of the figure of steps: tracker, or side of the search window. The first column
+#: that varies is used.
 _LINE_COLUMNS = ("algorithm", "search_px")
 _STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
 #: Edges of the classes of maximum obliquity, deg.
@@ -239,7 +242,10 @@ _OBLIQUITY_EDGES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
 
 def steps_section(subject: Subject) -> Section | None:
-    """Create the section on step sizes (Fig. 8, sections 5.2 and 5.3); None unless targets share the images."""
+    """Create the section on step sizes (Fig. 8, sections 5.2 and 5.3).
+
+    None unless the rows contain step sizes, and the drive is one leg of a motion in the paper.
+    """
     motion, steps = _read_motion(subject), step_rates(subject)
     if motion is None or not steps:
         return None
@@ -279,14 +285,18 @@ def steps_section(subject: Subject) -> Section | None:
 
 
 def _read_motion(subject: Subject) -> Mapping[str, Any] | None:
-    """Read the paper's numbers of the campaign's motion; None unless the drive has exactly one leg."""
+    """Read the paper's results for the motion of the drive; None unless it is one leg of a motion in the paper."""
     drive_legs = read_legs(subject)
     motions: Mapping[str, Mapping[str, Any]] = PAPER["steps"]
     return motions.get(str(drive_legs[0].get("motion", "approach"))) if len(drive_legs) == 1 else None
 
 
 def step_rates(subject: Subject) -> list[dict[str, Any]]:
-    """Compute the rates for every line (tracker or search window) and step size; `good`: of selectable targets."""
+    """Compute the rates of tracked targets for every line (tracker or search window) and step size.
+
+    - good, false_tracks: fractions of the selectable targets that are tracked, and that have a false track
+    - all_targets: fraction of all targets that are tracked
+    """
     frame, motion = subject.frame, _read_motion(subject)
     if motion is None or not is_tracking(frame) or "step" not in frame or "skipped_stops" not in frame:
         return []
@@ -295,14 +305,14 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
         paper = motion["paper"].get(line) or motion["paper"].get("", {})
         for _, step_rows in line_rows.groupby("skipped_stops"):
             step = float(step_rows["step"].iloc[0]) * (100.0 if motion["per_cent"] else 1.0)
-            good_rows = selectable_targets(step_rows)
+            selectable_rows = selectable_targets(step_rows)
             cells.append(
                 {
                     "line": line,
                     "step": step,
-                    "good": rates.flag_fraction(good_rows, "tracked"),
+                    "good": rates.flag_fraction(selectable_rows, "tracked"),
                     "all_targets": rates.flag_fraction(step_rows, "tracked"),
-                    "false_tracks": rates.flag_fraction(good_rows, "no_false_track", value=False),
+                    "false_tracks": rates.flag_fraction(selectable_rows, "no_false_track", value=False),
                     "paper_percent": next(
                         (percentage for size, percentage in paper.items() if abs(step - float(size)) < 0.5), None
                     ),
@@ -354,11 +364,11 @@ def terrains_section(subject: Subject) -> Section | None:
     rows, data = [], []
     for name in ordered_names:
         runs = frame[frame["incline"].eq(name)]
-        good_runs, slips = selectable_targets(runs), rates.finite_values(runs, "slip_max")
-        lost_runs = good_runs[~rates.flag_mask(good_runs, "tracked")]
+        selectable_runs, slips = selectable_targets(runs), rates.finite_values(runs, "slip_max")
+        lost_runs = selectable_runs[~rates.flag_mask(selectable_runs, "tracked")]
         cause_counts = dict(Counter(failure_cause(row) for _, row in lost_runs.iterrows()).most_common())
         failure_fraction, failure_fraction_all = (
-            rates.flag_fraction(group, "tracked", value=False) for group in (good_runs, runs)
+            rates.flag_fraction(group, "tracked", value=False) for group in (selectable_runs, runs)
         )
         slip = float(slips.max()) if slips.size else float("nan")
         row = printed_rows.get(name)

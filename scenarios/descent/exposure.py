@@ -1,4 +1,4 @@
-"""Rendered images of a descent: terrain and light, camera, dust haze, and the falling heat shield in the view."""
+"""Simulate the images of a descent: terrain, light, camera, dust haze, and a falling heat shield in view."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class World:
         return add_meshes(scene, self.meshes, (east_m, north_m))
 
 
-#: Path length to which the optical depth of the haze fault refers, m: about the height of the first image.
+#: Path length for which the fault `haze` states an optical depth, m: about the height of the first image.
 HAZE_PATH_M = 2000.0
 #: Diameter of MER's aeroshell (Desai & Knocke 2004), m.
 SHIELD_DIAMETER_M = 2.65
@@ -102,11 +102,15 @@ def take_exposures(
     detector: Detector,
     streams: Streams,
 ) -> Iterator[tuple[UInt16[np.ndarray, "rows columns"], Frame]]:
-    """Render and expose the images; yield detector counts and rendered frame of each, without delivery faults."""
+    """Render and expose the images; yield detector counts and rendered frame of each image.
+
+    Faults of the transmission (repeated or black images) are added later.
+    """
     first, last = states[0].position_m, states[-1].position_m
     first_ground_m, last_ground_m = (float(world.surface.height(east, north)) for east, north, _ in (first, last))
     scene = world.scene(float(first[0]), float(first[1]), float(last[2]) - last_ground_m, optics.rays.pixel_rad)
     clouds = draw_clouds(p.faults, first_ground_m, streams.generator("clouds"))
+    # a disc at the camera casts the vehicle's shadow
     scene = replace(scene, caster_diameter_m=p.lander.caster_diameter_m, clouds=clouds)
     # the camera is at the body's origin; its alignment error is a pure rotation, unknown to the lander
     alignment_deg = 0.0 if p.exact_instruments else p.camera.alignment_error_deg

@@ -140,7 +140,7 @@ def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: S
 STEP_DIAMETERS = 0.1
 #: Width of the margin of relief around the visible ground, in footprint diameters: touchdowns can lie outside it.
 MARGIN_DIAMETERS = 1.5
-#: Values of a hazard map: the footprint around the pixel's ground point is safe, unsafe, or partly out of view.
+#: True safety of the footprint around a pixel's ground point: safe, unsafe, or partly outside of an image.
 SAFE, UNSAFE, UNKNOWN = 0, 1, 255
 
 
@@ -185,8 +185,8 @@ class GroundTruth:
             pixels, in_front = image.camera.transform(state.world_from_body).project(points)
             with np.errstate(invalid="ignore"):
                 visible &= in_front & np.all((pixels >= 0.0) & (pixels <= np.array(image.camera.size) - 1.0), axis=1)
-        visible_radius = distance_transform_edt(np.pad(visible.reshape(heights.shape), 1))[1:-1, 1:-1] * step
-        covered = visible_radius >= 0.5 * limits.diameter_m
+        distance_to_invisible_m = distance_transform_edt(np.pad(visible.reshape(heights.shape), 1))[1:-1, 1:-1] * step
+        covered = distance_to_invisible_m >= 0.5 * limits.diameter_m
         return cls(relief, limits, positions, relief.footprints(positions, limits), covered, step)
 
     @property
@@ -205,8 +205,8 @@ class GroundTruth:
         unsafe = self.positions[~self.footprints.safe]
         return float(np.hypot(*(unsafe - position).T).min()) if len(unsafe) else float("inf")
 
-    def hazard_map(self, points: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns"]:
-        """Classify the footprint around each pixel's ground point by the nearest grid position."""
+    def classify_points(self, points: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns"]:
+        """Classify the footprint around each ground point (SAFE, UNSAFE, UNKNOWN) by the nearest grid position."""
         origin = self.positions[0, 0]
         axes = np.stack([self.positions[0, 1] - origin, self.positions[1, 0] - origin], axis=1)
         cells = np.linalg.solve(axes, (points[..., :2] - origin).reshape(-1, 2).T).T
@@ -214,11 +214,11 @@ class GroundTruth:
         columns, rows = np.rint(np.where(is_inside[:, None], cells, -1.0)).astype(np.int64).T
         shape = self.covered.shape
         is_inside &= (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
-        hazard = np.full(len(cells), UNKNOWN, dtype=np.uint8)
+        true_class = np.full(len(cells), UNKNOWN, dtype=np.uint8)
         indices = rows[is_inside], columns[is_inside]
-        site_class = np.where(self.footprints.safe[indices], SAFE, UNSAFE)
-        hazard[is_inside] = np.where(self.covered[indices], site_class, UNKNOWN)
-        return hazard.reshape(points.shape[:2])
+        footprint_class = np.where(self.footprints.safe[indices], SAFE, UNSAFE)
+        true_class[is_inside] = np.where(self.covered[indices], footprint_class, UNKNOWN)
+        return true_class.reshape(points.shape[:2])
 
     def footprint_at(self, position: Float[np.ndarray, "2"]) -> Footprints | None:
         """Compute slope and roughness under a lander at any position (x, y); None outside the relief."""
@@ -295,8 +295,8 @@ def count_hazards(ground: Ground, sampled: SampledMap, truth: GroundTruth) -> di
     - `footprints_*_safe`: number that the map classifies as safe
     - `footprints_*_unflagged`: number without a hazard cell, before the algorithm dilates the hazard cells
 
-    Over all classes, `footprints_called_safe` counts the footprints that the map classifies as safe, and
-    `footprints_called_safe_unsafe` those of them that are unsafe in truth.
+    `footprints_called_safe` is the number of all footprints that the map classifies as safe, and
+    `footprints_called_safe_unsafe` the number of these footprints that are truly unsafe.
 
     `gross_*` hazards have at least twice the roughness limit and a diameter of at least three cells. `false_alarms` are
     safe footprints with a hazard cell; `missed` are unsafe footprints without one.
@@ -334,8 +334,9 @@ def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: Groun
     """Compute the errors of the map's elevation and slope.
 
     The reference elevation is the mean of the exact heights in a cell, relative to the camera. `bias` is the mean
-    error, `rms` the RMS error. `noise` is the robust standard deviation of the errors about a fitted plane; it affects
-    roughness. `outliers` is the fraction of errors beyond five times `noise`.
+    error, `rms` the RMS error, `median_error` the median absolute error. `noise` is the robust standard deviation of
+    the errors about a fitted plane; it affects roughness. `outliers` is the fraction of errors about this plane beyond
+    five times `noise`. The result is empty for fewer than four cells with an elevation.
     """
     rows, columns = np.indices(ground.elevation.elevation_m.shape)
     local = ground.elevation.positions(np.stack([rows, columns], axis=-1).astype(np.float64))

@@ -68,7 +68,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 "sun_direction": case.world.sun.direction.tolist(),
                 "lander": p.lander.model_dump(mode="json"),
             }
-            hazard = case.truth.hazard_map(frame.points_world()[select_middle_rows(p.detector.rows_summed)])
+            hazard = case.truth.classify_points(frame.points_world()[select_middle_rows(p.detector.rows_summed)])
             yield pixel_sample(image.counts, frame, p.detector, image.camera, metadata, hazard)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:

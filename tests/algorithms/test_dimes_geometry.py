@@ -54,19 +54,18 @@ MAX_OFF_NADIR_RAD = OPTIONS.max_off_nadir_rad
 SUN_BELOW_HORIZON = direction(0.0, -1.0)  # no zero-phase spot on the ground
 
 
-def make_blank_view(
-    attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None
-) -> View:
-    pixels = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
+def make_view(attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None) -> View:
+    """Create a view of level ground; its image is uniform unless `counts` are given."""
+    image = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
     return build_view(
-        DetectorImage(pixels, time_s, CAMERA.bin(1, ROWS_SUMMED), make_calibration()), attitude, altitude_m, (256, 256)
+        DetectorImage(image, time_s, CAMERA.bin(1, ROWS_SUMMED), make_calibration()), attitude, altitude_m, (256, 256)
     )
 
 
 def make_views(
     first: Rotation, second: Rotation, altitudes: tuple[float, float] = (2000.0, 1719.0)
 ) -> tuple[View, View]:
-    return make_blank_view(first, altitudes[0]), make_blank_view(second, altitudes[1], INTERVAL_S)
+    return make_view(first, altitudes[0]), make_view(second, altitudes[1], INTERVAL_S)
 
 
 def find_candidates(first: View, second: View, sun: np.ndarray = SUN_BELOW_HORIZON) -> Candidates:
@@ -74,7 +73,7 @@ def find_candidates(first: View, second: View, sun: np.ndarray = SUN_BELOW_HORIZ
 
 
 def test_ground_and_pixel_projections_are_inverse() -> None:
-    view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
+    view = make_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     pixels = grid_pixels(view.size, 16)
     ground, is_within_limit = ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
     projections, visible = pixels_from_ground(view, ground)
@@ -84,7 +83,7 @@ def test_ground_and_pixel_projections_are_inverse() -> None:
 
 
 def test_distant_rays_are_clipped_at_the_off_nadir_limit() -> None:
-    view = make_blank_view(tilt_body(80.0, 0.0, 0.0), 1500.0)  # tilted: half of the image is sky
+    view = make_view(tilt_body(80.0, 0.0, 0.0), 1500.0)  # tilted: half of the image is sky
     pixels = border_pixels(view.size)
     ground, is_within_limit = ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
     _, directions = view.camera.rays(pixels)
@@ -175,7 +174,7 @@ def test_images_without_overlap_have_no_candidates(first: Rotation, second: Rota
 def test_zero_phase_pixel_is_at_the_lander_shadow() -> None:
     # The sun is in the east, 60 deg high: the shadow is in the west, at altitude / tan 60 from the nadir.
     sun = direction(np.radians(90.0), np.radians(60.0))
-    view = make_blank_view(tilt_body(10.0, 200.0, 30.0), 2000.0)
+    view = make_view(tilt_body(10.0, 200.0, 30.0), 2000.0)
     shadow = np.array([[-2000.0 / np.tan(np.radians(60.0)), 0.0]])
     # A direction and a ground point along it project to the same pixel, except for rounding at distances of 1e7 m.
     np.testing.assert_allclose(zero_phase_pixel(view, sun), pixels_from_ground(view, shadow)[0][0], atol=1e-3)
@@ -183,24 +182,25 @@ def test_zero_phase_pixel_is_at_the_lander_shadow() -> None:
 
 
 def test_templates_and_windows_avoid_zero_phase_spot() -> None:
+    """All templates are outside of the spot. A candidate is preferred if its whole search window is also outside."""
     radius = OPTIONS.zero_phase_radius_rad
     for azimuth in np.radians([0.0, 100.0, 230.0]):
         sun = direction(azimuth, np.radians(80.0))
         first, second = make_views(tilt_body(5.0, 30.0, 0.0), tilt_body(8.0, 60.0, 140.0))
         geometry = search_geometry(first, second, OPTIONS)
-        selectable = find_candidates(first, second, sun)
-        all_candidates = find_candidates(first, second)
-        assert 0 < len(selectable.pixels) < len(all_candidates.pixels)
-        assert 0 < selectable.preferred.sum() < len(selectable.pixels)
+        candidates = find_candidates(first, second, sun)
+        candidates_without_spot = find_candidates(first, second)
+        assert 0 < len(candidates.pixels) < len(candidates_without_spot.pixels)
+        assert 0 < candidates.preferred.sum() < len(candidates.pixels)
         for view in (first, second):
-            for ground, preferred in zip(selectable.ground, selectable.preferred, strict=True):
+            for ground, preferred in zip(candidates.ground, candidates.preferred, strict=True):
                 half = geometry.window_half_m if preferred and view is second else geometry.template_half_m
                 points = np.column_stack([ground + square_lattice(half, 25), np.zeros(625)]) - view.centre
                 cosines = points @ -sun / np.linalg.norm(points, axis=1)
                 # Between lattice points the spot may extend into the window by a fraction of a degree.
                 assert np.degrees(np.arccos(cosines.max())) > np.degrees(radius) - 0.6
-        selected, _ = select_templates(first, selectable, OPTIONS)
-        assert all(selectable.preferred[k] for k in selected)
+        selected, _ = select_templates(first, candidates, OPTIONS)
+        assert all(candidates.preferred[k] for k in selected)
 
 
 def test_grid_has_the_given_step_and_is_centred() -> None:
@@ -223,14 +223,14 @@ def test_candidates_with_highest_contrast_are_selected_with_min_spacing() -> Non
     assert best_candidates(np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=bool), 2, 31.0) == []
 
 
-def test_only_textured_area_is_selected() -> None:
+def test_first_selected_template_is_in_the_textured_area() -> None:
     counts = np.full((256, 1024), 1000, dtype=np.uint16)
     rng = np.random.default_rng(6)
     counts[140:170, 4 * 60 : 4 * 90] = np.repeat(rng.integers(700, 1300, (30, 30), dtype=np.uint16), 4, axis=1)
-    view = make_blank_view(Rotation.identity(), 2000.0, 0.0, counts)
+    view = make_view(Rotation.identity(), 2000.0, 0.0, counts)
     pixels = grid_pixels(view.size, OPTIONS.grid_step_px)
-    positions = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
-    selected_numbers, contrasts = select_templates(view, positions, OPTIONS)
+    candidates = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
+    selected_numbers, contrasts = select_templates(view, candidates, OPTIONS)
     np.testing.assert_allclose(pixels[selected_numbers[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
     assert contrasts[0] > 0.02
     assert contrasts[1] < 0.001
@@ -260,7 +260,7 @@ def test_ground_lattice_is_north_up() -> None:
 def test_rectified_patch_shows_its_lattice_positions(attitude: Rotation) -> None:
     position = np.array([700.0, -300.0, 1700.0])
     counts = expose_scene(trace_scene(make_wave_texture(), attitude, position), make_calibration(), level=1600.0)
-    view = make_blank_view(attitude, 1700.0, 0.0, counts)
+    view = make_view(attitude, 1700.0, 0.0, counts)
     centre, is_within_limit = ground_from_pixels(view, np.array([[150.0, 90.0]]), MAX_OFF_NADIR_RAD)
     assert is_within_limit[0]
     patch = rectify_patch(view, centre[0], 61, 5.5)
@@ -285,7 +285,7 @@ def _estimate_shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray
 
 
 def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
-    view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
+    view = make_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     lattice = ground_lattice(np.array([-150.0, 200.0]), 31, 5.5)
     exact_pixels, is_visible_exactly = pixels_from_ground(view, lattice)
     pixels, is_visible = homography_lattice(view, lattice)
@@ -303,6 +303,6 @@ def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
 
 
 def test_homography_of_an_invisible_corner_is_invisible() -> None:
-    view = make_blank_view(tilt_body(75.0, 0.0, 0.0), 1500.0)
+    view = make_view(tilt_body(75.0, 0.0, 0.0), 1500.0)
     _, is_visible = homography_lattice(view, ground_lattice(np.array([0.0, -40000.0]), 5, 5.5))
     assert not is_visible.any()

@@ -77,6 +77,9 @@ def test_equinox_sun_is_over_the_equator() -> None:
     """Equinox of 23 September 2002, 04:55 UT (United States Naval Observatory)."""
     sun = sun_direction(datetime(2002, 9, 23, 4, 55, tzinfo=UTC), 90.0, 0.0)
     assert np.degrees(np.arcsin(sun[2])) == pytest.approx(0.0, abs=0.01)
+
+
+def test_time_without_a_time_zone_is_rejected() -> None:
     with pytest.raises(ValueError, match="time zone"):
         sun_direction(datetime(2002, 9, 23), 0.0, 0.0)
 
@@ -207,8 +210,8 @@ def test_targets_are_detected_in_the_images_of_a_pass(run_index: int, monkeypatc
     assert np.all(np.sqrt(np.mean(errors[is_detected] ** 2, axis=0)) < [0.37, 0.25])
 
 
-def test_no_targets_are_detected_on_bare_ground() -> None:
-    """Spots of noise and a bright rock do not match the pattern of the targets."""
+def test_targets_are_detected_only_if_the_image_contains_them() -> None:
+    """Spots of noise and a bright rock on bare ground do not match the pattern of the targets."""
     rng = np.random.default_rng(3)
     camera = field_camera().bin(columns=1, rows=4)
     image = rng.normal(1000.0, 30.0, (256, 1024)).clip(0.0).astype(np.uint16)
@@ -237,8 +240,8 @@ def test_run_without_detected_targets_is_an_error(monkeypatch: pytest.MonkeyPatc
         make_ivanpah_run(targets={"images": 1})
 
 
-def test_elevation_model_has_the_error_of_its_class() -> None:
-    """Over flat ground the heights have the RMS error of the posts, 6 m. Interpolation reduces it slightly."""
+def test_elevation_model_has_the_specified_rms_error() -> None:
+    """Over flat ground the heights have the RMS error of the grid points, 6 m. Interpolation reduces it slightly."""
     flat_ground = Surface.from_samples(np.zeros((64, 64, 2), dtype=np.float32), 500.0)
     positions = np.random.default_rng(1).uniform(0.0, 30000.0, (4000, 2))
     elevation_model = simulate_elevation_model(ElevationParameters(), flat_ground, positions, np.random.default_rng(2))
@@ -268,7 +271,8 @@ def test_triples_match_their_category() -> None:
     assert counts == {Category.SHORT_TIME: 139, Category.SAME_DIRECTION: 66, Category.OPPOSITE_DIRECTION: 24}
 
 
-def test_case_order_contains_the_paper_triples_evenly() -> None:
+def test_first_cases_contain_the_runs_in_proportion_to_their_triples() -> None:
+    """Each image triple of the paper is one case."""
     parameters = make_parameters()
     order = case_order(parameters)
     assert len(order) == len(set(order)) == N_PAPER_TRIPLES

@@ -13,7 +13,8 @@ from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def _print_cache_folder(sources: Path, cache: Path, **environment: str) -> str:
+def _find_cache_folder(sources: Path, cache: Path, **environment: str) -> str:
+    """Return the folder that a new process selects for the kernels in `sources`."""
     base_environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     result = subprocess.run(
         [sys.executable, "-c", "import os, marsyard.sim; print(os.environ['NUMBA_CACHE_DIR'])"],
@@ -31,18 +32,19 @@ def _print_cache_folder(sources: Path, cache: Path, **environment: str) -> str:
 def test_changed_kernel_changes_the_cache_folder(kernels: str, tmp_path: Path) -> None:
     sources = tmp_path / "sources"
     shutil.copytree(ROOT / "marsyard", sources / "marsyard", ignore=shutil.ignore_patterns("__pycache__"))
-    original_folder = _print_cache_folder(sources, tmp_path / "cache")
-    assert _print_cache_folder(sources, tmp_path / "cache") == original_folder
+    original_folder = _find_cache_folder(sources, tmp_path / "cache")
+    assert _find_cache_folder(sources, tmp_path / "cache") == original_folder
     kernel_file = sources / "marsyard" / kernels
     kernel_file.write_text(kernel_file.read_text() + "\n# changed\n")
-    assert _print_cache_folder(sources, tmp_path / "cache") != original_folder
+    assert _find_cache_folder(sources, tmp_path / "cache") != original_folder
 
 
 def test_cache_folder_set_by_the_user_is_used(tmp_path: Path) -> None:
-    assert _print_cache_folder(ROOT, tmp_path, NUMBA_CACHE_DIR="/somewhere") == "/somewhere"
+    assert _find_cache_folder(ROOT, tmp_path, NUMBA_CACHE_DIR="/somewhere") == "/somewhere"
 
 
-def test_completed_runs_are_recorded_until_kernels_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_ready_only_for_marked_scenario_and_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Changed kernels have another folder, in which no scenario is marked."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "one"))
     assert not kernels_are_ready("descent")
     mark_ready("descent")
@@ -52,7 +54,7 @@ def test_completed_runs_are_recorded_until_kernels_change(tmp_path: Path, monkey
     assert not kernels_are_ready("descent")
 
 
-def test_runs_are_not_recorded_without_a_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_never_ready_without_a_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     mark_ready("descent")
     assert not kernels_are_ready("descent")

@@ -13,7 +13,7 @@ from marsyard.reports.verdicts import Status, evaluate_requirements
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, write_campaign
 from tests.campaigns.hostile_scenario import FAULTS
 
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")]
 
 TOP_LEVEL_KEYS = """
 name = "hostile"
@@ -41,8 +41,6 @@ REASONS = {
     "exits": "the worker process died: EXIT (3)",
     "list in a column": "column text contains a list",
 }
-
-pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,9 @@
-"""Tests of error budgets: contributions and Sobol indices of a known model, continuation, replay, report and errors."""
+"""Tests of error budgets: contributions and Sobol indices of a known model, continuation, replay, report and errors.
+
+The model (`tests.campaigns.studies.error_model`) has the error load + floor + gyro + radar, plus an optional
+interaction of gyro and radar. Gyro and radar are its error sources. By default the variances of load and floor are 1,
+that of gyro is 9 and that of radar is 4 * 4/3. The source `fan` has no effect, because the fan is off.
+"""
 
 from __future__ import annotations
 
@@ -50,32 +55,32 @@ def run_budget(path: Path, directory: Path, settings: BudgetSettings, *overrides
 
 def test_contributions_of_independent_errors_are_their_variances(campaign_path: Path, tmp_path: Path) -> None:
     result = run_budget(campaign_path, tmp_path / "run", SETTINGS)
-    contents = result.budget
-    assert contents is not None
+    error_budget = result.budget
+    assert error_budget is not None
     assert result.inactive == ("fan",)
-    contributions = {item.source: item for item in contents.contributions}
-    assert [item.source for item in contents.contributions] == ["gyro", "radar"]
+    contributions = {item.source: item for item in error_budget.contributions}
+    assert [item.source for item in error_budget.contributions] == ["gyro", "radar"]
     # the relative standard deviation of a mean square of 200 normal numbers is sqrt(2 / 200)
     assert contributions["gyro"].mean == pytest.approx(9.0, rel=0.3)
     assert contributions["radar"].mean == pytest.approx(4.0 * 4.0 / 3.0, rel=0.4)
-    # without any source: load and floor
-    assert contents.remaining == pytest.approx(2.0, rel=0.3)
+    # the sum of the variances of load and floor, which are not error sources
+    assert error_budget.remaining == pytest.approx(2.0, rel=0.3)
     for item in contributions.values():
         assert item.lower < item.mean < item.upper
-    assert contents.closure == pytest.approx(1.0, abs=1e-9)
-    assert (contents.common, result.violations, result.evaluated) == (200, 0, 200 * 6)
+    assert error_budget.closure == pytest.approx(1.0, abs=1e-9)
+    assert (error_budget.common, result.violations, result.evaluated) == (200, 0, 200 * 6)
 
 
-def test_intervals_contain_the_variances_at_their_confidence() -> None:
+def test_coverage_of_the_intervals_equals_their_confidence() -> None:
     rng = np.random.default_rng(2)
     sources = [ErrorSource("a", "a", ()), ErrorSource("b", "b", ())]
     hits = 0
     for _ in range(200):
         floor, a, b = rng.standard_normal((3, 100)) * [[1.0], [3.0], [2.0]]
         errors = np.array([floor + a + b, floor, floor + b, floor + a, floor + a, floor + b])
-        contents = compute_budget(errors, np.arange(100), sources, is_centred=False, confidence=0.9)
-        assert contents is not None
-        hits += sum(item.lower < {"a": 9.0, "b": 4.0}[item.source] < item.upper for item in contents.contributions)
+        error_budget = compute_budget(errors, np.arange(100), sources, is_centred=False, confidence=0.9)
+        assert error_budget is not None
+        hits += sum(item.lower < {"a": 9.0, "b": 4.0}[item.source] < item.upper for item in error_budget.contributions)
     # 400 intervals at 90 %; percentile intervals of a bootstrap with 100 cases are slightly short
     assert 0.85 <= hits / 400 <= 0.95
 

@@ -109,8 +109,8 @@ def test_span_between_images_is_interpolated() -> None:
 
 
 def test_many_image_case_is_deterministic() -> None:
-    parts: dict[str, Any] = {"images": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
-    first_case, repeated_case = run_descent(**parts), run_descent(**parts)
+    settings: dict[str, Any] = {"images": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
+    first_case, repeated_case = run_descent(**settings), run_descent(**settings)
     assert differing_columns(dict(first_case.row), dict(repeated_case.row)) == ()
 
 
@@ -133,7 +133,7 @@ def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("parts", "message"),
+    ("settings", "message"),
     [
         ({"images": 2}, "images is 2, but 'dimes' needs 3; allowed: 3 to 100"),
         ({"images": 1}, "greater than or equal to 2"),
@@ -145,9 +145,9 @@ def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_invalid_image_counts_are_rejected(parts: dict[str, Any], message: str) -> None:
+def test_invalid_image_counts_are_rejected(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        make_parameters(**parts)
+        make_parameters(**settings)
 
 
 @pytest.mark.parametrize(("images", "positions"), [(3, (0, 1, 2)), (4, (1, 2, 3)), (5, (0, 2, 4)), (10, (1, 5, 9))])

@@ -1,4 +1,4 @@
-"""Tests of the selection of an image pair against closed forms for level ground and straight flight."""
+"""Tests of the selection of an image pair against analytic solutions for level ground and straight flight."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def test_shortest_sufficient_baseline_has_max_overlap() -> None:
     assert choice.overlap == pytest.approx(1.0 - 2.0 / 8.0, abs=0.006)
 
 
-def test_insufficient_overlap_maximises_baseline_times_overlap() -> None:
-    """With the field width w, b (1 - b / w) is maximal at b = w / 2 = 4.0 m, if the required overlap allows it."""
+def test_product_of_baseline_and_overlap_is_maximal_without_baseline_limit() -> None:
+    """With the field width w, b (1 - b / w) is maximal at b = w / 2 = 4.0 m, where the overlap is one half."""
     choice = choose_pair(
         _make_poses(0.125), RANGES_M, CAMERA, PairParameters(max_baseline_fraction=1.0, min_overlap=0.1), HEIGHT_M
     )

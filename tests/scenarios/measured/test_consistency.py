@@ -1,4 +1,4 @@
-"""Tests of the epipolar residuals of matches for given camera poses, and of their summary row."""
+"""Tests of the offsets of matches from the epipolar curves of given camera poses, and of their summary in a row."""
 
 from __future__ import annotations
 
@@ -24,42 +24,47 @@ ROTATION = Rotation.from_euler("xyz", [3.0, -2.0, 20.0], degrees=True)
 
 
 @pytest.mark.parametrize("baseline_m", [0.0, 0.05, 40.0])
-def test_correct_poses_have_zero_residuals(baseline_m: float) -> None:
+def test_offsets_are_zero_for_correct_poses(baseline_m: float) -> None:
     rng = np.random.default_rng(1)
     second_camera = CAMERA.transform(rigid(ROTATION, baseline_m * np.array([1.0, 0.4, 0.1])))
     points = np.stack([rng.uniform(-30, 30, 400), rng.uniform(-25, 25, 400), -100.0 - rng.uniform(0, 50, 400)], axis=1)
     if baseline_m == 0.0:
-        points *= 1e4  # without a baseline the epipolar line is the point at infinity: use distant points
+        # without a baseline the epipolar curve is a single point, the image of infinity: use distant points
+        points *= 1e4
     first_px, second_px = CAMERA.project(points)[0], second_camera.project(points)[0]
     assert np.abs(epipolar_offsets_px(CAMERA, second_camera, first_px, second_px)).max() < 1e-5
 
 
-def test_offset_is_the_error_perpendicular_to_the_epipolar_line() -> None:
+def test_offset_is_perpendicular_to_the_epipolar_line() -> None:
     """A camera that moves along the x axis of its images has horizontal epipolar lines."""
     pinhole = Cahv(CAMERA.c, CAMERA.a, CAMERA.h, CAMERA.v, CAMERA.size)
     second_camera = pinhole.transform(rigid(Rotation.identity(), np.array([5.0, 0.0, 0.0])))
     points = np.array([[0.0, 0.0, -100.0], [10.0, -6.0, -120.0], [-4.0, 7.0, -90.0]])
     first_px, second_px = pinhole.project(points)[0], second_camera.project(points)[0]
-    perpendicular_errors = epipolar_offsets_px(pinhole, second_camera, first_px, second_px + np.array([0.0, 2.0]))
-    parallel_errors = epipolar_offsets_px(pinhole, second_camera, first_px, second_px + np.array([3.0, 0.0]))
+    offsets_after_perpendicular_shift = epipolar_offsets_px(
+        pinhole, second_camera, first_px, second_px + np.array([0.0, 2.0])
+    )
+    offsets_after_parallel_shift = epipolar_offsets_px(
+        pinhole, second_camera, first_px, second_px + np.array([3.0, 0.0])
+    )
     # Tolerance: the nearest point of the line is that with the smallest angular distance, not pixel distance.
-    assert np.allclose(perpendicular_errors, [0.0, 2.0], atol=0.05)
-    assert np.allclose(parallel_errors, 0.0, atol=1e-6)
+    assert np.allclose(offsets_after_perpendicular_shift, [0.0, 2.0], atol=0.05)
+    assert np.allclose(offsets_after_parallel_shift, 0.0, atol=1e-6)
     # The epipolar line ends at the image of an infinitely distant point; beyond this end, offsets are measured from it.
     infinity_px = second_camera.project(1e9 * pinhole.rays(first_px)[1])[0]
-    errors_beyond_infinity = epipolar_offsets_px(pinhole, second_camera, first_px, infinity_px + np.array([4.0, 0.0]))
-    assert np.allclose(errors_beyond_infinity, [4.0, 0.0], atol=0.05)
+    offsets_beyond_infinity = epipolar_offsets_px(pinhole, second_camera, first_px, infinity_px + np.array([4.0, 0.0]))
+    assert np.allclose(offsets_beyond_infinity, [4.0, 0.0], atol=0.05)
 
 
 def test_offsets_after_a_pure_rotation_are_measured_from_the_predicted_pixel() -> None:
     second_camera = CAMERA.transform(rigid(ROTATION, np.zeros(3)))
     first_px = np.array([[300.0, 200.0], [400.0, 260.0]])
     second_px = second_camera.project(1e3 * CAMERA.rays(first_px)[1])[0]
-    result = epipolar_offsets_px(CAMERA, second_camera, first_px, second_px + np.array([1.5, -2.0]))
-    assert np.allclose(result, [1.5, -2.0], atol=1e-4)
+    offsets = epipolar_offsets_px(CAMERA, second_camera, first_px, second_px + np.array([1.5, -2.0]))
+    assert np.allclose(offsets, [1.5, -2.0], atol=1e-4)
 
 
-def test_agreement_row_uses_inliers_only() -> None:
+def test_summary_row_uses_inliers_only() -> None:
     offsets = np.full((40, 2), [3.0, 4.0])
     is_inlier = np.arange(40) < 20
     offsets[~is_inlier] = 500.0

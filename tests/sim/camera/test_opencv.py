@@ -20,8 +20,6 @@ def sample_frame(camera: CameraModel) -> np.ndarray:
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
 
-# ----- from OpenCV -----
-
 MATRIX = np.array([[900.0, 0.0, 630.0], [0.0, 905.0, 350.0], [0.0, 0.0, 1.0]])
 POSE = RigidTransform.from_components([0.5, -1.0, 2.0], Rotation.from_rotvec([0.4, -0.2, 1.0]))
 

@@ -103,7 +103,7 @@ def test_rover_slides_downhill_across_a_slope(azimuth_rad: float) -> None:
 
 
 def test_slip_reduces_the_turn_angle() -> None:
-    """The default fraction of a lost turn is 0.03, plus half of the path fraction that the slope costs uphill."""
+    """The default lost fraction of a turn is 0.03, plus half of the path fraction lost uphill by the slope."""
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
     result = drive(
         MER, Plane(), Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _make_rng()
