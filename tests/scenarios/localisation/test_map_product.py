@@ -132,11 +132,10 @@ def test_map_equals_the_orthorectified_image_of_a_pinhole_camera(world: Localisa
     assert visible.all()
     expected = map_coordinates(frame.radiance.astype(np.float64), np.moveaxis(pixels[..., ::-1], -1, 0), order=3)
     difference = product.appearance - expected
-    print(np.sqrt(np.mean(difference**2)), product.appearance.std(), np.quantile(np.abs(difference), [0.5, 0.9, 0.99, 1.0]))
+    assert np.sqrt(np.mean(difference**2)) < 5e-3 * product.appearance.std()
     # displacement by least squares on the gradient of the image, map pixels
     gradient = np.stack([g.ravel() for g in np.gradient(expected)[::-1]], axis=-1)
     displacement = np.linalg.lstsq(gradient, -difference.ravel(), rcond=None)[0]
-    print(displacement)
     np.testing.assert_allclose(displacement, 0.0, atol=1e-3)
 
 
@@ -198,10 +197,13 @@ def test_noise_counts_and_elevation_errors_have_the_stated_size(world: Localisat
 def test_posts_smooth_the_elevation(world: LocalisationWorld) -> None:
     exact, _ = _make(world)
     posts, _ = _make(world, elevation_post_m=20.0)
-    difference = posts.elevation_m - exact.elevation_m
+    difference = (posts.elevation_m - exact.elevation_m).astype(np.float64)
     # relief within 20 m on slopes of about 6 deg with a Hurst exponent near 1
     assert 0.02 < difference.std() < 1.5
-    assert abs(difference.mean()) < 0.1
+    # symmetric smoothing: no horizontal displacement, pixels, beyond the regression's noise
+    gradient = np.stack([g.ravel() for g in np.gradient(exact.elevation_m)[::-1]] + [np.ones(SIDE_PX**2)], axis=-1)
+    displacement = np.linalg.lstsq(gradient, difference.ravel(), rcond=None)[0][:2]
+    np.testing.assert_allclose(displacement, 0.0, atol=0.05)
 
 
 def test_blur_has_the_transfer_at_the_nyquist_frequency() -> None:
