@@ -27,13 +27,13 @@ from marsyard.scenarios.views import SiteGround, micro_relief
 from marsyard.sim.frames import rigid
 from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.render import PixelRays, Scene, Sun, Texture, process_renderer
-from marsyard.sim.render.backend import Backend
+from marsyard.sim.render.backend import Backend, RenderingError
 from marsyard.sim.render.rays import VIEW_SIDES_PX
 from marsyard.sim.terrain import Surface
 
-#: Spacing of the mesh of first guesses, metres. Rays are nearly vertical: Newton's method converges from any guess
-#: within the terrain's relief.
-MESH_M = 40.0
+#: Spacing of the mesh of first guesses at the centre, metres, and its relative growth per line. Rays are nearly
+#: vertical: Newton's method converges from any guess within the terrain's relief.
+_MESH_M, _MESH_GROWTH = 40.0, 0.02
 #: Side of the view of first guesses, samples, and margin around the rays in it, as a fraction.
 _VIEW_SIDE_PX, _VIEW_MARGIN = VIEW_SIDES_PX[0], 0.03
 #: Quantile of the brightness that becomes the largest count of the map, and step between pixels for this quantile.
@@ -237,9 +237,10 @@ def _render(
     sun = sun_at(air, p.sun_azimuth_deg, p.sun_elevation_deg)
     orbiter = np.array([*centre_m, float(ground.surface.height(*centre_m)) + p.orbit_height_m])
     rays = orbital_rays(ground.surface, orbiter, east, north, p.pixel_m)
-    frame = process_renderer(backend).render(
-        _map_scene(ground, sun, centre_m, east, north), rays, rigid(Rotation.identity(), orbiter)
-    )
+    scene = _map_scene(ground, sun, centre_m, east, north, p.orbit_height_m)
+    frame = process_renderer(backend).render(scene, rays, rigid(Rotation.identity(), orbiter))
+    if not np.isfinite(frame.range_m).all():
+        raise RenderingError("the mesh of the orbital images does not cover the map")
     return add_haze(frame, air, sun, air.mean_extinction_m(p.orbit_height_m))
 
 
@@ -286,10 +287,13 @@ def _map_scene(
     centre_m: Float64[np.ndarray, "2"],
     east: Float64[np.ndarray, "rows columns"],
     north: Float64[np.ndarray, "rows columns"],
+    orbit_height_m: float,
 ) -> Scene:
     """Create the scene of the orbital images: the ground without rocks, which are smaller than a map pixel."""
     bounds = float(east.min()), float(east.max()), float(north.min()), float(north.max())
-    reach_m = max(abs(bound - centre_m[k // 2]) for k, bound in enumerate(bounds)) + 10.0 * MESH_M
+    # the renderer follows rays up to twice the reach of the mesh
+    reach_m = 0.55 * orbit_height_m
+    half_lines = int(np.arcsinh(reach_m / _MESH_M * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH)
     texture = ground.site.ground_texture
     return Scene(
         ground.surface,
@@ -298,8 +302,8 @@ def _map_scene(
         ground.photometry(sun),
         relief=micro_relief(ground),
         ground_texture=Texture(texture.coarsest_m, texture.amplitudes),
-        mesh_finest_m=MESH_M,
+        mesh_finest_m=_MESH_M,
         mesh_half_width_m=reach_m,
-        mesh_lines=2 * int(0.9 * reach_m / MESH_M) + 1,
+        mesh_lines=2 * half_lines + 1,
         visible_m=bounds,
     )
