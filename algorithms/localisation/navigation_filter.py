@@ -178,7 +178,9 @@ class NavigationFilter:
         """Update by an altitude above the ground below the body frame's origin.
 
         `ground_height` is the map's height at the estimated position with its slope (east, north), or a function that
-        returns both for a position (x, y), NaN outside the map. `sd_m` contains the map's error of elevation.
+        returns both for a position (x, y), NaN outside the map. `sd_m` contains the map's error of elevation. The slope
+        is extrapolated linearly to the true position: while the horizontal position is uncertain by more than the
+        slope's extent, use a slope of zero and the relief's standard deviation.
         """
         update = partial(
             updates.update_altitude,
