@@ -89,11 +89,7 @@ class _Search:
 
 
 def match_landmarks(
-    image: PosedImage,
-    landmarks: Landmarks,
-    map_product: MapProduct,
-    position_sd_m: Vector3,
-    options: LvsOptions,
+    image: PosedImage, landmarks: Landmarks, map_product: MapProduct, position_sd_m: Vector3, options: LvsOptions
 ) -> LandmarkMatches:
     """Match the landmarks of a map in one image; without enough consistent landmarks, the result has no match.
 
@@ -167,11 +163,7 @@ def _search_landmarks(
 
 
 def render_templates(
-    camera: CameraModel,
-    corners: Int[np.ndarray, "n 2"],
-    elevations_m: Vector,
-    map_product: MapProduct,
-    side: int,
+    camera: CameraModel, corners: Int[np.ndarray, "n 2"], elevations_m: Vector, map_product: MapProduct, side: int
 ) -> tuple[Float32[np.ndarray, "n side side"], Bool[np.ndarray, "n"]]:
     """Render squares of image pixels from the map; also return whether all their ground lies inside the map.
 

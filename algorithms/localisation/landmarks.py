@@ -55,9 +55,7 @@ def select_landmarks(map_product: MapProduct, options: LvsOptions) -> Landmarks:
     return Landmarks(points, values.astype(np.float64), levels, options.landmark_spacing_px * map_product.pixel_m)
 
 
-def _best_of_cells(
-    interest: Raster, side: int
-) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Vector]:
+def _best_of_cells(interest: Raster, side: int) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Vector]:
     """Rows, columns and values of the maxima of square cells; an incomplete cell at the border is left out."""
     cell_rows, cell_columns = interest.shape[0] // side, interest.shape[1] // side
     cells = interest[: cell_rows * side, : cell_columns * side].reshape(cell_rows, side, cell_columns, side)
@@ -86,7 +84,7 @@ def visible_landmarks(
     image: PosedImage,
     camera: CameraModel,
     ground_m: float,
-    border_px: float,
+    border_px: int,
     count: int,
     max_off_nadir_rad: float,
 ) -> tuple[Int[np.ndarray, "k"], Points2]:

@@ -27,8 +27,7 @@ def sample_raster(
 
 
 def sample_averages(
-    raster: Float32[np.ndarray, "rows columns"],
-    pixels: Float[np.ndarray, "patches n n 2"],
+    raster: Float32[np.ndarray, "rows columns"], pixels: Float[np.ndarray, "patches n n 2"]
 ) -> Float32[np.ndarray, "patches n n"]:
     """Average a raster over the cells of lattices of positions (column, row): four samples in each cell.
 

@@ -92,9 +92,7 @@ def fit_pose(
     return PoseFit(correction[:3], correction[3:], residuals, consistent)
 
 
-def _truncated_weights(
-    squares: Float[np.ndarray, "n"], limit2: float, mu: float
-) -> Float[np.ndarray, "n"]:
+def _truncated_weights(squares: Float[np.ndarray, "n"], limit2: float, mu: float) -> Float[np.ndarray, "n"]:
     """Weights of truncated least squares for the control parameter mu (Yang et al., Eq. 14)."""
     roots = np.sqrt(limit2 * mu * (mu + 1.0) / np.maximum(squares, np.finfo(np.float64).tiny)) - mu
     weights = np.where(squares <= mu / (mu + 1.0) * limit2, 1.0, roots)

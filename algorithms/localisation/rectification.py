@@ -81,9 +81,10 @@ def rectify_to_plane(view: GroundView, grid: MapProduct, max_off_nadir_rad: floa
     nodes = (np.ceil(high).astype(np.int64) - corner) // _NODE_STEP + 2
     columns, rows = corner[0] + _NODE_STEP * np.arange(nodes[0]), corner[1] + _NODE_STEP * np.arange(nodes[1])
     ground = np.zeros((len(rows), len(columns), 3))
-    ground[..., 0], ground[..., 1] = grid.origin_m[0] + grid.pixel_m * columns, (
-        grid.origin_m[1] + grid.pixel_m * rows
-    )[:, np.newaxis]
+    ground[..., 0], ground[..., 1] = (
+        grid.origin_m[0] + grid.pixel_m * columns,
+        (grid.origin_m[1] + grid.pixel_m * rows)[:, np.newaxis],
+    )
     pixels, visible = view.camera.project(ground)
     off_nadir = np.hypot(*np.moveaxis(ground[..., :2] - view.camera.c[:2], -1, 0))
     usable = visible & view.camera.in_frame(pixels) & (off_nadir <= reach)
@@ -111,11 +112,7 @@ def _average_cells(
 
 
 def rectify_patches(
-    view: GroundView,
-    grid: MapProduct,
-    corners: Float[np.ndarray, "n 2"],
-    side: int,
-    offset_m: Vector2,
+    view: GroundView, grid: MapProduct, corners: Float[np.ndarray, "n 2"], side: int, offset_m: Vector2
 ) -> tuple[Float32[np.ndarray, "n side side"], Bool[np.ndarray, "n"]]:
     """Resample squares of the map's grid from the image, at the map's elevation and the position plus `offset_m`.
 
