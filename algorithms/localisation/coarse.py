@@ -13,7 +13,7 @@ the estimated attitude and the altimeter's height, and correlated with the map a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import cv2
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from marsyard.algorithms.arrays import Flags, Points2, Raster, Vector, Vector2
-from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak
+from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, second_peak
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.algorithms.localisation.options import LvsOptions
@@ -43,6 +43,10 @@ _PATCH_SPACING = 0.75
 _FOOTPRINT_FRACTION = 0.4
 #: Minimum standard deviation of a patch relative to its mean: below it, only noise and rounding remain (assumed).
 _MIN_PATCH_CONTRAST = 1e-3
+
+
+#: Correlation over offsets (rows, columns).
+Surface = Float[np.ndarray, "_ _"]
 
 
 class CoarseRefusal(Enum):
@@ -79,8 +83,8 @@ class CoarseFix:
     """Horizontal offset of the true position from the estimated one, the same for all images.
 
     - offset_m: true minus estimated position (east, north)
-    - covariance: of the offset, m^2: the scatter of the patches, the attitude error that is common to them, and the map's
-      registration and distortion
+    - covariance: of the offset, m^2: the scatter of the patches, the attitude error that is common to them, and the
+      map's registration and distortion
     - matches: the patches' matches
     - support, second_support: sums of the scores of the consistent patches of the best and of the second candidate
     """
@@ -107,12 +111,17 @@ class _Patch:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Verified candidate: mean offset, and offset, score and consistency of each patch."""
+    """Verified candidate: mean offset, and offset, score and consistency of each patch.
+
+    - repetition: second-highest local maximum of the patches' mean correlation near the candidate, relative to the
+      maximum
+    """
 
     offset_m: Vector2
     offsets_m: Points2
     scores: Vector
     consistent: Flags
+    repetition: float = 0.0
 
     @property
     def count(self) -> int:
@@ -253,17 +262,27 @@ def _verify(
     )
     for half in (2 * tolerance, tolerance):
         offsets, scores = np.zeros((len(patches), 2)), np.full(len(patches), -1.0)
+        surfaces: list[Surface] = []
         for number, view in enumerate(views):
             rows = [k for k, patch in enumerate(patches) if patch.image == number]
             if rows:
-                members = [patches[k] for k in rows]
-                offsets[rows], scores[rows] = _match_near(
-                    candidate.offset_m, members, view, grid, appearance, half, options
-                )
+                members, near = [patches[k] for k in rows], candidate.offset_m
+                matches = _match_near(near, members, view, grid, appearance, half, options)
+                offsets[rows], scores[rows] = matches[:2]
+                surfaces += matches[2]
         candidate = _find_consensus(candidate.offset_m, offsets, scores, options)
         if not candidate.count:
-            break
-    return candidate
+            return candidate
+    return replace(candidate, repetition=_repetition(surfaces, options.relief_tolerance_m / grid.pixel_m))
+
+
+def _repetition(surfaces: Sequence[Surface], exclusion_px: float) -> float:
+    """Ratio of the second-highest local maximum of the mean of surfaces to the maximum; 0 without surfaces."""
+    if not surfaces:
+        return 0.0
+    mean = np.mean(surfaces, axis=0)
+    peak = highest_peak(mean)
+    return second_peak(mean, peak, exclusion_px) / peak.value if peak.value > 0.0 else 0.0
 
 
 def _match_near(
@@ -274,13 +293,17 @@ def _match_near(
     appearance: Raster,
     half: int,
     options: LvsOptions,
-) -> tuple[Points2, Vector]:
-    """Offsets (east, north) and scores of one image's patches near an offset; the score is -1 if there is no match."""
+) -> tuple[Points2, Vector, list[Surface]]:
+    """Offsets (east, north) and scores of one image's patches near an offset; the score is -1 if there is no match.
+
+    Also returns the surfaces of correlation that the map's border does not cut.
+    """
     shift = np.rint(offset_m / grid.pixel_m)
     corners = np.array([patch.corner for patch in patches]) + shift
     values, inside = rectify_patches(view, grid, corners, patches[0].side, offset_m)
     offsets, scores = np.zeros((len(patches), 2)), np.full(len(patches), -1.0)
     side = patches[0].side
+    surfaces: list[Surface] = []
     for k in np.flatnonzero(inside):
         template = _filter(values[k], options)
         column, row = (int(i) for i in corners[k])
@@ -290,12 +313,14 @@ def _match_near(
         )
         surface = cv2.matchTemplate(window, template.astype(np.float32), cv2.TM_CCOEFF_NORMED).astype(np.float64)
         peak = highest_peak(surface)
+        if surface.shape == (2 * half + 1, 2 * half + 1):
+            surfaces.append(surface)
         if peak.on_border or not np.isfinite(peak.value):
             continue
         found = np.array([peak.row, peak.column]) + biquadratic_offset(surface, peak)
         offsets[k] = offset_m + grid.pixel_m * np.array([low_column + found[1] - column, low_row + found[0] - row])
         scores[k] = peak.value
-    return offsets, scores
+    return offsets, scores, surfaces
 
 
 def _find_consensus(start_m: Vector2, offsets_m: Points2, scores: Vector, options: LvsOptions) -> _Candidate:
@@ -329,7 +354,7 @@ def _decide(
     # a candidate that moved to the same offset is no alternative
     others = [c.support for c, d in zip(ranked, distances, strict=True) if d > 2.0 * options.relief_tolerance_m]
     second = max(others, default=0.0)
-    if second > options.max_second_support * best.support:
+    if second > options.max_second_support * best.support or best.repetition > options.alternative_score:
         return CoarseRefusal.AMBIGUOUS
     if np.linalg.norm(best.offset_m) > radius * grid.pixel_m - options.relief_tolerance_m:
         return CoarseRefusal.BORDER

@@ -84,7 +84,7 @@ def visible_landmarks(
     image: PosedImage,
     camera: CameraModel,
     ground_m: float,
-    border_px: float,
+    border_px: int,
     count: int,
     max_off_nadir_rad: float,
 ) -> tuple[Int[np.ndarray, "k"], Points2]:

@@ -51,10 +51,9 @@ def map_from_fine(fine_appearance: np.ndarray, fine: int, elevation: np.ndarray)
 
 
 @cache
-def make_scene(seed: int = 1, size: int = 1536, relief_m: float = 80.0, contrast: float = 0.12) -> Scene:
+def make_scene(seed: int = 1, size: int = 1536, relief_m: float = 80.0, contrast: float = 0.12, fine: int = 2) -> Scene:
     """Terrain with texture of all scales down to 7.5 m, and relief of `relief_m` (standard deviation)."""
     rng = np.random.default_rng(seed)
-    fine = 2
     texture = random_field(fine * size, 1.2, rng, 8.0)
     elevation = relief_m * random_field(size, 2.5, rng, 2.0, max_frequency=0.04)
     appearance = (1.0 + contrast * texture).astype(np.float32)
@@ -100,10 +99,12 @@ def trace_image(
     origin = origins.reshape(-1, 3).mean(axis=0)  # the pupil moves by millimetres
     product = scene.map_product
     elevation = np.zeros(slopes.shape[1:], np.float32)
-    for _ in range(12):
+    for _ in range(20):
         x = (origin[0] + (elevation - origin[2]) * slopes[0] - product.origin_m[0]) / MAP_PIXEL_M
         y = (origin[1] + (elevation - origin[2]) * slopes[1] - product.origin_m[1]) / MAP_PIXEL_M
-        elevation = _sample(product.elevation_m, x, y)
+        previous, elevation = elevation, _sample(product.elevation_m, x, y)
+        if np.abs(elevation - previous).max() < 2e-3:
+            break
     f = scene.fine
     values = _sample(scene.fine_appearance, (x + 0.5) * f - 0.5, (y + 0.5) * f - 0.5)
     return np.asarray(cv2.resize(values, camera.size, interpolation=cv2.INTER_AREA))

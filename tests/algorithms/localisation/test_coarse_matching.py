@@ -1,0 +1,112 @@
+"""Coarse stage: offset of the position from large patches, and refusals, on ray-traced images of synthetic terrain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from marsyard.algorithms.localisation.coarse import CoarseFix, CoarseRefusal, find_coarse_position
+from marsyard.algorithms.localisation.interface import MapProduct
+from marsyard.algorithms.localisation.map_sampling import elevation_at
+from marsyard.algorithms.localisation.options import LvsOptions
+from marsyard.algorithms.localisation.posed_image import PosedImage
+from tests.algorithms.localisation.synthetic_map import (
+    MAP_PIXEL_M,
+    Scene,
+    make_camera,
+    make_image,
+    make_scene,
+    map_from_fine,
+)
+
+OPTIONS = LvsOptions()
+HEIGHTS_M = (3500.0, 3410.0, 3320.0)
+#: 3.5 standard deviations are more than the search radius of 3.2 km.
+SD_M = 1067.0
+OFFSET_M = np.array([2400.0, -1800.0])
+
+
+def make_images(scene: Scene) -> tuple[PosedImage, ...]:
+    """Three images one second apart, with exact poses."""
+    camera, images = make_camera(512), []
+    for k, height in enumerate(HEIGHTS_M):
+        position = np.array([130.0 + 30.0 * k, -210.0 + 20.0 * k, 0.0])
+        position[2] = elevation_at(scene.map_product, position[:2]) + height
+        attitude = Rotation.from_euler("zyx", [30 + 5 * k, 6 - 2 * k, -4], degrees=True)
+        images.append(make_image(scene, camera, position, attitude, time_s=float(k)))
+    return tuple(images)
+
+
+@cache
+def random_images() -> tuple[PosedImage, ...]:
+    return make_images(make_scene())
+
+
+def find(
+    images: tuple[PosedImage, ...], map_product: MapProduct, offset: np.ndarray, height_error_m: float = 0.0
+) -> CoarseFix | CoarseRefusal:
+    """Run the coarse stage with the position wrong by the offset, and the altitude (150 m) by less."""
+    error = np.array([-offset[0], -offset[1], 150.0])
+    wrong = [replace(image, position_m=image.position_m + error) for image in images]
+    return find_coarse_position(wrong, [h + height_error_m for h in HEIGHTS_M], map_product, SD_M, OPTIONS)
+
+
+def test_exact_images_determine_an_offset_of_three_kilometres() -> None:
+    fix = find(random_images(), make_scene().map_product, OFFSET_M)
+    assert isinstance(fix, CoarseFix)
+    # noise-free: a tenth of a coarse pixel; required: 100 m
+    np.testing.assert_allclose(fix.offset_m, OFFSET_M, atol=1.2)
+    assert fix.matches.consistent.sum() >= 14
+    assert fix.second_support == 0.0
+    np.testing.assert_allclose(fix.matches.map_m - fix.matches.predicted_m, np.tile(OFFSET_M, (15, 1)), atol=12.0)
+
+
+def test_errors_of_pose_altitude_radiometry_and_noise_stay_within_100_m() -> None:
+    rng = np.random.default_rng(3)
+    images = []
+    for image in random_images():
+        haze = np.linspace(0.3, 0.6, image.radiance.shape[1], dtype=np.float32)
+        seen = haze + 0.4 * image.radiance**1.5
+        noisy = (seen + seen.mean() / 40.0 * rng.standard_normal(seen.shape)).astype(np.float32)
+        attitude = Rotation.from_rotvec([2e-3, -3e-3, 5e-3]) * image.world_from_body
+        images.append(replace(image, radiance=noisy, world_from_body=attitude))
+    fix = find(tuple(images), make_scene().map_product, OFFSET_M, height_error_m=30.0)
+    assert isinstance(fix, CoarseFix)
+    error = fix.offset_m - OFFSET_M
+    # attitude errors of 3.6 mrad shift the ground by 12.6 m
+    assert np.hypot(*error) < 20.0
+    assert error @ np.linalg.solve(fix.covariance, error) < 13.8  # 99.9 % of chi-square with two degrees of freedom
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_an_unrelated_map_is_refused(seed: int) -> None:
+    assert find(random_images(), make_scene(seed=seed, fine=1).map_product, OFFSET_M) is CoarseRefusal.NO_CONSENSUS
+
+
+def make_dunes(period_m: float) -> Scene:
+    """Flat ground with crossed dunes."""
+    size = 1536
+    phase = 2.0 * np.pi * np.arange(size) * (MAP_PIXEL_M / period_m)
+    appearance = (1.0 + 0.1 * (np.sin(phase)[:, np.newaxis] + np.sin(0.97 * phase + 1.0))).astype(np.float32)
+    return Scene(appearance, 1, map_from_fine(appearance, 1, np.zeros((size, size), np.float32)))
+
+
+@pytest.mark.parametrize("period_m", [110.0, 400.0])
+def test_periodic_dunes_are_refused(period_m: float) -> None:
+    dunes = make_dunes(period_m)
+    result = find(make_images(dunes), dunes.map_product, OFFSET_M)
+    assert isinstance(result, CoarseRefusal)
+
+
+def test_uniform_ground_is_refused() -> None:
+    flat = np.ones_like(random_images()[0].radiance)
+    images = tuple(replace(image, radiance=flat) for image in random_images())
+    assert find(images, make_scene().map_product, OFFSET_M) is CoarseRefusal.TOO_FEW_PATCHES
+
+
+def test_an_offset_beyond_the_search_radius_is_refused() -> None:
+    assert isinstance(find(random_images(), make_scene().map_product, np.array([2800.0, 2200.0])), CoarseRefusal)
