@@ -150,8 +150,8 @@ MEMS = ImuParameters(
     accelerometer_count_m_s=0.0,
 )  # fmt: skip
 
-#: Radar altimeter: errors of the MER altimeter; a beam of 30 deg includes nadir at tilts up to 15 deg (assumed).
-RADAR = RadarParameters(rate_hz=2.0, beam_deg=30.0, max_range_m=8000.0)
+#: Radar altimeter: errors of the MER altimeter; a beam of 40 deg includes nadir at tilts up to 20 deg (assumed).
+RADAR = RadarParameters(rate_hz=2.0, beam_deg=40.0, max_range_m=8000.0)
 
 #: Clock of the image time tags, relative to the true time; that of the inertial unit is in `ImuParameters` (assumed).
 IMAGE_CLOCK = ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005)

@@ -142,7 +142,7 @@ def test_inertial_navigation_errors_have_the_predicted_size(flight: LanderFlight
         last = float(imu.boundaries(0.0, duration)[-1])
         errors[unit] = (_navigate(flight, increments) - flight.state(last).position_m)[:2]
     # 99.9 % interval of the sum of squares of 20 normal errors, and 10 % for the simplified theory
-    low, high = chi2.ppf([5e-4, 1.0 - 5e-4], errors.size)
+    low, high = (float(chi2.ppf(quantile, errors.size)) for quantile in (5e-4, 1.0 - 5e-4))
     square_sum = float(np.sum(errors**2)) / expected**2
     assert 0.8 * low < square_sum < 1.2 * high
 

@@ -138,7 +138,7 @@ def test_initial_errors_have_the_stated_covariance(flight: LanderFlight, horizon
     drawn, covariance = _draw_errors(errors, flight, count), errors.covariance()
     assert np.hypot(drawn[:, 0], drawn[:, 1]).max() < errors.horizontal_max_m
     whitened = np.linalg.solve(np.linalg.cholesky(covariance), drawn.T)
-    low, high = chi2.ppf([1e-5, 1.0 - 1e-5], count)
+    low, high = (float(chi2.ppf(quantile, count)) for quantile in (1e-5, 1.0 - 1e-5))
     squares = np.sum(whitened**2, axis=1)
     assert np.all((squares > low) & (squares < high))
     correlations = whitened @ whitened.T / count - np.diag(squares) / count
