@@ -112,8 +112,8 @@ class MapTruth:
 
     def distortion(self, map_m: Float[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
         """Return the displacement of map positions relative to the whole map, m."""
-        x, y = map_m[..., 0], map_m[..., 1]
-        return np.stack([self.distortion_x.at(x, y), self.distortion_y.at(x, y)], axis=-1)
+        x, y = np.atleast_1d(map_m[..., 0]), np.atleast_1d(map_m[..., 1])
+        return np.stack([self.distortion_x.at(x, y), self.distortion_y.at(x, y)], axis=-1).reshape(np.shape(map_m))
 
     def world_position(self, map_m: Float[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
         """Return the world x, y of the surface point that appears at a map position; an error of the map is

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt16
@@ -11,7 +12,7 @@ from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.answers import check_estimate
-from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
+from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionOutcome
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
@@ -21,7 +22,7 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation import score
 from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.instruments import draw_calibrated_camera, measure_altitudes, true_camera
-from marsyard.scenarios.localisation.map_product import MapParameters, MapTruth, make_map
+from marsyard.scenarios.localisation.map_product import MapTruth, make_map
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.stream import Event, StreamAnswers, feed, merge
 from marsyard.scenarios.localisation.task import LOCALISATION
@@ -93,10 +94,12 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
         return case_result(p.algorithms, evaluate, shared)
 
 
-def _check_answers(answers: object, span_s: tuple[float, float]) -> StreamAnswers:
+def _check_answers(answers: Any, span_s: tuple[float, float]) -> StreamAnswers:
     """Validate the answers of a stream. Raises AlgorithmError."""
-    assert isinstance(answers, StreamAnswers)
-    return replace(answers, estimates=tuple(check_estimate(answer, span_s) for answer in answers.estimates))
+    checked: StreamAnswers = replace(
+        answers, estimates=tuple(check_estimate(answer, span_s) for answer in answers.estimates)
+    )
+    return checked
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,7 @@ class LocalisedDescent:
     - states: true states at the images
     - images: delivered images
     - increments: measured inertial increments of the whole descent
+    - imu_offset_s: time tags of the inertial unit minus true times, without jitter
     """
 
     p: LocalisationScenarioParameters
@@ -124,6 +128,7 @@ class LocalisedDescent:
     map_truth: MapTruth
     images: tuple[DetectorImage, ...]
     increments: ImuIncrements
+    imu_offset_s: float
     measurements: LocalisationMeasurements
 
     @classmethod
@@ -145,16 +150,11 @@ class LocalisedDescent:
         times = p.images.times(0.0, flight.end_s)
         states = tuple(flight.motion(times).state(row) for row in range(times.size))
         images = _take_images(p, world, states, streams)
-        increments, initial = _measure_inertially(p, flight, float(times[-1]), gravity, streams)
+        increments, initial, offset_s = _measure_inertially(p, flight, float(times[-1]), gravity, streams)
         altitudes = _measure_altitudes(p, world, flight, float(times[-1]), streams)
         events = merge(increments, altitudes, images)
         measurements = LocalisationMeasurements(initial, map_product, tuple(events))
-        return cls(p, world, flight, states, map_truth, tuple(images), increments, measurements)
-
-    @property
-    def map(self) -> MapParameters:
-        """Parameters of the map."""
-        return self.p.map
+        return cls(p, world, flight, states, map_truth, tuple(images), increments, offset_s, measurements)
 
 
 def _create_world(p: LocalisationScenarioParameters, number: int) -> LocalisationWorld:
@@ -212,8 +212,8 @@ def _take_images(
 
 def _measure_inertially(
     p: LocalisationScenarioParameters, flight: LanderFlight, last_s: float, gravity_m_s2: float, streams: Streams
-) -> tuple[ImuIncrements, InitialState]:
-    """Measure the inertial increments of the descent, and draw the state at their beginning."""
+) -> tuple[ImuIncrements, InitialState, float]:
+    """Measure the inertial increments, draw the state at their beginning, and return the offset of their time tags."""
     start_s, end_s = -LEAD_S, last_s + MARGIN_S
     imu = Imu.draw(p.imu, (start_s, end_s), streams.generator("imu"))
     if p.exact_instruments:
@@ -226,9 +226,11 @@ def _measure_inertially(
     initial = p.initial.draw(truth, float(increments.times_s[0]), gravity_m_s2, rng)
     azimuth = rng.uniform(-np.pi, np.pi)
     if p.exact_instruments:
-        return increments, replace(initial, world_from_body=truth.attitude, velocity_m_s=truth.velocity_m_s)
+        exact = replace(initial, world_from_body=truth.attitude, velocity_m_s=truth.velocity_m_s)
+        return increments, exact, 0.0
     tilt = np.radians(p.faults.attitude_error_deg) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    return increments, replace(initial, world_from_body=Rotation.from_rotvec(tilt) * initial.world_from_body)
+    tilted = Rotation.from_rotvec(tilt) * initial.world_from_body
+    return increments, replace(initial, world_from_body=tilted), imu.clock.offset_s
 
 
 def _measure_altitudes(
@@ -244,8 +246,3 @@ def _measure_altitudes(
         return [AltitudeMeasurement(float(height), float(tag)) for height, tag in zip(heights, times, strict=True)]
     factor = 1.0 + p.faults.altitude_error
     return [AltitudeMeasurement(factor * reading.altitude_m, reading.time_s) for reading in readings]
-
-
-def final_estimate(answers: StreamAnswers) -> PositionEstimate:
-    """Return the final estimate of a stream."""
-    return answers.estimates[-1]

@@ -39,6 +39,7 @@ REQUIRED_M, REQUIRED_S = 40.0, 10.0
 #: Side of the stored map, pixels.
 _THUMBNAIL_PX = 512
 _NAN = float("nan")
+_AXES = ("east", "north", "up")
 
 
 def conditions(descent: LocalisedDescent) -> dict[str, Scalar]:
@@ -104,11 +105,14 @@ class EstimateErrors:
 
     @classmethod
     def from_estimate(cls, estimate: PositionEstimate, truth: State, map_truth: MapTruth) -> EstimateErrors:
-        """Compute the errors of a valid estimate from the true state at its time tag."""
-        assert estimate.position_m is not None
-        assert estimate.velocity_m_s is not None
-        assert estimate.world_from_body is not None
-        assert estimate.covariance is not None
+        """Compute the errors of a valid estimate from the true state at its time. Raises ValueError for a refusal."""
+        if (
+            estimate.position_m is None
+            or estimate.velocity_m_s is None
+            or estimate.world_from_body is None
+            or estimate.covariance is None
+        ):
+            raise ValueError(f"the estimate is {estimate.outcome.name}; allowed: VALID")
         reference = np.append(map_truth.map_position(truth.position_m[:2]), truth.position_m[2])
         error = estimate.position_m - reference
         horizontal = estimate.covariance[:2, :2]
@@ -128,7 +132,9 @@ def compute_errors(descent: LocalisedDescent, answers: StreamAnswers) -> list[Es
     first, last = descent.flight.span_s
     return [
         EstimateErrors.from_estimate(
-            estimate, descent.flight.state(float(np.clip(estimate.time_s, first, last))), descent.map_truth
+            estimate,
+            descent.flight.state(float(np.clip(estimate.time_s - descent.imu_offset_s, first, last))),
+            descent.map_truth,
         )
         if estimate.outcome is PositionOutcome.VALID
         else None
@@ -165,9 +171,7 @@ def answer_row(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, S
 def _final_columns(error: EstimateErrors | None) -> dict[str, Scalar]:
     """Return components and consistency of the final error; NaN without a valid estimate."""
     if error is None:
-        names = ("east", "north", "up")
-        row: dict[str, Scalar] = {f"position_error_{name}_m": _NAN for name in names}
-        row |= {f"position_sd_{name}_m": _NAN for name in names}
+        row: dict[str, Scalar] = {f"position_{kind}_{name}_m": _NAN for name in _AXES for kind in ("error", "sd")}
         return row | dict.fromkeys(
             ("position_error_world_m", "velocity_error_m_s", "attitude_error_deg", "position_nees"), _NAN
         )
