@@ -381,7 +381,7 @@ def test_estimates_are_consistent(truth: Descent, exact: ImuIncrements) -> None:
     for block in (slice(0, 3), slice(3, 6), slice(6, 9), slice(0, 9)):
         size = block.stop - block.start
         nees = sum([float(error[block] @ np.linalg.solve(cov[block, block], error[block])) for error, cov in results])
-        low, high = chi2.ppf([0.005, 0.995], size * runs) / (size * runs)
+        low, high = np.asarray(chi2.ppf([0.005, 0.995], size * runs)) / (size * runs)
         print(f"NEES {block.start}-{block.stop}: {nees / size / runs:.3f} (99 %: {low:.3f} to {high:.3f})")
         assert low < nees / (size * runs) < high
     print("rms of position, m:", np.sqrt(np.mean(np.array([error[:3] for error, _ in results]) ** 2, axis=0)))
