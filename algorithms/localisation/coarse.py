@@ -156,18 +156,13 @@ def find_coarse_position(
         patches += _select_patches(rectified, grid, number, options)
     if len(patches) < options.min_consistent_patches:
         return CoarseRefusal.TOO_FEW_PATCHES
-    appearance = _filter(grid.appearance, options)
+    # differences from the mean keep the precision of float32 sums
+    appearance = grid.appearance - grid.appearance.mean()
     radius = int(np.ceil(min(options.search_radius_m, options.search_sigmas * sd_m) / grid.pixel_m))
     surfaces = np.stack([_correlate(patch, appearance, radius) for patch in patches])
     peaks = _candidate_offsets(surfaces, radius, grid.pixel_m, options)
     candidates = [_verify(peak, patches, views, grid, appearance, options) for peak in peaks]
     return _decide(candidates, patches, views, grid, radius, options)
-
-
-def _filter(raster: Raster, options: LvsOptions) -> Raster:
-    """Subtract the mean, or the local mean if the option is set."""
-    side = options.coarse_high_pass_px
-    return np.asarray(raster - (cv2.blur(raster, (side, side)) if side else raster.mean()))
 
 
 def _select_patches(rectified: RectifiedImage, grid: MapProduct, number: int, options: LvsOptions) -> list[_Patch]:
@@ -179,7 +174,7 @@ def _select_patches(rectified: RectifiedImage, grid: MapProduct, number: int, op
     mean = float(rectified.values[rectified.valid].mean())
     if not mean > 0.0:
         return []
-    values = _filter(np.where(rectified.valid, rectified.values, np.float32(mean)), options)
+    values = np.where(rectified.valid, rectified.values - np.float32(mean), np.float32(0.0))
     interest = harris_interest(*structure_tensor(values, _CONTRAST_SUPPORT_PX))
     contrasts = cv2.boxFilter(interest.astype(np.float32), cv2.CV_32F, (side, side), anchor=(0, 0))
     filled = cv2.boxFilter(rectified.valid.astype(np.float32), cv2.CV_32F, (side, side), anchor=(0, 0)) > 0.9999
@@ -305,7 +300,7 @@ def _match_near(
     side = patches[0].side
     surfaces: list[Surface] = []
     for k in np.flatnonzero(inside):
-        template = _filter(values[k], options)
+        template = values[k] - values[k].mean()
         column, row = (int(i) for i in corners[k])
         low_column, low_row = max(column - half, 0), max(row - half, 0)
         window = np.ascontiguousarray(

@@ -58,8 +58,8 @@ def select_landmarks(map_product: MapProduct, options: LvsOptions) -> Landmarks:
 def _best_of_cells(interest: Raster, side: int) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Vector]:
     """Rows, columns and values of the maxima of square cells; an incomplete cell at the border is left out."""
     cell_rows, cell_columns = interest.shape[0] // side, interest.shape[1] // side
-    cells = interest[: cell_rows * side, : cell_columns * side].reshape(cell_rows, side, cell_columns, side)
-    cells = np.ascontiguousarray(cells.swapaxes(1, 2)).reshape(cell_rows * cell_columns, side * side)
+    blocks = interest[: cell_rows * side, : cell_columns * side].reshape(cell_rows, side, cell_columns, side)
+    cells = np.ascontiguousarray(blocks.swapaxes(1, 2)).reshape(cell_rows * cell_columns, side * side)
     best = cells.argmax(axis=1)
     index = np.arange(len(cells))
     rows = index // cell_columns * side + best // side

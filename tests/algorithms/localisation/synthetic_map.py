@@ -12,6 +12,7 @@ from functools import cache
 import cv2
 import numpy as np
 from scipy import fft
+from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import MapProduct
@@ -31,8 +32,10 @@ class Scene:
     map_product: MapProduct
 
 
-def random_field(size: int, slope: float, rng: np.random.Generator, low_cycles: float, max_frequency: float = 0.4):
-    """Random field with amplitudes proportional to frequency**-slope, standard deviation 1, not periodic at the cut."""
+def random_field(
+    size: int, slope: float, rng: np.random.Generator, low_cycles: float, max_frequency: float = 0.4
+) -> np.ndarray:
+    """Random field with amplitudes proportional to frequency**-slope, standard deviation 1."""
     n = fft.next_fast_len(size, real=True)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(n), fft.rfftfreq(n), indexing="ij")).astype(np.float32)
     amplitude = np.zeros_like(frequency)
@@ -74,10 +77,10 @@ def make_camera(pixels: int) -> Cahvore:
     return Cahvore.from_cahv(pinhole, (0.0, 0.01, -0.005), (0.001, 0.0, 0.0), linearity=0.0)
 
 
-def _refine(pixels: np.ndarray, samples: int) -> np.ndarray:
+def _refine(size: tuple[int, int], samples: int) -> np.ndarray:
     """Centres of `samples` x `samples` squares in each pixel."""
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
-    columns, rows = pixels
+    columns, rows = size
     u, v = np.arange(columns)[:, None] + offsets, np.arange(rows)[:, None] + offsets
     return np.stack(np.meshgrid(u.ravel(), v.ravel()), axis=-1)
 
@@ -111,8 +114,6 @@ def trace_image(
 
 
 def _interpolate(values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    from scipy.interpolate import RectBivariateSpline
-
     spline = RectBivariateSpline(np.arange(values.shape[0]), np.arange(values.shape[1]), values)
     return np.asarray(spline(rows, columns))
 
