@@ -91,7 +91,7 @@ class MapParameters(Parameters):
         Positive, Field(description="correlation length of the elevation error, m; assumed")
     ] = 300.0
     elevation_post_m: Annotated[
-        NonNegative, Field(description="distance of the elevation model's posts, m; 0: exact elevation in each pixel")
+        NonNegative, Field(description="distance of the elevation model's posts, m; assumed; 0: exact in each pixel")
     ] = 20.0
 
 
