@@ -68,7 +68,8 @@ class LocalisationWorld:
         One scene serves a whole descent; `height_m` is then the height of the last image. The mesh only gives first
         guesses of the ground, which are refined on the exact surface. A mesh that is too coarse changes pixels at the
         edges of hidden slopes: over the highland 0.2 % of the pixels of an image 500 m above the ground with a mesh
-        for 2000 m. A mesh for 500 m takes a third more time per image at 4200 m than one for 4200 m. The terrain repeats beyond its period.
+        for 2000 m. A mesh for 500 m takes a third more time per image at 4200 m than one for 4200 m. The
+        terrain repeats beyond its period.
 
         - east_m, north_m: position about which the mesh is dense, such as that below the last image
         - height_m: height above the ground of the lowest image
