@@ -10,12 +10,13 @@ from numpy.random import Generator
 from scipy.interpolate import BSpline
 from scipy.ndimage import map_coordinates
 from scipy.signal import oaconvolve
+from scipy.sparse import csr_array
 
 #: Control points per correlation length.
 POINTS_PER_LENGTH = 4
 #: Extent of the smoothing kernel on each side, standard deviations.
 _KERNEL_EXTENT = 4.0
-#: A cubic B-spline's values at a knot, from the three control values there; the variance of the B-spline, knots squared.
+#: A cubic B-spline's values at a knot, from the three control values there; its variance, knots squared.
 _SPLINE_AT_KNOTS, _SPLINE_VARIANCE = np.array([1.0, 4.0, 1.0]) / 6.0, 1.0 / 3.0
 
 
@@ -68,7 +69,7 @@ class SmoothField:
         return np.asarray(along_y @ (along_x @ self.control.T).T)
 
 
-def _spline_matrix(positions: Float[np.ndarray, "n"], count: int) -> BSpline:
+def _spline_matrix(positions: Float[np.ndarray, "n"], count: int) -> csr_array:
     """Return the sparse matrix of B-spline weights, (n, count), of positions in control points."""
     # basis function k of these knots is centred at k
     return BSpline.design_matrix(positions, np.arange(-2.0, count + 2.0), 3)

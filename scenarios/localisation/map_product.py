@@ -26,8 +26,9 @@ from marsyard.scenarios.localisation.world import LocalisationWorld, sun_at
 from marsyard.scenarios.views import SiteGround, micro_relief
 from marsyard.sim.frames import rigid
 from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
-from marsyard.sim.render import PixelRays, Scene, Sun, Texture, process_renderer
+from marsyard.sim.render import Frame, PixelRays, Scene, Sun, Texture, process_renderer
 from marsyard.sim.render.backend import Backend, RenderingError
+from marsyard.sim.render.kernels.shading import GROUND
 from marsyard.sim.render.rays import VIEW_SIDES_PX
 from marsyard.sim.terrain import Surface
 
@@ -38,8 +39,8 @@ _MESH_M, _MESH_GROWTH = 40.0, 0.02
 _VIEW_SIDE_PX, _VIEW_MARGIN = VIEW_SIDES_PX[0], 0.03
 #: Quantile of the brightness that becomes the largest count of the map, and step between pixels for this quantile.
 _WHITE_QUANTILE, _QUANTILE_STEP = 0.999, 4
-#: Rows of a block for the computation of rays; it limits the memory.
-_BLOCK_ROWS = 128
+#: Rows of a block for the computation of rays, and of a band for rendering; they limit the memory.
+_BLOCK_ROWS, _BAND_ROWS = 128, 512
 #: Margin of error fields around the map, m: positions near its border can be inverted.
 _FIELD_MARGIN_M = 500.0
 #: Fixed-point iterations of `MapTruth.map_position`.
@@ -90,7 +91,7 @@ class MapParameters(Parameters):
         Positive, Field(description="correlation length of the elevation error, m; assumed")
     ] = 300.0
     elevation_post_m: Annotated[
-        NonNegative, Field(description="distance of the elevation model's posts, m; 0: exact elevation in each pixel")
+        NonNegative, Field(description="distance of the elevation model's posts, m; assumed; 0: exact in each pixel")
     ] = 20.0
 
 
@@ -116,8 +117,9 @@ class MapTruth:
         return np.stack([self.distortion_x.at(x, y), self.distortion_y.at(x, y)], axis=-1).reshape(np.shape(map_m))
 
     def world_position(self, map_m: Float[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
-        """Return the world x, y of the surface point that appears at a map position; an error of the map is
-        ``map_m - world_position(map_m)``.
+        """Return the world x, y of the surface point that appears at a map position.
+
+        The position error of the map is ``map_m - world_position(map_m)``.
         """
         return np.asarray(map_m - self.shift_m - self.distortion(map_m))
 
@@ -156,8 +158,10 @@ def make_map(
     elevation_error = SmoothField.draw(*extent, p.elevation_sd_m, p.elevation_length_m, rng)
     truth = MapTruth(shift, distortion_x, distortion_y, elevation_error, 1.0)
 
-    east, north = _world_grid(truth, x, y)
-    appearance = _render(world.ground, p, np.asarray(centre_m, dtype=np.float64), east, north, backend)
+    elevation = _elevation(world.surface, p, truth, x, y)
+    elevation += elevation_error.on_grid(x, y)
+    elevation = elevation.astype(np.float32)
+    appearance = _render(world.ground, p, np.asarray(centre_m, dtype=np.float64), truth, (x, y), backend)
     appearance = blur(appearance, p.nyquist_mtf)
     noise = rng.standard_normal(appearance.shape, dtype=np.float32)
     appearance += noise * np.float32(appearance.mean(dtype=np.float64) / p.signal_to_noise)
@@ -167,10 +171,9 @@ def make_map(
         truth = replace(truth, counts_per_radiance=top / float(white))
         appearance = np.clip(np.rint(appearance * np.float32(truth.counts_per_radiance)), 0.0, top)
 
-    elevation = _elevation(world.surface, p, truth, x, y, (east, north)) + elevation_error.on_grid(x, y)
     product = MapProduct(
         appearance=appearance.astype(np.float32, copy=False),
-        elevation_m=elevation.astype(np.float32),
+        elevation_m=elevation,
         origin_m=origin,
         pixel_m=p.pixel_m,
         registration_sd_m=p.registration_sd_m,
@@ -201,19 +204,14 @@ def _world_grid(
 
 
 def _elevation(
-    surface: Surface,
-    p: MapParameters,
-    truth: MapTruth,
-    x: Coordinates,
-    y: Coordinates,
-    world_grid: tuple[Float64[np.ndarray, "rows columns"], Float64[np.ndarray, "rows columns"]],
+    surface: Surface, p: MapParameters, truth: MapTruth, x: Coordinates, y: Coordinates
 ) -> Float64[np.ndarray, "rows columns"]:
     """Return the elevation of the map's pixels: exact, or interpolated by cubic splines between posts.
 
     A post has the height of the terrain level with the next smaller spacing: stereo correlation averages over a post.
     """
     if p.elevation_post_m == 0.0:
-        return surface.height(*world_grid)
+        return surface.height(*_world_grid(truth, x, y))
     level = int(np.clip(np.log2(p.elevation_post_m / surface.spacing_m), 0, len(surface.levels) - 1))
     posts_x, posts_y = (
         np.arange(line[0] - 2.0 * p.elevation_post_m, line[-1] + 3.0 * p.elevation_post_m, p.elevation_post_m)
@@ -227,21 +225,47 @@ def _render(
     ground: SiteGround,
     p: MapParameters,
     centre_m: Float64[np.ndarray, "2"],
-    east: Float64[np.ndarray, "rows columns"],
-    north: Float64[np.ndarray, "rows columns"],
+    truth: MapTruth,
+    map_axes: tuple[Coordinates, Coordinates],
     backend: Backend,
 ) -> Grid:
-    """Compute the radiance factor at the orbiter of the surface points at world x, y."""
+    """Compute the radiance factor at the orbiter of the surface points that appear on the grid of map positions."""
     ground = replace(ground, site=ground.site.with_dust(p.optical_depth))
     air = ground.site.environment
     sun = sun_at(air, p.sun_azimuth_deg, p.sun_elevation_deg)
     orbiter = np.array([*centre_m, float(ground.surface.height(*centre_m)) + p.orbit_height_m])
+    east, north = _world_grid(truth, *map_axes)
     rays = orbital_rays(ground.surface, orbiter, east, north, p.pixel_m)
     scene = _map_scene(ground, sun, centre_m, east, north, p.orbit_height_m)
-    frame = process_renderer(backend).render(scene, rays, rigid(Rotation.identity(), orbiter))
-    if not np.isfinite(frame.range_m).all():
+    del east, north  # memory
+    pose = rigid(Rotation.identity(), orbiter)
+    columns, rows = rays.size
+    radiance, range_m = np.empty((rows, columns), dtype=np.float32), np.empty((rows, columns))
+    for first in range(0, rows, _BAND_ROWS):
+        band = slice(first, min(first + _BAND_ROWS, rows))
+        part = process_renderer(backend).render(scene, _select_rows(rays, band), pose)
+        radiance[band], range_m[band] = part.radiance, part.range_m
+    if not np.isfinite(range_m).all():
         raise RenderingError("the mesh of the orbital images does not cover the map")
+    # the haze depends on the mean radiance of the whole map
+    body = np.broadcast_to(np.int32(GROUND), range_m.shape)
+    normal = np.broadcast_to(np.zeros(3, dtype=np.float32), (rows, columns, 3))
+    frame = Frame(radiance, range_m, body, normal, pose, rays)
     return add_haze(frame, air, sun, air.mean_extinction_m(p.orbit_height_m))
+
+
+def _select_rows(rays: PixelRays, rows: slice) -> PixelRays:
+    """Return the rays of some rows of an image with a single view."""
+    columns = rays.size[0]
+    pixels = slice(rows.start * columns, rows.stop * columns)
+    return replace(
+        rays,
+        origins=rays.origins[pixels],
+        directions=rays.directions[pixels],
+        size=(columns, rows.stop - rows.start),
+        pixel_angles=rays.pixel_angles[pixels],
+        view_of_pixel=rays.view_of_pixel[pixels],
+    )
 
 
 def orbital_rays(

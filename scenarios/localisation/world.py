@@ -65,13 +65,14 @@ class LocalisationWorld:
     def scene(self, east_m: float, north_m: float, height_m: float, pixel_rad: float) -> Scene:
         """Create the scene for a camera at or above a height above the ground.
 
-        One scene serves a whole descent: its mesh only gives first guesses, which are refined on the exact surface.
-        Angles up to 66 deg from nadir do not depend on it at all except at hidden slopes; flatter rays are traced
-        without it. The mesh is dense below (east_m, north_m) and reaches the horizon.
+        One scene serves a whole descent; `height_m` is then the height of the last image. The mesh only gives first
+        guesses of the ground, which are refined on the exact surface. A mesh that is too coarse changes pixels at the
+        edges of hidden slopes: over the highland 0.2 % of the pixels of an image 500 m above the ground with a mesh
+        for 2000 m. A mesh for 500 m takes a third more time per image at 4200 m than one for 4200 m. The
+        terrain repeats beyond its period.
 
-        - east_m, north_m: position below the first image
-        - height_m: height above the ground at which the mesh resolves the samples of the terrain; the time of an image
-          from a greater height grows with height / height_m
+        - east_m, north_m: position about which the mesh is dense, such as that below the last image
+        - height_m: height above the ground of the lowest image
         - pixel_rad: angle of a pixel
         """
         return site_scene(self.ground, Viewpoint(east_m, north_m, height_m, pixel_rad), self.sun)

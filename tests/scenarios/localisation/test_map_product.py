@@ -75,7 +75,9 @@ def _render_under_map_sun(
 ) -> Frame:
     """Render with a scene that differs from that of the map: the scene of a site from the orbiter's height."""
     sun = sun_at(world.air, EXACT.sun_azimuth_deg, sun_elevation_deg)
-    viewpoint = Viewpoint(*CENTRE.tolist(), EXACT.orbit_height_m, EXACT.pixel_m / EXACT.orbit_height_m)
+    viewpoint = Viewpoint(
+        float(CENTRE[0]), float(CENTRE[1]), EXACT.orbit_height_m, EXACT.pixel_m / EXACT.orbit_height_m
+    )
     scene = replace(site_scene(world.ground, viewpoint, sun), mesh_finest_m=100.0)
     return process_renderer(default_backend()).render(scene, rays, rigid(Rotation.identity(), position))
 
@@ -150,8 +152,7 @@ def test_rays_from_300_km_hit_the_surface_points_of_a_whole_map(world: Localisat
 
 
 def test_position_errors_are_those_of_the_truth(world: LocalisationWorld) -> None:
-    errors = {"registration_sd_m": 80.0, "distortion_sd_m": 6.0, "distortion_length_m": 300.0}
-    product, truth = _make(world, **errors)
+    product, truth = _make(world, registration_sd_m=80.0, distortion_sd_m=6.0, distortion_length_m=300.0)
     assert np.linalg.norm(truth.shift_m) > 1.0
     map_m = np.stack(_pixel_positions(), axis=-1)
     world_m = truth.world_position(map_m)
@@ -207,7 +208,7 @@ def test_posts_smooth_the_elevation(world: LocalisationWorld) -> None:
 
 
 def test_blur_has_the_transfer_at_the_nyquist_frequency() -> None:
-    stripes = np.tile(np.float32([1.0, -1.0]), (32, 16))
+    stripes = np.tile(np.array([1.0, -1.0], dtype=np.float32), (32, 16))
     # tolerance: truncation of the sampled kernel, whose transfer includes aliases (largest at the Nyquist frequency)
     centre = blur(stripes, 0.25)[16, 16]
     sd_px = np.sqrt(-2.0 * np.log(0.25)) / np.pi
