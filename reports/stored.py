@@ -19,7 +19,8 @@ from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
 from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
 
-#: Maximum number of cases with all columns in memory; of more cases, all columns of the first `FIRST_CASES` are read.
+#: Maximum number of cases of which all columns are read. In a larger campaign, all columns are read only for the first
+#: `FIRST_CASES` rows.
 MAX_FULL_CASES, FIRST_CASES = 50_000, 20_000
 
 TABLE_FILE = "cases.parquet"
@@ -30,10 +31,13 @@ RECORD_FILE = "campaign.json"
 class StoredRun:
     """Contents of a campaign's folder.
 
-    - frame: rows with all columns in the order of the cases; only the first rows of more than `MAX_FULL_CASES` cases
-    - all_cases: rows of all cases; of more than `MAX_FULL_CASES`, only the columns of verdicts, outcomes and errors
+    - frame: rows with all columns, sorted by case; only the first `FIRST_CASES` rows if the campaign has more than
+      `MAX_FULL_CASES` cases
+    - all_cases: rows of all cases; only the columns of verdicts, outcomes, errors and axes of figures if the campaign
+      has more than `MAX_FULL_CASES` cases
     - record: contents of `campaign.json`; empty if the file cannot be read
-    - showcases: cases with stored products; the case selected for the report is the first
+    - showcases: numbers of the cases with stored products: first the case that the report shows, then the others in
+      increasing order
     """
 
     directory: Path
@@ -124,14 +128,14 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
 
 
 def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Read `frame` and `all_cases` of `StoredRun`; they are the same up to `MAX_FULL_CASES` cases."""
+    """Read `frame` and `all_cases` of `StoredRun`; both are one table if there are at most `MAX_FULL_CASES` cases."""
     import pyarrow.parquet as pq
 
     file = pq.ParquetFile(path)
     stored_names = file.schema_arrow.names
     new_names = find_renamed_columns(stored_names, str(table(record.get("configuration")).get("scenario")))
     if file.metadata.num_rows <= MAX_FULL_CASES:
-        frame = _sort_columns(update_stored_rows(pd.read_parquet(path), new_names))
+        frame = _sort_rows(update_stored_rows(pd.read_parquet(path), new_names))
         return frame, frame
     first_rows = update_stored_rows(next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas(), new_names)
     requirement_list, names = record.get("requirements"), [new_names.get(name, name) for name in stored_names]
@@ -149,10 +153,11 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
     if metric is not None:
         columns.update([metric, *axis_columns(metric, names), *driver_columns(first_rows, metric, max_columns=3)])
     all_cases = pd.read_parquet(path, columns=[name for name in stored_names if new_names.get(name, name) in columns])
-    return _sort_columns(first_rows), _sort_columns(update_stored_rows(all_cases, new_names))
+    return _sort_rows(first_rows), _sort_rows(update_stored_rows(all_cases, new_names))
 
 
-def _sort_columns(frame: pd.DataFrame) -> pd.DataFrame:
+def _sort_rows(frame: pd.DataFrame) -> pd.DataFrame:
+    """Sort rows by case number."""
     if "case" not in frame or frame["case"].is_monotonic_increasing:
         return frame
     return frame.sort_values("case", kind="stable").reset_index(drop=True)

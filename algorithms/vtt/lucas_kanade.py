@@ -58,8 +58,8 @@ def match_by_lucas_kanade(
 def correlation(a: Float[np.ndarray, "n m"], b: Float[np.ndarray, "n m"]) -> float:
     """Normalised correlation of two patches, Eq. 11; 0 if either is flat."""
     a, b = a - a.mean(), b - b.mean()
-    energy = float(np.sqrt(np.sum(a * a) * np.sum(b * b)))
-    return float(np.sum(a * b)) / energy if energy > 0.0 else 0.0
+    norms = float(np.sqrt(np.sum(a * a) * np.sum(b * b)))  # product of both norms
+    return float(np.sum(a * b)) / norms if norms > 0.0 else 0.0
 
 
 def _normalize_to_8_bits(image: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:

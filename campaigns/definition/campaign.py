@@ -69,7 +69,10 @@ class Campaign:
     def _evaluate(
         self, probabilities: Mapping[str, float] | None, case: int, nominal: Sequence[str] = ()
     ) -> dict[str, Any]:
-        """Evaluate the dispersions; those in `nominal` (all without `probabilities`) have the campaign's parameter."""
+        """Evaluate the dispersions at cumulative probabilities.
+
+        Dispersions in `nominal` have the value of the campaign's parameter; all of them if `probabilities` is None.
+        """
         parameters = self.configuration.parameters
         values: dict[str, Any] = {}
         for path in self.order:
@@ -87,7 +90,7 @@ class Campaign:
         return {path: values[path] for path in self.marginals}
 
     def probabilities(self, case: int) -> dict[str, float] | None:
-        """Compute the uniform number of each random or grid dispersion of a case; None for the nominal case."""
+        """Compute the cumulative probability of each random or grid dispersion of a case; None for the nominal case."""
         configuration, paths = self.configuration, self.drawn_paths
         position = locate_case(configuration.design, configuration.blocks, configuration.grid_size, case)
         if position is None:

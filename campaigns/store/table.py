@@ -1,4 +1,8 @@
-"""Parquet table of a campaign, written from its row store in row groups to limit memory, and selection of cases."""
+"""Parquet table of a campaign, written from its row store in row groups to limit memory, and selection of cases.
+
+A layout is the tuple of column names of a stored row (`marsyard.campaigns.store.rows`): rows of one campaign can have
+different columns.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +30,8 @@ _GROUP_ROWS = 50_000
 def write_table(path: Path, store: RowStore, metric_columns: Sequence[str] = ()) -> None:
     """Write the rows of a store as a Parquet table in the order of the cases, atomically.
 
-    The engine's columns are the first and the last. Missing numbers are NaN, other missing values are null. The table
-    always contains the numeric columns `metric_columns`.
+    The columns of the engine come before and after those of the scenario. Missing numbers are NaN, other missing values
+    are null. The table always contains the numeric columns `metric_columns`.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -70,7 +74,11 @@ def write_table(path: Path, store: RowStore, metric_columns: Sequence[str] = ())
 def _transpose(
     chunk: Sequence[tuple[int, list[Any]]], layouts: Mapping[int, Sequence[str]], columns: Sequence[str]
 ) -> Iterator[Sequence[Any]]:
-    """Yield the values of each column from rows with their layouts; None for missing values."""
+    """Yield the values of each column; None for missing values.
+
+    - chunk: layout number and values of each row
+    - layouts: column names by layout number
+    """
     indices_by_layout: dict[int, list[int]] = {}
     for index, (layout, _) in enumerate(chunk):
         indices_by_layout.setdefault(layout, []).append(index)
@@ -91,7 +99,10 @@ def _transpose(
 
 
 def _choose_type(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
-    """Return an Arrow type that represents all values of a column, and the conversion to it (None if not needed)."""
+    """Return an Arrow type that represents all values of a column, and the conversion to it (None if not needed).
+
+    `kinds` are the types of the column's values; "big" is an integer outside 64 bits (`RowStore.kinds`).
+    """
     import pyarrow as pa
 
     if kinds == {"bool"}:
@@ -125,7 +136,7 @@ def refresh_table(directory: Path) -> None:
     Raises StoreError if the store is unreadable or the table is not writable.
     """
     if not (directory / ROWS_FILE).exists() and (directory / TABLE_FILE).exists():
-        return  # the folder is of an earlier version, which wrote the table at an interruption
+        return  # an earlier version, without a row store, has already written the table of the interrupted campaign
     requirements = stored_configuration(directory).requirements
     with RowStore(directory / ROWS_FILE) as store:
         write_table(directory / TABLE_FILE, store, numeric_metrics(requirements))
@@ -155,7 +166,7 @@ def find_showcase(configuration: CampaignConfiguration, table: Path, store: RowS
 
 def find_worst_cases(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
     """List the answered cases with the largest metric of the first requirement with a single column, worst first."""
-    # sums of columns are sums of times, which are not suitable to rank cases
+    # metrics that are sums of columns are computation times, which are not suitable to rank cases
     ranking = (item for item in configuration.requirements if item.bound is not None and len(item.metric_columns) == 1)
     metric = next((item.metric for item in ranking), None)
     if metric is None:

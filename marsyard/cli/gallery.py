@@ -74,7 +74,10 @@ class GalleryImage:
 
 
 def render_gallery(folder: Path, overwrite: bool, terrain_files: Sequence[Path] = ()) -> Path:
-    """Render all `VIEWS` and DTM files; write the gallery and return the path of the page. Raises ValueError."""
+    """Render all `VIEWS` and DTM files; write the gallery and return the path of the page.
+
+    Raises ValueError if a file is no DTM file, or if the gallery cannot be written or already exists.
+    """
     requests = [ImageRequest.from_defaults(site, camera, **settings) for site, camera, settings in VIEWS]
     for file in terrain_files:
         if not is_terrain_file(str(file)):
@@ -176,7 +179,7 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
 
 
 def encode_image(extension: str, grey: Grey, options: Sequence[int]) -> bytes:
-    """Encode an image in the format of a file extension. Raises ValueError."""
+    """Encode an image in the format of a file extension. Raises ValueError if OpenCV cannot encode it."""
     is_encoded, buffer = cv2.imencode(extension, grey, options)
     if not is_encoded:
         raise ValueError(f"an image could not be encoded as {extension}")

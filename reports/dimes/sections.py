@@ -151,10 +151,10 @@ def _field_note(cells: Sequence[Mapping[str, Any]]) -> str:
 def scatter_figures(subject: Subject) -> list[SvgFigure]:
     """Draw the signed errors of each category on equal axes (the paper's Fig. 10)."""
     frame, metric = subject.frame, subject.metric
-    parts = axis_columns(metric, [str(name) for name in frame.columns])[:2] if metric else []
-    if len(parts) < 2:
+    components = axis_columns(metric, [str(name) for name in frame.columns])[:2] if metric else []
+    if len(components) < 2:
         return []
-    points = np.column_stack([numbers(frame, part) for part in parts])
+    points = np.column_stack([numbers(frame, component) for component in components])
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         return []
@@ -165,23 +165,23 @@ def scatter_figures(subject: Subject) -> list[SvgFigure]:
         rows = frame[finite & frame["category"].eq(category).to_numpy(dtype=np.bool_)]
         if len(rows):
             caption = f"{category[:1].upper()}{category[1:]}: {count(len(rows), 'valid triple')}."
-            figure = _draw_scatter(rows, parts, subject, axis_limit)
+            figure = _draw_scatter(rows, components, subject, axis_limit)
             svg_figures.append(svg_figure(figure, f"fieldtest{index}", caption))
     return svg_figures
 
 
 @in_page_style
-def _draw_scatter(rows: section_kinds.Rows, parts: Sequence[str], subject: Subject, axis_limit: float) -> Figure:
+def _draw_scatter(rows: section_kinds.Rows, components: Sequence[str], subject: Subject, axis_limit: float) -> Figure:
     figure, axes = new_axes(4.2, 4.4)
     runs = sorted(str(run) for run in subject.frame["run"].dropna().unique())
     for index, run in enumerate(runs):
-        x, y = (numbers(rows[rows["run"].eq(run)], part) for part in parts)
+        x, y = (numbers(rows[rows["run"].eq(run)], component) for component in components)
         style: dict[str, Any] = {"marker": MARKERS[index % len(MARKERS)], "color": SERIES[index % len(SERIES)]}
         axes.plot(x, y, linestyle="", markersize=4.0, alpha=0.7, markeredgewidth=0.0, label=run, **style)
     if subject.bound is not None:
         axes.add_patch(Circle((0, 0), subject.bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--"))
     axes.set(xlim=(-axis_limit, axis_limit), ylim=(-axis_limit, axis_limit), aspect="equal")
-    axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
+    axes.set(xlabel=label(components[0]), ylabel=label(components[1]))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, handletextpad=0.2)
     return figure
 

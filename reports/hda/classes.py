@@ -145,7 +145,7 @@ _MIN_SIZES = 3
 
 @dataclass(frozen=True)
 class SizeResult:
-    """Correctly tracked features of flights with a change of one signed size; `good`: flights with good tracking."""
+    """Correctly tracked features of flights with a change of one signed size; `good`: number with good tracking."""
 
     size: float
     tracked: PooledRate
@@ -252,7 +252,11 @@ def tracking_curves(frame: pd.DataFrame) -> list[TrackingCurve]:
 
 
 def find_knee(results: Sequence[SizeResult], sign: float) -> float:
-    """Find the first change with a fraction below `GOOD_FRACTION`, for positive (1) or negative (-1) changes."""
+    """Find the size of change at which the interpolated fraction falls below `GOOD_FRACTION`.
+
+    `sign` selects positive (1) or negative (-1) changes. Infinite if all fractions are larger; NaN with fewer than two
+    sizes in this direction.
+    """
     points_by_change = sorted(
         (sign * point.size, point.tracked.fraction) for point in results if sign * point.size >= 0.0
     )

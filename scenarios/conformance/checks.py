@@ -27,7 +27,7 @@ _SCENARIOS = Path(__file__).resolve().parents[1]
 class Finding:
     """Result of one check.
 
-    - requirement: text of the protocol's requirement
+    - requirement: text of a requirement of the protocol, without its subject (the algorithm or part)
     - problem, next_step: the violation and its remedy; empty if the check passed
     - note: description of the answer, or its computation time
     """
@@ -80,12 +80,13 @@ class Check:
 class Suite(ABC):
     """Conformance suite of one algorithm or part; a new object is constructed for each check.
 
-    `marsyard.campaigns.running.replay` detects global state that a check changes in its process.
+    `marsyard.campaigns.running.replay` runs each check in a worker process, and also reports changes of the state of
+    this process.
 
     - make: constructs the algorithm or part
     - spec: name of the algorithm or part
+    - is_program: whether it is an external program; a program reads files, so it cannot change the Python inputs
     - limit_s: maximum computation time of an answer
-    - is_program: whether it is an external program, which reads files and cannot change the suite's objects
     """
 
     make: Callable[[], Any]
@@ -93,12 +94,13 @@ class Suite(ABC):
     is_program: bool
     limit_s: float
 
-    #: Advice of the check `deterministic`, and verb of the check `time`.
+    #: Remedy if the check `deterministic` fails.
     deterministic_advice = (
         "use numpy.random.default_rng(a fixed seed), created in estimate; keep no state between cases"
     )
+    #: Verb in the requirement of the check `time`.
     time_verb = "answers"
-    #: Message about an answer that differs after other cases.
+    #: Problem if the answer to a case differs after other cases.
     dependence_problem = "its answer depends on earlier cases"
     #: Whether imports of modules with ground truth are forbidden.
     forbids_truth = True
@@ -107,7 +109,7 @@ class Suite(ABC):
 
     @abstractmethod
     def checks(self) -> Iterator[Check]:
-        """Yield all checks, that of the ordinary case first."""
+        """Yield all checks; the first is the check of ordinary cases."""
 
     @abstractmethod
     def cases(self) -> Sequence[Any]:
@@ -134,8 +136,8 @@ class Suite(ABC):
         if not self.is_program:
             copies = "work on copies: counts.astype(...), array.copy()"
             yield Check("inputs", "does not change its inputs", copies, self._check_inputs)
-        rule = "returns the same answers to the same case, after any other cases"
-        yield Check("deterministic", rule, self.deterministic_advice, self._check_repeatability)
+        requirement = "returns the same answers to the same case, after any other cases"
+        yield Check("deterministic", requirement, self.deterministic_advice, self._check_repeatability)
         advice = "reduce the computation time, or raise the limit with --time-limit"
         yield Check("time", f"{self.time_verb} within {self.limit_s:g} s", advice, self._check_time)
         if self.forbids_truth and not self.is_program:

@@ -65,15 +65,19 @@ class PartSuite(Suite):
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         advice = "see docs/custom-parts.md for inputs and outputs"
-        rule = "returns the output of its kind: right shapes, finite and in order"
-        yield Check("answer", rule, advice, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
-        rule = "reports the same columns in every case: identifiers, with numbers or booleans"
-        yield Check("columns", rule, "report every column in every case; NaN for a missing number", self._check_columns)
+        requirement = "returns the output of its kind: right shapes, finite and in order"
+        yield Check(
+            "answer", requirement, advice, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases())
+        )
+        requirement = "reports the same columns in every case: identifiers, with numbers or booleans"
+        yield Check(
+            "columns", requirement, "report every column in every case; NaN for a missing number", self._check_columns
+        )
         yield from self.common_checks()
         if self.kind is not SCORE:
-            rule = "depends on its random stream only if its attribute random is true"
+            requirement = "depends on its random stream only if its attribute random is true"
             advice = "set random to true if it uses random numbers, and use only the generator in the arguments"
-            yield Check("random", rule, advice, self._check_random_attribute)
+            yield Check("random", requirement, advice, self._check_random_attribute)
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""

@@ -82,14 +82,14 @@ class TrackerSuite(Suite):
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         advice = "see algorithms/interface.py for aim, update and state"
-        rule = "returns a well-formed aim and answer at every stop of a drive"
-        yield Check("answer", rule, advice, self._list_states)
+        requirement = "returns a well-formed aim and answer at every stop of a drive"
+        yield Check("answer", requirement, advice, self._list_states)
         yield Check("states", "has no target before the designation and after clear", advice, self._check_states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
             yield Check(name, f"loses its target if images are {name}", advice, partial(self._check_loss, name, blank))
-        rule = "answers if the pose jumps and the images show a different scene"
-        yield Check("pose", rule, advice, self._check_pose_jump)
+        requirement = "answers if the pose jumps and the images show a different scene"
+        yield Check("pose", requirement, advice, self._check_pose_jump)
         yield from self.common_checks()
 
     def cases(self) -> Sequence[PixelTarget]:

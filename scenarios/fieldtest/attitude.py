@@ -92,6 +92,7 @@ def add_thermal_drift(
         -np.expm1(-np.maximum(times - change_s, 0.0) / p.time_constant_s)
         for change_s in (flight.fly_overs_s[0][1], flight.passes[-1].end_s)
     )
+    # the drift is that of the gyro along the body's x axis
     rates = DEG_H * p.across_deg_h_k * (p.change_k * (cooling - warming))
     delta_angles = increments.delta_angles_rad + np.outer(rates * increments.period_s, np.array([1.0, 0.0, 0.0]))
     return replace(increments, delta_angles_rad=delta_angles)

@@ -39,7 +39,7 @@ class RunParameters(Parameters):
     begins: Annotated[AwareDatetime, Field(description="start of the first pass, with time zone")]
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0, description="east positive")]
-    short_time: Annotated[Count, Field(description="triples of images close in time")] = 0
+    short_time: Annotated[Count, Field(description="number of triples of images close in time")] = 0
     same_direction: Annotated[Count, Field(description="triples at three altitudes, one flight direction")] = 0
     opposite_direction: Annotated[Count, Field(description="triples at three altitudes, both directions")] = 0
     clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the site")] = None
@@ -62,19 +62,22 @@ class DriftParameters(Parameters):
     """
 
     across_deg_h_k: Annotated[
-        float, Field(description="bias per temperature change of the gyro along the flight line, deg/h/K")
+        float,
+        Field(description="gyro bias per temperature change, deg/h/K; axis along the line: tilts the camera across it"),
     ] = 1.0
-    change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="final temperature change, K; 0: none")] = -22.0
+    change_k: Annotated[
+        float, Field(ge=-100.0, le=100.0, description="temperature change after a long time, K; 0: no drift")
+    ] = -22.0
     time_constant_s: Annotated[Positive, Field(description="time constant of the cooling, s (assumed)")] = 300.0
 
 
 class TargetParameters(Parameters):
     """The surveyed targets and the errors of their sightings (paper, III.D.2)."""
 
-    placed: Annotated[int, Field(ge=3, le=1000, description="targets on the ground")] = 11
-    used: Annotated[int, Field(ge=3, le=1000, description="targets used for attitude")] = 9
+    placed: Annotated[int, Field(ge=3, le=1000, description="number of targets on the ground")] = 11
+    used: Annotated[int, Field(ge=3, le=1000, description="number of these targets used for the attitude")] = 9
     within_m: Annotated[Positive, Field(description="half the side length of the targets' square, m (assumed)")] = 90.0
-    images: Annotated[int, Field(ge=1, le=1000, description="images of a pass over the targets")] = 20
+    images: Annotated[int, Field(ge=1, le=1000, description="number of images of a pass over the targets")] = 20
     side_m: Annotated[Positive, Field(description="side length of a target, m")] = 1.0
     albedo: Annotated[Positive, Field(le=1.0, description="albedo of the white targets (assumed)")] = 0.8
     sightings: Annotated[
@@ -99,7 +102,7 @@ class TargetParameters(Parameters):
 class ElevationParameters(Parameters):
     """The elevation model subtracted from the GPS height, with the accuracy class of SRTM (paper, III.D.1)."""
 
-    posting_m: Annotated[Positive, Field(description="distance between posts, m")] = 30.0
+    posting_m: Annotated[Positive, Field(description="spacing of the model's samples (posts), m")] = 30.0
     error_m: Annotated[NonNegative, Field(description="standard deviation of a post's error, m")] = 6.0
     correlation_m: Annotated[Positive, Field(description="correlation length of post errors, m (assumed)")] = 150.0
     interpolation_m: Annotated[NonNegative, Field(description="standard deviation of the interpolation error, m")] = 1.0
@@ -118,9 +121,14 @@ class TripleParameters(Parameters):
     """Selection of triples from a run's images (paper, III.D and IV)."""
 
     virtual_interval_s: Annotated[
-        Positive, Field(le=60.0, description="time assigned to the interval of two images, s, as in the landings")
+        Positive,
+        Field(
+            le=60.0, description="time that is assigned to the interval between two images, as in the MER landings, s"
+        ),
     ] = 3.75
-    max_speed_m_s: Annotated[Positive, Field(description="maximum speed over a virtual interval, as in DIMES")] = 30.0
+    max_speed_m_s: Annotated[
+        Positive, Field(description="maximum speed: distance divided by the virtual interval, as in DIMES")
+    ] = 30.0
     overlap_fraction: Annotated[
         Positive, Field(description="maximum distance between two image centres divided by the altitude (assumed)")
     ] = 0.35

@@ -34,7 +34,8 @@ _TOP_HAT_SIDES, _MIN_TOP_HAT_PX = 3.0, 3
 _THRESHOLD_SD = 5.0
 #: Half side of the window of a centroid, divided by the side length of a target in the image.
 _WINDOW_SIDES = 1.5
-#: Maximum distance of a candidate from a predicted target, in metres on the ground: in the vote, and after the fit.
+#: Maximum distance of a candidate from a predicted target, in metres on the ground: for the common displacement (the
+#: displacement with the most such candidates is selected), and after the fit.
 _MAX_VOTE_DISTANCE_M, _MAX_FIT_DISTANCE_M = 3.0, 1.2
 #: Iterations of assignment and fit, and minimum number of detected targets in a valid image.
 _ITERATIONS, _MIN_TARGETS = 3, 5

@@ -40,17 +40,23 @@ class Faults(SizedFaults):
 
     black_image: Annotated[int, bounded_field(0, 2, "number of the black image, 1 or 2; 0: none")] = 0
     repeated_image: Annotated[int, bounded_field(0, 1, "1: the second image is a copy of the first")] = 0
-    lost_rows: Annotated[float, bounded_field(0.0, 1.0, "fraction of lowest rows lost in image 2")] = 0.0
+    lost_rows: Annotated[
+        float, bounded_field(0.0, 1.0, "fraction of the rows of image 2 that is lost, from the bottom")
+    ] = 0.0
     lost_images: Annotated[float, bounded_field(0.0, 1.0, "fraction of images lost; two always arrive")] = 0.0
-    laser_silent: Annotated[int, bounded_field(0, 1, "1: the altimeter returns no range, also in the landing")] = 0
+    laser_silent: Annotated[
+        int, bounded_field(0, 1, "1: the altimeter returns no range, at the images and in the landing")
+    ] = 0
     laser_stuck: Annotated[float, bounded_field(0.0, 5.0, "relative excess of the stuck range; 0: no fault")] = 0.0
     gps_outage_s: Annotated[
         float, bounded_field(0.0, 300.0, "duration of the GPS outage before image 1; it lasts to the end")
     ] = 0.0
     listed_bad_pixels: Annotated[
-        float, bounded_field(0.0, 0.5, "fraction of bad pixels that the camera interpolates")
+        float, bounded_field(0.0, 0.5, "fraction of bad pixels in the camera's list, which it fills by interpolation")
     ] = 0.0
-    vehicle_shadow_m: Annotated[float, bounded_field(0.0, 100.0, "diameter of the shadow disc; raises the sun")] = 0.0
+    vehicle_shadow_m: Annotated[
+        float, bounded_field(0.0, 100.0, "diameter of the disc that casts the vehicle's shadow; also raises the sun")
+    ] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Return the detector parameters that the faults change; listed bad pixels are filled by the camera."""
@@ -122,7 +128,9 @@ class ImagePoseParameters(Parameters):
     heading_deg: Annotated[Angle, Field(description="azimuth of the image's upper edge")] = 0.0
     course_deg: Annotated[Angle, Field(description="clockwise from the upper edge; 90: along the rows")] = 90.0
     tilt_deg: Annotated[float, Field(ge=0.0, le=60.0, description="angle of the first optical axis from nadir")] = 0.0
-    tilt_towards_deg: Annotated[Angle, Field(description="azimuth of that tilt")] = 0.0
+    tilt_towards_deg: Annotated[Angle, Field(description="azimuth towards which the first optical axis is tilted")] = (
+        0.0
+    )
     climb_fraction: float = Field(default=0.0, gt=-0.9, le=5.0, description="change of height divided by height")
     roll_deg: Annotated[Angle, Field(description="rotation about the optical axis between the images")] = 0.0
     pitch_deg: Annotated[Angle, Field(description="rotation about the image's right direction")] = 0.0
@@ -160,7 +168,9 @@ class LanderParameters(Parameters):
     diameter_m: float = Field(default=2.0, gt=0.0, le=100.0, description="diameter of the footprint disc (paper, IV)")
     max_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="slope of the plane under the lander")] = 15.0
     max_roughness_m: float = Field(default=0.2, gt=0.0, le=100.0, description="maximum distance from the plane")
-    caster_diameter_m: NonNegative = Field(default=0.0, le=100.0, description="diameter of the shadow disc; 0: none")
+    caster_diameter_m: NonNegative = Field(
+        default=0.0, le=100.0, description="diameter of the disc that casts the lander's shadow; 0: none"
+    )
 
     @property
     def limits(self) -> Limits:
@@ -190,9 +200,12 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
     exposure: Annotated[AutoExposureParameters, Field(description="exposure control")] = AutoExposureParameters()
     image_poses: ImagePoseParameters = Field(
-        default=ImagePoseParameters(), description="poses; only azimuths for a helicopter"
+        default=ImagePoseParameters(),
+        description="camera poses at the images; a helicopter flight uses only the azimuths",
     )
-    navigation: NavigationParameters = Field(default=NavigationParameters(), description="errors without helicopter")
+    navigation: NavigationParameters = Field(
+        default=NavigationParameters(), description="navigation errors of cases without a helicopter flight"
+    )
     helicopter: HelicopterParameters | None = Field(default=None, description="helicopter flight and landing")
     pair: PairParameters = Field(default=PairParameters(), description="choice of two images of a helicopter flight")
     laser: LaserParameters = LaserParameters()

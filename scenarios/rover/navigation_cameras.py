@@ -31,7 +31,7 @@ ODOMETRY_EDGE_RAYS, MAP_EDGE_RAYS = 2, 1
 #: Circle that contains the imaged ground near the rover, for the test of the rover's shadow: distance ahead and radius,
 #: metres.
 _SHADOW_AHEAD_M, _SHADOW_RADIUS_M = 4.0, 4.0
-#: Spacing of the points of the oracle's heights, metres.
+#: Spacing of the points of `oracle_heights`, metres.
 _ORACLE_SPACING_M = 0.05
 #: Half of the horizontal field of view of a navcam and of a hazcam, radians.
 _MAST_HALF_RAD, _BODY_HALF_RAD = float(np.radians(22.5)), float(np.radians(60.0))
@@ -39,7 +39,7 @@ _MAST_HALF_RAD, _BODY_HALF_RAD = float(np.radians(22.5)), float(np.radians(60.0)
 
 @dataclass(frozen=True)
 class _StereoPair:
-    """A binned stereo pair: detectors, and true and calibrated cameras in the frame of the mast's head or the rover."""
+    """A binned stereo pair: detectors, and true and calibrated cameras in the frame of their mount (head or rover)."""
 
     camera: StereoCamera
     true: tuple[CameraModel, CameraModel]

@@ -60,21 +60,23 @@ class WorldParameters(Parameters):
     ] = "mars-yard"
     bank: Annotated[int, Field(ge=1, le=100000, description="number of terrains in the terrain bank")] = 8
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
-    terrain: Annotated[int, Field(ge=0, description="number of the terrain among the stored terrains")] = 0
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank, from 0")] = 0
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, every 2.5 cm")] = 2048
     incline: InclineParameters = InclineParameters()
     rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "ground's RMS slope; default: the site's")] = None
     dust_opacity: Annotated[
-        float | None, bounded_field(0.0, 10.0, "optical depth of the dusty air; default: that of the world")
+        float | None, bounded_field(0.0, 10.0, "optical depth of the dusty air; default: the site's")
     ] = None
     rock_abundance: Annotated[
-        float | None, bounded_field(0.0, 0.4, "fraction of the ground covered by rocks; by default that of the site")
+        float | None, bounded_field(0.0, 0.4, "fraction of the ground covered by rocks; default: the site's")
     ] = None
     largest_near_m: Annotated[NonNegative, Field(description="maximum diameter of rocks on the route")] = 0.08
-    east_m: float = Field(default=8.0, description="position of the target's rock, periodic terrain")
-    north_m: float = Field(default=8.0, description="position of the target's rock, periodic terrain")
-    rocks_underfoot: bool = Field(default=False, description="whether wheels roll over rocks; else only over ground")
-    background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle of rendered rocks' sector")] = 50.0
+    east_m: float = Field(default=8.0, description="east position of the target's rock on the periodic terrain, m")
+    north_m: float = Field(default=8.0, description="north position of the target's rock on the periodic terrain, m")
+    rocks_underfoot: bool = Field(default=False, description="whether the wheels roll over rocks too, not only ground")
+    background_half_deg: Annotated[
+        Positive, Field(le=180.0, description="half angle of the sector behind the target in which rocks are rendered")
+    ] = 50.0
 
     @model_validator(mode="after")
     def _check_terrain(self) -> WorldParameters:
@@ -122,7 +124,9 @@ class TargetParameters(Parameters):
 class StartParameters(Parameters):
     """The rover's position and heading at the start, relative to the target."""
 
-    distance_m: float = Field(default=10.0, gt=1.0, le=40.0, description="horizontal, from mast to designated point")
+    distance_m: float = Field(
+        default=10.0, gt=1.0, le=40.0, description="horizontal distance from mast to designated point"
+    )
     bearing_deg: Azimuth = Field(
         default=270.0, description="azimuth from the target to the rover at the start, clockwise from north"
     )
@@ -144,21 +148,27 @@ class LegParameters(Parameters):
 
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
     steps: Annotated[int, bounded_field(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
-    step_fraction: float = Field(default=0.1, gt=0.0, le=0.9, description="step length / the camera's distance")
+    step_fraction: float = Field(
+        default=0.1, gt=0.0, le=0.9, description="step length divided by the camera's distance from the target"
+    )
     step_m: Annotated[float | None, Field(description="fixed step length; required for straight")] = None
     step_deg: Annotated[RelativeAngle, Field(description="step of a turn or circle")] = 5.0
     goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
-    ends_with_steps: bool = Field(default=False, description="whether the leg may end after all steps before goal_m")
+    ends_with_steps: bool = Field(
+        default=False, description="whether the leg is complete after all steps, even before goal_m"
+    )
     offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
     shuffle_m: NonNegative = Field(
-        default=0.0, description="drive after each step of a turn, alternately forward, back"
+        default=0.0, description="length of a short drive after each step of a turn, alternately forward and back"
     )
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
-    visual_odometry_step_m: Positive = Field(default=0.75, description="maximum drive between images (60 % overlap)")
+    visual_odometry_step_m: Positive = Field(
+        default=0.75, description="maximum drive between two image pairs of visual odometry (60 % overlap)"
+    )
     autonav: bool = Field(default=False, description="whether a navigator avoids the hazards in its map")
     maps_first: Annotated[bool, Field(description="whether the navigator maps before the first step")] = False
     map_by: Annotated[Literal["body", "mast"], Field(description="cameras of the navigator's map")] = "mast"
-    wedges: Annotated[int, Field(ge=1, le=4, description="number of mapped wedges at each step, for the mast")] = 2
+    wedges: Annotated[int, Field(ge=1, le=4, description="number of mast azimuths that are mapped at each step")] = 2
     target_is_no_obstacle: bool = Field(default=True, description="whether the navigator ignores the target's rock")
 
     @model_validator(mode="after")
@@ -175,10 +185,10 @@ class SunParameters(Parameters):
 
     azimuth_deg: Annotated[Azimuth, Field(description="azimuth of the sun, clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="elevation of the sun above the horizon")] = 45.0
-    hour_angle_deg_min: Annotated[float, bounded_field(-1.0, 1.0, "rotation rate: 16 deg in 66 min (Table IV)")] = (
-        16.0 / 66.0
-    )
-    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
+    hour_angle_deg_min: Annotated[
+        float, bounded_field(-1.0, 1.0, "rotation rate of the sun, deg/min; Table IV: 16 deg in 66 min")
+    ] = 16.0 / 66.0
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="latitude of the site, north positive")] = -2.0
     update_interval_s: Annotated[Positive, Field(description="interval between updates of the sun's position, s")] = (
         120.0
     )

@@ -315,7 +315,7 @@ def ground_mesh(
 def cell_spans_in_hull(
     x: Float[np.ndarray, "columns"], y: Float[np.ndarray, "rows"], points: Float[np.ndarray, "points 2"]
 ) -> Int[np.ndarray, "strips 2"]:
-    """Spans of a grid's cells, for `ground_mesh`, that overlap the convex hull of points, not all on one line."""
+    """Find the spans of cells, for `ground_mesh`, that overlap the convex hull of points (not all on a line)."""
     return np.asarray(spans_in_hull(x, y, points[ConvexHull(points).vertices]))
 
 

@@ -21,7 +21,7 @@ from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
 from marsyard.sim.terrain.surface import ROUGHNESS, SMALLEST_LEVEL, TEXTURE, UNIFORM, Surface
 
-#: Modules without effect on the samples of a terrain, except through its parameters.
+#: Modules whose code does not change the samples of a terrain; `rocks` changes them only with wind tails.
 _MODULES_NOT_HASHED = ("rocks", "sites.py")
 #: Samples of the terrains that this process uses, by file: the cache does not evict these files.
 _IN_USE: WeakValueDictionary[Path, np.ndarray] = WeakValueDictionary()
@@ -74,7 +74,10 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
 
 @cache
 def _code_version(*, has_tails: bool) -> str:
-    """Compute a hash of the code that synthesises terrains: a change of the code invalidates cached terrains."""
+    """Compute a hash of the code that synthesises terrains: a change of the code invalidates cached terrains.
+
+    `has_tails`: whether rocks have wind tails, which are part of the terrain; the hash then includes the code of rocks.
+    """
     digest = hashlib.sha256(np.__version__.encode())
     folder = Path(__file__).parent
     for path in sorted(folder.rglob("*.py")):
@@ -86,11 +89,11 @@ def _code_version(*, has_tails: bool) -> str:
 
 @dataclass(frozen=True)
 class TerrainBank:
-    """Numbered terrains of one kind, cached on disk. Wind tails of rocks are part of the surface.
+    """Numbered terrains with the same parameters, cached on disk. Wind tails of rocks are part of the surface.
 
     Terrain k is a pure function of the parameters, the seed and k. The file of a terrain is one array: all levels, then
-    the factors of the ground. Workers memory-map it and therefore share its pages. The size of the cache is limited
-    (see `marsyard.sim.cache.evict_files`).
+    `Surface.factors` (fine relief, albedo contrast and rock density). Workers memory-map it and therefore share its
+    pages. The size of the cache is limited (see `marsyard.sim.cache.evict_files`).
     """
 
     parameters: TerrainParameters
@@ -118,6 +121,7 @@ class TerrainBank:
         return Surface(levels, self.parameters.spacing_m, factors.reshape(factor_side, factor_side, 3))
 
     def _build(self, number: int) -> Surface:
+        """Synthesise a terrain, with the wind tails of its rocks."""
         surface, rocks = synthesise(self.parameters, self._rng(number)), self.parameters.rocks
         if rocks is None or rocks.tails is None:
             return surface
@@ -148,6 +152,7 @@ class TerrainBank:
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
 
     def _sides(self) -> list[int]:
+        """Return the side of each level, in samples."""
         levels = (self.parameters.samples // SMALLEST_LEVEL).bit_length()
         return [self.parameters.samples >> level for level in range(levels)]
 
@@ -156,4 +161,5 @@ class TerrainBank:
         return 2 * sum(side**2 for side in self._sides()) + 3 * self._factor_side() ** 2
 
     def _factor_side(self) -> int:
+        """Return the side of the grid of `Surface.factors`."""
         return 1 if self.parameters.units is None else self.parameters.samples // FACTOR_STEP

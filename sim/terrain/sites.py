@@ -29,7 +29,7 @@ class Environment(Parameters):
     optical_depth: Annotated[float, Field(ge=0.0, le=10.0, description="optical depth of the atmosphere")] = 0.5
     single_scattering_albedo: Annotated[float, Field(ge=0.0, lt=1.0, description="scattering / extinction")] = 0.94
     asymmetry: Annotated[float, Field(gt=-1.0, lt=1.0, description="mean cosine of the scattering angle")] = 0.65
-    scale_height_m: Annotated[Positive, Field(description="height over which the extinction falls by e, m")] = 11100.0
+    scale_height_m: Annotated[Positive, Field(description="height over which extinction falls to 1/e, m")] = 11100.0
 
     @property
     def sun_radius_rad(self) -> float:

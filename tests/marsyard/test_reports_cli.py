@@ -157,7 +157,7 @@ def _find_next_look(n: int, failures: int, max_cases: int, **changes: Any) -> in
     return next_look(evaluate_requirements(_make_rows(n, failures), [requirement], design), design, n)
 
 
-def test_undecided_campaign_continues() -> None:
+def test_campaign_continues_until_its_verdict_is_decided() -> None:
     # evaluations are planned at 16, 32, 64, 128, 256 and 512 cases
     assert _find_next_look(16, 1, 512) == 32
     # the evaluation at 128 cases spends 1/8 of the risk: its confidence is 98.75 %
@@ -168,7 +168,7 @@ def test_undecided_campaign_continues() -> None:
     assert _find_next_look(16, 1, 512, decide_by="estimate") is None
 
 
-def test_undecidable_campaign_stops() -> None:
+def test_campaign_stops_if_no_further_evaluation_can_decide() -> None:
     # 64 cases cannot show 99.99 % (23,026 cases needed), but one failure can refute it
     assert _find_next_look(16, 0, 64, probability=0.9999) == 32
     assert _find_next_look(32, 0, 33, probability=0.5) is None

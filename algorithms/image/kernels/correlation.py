@@ -113,7 +113,7 @@ def search_near(
     """Search the best position within `radius` rows and columns of each position (row, column).
 
     Returns the best positions and Eq. 11 at each. Positions outside the window are clamped to its border. The template
-    must have a mean of zero; the window is unchanged, because all sums are float64.
+    must have a mean of zero. The mean of the window need not be subtracted, because all sums are float64.
     """
     n, m = template.shape
     last_row, last_column = window.shape[0] - n, window.shape[1] - m

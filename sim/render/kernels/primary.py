@@ -48,15 +48,15 @@ class _Strip(NamedTuple):
 
     - work: rows of numbers, `ROW` apart
     - row, column: the upper left of the four samples around each ray in its view
-    - ids: bitwise OR of the triangle numbers of these samples
+    - any_id: bitwise OR of the triangle numbers (from 1) of these samples; 0 if no sample shows a triangle
     - level: terrain level of each ray
-    - refined: indices of the rays to refine
+    - refined: indices of the rays that Newton's method refines
     """
 
     work: Array
     row: Longs
     column: Longs
-    ids: Ints
+    any_id: Ints
     level: Longs
     refined: Longs
 
@@ -136,7 +136,7 @@ def _project(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None:
-    """First guesses of distance, and footprints, from the four samples around each ray; 0 if depth is discontinuous.
+    """Interpolate first guesses of distance, and footprints, from four samples; 0 if their depth is discontinuous.
 
     Inverse depth is interpolated, because the inverse depth of a plane is linear in the image.
     """
@@ -213,7 +213,7 @@ def _refine_on_ground(
 def _sample_views(views: Views, directions: Array32, first: int, width: int, strip: _Strip) -> None:
     """Project the rays of a strip into their views, and read the four samples around each ray."""
     depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
-    work, row, column, any_id = strip.work, strip.row, strip.column, strip.ids
+    work, row, column, any_id = strip.work, strip.row, strip.column, strip.any_id
     side = depth.shape[1]
     objects = ids.shape[1] > 0
     start = 0
@@ -250,9 +250,13 @@ def _sample_views(views: Views, directions: Array32, first: int, width: int, str
 def _select_levels(
     spacing: float, top_level: int, views: Views, pixel_angles: Array32, first: int, width: int, strip: _Strip
 ) -> None:
-    """Distance at which each ray of a strip hits the mesh, and the terrain level for its footprint there."""
+    """Select the terrain level of each ray of a strip by the size of its pixel's footprint on the ground.
+
+    `GUESS` and `DISTANCE` become the distance at which the ray hits the mesh. Where four samples gave no guess, it is
+    that of the nearest ground sample; `DISTANCE` is infinite if there is none.
+    """
     depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
-    work, row, column, any_id, level_of = strip.work, strip.row, strip.column, strip.ids, strip.level
+    work, row, column, any_id, level_of = strip.work, strip.row, strip.column, strip.any_id, strip.level
     for k in range(width):
         if any_id[k] != 0 or work[GUESS + k] == 0.0:
             view = view_of_pixel[first + k]
@@ -261,6 +265,7 @@ def _select_levels(
             work[FOOTPRINT + k] = work[GUESS + k] * pixel_angles[k] / max(-work[DZ + k], MIN_INCIDENCE_SINE)
         level_of[k] = 0
         if work[GUESS + k] == 0.0:
+            # a guess that differs from the distance: this ray is not refined
             work[GUESS + k] = -1.0
             work[DISTANCE + k] = math.inf
             continue
@@ -279,6 +284,7 @@ def _write_hits(views: Views, tree: Hierarchy, first: int, width: int, strip: _S
     for k in range(width):
         n = first + k
         t = work[DISTANCE + k]
+        # a distance equal to the first guess is that of the mesh: level -1 (see `Hits`)
         on_terrain = level_of[k] == 0 and t != work[GUESS + k]
         level[n] = 0 if on_terrain else (level_of[k] if level_of[k] > 0 else -1)
         distance[n] = t

@@ -77,11 +77,11 @@ ROWS = 36
 
 
 class Occluders(NamedTuple):
-    """Occluders of the sun: the ground's shadow, lists of triangles, and the region these may shade."""
+    """Occluders of the sun: the ground's shadow, the objects' triangles, and the region that objects may shade."""
 
     shadow: GroundShadow
     casters: Casters
-    footprint: Footprint
+    shadow_footprint: Footprint
 
 
 class _Strip(NamedTuple):
@@ -89,7 +89,8 @@ class _Strip(NamedTuple):
 
     - work: rows of values (see `X` and the following constants)
     - level: terrain level of each pixel
-    - ground, blended, other: indices of pixels with ground, with two blended levels, and without ground
+    - ground, blended, other: indices of pixels with ground, with two blended levels, and without ground; `other` is
+      reused for the pixels with objects and for the pixels that are tested for shadows of objects
     - hidden: whether objects hide the sun
     """
 
@@ -102,13 +103,13 @@ class _Strip(NamedTuple):
 
 
 @njit(cache=True, inline="always")
-def _in_footprint(footprint: Footprint, x: float, y: float) -> bool:
+def _may_be_shaded(region: Footprint, x: float, y: float) -> bool:
     """Return whether an object may hide the sun from the ground at a position."""
-    if footprint.per_metre == 0.0:
+    if region.per_metre == 0.0:
         return True
-    cells = footprint.cells
-    column = math.floor((x - footprint.west) * footprint.per_metre)
-    row = math.floor((y - footprint.south) * footprint.per_metre)
+    cells = region.cells
+    column = math.floor((x - region.west) * region.per_metre)
+    row = math.floor((y - region.south) * region.per_metre)
     return bool(0 <= row < cells.shape[0] and 0 <= column < cells.shape[1] and cells[row, column])
 
 
@@ -268,7 +269,8 @@ def _sample_objects(
 def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
     """Tilt the normals of the ground by the micro-relief, and set the strength of the texture.
 
-    The reflectance law already includes the mean effect of all roughness; `_shade_roughness` restores this mean.
+    Tilted normals change the mean radiance, but the reflectance law already includes the mean effect of all roughness.
+    `_shade_roughness` therefore restores the mean.
     """
     work = strip.work
     for k in range(width):
@@ -357,7 +359,7 @@ def _cast_shadows(
     sun, radius = light.sun, light.law[SUN_RADIUS]
     distance, triangle, level = hits.distance, hits.triangle, hits.level
     work, other, hidden = strip.work, strip.other, strip.hidden
-    shadow, casters, footprint = occluders
+    shadow, casters, shadow_footprint = occluders
     has_shadow = shadow.height.shape[0] > 1
     has_objects = casters[0].shape[0] > 0
     margin = COARSE_GRID_MARGIN * shadow.spacing
@@ -385,7 +387,7 @@ def _cast_shadows(
                 # at the edge of the shadow the grid is too coarse: march towards the sun
                 sun_fraction = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
         work[SUN_FRACTION + k] = sun_fraction
-        if sun_fraction > 0.0 and has_objects and (on_object or _in_footprint(footprint, x, y)):
+        if sun_fraction > 0.0 and has_objects and (on_object or _may_be_shaded(shadow_footprint, x, y)):
             # an offset along the normal: without it, rounding errors would let a facet shade itself
             offset = 1e-4 + (0.05 * distance[k] * pixel_angles[k] if on_object else 0.0)
             work[OBJECT_X + n_tested] = x + offset * work[NX + k]
@@ -449,8 +451,9 @@ def shade_sky(light: Light, pixel_angles: Array32, body: Ints, work: Array, radi
     sun, sky, radius = light.sun, light.sky, light.law[SUN_RADIUS]
     for k in range(body.size):
         if body[k] == SKY:
-            cos_g = work[DX + k] * sun[0] + work[DY + k] * sun[1] + work[DZ + k] * sun[2]
-            radiance[k] = sky_brightness(sky, sun[2], radius, work[DZ + k], cos_g, pixel_angles[k])
+            # cosine of the angle between the line of sight and the sun
+            cos_sun = work[DX + k] * sun[0] + work[DY + k] * sun[1] + work[DZ + k] * sun[2]
+            radiance[k] = sky_brightness(sky, sun[2], radius, work[DZ + k], cos_sun, pixel_angles[k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})

@@ -3,14 +3,15 @@
 The filter is modelled as an instrument: an algorithm under test receives only its pose estimates.
 
 Fifteen errors are estimated (landing paper, section IV, and its reference [12]): position, velocity, attitude
-(multiplicative), gyro bias and accelerometer bias. Time-correlated errors of the readings (wander of the receiver,
-constant errors of compass and inclinometers) are *considered* (Schmidt 1966): they are part of the covariance, but not
-estimated. Without them the covariance would be too small, because averaging does not remove these errors.
+(multiplicative), gyro bias and accelerometer bias. Time-correlated errors of the readings (that of the receiver, called
+wander, and constant errors of compass and inclinometers) are *considered* (Schmidt 1966): they are part of the
+covariance, but not estimated. Without them the covariance would be too small, because averaging does not
+remove these errors.
 
 The filter uses the standard deviations in the instruments' parameters, not the sampled errors. The receiver reports the
-standard deviation of its position. Each RTK solution is propagated from its time to its delivery time by inertial
-navigation. The assumed noise of inclinometers and compass grows with acceleration. Readings outside the gate and
-readings of stuck instruments are rejected. After `max_rejected_fixes` rejected solutions the filter restarts at the
+standard deviation of its position. Each RTK solution (position fix) is propagated from its time to its delivery time by
+inertial navigation. The assumed noise of inclinometers and compass grows with acceleration. Readings outside the gate
+and readings of stuck instruments are rejected. After `max_rejected_fixes` rejected solutions the filter restarts at the
 next solution.
 
 The landing paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
@@ -42,11 +43,13 @@ class FilterParameters(Parameters):
     initial_velocity_sd_m_s: Annotated[Positive, Field(description="initial sd of the velocity, m/s")] = 3.0
     initial_tilt_sd_deg: Annotated[Positive, Field(description="initial sd of pitch and roll, deg")] = 5.0
     initial_heading_sd_deg: Annotated[Positive, Field(description="initial sd of the heading, deg")] = 20.0
-    disturbance: Annotated[Positive, Field(description="tilt error / (acceleration / gravity), rad")] = 3.0
+    disturbance: Annotated[Positive, Field(description="tilt error, rad, divided by acceleration / gravity")] = 3.0
     unmodelled_acceleration_m_s2: Annotated[Positive, Field(description="assumed unmodelled acceleration, m/s2")] = 0.3
     gate: Annotated[Positive, Field(description="maximum normalised innovation of an accepted reading")] = 5.0
-    max_rejected_fixes: Annotated[int, Field(ge=1, description="rejected consecutive fixes before a restart")] = 10
-    max_repeated_fixes: Annotated[int, Field(ge=2, description="equal consecutive readings of a stuck sensor")] = 8
+    max_rejected_fixes: Annotated[
+        int, Field(ge=1, description="consecutive rejected RTK solutions before a restart")
+    ] = 10
+    max_repeated_fixes: Annotated[int, Field(ge=2, description="maximum equal consecutive readings; more: stuck")] = 8
 
 
 @dataclass(frozen=True)
@@ -201,7 +204,10 @@ class NavigationFilter:
         )
 
     def _convert_solutions(self, solutions: RtkSolutions) -> Float64[np.ndarray, "n 15"]:
-        """Convert solutions to rows for the kernels; reported deviations are split as in the receiver's parameters."""
+        """Convert solutions to rows for the kernels.
+
+        The reported standard deviation is divided into wander and noise in the ratio of the receiver's parameters.
+        """
         fixed, floating = self.rtk.fixed, self.rtk.floating
         wanders, noises = (
             np.where(solutions.fixed[:, None], _error_fraction(fixed, part), _error_fraction(floating, part))
@@ -254,7 +260,7 @@ class NavigationFilter:
 
 
 def _error_fraction(errors: SolutionErrors, part: str) -> Float64[np.ndarray, "3"]:
-    """Compute the fraction of a solution's standard deviation that is wander or noise; 0 without errors."""
+    """Compute the fraction of a solution's error that is `part`, "wander_m" or "noise_m"; 0 without errors."""
     return np.asarray(np.array(getattr(errors, part)) / np.maximum(errors.total_m, np.finfo(float).tiny))
 
 

@@ -59,8 +59,10 @@ class Dunes(Parameters):
     wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth from which the wind blows")] = 270.0
     repose_deg: Annotated[float, Field(ge=10.0, le=36.0, description="slope of the faces away from the wind")] = 32.0
     crest_length: Annotated[float, Field(ge=0.5, le=50.0, description="length of crests, wavelengths")] = 4.0
-    regularity: Annotated[float, Field(ge=0.3, le=20.0, description="wavelengths over which spacing persists")] = 1.5
-    albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of crests' albedo over troughs'")] = 0.05
+    regularity: Annotated[
+        float, Field(ge=0.3, le=20.0, description="length over which the spacing persists, wavelengths")
+    ] = 1.5
+    albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of crests / of troughs)")] = 0.05
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the dunes, with the wave vector that is periodic on the terrain and nearest to the parameters."""
@@ -102,7 +104,7 @@ class Lava(Parameters):
     aa_fraction: Annotated[Fraction, Field(description="fraction of the ground under a'a")] = 0.25
     aa_block_m: Annotated[Positive, Field(description="size of its blocks, m")] = 6.0
     aa_relief_m: Annotated[NonNegative, Field(description="RMS height of its blocks, m")] = 0.45
-    aa_contrast: Annotated[float, Field(ge=-1.0, le=1.0, description="log albedo of a'a over pahoehoe's")] = -0.06
+    aa_contrast: Annotated[float, Field(ge=-1.0, le=1.0, description="ln(albedo of a'a / of pahoehoe)")] = -0.06
     pahoehoe_relief_m: Annotated[NonNegative, Field(description="RMS height of hummocks on pahoehoe, m")] = 0.05
 
     def apply(self, ground: Ground, rng: Generator) -> None:
@@ -269,7 +271,7 @@ class Gullies(Parameters):
     length_m: Annotated[Positive, Field(description="mean length of a trunk, m")] = 90.0
     tributaries: Annotated[int, Field(ge=0, le=50, description="tributaries of a trunk")] = 4
     downhill_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth to which they run")] = 90.0
-    contrast: Annotated[float, bounded_field(-1.0, 1.0, "log albedo of their floors over the ground's")] = -0.1
+    contrast: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of their floors / of the ground)")] = -0.1
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Cut the gullies."""
@@ -280,6 +282,7 @@ class Gullies(Parameters):
         width = self.width_m * np.exp(0.3 * rng.standard_normal(count))
         length = self.length_m * rng.uniform(0.6, 1.4, count)
         start = rng.uniform(0.0, ground.period_m, (count, 2))
+        # the depth is proportional to the width
         depth = width * self._compute_depth(1.0)
         trunks = draw_channels(start, heading, length, width, depth, 0.15, rng)
         # the profile depth (1 - (r / w)**1.5) has its maximum slope at the rim: 1.5 depth / w
@@ -312,7 +315,7 @@ class Playa(Parameters):
     polygon_m: Annotated[Positive, Field(description="width of the polygons, m")] = 60.0
     fissure_m: Annotated[Positive, Field(description="half width over which a fissure fades, m")] = 3.0
     fissure_depth_m: Annotated[NonNegative, Field(description="depth of a fissure, m")] = 0.1
-    contrast: Annotated[float, Field(ge=-2.0, le=2.0, description="log albedo of fissures over the plates'")] = -0.12
+    contrast: Annotated[float, Field(ge=-2.0, le=2.0, description="ln(albedo of fissures / of the plates)")] = -0.12
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add fissures to the whole terrain."""
@@ -349,8 +352,8 @@ class Fans(Parameters):
     washes_per_fan: Annotated[int, Field(ge=0, le=500, description="channels on a fan")] = 50
     wash_width_m: Annotated[Positive, Field(description="median width of a wash, m")] = 9.0
     wash_depth_m: Annotated[NonNegative, Field(description="median depth of a wash, m")] = 0.7
-    wash_contrast: Annotated[float, Field(ge=-1.0, le=1.0, description="log albedo of washes over the fan's")] = 0.06
-    fan_contrast: Annotated[float, Field(ge=-2.0, le=2.0, description="log albedo of fans over the playa's")] = -0.12
+    wash_contrast: Annotated[float, Field(ge=-1.0, le=1.0, description="ln(albedo of washes / of the fan)")] = 0.06
+    fan_contrast: Annotated[float, Field(ge=-2.0, le=2.0, description="ln(albedo of fans / of the playa)")] = -0.12
 
     polygons: Annotated[Playa | None, Field(description="desiccation polygons on the playa")] = None
 

@@ -33,7 +33,9 @@ TOLERANCES = Tolerances(distance_m=0.2, position_m=0.4)
         ("position_correction_m", 0.41, TargetLoss.POSITION_JUMP),
     ],
 )
-def test_each_loss_criterion_is_independent(criterion: str, value: float, expected: TargetLoss | None) -> None:
+def test_target_is_lost_if_one_criterion_exceeds_its_limit(
+    criterion: str, value: float, expected: TargetLoss | None
+) -> None:
     result = find_losses(Evidence(**(GOOD | {criterion: value})), TOLERANCES, OPTIONS)
     assert result == (() if expected is None else (expected,))
 
@@ -72,8 +74,9 @@ def test_stereo_noise_rarely_loses_a_target(mast: MastCalibration) -> None:
     # 1 px (3 sigma) in two disparities and 20 % (3 sigma) of a 1 m step. Less than 0.3 % exceed the root sum square
     # before the constant term of the tolerance is added.
     rng = np.random.default_rng(1)
-    scale = mast.left.focal_lengths[0] * np.linalg.norm(mast.left.c - mast.right.c)
-    old, new = (scale / (scale / r + rng.normal(0.0, 1.0 / 3.0, 100_000)) for r in (10.0, 9.0))
+    # range = focal length x baseline / disparity
+    range_disparity = mast.left.focal_lengths[0] * np.linalg.norm(mast.left.c - mast.right.c)
+    old, new = (range_disparity / (range_disparity / r + rng.normal(0.0, 1.0 / 3.0, 100_000)) for r in (10.0, 9.0))
     correction = new - (old - 1.0 + rng.normal(0.0, 0.2 / 3.0, 100_000))
     tolerance = tolerances(Distances(10.0, 10.0, 9.0, 1.0, 1.0), mast.left, mast.right, OPTIONS)
     assert np.mean(np.abs(correction) > tolerance.distance_m) < 0.003

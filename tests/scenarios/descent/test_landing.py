@@ -36,9 +36,16 @@ def test_wrong_answer_increases_the_velocity() -> None:
 
 @pytest.mark.parametrize(
     ("estimate", "available_s"),
-    [(None, 17.0), (TRUE_VELOCITY, IDEAL.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)],
+    [
+        (None, 17.0),
+        (TRUE_VELOCITY, IDEAL.computation_s - 0.1),
+        # 5 m/s: the deadband, up to which the burn is not steered
+        (np.array([3.0, -4.0]), 17.0),
+    ],
 )
-def test_late_or_missing_answer_disables_steering(estimate: np.ndarray | None, available_s: float) -> None:
+def test_burn_is_not_steered_without_a_timely_estimate_above_the_deadband(
+    estimate: np.ndarray | None, available_s: float
+) -> None:
     result = compute_touchdown(IDEAL, TRUE_VELOCITY, estimate, available_s, make_rng())
     np.testing.assert_array_equal(result.with_answer, result.without_answer)
     assert result.is_in_time == (available_s >= IDEAL.computation_s)

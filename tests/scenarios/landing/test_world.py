@@ -12,14 +12,14 @@ from marsyard.sim.terrain import site
 
 
 @pytest.mark.parametrize(("site_name", "camera"), [("gusev", "mer-descent-flown"), ("heli-hazardous", "xc-55")])
-def test_sun_factor_is_1_at_the_planet_of_the_camera_specification(site_name: str, camera: str) -> None:
-    # The datasheet refers to sunlight on the same planet, so the factor of 0.44 for Mars (1.5 au) is not applied again.
+def test_camera_preset_refers_to_the_sunlight_on_the_planet_of_its_site(site_name: str, camera: str) -> None:
+    # The responsivity of a preset already contains the factor of 0.44 for sunlight on Mars (1.5 au), or 1 on Earth.
     environment = site(site_name).environment
     assert environment.solar_irradiance / preset(camera).detector.sunlight == pytest.approx(1.0, abs=0.02)
 
 
-def test_electron_count_is_independent_of_the_datasheet_sun_distance() -> None:
-    """A datasheet for a more distant sun specifies a smaller responsivity (electrons/s), by the inverse square law."""
+def test_electron_count_does_not_depend_on_the_sun_distance_of_the_responsivity() -> None:
+    """The responsivity (electrons/s) decreases with the square of the distance from the sun for which it is given."""
     small_terrain = {"terrain": {"samples": 256}, "location": {"bank": 1}}
     electrons = []
     for sun_au in (1.0, 1.5, 3.0):
@@ -29,9 +29,7 @@ def test_electron_count_is_independent_of_the_datasheet_sun_distance() -> None:
     assert electrons == pytest.approx([electrons[0]] * 3, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("bank", "n_terrains"), [(1, 1), (MAX_GROUNDS, MAX_GROUNDS), (MAX_GROUNDS + 1, 0), (10_000, 0)]
-)
-def test_only_small_banks_are_built_in_advance(bank: int, n_terrains: int) -> None:
+@pytest.mark.parametrize(("bank", "n_built"), [(1, 1), (MAX_GROUNDS, MAX_GROUNDS), (MAX_GROUNDS + 1, 0), (10_000, 0)])
+def test_only_small_banks_are_built_in_advance(bank: int, n_built: int) -> None:
     parameters = LandingScenarioParameters.model_validate({"location": {"bank": bank}})
-    assert LandingScenario().shared_inputs(parameters) == tuple(range(n_terrains))
+    assert LandingScenario().shared_inputs(parameters) == tuple(range(n_built))

@@ -70,7 +70,7 @@ def test_circle_keeps_target_distance_and_bearing() -> None:
     assert is_finished(leg, 7, target)
 
 
-def test_commands_of_turn_back_off_and_straight_legs() -> None:
+def test_turn_back_off_and_straight_legs_have_their_commands() -> None:
     turn_leg = LegParameters(motion="turn", step_deg=10.0, steps=7, shuffle_m=0.1)
     first, second = (
         list(plan_step(turn_leg, 0, make_target(3.0, 0.0))),
@@ -85,6 +85,9 @@ def test_commands_of_turn_back_off_and_straight_legs() -> None:
     assert is_finished(back_off, 1, make_target(7.0, 0.0))
     straight_leg = LegParameters(motion="straight", step_m=0.425, steps=2)
     assert [command.forward_m for command in plan_step(straight_leg, 0, make_target(1.0, 4.0))] == [0.425]
+
+
+def test_incomplete_or_inconsistent_legs_are_rejected() -> None:
     with pytest.raises(ValueError, match="needs step_m"):
         LegParameters(motion="straight")
     with pytest.raises(ValueError, match="autonav needs a leg of motion 'approach'"):

@@ -51,7 +51,7 @@ def test_mounting_preserves_all_angles(euroc: Path) -> None:
     assert np.allclose(mounted_camera.project(point * [1.0, -1.0, -1.0])[0], expected_pixels.ravel(), rtol=0, atol=0.2)
 
 
-def test_opportunity_labels_can_be_mounted(shared_data: Path) -> None:
+def test_mounting_an_opportunity_camera_preserves_all_angles(shared_data: Path) -> None:
     label = shared_data / "mer_opportunity" / "1N491020376ILFCNY9P0706L0M1.IMG"
     custom = CHOICE.validate_python(str(label))
     assert custom.model == "CAHVOR"

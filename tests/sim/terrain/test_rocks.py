@@ -130,7 +130,7 @@ def test_no_two_rocks_overlap(field: RockField) -> None:
     assert np.all(np.hypot(*offsets_m.T) >= radius_m[pairs].sum(axis=1))
 
 
-def test_max_rock_density_is_reached(ground: Surface) -> None:
+def test_rocks_of_max_abundance_cover_the_specified_fraction(ground: Surface) -> None:
     field = make_field(ground, abundance=0.4, smallest_m=0.06, placed=())
     covered_fraction = np.sum(np.pi / 4 * field.diameter_m**2) / field.period_m**2
     assert covered_fraction == pytest.approx(0.4 * np.exp(-0.06 * decay_per_m(0.4)), rel=0.1)
@@ -255,7 +255,7 @@ def test_too_many_rocks_and_unknown_shapes_are_rejected(ground: Surface) -> None
 
 @pytest.mark.parametrize("number", [0, 9, 15, 16, 27, 32, 47, 50, 63, 70])
 @pytest.mark.parametrize("detail", [COARSEST, COARSE, MEDIUM, FINE])
-def test_coarse_rock_matches_the_finest_within_subpixels(number: int, detail: int) -> None:
+def test_coarse_rock_deviates_from_the_finest_by_a_quarter_pixel(number: int, detail: int) -> None:
     """The RMS distance above the ground to the plane of the nearest coarse triangle is about 0.25 px (requirement)."""
     coarse = make_mesh(rock_shapes(detail), number)
     samples, triangles = trimesh.sample.sample_surface(coarse, 200_000, seed=1)
