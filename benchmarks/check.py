@@ -1,9 +1,11 @@
-"""Detect hot paths that became slower, by their stored time ratios: ``python -m benchmarks.check [--keep]``.
+"""Detect hot paths that became slower since an earlier version: ``python -m benchmarks.check [--keep]``.
 
-Runs of each path alternate with runs of a reference workload (matrix products, filters, sorting, copies), so that a
-slow or busy machine affects both. Welch's test compares the logarithms of the ratios of their processor times with the
-stored logarithms. A path is slower if its mean ratio has grown by more than the factor `ALLOWED_GROWTH`. The false
-alarm rate is `FALSE_ALARM_RATE` for all paths together. Ratios are valid for one type of processor.
+A hot path is code that takes a large part of the processor time (docs/performance.md). Its runs alternate with runs of
+a reference workload (matrix products, filters, sorting, copies), so that a slow or busy machine affects both. A ratio
+is the processor time of a run divided by that of the reference workload. Welch's test compares the logarithms of the
+ratios with those that an earlier version stored (``--keep``). A hot path is slower if its mean ratio has grown by more
+than the factor `ALLOWED_GROWTH`. The false alarm rate is `FALSE_ALARM_RATE` for all hot paths together. Ratios are
+valid for one type of processor.
 """
 
 from __future__ import annotations
@@ -31,11 +33,11 @@ from marsyard.algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, haza
 from marsyard.sim.kernel_cache import processor_features
 
 RATIOS = Path(__file__).parent / "results" / "ratios.json"
-#: Pairs of runs of a path and the reference workload.
+#: Number of runs of each hot path; each run is paired with runs of the reference workload.
 PAIRS = 15
-#: Accepted factor of growth of a ratio, because memory and caches are shared with other programs.
+#: Accepted growth of a ratio, as a factor: memory and caches are shared with other programs.
 ALLOWED_GROWTH = 1.15
-#: Probability that at least one path of an unchanged program is reported.
+#: Probability that at least one hot path of an unchanged program is reported as slower.
 FALSE_ALARM_RATE = 0.01
 
 
@@ -55,8 +57,8 @@ def _prepare_hazard_maps() -> Callable[[], object]:
     return lambda: hazard_maps(ground, HdaOptions())
 
 
-#: Path: function that prepares it and returns a function for repeated runs.
-PATHS: Mapping[str, Callable[[], Callable[[], object]]] = {
+#: Hot paths by name: each function prepares the inputs and returns a function that runs the hot path once.
+HOT_PATHS: Mapping[str, Callable[[], Callable[[], object]]] = {
     "descent image with detector": prepare_descent_exposure,
     "DIMES, three images": _prepare_dimes,
     "target tracking, an update": prepare_update,
@@ -82,12 +84,12 @@ def reference_workload() -> Callable[[], object]:
     return run
 
 
-def log_ratios(path: Callable[[], object], reference: Callable[[], object], pairs: int) -> list[float]:
-    """Return, for each pair, the log of the path's time divided by the mean reference time before and after it."""
-    path()
+def log_ratios(hot_path: Callable[[], object], reference: Callable[[], object], runs: int) -> list[float]:
+    """Return, for each run, the log of its time divided by the mean time of the reference before and after it."""
+    hot_path()
     ratios, before = [], _processor_seconds(reference)
-    for _ in range(pairs):
-        elapsed, after = _processor_seconds(path), _processor_seconds(reference)
+    for _ in range(runs):
+        elapsed, after = _processor_seconds(hot_path), _processor_seconds(reference)
         ratios.append(float(np.log(elapsed / (0.5 * (before + after)))))
         before = after
     return ratios
@@ -102,7 +104,7 @@ def _processor_seconds(run: Callable[[], object]) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of a path with its stored ratio: factor of growth, and p-value of the hypothesis of no slow-down."""
+    """Growth of a hot path's mean ratio, as a factor, and p-value of the hypothesis of at most the accepted growth."""
 
     name: str
     growth: float
@@ -110,7 +112,7 @@ class Comparison:
 
 
 def compare(current: Mapping[str, Sequence[float]], stored: Mapping[str, Sequence[float]]) -> list[Comparison]:
-    """Compare the log ratios of every path that both records contain."""
+    """Compare the log ratios of every hot path that both records contain."""
     comparisons = []
     for name in current.keys() & stored.keys():
         ratios, stored_ratios = np.asarray(current[name]), np.asarray(stored[name])
@@ -120,12 +122,12 @@ def compare(current: Mapping[str, Sequence[float]], stored: Mapping[str, Sequenc
 
 
 def select_slower(comparisons: Sequence[Comparison]) -> list[Comparison]:
-    """Select paths that exceed the accepted growth, with Bonferroni's correction."""
+    """Select the hot paths that exceed the accepted growth, with Bonferroni's correction."""
     return [comparison for comparison in comparisons if comparison.p_value < FALSE_ALARM_RATE / len(comparisons)]
 
 
 def main() -> int:
-    """Measure, then store or compare. Returns 1 if a path is slower, 2 without stored ratios of this processor."""
+    """Measure, then store or compare. Returns 1 if a hot path is slower, 2 without stored ratios of this processor."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.check", description=__doc__)
     parser.add_argument("--keep", action="store_true", help="store these ratios for later comparisons")
     keep = parser.parse_args().keep
@@ -140,7 +142,7 @@ def main() -> int:
         return 2
     cv2.setNumThreads(1)
     reference = reference_workload()
-    ratios = {name: log_ratios(prepare(), reference, PAIRS) for name, prepare in PATHS.items()}
+    ratios = {name: log_ratios(prepare(), reference, PAIRS) for name, prepare in HOT_PATHS.items()}
     if keep:
         record = {
             "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
@@ -155,7 +157,7 @@ def main() -> int:
 
 
 def _print_comparison(comparisons: Sequence[Comparison], date: str) -> int:
-    """Print the comparison. Returns 1 if a path is slower."""
+    """Print the comparison. Returns 1 if a hot path is slower."""
     slower = select_slower(comparisons)
     print(f"{'ratio divided by that of ' + date[:10]:<40}{'factor':>8}{'p':>10}")
     for comparison in comparisons:

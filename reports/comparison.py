@@ -1,9 +1,10 @@
 """Comparison of algorithms on the same cases, and of two stored campaigns.
 
-Algorithms are paired case by case: successes are compared by discordant cases, errors by the differences of cases that
-both answered (`marsyard.reports.statistics.changes`). Campaigns with the same draws (name, seed, dispersions) are
-paired as well; otherwise they are compared per terrain if they share terrains, else with terrains as independent
-clusters. Cases on one terrain form a cluster. All p-values are corrected by Holm's method.
+Other algorithms are compared with the tested one (the algorithm under test) case by case: successes by discordant
+cases, errors by the differences of the cases that both answered (`marsyard.reports.statistics.changes`). Campaigns with
+the same draws (name, seed, dispersions) are paired as well; otherwise they are compared per terrain if they share
+terrains, else with terrains as independent clusters. Cases on one terrain form a cluster. All p-values are corrected by
+Holm's method.
 """
 
 from __future__ import annotations
@@ -83,13 +84,13 @@ class PairedComparison:
 
 
 def list_compared_algorithms(frame: pd.DataFrame) -> list[str]:
-    """List the names of the compared algorithms in the rows."""
+    """List the names of the other algorithms in the rows, which are compared with the tested one."""
     names = [str(column).removesuffix(".answered") for column in frame.columns if str(column).endswith(".answered")]
     return [name for name in names if rates.is_flag(frame, f"{name}.answered")]
 
 
 def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
-    """Return the rows with the results of a compared algorithm instead of the algorithm under test."""
+    """Return the rows with the results of another algorithm in the columns of the tested one."""
     prefix = f"{name}."
     columns = [str(column) for column in frame.columns if str(column).startswith(prefix)]
     new_names = {name: name.removeprefix(prefix) for name in columns}
@@ -114,18 +115,18 @@ def summarize_algorithm(frame: pd.DataFrame, name: str, metric: str | None, boun
     )
 
 
-def compare_with_baseline(
-    first: pd.DataFrame, other: pd.DataFrame, name: str, metric: str, bound: float | None
+def compare_with_tested(
+    tested: pd.DataFrame, other: pd.DataFrame, name: str, metric: str, bound: float | None
 ) -> PairedComparison:
-    """Compare another algorithm with the first, from rows of the same cases in the same order."""
-    first_error, other_error = (np.abs(numbers(frame, metric)) for frame in (first, other))
-    both_answered, groups = np.isfinite(first_error) & np.isfinite(other_error), rates.terrain_groups(first)
+    """Compare another algorithm, called `name`, with the tested one, from rows of the same cases in the same order."""
+    tested_error, other_error = (np.abs(numbers(frame, metric)) for frame in (tested, other))
+    both_answered, groups = np.isfinite(tested_error) & np.isfinite(other_error), rates.terrain_groups(tested)
     success: tuple[int | None, int | None, float] = (None, None, math.nan)
     if bound is not None:
-        success = compare_successes(first_error <= bound, other_error <= bound, groups)
+        success = compare_successes(tested_error <= bound, other_error <= bound, groups)
     answered_groups = None if groups is None else groups[both_answered]
     mean, lower, upper, p_value = compare_errors(
-        (other_error - first_error)[both_answered], answered_groups, CONFIDENCE
+        (other_error - tested_error)[both_answered], answered_groups, CONFIDENCE
     )
     return PairedComparison(name, *success, int(both_answered.sum()), mean, lower, upper, p_value)
 
@@ -133,7 +134,7 @@ def compare_with_baseline(
 def compare_algorithms(
     frame: pd.DataFrame, metric: str | None, bound: float | None
 ) -> tuple[list[AlgorithmResult], list[PairedComparison]]:
-    """Summarize all algorithms, the one under test first, and compare the others with it; empty for a single one."""
+    """Summarize all algorithms, the tested one first, and compare the others with it; empty for a single algorithm."""
     names = list_compared_algorithms(frame)
     # cases that ended before any algorithm ran have no answers to compare
     frame = frame[np.logical_and.reduce([frame[f"{name}.answered"].notna() for name in names])] if names else frame
@@ -146,7 +147,7 @@ def compare_algorithms(
     if metric is None:
         return results, []
     differences = [
-        compare_with_baseline(frame, rows, name, metric, bound) for name, rows in frames.items() if metric in rows
+        compare_with_tested(frame, rows, name, metric, bound) for name, rows in frames.items() if metric in rows
     ]
     success_p, error_p = (
         correct_holm([difference.success_p for difference in differences]),
@@ -254,7 +255,10 @@ class MetricComparison:
 
 
 def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
-    """Return the rows without the nominal case, and metrics: successes by requirement, errors, answers, completion."""
+    """Return the rows without the nominal case, and the metrics that can be compared between campaigns.
+
+    Metrics: success of each requirement, errors, "answered", and "came to an end" (the case was completed).
+    """
     frame = read_sampling_design(run.configuration).exclude_nominal_case(run.frame)
     metrics: dict[str, Metric] = {}
     error_columns = dict.fromkeys([primary_metric(frame, run.requirements)])

@@ -32,8 +32,10 @@ _NO_VERDICT = "NO VERDICT"
 class OverallVerdict:
     """Verdict of a campaign.
 
-    - status: None without requirements, and for a study without a verdict
-    - crashed: number of crashed cases; sentence: explanation; without_status: headline if there is no status
+    - status: worst status of the requirements, or status of a study; None without requirements or without a verdict
+    - crashed: number of crashed cases
+    - sentence: explanation
+    - without_status: headline if `status` is None
     """
 
     status: Status | None
@@ -53,7 +55,7 @@ def combine_verdicts(
     sampling: SamplingDesign = INDEPENDENT,
     evidence: Evidence | None = None,
 ) -> OverallVerdict:
-    """Combine the verdicts to the worst of them, in the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
+    """Return the worst of the verdicts, in the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
     crashed = int(engine_failed(frame).sum())
     statuses = [verdict.status for verdict in verdicts]
     crash_text = f" {count(crashed, 'case')} crashed." if crashed else ""
@@ -140,7 +142,7 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     if study:
         return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(study, run.all_cases))
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
-    columns = _shipped_columns(str(run.configuration.get("scenario") or ""))
+    columns = _read_columns(str(run.configuration.get("scenario") or ""))
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
     verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling, from_truth, configured)
     verdicts = [withhold_verdict(verdict, evidence) for verdict in verdicts]
@@ -166,8 +168,8 @@ def _evaluate_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVer
     return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {statement}.")
 
 
-def _shipped_columns(scenario: str) -> RowColumns | None:
-    """Return the columns of a scenario; None if they are unknown or their file is invalid."""
+def _read_columns(scenario: str) -> RowColumns | None:
+    """Read the columns of a scenario; None if they are unknown or their file is invalid."""
     try:
         return row_columns(scenario)
     except ValueError:

@@ -1,1 +1,1 @@
-"""Scenarios combine world, trajectory, instruments and score into cases; the catalogue of campaigns as data files."""
+"""Scenarios, which combine world, trajectory, instruments and score into cases, and the catalogue of campaign files."""

@@ -207,7 +207,7 @@ MIN_RESPONSE = 0.02
 
 
 def correct_patch(view: View, rows: slice, columns: slice) -> Float[np.ndarray, "_ _"]:
-    """Correct part of a view for the frame-transfer ramp and the flat field, counts, float64."""
+    """Correct part of a view for the frame-transfer smear and the flat field, counts, float64."""
     exposure_signal = remove_frame_transfer(view.signal[:, columns], view.calibration, view.rows_summed)
     return np.asarray(exposure_signal[rows] / np.maximum(view.flat_field[rows, columns], MIN_RESPONSE))
 

@@ -145,7 +145,7 @@ DARK_FRACTION = 0.01
 def template_contrasts(view: binning.View, pixels: Points2, support: int) -> Vector:
     """Harris interest over squares of `support` pixels around whole pixels (u, v), divided by their mean signal.
 
-    The image is not corrected: the frame-transfer ramp is smooth along columns and its effect is negligible.
+    The image is not corrected: the frame-transfer smear is smooth along columns and its effect is negligible.
     """
     columns, rows = np.rint(pixels).astype(int).T
     uu, vv, uv = (part[rows, columns] for part in structure_tensor(view.signal, support))

@@ -1,4 +1,4 @@
-"""Removal of the frame-transfer ramp of a camera without shutter ("Field Testing of the MER DIMES", section II.A).
+"""Removal of the frame-transfer smear of a camera without shutter ("Field Testing of the MER DIMES", section II.A).
 
 Without a shutter a charge packet collects light in every row that it passes. The packet of physical row r passes rows
 r+1 .. N-1 while the detector is cleared before the exposure (`clear_row_s` in each), and rows r-1 .. 0 during the

@@ -1,7 +1,8 @@
 """Checks of the simulated world: statistics of rendered images compared with those of images from Mars.
 
-The limits are derived from Spirit's descent images (public copies, 843 pixels), HiRISE orthoimages, and mast images of
-both rovers. Terrains fitted to these images are no predictions; `sim/terrain/sites.toml` lists them.
+The limits are derived from Spirit's descent images (the public copies, which have 843 x 843 pixels), HiRISE
+orthoimages, and mast images of both rovers. Some terrains of `sim/terrain/sites.toml` are fitted to these images; for
+these the checks are no predictions. A "flown" value is one of images from Mars.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from marsyard.sim.image_statistics import ImageStatistics, compute_image_statist
 
 #: Altitudes of two of Spirit's descent images, metres.
 ALTITUDES_M = (1433.0, 1983.0)
-#: Azimuths and elevation of mast images, degrees; like the flown images, they do not contain the horizon.
+#: Azimuths and elevation of mast images, degrees; like the compared images from Mars, they do not contain the horizon.
 AZIMUTHS_DEG, ELEVATION_DEG = (0.0, 90.0, 180.0, 270.0), -35.0
 
 
@@ -68,14 +69,18 @@ def run_mast(quick: bool) -> Iterator[Measure]:
         yield Measure(f"{claim}, upper limit", contrast, "1", 0.075, how)
 
 
-#: Extremes of the four DIMES templates of Spirit's descent images: peak width, px, and ratio of second to first peak.
+#: Minimum and maximum over the four DIMES templates of Spirit's descent images: width of the correlation peak, px, and
+#: ratio of the second to the first peak.
 FLOWN_WIDTHS_PX, FLOWN_SECOND_PEAKS = (3.3, 15.6), (0.40, 0.82)
-#: 95 % interval of the fraction of rejected templates by Clopper and Pearson: one of four was rejected.
-FLOWN_REJECTED_FRACTION = (0.006, 0.806)
+#: 95 % confidence interval (Clopper and Pearson) of the fraction of refused templates: one of the four was refused.
+FLOWN_REFUSED_FRACTION = (0.006, 0.806)
 
 
 def run_templates(quick: bool) -> Iterator[Measure]:
-    """Compare the correlation peaks of DIMES' templates in `dimes-gusev` with those of the four flown templates."""
+    """Compare the correlation peaks of DIMES' templates in `dimes-gusev` with those of the four flown templates.
+
+    The range of the simulated values must contain the range of the flown values.
+    """
     campaign = marsyard.load_campaign("dimes-gusev", {"location.bank": 8})
     products = [marsyard.run_case(campaign, case).products for case in range(1, 4 if quick else 41)]
     tracks = np.concatenate([product["tracks"] for product in products if "tracks" in product])
@@ -91,10 +96,10 @@ def run_templates(quick: bool) -> Iterator[Measure]:
         text = f"{how}; median {median:.2g}, 5 to 95 % {low_5:.2g} to {high_95:.2g}"
         yield Measure(f"{name}: minimum", float(values.min()), "1", low, text)
         yield Measure(f"{name}: maximum", float(values.max()), "1", high, text, "at least")
-    rejected_fraction = float(np.mean(valid == 0.0))
-    yield Measure("refused templates", rejected_fraction, "1", FLOWN_REJECTED_FRACTION[1], f"{how}, one refused")
+    refused_fraction = float(np.mean(valid == 0.0))
+    yield Measure("refused templates", refused_fraction, "1", FLOWN_REFUSED_FRACTION[1], f"{how}, one refused")
     claim = "refused templates, lower limit"
-    yield Measure(claim, rejected_fraction, "1", FLOWN_REJECTED_FRACTION[0], f"{how}, one refused", "at least")
+    yield Measure(claim, refused_fraction, "1", FLOWN_REFUSED_FRACTION[0], f"{how}, one refused", "at least")
 
 
 CHECKS = (

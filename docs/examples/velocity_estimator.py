@@ -43,6 +43,7 @@ def _measure_velocities(measurements: DescentMeasurements) -> np.ndarray:
     """Measure the velocity of each matched template, shape (n, 2), m/s east and north."""
     second, third = (measurements.images[number].counts.astype(np.float32) for number in (1, 2))
     interval_s = measurements.images[2].time_s - measurements.images[1].time_s
+    # motion of the ground relative to the body between the images
     displacement = -measurements.interval_velocities_m_s[1] * interval_s
     rows, columns = second.shape
     # templates on a grid with a spacing of one sixth of the image

@@ -32,7 +32,7 @@ HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "s
 #: Verdict of a campaign that could not be run.
 NOT_RUN = "NOT RUN"
 
-#: The plan that ships with Marsyard.
+#: The plan that is installed with Marsyard.
 PLAN_FILE = Path(__file__).resolve().parents[1] / "scenarios" / "nightly.toml"
 
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
@@ -81,7 +81,10 @@ def night_seed(seed: int, night: int) -> int:
 
 
 def hash_definition(campaign: Campaign) -> str:
-    """Hash a campaign's definition except seed, texts and number of cases; only equal definitions are compared."""
+    """Hash a campaign's definition; only nights with equal definitions are compared.
+
+    Seed, description, retained products, limits and number of cases are excluded.
+    """
     excluded_keys = {"seed", "description", "retain", "limits", "cases"}
     definition = campaign.configuration.model_dump(mode="json", exclude=excluded_keys)
     return hashlib.sha256(json.dumps(definition, sort_keys=True).encode()).hexdigest()
@@ -133,7 +136,7 @@ def write_page(history: History, night: int, out: Path, changes: Sequence[Change
     """Write the page with the results of the night so far, and the significant changes; return its text."""
     nights = {record.night: record for record in history.nights()}
     earlier_nights = [record for number, record in nights.items() if number < night]
-    comparisons = sum(bool(comparison.before) for comparison in list_comparisons(history, night))
-    text = format_night_page(nights[night], earlier_nights, history.campaigns(night), changes, comparisons)
+    n_comparisons = sum(bool(comparison.before) for comparison in list_comparisons(history, night))
+    text = format_night_page(nights[night], earlier_nights, history.campaigns(night), changes, n_comparisons)
     write_atomic(out / PAGE_FILE, text)
     return text

@@ -1,7 +1,7 @@
 """Static site of the dashboard: an index of requirements and campaigns, and a page for each campaign and stored case.
 
 All pages are in the site's folder and need no other files; the reports of campaigns are linked or copied into it.
-Pages of unchanged campaigns are not written again; an update takes time only for new campaigns.
+Pages of unchanged campaigns are not written again.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Site:
 def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, SharedRequirement] | None = None) -> Site:
     """Write the dashboard of all campaigns in or below the folders `sources`.
 
-    shared: shared requirements by id; None for the requirements that Marsyard installs
+    `shared` contains the requirements that campaigns reference by id; None for those installed with Marsyard.
     """
     entries, problems = stored.read_entries(stored.find_campaigns(sources))
     rows = stored.requirement_rows(entries, shipped_requirements() if shared is None else shared)

@@ -34,8 +34,9 @@ BORDER_PX = 12.0
 MIN_TRACKED_FRACTION = 0.9
 #: Match statuses whose matches are dropped and counted.
 DROP_STATUSES = (MatchStatus.DISSIMILAR, MatchStatus.OUT_OF_BOUNDS, MatchStatus.INCONSISTENT)
-#: Maximum changes for tracking (section II.A): rotation about the optical axis, about other axes, relative height.
-MAX_ROLL_DEG, MAX_TILT_DEG, MAX_CLIMB = 10.0, 20.0, 0.2
+#: Maximum changes between the images for tracking (section II.A): rotation about the optical axis and about each other
+#: axis, and change of height as a fraction of the range along the optical axis.
+MAX_ROLL_DEG, MAX_TILT_DEG, MAX_HEIGHT_CHANGE_FRACTION = 10.0, 20.0, 0.2
 #: Columns of tracks, motion, structure and map.
 MOTION_COLUMNS = (
     "features", "tracks", "features_in_view", "tracks_correct", "tracked_fraction", "tracks_outlier_fraction",
@@ -122,8 +123,12 @@ def landing_row(
     `touchdown_error_gps_m` is the distance from the receiver's averaged solutions to the site's coordinates, as
     measured in the paper. `touchdown_error_m` is the distance from the true touchdown to the true site, which excludes
     the navigation error at the first image. `touchdown_safe` is true if the ground under the helicopter is safe.
-    `touchdown_sink_m_s` and `touchdown_drift_m_s` are the vertical and horizontal speeds at touchdown. Without a site
-    or a helicopter there is no landing: numbers are NaN, and `touchdown_safe` is missing.
+    `touchdown_sink_m_s` and `touchdown_drift_m_s` are the vertical and horizontal speeds at touchdown. `gps_solutions`
+    is the number of averaged solutions; `gps_deviation_north_m` and `gps_deviation_east_m` are the means of the
+    standard deviations that the receiver reports. `landing_after_s` is the time from the second image to touchdown.
+    `landing_turns` and `landing_moved_m` are the number of iterations of flight and filter and the change of the path
+    in the last iteration (`marsyard.scenarios.landing.helicopter`). Without a site or a helicopter there is no landing:
+    numbers are NaN, and `touchdown_safe` is missing.
     """
     site, relief, touchdown = estimate.site_world, truth.relief, None
     if flight.transit is not None and site is not None:
@@ -198,9 +203,9 @@ def motion_errors(estimated: RigidTransform, true: RigidTransform) -> dict[str, 
     (translation, length), (true_translation, true_length) = (
         (np.array(motion.translation), float(np.linalg.norm(motion.translation))) for motion in (estimated, true)
     )
-    is_defined = length and true_length
+    has_directions = length and true_length
     # chord between the unit vectors of both directions
-    chord = float(np.linalg.norm(translation / length - true_translation / true_length)) if is_defined else NAN
+    chord = float(np.linalg.norm(translation / length - true_translation / true_length)) if has_directions else NAN
     error = float(np.linalg.norm(translation - true_translation))
     return {
         "rotation_error_deg": float(np.degrees((estimated.rotation * true.rotation.inv()).magnitude())),
@@ -251,9 +256,10 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     p, pair, truth = case.p, case.pair, case.truth
     covered = truth.covered
     slopes = truth.footprints.slope_rad[covered]
-    # the paper's limits of tracking (section II.A)
+    # the paper's limits of tracking (section II.A); pitch, yaw and roll are the components of the rotation vector about
+    # the x, y and optical axes of the camera
     pitch, yaw, roll = np.degrees(np.abs(true_motion(case.flight, pair).rotation.as_rotvec()))
-    # height and attitude at the first image, motion and rotation to the second
+    # height and vertical at the first image; motion and rotation vector, body axes, to the second image
     first, second = case.flight.states
     motion = second.position_m - first.position_m
     positions = np.stack([first.position_m, second.position_m])
@@ -264,7 +270,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     within_limits = (
         roll < MAX_ROLL_DEG + 0.5
         and max(pitch, yaw) < MAX_TILT_DEG + 0.5
-        and abs(float(motion[2])) < (MAX_CLIMB + 0.01) * pair.axis_range_m
+        and abs(float(motion[2])) < (MAX_HEIGHT_CHANGE_FRACTION + 0.01) * pair.axis_range_m
     )
     return {
         "site": p.site,

@@ -177,9 +177,9 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
             row: dict[str, Scalar] = {
                 "velocity_estimated_x_m_s": float(estimate_m_s[0]),
                 "velocity_estimated_y_m_s": float(estimate_m_s[1]),
-                # this difference includes the unknown error of the inertial velocity
+                # estimated minus inertial velocity, which has an unknown constant error
                 "inertial_difference_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
-                # the discrepancy excludes it: estimated minus inertial velocity change between the intervals
+                # estimated minus inertial velocity change between the intervals, in which this error cancels
                 "pair_discrepancy_m_s": NAN if velocity_pair is None else velocity_pair.discrepancy_m_s,
             }
             if true_velocity is not None:
@@ -317,6 +317,7 @@ def _site_answer_row(
     """
     site = _get_site(estimate)
     position = np.full(3, np.nan) if site is None else site
+    # without an answer both outcome columns are false, as for NO_STRUCTURE
     outcome = SiteOutcome.NO_STRUCTURE if estimate is None else estimate.outcome
     row: dict[str, Scalar] = {
         "converged": outcome.converged,

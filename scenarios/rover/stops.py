@@ -1,4 +1,4 @@
-"""Stops of a run: take stereo images, store poses and the tracker's answer; choose the target and its visibility.
+"""Stops of a run: stereo images, poses and the tracker's answer; designation and visibility of the target.
 
 The paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
@@ -71,7 +71,7 @@ class StereoCamera:
 
     @classmethod
     def draw(cls, p: RoverScenarioParameters, streams: Streams) -> StereoCamera:
-        """Draw the detectors of the designed pair."""
+        """Draw the detectors of both cameras; their fall-off is that of the nominal lens design."""
         design, settings, rng = p.camera.mast(), p.camera.settings(), streams.generator("detector response")
         left, right = (Detector.draw(_cached_fall_off(camera), settings, rng) for camera in (design.left, design.right))
         return cls(p, (left, right), streams.generator("detector noise"))
@@ -148,9 +148,9 @@ class RunOutcome(Enum):
 class View:
     """The images of a stop, with the poses at which they were taken."""
 
-    leg: int  #: index of the leg that ended at this stop; -1 for the start
+    leg: int  #: index of the leg (drive between two stops) that ended here; -1 for the start
     time_s: float  #: time since the start of the run
-    stance: Stance  #: true stance
+    stance: Stance  #: true pose and joint angles of the rover
     estimated_pose: RigidTransform  #: estimated world pose of the rover
     angles_rad: tuple[float, float]  #: azimuth and elevation read by the mast's encoders
     world_from_head: RigidTransform  #: true pose of the mast's head
@@ -188,9 +188,9 @@ class Stop(View):
         )
 
     def reported_px(self, mast: MastCalibration) -> Float64[np.ndarray, "2"]:
-        """Compute the reported pixel of the target in the left image; NaN if it was not tracked.
+        """Compute the pixel at which the tracker reports the target in the left image; NaN if it was not tracked.
 
-        Without details of the match the reported position is projected through the calibrated camera.
+        Without details of the match it is the projection of the reported position by the calibrated camera.
         """
         if self.reported_position_rover is None:
             return np.full(2, np.nan)
@@ -222,7 +222,7 @@ class DesignatedTarget:
 
     point_world: Vector
     designation: TargetDesignation
-    on_edge: bool  #: whether the template in a first image shows background far behind the rock
+    on_edge: bool  #: whether the template in one of the first images shows background far behind the rock
     lit: bool  #: whether the point is in direct sunlight at the start
 
 
@@ -235,13 +235,13 @@ class Visibility:
     the width by a sixth near 45 deg and by a third near 65 deg. Scale and roll of a template do not compensate this.
     """
 
-    in_view: bool  #: whether both cameras see the point at every stop, never on an occluding edge
+    in_view: bool  #: whether at every stop both cameras see the point, and it is not on an occluding edge
     obliquity_start_deg: float
     obliquity_max_deg: float
 
 
 def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance: Stance) -> DesignatedTarget:
-    """Select the designated point on the rock's face, as operators do from the start.
+    """Designate the point of the parameters `target.across` and `target.up` in the view from the start.
 
     The point is designated by its true pixel, or by the position triangulated from its true pixels in both images. The
     mast does not move between this designation and the rover's first images.
@@ -284,19 +284,21 @@ def pick_target(
     angles_rad: tuple[float, float],
     position: tuple[float, float],
     options: VttOptions,
-    picking_eye: Vector | None = None,
+    outline_viewpoint: Vector | None = None,
 ) -> DesignatedTarget:
-    """Select a point on the rock's face; designate it by its true pixel in the left image.
+    """Designate a point on the rock's face by its true pixel in the left image.
 
-    `position` is (across, up) seen from `picking_eye`, by default the left camera. The point is on an edge if it is on
-    an edge for either camera, because stereo matching needs it in both images.
+    `position` selects the point in the view from `outline_viewpoint`, by default the left camera: across the outline,
+    from -1 (left) to 1 (right), and up, from 0 (foot) to 1 (top). The point is on an edge if it is on an edge for
+    either camera, because stereo matching needs it in both images.
     """
-    eyes, triangles = rig.eyes(world_from_head), world.target_triangles
-    foot = float(world.rocks.position_m[world.target_number, 2])
-    outline = points.RockOutline.from_triangles(triangles, eyes[0] if picking_eye is None else picking_eye, foot)
+    cameras_m, triangles = rig.eyes(world_from_head), world.target_triangles
+    foot_m = float(world.rocks.position_m[world.target_number, 2])
+    outline_viewpoint = cameras_m[0] if outline_viewpoint is None else outline_viewpoint
+    outline = points.RockOutline.from_triangles(triangles, outline_viewpoint, foot_m)
     point = outline.point(*position)
     half_rad = 0.5 * options.template_px * rig.pixel_rad
-    is_on_edge = any(_is_on_edge(triangles, foot, viewpoint, point, half_rad) for viewpoint in eyes)
+    is_on_edge = any(_is_on_edge(triangles, foot_m, viewpoint, point, half_rad) for viewpoint in cameras_m)
     is_lit = not bool(points.find_self_shadow(triangles, point[None], world.sun.direction(0.0))[0])
     pixel = rig.left.project(np.asarray(world_from_head.inv().apply(point.copy())))[0]
     return DesignatedTarget(point, PixelTarget(np.asarray(pixel), *angles_rad), is_on_edge, is_lit)
@@ -307,24 +309,27 @@ def evaluate_visibility(
 ) -> Visibility:
     """Evaluate the visibility of a point on the rock from true poses of the mast's head, world axes."""
     half_rad, triangles = 0.5 * options.template_px * rig.pixel_rad, world.target_triangles
-    eyes = [rig.eyes(head) for head in heads]
-    normal = points.patch_normal(triangles, eyes[0][0], point, half_rad)
-    to_eyes = np.array([left - point for left, _ in eyes])
-    to_eyes /= np.linalg.norm(to_eyes, axis=1, keepdims=True)
-    obliquity_deg = np.degrees(np.arccos(np.clip(to_eyes @ normal, -1.0, 1.0)))
-    foot = float(world.rocks.position_m[world.target_number, 2])
+    cameras_m = [rig.eyes(head) for head in heads]
+    normal = points.patch_normal(triangles, cameras_m[0][0], point, half_rad)
+    to_cameras = np.array([left - point for left, _ in cameras_m])
+    to_cameras /= np.linalg.norm(to_cameras, axis=1, keepdims=True)
+    obliquity_deg = np.degrees(np.arccos(np.clip(to_cameras @ normal, -1.0, 1.0)))
+    foot_m = float(world.rocks.position_m[world.target_number, 2])
 
     def is_clear(viewpoint: Vector) -> bool:
         nearby = points.triangles_near_line(triangles, viewpoint, point, half_rad)
         is_occluded = points.find_self_occlusion(nearby, point[None], viewpoint)[0]
-        return not is_occluded and not _is_on_edge(nearby, foot, viewpoint, point, half_rad)
+        return not is_occluded and not _is_on_edge(nearby, foot_m, viewpoint, point, half_rad)
 
-    in_view = all(is_clear(viewpoint) for pair in eyes for viewpoint in pair)
+    in_view = all(is_clear(viewpoint) for pair in cameras_m for viewpoint in pair)
     return Visibility(in_view, float(obliquity_deg[0]), float(obliquity_deg.max()))
 
 
 def _is_on_edge(triangles: Triangles, foot_m: float, viewpoint: Vector, point: Vector, half_rad: float) -> bool:
-    """Return whether a line of sight, `half_rad` from the point, passes the rock and hits ground far behind."""
+    """Return whether a line of sight at the angle `half_rad` from the point misses the rock and hits ground far behind.
+
+    `foot_m` is the height of the rock's foot, world z.
+    """
     distance = float(np.linalg.norm(point - viewpoint))
     axis, right, up = points.sight_axes(point - viewpoint)
     angles = np.linspace(0.0, 2.0 * np.pi, _RING_DIRECTIONS, endpoint=False)

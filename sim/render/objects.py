@@ -25,7 +25,8 @@ class Objects:
     - normals: unit normals of the smooth surface at the triangles' corners
     - body_of_triangle: number of each triangle's body: row of `albedo`
     - first_triangle: first triangle of each body, and the number of triangles at the end
-    - names: number that identifies each body for its creator, such as the number of a rock in its field
+    - names: identifier of each body, a number that its creator defines: a rock has its number in the rock field, any
+      other object a negative number
     """
 
     triangles: Float64[np.ndarray, "triangles 3 3"]
@@ -142,13 +143,13 @@ def spheres_in_cone(
     offset, radius = spheres[:, :3] - apex, spheres[:, 3]
     distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
     off_axis = np.arccos(np.clip(offset @ axis / distance, -1.0, 1.0))
-    widening = np.where(distance <= radius, np.pi, np.arcsin(np.clip(radius / distance, 0.0, 1.0)))
-    return np.asarray(off_axis <= half_angle_rad + widening)
+    angular_radius = np.where(distance <= radius, np.pi, np.arcsin(np.clip(radius / distance, 0.0, 1.0)))
+    return np.asarray(off_axis <= half_angle_rad + angular_radius)
 
 
 #: Albedo of all rover parts, assumed: dusty bright metal and glass.
 ALBEDO = 0.25
-#: Number in `names` of the rover's body: rocks have numbers from 0; truth layers use -1 for ground and -2 for sky.
+#: Identifier of the rover in `names`: rocks have numbers from 0; truth layers use -1 for ground and -2 for sky.
 ROVER_NAME = -3
 #: Dimensions that affect shadows only, assumed: width of the legs, radius of the mast and thickness of the deck, m;
 #: length and width of the body as fractions of those of the deck.
@@ -173,7 +174,7 @@ def rover_objects(
     elevation_rad: float,
     baseline_m: float = 0.3,
 ) -> Objects:
-    """Build the rover as one body, in its stance and with its mast at these true angles.
+    """Build the rover as one body, with the pose and joint angles of `stance` and the mast at these true angles.
 
     To add it to the rocks of a scene: ``Objects.join([scene.objects, rover_objects(...)])``. `baseline_m` is the
     baseline of the widest stereo pair; the head is slightly wider.
@@ -184,20 +185,20 @@ def rover_objects(
         # body, deck, and mast up to the elbow
         _box((length, width, rover.deck_m - rover.clearance_m), (0.0, 0.0, 0.5 * (rover.deck_m + rover.clearance_m))),
         _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m)),
-        _rod((x, y, rover.deck_m), (x, y, z + mast.elbow_m[2]), _MAST_RADIUS_M),
+        _cylinder((x, y, rover.deck_m), (x, y, z + mast.elbow_m[2]), _MAST_RADIUS_M),
     ]
     shoulder, elbow, wrist = np.array([0.5 * length, 0.0, rover.deck_m]) + np.array(_ARM_JOINTS_M)
     turret = np.array([0.0, 0.5 * _TURRET_M, 0.0])
-    parts += [_rod(shoulder, elbow, _ARM_RADIUS_M), _rod(elbow, wrist, _ARM_RADIUS_M)]
-    parts.append(_rod(wrist - turret, wrist + turret, _TURRET_RADIUS_M))
+    parts += [_cylinder(shoulder, elbow, _ARM_RADIUS_M), _cylinder(elbow, wrist, _ARM_RADIUS_M)]
+    parts.append(_cylinder(wrist - turret, wrist + turret, _TURRET_RADIUS_M))
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
     for side, bogie in enumerate(compute_bogie_pivots(rover, stance.differential_rad)):
         front, middle, rear = centres[3 * side : 3 * side + 3]
         rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
         legs = ((rocker, front), (rocker, bogie), (bogie, middle), (bogie, rear))
-        parts += [_rod(start, end, 0.5 * _LEG_M) for start, end in legs]
-    half = np.array([0.0, 0.5 * rover.wheel_width_m, 0.0])
-    parts += [_rod(centre - half, centre + half, rover.wheel_radius_m) for centre in centres]
+        parts += [_cylinder(start, end, 0.5 * _LEG_M) for start, end in legs]
+    half_axle = np.array([0.0, 0.5 * rover.wheel_width_m, 0.0])
+    parts += [_cylinder(centre - half_axle, centre + half_axle, rover.wheel_radius_m) for centre in centres]
     # camera bar behind the cameras' centres, which lie on the y axis of the head's frame
     depth, height, extra_width = _HEAD_M
     rover_from_head = mast.rover_from_head(azimuth_rad, elevation_rad)
@@ -205,7 +206,7 @@ def rover_objects(
     parts.append(_transform(_box((depth, baseline_m + extra_width, height), middle_of_head), rover_from_head))
     # the elevation axis, from the mast's elbow to the head's middle
     top, end = rover_from_head.apply(np.array([-mast.head_m, middle_of_head]))
-    parts.append(_rod(top, end, _MAST_RADIUS_M))
+    parts.append(_cylinder(top, end, _MAST_RADIUS_M))
     triangles = _transform(np.concatenate(parts), stance.world_from_rover)
     face_normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals = face_normals / np.linalg.norm(face_normals, axis=1, keepdims=True)
@@ -219,7 +220,8 @@ def rover_sphere(
 ) -> Float64[np.ndarray, "1 4"]:
     """Bounding sphere of `rover_objects` for all angles of suspension and mast: centre and radius.
 
-    Its radius is the maximum length of a chain of links, which bounds the distance of each part.
+    Its centre is the origin of the rover frame. The links from there to a wheel or to the head may have any angles: the
+    sum of their lengths bounds the distance of each part.
     """
     front, middle, rear = compute_wheel_centres(rover, 0.0, (0.0, 0.0))[:3]
     bogie = compute_bogie_pivots(rover, 0.0)[0]
@@ -248,12 +250,13 @@ def may_cast_shadow(
     return bool(np.any((perpendicular <= max_distance) & (along_sun >= -max_distance)))
 
 
-def _length(*parts: float | Float64[np.ndarray, "3"]) -> float:
+def _length(*components: float | Float64[np.ndarray, "3"]) -> float:
     """Compute the length of a vector with these components."""
-    return float(np.linalg.norm(np.hstack(parts)))
+    return float(np.linalg.norm(np.hstack(components)))
 
 
 def _box(size_m: tuple[float, float, float], middle_m: tuple[float, float, float]) -> Triangles:
+    """Create a box with edges along the axes."""
     return np.asarray(_unit_box() * np.array(size_m) + np.array(middle_m))
 
 
@@ -265,24 +268,26 @@ def _unit_box() -> Triangles:
 
 
 @cache
-def _unit_rod() -> Triangles:
+def _unit_cylinder() -> Triangles:
+    """Return a cylinder of radius 1 around the z axis from z = 0 to z = 1."""
     import trimesh
 
-    rod = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=_SIDES)
-    return np.asarray(rod.triangles + np.array([0.0, 0.0, 0.5]), dtype=np.float64)
+    cylinder = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=_SIDES)
+    return np.asarray(cylinder.triangles + np.array([0.0, 0.0, 0.5]), dtype=np.float64)
 
 
-def _rod(
+def _cylinder(
     start: Float64[np.ndarray, "3"] | tuple[float, float, float],
     end: Float64[np.ndarray, "3"] | tuple[float, float, float],
     radius_m: float,
 ) -> Triangles:
+    """Create a cylinder between the centres of its ends."""
     axis = np.subtract(end, start)
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(axis)))], axis)
     x /= np.linalg.norm(x)
     y = np.cross(axis / float(np.linalg.norm(axis)), x)
     axes = np.stack([radius_m * x, radius_m * y, axis], axis=1)
-    return np.asarray(np.asarray(start) + _unit_rod() @ axes.T)
+    return np.asarray(np.asarray(start) + _unit_cylinder() @ axes.T)
 
 
 def _transform(triangles: Triangles, new_from_old: RigidTransform) -> Triangles:

@@ -9,11 +9,11 @@ Position from wheel odometry. Each part of a drive adds the commanded path in es
 ``dp = R_estimated ((1 + scale) path_commanded + noise)``.
 
 Position from visual odometry (paper, section 4.2: "roughly 2% of the rover travel distance"). Each drive adds the true
-motion with a separate scale error, a random walk and a constant noise; attitude comes from the inertial unit. If visual
-odometry does not converge, wheel odometry is used for that drive.
+motion with a separate scale error, a random walk and noise of constant variance; attitude comes from the inertial unit.
+If visual odometry does not converge, wheel odometry is used for that drive.
 
 Constant errors of a run are sampled once (`Odometer.draw`), the other errors with each drive. The estimate is exact at
-the start by definition. It assumes flat ground between stops: climbing over rocks has the effect of slip.
+the start by definition. Wheel odometry assumes flat ground between stops: climbing over rocks has the effect of slip.
 
 The paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
@@ -133,7 +133,7 @@ class Odometer:
     def step(
         self, estimate: PoseEstimate, drive: Drive, rng: np.random.Generator, visual: bool = False
     ) -> PoseEstimate:
-        """Update the estimate after a drive, with or without visual odometry, with the same number of draws."""
+        """Update the estimate after a drive. Random numbers are drawn for visual odometry even if it is not used."""
         p = self.parameters
         wheel_noise, heading_noise, tilt_noise, visual_noise = np.split(rng.standard_normal(8), [2, 3, 5])
         has_failed = bool(rng.random() < p.visual.failure_fraction)
@@ -145,14 +145,13 @@ class Odometer:
         else:
             noise_m = p.walk_m * np.sqrt(drive.command.length_m) * wheel_noise
             displacement = self._compute_wheel_displacement(estimate, drive, noise_m)
-        heading = estimate.heading_error_rad + self.heading_scale * drive.turn_left_rad
-        heading += self.heading_drift_rad_m * drive.length_m
-        heading += float(np.radians(p.heading_walk_deg) * np.sqrt(drive.length_m) * heading_noise[0])
+        heading_error_rad = estimate.heading_error_rad + self.heading_scale * drive.turn_left_rad
+        heading_error_rad += self.heading_drift_rad_m * drive.length_m
+        heading_error_rad += float(np.radians(p.heading_walk_deg) * np.sqrt(drive.length_m) * heading_noise[0])
         noise = Rotation.from_rotvec(np.radians(p.tilt_noise_deg) * np.array([*tilt_noise, 0.0]))
-        attitude = self._estimate_attitude(drive.end.world_from_rover, heading) * noise
-        return PoseEstimate(
-            rigid(attitude, estimate.world_from_rover.translation + displacement), heading, visual and has_failed
-        )
+        attitude = self._estimate_attitude(drive.end.world_from_rover, heading_error_rad) * noise
+        pose = rigid(attitude, estimate.world_from_rover.translation + displacement)
+        return PoseEstimate(pose, heading_error_rad, visual and has_failed)
 
     @cached_property
     def _start_correction(self) -> Rotation:
@@ -161,13 +160,13 @@ class Odometer:
 
     def _estimate_attitude(self, true: RigidTransform, heading_error_rad: float) -> Rotation:
         """Compute the estimated attitude without the noise of a stop."""
-        heading_error = Rotation.from_rotvec([0.0, 0.0, heading_error_rad]) * self._start_correction
-        return heading_error * true.rotation * self.misalignment
+        heading_error = Rotation.from_rotvec([0.0, 0.0, heading_error_rad])
+        return heading_error * self._start_correction * true.rotation * self.misalignment
 
     def _compute_wheel_displacement(
         self, estimate: PoseEstimate, drive: Drive, noise_m: Float64[np.ndarray, "2"]
     ) -> Float64[np.ndarray, "3"]:
-        """Compute the displacement from the wheel path and the turns of the gyros, world axes."""
+        """Compute the displacement from the wheel path and the turns measured by the gyros, world axes."""
         scale = 1.0 + self.wheel_scale
         paths = np.zeros((len(drive.parts), 3))
         for path, part in zip(paths, drive.parts, strict=True):
@@ -175,5 +174,6 @@ class Odometer:
             path[:2] = DriveCommand(forward_m, left_m, part.turn_left_rad).displacement_m
         paths[:, :2] += noise_m / len(paths)
         true_attitudes = Rotation.concatenate([part.before.world_from_rover.rotation for part in drive.parts])
-        heading_error = Rotation.from_rotvec([0.0, 0.0, estimate.heading_error_rad]) * self._start_correction
-        return np.asarray((heading_error * true_attitudes * self.misalignment).apply(paths).sum(axis=0))
+        heading_error = Rotation.from_rotvec([0.0, 0.0, estimate.heading_error_rad])
+        attitudes = heading_error * self._start_correction * true_attitudes * self.misalignment
+        return np.asarray(attitudes.apply(paths).sum(axis=0))

@@ -148,7 +148,7 @@ def fill_holes(values: Grid) -> tuple[Grid, int]:
     return filled, holes
 
 
-MEMBRANE_SIDE = 128  #: Cells along a side of the grid on which the synthetic terrain is deformed to meet the DTM.
+DEFORMATION_SIDE = 128  #: Cells along a side of the grid on which the synthetic terrain is deformed to meet the DTM.
 #: Iterations of the relaxation in holes, and of that on each grid outside the DTM.
 _HOLE_ITERATIONS, _BORDER_ITERATIONS = 200, 60
 MIN_RELATIVE_BRIGHTNESS = 0.2  #: Lower limit of an orthoimage's brightness divided by its mean.
@@ -282,8 +282,8 @@ def choose_grid(source: RealTerrain) -> tuple[int, float]:
     longest = max(raster.values.shape)
     # the terrain's side is the power of two that is at least 1.5 times that of the DTM
     samples = max(64, 1 << int(np.ceil(np.log2(1.5 * longest))))
-    # the maximum in the message is MAX_SIDE / 1.5
     if samples > MAX_SIDE:
+        # 5461 is MAX_SIDE / 1.5
         raise TerrainFileError(f"{source.dtm} has {longest} posts along a side; maximum: 5461")
     return samples, raster.posting_m
 
@@ -312,7 +312,7 @@ def blend_into_ground(ground: Ground, dtm: EmbeddedDtm, detail: Detail | None) -
     the border, extrapolated by Laplace's equation on a coarse periodic grid.
     """
     height = dtm.height if detail is None else dtm.height + detail[0]
-    step = max(ground.side // MEMBRANE_SIDE, 1)
+    step = max(ground.side // DEFORMATION_SIDE, 1)
     is_covered = np.zeros((ground.side, ground.side), dtype=bool)
     is_covered[dtm.rows, dtm.columns] = dtm.weight > 0.0
     difference = np.zeros((ground.side, ground.side), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Tests of the detection of slow paths (`benchmarks.check`) with random ratios: false alarms and detections."""
+"""Tests of the detection of slower hot paths (`benchmarks.check`) with random ratios: false alarms and detections."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import pytest
 
 from benchmarks.check import PAIRS, compare, log_ratios, select_slower
 
-PATHS = ("one", "two", "three", "four", "five", "six")
+HOT_PATHS = ("one", "two", "three", "four", "five", "six")
 
 
 def draw_ratios(rng: np.random.Generator, sd: float, factor: float = 1.0) -> dict[str, list[float]]:
-    """Draw the logarithms of time ratios with the median `factor` for each path."""
-    return {name: (np.log(factor) + sd * rng.standard_normal(PAIRS)).tolist() for name in PATHS}
+    """Draw the logarithms of time ratios with the median `factor` for each hot path."""
+    return {name: (np.log(factor) + sd * rng.standard_normal(PAIRS)).tolist() for name in HOT_PATHS}
 
 
 @pytest.mark.parametrize("sd", [0.03, 0.2])
-def test_unchanged_paths_raise_few_alarms(sd: float) -> None:
+def test_unchanged_hot_paths_raise_few_alarms(sd: float) -> None:
     """At a false alarm rate of 1 %, more than 9 alarms in 400 comparisons have a probability below 1 %."""
     rng = np.random.default_rng(1)
     alarms = sum(bool(select_slower(compare(draw_ratios(rng, sd), draw_ratios(rng, sd)))) for _ in range(400))
@@ -32,7 +32,7 @@ def test_accepted_growth_raises_few_alarms() -> None:
 
 
 @pytest.mark.parametrize(("sd", "factor"), [(0.05, 1.3), (0.2, 1.8)])
-def test_slower_path_is_detected(sd: float, factor: float) -> None:
+def test_slower_hot_path_is_detected(sd: float, factor: float) -> None:
     rng = np.random.default_rng(3)
     detections = 0
     for _ in range(100):

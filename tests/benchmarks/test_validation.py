@@ -1,4 +1,4 @@
-"""Tests that validation checks fail if they should: lost cases, a wrong threshold, and limits that are too wide."""
+"""Tests that validation checks fail for lost cases and a wrong threshold, and that their limits are not too wide."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch)
     assert "descents with one correct track per pair that pass the IMU check" in claims
 
 
-def test_reference_has_only_the_matching_error_without_instrument_errors() -> None:
+def test_matching_is_the_only_error_of_a_reference_with_exact_instruments() -> None:
     inputs = ThresholdInputs(
         altitude_sd=0.0, common_attitude_sd_deg=0.0, attitude_sd_deg=0.0, tag_sd_s=0.0, feature_height_sd_m=0.0
     )

@@ -15,8 +15,8 @@ from marsyard.scenarios.user_files import import_object
 def _list_undeclared_columns(row: Any, declared_columns: RowColumns, custom_prefixes: tuple[str, ...]) -> list[str]:
     """Return the undeclared columns of numbers and booleans.
 
-    Columns of compared algorithms are checked without the name of the algorithm and its point. The point in the name
-    of a `footprints_` column is a decimal point.
+    The name of a compared algorithm, which precedes a dot, is removed before the check. In the name of a `footprints_`
+    column, a dot is a decimal point.
     """
     undeclared_names = []
     for name, value in row.items():

@@ -168,10 +168,11 @@ def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, wi
 def solve(
     matches: Matches, start: Motion, with_depths: bool, iterations: int, tolerance: float
 ) -> tuple[Motion, float, bool, int]:
-    """Minimise Cauchy's cost from the motion `start`; translation and depths have the same unit.
+    """Minimise Cauchy's cost from the motion `start`; inverse depths have the inverse unit of the translation.
 
-    Returns the motion with inverse depths, its cost, whether the iteration converged (step length below `tolerance`),
-    and the number of steps. `with_depths` estimates the inverse depths; otherwise they are fixed.
+    Returns the motion with inverse depths, its cost, whether the iteration converged, and the number of steps. The
+    iteration converges if the norm of the step of rotation (radians) and translation is below `tolerance`. With
+    `with_depths` the inverse depths are estimated; otherwise they are fixed.
     """
     motion = start
     r = residuals(matches, motion)

@@ -71,7 +71,11 @@ class SurfaceUnits(Parameters):
     def apply(
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], rng: Generator
     ) -> Float32[np.ndarray, "side side 3"]:
-        """Add the albedo of units, dust devil tracks and wind tails of craters; return the factors (see `Surface`)."""
+        """Add the albedo of units, dust devil tracks and wind tails (streaks) of craters to the ground.
+
+        `craters` are rows of `kernels.stamp_craters`. Returns the factors of roughness, texture and rocks (see
+        `Surface`). Craters change the roughness: filled floors are smoother, fresh ejecta are rougher.
+        """
         units = self.kinds
         expected_areas = np.array([unit.fraction for unit in units])
         areas = rng.dirichlet(self.concentration * expected_areas / expected_areas.sum())
@@ -89,20 +93,21 @@ class SurfaceUnits(Parameters):
         ground.add(Ground(np.zeros_like(log_albedo), log_albedo, spacing))
         self._add_streaks(ground, craters, downwind, rng)
         if len(craters):
-            # rows of `draw_craters`; from the rim to the floor a fresh crater has a depth of 0.4 radii
-            fill, depth, radius = craters[:, 6], craters[:, 3] + craters[:, 4], craters[:, 2]
+            # depth below the rim; a fresh crater has a depth of 0.4 radii
+            radius, depth, filled_fraction = craters[:, 2], craters[:, 3] + craters[:, 4], craters[:, 6]
             freshness = np.clip(depth / radius / 0.4, 0.0, 1.0)
-            floor_factor, ejecta_factor = 1.0 - 1.6 * fill, 1.0 + freshness
-            rows = np.column_stack([craters[:, :3], floor_factor, ejecta_factor])
+            # assumed factors of roughness on the floor and on the ejecta
+            floor_factor, ejecta_factor = 1.0 - 1.6 * filled_fraction, 1.0 + freshness
+            crater_factors = np.column_stack([craters[:, :3], floor_factor, ejecta_factor])
             roughness = np.ascontiguousarray(factors[..., ROUGHNESS])
-            scale_roughness(roughness, spacing, rows, 2.0)
+            scale_roughness(roughness, spacing, crater_factors, 2.0)
             factors[..., ROUGHNESS] = roughness
-        # mean 1: the parameter `abundance` refers to the whole terrain
+        # factors with the mean 1, because the parameter `abundance` of the rocks refers to the whole terrain
         factors[..., ROCKS] /= factors[..., ROCKS].mean(dtype=np.float64)
         return np.asarray(factors)
 
     def _add_tracks(self, log_albedo: Grid, spacing: float, downwind: float, rng: Generator) -> None:
-        """Darken the tracks of dust devils; the profile of a track is that of a channel."""
+        """Darken the tracks of dust devils: winding channels whose depth is the decrease of the logarithm of albedo."""
         period = log_albedo.shape[0] * spacing
         count = int(rng.poisson(self.tracks_per_km2 * (period / 1000.0) ** 2))
         heading = downwind + 0.5 * rng.standard_normal(count)
@@ -118,15 +123,15 @@ class SurfaceUnits(Parameters):
     def _add_streaks(
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator
     ) -> None:
-        """Add wind tails to a random selection of the large craters."""
+        """Add wind tails (streaks) behind a random selection of the craters of at least `streak_min_m`."""
         large = craters[craters[:, 2] > 0.5 * self.streak_min_m]
         sources = large[rng.uniform(size=len(large)) < self.streak_fraction]
         radius, count = sources[:, 2], len(sources)
         heading = downwind + 0.12 * rng.standard_normal(count)
         length = 2.0 * radius * rng.uniform(2.0, 7.0, count)
         log_albedo = self.streak_log_albedo_rms * rng.standard_normal(count)
-        rows = np.column_stack([sources[:, :2], radius, length, np.cos(heading), np.sin(heading), log_albedo])
-        stamp_streaks(ground.log_albedo, ground.spacing_m, rows)
+        streaks = np.column_stack([sources[:, :2], radius, length, np.cos(heading), np.sin(heading), log_albedo])
+        stamp_streaks(ground.log_albedo, ground.spacing_m, streaks)
 
     def _compute_membership(
         self, fields: Float32[np.ndarray, "side side kinds"], areas: Float[np.ndarray, "kinds"]

@@ -1,4 +1,4 @@
-"""A fast scenario with known error sources: three normal errors, two of which interact."""
+"""A fast scenario whose error has known contributions: gyro, radar, their interaction, and a part without a source."""
 
 from __future__ import annotations
 
@@ -46,7 +46,18 @@ confidence = 0.9
 
 
 class ErrorModelParameters(BaseModel):
-    """Parameters of `ErrorModelScenario`; the unit of all errors is the same."""
+    """Parameters of `ErrorModelScenario`; all errors have the same unit.
+
+    - load: dispersed part of the error that belongs to no error source
+    - unused: dispersed parameter without an effect
+    - gyro_sd, radar_sd, floor_sd: standard deviations of the errors of gyroscope and radar, and of the error that
+      remains without them (in a budget: the remaining part)
+    - drift: factor of the radar's error
+    - interaction: factor of the product of the gyroscope's and the radar's errors
+    - fan: parameter of an inactive error source, which has no effect
+    - sleep_s: duration of a case
+    - refused_fraction: fraction of cases without an answer; a negative value makes each case fail
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -63,9 +74,10 @@ class ErrorModelParameters(BaseModel):
 
 
 class ErrorModelScenario:
-    """The column `miss` is ``load + floor f + gyro g + radar r drift + interaction gyro g radar r drift``.
+    """The error of a case is the column `miss`.
 
-    f, g and r are standard normal numbers of separate streams. The mean square of the uniform drift is 4/3.
+    It is ``load + floor f + gyro g + radar r drift + interaction gyro g radar r drift``, where f, g and r are standard
+    normal numbers of separate random streams. The mean square of the uniform drift is 4/3.
     """
 
     name = "error-model"
@@ -88,7 +100,7 @@ class ErrorModelScenario:
         floor, gyro, radar = (float(streams.generator(name).standard_normal()) for name in ("floor", "gyro", "radar"))
         gyro_error, radar_error = p.gyro_sd * gyro, p.radar_sd * radar * p.drift
         error = p.load + p.floor_sd * floor + gyro_error + radar_error + p.interaction * gyro_error * radar_error
-        math.sqrt(p.refused_fraction)  # a negative fraction raises ValueError
+        math.sqrt(p.refused_fraction)  # raises ValueError for a negative fraction, so that the case fails
         answered = bool(streams.generator("refusal").random() >= p.refused_fraction)
         error = error if answered else math.nan
         row = {"miss": error, "is_small": error <= 30.0, "error_margin": 30.0 - error}

@@ -88,7 +88,7 @@ def test_true_velocity_is_the_mean_camera_velocity() -> None:
 
 @pytest.mark.parametrize("wind", [(25.0, 0.0), (0.0, 25.0), (-18.0, -18.0)])
 def test_ideal_instruments_over_flat_ground_give_exact_velocity(wind: tuple[float, float]) -> None:
-    """Test of signs and axes of the complete chain. Tolerance 0.15 m/s: a tenth of a binned pixel over 3.75 s.
+    """Test signs and axes from rendering to estimate. The tolerance is a tenth of a binned pixel in 3.75 s: 0.15 m/s.
 
     Propagation to the firing with an ideal inertial unit does not change the error.
     """
@@ -113,7 +113,7 @@ def test_ideal_instruments_are_reported_without_errors(nominal_case: CaseResult)
 
 
 def test_instrument_errors_have_the_specified_size() -> None:
-    """Altimeter: 3 sigma of all errors is 1 %. Attitude: 1.4 deg (38 revolutions, gyro scale error of 100 ppm)."""
+    """The altimeter has an error of 1 % at 3 sigma. A gyro scale error of 100 ppm over 38 revolutions is 1.4 deg."""
     rows = [run_descent(case).row for case in range(4)]
     altitude = np.array([float(row["altitude_error_common"]) for row in rows])
     attitude = np.array([float(row["attitude_error_common_deg"]) for row in rows])

@@ -186,7 +186,8 @@ def test_search_returns_infinity_beyond_its_end(terrain: Surface, use_ceilings: 
         assert intersect_ground(level, Ray(*origin, *ray), begin, range_m - 1e-3) == np.inf
 
 
-def test_entry_distance_is_at_the_height_of_the_highest_ground() -> None:
+def test_rays_enter_at_the_height_of_the_highest_ground_and_leave_at_the_extent() -> None:
+    # Minimum and maximum x, then y, and maximum height.
     extent = (-10.0, 10.0, -20.0, 20.0, 3.0)
     assert entry_distance(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, -0.1)) == pytest.approx(20.0)
     assert entry_distance(extent, Ray(0.0, 0.0, 3.0, 1.0, 0.0, -0.1)) == 0.0

@@ -42,7 +42,7 @@ def _render_from_mast(renderer: Renderer, camera: Cahv, sun: Sun, photometry: Ph
 
 @pytest.mark.parametrize("elevation_deg", [15.0, 40.0, 90.0])
 @pytest.mark.parametrize("depth", [0.1, 0.9, 3.0])
-def test_sky_irradiance_on_level_ground_matches_its_fraction(elevation_deg: float, depth: float) -> None:
+def test_sky_irradiance_on_level_ground_matches_sky_fraction(elevation_deg: float, depth: float) -> None:
     photometry = replace(DUSTY, sky=DustySky(depth, 0.95, 0.65))
     sun = Sun(direction(0.3, np.radians(elevation_deg)))
     coefficients = photometry.sky_coefficients(sun)

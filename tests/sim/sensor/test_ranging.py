@@ -24,7 +24,7 @@ from marsyard.sim.sensor.ranging import RangingUnit, first_return, range_along
 from marsyard.sim.terrain import Surface
 from tests.sim.sensor.motions import Swaying
 
-#: A carrier-phase receiver with a nearby base station and errors of 2 cm (the class of NovAtel's RT2, fixed integers).
+#: A carrier-phase (RTK) receiver with a nearby base station, resolved integer ambiguities and errors of 2 cm.
 RTK = GpsParameters(
     horizontal_noise_m=0.01,
     vertical_noise_m=0.015,
@@ -216,14 +216,16 @@ def test_radar_above_the_horizon_has_no_return() -> None:
         assert first_return(FLAT, np.array([0.0, 0.0, height]), _make_axis(150.0), np.radians(30.0), 5000.0) == np.inf
 
 
-def test_radar_on_a_ledge_measures_the_ground_below() -> None:
+def test_radar_measures_the_ledge_below_it_or_the_ground_beyond() -> None:
     heights = np.zeros((SIDE, SIDE))
     edge = SIDE // 2
     heights[:, :edge] = 400.0
-    # The radar is 1 m above the ledge, 20 m from its edge. The narrow beam points east, 60 deg from nadir.
+    # The radar is 1 m above the ledge, 20 m from its edge. The narrow beam points east, 60 deg from nadir, and hits the
+    # ledge.
     position = np.array([edge * SPACING - 20.0, MIDDLE, 401.0])
     result = first_return(_make_surface(heights), position, _make_axis(60.0), np.radians(2.0), 5000.0)
     assert result < 10.0
+    # 15 m beyond the edge, the beam hits the ground 401 m below.
     position = np.array([edge * SPACING + 15.0, MIDDLE, 401.0])
     result = first_return(_make_surface(heights), position, _make_axis(60.0), np.radians(2.0), 5000.0)
     assert result == pytest.approx(401.0 / np.cos(np.radians(58.0)), rel=5e-3)
