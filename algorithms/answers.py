@@ -164,6 +164,7 @@ def check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.n
 
 
 def check_type(name: str, value: Any, kind: type) -> None:
+    """Raise AlgorithmError (BAD_ANSWER) unless a value has this type."""
     """Raise AlgorithmError (BAD_ANSWER) unless a value is of this type; `name` is that of the value in the message."""
     if not isinstance(value, kind):
         raise bad_answer(f"{name} is a {_type_name(value)}; allowed: a {kind.__name__}")

@@ -29,14 +29,16 @@ def check_estimate(answer: Any, span_s: tuple[float, float]) -> PositionEstimate
             allowed = "all parts of the state if and only if the outcome is VALID"
             raise bad_answer(f"outcome is {answer.outcome.name}, but {name} {problem}; allowed: {allowed}")
     if not is_valid:
-        return replace(answer, time_s=float(answer.time_s))
+        refusal: PositionEstimate = answer
+        return replace(refusal, time_s=float(answer.time_s))
     check_type("world_from_body", answer.world_from_body, Rotation)
     if not np.all(np.isfinite(answer.world_from_body.as_quat())):
         raise bad_answer("world_from_body is not finite")
-    covariance = check_numbers("covariance", answer.covariance, (9, 9))
+    covariance = np.asarray(check_numbers("covariance", answer.covariance, (9, 9)))
     check_covariance("covariance", covariance)
+    estimate: PositionEstimate = answer
     return replace(
-        answer,
+        estimate,
         time_s=float(answer.time_s),
         position_m=check_numbers("position_m", answer.position_m, (3,)),
         velocity_m_s=check_numbers("velocity_m_s", answer.velocity_m_s, (3,)),

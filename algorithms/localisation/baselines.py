@@ -1,4 +1,4 @@
-"""Baselines of localisation: inertial navigation alone, and OpenCV's feature matching with a perspective-n-point pose."""
+"""Baselines of localisation: inertial navigation alone, and SIFT features with a perspective-n-point pose (OpenCV)."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class FeatureEstimator(InertialEstimator):
     def start(self, initial: InitialState, map_product: MapProduct) -> None:
         """Reset the state, and extract the features of the map."""
         super().start(initial, map_product)
-        self._sift = cv2.SIFT_create(nfeatures=self.options.sift_map_features)
+        self._sift = cv2.SIFT.create(nfeatures=self.options.sift_map_features)
         keypoints, self._descriptors = self._sift.detectAndCompute(_to_bytes(map_product.appearance), None)
         pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2)
         heights = sample_raster(map_product.elevation_m, pixels)

@@ -26,7 +26,7 @@ def create_consistency_blocks(
     if nees.size == 0:
         return [], {}
     tail = 0.5 * (1.0 - _CONFIDENCE)
-    low, high = stats.chi2.ppf([tail, 1.0 - tail], _FREEDOM * nees.size) / nees.size
+    low, high = (float(stats.chi2.ppf(p, _FREEDOM * nees.size)) / nees.size for p in (tail, 1.0 - tail))
     inside = float(np.mean(nees <= stats.chi2.ppf(_CONFIDENCE, _FREEDOM)))
     rows = [
         ["Descents with a final position", f"{nees.size:,}"],

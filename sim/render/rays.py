@@ -18,8 +18,8 @@ from marsyard.sim.render.kernels.structs import Rays
 from marsyard.sim.render.kernels.views import max_image_radius, min_component, pixel_angles, sum_of_vectors
 from marsyard.sim.render.scene import Cone
 
-#: Sizes of the pinhole views, samples along a side. A camera uses the first that exceeds its image size by at least
-#: `_SPARE_PX`, otherwise the last (about the camera's resolution for 1024 x 1024 pixels and 45 deg).
+#: Sizes of the pinhole views, samples along a side. A camera uses the first that exceeds the part of its image in a view
+#: by at least `_SPARE_PX`, otherwise the last (about the camera's resolution for 1024 x 1024 pixels and 45 deg).
 VIEW_SIDES_PX = (208, 288, 352, 544, 1088)
 VIEW_SIDE_PX = VIEW_SIDES_PX[-1]
 _SPARE_PX = 16
@@ -93,27 +93,17 @@ class PixelRays:
         ray_origins, directions = camera.rays(camera.pixel_grid())
         if not np.isfinite(directions).all():
             raise RenderingError("the camera model has pixels without a ray")
-        side = next((size for size in VIEW_SIDES_PX if max(columns, rows) <= size - _SPARE_PX), VIEW_SIDE_PX)
+        parts, axes = _divide_field_of_view(directions)
         view_of_pixel = np.zeros((rows, columns), dtype=np.uint8)
-        axes: list[Float64[np.ndarray, "3 3"]] = []
-        focal: list[float] = []
-        # the image is divided into quarters until each part fits in a view
-        pending = [(slice(0, rows), slice(0, columns))]
-        while pending:
-            part = pending.pop(0)
-            part_axes = _view_axes(directions[part])
-            if (directions[part] @ part_axes[2]).min() >= np.cos(MAX_HALF_ANGLE_RAD):
-                view_of_pixel[part] = len(axes)
-                axes.append(part_axes)
-                # focal length with which these rays fill the view
-                focal.append(float((side / 2.0 - MARGIN_PX) / max_image_radius(directions[part], part_axes)))
-                continue
-            (top, bottom), (left, right) = ((extent.start, extent.stop) for extent in part)
-            if bottom - top < 4 or right - left < 4:
-                raise RenderingError("the rays of neighbouring pixels have very different directions")
-            row, column = (top + bottom) // 2, (left + right) // 2
-            quarters = product((slice(top, row), slice(row, bottom)), (slice(left, column), slice(column, right)))
-            pending += list(quarters)
+        for number, part in enumerate(parts):
+            view_of_pixel[part] = number
+        longest = max(max(directions[part].shape[:2]) for part in parts)
+        side = next((size for size in VIEW_SIDES_PX if longest <= size - _SPARE_PX), VIEW_SIDE_PX)
+        # focal lengths with which the rays fill the views
+        focal = [
+            float((side / 2.0 - MARGIN_PX) / max_image_radius(directions[part], part_axes))
+            for part, part_axes in zip(parts, axes, strict=True)
+        ]
         if ray_origins.strides[:2] == (0, 0):
             centre, origins = ray_origins[0, 0].copy(), np.zeros((rows * columns, 3), dtype=np.float32)
         else:
@@ -130,6 +120,28 @@ class PixelRays:
             focal_px=np.array(focal),
             view_of_pixel=view_of_pixel.ravel(),
         )
+
+
+def _divide_field_of_view(
+    directions: Float64[np.ndarray, "rows columns 3"],
+) -> tuple[list[tuple[slice, slice]], list[Float64[np.ndarray, "3 3"]]]:
+    """Divide an image into quarters until each part fits in a view; return the parts and the axes of their views."""
+    parts: list[tuple[slice, slice]] = []
+    axes: list[Float64[np.ndarray, "3 3"]] = []
+    pending = [(slice(0, directions.shape[0]), slice(0, directions.shape[1]))]
+    while pending:
+        part = pending.pop(0)
+        part_axes = _view_axes(directions[part])
+        if (directions[part] @ part_axes[2]).min() >= np.cos(MAX_HALF_ANGLE_RAD):
+            parts.append(part)
+            axes.append(part_axes)
+            continue
+        (top, bottom), (left, right) = ((extent.start, extent.stop) for extent in part)
+        if bottom - top < 4 or right - left < 4:
+            raise RenderingError("the rays of neighbouring pixels have very different directions")
+        row, column = (top + bottom) // 2, (left + right) // 2
+        pending += list(product((slice(top, row), slice(row, bottom)), (slice(left, column), slice(column, right))))
+    return parts, axes
 
 
 def _view_axes(directions: Float64[np.ndarray, "rows columns 3"]) -> Float64[np.ndarray, "3 3"]:
