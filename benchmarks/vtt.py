@@ -1,4 +1,4 @@
-"""Run times of a tracking update, of its template search and OpenCV's, and of a complete rover run."""
+"""Run times of a tracking update, of its template search (also by OpenCV), and of a complete rover run."""
 
 from __future__ import annotations
 

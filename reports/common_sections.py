@@ -1,4 +1,7 @@
-"""Sections of every campaign: answers, scatter, drivers, convergence, consistency and faults."""
+"""Sections of every campaign: answers, scatter, drivers, convergence, consistency and faults.
+
+A driver is a condition that may affect the errors or the failures.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +84,10 @@ def answers_section(subject: Subject) -> Section | None:
 
 
 def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
-    """Compute the fractions of answered cases and of wrong answers by name, as far as the rows have the columns."""
+    """Compute the fractions of answered cases and of wrong answers, by name; empty without the column `answered`.
+
+    Fractions that need other columns are omitted if the rows do not have them.
+    """
     frame = subject.all_cases
     if not rates.is_flag(frame, "answered") or frame.empty:
         return {}
@@ -147,7 +153,7 @@ MAX_CONDITIONS, MAX_CASES = 12, 20_000
 
 
 def drivers_section(subject: Subject) -> Section | None:
-    """Create the section that ranks conditions by explained variance of errors and of failures; None without ranks."""
+    """Create the section that ranks drivers by explained variance of errors and of failures; None without drivers."""
     metric = subject.metric
     if metric is None:
         return None
@@ -180,11 +186,12 @@ def drivers_section(subject: Subject) -> Section | None:
     return Section("explained", "Influences", title, [*blocks, Block(note=note)], data)
 
 
+#: Column, statistics and corrected p-value of each driver.
 RankedDrivers = Sequence[tuple[str, Driver, float]]
 
 
 def rank_drivers(frame: pd.DataFrame, columns: Sequence[str], response: Float[np.ndarray, " n"]) -> RankedDrivers:
-    """Rank columns by the variance of a response that they explain, with corrected p-values; largest first."""
+    """Rank columns by the fraction of a response's variance that they explain, largest first; correct the p-values."""
     groups = rates.terrain_groups(frame)
     drivers: Mapping[str, Driver] = {
         column: driver
@@ -205,7 +212,7 @@ QUANTILE = 0.95
 
 @dataclass(frozen=True)
 class Point:
-    """An estimate from the first cases with its bounds; NaN or infinite without bounds."""
+    """A point of a convergence curve: estimate from the first `cases` cases; bounds are NaN or infinite if unknown."""
 
     cases: int
     estimate: float
@@ -243,12 +250,12 @@ def convergence_section(subject: Subject) -> Section | None:
 
 
 def curve_sizes(cases: int) -> list[int]:
-    """Return the numbers of cases of the points of a curve."""
+    """Return the number of cases of each point of a convergence curve."""
     return sorted({round(float(size)) for size in np.geomspace(MIN_CASES, cases, MAX_POINTS)})
 
 
 def success_rate_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
-    """Return name, required rate and success rates of the first cases for each requirement that can be evaluated."""
+    """Return name, required rate and convergence curve of each requirement that can be evaluated."""
     sampling = read_sampling_design(subject.run.configuration)
     frame, requirements = subject.all_cases, subject.run.requirements
     sizes = curve_sizes(len(frame))
@@ -314,14 +321,14 @@ def curve_figure(points: Sequence[Point], name: str, required: float | None) -> 
     return figure
 
 
-#: Column of the normalised estimation error squared, and its degrees of freedom.
+#: Column of the normalised estimation error squared (NEES), and its degrees of freedom.
 NEES, NEES_DIMENSION = "velocity_nees", 2
 #: Probability of the band of the mean NEES, and of the error ellipse.
 BAND_PROBABILITY = 0.95
 
 
 def evaluate_consistency(nees: Float[np.ndarray, " n"], dimension: int = NEES_DIMENSION) -> dict[str, Any]:
-    """Evaluate the consistency of estimates with their covariances from their NEES (normalised error squared).
+    """Evaluate from the NEES of estimates whether their errors agree with their covariances.
 
     Keys: mean NEES with its 95 % band for correct covariances, fraction of errors `inside` their 95 % ellipse with its
     90 % interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic".
@@ -362,7 +369,7 @@ def consistency_section(subject: Subject) -> Section | None:
 
 
 def _classify_answers(rows: Rows, subject: Subject) -> dict[str, Bool[np.ndarray, " n"]]:
-    """Create masks of valid, missing and wrong answers."""
+    """Create the masks of answers within the bound (`valid`), cases without an answer (`invalid`) and wrong answers."""
     is_answered = rates.population_mask(rows, "valid")
     is_correct = rates.success_mask(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
     return {"valid": is_answered & is_correct, "invalid": ~is_answered, "wrong": is_answered & ~is_correct}
@@ -376,7 +383,7 @@ def find_frequent_refusal(rows: Rows) -> str:
     return str(refusals.index[0]) if len(refusals) else ""
 
 
-#: Valid, missing and wrong answers of off-nominal cases, by fault and its size.
+#: Outcomes of `_classify_answers` by fault and its size.
 FAULT_OUTCOMES = OutcomesBySize(
     outcomes=_classify_answers,
     styles={"valid": ("valid", "full"), "invalid": ("invalid", "hatched"), "wrong": ("wrong", "crossed")},

@@ -34,11 +34,11 @@ from marsyard.reports.wording import count as count_text
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95
-#: Maximum error on the axis divided by the bound; larger errors are counted, not drawn to scale.
+#: Maximum end of an error axis divided by the bound; larger errors are counted, not drawn to scale.
 _MAX_EDGE_RATIO = 3.0
 #: If all errors are below this fraction of the bound, an axis does not include the bound.
 _MIN_BOUND_FRACTION = 0.6
-#: If more than this fraction of the errors exceeds that limit, the axis ends at this quantile of the errors instead.
+#: If more than this fraction of the errors exceeds `_MAX_EDGE_RATIO` times the bound, the axis ends at this quantile.
 _MAX_FRACTION_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
 #: Number of cases per point of the curves of median and 95 % quantile; minimum and maximum number of points.
 _CASES_PER_POINT, _MIN_POINTS, _MAX_POINTS = 25, 4, 16
@@ -196,19 +196,20 @@ def note_beyond(axes: Axes, n_beyond: int) -> None:
 
 
 @in_page_style
-def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> Figure | None:
-    """Draw errors against a condition; None without cases that have a number for the condition.
+def error_scatter_against(frame: pd.DataFrame, metric: str, condition: str, bound: float | None) -> Figure | None:
+    """Draw errors against a condition (a column); None without cases that have a number for the condition.
 
-    Cases without an error are ticks at the upper edge; errors beyond the axis are hollow markers just below that edge.
+    Vertical strokes at the upper edge are cases without an error. Hollow markers just below that edge are errors beyond
+    the axis.
     """
-    x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
+    x, magnitude = numbers(frame, condition), np.abs(numbers(frame, metric))
     finite = np.isfinite(x) & np.isfinite(magnitude)
     unanswered = np.isfinite(x) & ~np.isfinite(magnitude)
     if not (finite | unanswered).any():
         return None
     figure, axes = new_axes(4.2, 3.2)
     edge = _scatter_edge(magnitude[finite], bound)
-    top = 1.12 * edge  # ticks of cases without an error; hollow markers are at 1.06 * edge
+    top = 1.12 * edge  # position of the vertical strokes; hollow markers are at 1.06 * edge
     groups = categories(frame, metric, bound)
     for group in groups:
         on_axis, beyond_axis = (group.mask & finite & on_scale for on_scale in (magnitude <= edge, magnitude > edge))
@@ -227,10 +228,10 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
             axes.plot(centres, values, line, color=INK, zorder=4)
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
-    ticks: dict[str, Any] = {"color": INK, "markersize": 9, "clip_on": False}
-    ticks["rasterized"] = bool(unanswered.sum() > section.MAX_VECTOR_POINTS)
-    axes.plot(x[unanswered], np.full(unanswered.sum(), top), "|", **ticks)
-    axes.set(xlabel=label(driver), ylabel=magnitude_label(metric), ylim=(0.0, top))
+    strokes: dict[str, Any] = {"color": INK, "markersize": 9, "clip_on": False}
+    strokes["rasterized"] = bool(unanswered.sum() > section.MAX_VECTOR_POINTS)
+    axes.plot(x[unanswered], np.full(unanswered.sum(), top), "|", **strokes)
+    axes.set(xlabel=label(condition), ylabel=magnitude_label(metric), ylim=(0.0, top))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     return figure
 
@@ -243,9 +244,9 @@ def _scatter_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> f
     return edge if includes_bound or largest == 0.0 else largest
 
 
-def count_beyond_axis(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> int:
+def count_beyond_axis(frame: pd.DataFrame, metric: str, condition: str, bound: float | None) -> int:
     """Count the hollow markers of `error_scatter_against`."""
-    x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
+    x, magnitude = numbers(frame, condition), np.abs(numbers(frame, metric))
     finite = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
     return int((finite > _scatter_edge(finite, bound)).sum())
 
@@ -279,6 +280,7 @@ def _annotate(axes: Axes, text: str, position: tuple[Any, Any], offset: tuple[in
 def _finite_magnitudes(
     frame: pd.DataFrame, metric: str, bound: float | None
 ) -> tuple[Float[np.ndarray, " finite"], float]:
+    """Return the finite error magnitudes, and the end of their axis."""
     magnitude = np.abs(numbers(frame, metric))
     finite = magnitude[np.isfinite(magnitude)]
     return finite, axis_edge(finite, bound)
@@ -297,7 +299,7 @@ def _draw_points(
 
 
 def _draw_bound(axes: Axes, metric: str, bound: float | None, height: float) -> None:
-    """Draw the requirement, with its text at a height in fractions of the axes."""
+    """Draw the requirement's bound as a vertical line, with its text at a height in fractions of the axes."""
     if bound is None:
         return
     axes.axvline(bound, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3)
@@ -340,8 +342,8 @@ def cumulative_figure(
             axes.plot(x, y, drawstyle="steps-post", color=colour, linestyle=line, label=name)
     for name, positions in (limits or {}).items():
         for index, position in enumerate(positions):
-            label = name if index == 0 else None
-            axes.axvline(position, color=REQUIREMENT, linewidth=0.9, linestyle="-.", label=label)
+            line_label = name if index == 0 else None
+            axes.axvline(position, color=REQUIREMENT, linewidth=0.9, linestyle="-.", label=line_label)
     axes.set(xlabel=labels[0], ylabel=labels[1], ylim=(0.0, 1.03))
     axes.set_xlim(left=0.0)
     if bound is None or edge is None:
@@ -356,7 +358,7 @@ def cumulative_figure(
 
 @dataclass(frozen=True)
 class RateLine:
-    """Rates at values `x` of a condition, and the rates of a paper by value of the condition."""
+    """Rates at the values `x` of a condition; `paper` contains the rates of a paper, by value of the condition."""
 
     name: str
     x: Sequence[float]

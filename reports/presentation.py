@@ -1,5 +1,8 @@
 """Presentation of a system (DIMES, for example): its report sections, and the views of its cases on the page.
 
+Cases with stored products can be drawn. The gallery consists of the cases that the page shows: some of the cases with
+stored products. Notable cases are those that `marsyard report --gallery` reruns, in order to store their products.
+
 Each system of `marsyard.scenarios.systems` defines the import path of its presentation in `System.report`.
 """
 
@@ -38,7 +41,12 @@ class TableRow:
 
 @dataclass(frozen=True)
 class CaseView:
-    """View of a case on the page: facts, figures and a table; `legend` replaces the legend of the case's kind."""
+    """View of a case on the page.
+
+    - facts: names and values
+    - head, rows: headings and rows of the case's table
+    - legend: text that explains the figures; None for the legend of the `CaseKind`
+    """
 
     facts: Sequence[tuple[str, str]]
     figures: Sequence[SvgFigure]
@@ -54,6 +62,7 @@ class CaseKind:
     - is_case: return whether the products are those of this kind of case
     - view: create the view for the page; the text argument prefixes the identifiers of figures
     - write: write the figures into a folder and return the paths; raises OSError if they cannot be written
+    - legend: text that explains the figures of a view
     """
 
     is_case: Callable[[Products], bool]
@@ -67,8 +76,8 @@ class Presentation:
     """Report sections and case figures of a system.
 
     - cases: kinds of case; the first kind that matches the products is used
-    - first: functions that create sections before the sections common to all campaigns
-    - sections: functions that create sections after the common sections
+    - sections: functions that create sections after the sections common to all campaigns
+    - first: functions that create sections before the common sections
     - outcomes: enumerations of outcomes; each value describes its outcome
     """
 
@@ -153,8 +162,8 @@ def read_arrays(
     return valid_arrays if len(valid_arrays) == len(shapes) else None
 
 
-#: Number of cases of each kind (largest errors, no answer, random); the images of a case need half a megabyte.
-CASES_PER_KIND = 2
+#: Number of selected cases of each group (largest errors, no answer, random); a case has half a megabyte of images.
+CASES_PER_GROUP = 2
 #: Fixed seeds of the random selection, for reproducible reports.
 _GALLERY_SEED, _NOTABLE_SEED = 20260301, 20260302
 
@@ -170,16 +179,19 @@ class ShowcaseView:
 
 
 def showcase_views(run: StoredRun) -> list[ShowcaseView]:
-    """Create the views of the cases on the page; cases that no system can draw are omitted."""
+    """Create the views of the gallery's cases; cases that no system can draw are omitted."""
     return [view for case in gallery_cases(run) if (view := showcase_view(run, case)) is not None]
 
 
 def gallery_cases(run: StoredRun) -> list[int]:
-    """List the cases of the page: the case selected for the report, largest errors, no answer, and random cases."""
+    """List the cases of the gallery: the case selected for the report, largest errors, no answer, and random cases.
+
+    All of them have stored products. Without a metric, the first cases with products are listed.
+    """
     stored_cases = list(run.showcases)
     metric = primary_metric(run.frame, run.requirements)
     if len(stored_cases) <= 1 or metric is None or "case" not in run.all_cases:
-        return stored_cases[: 3 * CASES_PER_KIND]
+        return stored_cases[: 3 * CASES_PER_GROUP]
     by_error, without_error = _sort_by_error(run.all_cases[run.all_cases["case"].isin(stored_cases)], metric)
     unanswered = [case for case in stored_cases if case in without_error]
     random_order = np.random.default_rng(_GALLERY_SEED).permutation(stored_cases)
@@ -187,7 +199,7 @@ def gallery_cases(run: StoredRun) -> list[int]:
 
 
 def notable_cases(run: StoredRun) -> list[int]:
-    """List completed cases: the largest errors, the first cases without an error, and random cases."""
+    """List completed cases to rerun for the gallery: largest errors, first cases without an error, and random cases."""
     rows = run.all_cases[population_mask(run.all_cases, "completed")]
     metric = primary_metric(run.frame, run.requirements)
     if "case" not in rows or metric is None:
@@ -205,11 +217,11 @@ def _sort_by_error(rows: pd.DataFrame, metric: str) -> tuple[list[int], list[int
     return cases[finite][np.argsort(-magnitudes[finite], kind="stable")].tolist(), cases[~finite].tolist()
 
 
-def _select_cases(first: list[int], *kinds: list[int]) -> list[int]:
-    """List the first cases, then up to `CASES_PER_KIND` further cases of each kind."""
+def _select_cases(first: list[int], *groups: list[int]) -> list[int]:
+    """List the cases `first`, then up to `CASES_PER_GROUP` further cases of each group."""
     cases = list(first)
-    for kind in kinds:
-        cases += [case for case in dict.fromkeys(kind) if case not in cases][:CASES_PER_KIND]
+    for group in groups:
+        cases += [case for case in dict.fromkeys(group) if case not in cases][:CASES_PER_GROUP]
     return cases
 
 

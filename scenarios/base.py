@@ -38,7 +38,8 @@ class BaseScenario(Generic[ParametersType]):
 class TerrainScenario(BaseScenario[ParametersType], ABC):
     """A scenario whose shared inputs are terrains; the most recently used terrains are cached in memory.
 
-    By default, algorithms and scores are selected at the top level of the parameters.
+    - algorithm_table: path of the parameter table that selects the algorithms; by default the top level
+    - part_keys: parameter keys that select custom parts, and the kind of each part; by default only scores
     """
 
     algorithm_table: tuple[str, ...] = ()
@@ -52,7 +53,7 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
         """Return the bank of a shared input, and the number of the terrain in the bank."""
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """Build one terrain into the cache on disk."""
+        """Build the terrain of a shared input and store it in the cache on disk."""
         bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
         bank.terrain(number)
 

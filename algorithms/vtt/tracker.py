@@ -348,12 +348,12 @@ def triangulate_target(
     stop: Stop, pixel: Vector2, template: Patch, ranges_m: tuple[float, float], details: VttDetails, options: VttOptions
 ) -> UpdateResult:
     """Triangulate the target from its left pixel, by point stereo over the ranges `ranges_m`."""
-    sight = stop.left.rays(pixel)
-    curve = epipolar_pixels(sight, stop.left, stop.right, ranges_m)
+    left_ray = stop.left.rays(pixel)
+    curve = epipolar_pixels(left_ray, stop.left, stop.right, ranges_m)
     stereo = point_stereo(template, stop.measurements.right, curve, options)
     if stereo is None:
         return UpdateResult((TargetLoss.OUT_OF_VIEW,), details)
-    position = nearest_point(sight, stop.right.rays(stereo.pixel))
+    position = nearest_point(left_ray, stop.right.rays(stereo.pixel))
     if position is None:
         return UpdateResult((TargetLoss.NO_RANGE,), replace(details, stereo=stereo))
     rover_points = np.asarray(stop.rover_from_head.apply(np.stack([position, stop.left.c])))

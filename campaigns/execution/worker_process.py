@@ -39,7 +39,7 @@ class TaskResult(Generic[Result]):
 
     - changed: names of the parts of the process state that the task changed
     - crashed: whether the task requested a fresh worker (`request_fresh_worker`)
-    - previous_item: item that ran before this item in the same process; None for the first item of a process
+    - previous_item: only for a crashed item: item that ran before in the same process; None for the first item
     - crashed_only_after: predecessor item needed to reproduce the crash; the item does not crash in a fresh process
     """
 

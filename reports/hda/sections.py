@@ -35,7 +35,10 @@ def landing_rows(subject: Subject) -> pd.DataFrame | None:
 
 
 def _threshold_rows(subject: Subject) -> pd.DataFrame | None:
-    """Add the number of footprints that are not truly safe to the rows."""
+    """Return the rows of landing cases with the additional column `footprints_not_safe`; None for other rows.
+
+    The column is the number of footprints that are not truly safe.
+    """
     frame = landing_rows(subject)
     if frame is None:
         return None
@@ -44,6 +47,7 @@ def _threshold_rows(subject: Subject) -> pd.DataFrame | None:
 
 
 def _lander_limit_m(subject: Subject) -> float:
+    """Return the roughness limit of the campaign's lander, or the default limit."""
     limit = subject.run.parameter("lander", "max_roughness_m")
     return float(limit) if isinstance(limit, int | float) else LanderParameters().max_roughness_m
 
@@ -74,10 +78,10 @@ THRESHOLD = section_kinds.SectionDeclaration(
                     "site_reported",
                     "Site reported, if a wide safe site exists",
                     section_kinds.flag_rate("site_reported", "wide_site_exists"),
-                    False,
+                    in_figure=False,
                 ),
                 section_kinds.Rate(
-                    "safe", "Sites truly safe", section_kinds.flag_rate("site_safe", "site_reported"), False
+                    "safe", "Sites truly safe", section_kinds.flag_rate("site_safe", "site_reported"), in_figure=False
                 ),
             ),
             cases="Flights",
@@ -96,6 +100,7 @@ THRESHOLD = section_kinds.SectionDeclaration(
 
 
 def _describe_fault(fault: str, size: float) -> tuple[str, str]:
+    """Return the name of a fault, and its size with the unit; the size is empty if it is NaN or has no unit."""
     description = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
     name, unit = description["name"], description.get("unit")
     if unit is None or math.isnan(size):
@@ -106,7 +111,10 @@ def _describe_fault(fault: str, size: float) -> tuple[str, str]:
 
 
 def classify_answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
-    """Create a mask for each outcome of the search; each row has exactly one outcome."""
+    """Create a mask for each outcome of the search, in the order of `ANSWERS`; each row has exactly one outcome.
+
+    `unconverged`: finished, but the algorithm reported neither a site nor that no site is safe.
+    """
     is_reported, is_safe, is_refused = (
         rates.flag_mask(frame, name) for name in ("site_reported", "site_safe", "no_site_reported")
     )
@@ -206,7 +214,7 @@ MAP_ERRORS = section_kinds.SectionDeclaration(
     ),
 )
 
-#: Errors of the touchdown.
+#: Three measures of the distance from touchdown to site.
 TOUCHDOWN_ERRORS = (
     section_kinds.Quantity("touchdown_error_gps_m", "averaged GPS as in the paper"),
     section_kinds.Quantity("touchdown_error_m", "true touchdown"),
@@ -221,7 +229,7 @@ def _landed_rows(subject: Subject) -> pd.DataFrame | None:
 
 
 def _create_table_2_blocks(landings: pd.DataFrame, subject: Subject, key: str) -> section_kinds.BlocksAndData:
-    """Create Table II: the paper's runs and their mean, and the campaign's landings by each measure."""
+    """Create Table II: the paper's runs and their mean, and the campaign's landings by each of `TOUCHDOWN_ERRORS`."""
     runs: Sequence[Mapping[str, float]] = PAPER["landings"]
     columns = ("error_m", "north_m", "east_m", "run_time_s")
     paper = {f"run {run['run']}": (1, [run[name] for name in columns]) for run in runs}
@@ -291,9 +299,10 @@ TOUCHDOWN = section_kinds.SectionDeclaration(
     ),
 )
 
-#: Classes of the true ground in both images, best first, and outcomes of the search. All positions within one lander
-#: radius of a wide safe site are also safe.
+#: Classes of the true ground that both images show, best first. All positions within one lander radius of a wide safe
+#: site are also safe.
 GROUNDS = ("wide safe site", "narrow safe site", "no safe site")
+#: Names of the outcomes of `classify_answers`, in the same order; "crashed" means every case that did not finish.
 ANSWERS = ("truly safe site", "unsafe site", "'no safe site'", "not converged", "crashed")
 
 
@@ -389,7 +398,7 @@ def run_times_section(subject: Subject) -> Section | None:
         return None
     medians_s, percentiles_95_s = np.median(durations, axis=0), np.quantile(durations, 0.95, axis=0)
     paper_total_s, total_s = sum(stage["seconds"] for stage in stages), float(medians_s.sum())
-    # scales the total run time to that of the paper
+    # the factor scales the total run time to that of the paper
     factor, rows, data = paper_total_s / total_s, [], []
     for stage, median_s, p95_s in zip(stages, medians_s.tolist(), percentiles_95_s.tolist(), strict=True):
         sizes = [rates.quantile(rates.finite_values(rows_with_times, name), 0.5) for name in stage["ours"]]

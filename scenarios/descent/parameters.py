@@ -63,15 +63,18 @@ class Faults(SizedFaults):
     repeated_image: Annotated[int, bounded_field(0, 3, "image replaced by the previous one, 2 or 3; 0: none")] = 0
     black_image: Annotated[int, bounded_field(0, 3, "image that is delivered black, 1 to 3; 0: none")] = 0
     shield_range_m: Annotated[
-        NonNegative, Field(le=2000.0, description="radar locked on the heat shield at this range in image 1; 0: none")
+        NonNegative,
+        Field(
+            le=2000.0, description="range to the heat shield in image 1, if the radar is locked on it; 0: not locked"
+        ),
     ] = 0.0
     altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0
     altitude_error_once: Annotated[
-        NonNegative, Field(le=0.9, description="additional relative error of the second altitude")
+        NonNegative, Field(le=0.9, description="additional relative error of the altitude of image 2")
     ] = 0.0
     attitude_error_deg: Annotated[NonNegative, Field(le=90.0, description="tilt error of all attitudes")] = 0.0
     attitude_error_once_deg: Annotated[
-        NonNegative, Field(le=90.0, description="additional tilt error of the second attitude")
+        NonNegative, Field(le=90.0, description="additional tilt error of the attitude of image 2")
     ] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
@@ -120,7 +123,7 @@ def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]
 def add_attitude_faults(
     faults: Faults, attitudes: Sequence[AttitudeMeasurement], rng: np.random.Generator
 ) -> list[AttitudeMeasurement]:
-    """Tilt attitudes about two sampled horizontal axes: the first for all attitudes, the second for `FAULTY_IMAGE`."""
+    """Tilt all attitudes about one random horizontal axis, and that of `FAULTY_IMAGE` also about a second one."""
     axes = [np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) for azimuth in rng.uniform(-np.pi, np.pi, 2)]
     common_tilt = Rotation.from_rotvec(np.radians(faults.attitude_error_deg) * axes[0])
     single_tilt = Rotation.from_rotvec(np.radians(faults.attitude_error_once_deg) * axes[1])
@@ -133,7 +136,7 @@ def add_attitude_faults(
     ]
 
 
-#: Number of images of an MER descent, and of the input of estimators that do not process a stream.
+#: Number of images of an MER descent. Estimators that do not process a stream receive this number of images.
 TRIPLE_SIZE = 3
 
 
@@ -171,22 +174,26 @@ class LanderParameters(Parameters):
 
     The parachute's canopy dominates. Its diameter is 15.09 m (nominal) times 0.72 (inflated; Witkowski & Bruno 2003,
     MER parachute); from 2 km it covers 80 % of the sun. Backshell and lander, 2.65 m in diameter, cover 1/20
-    of it; for a high sun their shadow is inside the shadow of the canopy. The canopy is about 40 m above the camera,
-    which moves its shadow by 1 deg in the view. This is not modelled: DIMES masks a zero-phase spot of 4 deg.
+    of the sun; for a high sun their shadow is inside the shadow of the canopy. The canopy is about 40 m above the
+    camera, which moves its shadow by 1 deg in the view. This is not modelled: DIMES masks a zero-phase spot of 4 deg.
     """
 
-    caster_diameter_m: Annotated[float, bounded_field(0.0, 100.0, "diameter of the shadow disc")] = 10.9
+    caster_diameter_m: Annotated[float, bounded_field(0.0, 100.0, "diameter of the disc that casts the shadow")] = 10.9
 
 
 class LandingParameters(Parameters):
-    """Parameters of the landing (`descent.score.compute_touchdown`); values other than the burn's are assumed."""
+    """Parameters of the landing (`descent.score.compute_touchdown`); all values except the burn's are assumed."""
 
     computation_s: Annotated[float, bounded_field(0.0, 1000.0, "computation time on the flight computer")] = 14.0
     processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="run time, flight / host (assumed)")] = 600.0
-    steering_deadband_m_s: Annotated[float, bounded_field(0.0, 100.0, "no steering up to this horizontal speed")] = 5.0
-    max_steering_m_s: Annotated[float, bounded_field(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
+    steering_deadband_m_s: Annotated[float, bounded_field(0.0, 100.0, "maximum horizontal speed without steering")] = (
+        5.0
+    )
+    max_steering_m_s: Annotated[float, bounded_field(0.0, 100.0, "limit of steering: burn of 80 m/s, 15 deg tilt")] = (
+        20.0
+    )
     steering_error: Annotated[float, bounded_field(0.0, 1.0, "RMS relative error of the steering per axis")] = 0.1
-    burn_error_m_s: Annotated[float, bounded_field(0.0, 50.0, "RMS of the burn's velocity error per axis")] = 1.0
+    burn_error_m_s: Annotated[float, bounded_field(0.0, 50.0, "RMS velocity error of the burn per axis")] = 1.0
 
 
 class CameraParameters(Parameters):
@@ -234,6 +241,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     have the same site: it is merged into `terrain` when the campaign is read, and cannot be dispersed.
     """
 
+    # task of the algorithms, and class of the cases that custom scores receive
     task = VELOCITY
     scored = ScoredDescent
 

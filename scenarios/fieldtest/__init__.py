@@ -1,5 +1,8 @@
 """The helicopter field test of DIMES (Johnson, Willson, Goguen, Alexander & Meller, sections III and IV).
 
-Modules in the order of the paper: `parameters`; a `run` with its `attitude`, sun and triples; and the `scenario`, whose
-case i is one triple.
+- `parameters`: parameters of campaigns
+- `imaging`: camera, sun, scene and exposure
+- `targets`, `attitude`: detection of surveyed targets, and estimation of attitudes from the targets and gyros
+- `run`: simulation and processing of a run, and selection of its triples
+- `scenario`: a case is one triple
 """

@@ -179,7 +179,7 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
     def compute_eye(world_from_head: RigidTransform) -> Float64[np.ndarray, "3"]:
         # rotate the left camera about the rock, clockwise from above
         rock = world.rocks.position_m[world.target_number]
-        east, north, up = rig.eyes(world_from_head)[0] - rock
+        east, north, up = rig.camera_positions(world_from_head)[0] - rock
         return np.asarray(rock + np.array([cosine * east + sine * north, cosine * north - sine * east, up]))
 
     mast = setup.vehicle.stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)

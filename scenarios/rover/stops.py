@@ -292,7 +292,7 @@ def pick_target(
     from -1 (left) to 1 (right), and up, from 0 (foot) to 1 (top). The point is on an edge if it is on an edge for
     either camera, because stereo matching needs it in both images.
     """
-    cameras_m, triangles = rig.eyes(world_from_head), world.target_triangles
+    cameras_m, triangles = rig.camera_positions(world_from_head), world.target_triangles
     foot_m = float(world.rocks.position_m[world.target_number, 2])
     outline_viewpoint = cameras_m[0] if outline_viewpoint is None else outline_viewpoint
     outline = points.RockOutline.from_triangles(triangles, outline_viewpoint, foot_m)
@@ -309,7 +309,7 @@ def evaluate_visibility(
 ) -> Visibility:
     """Evaluate the visibility of a point on the rock from true poses of the mast's head, world axes."""
     half_rad, triangles = 0.5 * options.template_px * rig.pixel_rad, world.target_triangles
-    cameras_m = [rig.eyes(head) for head in heads]
+    cameras_m = [rig.camera_positions(head) for head in heads]
     normal = points.patch_normal(triangles, cameras_m[0][0], point, half_rad)
     to_cameras = np.array([left - point for left, _ in cameras_m])
     to_cameras /= np.linalg.norm(to_cameras, axis=1, keepdims=True)

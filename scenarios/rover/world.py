@@ -28,22 +28,22 @@ from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS
 
 #: Name of the target's rock.
 TARGET = "target"
-#: Viewing height above the target's foot, m, which determines the scene's level of detail: height of the mast's head.
-EYE_HEIGHT_M = 1.2
+#: Height of the mast's head above the foot of the target's rock, m. It determines the scene's level of detail.
+MAST_HEAD_HEIGHT_M = 1.2
 #: Maximum distance of rendered ground and rocks behind the target, m.
 BACKGROUND_M = 25.0
-#: Mesh spacing of the ground around the target, m, and its relative growth from line to line. With half the spacing, 38
-#: of 1.4 million pixels change by a thousandth of their brightness (ADR 34).
+#: Mesh spacing of the ground around the target, m, and its relative growth from line to line. Half the spacing changes
+#: the brightness of 38 of 1.4 million pixels by a thousandth (ADR 34).
 MESH_FINEST_M, MESH_GROWTH = 0.04, 0.012
-#: Length of a plane slope divided by the terrain's period; its centre is at a quarter of the period.
+#: Length of the ramp divided by the terrain's period; the ramp's centre is at a quarter of the period.
 RAMP_FRACTION = 0.4
-#: Margin beyond start and target in which large rocks are removed, m.
+#: Large rocks are removed within the start distance plus this margin of the target, m.
 CLEARANCE_M = 2.0
 #: Minimum gap between the terrain's rocks and a placed rock, m.
 MIN_GAP_M = 0.05
-#: Maximum distances of rocks and of the ground in images of the navigation, m.
+#: Maximum distance of rendered rocks, and half width of the ground mesh, in images for navigation, m.
 NAVIGATION_ROCKS_M, NAVIGATION_HALF_WIDTH_M = 25.0, 60.0
-#: Margin beyond the start in which wheels roll over rocks, metres.
+#: Half side of the square around the target in which wheels roll over rocks, minus the start distance, m.
 ROUTE_MARGIN_M = 1.5
 
 
@@ -87,7 +87,7 @@ class RunWorld:
         radius = p.start.distance_m + BACKGROUND_M
         azimuth, half_angle = p.bearing_rad + np.pi, np.radians(world.background_half_deg)
         viewpoint = Viewpoint(
-            world.east_m, world.north_m, EYE_HEIGHT_M, pixel_rad, float(azimuth), float(half_angle), radius
+            world.east_m, world.north_m, MAST_HEAD_HEIGHT_M, pixel_rad, float(azimuth), float(half_angle), radius
         )
         clouds = None
         if p.clouds is not None:
@@ -111,12 +111,15 @@ class RunWorld:
     def face_distance_m(self, p: RoverScenarioParameters) -> float:
         """Compute the horizontal distance of the designated point from the rock's centre towards the start, metres.
 
-        The point is selected from near the rover's start: at the start's distance, EYE_HEIGHT_M above the rock's foot.
+        The viewpoint of the selection is near the rover's start: at the start distance from the rock's face, and
+        `MAST_HEAD_HEIGHT_M` above the rock's foot.
         """
         bearing, foot = p.bearing_rad, self.rocks.position_m[self.target_number]
         to_start = np.array([np.sin(bearing), np.cos(bearing), 0.0])
         viewpoint = (
-            foot + (p.start.distance_m + 0.5 * p.target.diameter_m) * to_start + np.array([0.0, 0.0, EYE_HEIGHT_M])
+            foot
+            + (p.start.distance_m + 0.5 * p.target.diameter_m) * to_start
+            + np.array([0.0, 0.0, MAST_HEAD_HEIGHT_M])
         )
         outline = RockOutline.from_triangles(self.target_triangles, viewpoint, float(foot[2]))
         return float((outline.point(p.target.across, p.target.up) - foot) @ to_start)
@@ -143,7 +146,7 @@ class RunWorld:
 
     @cached_property
     def route_ground(self) -> RockyGround:
-        """Ground with the rocks of the route, from the target to behind the start."""
+        """Ground with the rocks on the route from the target to `ROUTE_MARGIN_M` behind the start."""
         centre = (self.viewpoint.east_m, self.viewpoint.north_m)
         half_side_m = self.start_distance_m + ROUTE_MARGIN_M
         max_distance_m = float(np.sqrt(2.0)) * half_side_m
@@ -151,7 +154,7 @@ class RunWorld:
         return RockyGround.from_triangles(self.ground.surface, rocks.triangles, centre, half_side_m)
 
     def brightness(self, time_s: float) -> float:
-        """Compute the direct sunlight on the ground relative to 1 AU."""
+        """Compute the direct sunlight on the ground divided by the sunlight at 1 AU."""
         air = self.ground.site.environment
         elevation = float(np.arcsin(self.scene(time_s).sun.direction[2]))
         return air.direct_fraction(elevation) * air.solar_irradiance
@@ -227,7 +230,9 @@ class Rig:
         """True pose of the head in the rover frame."""
         return self.mast.rover_from_head(self.state)
 
-    def eyes(self, world_from_head: RigidTransform) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+    def camera_positions(
+        self, world_from_head: RigidTransform
+    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Compute the true positions of the left and the right camera, world, metres."""
         left, right = world_from_head.apply(np.stack([self.left.c, self.right.c]))
         return left, right

@@ -200,7 +200,7 @@ def natural_fall_off(camera: CameraModel) -> Image:
 
 
 def dust_transmission(shape: tuple[int, int], parameters: OpticsParameters, rng: np.random.Generator) -> Image:
-    """Draw the transmission of dust on the lens: soft absorbing discs at random positions."""
+    """Draw the transmission of dust on the camera window: absorbing discs with soft edges at random positions."""
     transmission = np.ones(shape, dtype=np.float32)
     for _ in range(parameters.dust_discs):
         centre = rng.uniform(0.0, 1.0, 2) * shape

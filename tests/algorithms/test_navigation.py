@@ -42,7 +42,7 @@ def _apply_command(pose: RigidTransform, command: DriveCommand) -> RigidTransfor
 def _drive_to_goal(
     terrain: TerrainMap, pose: RigidTransform, goal: np.ndarray, step_m: float, backwards: bool = False
 ) -> np.ndarray:
-    """Drive with a new plan at each step until the goal; return the positions (east, north), metres."""
+    """Drive to the goal with a new plan after each step; return the positions (east, north), metres."""
     positions = [pose.translation[:2]]
     for _ in range(60):
         plan = navigate(terrain, pose, goal, step_m, OPTIONS, backwards)
@@ -129,10 +129,10 @@ def test_target_rock_is_avoided_unless_it_is_excluded() -> None:
     assert plan.commands == (DriveCommand(forward_m=0.5),)
 
 
-def _map_wedges(apex_east: float, azimuths_deg: tuple[float, ...], *rocks: tuple[float, ...]) -> TerrainMap:
-    """Map the ground from 1.8 m on in navcam pairs, 45 deg wide, at these azimuths of the cameras."""
+def _map_stereo_sectors(camera_east_m: float, azimuths_deg: tuple[float, ...], *rocks: tuple[float, ...]) -> TerrainMap:
+    """Map the ground that stereo pairs of a navcam show: sectors of 45 deg about these azimuths, from 1.8 m on."""
     points = _sample_ground(rocks)  # type: ignore[arg-type]
-    offset = points[:, :2] - (apex_east, 0.0)
+    offset = points[:, :2] - (camera_east_m, 0.0)
     azimuth = np.degrees(np.arctan2(offset[:, 0], offset[:, 1]))
     is_mapped = np.zeros(len(points), dtype=np.bool_)
     for centre in azimuths_deg:
@@ -140,24 +140,25 @@ def _map_wedges(apex_east: float, azimuths_deg: tuple[float, ...], *rocks: tuple
     return TerrainMap.empty(np.zeros(2)).add_points(points[is_mapped & (np.hypot(*offset.T) >= 1.8)])
 
 
-def test_passing_a_hazard_needs_two_pairs() -> None:
-    # The cameras are 2.8 m behind the rover; the rock is 1.2 m ahead, where one pair maps 1.7 m to each side.
+def test_path_around_a_hazard_needs_two_mapped_sectors() -> None:
+    # The cameras are 2.8 m behind the rover. The rock is 1.2 m ahead, where one sector reaches 1.7 m to each side.
     rock, goal, pose = (1.2, 0.0, 0.25, 0.4), np.array([6.0, 0.0]), _make_pose(0.0, 0.0)
-    one_pair, two_pairs = (_map_wedges(-2.8, azimuths, rock) for azimuths in ((90.0,), (70.0, 110.0)))
-    assert navigate(one_pair, pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
-    assert _drive_to_goal(two_pairs, pose, goal, 0.5)[-1] == pytest.approx(goal, abs=0.02)
-    # Without the rock one pair is wide enough.
-    assert navigate(_map_wedges(-2.8, (90.0,)), pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
+    one_sector, two_sectors = (_map_stereo_sectors(-2.8, azimuths, rock) for azimuths in ((90.0,), (70.0, 110.0)))
+    assert navigate(one_sector, pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
+    assert _drive_to_goal(two_sectors, pose, goal, 0.5)[-1] == pytest.approx(goal, abs=0.02)
+    # Without the rock one sector is wide enough.
+    assert navigate(_map_stereo_sectors(-2.8, (90.0,)), pose, goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
 
 
-def test_path_starts_on_mapped_ground_after_some_metres() -> None:
-    goal, terrain = np.array([7.0, 0.0]), _map_wedges(0.0, (70.0, 110.0))
+def test_rover_on_unmapped_ground_has_no_path() -> None:
+    # The sectors start 1.8 m from the cameras: the ground at 0 m and 1 m is not mapped, the ground at 3 m is.
+    goal, terrain = np.array([7.0, 0.0]), _map_stereo_sectors(0.0, (70.0, 110.0))
     outcomes = {east: navigate(terrain, _make_pose(east, 0.0), goal, 0.5, OPTIONS).outcome for east in (0.0, 1.0, 3.0)}
     assert outcomes[0.0] is outcomes[1.0] is NavigationOutcome.NOT_MAPPED
     assert outcomes[3.0] is NavigationOutcome.PATH
 
 
-def test_one_step_may_cover_both_arcs() -> None:
+def test_plan_with_a_long_step_contains_both_arcs_of_the_path() -> None:
     plan = navigate(_map_ground((3.0, 0.0, 0.25, 0.4)), _make_pose(0.0, 0.0), np.array([6.0, 0.0]), 20.0, OPTIONS)
     curvatures = [command.turn_left_rad / command.forward_m for command in plan.commands if command.forward_m]
     assert len(curvatures) == 2

@@ -1,4 +1,4 @@
-"""Tests of the data explorer and of the cases selected for the gallery."""
+"""Tests of the explorer (the interactive scatter plot), of the gallery (cases on the page) and of notable cases."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_embedded_data_are_escaped() -> None:
     assert json.loads(text) == hostile
 
 
-def test_notable_cases_are_worst_unanswered_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_notable_cases_are_worst_unanswered_and_random_cases(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     frame = make_rows(60, n_crashed=2)
     cases = notable_cases(read_run(make_run(frame)))
     errors = frame["velocity_error_m_s"]

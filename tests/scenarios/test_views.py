@@ -81,20 +81,20 @@ def test_mast_pair_is_level_with_the_specified_baseline(ground: SiteGround) -> N
 
 
 def test_horizontal_view_covers_sector_and_nadir_view_disc(ground: SiteGround) -> None:
-    def make_eye(name: str, height: float, azimuth: float, elevation: float) -> Viewpoint:
+    def make_viewpoint(name: str, height: float, azimuth: float, elevation: float) -> Viewpoint:
         camera_preset = preset(name)
         pose = camera_pose(ground.surface, camera_preset.design, 1.0, 2.0, height, azimuth, elevation)
         return Viewpoint.from_pose(PixelRays.from_camera(camera_preset.cameras()[0]), pose, ground.surface)
 
-    pancam_eye = make_eye("research-pancam", 1.5, 90.0, -10.0)
-    assert pancam_eye.azimuth_rad == pytest.approx(np.radians(91.0), abs=0.01)  # left camera: 1 deg of toe-in
-    assert pancam_eye.half_width_rad < np.radians(20.0)
-    assert np.isinf(pancam_eye.max_distance_m)
-    assert pancam_eye.height_m == pytest.approx(1.5, abs=0.05)
-    nadir_eye = make_eye("xc-55", 10.0, 0.0, -90.0)
-    assert nadir_eye.half_width_rad == np.pi
+    pancam_viewpoint = make_viewpoint("research-pancam", 1.5, 90.0, -10.0)
+    assert pancam_viewpoint.azimuth_rad == pytest.approx(np.radians(91.0), abs=0.01)  # left camera: 1 deg of toe-in
+    assert pancam_viewpoint.half_width_rad < np.radians(20.0)
+    assert np.isinf(pancam_viewpoint.max_distance_m)
+    assert pancam_viewpoint.height_m == pytest.approx(1.5, abs=0.05)
+    nadir_viewpoint = make_viewpoint("xc-55", 10.0, 0.0, -90.0)
+    assert nadir_viewpoint.half_width_rad == np.pi
     # Half the diagonal field of view is 26 deg: 4.9 m at a height of 10 m.
-    assert 4.9 < nadir_eye.max_distance_m < 20.0
+    assert 4.9 < nadir_viewpoint.max_distance_m < 20.0
 
 
 def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
@@ -164,9 +164,9 @@ def test_scene_from_mast_and_nadir_has_the_terrain_heights(ground: SiteGround) -
 def test_sector_contains_the_rocks_of_the_full_circle(azimuth: float) -> None:
     """The sector has the same triangles as the full circle, also for rocks that repeat with the terrain period."""
     ground = SiteGround.from_site(_make_small_site("gusev", 512), "ground", seed=3)
-    full_eye = Viewpoint(0.4, 1.0, 1.2, 4e-3, max_distance_m=1.4 * ground.surface.period_m)
-    viewpoint = replace(full_eye, azimuth_rad=azimuth, half_width_rad=0.3)
-    full_circle, sector = (select_rocks(ground, entry) for entry in (full_eye, viewpoint))
+    full_viewpoint = Viewpoint(0.4, 1.0, 1.2, 4e-3, max_distance_m=1.4 * ground.surface.period_m)
+    sector_viewpoint = replace(full_viewpoint, azimuth_rad=azimuth, half_width_rad=0.3)
+    full_circle, sector = (select_rocks(ground, viewpoint) for viewpoint in (full_viewpoint, sector_viewpoint))
     offsets_m = full_circle.triangles[:, 0, :2] - (0.4, 1.0)
     angle_from_axis = np.abs((np.arctan2(offsets_m[:, 0], offsets_m[:, 1]) - azimuth + np.pi) % (2.0 * np.pi) - np.pi)
     # Within 5 m of the viewpoint, rocks outside the sector are included for their shadows.

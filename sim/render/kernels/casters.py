@@ -18,18 +18,20 @@ from marsyard.sim.render.kernels.structs import Flags, Longs
 from marsyard.sim.terrain.kernels import Array
 
 #: Grid over all bodies: (minimum u and v, cells per metre along u and v); cells along a side; start of each cell's list
-#: and the end of the last; bodies listed in the cells.
+#: and the end of the last list; bodies listed in the cells.
 Grid = tuple[Array, Longs, Longs, Longs]
 #: Grids of the bodies: one row of (minimum u and v, cells per metre along u and v, maximum s) per body; one row of
-#: (cells along a side, first cell) per body; start of each cell's list and the end of the last; triangles listed in
-#: the cells; maximum s of each listed triangle.
+#: (cells along a side, first cell) per body; start of each cell's list and the end of the last list; triangles listed
+#: in the cells; maximum s of each listed triangle.
 BodyGrids = tuple[Array, Longs, Longs, Longs, Array]
-#: Linear functions of each triangle (constant, slope along u, slope along v): the weights of the second and third
-#: corner, and s of its plane; unit vectors u and v perpendicular to the sun's direction, and s along it; grid over all
-#: bodies, and grids of the bodies.
+#: Triangles prepared for one direction of the sun. Three linear functions (constant, slope along u, slope along v) of
+#: each triangle: barycentric weights of its second and third corner, and s of its plane. Axes: unit vectors u and v
+#: perpendicular to the sun's direction, and s along it. Grid over all bodies. Grids of the bodies.
 Casters = tuple[Array, Array, Grid, BodyGrids]
-#: Minimum u and v, maximum u, v and s; or minimum u and v, cells per metre along u and v, and maximum s.
+#: Bounds: minimum u and v, maximum u, v and s.
 BoundsUVS = tuple[float, float, float, float, float]
+#: Row of a grid: minimum u and v, cells per metre along u and v, maximum s.
+GridRow = tuple[float, float, float, float, float]
 #: Average number of triangles per cell of a body's grid, and the maximum number of cells along a side.
 TRIANGLES_PER_CELL, MAX_CELLS = 4, 1024
 #: Margin of all bounds, metres; larger than rounding errors.
@@ -120,7 +122,7 @@ def _list_in_cells(
     - grid_rows: minimum u and v, cells per metre along u and v of each grid
     - sides, first_cells: cells along a side, and index of the first cell of each grid
 
-    Returns the start of each cell's list and the end of the last, and the listed rows.
+    Returns the start of each cell's list (and the end of the last list), and the listed rows.
     """
     grid_count = sides.size
     cells = first_cells[-1] + sides[-1] ** 2 if grid_count > 0 else 0
@@ -140,14 +142,19 @@ def _list_in_cells(
 
 
 @njit(cache=True)
-def _create_grid_row(bounds: BoundsUVS, side: int) -> BoundsUVS:
-    """Create the row of a grid over these bounds: minimum u and v, cells per metre along u and v, maximum s."""
+def _create_grid_row(bounds: BoundsUVS, side: int) -> GridRow:
+    """Create the row of a grid over these bounds, with `side` cells along each side."""
     return bounds[0], bounds[1], side / (bounds[2] - bounds[0]), side / (bounds[3] - bounds[1]), bounds[4]
 
 
 @njit(cache=True)
 def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Casters:
-    """Build the grids of bodies' triangles, in contiguous ranges, for a sun in the direction of the third axis."""
+    """Project the triangles along the sun's direction and list them in grids.
+
+    - triangles, first_triangle: corners; body b consists of the triangles `first_triangle[b]` to
+      `first_triangle[b + 1] - 1`
+    - axes: rows are the unit vectors u, v and s; s points to the sun
+    """
     bodies = first_triangle.size - 1
     bounds, linear = _project_along_sun(triangles, axes)
     body_bounds = np.empty((bodies, 5))
@@ -161,20 +168,22 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
         body_bounds[body], body_grids[body] = enclosing, _create_grid_row(enclosing, side)
         layouts[body, 0], layouts[body, 1] = side, cells
         cells += side * side
-    starts, items = _list_in_cells(bounds, first_triangle, body_grids, layouts[:, 0].copy(), layouts[:, 1].copy())
-    max_s = np.empty(items.size)
-    for k in range(items.size):
-        max_s[k] = bounds[items[k], 4]
+    triangle_starts, listed_triangles = _list_in_cells(
+        bounds, first_triangle, body_grids, layouts[:, 0].copy(), layouts[:, 1].copy()
+    )
+    max_s = np.empty(listed_triangles.size)
+    for k in range(listed_triangles.size):
+        max_s[k] = bounds[listed_triangles[k], 4]
     # one grid over all bodies
     sides = np.array([_choose_side(float(bodies))])
     scene_grid = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
     if bodies > 0:
         scene_grid[0] = _create_grid_row(_enclose_bounds(body_bounds, 0, bodies), sides[0])
-    first_items, body_entries = _list_in_cells(
+    body_starts, listed_bodies = _list_in_cells(
         body_bounds, np.array([0, bodies]), scene_grid, sides, np.zeros(1, dtype=np.int64)
     )
-    grid: Grid = (scene_grid[0, :4].copy(), sides, first_items, body_entries)
-    return linear, axes, grid, (body_grids, layouts, starts, items, max_s)
+    grid: Grid = (scene_grid[0, :4].copy(), sides, body_starts, listed_bodies)
+    return linear, axes, grid, (body_grids, layouts, triangle_starts, listed_triangles, max_s)
 
 
 @njit(cache=True)
@@ -183,7 +192,8 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
 
     All positions are tested in one call, because passing the arrays takes longer than testing most positions.
     """
-    linear, axes, (grid, sides, starts, bodies), (body_grids, layouts, first_items, listed_triangles, max_s) = casters
+    linear, axes, (grid, sides, body_starts, listed_bodies), body_lists = casters
+    body_grids, layouts, triangle_starts, listed_triangles, max_s = body_lists
     to_axes = unpack_matrix(axes)
     side = sides[0]
     min_u, min_v, per_u, per_v = grid[0], grid[1], grid[2], grid[3]
@@ -196,9 +206,9 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
         if not (0.0 <= column < side and 0.0 <= row < side):
             continue
         cell = int(row) * side + int(column)
-        k = starts[cell]
-        while k < starts[cell + 1] and not hidden[position]:
-            body = bodies[k]
+        k = body_starts[cell]
+        while k < body_starts[cell + 1] and not hidden[position]:
+            body = listed_bodies[k]
             k += 1
             if body_grids[body, 4] < s:
                 continue
@@ -208,7 +218,7 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
             if not (0.0 <= column < body_side and 0.0 <= row < body_side):
                 continue
             body_cell = layouts[body, 1] + int(row) * body_side + int(column)
-            for m in range(first_items[body_cell], first_items[body_cell + 1]):
+            for m in range(triangle_starts[body_cell], triangle_starts[body_cell + 1]):
                 if max_s[m] < s:
                     continue
                 n = listed_triangles[m]

@@ -20,7 +20,7 @@ def test_quantile_bound_needs_the_sample_size_of_wilks(quantile: float, confiden
 
 
 def test_quantile_bounds_have_nominal_coverage() -> None:
-    # 1500 samples: standard deviation of the coverage 0.8 %, tolerance of three
+    # with 1500 samples the coverage has a standard deviation of 0.8 %; the tolerance is three times that
     rng = np.random.default_rng(5)
     true_quantile = stats.norm.ppf(0.9)
     bounds = np.array([quantile_bounds(rng.standard_normal(80), 0.9, 0.9) for _ in range(1500)])
@@ -29,7 +29,8 @@ def test_quantile_bounds_have_nominal_coverage() -> None:
 
 
 def test_mean_interval_has_nominal_coverage() -> None:
-    # BCa interval of 40 exponential values: about 2 % below nominal (Efron 1987); 250 samples: standard deviation 1.4 %
+    # the coverage of the BCa interval of 40 exponential values is about 2 % too low (Efron 1987)
+    # with 250 samples the coverage has a standard deviation of 1.4 %
     rng = np.random.default_rng(6)
     intervals = np.array([mean_interval(rng.exponential(size=40), 0.95) for _ in range(250)])
     assert np.mean((intervals[:, 0] <= 1.0) & (intervals[:, 1] >= 1.0)) >= 0.95 - 0.02 - 3 * 0.014
@@ -75,7 +76,7 @@ def test_radial_quantiles_of_normal_errors_agree_with_the_rayleigh_distribution(
 
 
 def test_standard_deviation_interval_has_nominal_coverage() -> None:
-    # 250 samples: standard deviation of the coverage 1.4 %
+    # with 250 samples the coverage has a standard deviation of 1.4 %
     rng = np.random.default_rng(9)
     intervals = np.array([standard_deviation_interval(rng.normal(0.0, 2.0, 30), 0.95) for _ in range(250)])
     assert np.mean((intervals[:, 0] <= 2.0) & (intervals[:, 1] >= 2.0)) >= 0.95 - 3 * 0.014

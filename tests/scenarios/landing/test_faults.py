@@ -34,8 +34,8 @@ def test_receiver_outage_covers_images_and_landing() -> None:
             errors.append(float(np.hypot(*(estimate - transit.state(0).position_m)[:2])))
             has_solution = np.isfinite(transit.navigation_leg.solutions.positions_m[:, 0])
             fix_times_s = transit.navigation_leg.fix_times_s
-            assert has_solution.all() if not outage_s else not has_solution[fix_times_s >= -outage_s].any()
-            assert has_solution[fix_times_s < -outage_s].all()
+            is_outage = (fix_times_s >= -outage_s) & (outage_s > 0.0)
+            np.testing.assert_array_equal(has_solution, ~is_outage)
     assert np.median(position_errors_m[40.0]) > 10.0 * np.median(position_errors_m[0.0])
 
 
@@ -50,7 +50,7 @@ def test_altimeter_faults_replace_all_ranges() -> None:
     assert stuck_range_m(Faults(), 10.0) is None
 
 
-def test_two_images_are_received_for_any_loss_rate() -> None:
+def test_at_least_two_images_are_received_for_any_loss_rate() -> None:
     rng = np.random.default_rng(0)
     assert len(draw_received_images(Faults(), 40, rng)) == 40
     image_numbers = draw_received_images(Faults(lost_images=0.75), 40, rng)
@@ -66,7 +66,7 @@ def test_flight_faults_require_a_flight(fault: dict[str, float]) -> None:
         LandingScenarioParameters.model_validate({"faults": fault})
 
 
-def test_bad_pixels_can_be_listed() -> None:
+def test_bad_pixel_faults_set_the_fraction_and_the_list() -> None:
     detector = preset("xc-55").detector
     unlisted_defects, listed_defects = (
         add_detector_faults(Faults.model_validate({name: 0.01}), detector).defects

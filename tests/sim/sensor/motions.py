@@ -24,7 +24,11 @@ def uniform_motion(rows_s: float, columns_s: float) -> ImageMotion:
 class Swaying:
     """Motion of a body that spins about the vertical, nods about its x axis, falls on a parabola and sways east.
 
-    `tilt` is the attitude at time 0.
+    - spin_rad_s: rate of the rotation about the vertical
+    - nod_rad, nod_rad_s: amplitude and angular frequency of the rotation about the body's x axis
+    - position_m, velocity_m_s, acceleration_m_s2: parabola; initial position and velocity, constant acceleration
+    - sway_m, sway_rad_s: amplitude and angular frequency of the motion to the east
+    - tilt: attitude at time 0
     """
 
     spin_rad_s: float = 0.0

@@ -21,8 +21,8 @@ NO_ERRORS = {name: 0.0 for name in ImuParameters.model_fields if name.startswith
 AT_REST = Swaying()
 
 
-def perfect_unit(**errors: object) -> ImuParameters:
-    """Return the parameters of a unit that has only the given errors."""
+def make_parameters(**errors: object) -> ImuParameters:
+    """Return the parameters of a unit with only the given errors."""
     return ImuParameters.model_validate(NO_ERRORS | errors)
 
 
@@ -37,7 +37,7 @@ def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
     """The Allan deviation over the averaging time tau matches the formula for white noise plus a Markov bias."""
     # Angular random walk, deg/sqrt(h); bias wander, deg/h; its correlation time, s; sample rate, Hz.
     walk, wander, correlation_s, rate = 0.07, 1.0, 100.0, 4.0
-    parameters = perfect_unit(
+    parameters = make_parameters(
         rate_hz=rate, angular_random_walk_deg_sqrt_h=walk, gyro_wander_deg_h=wander, gyro_wander_s=correlation_s
     )
     rng = np.random.default_rng(0)
@@ -64,7 +64,7 @@ def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
 
 
 def test_static_ideal_unit_measures_gravity() -> None:
-    imu = Imu.draw(perfect_unit(), (0.0, 1.0), np.random.default_rng(0))
+    imu = Imu.draw(make_parameters(), (0.0, 1.0), np.random.default_rng(0))
     increments = imu.increments(AT_REST, 0.0, 1.0, np.random.default_rng(1))
     assert increments.times_s.size == 401
     np.testing.assert_array_equal(increments.delta_angles_rad, 0.0)
@@ -72,7 +72,7 @@ def test_static_ideal_unit_measures_gravity() -> None:
 
 
 def test_scale_and_misalignment_apply_to_true_increments() -> None:
-    parameters = perfect_unit(
+    parameters = make_parameters(
         gyro_scale_ppm=1000.0, gyro_misalignment_mrad=5.0, accelerometer_scale_ppm=2000.0, accelerometer_bias_mg=1.0
     )
     imu = Imu.draw(parameters, (0.0, 1.0), np.random.default_rng(3))
@@ -86,7 +86,7 @@ def test_scale_and_misalignment_apply_to_true_increments() -> None:
 
 
 def test_rounding_errors_do_not_accumulate() -> None:
-    parameters = perfect_unit(gyro_count_rad=1e-3, gyro_bias_deg_h=1.0 / DEG_H)
+    parameters = make_parameters(gyro_count_rad=1e-3, gyro_bias_deg_h=1.0 / DEG_H)
     imu = Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(0))
     delta_angles = imu.increments(AT_REST, 0.0, 10.0, np.random.default_rng(0)).delta_angles_rad
     np.testing.assert_allclose(delta_angles / 1e-3, np.rint(delta_angles / 1e-3), atol=1e-9)
@@ -96,7 +96,7 @@ def test_rounding_errors_do_not_accumulate() -> None:
 
 def test_bias_follows_temperature() -> None:
     warm_up = WarmUp(start_s=10.0, change_k=20.0, time_constant_s=100.0)
-    imu = Imu.draw(perfect_unit(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (0.0, 2000.0), np.random.default_rng(0))
+    imu = Imu.draw(make_parameters(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (0.0, 2000.0), np.random.default_rng(0))
     bias = imu.gyro.bias_at(np.array([0.0, 10.0, 110.0, 2000.0]))
     np.testing.assert_array_equal(bias[:2], 0.0)
     np.testing.assert_allclose(bias[2], imu.gyro.bias_per_k * 20.0 * (1.0 - np.exp(-1.0)), rtol=1e-12)
@@ -121,6 +121,6 @@ def test_random_errors_have_the_specified_deviations() -> None:
 
 
 def test_span_without_samples_is_rejected() -> None:
-    imu = Imu.draw(perfect_unit(), (0.0, 1.0), np.random.default_rng(0))
+    imu = Imu.draw(make_parameters(), (0.0, 1.0), np.random.default_rng(0))
     with pytest.raises(ValueError, match="no sample"):
         imu.boundaries(0.0, 0.001)

@@ -63,9 +63,9 @@ def test_bank_includes_tails_and_keeps_the_positions_of_rocks(tmp_path: Path, mo
     without_tails = TerrainParameters(samples=256, spacing_m=0.05, rocks=RockParameters(abundance=0.05, smallest_m=0.2))
     with_tails = without_tails.with_changes({"rocks": {"tails": {}}})
     plain_bank, tail_bank = TerrainBank(without_tails, 3), TerrainBank(with_tails, 3)
-    rise = tail_bank.terrain(0).levels[0][..., 0] - plain_bank.terrain(0).levels[0][..., 0]
-    assert rise.min() == 0.0
-    assert rise.max() > 0.02
+    tail_heights = tail_bank.terrain(0).levels[0][..., 0] - plain_bank.terrain(0).levels[0][..., 0]
+    assert tail_heights.min() == 0.0
+    assert tail_heights.max() > 0.02
     rocks, rocks_of_plain = tail_bank.rocks(0), plain_bank.rocks(0)
     assert rocks is not None
     assert rocks_of_plain is not None
@@ -75,7 +75,9 @@ def test_bank_includes_tails_and_keeps_the_positions_of_rocks(tmp_path: Path, mo
     np.testing.assert_array_equal(z, tail_bank.terrain(0).height(x, y))
 
 
-def test_rocks_identify_a_terrain_only_if_they_have_tails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rock_abundance_changes_the_cached_terrain_only_with_tails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
     rocks = RockParameters(abundance=0.05, smallest_m=0.2)
     parameters = TerrainParameters(samples=64, spacing_m=0.05, rocks=rocks)
