@@ -147,7 +147,7 @@ def _simulate_designation(number: int, camera: str) -> tuple[float, float] | Non
 def _range_error_m(run: Run) -> float:
     """First reported position minus the designated point, along the line of sight."""
     stop = run.stops[0]
-    eye = stop.stance.world_from_rover.inv().apply(run.rig.eyes(stop.world_from_head)[0])
+    eye = stop.stance.world_from_rover.inv().apply(run.rig.camera_positions(stop.world_from_head)[0])
     line_of_sight = (stop.point_rover - eye) / np.linalg.norm(stop.point_rover - eye)
     return float(stop.error_m() @ line_of_sight)
 

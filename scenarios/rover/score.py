@@ -129,7 +129,7 @@ def tracking_row(run: Run) -> dict[str, Scalar]:
 
 
 def update_quantities(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
-    """Collect the quantities of all updates in arrays; NaN if a tracker reports no details, or no match at the seed."""
+    """Collect the quantities of all updates in arrays; NaN if missing: for a tracker without details, for example."""
     rows = []
     for stop, error in zip(run.stops, errors_px(run), strict=True):
         azimuth, elevation = np.degrees(stop.angles_rad)
@@ -258,7 +258,7 @@ def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
     """
     half_angle, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
     for stop, error in zip(run.stops, np.hypot(*errors_px(run).T), strict=True):
-        viewpoint = run.rig.eyes(stop.world_from_head)[0]
+        viewpoint = run.rig.camera_positions(stop.world_from_head)[0]
         patch = sample_template(viewpoint, run.target.point_world, half_angle)
         sun = run.world.sun.direction(stop.time_s)
         if p.rover_shadow and rover_shades_patch(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):

@@ -291,7 +291,7 @@ def pick_target(
     `position` is (across, up) seen from `picking_eye`, by default the left camera. The point is on an edge if it is on
     an edge for either camera, because stereo matching needs it in both images.
     """
-    eyes, triangles = rig.eyes(world_from_head), world.target_triangles
+    eyes, triangles = rig.camera_positions(world_from_head), world.target_triangles
     foot = float(world.rocks.position_m[world.target_number, 2])
     outline = points.RockOutline.from_triangles(triangles, eyes[0] if picking_eye is None else picking_eye, foot)
     point = outline.point(*position)
@@ -307,7 +307,7 @@ def evaluate_visibility(
 ) -> Visibility:
     """Evaluate the visibility of a point on the rock from true poses of the mast's head, world axes."""
     half_rad, triangles = 0.5 * options.template_px * rig.pixel_rad, world.target_triangles
-    eyes = [rig.eyes(head) for head in heads]
+    eyes = [rig.camera_positions(head) for head in heads]
     normal = points.patch_normal(triangles, eyes[0][0], point, half_rad)
     to_eyes = np.array([left - point for left, _ in eyes])
     to_eyes /= np.linalg.norm(to_eyes, axis=1, keepdims=True)

@@ -227,7 +227,9 @@ class Rig:
         """True pose of the head in the rover frame."""
         return self.mast.rover_from_head(self.state)
 
-    def eyes(self, world_from_head: RigidTransform) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+    def camera_positions(
+        self, world_from_head: RigidTransform
+    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """Compute the true positions of the left and the right camera, world, metres."""
         left, right = world_from_head.apply(np.stack([self.left.c, self.right.c]))
         return left, right
