@@ -1,8 +1,10 @@
 """Growth of costs with size: ``python -m benchmarks.growth`` draws docs/images/growth.svg.
 
-Curves: time of a frame for numbers of pixels and triangles, of a case for sizes of the terrain, of a campaign for
-numbers of cases and workers (local and Dask, with cases that only wait), of a report for numbers of cases. Units are
-core-seconds; wall-clock seconds for campaigns.
+- Core-seconds of a frame as a function of its number of pixels, and of the number of triangles of the mesh
+- Core-seconds of a case as a function of the terrain's number of samples
+- Wall-clock seconds of a campaign as a function of its number of cases, and of the number of local or Dask workers; in
+  the latter the cases wait without computing
+- Core-seconds of a report as a function of the number of cases
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from marsyard.sim.streams import Streams
 
 RESULTS = Path(__file__).parent / "results" / "growth.json"
 FIGURE = Path(__file__).parents[1] / "docs" / "images" / "growth.svg"
-#: Waiting time of a case that does not compute, s.
+#: Waiting time of a case of `WaitingScenario`, s.
 WAITING_S = 0.02
 
 

@@ -1,4 +1,4 @@
-"""Errors and answers by condition: a table for each condition, whose bins have equal numbers of cases."""
+"""Errors and answers by condition: a table for each condition. Its bins are single values or intervals."""
 
 from __future__ import annotations
 
@@ -34,11 +34,15 @@ CONDITIONS = (
     "sun_elevation", "sun_azimuth", "image_contrast", "image_patchiness", "dust_opacity", "rocks_abundance", "defocus",
     "stray_light", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max", "pose_error_fraction",
 )  # fmt: skip
-#: A column with at most `MAX_VALUES` values and `CASES_PER_VALUE` cases per value on average has a row for each value.
+#: A column with at most `MAX_VALUES` values has a row for each value, if the mean number of cases per value is at least
+#: `CASES_PER_VALUE`.
 MAX_VALUES, CASES_PER_VALUE = 12, 10
-#: Other columns of numbers have 2 to `MAX_BINS` bins of about `CASES_PER_BIN` cases.
+#: Other columns of numbers have 2 to `MAX_BINS` intervals with equal numbers of cases, about `CASES_PER_BIN` each.
 CASES_PER_BIN, MAX_BINS = 40, 5
 QUANTILE = 0.99
+#: Names of the world axes.
+_AXIS_NAMES = {"x": "east", "y": "north", "z": "up"}
+_TERRAINS_NOTE = note_text("common.terrains")
 
 
 def conditions_section(subject: Subject) -> Section | None:
@@ -95,17 +99,15 @@ def bin_conditions(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, B
                 yield column, [(name, positions == index) for index, name in enumerate(names)]
 
 
-_TERRAINS_NOTE = note_text("common.terrains")
-
-
-def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
+def terrain_variance(frame: pd.DataFrame, column: str) -> dict[str, Any] | None:
     """Analyse the variance of an error column with terrains as random effects; None without repeated terrains.
 
-    Keys: `within_sd` of errors within a terrain, `between_sd` of the terrains' means, `fraction` of the variance
-    between terrains (intraclass correlation), `p_value` of equal means (F-test).
+    Keys: `part` (the column), `terrains` (their number), `within_sd` of errors within a terrain, `between_sd` of the
+    terrains' means, `fraction` of the variance between terrains (intraclass correlation), `p_value` of equal means
+    (F-test).
     """
     groups = rates.terrain_groups(frame)
-    values = numbers(frame, part)
+    values = numbers(frame, column)
     finite = np.isfinite(values) & rates.population_mask(frame, "valid")
     if groups is None or not finite.any():
         return None
@@ -123,7 +125,7 @@ def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
     variance_between = max(between - within, 0.0) / effective_size
     p_value = float(stats.f.sf(between / within, terrains - 1, cases - terrains)) if within > 0.0 else float("nan")
     return {
-        "part": part,
+        "part": column,
         "terrains": terrains,
         "within_sd": float(np.sqrt(within)),
         "between_sd": float(np.sqrt(variance_between)),
@@ -133,7 +135,7 @@ def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
 
 
 def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
-    """Summarize a bin: answers, mean and standard deviation of the signed errors, bound of the 99 % quantile."""
+    """Summarize a bin: answers, mean and SD of the signed errors, upper confidence bound of the 99 % quantile."""
     is_answered = rates.population_mask(rows, "valid")
     answered_rows = rows[is_answered]
     magnitude, groups = np.abs(numbers(answered_rows, metric)), rates.terrain_groups(answered_rows)
@@ -148,10 +150,6 @@ def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]
         "quantile_bound": quantile_bounds(magnitude, QUANTILE, CONFIDENCE, finite_groups)[1],
         "largest": float(magnitude.max()) if magnitude.size else float("nan"),
     }
-
-
-#: Names of the world axes.
-_AXIS_NAMES = {"x": "east", "y": "north", "z": "up"}
 
 
 def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -> Grid:

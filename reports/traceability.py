@@ -117,7 +117,7 @@ COLUMNS = (*_REQUIREMENT_COLUMNS, "campaign", *algorithm_cells(()), *_EVIDENCE_C
 def requirement_evidence(
     campaign: str, verdicts: Iterable[Verdict], algorithms: Sequence[Algorithm] = (), evidence_kind: str = ""
 ) -> list[dict[str, Any]]:
-    """Create the rows of the traceability matrix: the evidence of a campaign, of a kind, for each requirement."""
+    """Create the rows of the traceability matrix: the evidence of a campaign for each requirement."""
     cells = {"campaign": campaign, **algorithm_cells(algorithms), "evidence": evidence_kind}
     rows = []
     for verdict in verdicts:

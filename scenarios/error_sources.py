@@ -18,8 +18,8 @@ class ErrorSource:
 
     - name: short name, unique in its scenario; title: noun phrase for tables and figures
     - parameters: dotted paths of the parameters that cause the error
-    - remaining: factor of the numbers without the error; above 0 for errors that a filter on board assumes as well,
-      because it would trust its measurements without limit
+    - remaining: factor by which numeric parameters are multiplied to remove the error. It is 0 in general, and above 0
+      if the on-board filter is tuned with the same parameter: with 0 the filter would assume a perfect sensor
     """
 
     name: str
@@ -30,7 +30,7 @@ class ErrorSource:
     def exact_values(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of the parameters without this error, by path; missing parameters are omitted.
 
-        A number, or each number of a list, is multiplied by `remaining`, a switch becomes false, and a table None.
+        A number, or each number of a list, is multiplied by `remaining`. A switch becomes false, a table becomes None.
         Raises ValueError for a text.
         """
         values = {path: value for path in self.parameters for value in _find(parameters, path)}
@@ -60,10 +60,11 @@ def _exact_value(path: str, value: Any, factor: float) -> Any:
 
 @cache
 def error_sources(scenario: str) -> tuple[ErrorSource, ...]:
-    """Return the sources of error of a scenario, by the name in campaign files; empty if it names none.
+    """Return the sources of error of a scenario, which is given by its name in campaign files; empty if it has none.
 
-    They are in the file of its system. A scenario ``module:Class`` without a system has them in the attribute
-    `error_sources` of its class. Raises ValueError for an invalid file.
+    A system under test defines the sources of its scenarios in a TOML file (`System.error_sources`). A scenario
+    ``module:Class`` that belongs to no system defines them in the attribute `error_sources` of its class. Raises
+    ValueError for an invalid file.
     """
     system = find_system(scenario)
     if system is None:

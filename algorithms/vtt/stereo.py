@@ -72,7 +72,7 @@ def search_ranges(left: CameraModel, right: CameraModel, range_m: float, dispari
 def point_stereo(
     template: Patch, image: MastImage, curve: Float[np.ndarray, "points 2"], options: VttOptions
 ) -> StereoMatch | None:
-    """Match the left template near the epipolar `curve` (full-frame pixels) of the right image; None if none fits."""
+    """Match the left template near the epipolar `curve` (full-frame pixels) of the right image; None without match."""
     half, tolerance = (len(template) - 1) // 2, options.epipolar_tolerance_px
     curve_px = curve - np.array(image.corner, dtype=np.float64)
     rows, columns = image.counts.shape

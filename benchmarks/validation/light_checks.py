@@ -163,7 +163,7 @@ def _render_brightness(law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) 
 
 
 def _reflectance(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: npt.ArrayLike) -> np.ndarray:
-    """Independent implementation of the law of `Photometry`, for unit albedo and K."""
+    """Independent implementation of the law of `Photometry`, for unit albedo A and unit normalisation factor K."""
     # phase angle
     g = np.arccos(np.clip(cos_g, -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)

@@ -32,11 +32,11 @@ MEASURED: Mapping[str, float] = {
     "world points of a tilted plane: Sony XC-55": 1.1e-09,
     "bias of motion, pisgah from 2 km": 0.0032,
     "bias of motion, kelso from 2 km": 0.00053,
-    # micro-relief and one common blur, instead of two, add detail near the Nyquist frequency, which aliases
+    # detail near the Nyquist frequency, from micro-relief and the single blur of docs/adr/0033-one-blur.md, aliases
     "bias of motion, ivanpah from 2 km": 0.0026,
     "bias of motion, gusev from 2 km": 0.0044,
     "bias of motion, meridiani from 2 km": 0.00041,
-    # for the same reason; the requirement is 0.02 px
+    # larger because of the same aliasing; the requirement is 0.02 px
     "bias of motion, rock at 10 m": 0.0066,
     "bias of motion, ground at grazing view and rocks around the large rock, 10 m": 0.0058,
     "bias of motion, rock at 5 m": 0.003,

@@ -1,8 +1,8 @@
 """Kind of evidence of a run: calibration, confirmation or exploration, by its seed and its frozen algorithm.
 
 Options that were set by looking at results fit the cases of these results. Only new cases, drawn once after the
-algorithm was frozen, can confirm it. `marsyard run --confirm` draws the seed of such a run from a namespace, and enters
-the run in a record of confirmations (`marsyard.campaigns.store.confirmations`).
+algorithm was frozen, can confirm it. `marsyard run --confirm` draws the seed of such a run from a namespace, and
+appends the run to a record of confirmations (`marsyard.campaigns.store.confirmations`).
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from marsyard.campaigns.definition.identity import create_identity, describe_alg
 
 #: Namespace of the seeds of confirmations without a table `[calibration]` in the campaign file.
 NAMESPACE = "confirmation"
-#: Keys of a configuration that a confirmation does not freeze: the seed, the number of cases, texts, limits of the run.
-_KEYS_NOT_FROZEN = frozenset(
+#: Keys that the hash `configuration` of a frozen algorithm does not contain: the seed, the number of cases, texts,
+#: limits of the run, and the requirements, which have their own hash.
+_KEYS_NOT_HASHED = frozenset(
     {"appended", "calibration", "cases", "description", "limits", "max_cases", "requirements", "retain", "seed"}
 )
 #: Maximum number of a confirmation whose seed is recognised without an entry in the record.
@@ -29,7 +30,7 @@ _MAX_RESERVED_NUMBER = 1000
 
 
 class EvidenceKind(StrEnum):
-    """Kind of evidence of a run; the results of kinds in `KINDS_WITHOUT_PASS` cannot be PASS."""
+    """Kind of evidence of a run, explained by `Evidence.text`; results of `KINDS_WITHOUT_PASS` cannot be PASS."""
 
     CONFIRMATION = "confirmation"
     REPETITION = "repetition of a confirmation"
@@ -39,7 +40,8 @@ class EvidenceKind(StrEnum):
     CHANGED = "not the frozen evaluation"
 
 
-#: Kinds of evidence whose cases were known before the algorithm was frozen.
+#: Kinds of evidence that allow no PASS: the cases were known before the algorithm was frozen, or the evaluation is not
+#: the frozen one.
 KINDS_WITHOUT_PASS = frozenset({EvidenceKind.CALIBRATION, EvidenceKind.REUSED_SEED, EvidenceKind.CHANGED})
 
 
@@ -86,7 +88,7 @@ def freeze_algorithm(campaign: Campaign) -> FrozenAlgorithm:
     options = {f"{entry['spec']}.{name}": value for entry in algorithms for name, value in entry["options"].items()}
     values = configuration.model_dump(mode="json")
     options |= dict(leaves(values["parameters"], "parameters"))
-    frozen_values = {name: value for name, value in values.items() if name not in _KEYS_NOT_FROZEN}
+    frozen_values = {name: value for name, value in values.items() if name not in _KEYS_NOT_HASHED}
     identity = create_identity(configuration)
     contents = {
         "sources": [(entry["spec"], entry["source_hash"]) for entry in algorithms],
@@ -176,7 +178,7 @@ class Evidence:
 
     @property
     def excludes_pass(self) -> bool:
-        """Whether this kind of evidence allows no PASS: the cases were known before the algorithm was frozen."""
+        """Whether this kind of evidence allows no PASS, see `KINDS_WITHOUT_PASS`."""
         return self.kind in KINDS_WITHOUT_PASS
 
     @property

@@ -94,7 +94,7 @@ class Failure:
     - case: number of the reduced case; original_case: number of the case before the reduction
     - margin: margin of the reduced case
     - values: values of the dispersions that differ from the campaign's parameters, by path
-    - distance: distance of these values from the medians, standard deviations; a small distance is likely
+    - distance: distance of these values from the medians, standard deviations; small distances are more likely
     - similar: number of violations with the same cause
     - repeated, repetitions: number of violations among the repetitions with new random streams
     - outcome: outcome of the reduced case

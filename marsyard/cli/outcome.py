@@ -1,4 +1,4 @@
-"""Functions of the commands around a campaign: estimate before a run, evaluation and report after it, dashboard server.
+"""Work of the commands before and after the cases of a campaign: estimate, evaluation, report and dashboard server.
 
 Sequential runs (`--until-decided`) and reruns of notable cases are also here.
 """
@@ -134,13 +134,13 @@ def read_frame(directory: Path) -> pd.DataFrame:
 def write_csv(directory: Path) -> Path:
     """Write all rows as CSV in batches, atomically."""
     path = directory / "cases.csv"
-    partial = path.with_name(f"{path.name}.partial")
+    partial_path = path.with_name(f"{path.name}.partial")
     with report_write_errors(path):
         table = pq.ParquetFile(directory / TABLE_FILE)
-        with pa_csv.CSVWriter(partial, table.schema_arrow) as writer:
+        with pa_csv.CSVWriter(partial_path, table.schema_arrow) as writer:
             for batch in table.iter_batches():
                 writer.write_batch(batch)
-        partial.replace(path)
+        partial_path.replace(path)
     return path
 
 
@@ -187,10 +187,10 @@ _MAX_DRAWS = 5000
 
 
 def evidence_limits(campaign: Campaign) -> list[str]:
-    """Explain why the strictest requirement cannot be PASS even without a failure, with a remedy; empty if it can.
+    """Return the reasons why the strictest requirement cannot be PASS even without a failure; empty if it can.
 
-    Only requirements that are decided at a confidence are considered. The population is assumed to be all cases; a
-    smaller population requires more cases.
+    Each reason contains a remedy. Only requirements that are decided at a confidence are considered. The population is
+    assumed to be all cases; a smaller population requires more cases.
     """
     configuration = campaign.configuration
     requirements = [item for item in configuration.requirements if item.decide_by != ESTIMATE]
@@ -201,10 +201,10 @@ def evidence_limits(campaign: Campaign) -> list[str]:
         return [design.no_probability]
     strictest = max(requirements, key=lambda item: minimum_sample_size(item.probability, item.confidence))
     min_cases, cases = minimum_sample_size(strictest.probability, strictest.confidence), configuration.total_cases
-    level = f"{format_fraction(strictest.probability)} at {format_fraction(strictest.confidence)} confidence"
+    requirement_text = f"{format_fraction(strictest.probability)} at {format_fraction(strictest.confidence)} confidence"
     limits = []
     if cases < min_cases:
-        condition = f"{level} takes at least {count(min_cases, 'case')} without a failure"
+        condition = f"{requirement_text} takes at least {count(min_cases, 'case')} without a failure"
         limits.append(f"{strictest.id}: {condition}; the campaign has {cases}.")
     terrain_supply = design.terrains
     if terrain_supply is None:
@@ -288,7 +288,7 @@ def continue_until_decided(directory: Path, executor: ExecutorConfig, observer: 
         append_cases(directory, next_cases - cases, executor, observer)
 
 
-class _SiteHandler(SimpleHTTPRequestHandler):
+class _DashboardHandler(SimpleHTTPRequestHandler):
     """Request handler that serves only files in the dashboard's folder, without folder listings and log messages.
 
     `names` are the allowed host names of the server.
@@ -308,7 +308,7 @@ class _SiteHandler(SimpleHTTPRequestHandler):
         return True
 
     def translate_path(self, path: str) -> str:
-        """Map the path of a URL to a file; a path outside the site maps to a missing file."""
+        """Map the path of a URL to a file; a path outside the dashboard's folder maps to a missing file."""
         root = Path(self.directory).resolve()
         try:
             target = Path(super().translate_path(path)).resolve()
@@ -344,4 +344,4 @@ def is_own_host(header: str, names: Collection[str]) -> bool:
 def create_server(directory: Path, host: str, port: int) -> ThreadingHTTPServer:
     """Create an HTTP server of a dashboard's folder; port 0 selects a free port."""
     names = {"localhost", host.lower(), socket.gethostname().lower()}
-    return ThreadingHTTPServer((host, port), partial(_SiteHandler, directory=str(directory), names=names))
+    return ThreadingHTTPServer((host, port), partial(_DashboardHandler, directory=str(directory), names=names))

@@ -102,7 +102,7 @@ def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
 
 
 def draw_delivered_images(products: Mapping[str, Any]) -> Figure:
-    """Draw the three images with binned columns; raises ValueError if one is missing."""
+    """Draw the three images, binned to square pixels; raises ValueError if one is missing."""
     return draw_images([_read_image(products, f"image_{number}") for number in (1, 2, 3)])
 
 
@@ -174,12 +174,12 @@ def _draw_rectified(
     show_subframe(axes, rectified)
     axes.set_facecolor(INK)
     west, north, lattice_spacing_m = (float(value) for value in frame.ravel())
-    step_m = lattice_spacing_m * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
+    pixel_m = lattice_spacing_m * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
     spacing_m = float(gsd[0]) if gsd is not None and gsd.size == 1 else np.nan
 
     def draw_ground_square(ground: Float[np.ndarray, "2"], side_px: int, colour: str, is_valid: bool) -> None:
-        centre = ((ground[0] - west) / step_m, (north - ground[1]) / step_m)
-        _draw_square(axes, centre, side_px * spacing_m / step_m, colour, is_valid)
+        centre = ((ground[0] - west) / pixel_m, (north - ground[1]) / pixel_m)
+        _draw_square(axes, centre, side_px * spacing_m / pixel_m, colour, is_valid)
 
     for track in pair_tracks:
         ground = np.array([track.values.get(f"ground_{axis}_m", np.nan) for axis in ("east", "north")])
@@ -255,7 +255,7 @@ def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: s
 
 
 def _read_image(products: Mapping[str, Any], key: str) -> Image:
-    """Read an image and bin its columns to square size; raises ValueError if the image is missing."""
+    """Read an image and average its columns to square pixels; raises ValueError if the image is missing."""
     counts = to_matrix(products.get(key))
     if counts is None:
         raise ValueError(f"the products contain no image '{key}'")

@@ -1,10 +1,11 @@
 """Rover scenarios: one run of the closed loop, or one target tracked over the images of a shared drive.
 
-A shared drive is open-loop tracking (paper, 5.1 to 5.3): the tracker's answers do not move the rover. The point at the
-centre of all targets is designated in images of the start; the rover and its mast follow it by odometry. At every stop,
+A shared drive is open-loop tracking (paper, 5.1 to 5.3): the tracker's answers do not move the rover. A point at the
+mean position of all targets is designated in images of the start; rover and mast follow it by odometry. At every stop,
 both cameras take subframes that contain the rock and the search windows around it. A case tracks one target over the
-images of every (skipped_stops + 1)-th stop; skipping stops makes the steps larger. A drive depends only on the
-parameters, the campaign's seed and the run's index.
+images of every (skipped_stops + 1)-th stop; skipping stops makes the steps larger. A campaign has several drives, which
+the parameters call runs: each has its own rock, terrain and sun. A drive depends only on the parameters, the campaign's
+seed and the index of its run.
 
 The paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
@@ -57,7 +58,7 @@ MAX_GROUNDS, MAX_DRIVES, MAX_VISIBILITIES = 4, 1, 128
 
 
 class VariantParameters(Parameters):
-    """Rock, terrain and sun of one run."""
+    """Rock, terrain and sun of one run; `SharedDriveParameters.run` is the index of a run."""
 
     terrain: Annotated[int, Field(ge=0, description="number of the terrain among the stored terrains")] = 0
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 1.4
@@ -67,14 +68,14 @@ class VariantParameters(Parameters):
     sun_azimuth_deg: Annotated[
         float, Field(ge=-360.0, le=720.0, description="azimuth of the sun, clockwise from north")
     ] = 225.0
-    sun_elevation_deg: Annotated[float, Field(gt=3.0, le=90.0)] = 45.0
+    sun_elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="elevation of the sun")] = 45.0
 
 
 class PointParameters(Parameters):
-    """A target on the rock's face, as in `TargetParameters`; for a circle leg, seen from the middle of the circle."""
+    """A target on the rock's face, seen from the start of the drive, or from the middle of a circular drive."""
 
-    across: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
-    up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    across: Annotated[float, Field(ge=-1.0, le=1.0, description="-1 at the rock's left edge, 1 at its right")] = 0.0
+    up: Annotated[float, Field(ge=0.0, le=1.0, description="0 at the rock's foot, 1 at its top")] = 0.5
 
 
 class StepRangeParameters(Parameters):
@@ -92,7 +93,9 @@ class SharedDriveParameters(Parameters):
     """
 
     drive: Annotated[RoverScenarioParameters, Field(description="drive with its smallest steps, and the tracker")]
-    variants: Annotated[tuple[VariantParameters, ...], Field(min_length=1, description="the runs")]
+    variants: Annotated[
+        tuple[VariantParameters, ...], Field(min_length=1, description="rock, terrain, sun of each run")
+    ]
     targets: Annotated[tuple[PointParameters, ...], Field(min_length=1, description="points on every run's rock")]
     run: Annotated[int, Field(ge=0, description="index of the run")] = 0
     target: Annotated[int, Field(ge=0, description="index of the target")] = 0
@@ -104,7 +107,7 @@ class SharedDriveParameters(Parameters):
     ] = "estimate"
     step_ranges: Annotated[tuple[StepRangeParameters, ...], Field(description="ranges of steps")] = ()
     max_obliquity_deg: float | None = Field(
-        default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`"
+        default=None, gt=0.0, le=90.0, description="maximum obliquity of the face at a target for the column `on_face`"
     )
 
     @model_validator(mode="after")
@@ -140,7 +143,7 @@ class DriveKey:
     def from_parameters(cls, p: SharedDriveParameters, streams: Streams) -> DriveKey:
         """Create the key of a case's drive."""
         variant, drive = p.variants[p.run], p.drive
-        # the centre of all targets guides the drive
+        # the mean position of all targets guides the drive
         centre = {name: float(np.mean([getattr(point, name) for point in p.targets])) for name in ("across", "up")}
         rock = variant.model_dump(include={"diameter_m", "height_m", "shape", "yaw_deg"})
         sun = {"azimuth_deg": variant.sun_azimuth_deg, "elevation_deg": variant.sun_elevation_deg}
@@ -176,20 +179,20 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
     half_circle_rad = np.radians(0.5 * leg.steps * leg.step_deg) if leg.motion == "circle" else 0.0
     sine, cosine = np.sin(half_circle_rad), np.cos(half_circle_rad)
 
-    def compute_eye(world_from_head: RigidTransform) -> Float64[np.ndarray, "3"]:
-        # rotate the left camera about the rock, clockwise from above
+    def compute_viewpoint(world_from_head: RigidTransform) -> Float64[np.ndarray, "3"]:
+        """Compute the left camera's position, rotated about the rock by half the circle, clockwise from above."""
         rock = world.rocks.position_m[world.target_number]
         east, north, up = rig.camera_positions(world_from_head)[0] - rock
         return np.asarray(rock + np.array([cosine * east + sine * north, cosine * north - sine * east, up]))
 
     mast = setup.vehicle.stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
     position = p.target.across, p.target.up
-    run = Run.from_setup(setup, pick_target(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_eye(mast)))
+    run = Run.from_setup(setup, pick_target(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_viewpoint(mast)))
     guide = DesignationGuide.designate(run, key.margin_px, key.steering == "oracle-target")
     drive_legs(p, run, guide)
     if not guide.views:
         raise ValueError("the cameras cannot show the target's rock from the start of this drive")
-    return SharedDrive(run, tuple(guide.views), compute_eye(guide.views[0].world_from_head))
+    return SharedDrive(run, tuple(guide.views), compute_viewpoint(guide.views[0].world_from_head))
 
 
 def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:

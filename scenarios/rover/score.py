@@ -129,7 +129,7 @@ def tracking_row(run: Run) -> dict[str, Scalar]:
 
 
 def update_quantities(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
-    """Collect the quantities of all updates in arrays; NaN if a tracker reports no details, or no match at the seed."""
+    """Collect the quantities of all updates in arrays; NaN if missing: for a tracker without details, for example."""
     rows = []
     for stop, error in zip(run.stops, errors_px(run), strict=True):
         azimuth, elevation = np.degrees(stop.angles_rad)

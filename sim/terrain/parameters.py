@@ -27,27 +27,38 @@ class TerrainParameters(Parameters):
     outer_scale_m: Annotated[Positive, Field(description="wavelength above which relief stops growing, m")] = 3000.0
     craters_per_km2: Annotated[float, bounded_field(0.0, 2.0e6, "craters above the smallest diameter per km2")] = 60.0
     crater_exponent: Annotated[Positive, Field(description="exponent of the cumulative size-frequency power law")] = 2.0
-    crater_knee_m: Annotated[Positive, Field(description="maximum diameter of craters in saturation, m")] = 1e4
-    crater_steep_exponent: Annotated[Positive, Field(description="exponent above crater_knee_m")] = 3.2
-    crater_floor_contrast: Annotated[Fraction, Field(description="RMS of log albedo of floors over the ground's")] = 0.0
+    crater_knee_m: Annotated[Positive, Field(description="diameter above which crater_steep_exponent applies, m")] = 1e4
+    crater_steep_exponent: Annotated[Positive, Field(description="exponent of the power law above crater_knee_m")] = 3.2
+    crater_floor_contrast: Annotated[
+        Fraction, Field(description="SD of the log albedo of crater floors relative to the ground")
+    ] = 0.0
     crater_diameter_min_m: Annotated[Positive, Field(description="smallest crater diameter, m")] = 12.0
     crater_diameter_max_m: Annotated[Positive, Field(description="largest crater diameter, m")] = 600.0
-    crater_ejecta_contrast: Annotated[Fraction, Field(description="log albedo of the freshest ejecta, + or -")] = 0.12
+    crater_ejecta_contrast: Annotated[
+        Fraction, Field(description="log albedo of the freshest ejecta relative to the ground; the sign is random")
+    ] = 0.12
     albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="mean albedo")] = 0.2
-    albedo_contrast: Annotated[Fraction, Field(description="RMS of the fractal albedo's logarithm, all scales")] = 0.12
-    contrast_spread: Annotated[NonNegative, Field(description="SD of log albedo_contrast between terrains")] = 0.0
-    albedo_hurst: Annotated[float, Field(ge=-0.5, lt=1.0, description="Hurst exponent; 0: equal in all octaves")] = 0.0
+    albedo_contrast: Annotated[
+        Fraction, Field(description="SD of the logarithm of the fractal albedo, over all scales")
+    ] = 0.12
+    contrast_spread: Annotated[
+        NonNegative, Field(description="SD of the logarithm of albedo_contrast between terrains")
+    ] = 0.0
+    albedo_hurst: Annotated[
+        float,
+        Field(ge=-0.5, lt=1.0, description="Hurst exponent of the fractal albedo; 0: equal variance in all octaves"),
+    ] = 0.0
     units: Annotated[SurfaceUnits | None, Field(description="surface units; None: uniform ground")] = None
-    fine_below_m: Annotated[Positive, Field(description="wavelength below which units scale relief and albedo, m")] = (
-        60.0
-    )
+    fine_below_m: Annotated[
+        Positive, Field(description="wavelength below which surface units scale relief and albedo contrast, m")
+    ] = 60.0
     playa: Annotated[Playa | None, Field(description="desiccation polygons")] = None
     fans: Annotated[Fans | None, Field(description="alluvial fans around a playa")] = None
     lava: Annotated[Lava | None, Field(description="pahoehoe flows and a'a")] = None
     dunes: Annotated[Dunes | None, Field(description="transverse dunes")] = None
     ripples: Annotated[Dunes | None, Field(description="ripples, as small dunes")] = None
-    swell: Annotated[Swell | None, Field(description="broad relief")] = None
-    ramp: Annotated[Ramp | None, Field(description="an even slope")] = None
+    swell: Annotated[Swell | None, Field(description="relief of a few waves about as long as the terrain")] = None
+    ramp: Annotated[Ramp | None, Field(description="a slope of constant angle")] = None
     gullies: Annotated[Gullies | None, Field(description="steep-walled gullies")] = None
     source: Annotated[RealTerrain | None, Field(description="real terrain; the synthetic terrain surrounds it")] = None
     rocks: Annotated[RockParameters | None, Field(description="rocks on the ground")] = None

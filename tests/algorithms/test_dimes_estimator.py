@@ -43,6 +43,7 @@ def get_details(estimate: VelocityEstimate) -> DimesDetails:
 def compute_track_errors(
     flights: list[Flight], estimates: list[VelocityEstimate], valid_only: bool = True
 ) -> np.ndarray:
+    """Compute estimated minus true horizontal velocities of the tracks of all flights, shape (tracks, 2)."""
     return np.array(
         [
             track.velocity_m_s - flight.velocities[track.pair, :2]
@@ -151,7 +152,7 @@ def test_velocity_uses_image_time_tags() -> None:
     np.testing.assert_allclose(valid_velocity(answer), [12.0 / 1.25, 0.0], atol=0.1)
 
 
-def test_different_image_sizes_are_binned_equally() -> None:
+def test_velocity_is_correct_from_images_without_summed_rows() -> None:
     flight = steady_flight((12.0, -7.0))
     detector = replace(
         make_calibration(), rows_summed=1, flat_field=np.repeat(make_calibration().flat_field, 4, axis=0)
@@ -224,7 +225,7 @@ def measurements() -> DescentMeasurements:
         lambda number, counts: np.full_like(counts, number),
     ],
 )
-def test_any_image_returns_an_estimate(measurements: DescentMeasurements, change: ChangeCounts) -> None:
+def test_unusable_images_give_no_velocity(measurements: DescentMeasurements, change: ChangeCounts) -> None:
     answer = ESTIMATOR.estimate(_change_counts(measurements, change))
     assert answer.outcome is not VelocityOutcome.VALID
     assert answer.velocity_m_s is None
@@ -232,25 +233,27 @@ def test_any_image_returns_an_estimate(measurements: DescentMeasurements, change
 
 
 @pytest.mark.parametrize("altitude_m", [1e-300, 1e-3, 3.0, 120.0, 2e4, 9e5, 1e300, -10.0, np.nan, np.inf])
-def test_any_altitude_returns_an_estimate(measurements: DescentMeasurements, altitude_m: float) -> None:
+def test_wrong_altitude_gives_no_velocity(measurements: DescentMeasurements, altitude_m: float) -> None:
     altitudes = tuple(replace(a, altitude_m=altitude_m) for a in measurements.altitudes)
     answer = ESTIMATOR.estimate(replace(measurements, altitudes=altitudes))
     assert answer.outcome is not VelocityOutcome.VALID
 
 
-def test_any_attitude_returns_an_estimate(measurements: DescentMeasurements) -> None:
+def test_wrong_attitude_gives_no_velocity(measurements: DescentMeasurements) -> None:
     random = Rotation.random(3 * 15, rng=np.random.default_rng(5))
     for k in range(15):
         attitudes = tuple(replace(a, world_from_body=random[3 * k + i]) for i, a in enumerate(measurements.attitudes))
         assert ESTIMATOR.estimate(replace(measurements, attitudes=attitudes)).outcome is not VelocityOutcome.VALID
-    up = tuple(replace(a, world_from_body=tilt_body(180.0, 0.0, 0.0)) for a in measurements.attitudes)
-    assert ESTIMATOR.estimate(replace(measurements, attitudes=up)).outcome is VelocityOutcome.NO_TEMPLATE_AREA
+    looking_up = tuple(replace(a, world_from_body=tilt_body(180.0, 0.0, 0.0)) for a in measurements.attitudes)
+    assert ESTIMATOR.estimate(replace(measurements, attitudes=looking_up)).outcome is VelocityOutcome.NO_TEMPLATE_AREA
 
 
 @pytest.mark.parametrize(
     "times", [(0.0, 0.0, 0.0), (2.0, 1.0, 0.0), (0.0, 1e9, 2e9), (0.0, np.nan, 1.0), (0.0, 60.0, 120.0)]
 )
-def test_any_time_returns_an_estimate(measurements: DescentMeasurements, times: tuple[float, float, float]) -> None:
+def test_wrong_image_times_give_no_template_area(
+    measurements: DescentMeasurements, times: tuple[float, float, float]
+) -> None:
     images = tuple(replace(image, time_s=t) for image, t in zip(measurements.images, times, strict=True))
     altitudes = tuple(replace(a, time_s=t) for a, t in zip(measurements.altitudes, times, strict=True))
     answer = ESTIMATOR.estimate(replace(measurements, images=images, altitudes=altitudes))
@@ -260,7 +263,9 @@ def test_any_time_returns_an_estimate(measurements: DescentMeasurements, times: 
 @pytest.mark.parametrize(
     "sun", [np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]), np.full(3, np.nan)]
 )
-def test_any_sun_direction_returns_an_estimate(measurements: DescentMeasurements, sun: np.ndarray) -> None:
+def test_any_sun_direction_gives_a_velocity_or_no_template_area(
+    measurements: DescentMeasurements, sun: np.ndarray
+) -> None:
     answer = ESTIMATOR.estimate(replace(measurements, sun_direction=sun))
     assert answer.outcome in (VelocityOutcome.VALID, VelocityOutcome.NO_TEMPLATE_AREA)
 

@@ -21,12 +21,25 @@ POSITION, VELOCITY, ACCELERATION, ANGLE, RATE, ANGULAR_ACCELERATION, SIZE = 0, 3
 THRUST, TRIM, AUTOPILOT_SIZE = 0, 1, 4
 #: Maximum commanded vertical acceleration, in units of gravity.
 MAX_VERTICAL_G = 0.4
-#: Phases of a flight.
+#: Phases of a flight: along the path with images, hovering until the site is known, approach to the site at constant
+#: height, descent, slow descent near the ground, and on the ground.
 FOLLOW, WAIT, APPROACH, DESCEND, FLARE, REST = range(6)
 
 
 class Craft(NamedTuple):
-    """Constants of the helicopter and its autopilot: `RotorcraftParameters` in SI units."""
+    """Constants of the helicopter and its autopilot: `RotorcraftParameters` in SI units.
+
+    - drag_s: time constant of the decay of airspeed by drag
+    - attitude_rad_s, heading_rad_s: natural frequencies of pitch and roll, and of yaw
+    - attitude_damping: damping ratio of the angles
+    - thrust_lag_s: time constant of the thrust
+    - gust_tilt_s_m, gust_yaw_s_m: tilt along a gust and yaw into it, radians per m/s
+    - position_gain: commanded speed per distance
+    - speed_gain, trim_gain: commanded acceleration, and rate of change of the trim, per speed error
+    - delay_steps: delay of the autopilot's command, time steps
+    - gear_m: height of the camera above the skids
+    - contact_s: time constant of the motion on the ground
+    """
 
     gravity_m_s2: float
     drag_s: float
@@ -46,7 +59,16 @@ class Craft(NamedTuple):
 
 
 class Landing(NamedTuple):
-    """Constants of the landing: `LandingGuidance`, the site in navigation's coordinates, and the laser's errors."""
+    """Constants of the landing: `LandingGuidance`, the site in navigation's coordinates, and the laser's errors.
+
+    - hover_m: height of the hover and of the approach
+    - wait_until: row at which the approach begins
+    - approach_m_s: maximum commanded horizontal speed
+    - near_m: horizontal distance from the site at which the descent begins
+    - descent_m_s, flare_m_s: commanded sink rates of descent and flare
+    - flare_range_m: laser range at which the flare begins
+    - laser_scale, laser_stuck_m: factor of the laser's range; constant reading of a stuck laser, NaN if it works
+    """
 
     site_east_m: float
     site_north_m: float
@@ -62,7 +84,13 @@ class Landing(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """A simulated flight: rows and autopilot's state (both updated), commanded yaw, mean wind, gusts of each row."""
+    """A simulated flight.
+
+    - rows, autopilot: rows and state of the autopilot; the functions update both
+    - heading: commanded yaw, radians
+    - wind, gusts: mean wind (east, north, up), and its deviation at each row, m/s
+    - step: time between knots, s
+    """
 
     rows: Array
     autopilot: Array

@@ -295,7 +295,7 @@ def test_any_image_returns_an_estimate(name: str, measurements: LandingMeasureme
         assert isinstance(result.outcome, SiteOutcome)
 
 
-def test_poses_can_predict_feature_positions(scene: Pass) -> None:
+def test_predicted_feature_positions_allow_a_wide_baseline(scene: Pass) -> None:
     # A baseline of 1.5 m moves the ground by at least 60 px, beyond the search window without a prediction.
     wide_pass = Pass(scene.height, (scene.poses[0], make_pose(0.1, -1.5, 10.1, 7.0, 2.0, -1.0)))
     inputs = measure_pass(wide_pass)

@@ -19,7 +19,8 @@ from marsyard.algorithms.localisation.navigation_filter import FilterOptions, Na
 from marsyard.algorithms.localisation.state_updates import UpdateOutcome
 from marsyard.sim.camera import Cahvore, mount_looking_down
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates
-from marsyard.sim.sensor.imu import Imu, ImuIncrements, ImuParameters, true_increments
+from marsyard.sim.measurements import ImuIncrements
+from marsyard.sim.sensor.imu import Imu, ImuParameters, true_increments
 
 GRAVITY = 3.71
 RATE_HZ = 400.0

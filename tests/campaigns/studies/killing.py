@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def kill_and_resume(arguments: Sequence[str], directory: Path, log_bytes: int) -> subprocess.CompletedProcess[str]:
-    """Run ``marsyard ARGUMENTS --out DIRECTORY``, kill it when its log of rows has a size, and resume the run."""
+    """Run ``marsyard ARGUMENTS --out DIRECTORY``, kill it when its log exceeds `log_bytes`, and resume the study."""
     marsyard = [sys.executable, "-m", "marsyard"]
     command = [*marsyard, *arguments, "--jobs", "2", "--out", str(directory)]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:

@@ -86,7 +86,10 @@ def test_equal_streams_give_equal_flights() -> None:
 
 
 def test_landing_iteration_converges_to_a_consistent_flight() -> None:
-    """A new flight with the recorded filter errors ends at the same position."""
+    """The last iteration changes the path by less than 1 mm.
+
+    True position plus filter error at touchdown is the reported estimate.
+    """
     for case in range(3):
         transit, touchdown = _fly_landing(case)
         assert touchdown.iterations < 8
@@ -108,13 +111,13 @@ def test_landing_iteration_converges_to_a_consistent_flight() -> None:
 
 
 def test_touchdown_error_equals_the_receiver_error() -> None:
-    """True minus estimated position at touchdown is the negative, slowly varying receiver error."""
+    """True minus estimated position at touchdown is the negative of the receiver's slowly varying error."""
     for case in range(5):
         transit, touchdown = _fly_landing(case)
         navigation_error = (touchdown.state.position_m - touchdown.estimated_m)[:2]
-        wander = transit.instruments.receiver.floating_wander.at(np.array([touchdown.time_s]))[0, :2]
+        receiver_error = transit.instruments.receiver.floating_wander.at(np.array([touchdown.time_s]))[0, :2]
         # The filter follows the receiver within some centimetres.
-        np.testing.assert_allclose(navigation_error, -wander, atol=0.12)
+        np.testing.assert_allclose(navigation_error, -receiver_error, atol=0.12)
         assert horizontal_distance_m(touchdown.estimated_m, SITE) < 1.2
         assert horizontal_distance_m(touchdown.gps_m, SITE) < 1.2
 
@@ -125,9 +128,10 @@ def test_touchdown_position_is_a_mean_of_rtk_solutions() -> None:
     assert touchdown.gps_solutions == 50
     receiver = transit.instruments.receiver
     times = np.linspace(touchdown.time_s + 2.0, touchdown.time_s + 7.0, 200)
-    wander = receiver.floating_wander.at(times).mean(axis=0)
-    # Noise of 3 cm (5 cm vertical) averaged over 50 solutions; the skids slide by the motion of a tenth of a second.
-    np.testing.assert_allclose(touchdown.gps_m[:2], (touchdown.state.position_m + wander)[:2], atol=0.05)
+    receiver_error = receiver.floating_wander.at(times).mean(axis=0)
+    # The noise of 3 cm (5 cm vertical) is averaged over 50 solutions. After the touchdown the helicopter slides by its
+    # velocity times the time constant of the ground contact, 0.1 s.
+    np.testing.assert_allclose(touchdown.gps_m[:2], (touchdown.state.position_m + receiver_error)[:2], atol=0.05)
     np.testing.assert_allclose(
         touchdown.gps_deviation_m, receiver.reported_factor * np.hypot([0.42, 0.55, 0.8], [0.03, 0.03, 0.05])
     )

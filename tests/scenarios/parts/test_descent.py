@@ -129,7 +129,7 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
         f"{MODULE}OffsetAltimeter",
     )
     assert row["attitude_source_yaw_error_deg"] == 0.3
-    # The score receives the algorithm, its answer and the truth.
+    # The score receives the algorithm's measurements, its answer and the truth.
     assert row["record_inputs_altitude_m"] == pytest.approx(float(row["altitude_2_m"]) + 6.0, abs=1e-6)
     assert row["record_inputs_error_m_s"] == pytest.approx(row["velocity_error_m_s"], abs=1e-9)
     assert row["record_inputs_touchdown_m_s"] == row["touchdown_speed_corrected_m_s"]

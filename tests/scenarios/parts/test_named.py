@@ -156,7 +156,7 @@ def test_invalid_columns_are_rejected(columns: object, message: str) -> None:
 
 
 def test_campaign_identity_includes_the_modules_of_parts() -> None:
-    """Parts occur in parameters and in dispersions, there as a value or in a table."""
+    """Custom parts occur in parameters, as a dispersed value, and in a dispersed table."""
     configuration = CampaignConfiguration.model_validate(
         {
             "name": "parts",

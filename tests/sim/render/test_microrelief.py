@@ -28,13 +28,14 @@ from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.microrelief import octave_heights
 
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
-#: Cover of one cell with the amplitude factor 1.
+#: Map of amplitude factors with a single sample, 1: equal relief everywhere.
 UNIFORM = np.ones((1, 1), dtype=np.float32)
 POSE = rigid(Rotation.identity(), np.array([30.0, 40.0, 20.0]))
 
 
 def _make_relief(coarsest_m: float, *heights_m: float) -> MicroRelief:
-    return MicroRelief(coarsest_m, np.array(heights_m), UNIFORM, UNIFORM, 0.0)
+    """Create octaves of relief, equal everywhere; `coarsest_m` is the cell size of the first octave."""
+    return MicroRelief(coarsest_m, np.array(heights_m), roughness=UNIFORM, texture=UNIFORM, per_metre=0.0)
 
 
 def _sample_noise(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -124,6 +125,7 @@ def test_unresolved_octaves_only_add_to_the_variance() -> None:
 @pytest.mark.parametrize("slope_deg", [5.0, 15.0, 25.0])
 def test_shadowing_equals_smiths_formula(elevation_deg: float, slope_deg: float) -> None:
     """Smith's parameter a is the tangent of the elevation divided by sqrt(2) times the RMS slope sigma."""
+    # On level ground the cosine of the angle of incidence is the sine of the elevation.
     cosine, sigma = np.sin(np.radians(elevation_deg)), np.tan(np.radians(slope_deg))
     a = cosine / (np.sqrt(2.0) * sigma * np.sqrt(1.0 - cosine**2))
     smith_lambda = 0.5 * (np.exp(-(a**2)) / (a * np.sqrt(np.pi)) - special.erfc(a))
@@ -164,10 +166,9 @@ def test_shading_changes_with_the_sun_as_for_a_height_field(
     reference_images = []
     for sun in suns:
         image = _shade_heights(heights, step, sun)
-        side = [n // samples_per_pixel * samples_per_pixel for n in image.shape]
-        image = image[: side[0], : side[1]].reshape(
-            side[0] // samples_per_pixel, samples_per_pixel, side[1] // samples_per_pixel, samples_per_pixel
-        )
+        rows, columns = (extent // samples_per_pixel for extent in image.shape)
+        image = image[: rows * samples_per_pixel, : columns * samples_per_pixel]
+        image = image.reshape(rows, samples_per_pixel, columns, samples_per_pixel)
         reference_images.append(image.mean(axis=(1, 3)).ravel())
     assert rendered_correlation == pytest.approx(np.corrcoef(*reference_images)[0, 1], abs=0.05)
     for frame in frames:
