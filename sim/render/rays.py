@@ -18,8 +18,8 @@ from marsyard.sim.render.kernels.structs import Rays
 from marsyard.sim.render.kernels.views import max_image_radius, min_component, pixel_angles, sum_of_vectors
 from marsyard.sim.render.scene import Cone
 
-#: Sizes of the pinhole views, samples along a side. A camera uses the first that exceeds the part of its image in a view
-#: by at least `_SPARE_PX`, otherwise the last (about the camera's resolution for 1024 x 1024 pixels and 45 deg).
+#: Sizes of the pinhole views, samples along a side. A camera uses the first that exceeds the part of its image in a
+#: view by at least `_SPARE_PX`, otherwise the last (about the camera's resolution for 1024 x 1024 pixels and 45 deg).
 VIEW_SIDES_PX = (208, 288, 352, 544, 1088)
 VIEW_SIDE_PX = VIEW_SIDES_PX[-1]
 _SPARE_PX = 16
