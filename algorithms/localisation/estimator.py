@@ -113,6 +113,10 @@ class MapRelativeEstimator:
         if len(matches) == 0:
             return self._fail(image.time_s, LocalisationDetails("fine", coarse_offset))
         point_sd_m = np.array([self._map.distortion_sd_m, self._map.distortion_sd_m, self._map.elevation_sd_m])
+        height_m = max(float(posed.position_m[2]) - elevation_at(self._map, posed.position_m[:2]), 0.0)
+        common_sd_m = np.hypot(
+            options.common_fraction * point_sd_m, height_m * options.calibration_sd_rad * np.array([1.0, 1.0, 0.0])
+        )
         result = self._filter.update_landmarks(
             image.time_s,
             image.camera,
@@ -120,7 +124,7 @@ class MapRelativeEstimator:
             matches.measured_px,
             pixel_sd=options.landmark_sd_px * matches.working_pixel,
             point_sd_m=point_sd_m,
-            common_sd_m=options.common_fraction * point_sd_m,
+            common_sd_m=np.sqrt(options.correlated_images) * common_sd_m,
         )
         details = LocalisationDetails(
             "fine",

@@ -70,6 +70,10 @@ class LvsOptions:
     - imu: Errors of the inertial unit, for the filter
     - landmark_sd_px: Standard deviation of a landmark per axis, working pixels
     - common_fraction: Common part of the map's distortion and elevation error in one image / its standard deviation
+    - calibration_sd_rad: Standard deviation of the error of all lines of sight by the calibration and alignment of the
+      camera, per axis: half a pixel of the image centre, and 0.02 deg
+    - correlated_images: Number of images whose common errors are equal. The filter treats these errors as independent
+      between images, and multiplies their variance by this number instead
     - altitude_sd: Relative standard deviation of an altitude
     - max_failures: Number of successive images without an update after which the coarse stage is repeated
     - max_position_sd_m: Largest standard deviation of a reported horizontal position
@@ -114,6 +118,8 @@ class LvsOptions:
     imu: ImuErrorModel = field(default_factory=ImuErrorModel)
     landmark_sd_px: float = 0.3
     common_fraction: float = 0.5
+    calibration_sd_rad: float = 1e-3
+    correlated_images: int = 10
     altitude_sd: float = 0.02
     max_failures: int = 3
     max_position_sd_m: float = 15.0

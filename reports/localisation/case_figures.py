@@ -53,10 +53,14 @@ def draw_map(products: Mapping[str, Any]) -> Figure:
     extent = np.asarray(products["map_extent_m"], dtype=np.float64) / 1e3
     axes.imshow(products["map"], cmap="gray", origin="lower", extent=tuple(extent), interpolation="antialiased")
     true, estimated = (np.asarray(products[name], dtype=np.float64) / 1e3 for name in ("true_xy_m", "estimated_xy_m"))
-    axes.plot(*true.T, color=SERIES[0], linewidth=2.0, label="true")
+    initial = check_shape(products.get("initial_xy_m"), 2)
+    if initial is not None:
+        axes.plot(*initial / 1e3, marker="X", color=SERIES[3], linestyle="none", markersize=9.0, label="initial")
+    axes.plot(*true.T, color=SERIES[0], linewidth=3.0, label="true")
     axes.plot(*estimated.T, marker="o", color=SERIES[1], linestyle="none", markersize=4.0, label="estimated")
     axes.set(xlabel="East (km)", ylabel="North (km)")
-    axes.legend()
+    axes.grid(visible=False)
+    axes.legend(frameon=True, facecolor="white", framealpha=1.0, labelcolor="black")
     return figure
 
 

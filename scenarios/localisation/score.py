@@ -199,6 +199,7 @@ def products(descent: LocalisedDescent, answers: StreamAnswers) -> Mapping[str, 
         outcomes            outcome of each estimate
         inliers             landmarks used in each image; NaN without a match
         true_xy_m           true positions on the map at the images; estimated_xy_m: estimates, NaN for a refusal
+        initial_xy_m        initial position of inertial navigation
         map                 appearance of the map, reduced; map_extent_m: west, east, south, north
         image_1, image_2    first and last image
         landmarks_px        measured pixels of the landmarks in the last image; landmarks_residual_px, landmarks_used
@@ -229,6 +230,7 @@ def products(descent: LocalisedDescent, answers: StreamAnswers) -> Mapping[str, 
         ),
         "true_xy_m": np.array([descent.map_truth.map_position(state.position_m[:2]) for state in descent.states]),
         "estimated_xy_m": np.stack(estimated),
+        "initial_xy_m": descent.measurements.initial.position_m[:2],
         "map": thumbnail.astype(np.uint8),
         "map_extent_m": np.array(
             [west, west + columns * map_product.pixel_m, south, south + rows * map_product.pixel_m]
