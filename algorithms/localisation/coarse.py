@@ -370,7 +370,7 @@ def _covariance(
     scatter = np.cov(offsets.T) if len(offsets) > 2 else np.eye(2) * options.relief_tolerance_m**2
     independent = max(len(offsets) / max(len(views), 1), 1.0)
     height = float(np.mean([view.camera.c[2] for view in views]))
-    common = (options.attitude_sd_rad * height) ** 2 + grid.registration_sd_m**2 + grid.distortion_sd_m**2
+    common = (options.attitude_sd_rad * height) ** 2 + grid.distortion_sd_m**2
     quantisation = grid.pixel_m**2 / 12.0
     return np.asarray(scatter / independent + (common + quantisation) * np.eye(2))
 

@@ -39,6 +39,8 @@ from marsyard.sim.terrain import TerrainBank
 
 #: Time between the start of the inertial data and the start of localisation, s, and after the last image.
 LEAD_S, MARGIN_S = 0.2, 0.2
+#: Largest bank whose terrains are built before the cases; a terrain needs 180 MB on disk.
+MAX_SHARED_TERRAINS = 20
 #: Index of the terrain on a wrong map, relative to that of the case.
 _WRONG_TERRAIN = 1
 
@@ -52,8 +54,9 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
     part_keys: Mapping[str, PartKind] = {}
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return the indices of the terrains in the terrain bank."""
-        return tuple(range(self.check_parameters(parameters).location.bank))
+        """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""
+        bank = self.check_parameters(parameters).location.bank
+        return tuple(range(bank)) if bank <= MAX_SHARED_TERRAINS else ()
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """Return the index of the terrain below the descent."""

@@ -155,6 +155,7 @@ def answer_row(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, S
     return {
         "fix_after_s": valid[0].time_s if valid else _NAN,
         "fixed_in_time": bool(early),
+        "position_reported": bool(valid),
         "position_error_at_10_s_m": early[-1].horizontal_m if early else _NAN,
         "position_error_m": _NAN if final is None else final.horizontal_m,
         "position_error_max_m": max(horizontal, default=_NAN),

@@ -50,7 +50,7 @@ def test_altimeter_faults_replace_all_ranges() -> None:
     assert stuck_range_m(Faults(), 10.0) is None
 
 
-def test_at_least_two_images_are_received_for_any_loss_rate() -> None:
+def test_two_or_more_images_are_received_for_any_loss_rate() -> None:
     rng = np.random.default_rng(0)
     assert len(draw_received_images(Faults(), 40, rng)) == 40
     image_numbers = draw_received_images(Faults(lost_images=0.75), 40, rng)
