@@ -111,21 +111,36 @@ class SelectsInputs(Protocol):
 
 @runtime_checkable
 class HasAlgorithms(Protocol):
-    """A scenario with selectable algorithms; its parameters contain an `AlgorithmSelection`."""
+    """A scenario whose algorithms are selected in the campaign file.
+
+    The keys are `algorithm` (under test) and `compared` (further algorithms on the same cases), the fields of
+    `AlgorithmSelection` (`marsyard.scenarios.algorithm_run`). A scenario without these keys does not implement
+    this protocol.
+    """
 
     @property
     def task(self) -> Task[Any, Any]:
-        """Task of the algorithms."""
+        """Task that the algorithms solve, such as velocity estimation; it lists the accepted algorithms."""
 
     @property
     def algorithm_table(self) -> tuple[str, ...]:
-        """Table of the parameters with the selection; empty for the top level."""
+        """Path of the TOML table, below `[parameters]`, that contains the keys `algorithm` and `compared`.
+
+        ``("drive",)`` for `[parameters.drive]`; ``()`` for `[parameters]` itself.
+        """
 
 
 @runtime_checkable
 class HasParts(Protocol):
-    """A scenario whose cases may use user-defined parts (`marsyard.scenarios.parts`)."""
+    """A scenario in which users can replace parts of the simulation: motions, instruments or scores.
+
+    A campaign file selects a part by its name (`marsyard.scenarios.parts`, docs/custom-parts.md).
+    """
 
     @property
     def part_keys(self) -> Mapping[str, PartKind]:
-        """Kinds of the parts by the dotted path of their parameter, which contains one name or a list."""
+        """Kind of part for each parameter that selects parts.
+
+        A key is the dotted path of the parameter, such as ``"flight.motion"``. The value of the parameter in the
+        campaign file is the name of one part, or a list of names.
+        """

@@ -1,4 +1,8 @@
-"""Run velocity estimators, and compute the columns and products of their answers."""
+"""Run velocity estimators; compute the result columns of their answers, and the arrays for the figures of a case.
+
+The answer of a velocity estimator is a mean velocity over a span: the interval between two time tags. The truth of an
+answer is the true mean velocity over the same span.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +35,9 @@ def run_estimator(
 ) -> AlgorithmRun[VelocityEstimate]:
     """Run an estimator on a descent; the answer contains its span.
 
-    Streams, exports and recorded answers use all images. Other estimators use three images; they fail without a triple.
+    Estimators that receive images one by one (streams), exports of the inputs and recorded answers use all images. All
+    other estimators use the three images of `triple`. It is None if the descent has fewer than three images; the result
+    for these estimators is then a failure with a message.
     """
     tags = measurements.tags_s
 
@@ -50,7 +56,11 @@ def run_estimator(
 
 
 def check_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:
-    """Validate an answer for the last interval, the only interval with known truth. Raises AlgorithmError."""
+    """Validate an answer of a scenario that scores only the interval between the last two images.
+
+    These scenarios have one true velocity per case: the mean over this interval. `DescentScenario` computes the truth
+    of any span and does not call this function. Raises AlgorithmError for another span.
+    """
     estimate = check_and_set_span(answer, measurements.tags_s)
     if estimate.span_s not in (None, measurements.last_interval_s):
         raise AlgorithmError(
@@ -121,7 +131,7 @@ def consistency_row(estimate: VelocityEstimate | None, truth: Horizontal) -> dic
 def velocity_products(
     images: Sequence[UInt16[np.ndarray, "rows columns"]], estimate: VelocityEstimate | None, truth: Horizontal
 ) -> dict[str, object]:
-    """Return the arrays for a case's figures."""
+    """Return the arrays for the figures of a case: images, DIMES' intermediate results, true and estimated velocity."""
     arrays: dict[str, object] = {f"image_{number}": counts for number, counts in enumerate(images, start=1)}
     if estimate is not None and isinstance(estimate.details, DimesDetails):
         arrays.update(dimes_products(estimate.details))
@@ -132,7 +142,10 @@ def velocity_products(
 
 
 def stream_products(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, object]:
-    """Return a stream's answers after each image with the truth, NaN without an answer; empty for other estimators."""
+    """Return the answers of a stream for the figures of a case, with their truth; empty for other estimators.
+
+    The arrays have one row per image: span, velocity and true velocity, NaN without a velocity.
+    """
     names = ("after_spans_s", "after_velocities_m_s", "after_true_m_s")
     columns = zip(*_answers_after_images(estimate, truth), strict=True)
     return {name: np.array(values) for name, values in zip(names, columns, strict=False)}

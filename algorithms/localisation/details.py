@@ -10,13 +10,16 @@ from jaxtyping import Bool, Float
 
 @dataclass(frozen=True)
 class LocalisationDetails:
-    """Stages of one image.
+    """Intermediate results of one image.
 
-    - stage: `coarse` (search over the map) or `fine` (landmarks)
-    - coarse_offset_m: horizontal correction of the coarse stage (east, north); None if it found none, or was not run
-    - inliers: landmarks that updated the state; None without a match
-    - measured_px, residuals_px, used: measured pixels of the matched landmarks, their residuals after the common
-      correction of the pose, and whether they updated the state; None without a match
+    - stage: Last stage that was run: `coarse` (search over the map) or `fine` (landmarks)
+    - coarse_offset_m: Horizontal correction of the coarse stage (east, north); None if it found none, or was not run
+    - inliers: Number of landmarks that agree with each other and with the state; the update uses only these. The number
+      is also given if the update was not applied, for example because they are too few. None without a match. For the
+      SIFT baseline: number of features that agree with the solved position.
+    - measured_px: Measured pixels of the matched landmarks; None without a match
+    - residuals_px: Measured minus expected pixels, after the estimated correction of the state; NaN if not visible
+    - used: Whether a matched landmark is one of the inliers, also if the update was not applied
     """
 
     stage: str

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.dimes_threshold import STORED, WRONG_TRACK_ERRORS_M_S
 from benchmarks.estimators import ESTIMATORS, record_descents, run_estimator
 from benchmarks.threshold_derivation import ThresholdInputs
-from benchmarks.validation.imu_reference import Reference
+from benchmarks.validation.imu_reference import VelocityErrors
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes import DimesOptions
 
@@ -25,9 +25,9 @@ def check_imu_threshold(quick: bool) -> Iterator[Measure]:
     """Compare the threshold with a second implementation of its Monte Carlo derivation."""
     inputs, descents = ThresholdInputs(), 300 if quick else 3000
     rng = np.random.default_rng(SEED)
-    reference = Reference.draw(inputs, descents, rng)
+    errors = VelocityErrors.draw(inputs, descents, rng)
     threshold = DimesOptions().imu_threshold_m_s
-    discrepancies_m_s = reference.one_track_discrepancies_m_s()
+    discrepancies_m_s = errors.one_track_discrepancies_m_s()
     how = f"{descents} descents of a second implementation by first-order propagation; threshold {threshold:g} m/s"
     # The limits are three standard errors of a quantile. The relative standard error of the quantile q is
     # sqrt(q (1 - q) / n) / (probability density * quantile). The denominator is 0.44 at the median, 0.03 at 99.5 %.
@@ -53,13 +53,13 @@ def check_imu_threshold(quick: bool) -> Iterator[Measure]:
         f"{how}; limit: 99.5 % minus three standard deviations of the simulation",
         "at least",
     )
-    passed_fraction = float(np.mean(reference.two_track_discrepancies_m_s() < threshold))
+    passed_fraction = float(np.mean(errors.two_track_discrepancies_m_s() < threshold))
     yield Measure(
         "descents with two correct tracks per pair that pass the IMU check", passed_fraction, "", 0.995, how, "at least"
     )
     for tracks in (1, 2):
         for low, high in WRONG_TRACK_ERRORS_M_S:
-            correct, rejected = reference.correct_and_rejected_fractions(tracks, (low, high), threshold, rng)
+            correct, rejected = errors.correct_and_rejected_fractions(tracks, (low, high), threshold, rng)
             error_range = f"{low:g} m/s" if low == high else f"{low:g} to {high:g} m/s"
             yield Measure(
                 f"one of {2 * tracks} tracks wrong by {error_range}: correct velocity or none",

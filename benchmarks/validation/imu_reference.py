@@ -1,8 +1,15 @@
-"""Second implementation of the Monte Carlo for DIMES' IMU check, with first-order propagation of errors.
+"""Second implementation of the simulation that derives the threshold of DIMES' IMU check, by first-order errors.
 
-`benchmarks.threshold_derivation` uses DIMES' ground intersection, template grid, combination of tracks and camera
-models. Here templates are at random positions with feasible overlap, cameras are slopes of rays, and each error changes
-the velocity by its partial derivative. Both implementations use the distributions of `ThresholdInputs`.
+The IMU check compares the change of velocity between the two image pairs, measured by tracks, with the change that the
+inertial unit (IMU) measures. The length of the difference of the two changes is the discrepancy, m/s. DIMES accepts a
+velocity if the discrepancy is below a threshold (`DimesOptions.imu_threshold_m_s`).
+
+`benchmarks.threshold_derivation` derives this threshold by a Monte Carlo simulation: it draws descents with random
+errors of instruments and matches, and computes the discrepancy of correct tracks. The threshold must accept 99.5 % of
+the descents. That simulation uses DIMES' own ground intersection, template grid, combination of tracks and camera
+models. This module repeats it without these parts, so that an error in one of them is detected. Templates are at random
+positions with feasible overlap, cameras are slopes of rays, and each error changes the velocity by its partial
+derivative. Both implementations use the distributions of `ThresholdInputs`.
 
 Let s be the slope of a ray (horizontal over downward), H the height and T the time between images. A feature is located
 at H s. Relative errors a of both heights, rotations e of both attitudes and a height h of the feature change the
@@ -28,29 +35,32 @@ FOCAL_PX, HALF_PX = 14.67e-3 / 48e-6, 127.5
 #: Template side, minimum distance of two templates and margin of the search window, in pixels, as in the field test
 #: paper and `DimesOptions`.
 TEMPLATE_PX, MIN_DISTANCE_PX, MARGIN_PX = 31, 31.0, 4
+#: Maximum off-nadir angle of ground that is used (`DimesOptions.max_off_nadir_rad`), degrees.
+MAX_OFF_NADIR_DEG = 55.0
 #: Number of random template positions per pair; with fewer than two usable ones, the pair has no feasible overlap.
 CANDIDATES = 200
+#: Maximum error of a correct velocity, m/s (requirement DIMES-VEL).
 REQUIRED_M_S = 5.0
 
 
 @dataclass(frozen=True)
-class Reference:
-    """Velocity errors of correct tracks and of the IMU, m/s, axes east and north.
+class VelocityErrors:
+    """Velocity errors of simulated descents, m/s, axes east and north; the true values cancel in a discrepancy.
 
     Attributes
     ----------
-    tracks
-        Errors by descent, pair and template, shape (n, 2, 2, 2).
-    imu
-        Error of the velocity change of the IMU, shape (n, 2).
+    tracks_m_s
+        Errors of the velocities of correct tracks by descent, pair and template, shape (n, 2, 2, 2).
+    imu_m_s
+        Error of the change of velocity that the IMU measures, shape (n, 2).
     """
 
-    tracks: Float[np.ndarray, "n 2 2 2"]
-    imu: Float[np.ndarray, "n 2"]
+    tracks_m_s: Float[np.ndarray, "n 2 2 2"]
+    imu_m_s: Float[np.ndarray, "n 2"]
 
     @classmethod
-    def draw(cls, inputs: ThresholdInputs, descents: int, rng: np.random.Generator) -> Reference:
-        """Draw descents with feasible overlap for two templates in each pair."""
+    def draw(cls, inputs: ThresholdInputs, descents: int, rng: np.random.Generator) -> VelocityErrors:
+        """Draw the errors of descents with feasible overlap for two templates in each pair."""
         tracks = np.empty((descents, 2, 2, 2))
         for number in range(descents):
             while (errors := _draw_descent_errors(inputs, rng)) is None:
@@ -59,23 +69,28 @@ class Reference:
         return cls(tracks, inputs.imu_sd_m_s * rng.standard_normal((descents, 2)))
 
     def one_track_discrepancies_m_s(self) -> Float[np.ndarray, " n"]:
-        """Compute the discrepancy of one correct track in each pair."""
-        return np.asarray(np.linalg.norm(self.tracks[:, 1, 0] - self.tracks[:, 0, 0] - self.imu, axis=-1))
+        """Compute the discrepancy of each descent for one correct track in each pair."""
+        return np.asarray(np.linalg.norm(self.tracks_m_s[:, 1, 0] - self.tracks_m_s[:, 0, 0] - self.imu_m_s, axis=-1))
 
     def two_track_discrepancies_m_s(self) -> Float[np.ndarray, " n"]:
-        """Compute the minimum discrepancy of two correct tracks in each pair."""
-        return np.asarray(_discrepancies(self.tracks, self.imu).min(axis=(1, 2)))
+        """Compute the minimum discrepancy of each descent for two correct tracks in each pair (four combinations)."""
+        return np.asarray(_discrepancies(self.tracks_m_s, self.imu_m_s).min(axis=(1, 2)))
 
     def correct_and_rejected_fractions(
         self, templates: int, track_error_range_m_s: tuple[float, float], threshold_m_s: float, rng: np.random.Generator
     ) -> tuple[float, float]:
-        """Simulate one wrong track; return the fractions of descents with a correct velocity and without a velocity."""
-        tracks = self.tracks[:, :, :templates].copy()
+        """Add an error to one track of each descent; return the fractions of correct and of rejected velocities.
+
+        The error has a random direction and a length in `track_error_range_m_s`. The velocity is that of the second
+        pair in the combination with the minimum discrepancy. It is rejected if this discrepancy reaches
+        `threshold_m_s`, and correct if it is accepted with an error of at most `REQUIRED_M_S`.
+        """
+        tracks = self.tracks_m_s[:, :, :templates].copy()
         n = len(tracks)
         angle, size = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(*track_error_range_m_s, n)
         wrong_errors = np.column_stack([size * np.cos(angle), size * np.sin(angle)])
         tracks[np.arange(n), rng.integers(2, size=n), rng.integers(templates, size=n)] += wrong_errors
-        discrepancies = _discrepancies(tracks, self.imu).reshape(n, -1)
+        discrepancies = _discrepancies(tracks, self.imu_m_s).reshape(n, -1)
         second = tracks[np.arange(n), 1, discrepancies.argmin(axis=1) % templates]
         is_accepted = discrepancies.min(axis=1) < threshold_m_s
         is_correct = is_accepted & (np.linalg.norm(second, axis=1) <= REQUIRED_M_S)
@@ -85,7 +100,7 @@ class Reference:
 def _discrepancies(
     tracks: Float[np.ndarray, "n 2 templates 2"], imu: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n templates templates"]:
-    """Discrepancies of tracks of the first pair (rows) and of the second pair (columns)."""
+    """Compute the discrepancies, m/s, of all combinations of a track of the first (rows) and second pair (columns)."""
     change = tracks[:, 1, None, :] - tracks[:, 0, :, None] - imu[:, None, None]
     return np.asarray(np.linalg.norm(change, axis=-1))
 
@@ -149,7 +164,7 @@ def _draw_templates(
     pixels = rng.uniform(-HALF_PX, HALF_PX, (CANDIDATES, 2))
     rays = attitudes[0].apply(np.column_stack([pixels / FOCAL_PX, -np.ones(CANDIDATES)]))
     down = -rays[:, 2]
-    is_usable = down > np.cos(np.radians(55.0)) * np.linalg.norm(rays, axis=1)
+    is_usable = down > np.cos(np.radians(MAX_OFF_NADIR_DEG)) * np.linalg.norm(rays, axis=1)
     pixels, slopes = pixels[is_usable], rays[is_usable, :2] / down[is_usable, None]
     gsd_m = heights[1] / FOCAL_PX
     search_px = np.ceil(inputs.max_speed_m_s * inputs.interval_s / gsd_m) + MARGIN_PX

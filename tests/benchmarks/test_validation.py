@@ -16,7 +16,7 @@ from benchmarks.stages import STAGES
 from benchmarks.threshold_derivation import ThresholdInputs, draw_correct_track_errors
 from benchmarks.validation import dimes_checks, landing_checks, tracking_checks
 from benchmarks.validation.document import RESULTS
-from benchmarks.validation.imu_reference import Reference
+from benchmarks.validation.imu_reference import VelocityErrors
 from benchmarks.validation.records import Measure
 
 NAN = float("nan")
@@ -116,11 +116,11 @@ def test_matching_is_the_only_error_of_a_reference_with_exact_instruments() -> N
     inputs = ThresholdInputs(
         altitude_sd=0.0, common_attitude_sd_deg=0.0, attitude_sd_deg=0.0, tag_sd_s=0.0, feature_height_sd_m=0.0
     )
-    reference = Reference.draw(inputs, 300, np.random.default_rng(1))
-    np.testing.assert_allclose(reference.tracks.std(), inputs.match_sd_m_s, rtol=0.1)
+    errors = VelocityErrors.draw(inputs, 300, np.random.default_rng(1))
+    np.testing.assert_allclose(errors.tracks_m_s.std(), inputs.match_sd_m_s, rtol=0.1)
     # The discrepancy of two tracks and the IMU has a Rayleigh distribution with the median sd sqrt(2 ln 2).
     sd = math.sqrt(2.0 * inputs.match_sd_m_s**2 + inputs.imu_sd_m_s**2)
-    assert np.median(reference.one_track_discrepancies_m_s()) == pytest.approx(
+    assert np.median(errors.one_track_discrepancies_m_s()) == pytest.approx(
         sd * math.sqrt(2.0 * math.log(2.0)), rel=0.15
     )
 

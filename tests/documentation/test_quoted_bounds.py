@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from marsyard.reports.statistics.proportions import (
 )
 
 DOCS = Path(__file__).parents[2] / "docs"
+CONFIRMATIONS = DOCS.parent / "benchmarks" / "results" / "confirmations.jsonl"
 
 
 def read_page(page: str) -> str:
@@ -69,23 +71,21 @@ def test_bound_of_landings_counts_terrains() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "row_start",
-    [
-        "selected sites truly safe",
-        "safe sites exist, none with safe surroundings",
-        "`no safe site` where there is none",
-    ],
-)
-def test_quoted_bounds_of_hazardous_flights_are_correct(row_start: str) -> None:
-    _, rate_cell, interval_cell = find_cells("hda.md", row_start)
-    successes, n = parse_counts(re.sub(r"^at least ", "", rate_cell))
-    lower = f"{100.0 * proportion_lower(successes, n, 0.9):.2f}"
-    assert re.search(rf"\b({lower}|{float(lower):.1f}) %", rate_cell), f"expected {lower} % at 90 % confidence"
-    low, high = (100.0 * bound for bound in proportion_interval(successes, n, 0.95))
-    assert parse_percent(interval_cell.split(" to ")[0] + " %") == round(low, 1)
-    if successes < n and not rate_cell.startswith("at least"):
-        assert parse_percent(interval_cell) == round(high, 1)
+def test_quoted_intervals_of_landings_are_correct() -> None:
+    page = read_page("hda.md")
+    quotes = re.findall(r"(\d+) of (\d+) \(([\d.]+) to ([\d.]+) %\)", page)
+    assert len(quotes) >= 20
+    for successes, total, quoted_low, quoted_high in quotes:
+        low, high = (100.0 * bound for bound in proportion_interval(int(successes), int(total), 0.95))
+        assert (quoted_low, quoted_high) == (f"{low:.1f}", f"{high:.1f}"), (successes, total)
+
+
+def test_quoted_bounds_of_landings_are_correct() -> None:
+    page = read_page("hda.md")
+    for successes, total in ((140, 142), (15, 15)):
+        lower = f"{100.0 * proportion_lower(successes, total, 0.9):.1f}"
+        assert re.search(rf"{successes} of {total} \([^)]*\)[^|]*?, at least {lower} % at 90 % confidence", page)
+    assert f"at most {100.0 * proportion_upper(31, 33, 0.9):.1f} % at 90 % confidence" in page
 
 
 def test_groups_of_hazardous_flights_sum_to_all_flights() -> None:
@@ -95,7 +95,9 @@ def test_groups_of_hazardous_flights_sum_to_all_flights() -> None:
     )
     assert match is not None
     flights, *groups = (int(count.replace(",", "")) for count in match.groups())
-    assert flights == sum(groups) == load_campaign("hda-hazardous").configuration.cases
+    records = [json.loads(line) for line in CONFIRMATIONS.read_text(encoding="utf-8").splitlines()]
+    (cases,) = {record["cases"] for record in records if (record["campaign"], record["number"]) == ("hda-hazardous", 1)}
+    assert flights == sum(groups) == cases
 
 
 def test_quoted_bounds_of_runs_to_the_goal_are_correct() -> None:
