@@ -34,7 +34,13 @@ SiteArgument = Annotated[
     str, Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
 ]
 MaxHolesOption = Annotated[
-    float | None, Option(metavar="F", min=0.0, max=0.99, help="Maximum fraction of missing elevation samples of a DTM.")
+    float | None,
+    Option(
+        metavar="F",
+        min=0.0,
+        max=0.99,
+        help="Accept a DTM with up to this fraction of missing elevations, which are filled. [default: 0.2]",
+    ),
 ]
 CasesOption = Annotated[int | None, Option("-n", "--cases", metavar="N", help="Number of cases.")]
 SeedOption = Annotated[int | None, Option(metavar="S", help="Root seed of the random draws.")]

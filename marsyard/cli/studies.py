@@ -28,13 +28,23 @@ class StudyOptions:
     """Arguments and options of all studies."""
 
     campaign: options.CampaignArgument
-    requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign that the study analyses.")]
+    requirement: Annotated[
+        str, Option(metavar="ID", help="Requirement of the campaign; the study analyses its metric and bound.")
+    ]
     seed: options.SeedOption = None
     jobs: options.JobsOption = None
     cluster: options.ClusterOption = None
     out: options.OutOption = None
     override: options.SetOption = None
-    algorithm: options.AlgorithmOption = None
+    algorithm: Annotated[
+        list[str] | None,
+        Option(
+            metavar="NAME",
+            help="The algorithm that the study analyses: a name, module:Class, exec:PROGRAM (started per case) or "
+            "serve:PROGRAM (one process for all cases). Further algorithms run on the cases that the study selects "
+            "for the first; their results are stored only.",
+        ),
+    ] = None
 
 
 def prepare_study(arguments: StudyOptions, kind: str) -> tuple[Campaign, ExecutorConfig, Path]:
@@ -56,11 +66,17 @@ class RareOptions(StudyOptions):
         float, Option(metavar="P", help="Maximum probability of a violation per case, such as 1e-4.")
     ] = 1e-4
     method: Annotated[
-        str, Option(metavar="METHOD", help="subset, or importance: subset simulation followed by importance sampling.")
+        str,
+        Option(
+            metavar="METHOD",
+            help="`subset`: subset simulation. `importance`: the same, followed by importance sampling.",
+        ),
     ] = "subset"
     samples: Annotated[int, Option(metavar="N", help="Cases per level of a subset simulation.")] = 200
     replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, at least 2.")] = 6
-    importance_cases: Annotated[int, Option(metavar="N", help="Cases of importance sampling.")] = 600
+    importance_cases: Annotated[
+        int, Option(metavar="N", help="Cases of importance sampling, for --method importance.")
+    ] = 600
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the interval.")] = 0.9
     max_cases: MaxCasesOption = 20_000
 
@@ -68,7 +84,10 @@ class RareOptions(StudyOptions):
 @options.handle_user_errors
 @options.with_options(RareOptions)
 def rare(arguments: RareOptions) -> None:
-    """Estimate the probability of a rare violation of a requirement by subset simulation, and compare with a limit."""
+    """Estimate the probability of a rare violation of a requirement by subset simulation, and compare with a limit.
+
+    Exit status: 0 if the probability is below the limit, 1 if above, 3 if undecided.
+    """
     from marsyard.campaigns.studies.rare import RareSettings, start_rare
 
     settings = RareSettings(
@@ -91,12 +110,14 @@ class SearchOptions(StudyOptions):
     """Arguments and options of `marsyard search`."""
 
     cases: Annotated[
-        int, Option("-n", "--cases", metavar="N", help="Cases of the search, without those that reduce violations.")
+        int, Option("-n", "--cases", metavar="N", help="Cases that search for violations; reducing them takes more.")
     ] = 300
     restarts: Annotated[
         int, Option(metavar="N", help="Number of optimizer (CMA-ES) runs from different starting cases.")
     ] = 3
-    failures: Annotated[int, Option(metavar="N", help="Maximum number of violations to reduce.")] = 5
+    failures: Annotated[
+        int, Option(metavar="N", help="Maximum number of violations whose causes are reduced to a few parameters.")
+    ] = 5
     max_cases: MaxCasesOption = 5_000
 
 
@@ -127,7 +148,7 @@ class BudgetOptions(StudyOptions):
         int,
         Option(
             metavar="N",
-            help="Base samples (a power of 2) of Sobol indices of the d dispersions: N (d + 3) more cases; 0: none.",
+            help="Base samples for Sobol indices, a power of 2; they take N (d + 3) more cases for d dispersions. 0: none.",
         ),
     ] = 0
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the intervals.")] = 0.9

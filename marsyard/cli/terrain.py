@@ -61,13 +61,22 @@ def list_sites(as_json: JsonOption = False) -> None:
 @app.command()
 def stats(
     site: SiteArgument,
-    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; default: the coarser scale.")] = None,
+    scale: Annotated[
+        str | None,
+        Option(
+            metavar="SCALE",
+            help="`descent` (kilometres) or `ground` (a hundred metres); by default `descent`, if the site has it.",
+        ),
+    ] = None,
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,
     max_holes: MaxHolesOption = None,
     image: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir image; filled holes are red.")] = None,
 ) -> None:
-    """Print albedo, slopes, relief and image contrast of a site's terrain, and those in the DIMES field test paper."""
+    """Print albedo, slopes, relief and image contrast of a terrain.
+
+    For a site of the DIMES field test paper (Johnson, Willson et al.), its published values follow for comparison.
+    """
     import numpy as np
 
     from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, grid_north_deg, load_site
