@@ -32,6 +32,8 @@ def check_estimate(answer: Any, span_s: tuple[float, float]) -> PositionEstimate
         refusal: PositionEstimate = answer
         return replace(refusal, time_s=float(answer.time_s))
     check_type("world_from_body", answer.world_from_body, Rotation)
+    if not answer.world_from_body.single:
+        raise bad_answer(f"world_from_body contains {len(answer.world_from_body)} rotations; allowed: one")
     if not np.all(np.isfinite(answer.world_from_body.as_quat())):
         raise bad_answer("world_from_body is not finite")
     covariance = np.asarray(check_numbers("covariance", answer.covariance, (9, 9)))

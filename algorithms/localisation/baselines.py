@@ -58,7 +58,7 @@ class FeatureEstimator(InertialEstimator):
         self._sift = cv2.SIFT.create(nfeatures=self.options.sift_map_features)
         keypoints, self._descriptors = self._sift.detectAndCompute(_to_bytes(map_product.appearance), None)
         pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2)
-        heights = sample_raster(map_product.elevation_m, pixels)
+        heights = sample_raster(map_product.elevation_m, pixels[:, np.newaxis])[:, 0] if len(pixels) else np.empty(0)
         self._points = np.column_stack([map_product.origin_m + map_product.pixel_m * pixels, heights])
         self._is_valid = False
         self._altitude_m: float | None = None

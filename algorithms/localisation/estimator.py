@@ -93,10 +93,11 @@ class MapRelativeEstimator:
         fix = find_coarse_position(images, heights, self._map, sd_m, self.options)
         if not isinstance(fix, CoarseFix):
             return None
-        self._filter = copy.deepcopy(self._inertial)
-        result = self._filter.update_position(image.time_s, state.position_m[:2] + fix.offset_m, fix.covariance)
+        updated = copy.deepcopy(self._inertial)
+        result = updated.update_position(image.time_s, state.position_m[:2] + fix.offset_m, fix.covariance)
         if result.outcome is not UpdateOutcome.APPLIED:
             return None
+        self._filter = updated
         self._has_fix, self._failures = True, 0
         self._outcome = PositionOutcome.UNCERTAIN
         for altitude in self._altitudes:

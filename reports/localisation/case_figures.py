@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from marsyard.reports.presentation import check_shape, to_matrix
+from marsyard.algorithms.localisation.interface import PositionOutcome
+from marsyard.reports.presentation import check_shape, read_arrays, to_matrix
 from marsyard.reports.section import INK, MUTED, REQUIREMENT, SERIES, in_page_style, show_image
 
 _AXES = ("east", "north", "up")
@@ -18,8 +19,15 @@ _RESIDUAL_SCALE = 20.0
 
 
 def is_localisation_case(products: Mapping[str, Any]) -> bool:
-    """Return whether products contain the track of a localisation case."""
-    return check_shape(products.get("track"), None, 7) is not None and to_matrix(products.get("map")) is not None
+    """Return whether products contain the track of a localisation case and its map, with the outcomes of the track."""
+    shapes = {"track": (None, 7), "inliers": (None,), "true_xy_m": (None, 2), "estimated_xy_m": (None, 2)}
+    arrays = read_arrays(products, shapes)
+    extent = read_arrays(products, {"map_extent_m": (4,)}, finite=True)
+    if arrays is None or extent is None or to_matrix(products.get("map")) is None:
+        return False
+    outcomes = products.get("outcomes")
+    names = [str(name) for name in outcomes] if isinstance(outcomes, list | tuple | np.ndarray) else []
+    return len(arrays[0]) == len(arrays[1]) == len(names) and set(names) <= set(PositionOutcome.__members__)
 
 
 def read_track(products: Mapping[str, Any]) -> Float[np.ndarray, "n 7"]:
@@ -68,10 +76,12 @@ def draw_map(products: Mapping[str, Any]) -> Figure:
 def draw_landmarks(products: Mapping[str, Any]) -> Figure | None:
     """Draw the last image with its landmarks and their residuals; None without landmarks."""
     pixels, residuals = (check_shape(products.get(f"landmarks_{name}"), None, 2) for name in ("px", "residual_px"))
-    image = to_matrix(products.get("image_2"))
-    if pixels is None or residuals is None or image is None or len(pixels) != len(residuals):
+    flags, image = check_shape(products.get("landmarks_used"), None), to_matrix(products.get("image_2"))
+    if pixels is None or residuals is None or flags is None or image is None:
         return None
-    used = np.asarray(products["landmarks_used"], dtype=bool)
+    if not len(pixels) == len(residuals) == len(flags):
+        return None
+    used = flags > 0.5
     figure = Figure(figsize=(6.0, 6.0), layout="constrained")
     axes = figure.add_subplot()
     show_image(axes, image)

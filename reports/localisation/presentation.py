@@ -27,7 +27,7 @@ from marsyard.reports.section_kinds import (
 )
 from marsyard.reports.wording import number
 
-_LEGEND = "The grey lines are the true positions; the bands are three standard deviations that the algorithm reports."
+_LEGEND = "The blue line is the true position; the bands are three standard deviations that the algorithm reports."
 _REQUIRED_M = 40.0
 
 
@@ -68,7 +68,7 @@ POSITION = SectionDeclaration(
     "localisation",
     "Localisation",
     "Position on the map",
-    requires=("fix_after_s",),
+    requires=("fixed_in_time",),
     parts=(
         RateTable((_FIXED, _FALSE), cases="Descents", heading="Positions"),
         Distribution(
@@ -106,7 +106,7 @@ CONDITIONS = SectionDeclaration(
     "localisation-conditions",
     "Light",
     "Light and texture",
-    requires=("sun_difference_deg", "fix_after_s"),
+    requires=("sun_difference_deg", "fixed_in_time"),
     parts=(
         RateByCondition(
             Quantity("sun_difference_deg", "Angle between the suns of map and landing (deg)"),

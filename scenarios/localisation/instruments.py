@@ -46,7 +46,11 @@ class CameraParameters(Parameters):
 
     @model_validator(mode="after")
     def _check_field(self) -> CameraParameters:
-        if not np.all(np.isfinite(true_camera(self).corner_rays()[1])):
+        camera = true_camera(self)
+        edge = np.array([[-0.5, 0.5 * (self.pixels - 1)]])
+        angle = np.arccos(-camera.rays(edge)[1][0, 2])
+        # a distortion that is not monotonic has the angle of another point at the edge
+        if not np.all(np.isfinite(camera.corner_rays()[1])) or not abs(angle - 0.5 * np.radians(self.field_deg)) < 1e-4:
             raise ValueError(
                 f"field_deg of {self.field_deg:.6g} with {self.pixels} pixels of {self.pixel_mrad:.6g} mrad is not a "
                 f"one-to-one image; allowed: a field close to pixels x pixel_mrad"

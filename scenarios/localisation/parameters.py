@@ -117,6 +117,8 @@ class LocalisationScenarioParameters(AlgorithmSelection):
             raise ValueError(
                 f"the map of {side_m:.6g} m is larger than the terrain, which repeats after {period_m:.6g} m"
             )
+        if self.faults.wrong_map and self.location.bank < 2:
+            raise ValueError("faults.wrong_map needs another terrain; allowed: a location.bank of at least 2")
         return self
 
     @property

@@ -59,8 +59,9 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
         return tuple(range(bank)) if bank <= MAX_SHARED_TERRAINS else ()
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """Return the index of the terrain below the descent."""
-        return (self.check_parameters(parameters).location.terrain,)
+        """Return the indices of the terrains below the descent and on the map."""
+        p = self.check_parameters(parameters)
+        return (p.location.terrain, _map_terrain(p)) if p.faults.wrong_map else (p.location.terrain,)
 
     def input_terrain(self, p: LocalisationScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
         """Return the terrain bank and the index of a terrain in it."""
@@ -134,6 +135,11 @@ class LocalisedDescent:
     imu_offset_s: float
     measurements: LocalisationMeasurements
 
+    @property
+    def initial_truth(self) -> State:
+        """True state at the time of the initial state of inertial navigation."""
+        return self.flight.state(-LEAD_S)
+
     @classmethod
     def simulate(cls, p: LocalisationScenarioParameters, streams: Streams) -> LocalisedDescent:
         """Simulate the descent of a case, its map and its measurements."""
@@ -146,11 +152,14 @@ class LocalisedDescent:
         flight = LanderFlight.simulate(
             p.flight, start, streams.generator("flight"), ground_height_m=ground_m, gravity_m_s2=gravity
         )
-        mapped = world
-        if p.faults.wrong_map:
-            mapped = _create_world(p, (p.location.terrain + _WRONG_TERRAIN) % p.location.bank)
+        mapped = _create_world(p, _map_terrain(p)) if p.faults.wrong_map else world
         map_product, map_truth = make_map(mapped, p.map, centre, streams.generator("map"), p.render.backend)
         times = p.images.times(0.0, flight.end_s)
+        if not times.size:
+            raise ValueError(
+                f"images.first_s is {p.images.first_s:.6g} s; allowed: before the end of the flight, "
+                f"{flight.end_s:.4g} s"
+            )
         states = tuple(flight.motion(times).state(row) for row in range(times.size))
         images = _take_images(p, world, states, streams)
         increments, initial, offset_s = _measure_inertially(p, flight, float(times[-1]), gravity, streams)
@@ -158,6 +167,11 @@ class LocalisedDescent:
         events = merge(increments, altitudes, images)
         measurements = LocalisationMeasurements(initial, map_product, tuple(events))
         return cls(p, world, flight, states, map_truth, tuple(images), increments, offset_s, measurements)
+
+
+def _map_terrain(p: LocalisationScenarioParameters) -> int:
+    """Return the index of the terrain on the map."""
+    return (p.location.terrain + p.faults.wrong_map * _WRONG_TERRAIN) % p.location.bank
 
 
 def _create_world(p: LocalisationScenarioParameters, number: int) -> LocalisationWorld:

@@ -48,7 +48,7 @@ def conditions(descent: LocalisedDescent) -> dict[str, Scalar]:
     map_sun = sun_at(world.air, p.map.sun_azimuth_deg, p.map.sun_elevation_deg)
     cosine = float(np.clip(map_sun.direction @ world.sun.direction, -1.0, 1.0))
     initial, shift = descent.measurements.initial, descent.map_truth.shift_m
-    reference = descent.map_truth.map_position(descent.flight.state(initial.time_s).position_m[:2])
+    reference = descent.map_truth.map_position(descent.initial_truth.position_m[:2])
     images = descent.images
     return {
         "site": p.site,
@@ -67,9 +67,7 @@ def conditions(descent: LocalisedDescent) -> dict[str, Scalar]:
         "images": len(images),
         "map_shift_m": float(np.hypot(*shift)),
         "initial_error_m": float(np.hypot(*(initial.position_m[:2] - reference))),
-        "initial_attitude_error_deg": _attitude_error_deg(
-            initial.world_from_body, descent.flight.state(initial.time_s)
-        ),
+        "initial_attitude_error_deg": _attitude_error_deg(initial.world_from_body, descent.initial_truth),
         "off_nadir_max_deg": max(off_nadir_deg(state) for state in states),
         "attitude_rate_max_deg_s": max(attitude_rate_deg_s(state) for state in states),
         "altitude_last_m": float(states[-1].position_m[2] - world.surface.height(*states[-1].position_m[:2])),

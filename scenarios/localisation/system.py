@@ -18,6 +18,8 @@ SYSTEM = System(
     requirements=_FOLDER / "requirements.toml",
     columns=_FOLDER / "columns.toml",
     error_sources=_FOLDER / "error_sources.toml",
-    compilation_campaigns={"loc-smoke": ("terrain.samples=512", "map.side_px=256", "camera.pixels=128")},
+    compilation_campaigns={
+        "loc-smoke": ("terrain.samples=512", "map.side_px=256", "camera.pixels=128", "camera.pixel_mrad=13.36")
+    },
     report="marsyard.reports.localisation.presentation:LOCALISATION",
 )
