@@ -148,7 +148,7 @@ class BudgetOptions(StudyOptions):
         int,
         Option(
             metavar="N",
-            help="Base samples for Sobol indices, a power of 2; they take N (d + 3) more cases for d dispersions. 0: none.",
+            help="Base samples for Sobol indices, a power of 2: N (d + 3) more cases for d dispersions. 0: none.",
         ),
     ] = 0
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the intervals.")] = 0.9

@@ -197,7 +197,7 @@ def test_unsuitable_settings_are_rejected(
 def test_sources_of_all_scenarios_have_valid_values() -> None:
     """Every source of the included scenarios names at least one parameter, and its case is valid without the error."""
     campaigns = {"descent": "dimes-offnominal", "fieldtest": "dimes-fieldtest", "landing": "hda-benign"}
-    campaigns |= {"rover": "vtt-montecarlo", "rover-drive": "vtt-straight"}
+    campaigns |= {"rover": "vtt-montecarlo", "rover-drive": "vtt-straight", "localisation": "loc-faults"}
     for scenario, name in campaigns.items():
         campaign = load_campaign(name)
         assert campaign.configuration.scenario == scenario

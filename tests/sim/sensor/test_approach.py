@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from marsyard.sim.dynamics import Motion, State
 from marsyard.sim.sensor import Approach, ApproachParameters, Imu, ImuIncrements, ImuParameters, InertialSolution
 from marsyard.sim.sensor.imu import true_increments
-from tests.sim.sensor.test_imu import perfect_unit
+from tests.sim.sensor.test_imu import make_parameters
 
 #: A profile short enough for a propagation at the full rate, without initial errors.
 SHORT = ApproachParameters(
@@ -94,7 +94,7 @@ def test_profile_has_specified_deceleration_and_ends_upright() -> None:
 
 
 def test_constant_errors_match_a_full_rate_propagation() -> None:
-    unit_parameters = perfect_unit(
+    unit_parameters = make_parameters(
         gyro_bias_deg_h=30.0,
         gyro_wander_deg_h=10.0,
         gyro_scale_ppm=300.0,
@@ -115,7 +115,7 @@ def test_constant_errors_match_a_full_rate_propagation() -> None:
 
 
 def test_noise_matches_a_full_rate_propagation() -> None:
-    unit_parameters = perfect_unit(
+    unit_parameters = make_parameters(
         rate_hz=20.0, angular_random_walk_deg_sqrt_h=1.0, velocity_random_walk_ug_sqrt_hz=3000.0
     )
     approach = Approach(SHORT, -2.0)
@@ -137,7 +137,7 @@ def test_noise_matches_a_full_rate_propagation() -> None:
 def test_scale_error_rotates_attitude_about_spin_axis() -> None:
     parameters = SHORT.model_copy(update={"cruise_s": 900.0, "spin_scale_ppm": 20.0})
     approach = Approach(parameters, 0.0)
-    imu = Imu.draw(perfect_unit(gyro_scale_ppm=1e4), (approach.start_s, 0.0), np.random.default_rng(0))
+    imu = Imu.draw(make_parameters(gyro_scale_ppm=1e4), (approach.start_s, 0.0), np.random.default_rng(0))
     calibrated_imu = approach.calibrate(imu, np.random.default_rng(1))
     level_approach = Approach(
         parameters.model_copy(update={"entry_off_nadir_deg": 0.0, "deploy_off_nadir_deg": 0.0}), 0.0

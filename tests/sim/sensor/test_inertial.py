@@ -10,7 +10,7 @@ from marsyard.sim.sensor import Imu, ImuIncrements, ImuParameters, InertialSolut
 from marsyard.sim.sensor.imu import DEG_H
 from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from tests.sim.sensor.motions import GRAVITY, Swaying
-from tests.sim.sensor.test_imu import perfect_unit
+from tests.sim.sensor.test_imu import make_parameters
 
 #: A motion like a descent: it nods with 60 deg/s, rotates, sways and falls.
 DESCENT = Swaying(
@@ -38,7 +38,7 @@ def _navigate(
 
 
 def test_error_free_navigation_reproduces_the_motion() -> None:
-    _, solution = _navigate(DESCENT, perfect_unit())
+    _, solution = _navigate(DESCENT, make_parameters())
     # Times between samples are included.
     times = np.linspace(-2.0, 18.0, 137)
     truth = DESCENT.motion(times)
@@ -53,14 +53,14 @@ def test_error_free_navigation_reproduces_the_motion() -> None:
 
 
 def test_gyro_bias_rotates_the_attitude() -> None:
-    imu, solution = _navigate(Swaying(), perfect_unit(gyro_bias_deg_h=100.0))
+    imu, solution = _navigate(Swaying(), make_parameters(gyro_bias_deg_h=100.0))
     error = solution.attitude(np.array([18.0]))[0].as_rotvec()
     np.testing.assert_allclose(error, imu.gyro.bias * 20.0, rtol=1e-9)
 
 
 def test_only_bias_along_the_spin_axis_accumulates() -> None:
     spin = 2.0 * np.pi / 4.0
-    imu, solution = _navigate(Swaying(spin_rad_s=spin), perfect_unit(gyro_bias_deg_h=100.0))
+    imu, solution = _navigate(Swaying(spin_rad_s=spin), make_parameters(gyro_bias_deg_h=100.0))
     truth = Swaying(spin_rad_s=spin).state(18.0).attitude
     error = (solution.attitude(np.array([18.0]))[0] * truth.inv()).as_rotvec()
     # The body makes five complete turns. Second-order errors are 1e-5 of those of first order.
@@ -69,10 +69,10 @@ def test_only_bias_along_the_spin_axis_accumulates() -> None:
 
 
 def test_accelerometer_bias_and_tilt_cause_velocity_errors() -> None:
-    imu, solution = _navigate(Swaying(), perfect_unit(accelerometer_bias_mg=1.0))
+    imu, solution = _navigate(Swaying(), make_parameters(accelerometer_bias_mg=1.0))
     np.testing.assert_allclose(solution.velocity(np.array([18.0]))[0], imu.accelerometer.bias * 20.0, rtol=1e-9)
     tilt = np.array([1e-3, -2e-3, 5e-3])
-    _, solution = _navigate(Swaying(), perfect_unit(), NavigationErrors(tilt, np.array([3.0, 0.0, 0.0])))
+    _, solution = _navigate(Swaying(), make_parameters(), NavigationErrors(tilt, np.array([3.0, 0.0, 0.0])))
     expected = np.array([3.0, 0.0, 0.0]) + 20.0 * np.cross(tilt, [0.0, 0.0, GRAVITY])
     np.testing.assert_allclose(solution.velocity(np.array([18.0]))[0], expected, atol=20.0 * GRAVITY * 2e-5)
 
@@ -80,7 +80,7 @@ def test_accelerometer_bias_and_tilt_cause_velocity_errors() -> None:
 def test_random_walks_have_the_specified_deviation() -> None:
     attitudes_deg, velocities_m_s = [], []
     for seed in range(150):
-        parameters = perfect_unit(
+        parameters = make_parameters(
             rate_hz=50.0, angular_random_walk_deg_sqrt_h=0.07, velocity_random_walk_ug_sqrt_hz=50.0
         )
         _, solution = _navigate(Swaying(), parameters, seed=seed)
@@ -95,20 +95,20 @@ def test_random_walks_have_the_specified_deviation() -> None:
 def test_tag_error_of_10_ms_shifts_ground_by_21_m() -> None:
     # A rotation of 60 deg/s during 10 ms shifts the line of sight by 21 m on the ground 2000 m below.
     motion = Swaying(spin_rad_s=np.radians(60.0), tilt=Rotation.from_euler("x", 90.0, degrees=True))
-    _, solution = _navigate(motion, perfect_unit())
+    _, solution = _navigate(motion, make_parameters())
     clock = Clock(ClockParameters(), offset_s=0.01)
     tag = clock.tags(np.array([3.75]), np.random.default_rng(0))
     angle_error = (solution.attitude(tag)[0] * motion.state(3.75).attitude.inv()).magnitude()
     assert 2000.0 * np.tan(angle_error) == pytest.approx(20.9, abs=0.1)
     # If the unit has the same clock offset, the error is zero.
-    imu = Imu.draw(perfect_unit(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
+    imu = Imu.draw(make_parameters(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
     increments = imu.increments(motion, *SPAN, np.random.default_rng(0))
     synchronous_solution = InertialSolution.propagate(increments, motion.state(SPAN[0]).attitude, np.zeros(3), GRAVITY)
     assert (synchronous_solution.attitude(tag)[0] * motion.state(3.75).attitude.inv()).magnitude() < 1e-9
 
 
 def test_time_tags_increase_despite_large_jitter() -> None:
-    imu = Imu.draw(perfect_unit(clock=ClockParameters(jitter_sd_s=0.01)), SPAN, np.random.default_rng(0))
+    imu = Imu.draw(make_parameters(clock=ClockParameters(jitter_sd_s=0.01)), SPAN, np.random.default_rng(0))
     increments = imu.increments(DESCENT, *SPAN, np.random.default_rng(0))
     assert np.all(np.diff(increments.times_s) >= 0.0)
     start = DESCENT.state(SPAN[0])
