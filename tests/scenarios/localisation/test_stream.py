@@ -26,14 +26,9 @@ from marsyard.scenarios.localisation.instruments import (
     true_camera,
 )
 from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, ImageSchedule, StreamAnswers, feed, merge
-from marsyard.sim.measurements import (
-    AltitudeMeasurement,
-    DetectorCalibration,
-    DetectorImage,
-    ImuIncrements,
-    true_increments,
-)
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
 from marsyard.sim.sensor import Clock, Imu, RadarAltimeter
+from marsyard.sim.sensor.imu import true_increments
 from marsyard.sim.terrain import Surface
 
 SPAN_S = (0.0, 6.0)
