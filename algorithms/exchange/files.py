@@ -64,7 +64,7 @@ def write_case(
         content = {
             "task": "velocity",
             "attitudes": [_encode_attitude(attitude) for attitude in measurements.attitudes],
-            "altitudes": [_encode_altitude(altitude) for altitude in measurements.altitudes],
+            "altitudes": [encode_altitude(altitude) for altitude in measurements.altitudes],
             "interval_velocities_m_s": measurements.interval_velocities_m_s.tolist(),
             "inertial_velocities_m_s": _encode_vector(measurements.inertial_velocities_m_s),
             "sun_direction": measurements.sun_direction.tolist(),
@@ -79,18 +79,18 @@ def write_case(
             "up_body": measurements.up_body.tolist(),
             "apriori_site_world": measurements.apriori_site_world.tolist(),
         }
-    images = _write_images(folder, measurements.images, image_format)
+    images = write_images(folder, measurements.images, image_format)
     write_json(folder / CASE_FILE, {"exchange": FORMAT_VERSION, **content, "images": images})
 
 
 def write_frame(folder: Path, frame: DescentFrame) -> None:
     """Write one descent image and its measurements into an existing folder. Raises OSError if that fails."""
-    (image,) = _write_images(folder, [frame.image], "pgm")
+    (image,) = write_images(folder, [frame.image], "pgm")
     content = {
         "exchange": FORMAT_VERSION,
         "image": image,
         "attitude": _encode_attitude(frame.attitude),
-        "altitude": _encode_altitude(frame.altitude),
+        "altitude": encode_altitude(frame.altitude),
         "sun_direction": frame.sun_direction.tolist(),
         "inertial_velocity_m_s": _encode_vector(frame.inertial_velocity_m_s),
         "interval_velocity_m_s": _encode_vector(frame.interval_velocity_m_s),
@@ -101,11 +101,11 @@ def write_frame(folder: Path, frame: DescentFrame) -> None:
 def read_frame(folder: Path) -> DescentFrame:
     """Read the frame that `write_frame` wrote. Raises ValueError if it is missing or has another version."""
     with open_json(folder / FRAME_FILE, "descent image") as content:
-        _check_version(content)
+        check_version(content)
         return DescentFrame(
-            image=_read_image(folder, content["image"]),
+            image=read_image(folder, content["image"]),
             attitude=_read_attitude(content["attitude"]),
-            altitude=_read_altitude(content["altitude"]),
+            altitude=read_altitude(content["altitude"]),
             sun_direction=_read_vector(content["sun_direction"]),
             inertial_velocity_m_s=_read_vector(content["inertial_velocity_m_s"]),
             interval_velocity_m_s=_read_vector(content["interval_velocity_m_s"]),
@@ -115,13 +115,13 @@ def read_frame(folder: Path) -> DescentFrame:
 def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
     """Read the case that `write_case` wrote. Raises ValueError if it is missing or has another version."""
     with open_json(folder / CASE_FILE, "case") as content:
-        _check_version(content)
-        images = [_read_image(folder, record) for record in content["images"]]
+        check_version(content)
+        images = [read_image(folder, record) for record in content["images"]]
         if content["task"] == "velocity":
             return DescentMeasurements(
                 images=tuple(images),
                 attitudes=tuple(_read_attitude(record) for record in content["attitudes"]),
-                altitudes=tuple(_read_altitude(record) for record in content["altitudes"]),
+                altitudes=tuple(read_altitude(record) for record in content["altitudes"]),
                 interval_velocities_m_s=_read_vector(content["interval_velocities_m_s"]).reshape(-1, 3),
                 sun_direction=_read_vector(content["sun_direction"]),
                 inertial_velocities_m_s=_read_vector(content.get("inertial_velocities_m_s")),
@@ -150,7 +150,8 @@ def open_json(path: Path, kind: str) -> Iterator[Mapping[str, Any]]:
         raise ValueError(f"{path} is not a valid {kind} file: {error}") from error
 
 
-def _check_version(content: Mapping[str, Any]) -> None:
+def check_version(content: Mapping[str, Any]) -> None:
+    """Raise ValueError if the table of a file has another version."""
     if content["exchange"] != FORMAT_VERSION:
         raise ValueError(f"exchange format version {content['exchange']} is not supported; supported: {FORMAT_VERSION}")
 
@@ -163,11 +164,13 @@ def _read_attitude(content: Mapping[str, Any]) -> AttitudeMeasurement:
     return AttitudeMeasurement(Rotation.from_quat(content["world_from_body_xyzw"]), content["time_s"])
 
 
-def _encode_altitude(altitude: AltitudeMeasurement) -> dict[str, Any]:
+def encode_altitude(altitude: AltitudeMeasurement) -> dict[str, Any]:
+    """Encode an altitude for JSON; null without a reading."""
     return {"altitude_m": _encode_length(altitude.altitude_m), "time_s": altitude.time_s}
 
 
-def _read_altitude(content: Mapping[str, Any]) -> AltitudeMeasurement:
+def read_altitude(content: Mapping[str, Any]) -> AltitudeMeasurement:
+    """Decode an altitude that `encode_altitude` encoded."""
     return AltitudeMeasurement(_read_length(content["altitude_m"]), content["time_s"])
 
 
@@ -187,7 +190,7 @@ def _read_vector(content: Any) -> Any:
     return None if content is None else np.array(content, dtype=np.float64)
 
 
-def _write_images(folder: Path, images: Sequence[DetectorImage], image_format: ImageFormat) -> list[dict[str, Any]]:
+def write_images(folder: Path, images: Sequence[DetectorImage], image_format: ImageFormat) -> list[dict[str, Any]]:
     """Write images, cameras and flat fields; equal flat fields are written once. Returns one JSON record per image."""
     records: list[dict[str, Any]] = []
     flat_fields: dict[str, Float[np.ndarray, "rows columns"]] = {}
@@ -209,7 +212,8 @@ def _write_images(folder: Path, images: Sequence[DetectorImage], image_format: I
     return records
 
 
-def _read_image(folder: Path, content: Mapping[str, Any]) -> DetectorImage:
+def read_image(folder: Path, content: Mapping[str, Any]) -> DetectorImage:
+    """Read an image from its record by `write_images`."""
     calibration, shape = content["calibration"], (content["rows"], content["columns"])
     flat_field = np.fromfile(folder / calibration["flat_field"], dtype="<f8").reshape(shape).astype(np.float64)
     return DetectorImage(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -87,6 +87,7 @@ class PositionEstimate:
     details: object | None = None
 
 
+@runtime_checkable
 class PositionEstimator(Protocol):
     """Protocol: estimate a lander's position on a map from a stream of measurements in the order of their arrival.
 

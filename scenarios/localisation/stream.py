@@ -5,12 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
+from marsyard.algorithms.exchange import ProgramDetails
+from marsyard.algorithms.localisation.exchange import ExecutablePositionEstimator
 from marsyard.algorithms.localisation.interface import (
     InitialState,
     MapProduct,
@@ -90,7 +93,10 @@ def _part(increments: ImuIncrements, first: int, last: int) -> ImuIncrements:
 
 @dataclass(frozen=True)
 class ProcessorTimes:
-    """Processor time of each call of an estimator, s; one value per call of `imu`, `altitude` and `image`."""
+    """Processor time of each call of an estimator, s; one value per call of `imu`, `altitude` and `image`.
+
+    For an external program, the wall-clock time of its answer.
+    """
 
     start_s: float
     imu_s: tuple[float, ...]
@@ -120,12 +126,18 @@ class StreamAnswers:
         """Outcome of the final estimate."""
         return self.estimates[-1].outcome
 
+    @property
+    def details(self) -> ProgramDetails | None:
+        """Standard error and wall-clock time of an external program in the whole descent; None for a Python class."""
+        details = self.estimates[-1].details
+        return details if isinstance(details, ProgramDetails) else None
+
 
 def feed(
     estimator: PositionEstimator, initial: InitialState, map_product: MapProduct, events: Sequence[Event]
 ) -> StreamAnswers:
     """Run an estimator over a stream; it receives read-only arrays. Its exceptions are not handled."""
-    _, start_s = _measure_time(lambda: estimator.start(_read_only(initial), _read_only(map_product)))
+    start_s = _measure_time(estimator, lambda: estimator.start(_read_only(initial), _read_only(map_product)))[1]
     estimates: list[PositionEstimate] = []
     imu_s: list[float] = []
     altitude_s: list[float] = []
@@ -133,23 +145,24 @@ def feed(
     for event in events:
         data = _read_only(event)
         if isinstance(data, ImuIncrements):
-            imu_s.append(_measure_time(lambda data=data: estimator.imu(data))[1])  # type: ignore[misc]
+            imu_s.append(_measure_time(estimator, partial(estimator.imu, data))[1])
         elif isinstance(data, AltitudeMeasurement):
-            altitude_s.append(_measure_time(lambda data=data: estimator.altitude(data))[1])  # type: ignore[misc]
+            altitude_s.append(_measure_time(estimator, partial(estimator.altitude, data))[1])
         else:
-            estimate, elapsed_s = _measure_time(lambda data=data: estimator.image(data))  # type: ignore[misc]
+            estimate, elapsed_s = _measure_time(estimator, partial(estimator.image, data))
             estimates.append(estimate)
             image_s.append(elapsed_s)
-    final, finish_s = _measure_time(estimator.finish)
+    final, finish_s = _measure_time(estimator, estimator.finish)
     times = ProcessorTimes(start_s, tuple(imu_s), tuple(altitude_s), tuple(image_s), finish_s)
     return StreamAnswers((*estimates, final), times)
 
 
-def _measure_time(call: Callable[[], Result]) -> tuple[Result, float]:
-    """Return the result of a call, and its processor time, s."""
+def _measure_time(estimator: PositionEstimator, call: Callable[[], Result]) -> tuple[Result, float]:
+    """Return the result of a call, and its processor time, s; the wall-clock time of a program's answer."""
     start_s = time.process_time()
     result = call()
-    return result, time.process_time() - start_s
+    elapsed_s = time.process_time() - start_s
+    return result, estimator.request_time_s if isinstance(estimator, ExecutablePositionEstimator) else elapsed_s
 
 
 def _read_only(data: Data) -> Data:

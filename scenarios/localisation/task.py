@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from marsyard.algorithms.localisation.baselines import FeatureEstimator, InertialEstimator
 from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
+from marsyard.algorithms.localisation.exchange import ExecutablePositionEstimator
 from marsyard.algorithms.localisation.interface import PositionEstimator
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.scenarios.estimators import Task
@@ -19,5 +20,6 @@ LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
         "sift": lambda options: FeatureEstimator(options),
         "inertial": lambda options: InertialEstimator(replace(options)),
     },
+    executable=ExecutablePositionEstimator,
     options=LvsOptions,
 )

@@ -1,0 +1,279 @@
+"""Tests of external programs as position estimators: exchanged values, answers, separate processes, and faults."""
+
+from __future__ import annotations
+
+import gc
+import io
+import json
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from marsyard.algorithms.answers import AlgorithmError, Fault
+from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails, parse_command
+from marsyard.algorithms.exchange.serving import idle_processes
+from marsyard.algorithms.localisation.baselines import InertialEstimator
+from marsyard.algorithms.localisation.exchange import (
+    ExecutablePositionEstimator,
+    encode_estimate,
+    encode_increments,
+    encode_initial,
+    read_descent_image,
+    read_estimate,
+    read_increments,
+    read_initial,
+    read_map,
+    serve,
+    write_image,
+    write_map,
+)
+from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
+from marsyard.algorithms.localisation.options import LvsOptions
+from marsyard.scenarios.algorithm_run import hash_inputs, run_algorithm
+from marsyard.scenarios.localisation.stream import Event, StreamAnswers, feed
+from marsyard.scenarios.localisation.task import LOCALISATION
+from marsyard.sim.camera import Cahv, Cahvore
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
+
+RNG = np.random.default_rng(7)
+#: Times of the inertial boundaries, 0.01 s apart; the image is at 0.5 s, and the altitude at 0.3 s.
+TIMES_S = np.linspace(0.0, 1.0, 101)
+RASTERS = RNG.random((2, 4, 6), dtype=np.float32)
+MAP = MapProduct(RASTERS[0], RASTERS[1], np.array([-5.1, 0.3]), 6.0, 50.0, 6.0, 5.0)
+INITIAL = InitialState(
+    0.0, np.array([0.1, 0.2, 900.0]), np.array([3.0, 1.0, -50.0]), Rotation.from_rotvec([0.1, -0.2, 0.3]),
+    np.diag(np.arange(1.0, 10.0)), 3.71,
+)  # fmt: skip
+
+
+def make_increments(first: int, last: int) -> ImuIncrements:
+    angles, velocities = RNG.normal(0.0, 1e-3, (2, last - first, 3))
+    return ImuIncrements(TIMES_S[first : last + 1], 0.01, angles, velocities)
+
+
+def make_image() -> DetectorImage:
+    pinhole = Cahv.from_axes((20.0, 20.0), (32, 24), axis=(0.0, 0.0, -1.0), right=(1.0, 0.0, 0.0))
+    camera = Cahvore.from_cahv(pinhole, (0.0, 0.01, -0.005), (0.001, 0.0, 0.0), linearity=0.0)
+    calibration = DetectorCalibration(RNG.uniform(0.8, 1.0, (24, 32)), 150e-6, 0.0, 0.0, 1, 2.0, 255)
+    return DetectorImage(RNG.integers(0, 256, (24, 32), dtype=np.uint16), 0.5, camera, calibration)
+
+
+IMAGE = make_image()
+EVENTS: list[Event] = [
+    make_increments(0, 30), AltitudeMeasurement(880.0, 0.3), make_increments(30, 50), IMAGE, make_increments(50, 100)
+]  # fmt: skip
+
+#: A program that serves the inertial estimator, and writes the names of the calls and its process id.
+SERVER = """
+import os, sys
+from marsyard.algorithms.localisation.baselines import InertialEstimator
+from marsyard.algorithms.localisation.exchange import serve
+class Estimator(InertialEstimator):
+    def start(self, initial, map_product):
+        print("start", os.getpid())
+        super().start(initial, map_product)
+    def altitude(self, measurement):
+        print("altitude", measurement.altitude_m, file=sys.stderr)
+    def image(self, image):
+        print("image", image.counts.sum())
+        return super().image(image)
+serve(Estimator())
+"""
+
+
+def write_program(folder: Path, text: str) -> str:
+    """Write a Python program and return its command line specification."""
+    path = folder / "estimator.py"
+    path.write_text(text)
+    return f"{sys.executable} {path}"
+
+
+def run(spec: str, **limits: float) -> StreamAnswers:
+    estimator = LOCALISATION.make(spec, LvsOptions(), ExecutableLimits(**{"time_s": 60.0, **limits}))
+    return feed(estimator, INITIAL, MAP, EVENTS)
+
+
+def test_exchanged_values_are_restored_exactly(tmp_path: Path) -> None:
+    write_map(tmp_path, MAP)
+    write_image(tmp_path, IMAGE)
+    # JSON stores the shortest decimal text of a float64; quaternions are normalised again
+    assert hash_inputs(read_map(tmp_path)) == hash_inputs(MAP)
+    image = read_descent_image(tmp_path)
+    assert hash_inputs((image.counts, image.calibration, image.time_s)) == hash_inputs(
+        (IMAGE.counts, IMAGE.calibration, IMAGE.time_s)
+    )
+    for letter in "cahvore":
+        np.testing.assert_array_equal(getattr(image.camera, letter), getattr(IMAGE.camera, letter))
+    increments = EVENTS[0]
+    assert isinstance(increments, ImuIncrements)
+    assert hash_inputs(read_increments(json.loads(json.dumps(encode_increments(increments))))) == hash_inputs(
+        increments
+    )
+    initial = read_initial(json.loads(json.dumps(encode_initial(INITIAL))))
+    assert (initial.world_from_body.inv() * INITIAL.world_from_body).magnitude() < 1e-14
+    same = replace(initial, world_from_body=INITIAL.world_from_body)
+    assert hash_inputs(same) == hash_inputs(INITIAL)
+
+
+def test_answers_are_restored_exactly() -> None:
+    valid = PositionEstimate(
+        PositionOutcome.VALID, 0.1, np.ones(3), np.zeros(3), Rotation.identity(), np.eye(9), details="not transmitted"
+    )
+    for estimate in (valid, PositionEstimate(PositionOutcome.UNCERTAIN, 0.7)):
+        answer = {"exchange": 2, **json.loads(json.dumps(encode_estimate(estimate)))}
+        assert hash_inputs(read_estimate(answer), ("details",)) == hash_inputs(estimate, ("details",))
+
+
+def test_file_of_another_version_is_rejected(tmp_path: Path) -> None:
+    write_map(tmp_path, MAP)
+    path = tmp_path / "map.json"
+    path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 3'))
+    with pytest.raises(ValueError, match="version 3 is not supported; supported: 1"):
+        read_map(tmp_path)
+
+
+@pytest.mark.parametrize("prefix", ["exec", "serve"])
+def test_program_answers_like_its_python_class(tmp_path: Path, prefix: str) -> None:
+    spec = f"{prefix}:{write_program(tmp_path, SERVER)}"
+    LOCALISATION.check(spec)
+    answers = run(spec)
+    expected = feed(InertialEstimator(), INITIAL, MAP, EVENTS)
+    for answer, reference in zip(answers.estimates, expected.estimates, strict=True):
+        assert (answer.outcome, answer.time_s) == (reference.outcome, reference.time_s)
+        # the initial quaternion is normalised again: a rounding error of the attitude
+        np.testing.assert_allclose(answer.position_m, reference.position_m, atol=1e-9)
+        np.testing.assert_allclose(answer.covariance, reference.covariance, rtol=1e-9, atol=1e-12)
+    image_details, details = (estimate.details for estimate in answers.estimates)
+    assert isinstance(image_details, ProgramDetails)
+    assert isinstance(details, ProgramDetails)
+    assert image_details.stderr == f"image {IMAGE.counts.sum()}\n"
+    assert details.stderr.splitlines()[1:] == ["altitude 880.0", f"image {IMAGE.counts.sum()}"]
+    # times are those of the program's answers
+    times = answers.processor_times
+    assert times.image_s == (image_details.time_s,)
+    assert times.total_s == pytest.approx(details.time_s, rel=1e-9)
+    algorithm_run = run_algorithm(lambda: answers, lambda answer: answer)
+    assert algorithm_run.row == {"estimation_time_s": details.time_s, "stderr": details.stderr}
+
+
+#: A program in plain Python, as in any other language: `ANSWER` is its answer to an image and to finish.
+PLAIN = """
+import json, os, sys, time
+ANSWER = {"outcome": "NO_COARSE_FIX", "time_s": 0.5}
+COVARIANCE = [[float(row == column) for column in range(9)] for row in range(9)]
+STATE = {"position_m": [1, 2, 3], "velocity_m_s": [0, 0, 0], "world_from_body_xyzw": [0, 0, 0, 1],
+         "covariance": COVARIANCE}
+actions = []
+print(json.dumps({"exchange": 2, "ready": True}), flush=True)
+for line in sys.stdin:
+    request = json.loads(line)
+    actions.append(request["do"])
+    answer = ANSWER if request["do"] in ("image", "finish") else {"outcome": None}
+    # BODY
+    print(json.dumps({"exchange": 2, "id": request["id"], **answer}), flush=True)
+"""
+
+
+def write_plain(folder: Path, body: str, header: str = "") -> str:
+    return write_program(folder, header + PLAIN.replace("# BODY", body))
+
+
+def test_each_descent_has_its_own_process_and_order_of_messages(tmp_path: Path) -> None:
+    body = "print(actions, os.getpid(), file=sys.stderr, flush=True) if request['do'] == 'finish' else None"
+    spec = f"serve:{write_plain(tmp_path, body)}"
+    outputs = [run(spec).details for _ in range(2)]
+    actions, process_ids = zip(*(item.stderr.rsplit(" ", 1) for item in outputs if item is not None), strict=True)
+    assert actions[0] == actions[1] == "['start', 'imu', 'altitude', 'imu', 'image', 'imu', 'finish']"
+    assert process_ids[0] != process_ids[1]
+    gc.collect()
+    assert not {int(number) for number in process_ids} & idle_processes()
+    assert not any(Path(f"/proc/{int(number)}").exists() for number in process_ids)
+
+
+def test_an_estimator_starts_again_in_the_same_process(tmp_path: Path) -> None:
+    command = parse_command(f"serve:{write_plain(tmp_path, 'answer.get(chr(97))')}")
+    assert command is not None
+    estimator = ExecutablePositionEstimator(command, ExecutableLimits(time_s=60.0))
+    first, second = (feed(estimator, INITIAL, MAP, EVENTS) for _ in range(2))
+    assert first.outcome is second.outcome is PositionOutcome.NO_COARSE_FIX
+
+
+VALID = 'answer = {**STATE, "outcome": "VALID", "time_s": 0.5} if "outcome" in answer and answer["outcome"] else answer'
+
+
+def test_valid_answer_of_a_plain_program(tmp_path: Path) -> None:
+    final = run(f"serve:{write_plain(tmp_path, VALID)}").estimates[-1]
+    assert final.outcome is PositionOutcome.VALID
+    np.testing.assert_array_equal(final.position_m, [1.0, 2.0, 3.0])
+
+
+IF_IMAGE = "if request['do'] == 'image': "
+
+
+@pytest.mark.parametrize(
+    ("body", "fault", "message"),
+    [
+        ("if request['do'] == 'start': sys.exit(3)", Fault.CRASHED, "status 3"),
+        ("if request['do'] == 'imu': os.abort()", Fault.CRASHED, "SIGABRT"),
+        ("if request['do'] == 'altitude': raise ValueError", Fault.CRASHED, "status 1"),
+        (f"{IF_IMAGE}sys.exit(0)", Fault.CRASHED, "its output ended without an answer"),
+        (f"{IF_IMAGE}time.sleep(60)", Fault.TIMED_OUT, "no answer within 1 s"),
+        ("if request['do'] == 'imu': time.sleep(60)", Fault.TIMED_OUT, "no answer within 1 s"),
+        (f"{IF_IMAGE}x = bytearray(400_000_000); time.sleep(60)", Fault.OUT_OF_MEMORY, "0.2 GB"),
+        (f"{IF_IMAGE}print('x' * 2_000_000)", Fault.TOO_MUCH_OUTPUT, "1 MB"),
+        (f"{IF_IMAGE}print('position unknown')", Fault.BAD_ANSWER, "one line|not one JSON object"),
+        (f"{IF_IMAGE}request['id'] = 1", Fault.BAD_ANSWER, "the answer's id is 1; allowed: "),
+        ("if request['do'] == 'start': answer = ANSWER", Fault.BAD_ANSWER, "unknown key 'time_s'"),
+        ("if request['do'] == 'imu': answer = {}", Fault.BAD_ANSWER, "outcome is None; .* allowed: null"),
+        (f"{IF_IMAGE}answer = {{'outcome': None}}", Fault.BAD_ANSWER, "outcome is None; allowed: VALID, NO_COARSE"),
+        (f"{IF_IMAGE}answer = {{'outcome': 'UNCERTAIN'}}", Fault.BAD_ANSWER, "time_s is missing"),
+        (f"{IF_IMAGE}answer = {{**ANSWER, 'time_s': -1.0}}", Fault.BAD_ANSWER, "time_s is -1.0; allowed: 0.0 to inf"),
+        (f"{IF_IMAGE}answer = {{**ANSWER, 'time_s': float('nan')}}", Fault.BAD_ANSWER, "time_s is 'NaN'; allowed"),
+        (f"{IF_IMAGE}answer = {{**ANSWER, 'position': 1}}", Fault.BAD_ANSWER, "unknown key 'position'"),
+        (f"{IF_IMAGE}answer = {{**ANSWER, 'outcome': 'VALID'}}", Fault.BAD_ANSWER, "VALID, but position_m is missing"),
+        (f"{IF_IMAGE}answer = {{**ANSWER, **STATE}}", Fault.BAD_ANSWER, "NO_COARSE_FIX, but position_m is given"),
+        (f"{VALID}; STATE['covariance'][0][0] = -1.0", Fault.BAD_ANSWER, "covariance is not positive definite"),
+        (f"{VALID}; STATE['world_from_body_xyzw'] = [0] * 4", Fault.BAD_ANSWER, "allowed: a unit quaternion"),
+        (f"{VALID}; STATE['velocity_m_s'] = [1, 2]", Fault.BAD_ANSWER, "velocity_m_s is '.1, 2.'; allowed: numbers"),
+    ],
+)
+def test_failures_of_a_program_are_faults(tmp_path: Path, body: str, fault: Fault, message: str) -> None:
+    spec = f"serve:{write_plain(tmp_path, body)}"
+    start_s = time.monotonic()
+    limits = {"time_s": 1.0} if fault is Fault.TIMED_OUT else {}
+    limits |= {"memory_gb": 0.2} if fault is Fault.OUT_OF_MEMORY else {}
+    with pytest.raises(AlgorithmError, match=message) as error:
+        run(spec, **limits)
+    assert error.value.fault is fault
+    assert time.monotonic() - start_s < 30.0  # far below the pauses of 60 s
+
+
+def test_a_failure_in_a_case_is_recorded_as_an_outcome(tmp_path: Path) -> None:
+    spec = f"serve:{write_plain(tmp_path, 'sys.exit(repr(actions))')}"
+    algorithm_run = run_algorithm(lambda: run(spec), lambda answer: answer)
+    assert algorithm_run.failure is not None
+    assert algorithm_run.failure.outcome == "CRASHED"
+    assert algorithm_run.row["stderr"] == "['start']\n"
+
+
+def test_program_without_greeting_is_rejected(tmp_path: Path) -> None:
+    with pytest.raises(AlgorithmError, match="its first line is") as error:
+        run(f"serve:{write_program(tmp_path, 'print({})')}")
+    assert error.value.fault is Fault.BAD_ANSWER
+
+
+def test_streams_of_frames_are_not_accepted() -> None:
+    with pytest.raises(ValueError, match="does not accept a stream of images; allowed: exec:, serve:"):
+        LOCALISATION.check(f"serve-stream:{sys.executable}")
+
+
+def test_serve_rejects_an_unknown_request() -> None:
+    answers = io.StringIO()
+    with pytest.raises(ValueError, match="unknown request 'picture'; allowed: start, imu"):
+        serve(InertialEstimator(), ['{"exchange": 2, "id": 1, "do": "picture"}\n'], answers)
+    assert json.loads(answers.getvalue()) == {"exchange": 2, "ready": True}
