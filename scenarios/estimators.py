@@ -88,6 +88,8 @@ class Task(Generic[Algorithm, Options]):
     - executable: function that wraps an external program; None if programs are not accepted
     - offline: format of the answers in a table; None if an answer determines the next inputs
     - streamed: function that wraps an algorithm that receives images one by one; None if streams are not accepted
+    - suite: ``module:Class`` of the conformance suite, a `marsyard.scenarios.conformance.checks.Suite`; empty without
+      one, and for the tasks in `TASKS`
     """
 
     name: str
@@ -98,6 +100,7 @@ class Task(Generic[Algorithm, Options]):
     executable: Callable[[exchange.Command, exchange.ExecutableLimits], Algorithm] | None = None
     offline: AnswerFormat[Any] | None = None
     streamed: Callable[[Any], Algorithm] | None = None
+    suite: str = ""
 
     def check(self, spec: str) -> None:
         """Raise ValueError, with the allowed algorithms in the message, if the task has no algorithm of this name."""
@@ -237,7 +240,7 @@ LANDING: Task[SiteEstimator, HdaOptions] = Task(
     offline=SITE_FORMAT,
 )
 
-#: Tasks with a conformance suite, by name.
+#: Tasks whose conformance suites are in `marsyard.scenarios.conformance`, by name.
 TASKS: Mapping[str, Task[Any, Any]] = {task.name: task for task in (VELOCITY, TRACKING, LANDING)}
 
 

@@ -137,8 +137,8 @@ def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject
     task: task of the algorithm; None for the task that its interface determines.
     Raises CampaignError if the name or the task is unknown.
     """
-    if task is not None and task not in suite.SUBJECT_KINDS:
-        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(suite.SUBJECT_KINDS)}")
+    if task is not None and task not in suite.subject_kinds():
+        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(suite.subject_kinds())}")
     try:
         task_name = suite.determine_task(spec) if task is None else task
         suite.check_subject(spec, task_name)

@@ -1,15 +1,17 @@
 """Conformance suites: checks of an algorithm or a user-defined part against its protocol.
 
 `inputs` synthesizes measurements without terrain or renderer; `checks` contains the checks common to all suites;
-`estimators`, `trackers` and `parts` add the checks of their protocols. This module selects the suite, and runs its
-checks one by one.
+`estimators`, `trackers` and `parts` add the checks of their protocols. The tasks of further systems define their own
+suites (`marsyard.scenarios.estimators.Task.suite`). This module selects the suite, and runs its checks one by one.
 """
 
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
@@ -18,10 +20,25 @@ from marsyard.scenarios.conformance.checks import Finding as Finding
 from marsyard.scenarios.conformance.checks import Suite
 from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, list_installed
 from marsyard.scenarios.parts.named import KINDS
+from marsyard.scenarios.systems import systems
 from marsyard.scenarios.user_files import import_object
 
-#: Names, on the command line, of the tasks and kinds of parts that have a suite.
-SUBJECT_KINDS = (*TASKS, *KINDS)
+
+@cache
+def tasks() -> Mapping[str, Task[Any, Any]]:
+    """Return the tasks with a conformance suite, by name: `TASKS`, then those of the systems that define a suite."""
+    found = dict(TASKS)
+    for path in dict.fromkeys(path for system in systems() for path in system.tasks):
+        with suppress(ImportError):  # the campaigns of the system report the error
+            task = import_object(path)
+            if task.suite:
+                found.setdefault(task.name, task)
+    return found
+
+
+def subject_kinds() -> tuple[str, ...]:
+    """Return the names, on the command line, of the tasks and kinds of parts that have a suite."""
+    return (*tasks(), *KINDS)
 
 
 @dataclass(frozen=True)
@@ -42,9 +59,12 @@ class Subject:
         if self.task in KINDS:
             kind = KINDS[self.task]
             return parts.PartSuite(partial(parts.load_part, kind, self.spec), self.spec, False, self.limit_s, kind)
-        task: Task[Any, Any] = TASKS[self.task]
+        task = tasks()[self.task]
         create = partial(task.make, self.spec, task.options(), ExecutableLimits(time_s=self.limit_s))
         is_program = self.spec.startswith(tuple(PREFIXES))
+        if task.suite:
+            suite: Suite = import_object(task.suite)(create, self.spec, is_program, self.limit_s)
+            return suite
         if task is TRACKING:
             return trackers.TrackerSuite(create, self.spec, is_program, self.limit_s)
         protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
@@ -63,7 +83,7 @@ def check_subject(spec: str, task: str) -> None:
     if task in KINDS:
         parts.load_part(KINDS[task], spec)
     else:
-        TASKS[task].check(spec)
+        tasks()[task].check(spec)
 
 
 def check_names(subject: Subject) -> list[tuple[str, str]]:
@@ -81,7 +101,7 @@ def determine_task(spec: str) -> str:
 
     Raises ValueError if the algorithm does not exist.
     """
-    shipped = next((task.name for task in TASKS.values() if spec in task.shipped), None)
+    shipped = next((task.name for task in tasks().values() if spec in task.shipped), None)
     if shipped is not None:
         return shipped
     if spec.startswith(tuple(PREFIXES)):
@@ -98,6 +118,9 @@ def determine_task(spec: str) -> str:
         raise ValueError(f"cannot import algorithm '{spec}': {error}") from error
     if hasattr(algorithm, "designate"):
         return TRACKING.name
+    for task in tasks().values():
+        if task.suite and all(hasattr(algorithm, method) for method in task.methods):
+            return task.name
     annotations = inspect.get_annotations(getattr(algorithm, "estimate", None) or algorithm)
     is_landing = any("Landing" in str(item) or "Site" in str(item) for item in annotations.values())
     return LANDING.name if is_landing else VELOCITY.name

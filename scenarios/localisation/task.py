@@ -22,4 +22,5 @@ LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
     },
     executable=ExecutablePositionEstimator,
     options=LvsOptions,
+    suite="marsyard.scenarios.localisation.conformance:PositionSuite",
 )

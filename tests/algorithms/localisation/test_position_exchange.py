@@ -137,9 +137,8 @@ def test_file_of_another_version_is_rejected(tmp_path: Path) -> None:
         read_map(tmp_path)
 
 
-@pytest.mark.parametrize("prefix", ["exec", "serve"])
-def test_program_answers_like_its_python_class(tmp_path: Path, prefix: str) -> None:
-    spec = f"{prefix}:{write_program(tmp_path, SERVER)}"
+def test_program_answers_like_its_python_class(tmp_path: Path) -> None:
+    spec = f"serve:{write_program(tmp_path, SERVER)}"
     LOCALISATION.check(spec)
     answers = run(spec)
     expected = feed(InertialEstimator(), INITIAL, MAP, EVENTS)
@@ -183,9 +182,10 @@ def write_plain(folder: Path, body: str, header: str = "") -> str:
     return write_program(folder, header + PLAIN.replace("# BODY", body))
 
 
-def test_each_descent_has_its_own_process_and_order_of_messages(tmp_path: Path) -> None:
+@pytest.mark.parametrize("prefix", ["exec", "serve"])
+def test_each_descent_has_its_own_process_and_order_of_messages(tmp_path: Path, prefix: str) -> None:
     body = "print(actions, os.getpid(), file=sys.stderr, flush=True) if request['do'] == 'finish' else None"
-    spec = f"serve:{write_plain(tmp_path, body)}"
+    spec = f"{prefix}:{write_plain(tmp_path, body)}"
     outputs = [run(spec).details for _ in range(2)]
     actions, process_ids = zip(*(item.stderr.rsplit(" ", 1) for item in outputs if item is not None), strict=True)
     assert actions[0] == actions[1] == "['start', 'imu', 'altitude', 'imu', 'image', 'imu', 'finish']"

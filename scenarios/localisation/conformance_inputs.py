@@ -1,0 +1,193 @@
+"""Synthetic descents for the conformance checks of position estimators: level, textured ground and its exact map.
+
+The lander descends at constant velocity and turns slowly, so that its inertial increments are exact. The images are
+those of the conformance suites' textured plane, without terrain or renderer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+
+import numpy as np
+from jaxtyping import Float64, UInt16
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+
+from marsyard.algorithms.localisation.interface import InitialState, MapProduct
+from marsyard.scenarios.conformance.inputs import BLANKS, MEAN, Blank, TexturedPlane, texture
+from marsyard.scenarios.localisation.instruments import CameraParameters, true_camera
+from marsyard.scenarios.localisation.stream import Event, merge
+from marsyard.sim.camera import Cahvore
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
+
+#: Motion of the lander: start, constant velocity, attitude at the start about z, y and x, turn rate about the vertical.
+START_M, VELOCITY_M_S = np.array([150.0, -120.0, 2400.0]), np.array([8.0, -5.0, -60.0])
+_ATTITUDE_DEG, _TURN_RAD_S, _GRAVITY_M_S2 = (20.0, 3.0, -4.0), 0.02, 3.71
+#: Error of the initial position (estimate minus truth), and standard deviations of the initial state per axis.
+_ERROR_M = np.array([160.0, -110.0, 20.0])
+_POSITION_SD_M, _VELOCITY_SD_M_S, _ATTITUDE_SD_RAD = (150.0, 150.0, 50.0), 0.5, 1e-3
+#: Rates of the inertial unit and the altimeter, end of the inertial data, and times of the images.
+_IMU_HZ, _ALTIMETER_HZ, _END_S = 100.0, 2.0, 8.0
+_IMAGE_TIMES_S = np.array([1.0, 3.0, 5.0, 7.0])
+#: Spacing of the texture's samples; pixel and size of the map.
+_TEXTURE_STEP_M, _MAP_PIXEL_M, _MAP_PX = 12.0, 6.0, 640
+#: Counts of the 8-bit camera at the mean radiance, and without light.
+_MEAN_DN, _OFFSET_DN, _FULL_SCALE_DN = 110.0, 2.0, 255
+#: Jitter of the time tags: images and altitudes, s; inertial data, as a fraction of the interval.
+_TAG_JITTER_S, _IMU_JITTER = 0.005, 0.4
+
+#: Counts of the blank images of this suite; `black` is below the offset.
+BLANK_COUNTS: dict[str, Blank] = {**BLANKS, "black": lambda _: 0}
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Inputs of a position estimator: initial state, map, and measurements in the order of their arrival."""
+
+    initial: InitialState
+    map_product: MapProduct
+    events: list[Event]
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last increment."""
+        return max(float(event.times_s[-1]) for event in self.events if isinstance(event, ImuIncrements))
+
+
+def true_position(time_s: float) -> Float64[np.ndarray, "3"]:
+    """Return the true position at a time."""
+    return np.asarray(START_M + time_s * VELOCITY_M_S)
+
+
+@cache
+def ordinary() -> Descent:
+    """Create an ordinary descent; only the initial position has an error."""
+    return _create(_increments(), _altitudes(), _images())
+
+
+@cache
+def shifted() -> Descent:
+    """Create the ordinary descent on another map: the positions of map and lander are shifted by a kilometre."""
+    case, shift = ordinary(), np.array([1000.0, -500.0, 0.0])
+    initial = replace(case.initial, position_m=case.initial.position_m + shift)
+    return Descent(initial, replace(case.map_product, origin_m=case.map_product.origin_m + shift[:2]), case.events)
+
+
+@cache
+def jittered() -> Descent:
+    """Create a descent with jitter of all time tags; two inertial boundaries, and an image and an altitude, are equal.
+
+    The order of the inertial boundaries is kept.
+    """
+    rng = np.random.default_rng(20210218)
+    increments, altitudes, images = _increments(), _altitudes(), _images()
+    tags = increments.times_s + _IMU_JITTER / _IMU_HZ * rng.uniform(-1.0, 1.0, increments.times_s.size)
+    tags[[0, -1]] = increments.times_s[[0, -1]]
+    tags = np.maximum.accumulate(tags)
+    tags[50] = tags[51]
+    images = [replace(image, time_s=image.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for image in images]
+    altitudes = [replace(item, time_s=item.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for item in altitudes]
+    altitudes[1] = replace(altitudes[1], time_s=images[0].time_s)
+    return _create(replace(increments, times_s=tags), altitudes, images)
+
+
+def without_altitudes() -> Descent:
+    """Create a descent whose altimeter has no reading."""
+    return _create(_increments(), [], _images())
+
+
+def without_images() -> Descent:
+    """Create a descent whose images are all lost."""
+    return _create(_increments(), _altitudes(), [])
+
+
+def repeated() -> Descent:
+    """Create a descent in which all images show the first scene, and each is delivered twice."""
+    first = _images()[0]
+    images = [replace(image, counts=first.counts) for image in _images() for _ in range(2)]
+    return _create(_increments(), _altitudes(), images)
+
+
+def noisy() -> Descent:
+    """Create a descent whose images are noise."""
+    rng = np.random.default_rng(1)
+    return _change_counts(lambda image: rng.integers(0, _FULL_SCALE_DN + 1, image.counts.shape, dtype=np.uint16))
+
+
+def blank(name: str) -> Descent:
+    """Create a descent whose images have one count, by name of `BLANK_COUNTS`."""
+    return _change_counts(lambda image: np.full_like(image.counts, BLANK_COUNTS[name](image.calibration)))
+
+
+def _change_counts(change: Callable[[DetectorImage], UInt16[np.ndarray, "rows columns"]]) -> Descent:
+    images = [replace(image, counts=change(image)) for image in _images()]
+    return _create(_increments(), _altitudes(), images)
+
+
+def _create(
+    increments: ImuIncrements, altitudes: Sequence[AltitudeMeasurement], images: Sequence[DetectorImage]
+) -> Descent:
+    variances = np.square([*_POSITION_SD_M, *[_VELOCITY_SD_M_S] * 3, *[_ATTITUDE_SD_RAD] * 3])
+    position = true_position(0.0) + _ERROR_M
+    initial = InitialState(0.0, position, VELOCITY_M_S, _attitude(0.0), np.diag(variances), _GRAVITY_M_S2)
+    return Descent(initial, _map(), merge(increments, altitudes, images))
+
+
+def _attitude(time_s: float) -> Rotation:
+    """Return the rotation from body axes to world axes."""
+    return Rotation.from_rotvec([0.0, 0.0, _TURN_RAD_S * time_s]) * Rotation.from_euler(
+        "ZYX", _ATTITUDE_DEG, degrees=True
+    )
+
+
+@cache
+def _increments() -> ImuIncrements:
+    """Create exact increments: the specific force is constant in world axes, the angular rate in body axes."""
+    times = np.arange(round(_END_S * _IMU_HZ) + 1) / _IMU_HZ
+    turn = _attitude(0.0).inv().apply([0.0, 0.0, _TURN_RAD_S / _IMU_HZ])
+    force = [_attitude(time_s).inv().apply([0.0, 0.0, _GRAVITY_M_S2 / _IMU_HZ]) for time_s in times[:-1]]
+    return ImuIncrements(times, 1.0 / _IMU_HZ, np.tile(turn, (times.size - 1, 1)), np.array(force))
+
+
+@cache
+def _altitudes() -> list[AltitudeMeasurement]:
+    times = np.arange(1, round(_END_S * _ALTIMETER_HZ)) / _ALTIMETER_HZ
+    return [AltitudeMeasurement(float(true_position(time_s)[2]), float(time_s)) for time_s in times]
+
+
+@cache
+def _images() -> list[DetectorImage]:
+    """Take the images of the ground at the height 0."""
+    camera: Cahvore = true_camera(CameraParameters(pixels=192, pixel_mrad=8.7))
+    shape = camera.size[::-1]
+    calibration = DetectorCalibration(np.ones(shape), 150e-6, 0.0, 0.0, 1, _OFFSET_DN, _FULL_SCALE_DN)
+    ground = TexturedPlane(np.zeros(3), np.eye(3)[:2], _TEXTURE_STEP_M)
+    images = []
+    for time_s in _IMAGE_TIMES_S:
+        radiance = ground.radiance(camera.transform(rigid(_attitude(time_s), true_position(time_s))))
+        counts = np.clip(np.rint(_OFFSET_DN + _MEAN_DN / MEAN * radiance), 0, _FULL_SCALE_DN).astype(np.uint16)
+        images.append(DetectorImage(counts, float(time_s), camera, calibration))
+    return images
+
+
+@cache
+def _map() -> MapProduct:
+    """Create the exact map, centred at the world's origin."""
+    offsets = _MAP_PIXEL_M * (np.arange(_MAP_PX) - _MAP_PX // 2)
+    samples = np.stack(np.meshgrid(offsets, offsets, indexing="ij")) / _TEXTURE_STEP_M
+    appearance = map_coordinates(texture(), samples, order=1, mode="grid-wrap").astype(np.float32)
+    return MapProduct(appearance, np.zeros_like(appearance), np.full(2, offsets[0]), _MAP_PIXEL_M, 1.0, 1.0, 1.0)
+
+
+#: Functions that create descents with unusual measurements, by the name of the check, with the requirement's end.
+UNUSUAL: dict[str, tuple[Callable[[], Descent], str]] = {
+    **{name: (partial(blank, name), f"images that are {name}") for name in BLANK_COUNTS},
+    "noise": (noisy, "images of noise"),
+    "repeated": (repeated, "images that repeat the first, each delivered twice"),
+    "no-altitudes": (without_altitudes, "a descent without altitudes"),
+    "no-images": (without_images, "a descent without images"),
+    "jitter": (jittered, "time tags with jitter, some of them equal"),
+}

@@ -1,0 +1,241 @@
+"""Tests of the conformance suite for position estimators: shipped estimators pass, and defects are reported."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from marsyard.algorithms.localisation.navigation_filter import NavigationFilter
+from marsyard.campaigns.running.replay import create_subject
+from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, run_check, subject_kinds
+from marsyard.scenarios.localisation import conformance_inputs as inputs
+from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
+
+MODULE_HEADER = """
+import numpy as np
+from marsyard.algorithms.localisation.baselines import InertialEstimator
+from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome as Outcome
+"""
+
+
+def run_suite(spec: str, *checks: str, limit_s: float = 60.0) -> dict[str, Finding]:
+    """Run the given checks, or all checks, of an estimator; return the findings by name of the check."""
+    subject = Subject(spec, "localisation", limit_s)
+    names = [name for name, _ in check_names(subject)]
+    return {name: run_check(subject, names.index(name)) for name in (checks or names)}
+
+
+@pytest.mark.parametrize(
+    ("spec", "checks"),
+    [
+        ("inertial", ()),
+        # all checks of the other two take 15 s each
+        ("lvs", ("answer", "black", "no-altitudes")),
+        ("sift", ("answer", "dark")),
+    ],
+)
+def test_shipped_estimators_conform(spec: str, checks: tuple[str, ...]) -> None:
+    findings = run_suite(spec, *checks)
+    assert {name: finding.problem for name, finding in findings.items() if not finding.passed} == {}
+    if spec != "inertial":
+        # the position is found on these inputs, so that the checks execute all stages
+        assert "VALID; " in findings["answer"].note
+        assert float(findings["answer"].note.split("; ")[1].split(" m ")[0]) < 20.0
+
+
+def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
+    """Write a module with a class `Defective`; its name is unique (Python caches modules). Return the class's path."""
+    name = f"bad_position_{abs(hash(body))}"
+    (folder / f"{name}.py").write_text(f"{MODULE_HEADER}class Defective(InertialEstimator):\n{body}\n")
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(str(folder))
+    return f"{name}:Defective"
+
+
+@pytest.mark.parametrize(
+    ("check", "method", "problem"),
+    [
+        ("answer", "def image(self, image): return None", "BAD_ANSWER: the answer is a NoneType; allowed: a PositionE"),
+        ("answer", "def finish(self): return PositionEstimate(Outcome.VALID, 8.0)", "but position_m is missing"),
+        (
+            "answer",
+            "def image(self, image): return PositionEstimate(Outcome.UNCERTAIN, image.time_s + 0.5)",
+            "the time_s of its answer to image 1 is 1.5 s; expected 1.0 s",
+        ),
+        ("answer", "def finish(self): return PositionEstimate(Outcome.UNCERTAIN, 99.0)", "time_s is 99.0; allowed"),
+        ("answer", "def image(self, image): image.counts[:] = 0", "it raised ValueError"),
+        ("black", "def image(self, image): return 1 // int(image.counts.max())", "it raised ZeroDivisionError"),
+        ("saturated", "def image(self, image): assert image.counts.min() < 255", "it raised AssertionError"),
+        (
+            "repeated",
+            """
+            last = None
+            def image(self, image):
+                assert image.time_s != self.last
+                self.last = image.time_s
+                return super().image(image)
+            """,
+            "it raised AssertionError",
+        ),
+        (
+            "no-altitudes",
+            """
+            def altitude(self, measurement): self.last = measurement
+            def image(self, image): return PositionEstimate(Outcome.UNCERTAIN, image.time_s, self.last and None)
+            """,
+            "it raised AttributeError: 'Defective' object has no attribute 'last'",
+        ),
+        (
+            "no-images",
+            """
+            def image(self, image):
+                self.last = super().image(image)
+                return self.last
+            def finish(self): return self.last and super().finish()
+            """,
+            "it raised AttributeError",
+        ),
+        (
+            "jitter",
+            "def imu(self, increments): assert np.diff(increments.times_s).min() > 0; super().imu(increments)",
+            "it raised AssertionError",
+        ),
+        ("inputs", "def image(self, image): image.counts[:] = 0; return super().image(image)", "it changed its input"),
+        ("inputs", "def start(self, i, m): super().start(i, m); m.appearance[0, 0] += 1", "it changed its input"),
+        (
+            "deterministic",
+            """
+            def image(self, image):
+                return PositionEstimate(Outcome.UNCERTAIN, image.time_s + 1e-7 * np.random.random())
+            """,
+            "its answers to the same case differ between two calls",
+        ),
+        (
+            "deterministic",
+            """
+            count = 0
+            def altitude(self, measurement): self.count += 1
+            def finish(self): return PositionEstimate(list(Outcome)[1 + self.count // 20], self._filter.time_s)
+            """,
+            "after another descent, its answers differ",
+        ),
+        (
+            "start",
+            """
+            count = 0
+            def image(self, image):
+                self.count += 1
+                return PositionEstimate(list(Outcome)[1 + self.count % 2], image.time_s)
+            """,
+            "after a restart in the middle of a descent, its answers differ",
+        ),
+        (
+            "truth",
+            "def finish(self): import marsyard.sim.terrain; return super().finish()",
+            "access to the truth: bad_",
+        ),
+    ],
+)
+def test_defects_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, method: str, problem: str
+) -> None:
+    spec = write_defective_module(tmp_path, monkeypatch, textwrap.indent(textwrap.dedent(method), " " * 4))
+    finding = run_suite(spec, check)[check]
+    assert problem in finding.problem
+    assert not finding.passed
+    assert finding.next_step
+
+
+def test_slow_estimator_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    body = "    def image(self, image): import time; time.sleep(0.02); return super().image(image)"
+    finding = run_suite(write_defective_module(tmp_path, monkeypatch, body), "time", limit_s=0.01)["time"]
+    assert "it took 0.02" in finding.problem
+    assert finding.requirement == "answers each image within 0.01 s"
+
+
+PROGRAM = """
+import json, sys, time
+print(json.dumps({"exchange": 2, "ready": True}), flush=True)
+time_s, images, body = 0.0, 0, sys.argv[1]
+for line in sys.stdin:
+    request = json.loads(line)
+    answer = {"outcome": None}
+    if request["do"] == "imu":
+        time_s = request["increments"]["times_s"][-1]
+    if request["do"] in ("image", "finish"):
+        images += 1
+        tag = json.load(open(request["image"] + "/image.json"))["image"]["time_s"] if "image" in request else time_s
+        answer = {"outcome": "UNCERTAIN", "time_s": tag}
+        exec(body)
+    print(json.dumps({"exchange": 2, "id": request["id"], **answer}), flush=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ("body", "problem"),
+    [
+        ("pass", ""),
+        ("sys.exit('the end' if images == 2 else 0)", "CRASHED: "),
+        ("sys.exit('the end')", "CRASHED: it ended with status 1; its standard error ends with: the end"),
+        ("time.sleep(60)", "TIMED_OUT: no answer within 1 s"),
+        ("answer = {'outcome': 'PROBABLY'}", "BAD_ANSWER: outcome is 'PROBABLY'; allowed: VALID, NO_COARSE_FIX"),
+        ("print('here'); answer = {}", "BAD_ANSWER: "),
+    ],
+)
+def test_faults_of_programs_are_reported(tmp_path: Path, body: str, problem: str) -> None:
+    path = tmp_path / "estimator.py"
+    path.write_text(PROGRAM)
+    spec = f'serve:{sys.executable} {path} "{body}"'
+    finding = run_suite(spec, "answer", limit_s=1.0 if "TIMED_OUT" in problem else 60.0)["answer"]
+    assert finding.problem.startswith(problem)
+    assert finding.passed == (problem == "")
+
+
+def test_program_without_memory_of_earlier_descents_passes(tmp_path: Path) -> None:
+    path = tmp_path / "estimator.py"
+    path.write_text(PROGRAM)
+    findings = run_suite(f"exec:{sys.executable} {path} pass", "jitter", "no-images", "start")
+    assert {name: finding.problem for name, finding in findings.items() if not finding.passed} == {}
+
+
+def test_the_suite_is_registered_by_the_task_of_the_system() -> None:
+    assert subject_kinds()[:4] == ("velocity", "tracking", "landing", "localisation")
+    assert [determine_task(name) for name in ("lvs", "sift", "inertial")] == ["localisation"] * 3
+    assert determine_task("marsyard.algorithms.localisation.estimator:MapRelativeEstimator") == "localisation"
+    assert create_subject("inertial", None, 60.0).task == "localisation"
+    names = [name for name, _ in check_names(Subject("serve:cat", "localisation", 60.0))]
+    assert "start" in names
+    assert "inputs" not in names  # a program receives files
+
+
+def test_inertial_data_are_exact() -> None:
+    """Propagation from the true initial state ends at the true position."""
+    case = inputs.ordinary()
+    navigation = NavigationFilter.from_initial(case.initial)
+    for event in case.events:
+        if isinstance(event, ImuIncrements):
+            navigation.propagate(event)
+    error = navigation.estimate(case.end_s)[0] - inputs.true_position(case.end_s)
+    # the initial error (160, -110, 20) m is constant; the trapezoidal rule is exact for a constant force
+    np.testing.assert_allclose(error, [160.0, -110.0, 20.0], atol=1e-3)
+
+
+def test_unusual_descents_differ_as_described() -> None:
+    def select(case: inputs.Descent, kind: type) -> list:
+        return [event for event in case.events if isinstance(event, kind)]
+
+    images = select(inputs.ordinary(), DetectorImage)
+    assert {float(image.counts.std()) > 5.0 for image in images} == {True}
+    assert len(select(inputs.repeated(), DetectorImage)) == 2 * len(images)
+    assert {int(image.counts.max()) for image in select(inputs.blank("saturated"), DetectorImage)} == {255}
+    assert (
+        select(inputs.without_altitudes(), AltitudeMeasurement) == select(inputs.without_images(), DetectorImage) == []
+    )
+    jittered, tags = inputs.jittered(), [image.time_s for image in images]
+    assert [image.time_s for image in select(jittered, DetectorImage)] != tags
+    boundaries = np.concatenate([part.times_s[1:] for part in select(jittered, ImuIncrements)])
+    assert np.diff(boundaries).min() == 0.0
