@@ -134,8 +134,8 @@ def conformance(
         str | None,
         Option(
             metavar="TASK",
-            help="Interface to check: velocity, tracking, landing, dynamics, instrument or score; by default "
-            "inferred from the methods of the class.",
+            help="Interface to check: velocity, tracking, landing, localisation, dynamics, instrument or score; by "
+            "default inferred from the methods of the class.",
         ),
     ] = None,
     time_limit: Annotated[float, Option(metavar="S", help="Time limit of one call in seconds.", min=0.1)] = 60.0,
