@@ -34,7 +34,7 @@ from marsyard.algorithms.exchange.files import (
     write_json,
 )
 from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS
-from marsyard.algorithms.exchange.serving import AnswerReader, Session, check_keys, read_member, read_numbers
+from marsyard.algorithms.exchange.serving import Answer, AnswerReader, Session, check_keys, read_member, read_numbers
 from marsyard.algorithms.localisation.answers import check_estimate
 from marsyard.algorithms.localisation.interface import (
     InitialState,
@@ -92,10 +92,10 @@ class ExecutablePositionEstimator:
         answer = self._session.send_request("finish", {}, self._timed(self._read_estimate))
         return replace(answer, details=self._total)
 
-    def _timed(self, read: AnswerReader[Any]) -> AnswerReader[Any]:
+    def _timed(self, read: AnswerReader[Answer]) -> AnswerReader[Answer]:
         """Return a reader that also adds the answer's standard error and time to those of the descent."""
 
-        def read_timed(answer: Mapping[str, Any], details: ProgramDetails) -> Any:
+        def read_timed(answer: Mapping[str, Any], details: ProgramDetails) -> Answer:
             self.request_time_s = details.time_s
             stderr = (self._total.stderr + details.stderr)[-MAX_STDERR_CHARACTERS:]
             self._total = ProgramDetails(stderr, self._total.time_s + details.time_s)

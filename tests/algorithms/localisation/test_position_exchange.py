@@ -145,8 +145,8 @@ def test_program_answers_like_its_python_class(tmp_path: Path) -> None:
     for answer, reference in zip(answers.estimates, expected.estimates, strict=True):
         assert (answer.outcome, answer.time_s) == (reference.outcome, reference.time_s)
         # the initial quaternion is normalised again: a rounding error of the attitude
-        np.testing.assert_allclose(answer.position_m, reference.position_m, atol=1e-9)
-        np.testing.assert_allclose(answer.covariance, reference.covariance, rtol=1e-9, atol=1e-12)
+        for name in ("position_m", "velocity_m_s", "covariance"):
+            np.testing.assert_allclose(getattr(answer, name), getattr(reference, name), rtol=1e-9, atol=1e-12)
     image_details, details = (estimate.details for estimate in answers.estimates)
     assert isinstance(image_details, ProgramDetails)
     assert isinstance(details, ProgramDetails)
