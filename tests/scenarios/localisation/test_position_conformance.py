@@ -34,7 +34,7 @@ def run_suite(spec: str, *checks: str, limit_s: float = 60.0) -> dict[str, Findi
     [
         ("inertial", ()),
         # all checks of the other two take 15 s each
-        ("lvs", ("answer", "black", "no-altitudes")),
+        ("lvs", ("answer", "black")),
         ("sift", ("answer", "dark")),
     ],
 )
@@ -181,7 +181,7 @@ for line in sys.stdin:
         ("pass", ""),
         ("sys.exit('the end' if images == 2 else 0)", "CRASHED: "),
         ("sys.exit('the end')", "CRASHED: it ended with status 1; its standard error ends with: the end"),
-        ("time.sleep(60)", "TIMED_OUT: no answer within 1 s"),
+        ("time.sleep(60)", "TIMED_OUT: no answer within 0.5 s"),
         ("answer = {'outcome': 'PROBABLY'}", "BAD_ANSWER: outcome is 'PROBABLY'; allowed: VALID, NO_COARSE_FIX"),
         ("print('here'); answer = {}", "BAD_ANSWER: "),
     ],
@@ -190,7 +190,7 @@ def test_faults_of_programs_are_reported(tmp_path: Path, body: str, problem: str
     path = tmp_path / "estimator.py"
     path.write_text(PROGRAM)
     spec = f'serve:{sys.executable} {path} "{body}"'
-    finding = run_suite(spec, "answer", limit_s=1.0 if "TIMED_OUT" in problem else 60.0)["answer"]
+    finding = run_suite(spec, "answer", limit_s=0.5 if "TIMED_OUT" in problem else 60.0)["answer"]
     assert finding.problem.startswith(problem)
     assert finding.passed == (problem == "")
 
@@ -198,7 +198,7 @@ def test_faults_of_programs_are_reported(tmp_path: Path, body: str, problem: str
 def test_program_without_memory_of_earlier_descents_passes(tmp_path: Path) -> None:
     path = tmp_path / "estimator.py"
     path.write_text(PROGRAM)
-    findings = run_suite(f"exec:{sys.executable} {path} pass", "jitter", "no-images", "start")
+    findings = run_suite(f"exec:{sys.executable} {path} pass", "no-images", "start")
     assert {name: finding.problem for name, finding in findings.items() if not finding.passed} == {}
 
 
