@@ -159,10 +159,21 @@ def case_result(
     first, *compared_results = [evaluate(spec) for spec in algorithms]
     row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}
     for name, result in zip(names[1:], compared_results, strict=True):
-        columns: dict[str, Scalar] = {"outcome": result.outcome, "answered": result.answered, **result.row}
+        columns: dict[str, Scalar] = {"outcome": result.outcome, "answered": result.answered}
+        columns |= _empty_columns(first.row) if result.failure is not None else {}
+        columns |= result.row
         columns["error"] = "" if result.failure is None else result.failure.error
         row |= {f"{name}.{column}": value for column, value in columns.items()}
     return replace(first, row=row)
+
+
+def _empty_columns(row: Mapping[str, Scalar]) -> dict[str, Scalar]:
+    """Return the columns of a failed algorithm: without them a report would show those of the algorithm under test."""
+    return {
+        column: False if isinstance(value, bool | np.bool_) else float("nan")
+        for column, value in row.items()
+        if not isinstance(value, str)
+    }
 
 
 class AlgorithmSelection(BaseModel):

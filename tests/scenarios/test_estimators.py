@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from marsyard.algorithms.answers import StreamedEstimator
@@ -14,11 +15,12 @@ from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.exchange import ExecutableLimits, ExecutableTargetTracker, ExecutableVelocityEstimator
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
+from marsyard.reports.comparison import select_algorithm
 from marsyard.scenarios import estimators
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, Task, check_algorithms, labels
-from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.interface import CaseResult, Failure
 from marsyard.scenarios.velocity import consistency_row
 
 LIMITS = ExecutableLimits()
@@ -119,6 +121,23 @@ def test_failing_algorithm_does_not_affect_others() -> None:
     assert swapped_case.outcome == swapped_case.failure.outcome == "CRASHED"
     assert swapped_case.row["altitude_m"] == 7.0
     assert swapped_case.row["a_2.outcome"] == "VALID"
+
+
+def test_failed_algorithm_has_its_own_empty_columns() -> None:
+    """Without them, a comparison would show the columns of the algorithm under test as those of the failed one."""
+
+    def evaluate(spec: str) -> CaseResult:
+        if spec == "tested":
+            return CaseResult("VALID", True, {"error_m": 0.5, "in_time": True, "note": "text"})
+        return CaseResult("CRASHED", False, {"time_s": 2.0}, failure=Failure("CRASHED", "it crashed", ""))
+
+    row = case_result(["tested", "other"], evaluate, {"altitude_m": 7.0}).row
+    assert np.isnan(row["other.error_m"])
+    assert (row["other.in_time"], row["other.time_s"]) == (False, 2.0)
+    assert "other.note" not in row
+    frame = pd.DataFrame([row, row])
+    assert select_algorithm(frame, "other")["error_m"].isna().all()
+    assert select_algorithm(frame, "other")["altitude_m"].eq(7.0).all()
 
 
 def test_normalised_error_uses_the_covariance() -> None:
