@@ -21,10 +21,10 @@ def test_every_system_has_a_compile_case() -> None:
 
 def test_compiled_systems_are_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    for scenario in ("descent", "rover", "landing"):
+    for scenario in ("descent", "rover", "landing", "localisation"):
         mark_ready(scenario)
     result = CliRunner().invoke(app, ["compile"])
     assert (result.exit_code, result.output) == (
         0,
-        "descent: already compiled\nrover: already compiled\nlanding: already compiled\n",
+        "".join(f"{name}: already compiled\n" for name in ("descent", "rover", "landing", "localisation")),
     )

@@ -84,9 +84,9 @@ def test_built_in_systems_are_complete() -> None:
         for name, path in system.campaigns.items():
             assert catalogue()[name] == path
         assert set(system.compilation_campaigns) <= set(system.campaigns)
-    # Each campaign file in the folder belongs to a system.
-    folder = next(iter(catalogue().values())).parent
-    assert set(catalogue()) == {path.stem for path in folder.glob("*.toml")}
+    # Each campaign file in the folders belongs to a system.
+    folders = {path.parent for path in catalogue().values()}
+    assert set(catalogue()) == {path.stem for folder in folders for path in folder.glob("*.toml")}
     assert list(template_paths()) == ["velocity", "tracking", "landing"]
     assert {"dimes", "vtt", "hda", "homography"} <= shipped_names()
 
@@ -148,12 +148,12 @@ def test_invalid_system_does_not_affect_others(install: Install, source: str, re
     (message,) = problems()
     assert message.startswith("system 'mine' (mine:SYSTEM) is omitted: ")
     assert reason in message
-    assert [entry.name for entry in systems()[len(BUILT_IN) :]] == ["valid"]
+    assert [entry.name for entry in systems()[len(BUILT_IN) :]] == ["localisation", "valid"]
     result = CliRunner().invoke(app, ["list"])
     assert (result.exit_code, result.stderr) == (0, f"warning: {message}\n")
     assert "dimes-smoke" in result.stdout
     checks = list(check_systems())
-    assert checks[0].finding.endswith("from other packages: valid")
+    assert checks[0].finding.endswith("plug-ins: localisation, valid")
     assert [entry.finding for entry in checks if entry.verdict is Verdict.WARN] == [message]
     with pytest.raises(UnknownScenarioError, match="is omitted"):
         scenario("unknown-scenario")

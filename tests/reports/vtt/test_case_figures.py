@@ -22,6 +22,7 @@ from marsyard.reports.vtt.case_figures import (
     read_stops,
 )
 from marsyard.reports.vtt.presentation import view
+from marsyard.sim.parameters import rename_products
 from tests.reports.vtt.tracking_rows import make_products
 
 
@@ -58,7 +59,7 @@ def test_template_around_the_match_is_enlarged() -> None:
 def test_matches_with_the_deprecated_name_are_read() -> None:
     case_products = make_products()
     matches = case_products.pop("stop_1_matches")
-    stop = read_stops(case_products | {"stop_1_found": matches})[0]
+    stop = read_stops(rename_products(case_products | {"stop_1_found": matches}))[0]
     np.testing.assert_array_equal(stop.matches, matches)
 
 
