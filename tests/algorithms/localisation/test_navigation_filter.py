@@ -374,6 +374,7 @@ def simulate(
     return state_errors(truth, state), covariance[:9, :9]
 
 
+@pytest.mark.slow
 def test_estimates_are_consistent(truth: Descent, exact: ImuIncrements) -> None:
     """NEES of 60 runs: the sum is chi-square with 3 x 60 (9 x 60) degrees of freedom."""
     runs = 60
