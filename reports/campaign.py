@@ -120,7 +120,7 @@ def page_context(
         "metric_title": "" if metric is None else label(metric)[:1].upper() + label(metric)[1:],
         "bound": bound,
         "extra_sections": extra,
-        "outcomes": sections.outcome_grid(run.all_cases),
+        "outcomes": sections.outcome_grid(run.all_cases, str(run.configuration.get("scenario") or "")),
         "outcome_figures": sections.outcome_figures(run.all_cases),
         "crashed": sections.crashed_rows(run),
         "dispersions": sections.dispersion_grid(subject.run),

@@ -193,9 +193,14 @@ def read_evidence(record: Mapping[str, Any], *, uses_campaign_requirements: bool
 
 
 def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
-    """Replace PASS and MET BY RATE by INSUFFICIENT for evidence that allows no PASS (`Evidence.excludes_pass`)."""
-    if not evidence.excludes_pass or verdict.status not in (Status.PASS, Status.MET_BY_RATE):
+    """Replace PASS and MET BY RATE by INSUFFICIENT for evidence that allows no PASS (`Evidence.excludes_pass`).
+
+    Additional cases of such a run cannot lead to PASS either.
+    """
+    if not evidence.excludes_pass:
         return verdict
+    if verdict.status not in (Status.PASS, Status.MET_BY_RATE):
+        return replace(verdict, further_cases=None)
     reason = f"The verdict would be {verdict.status}. {evidence.text}"
     return replace(
         verdict, status=Status.INSUFFICIENT, withheld_status=verdict.status, reason=reason, further_cases=None

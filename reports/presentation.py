@@ -25,7 +25,7 @@ from marsyard.reports.rates import population_mask
 from marsyard.reports.section import SectionMaker, SvgFigure
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import NOTHING, numbers, primary_metric
-from marsyard.scenarios.systems import systems
+from marsyard.scenarios.systems import find_system, systems
 from marsyard.scenarios.user_files import import_object
 
 Products = Mapping[str, Any]
@@ -106,6 +106,18 @@ def presentations() -> tuple[Presentation, ...]:
             type_name = type(presentation).__name__
             _warn(f"{description} is a {type_name}; allowed: a marsyard.reports.presentation.Presentation")
     return tuple(valid_presentations)
+
+
+def system_presentation(scenario: str) -> Presentation | None:
+    """Return the presentation of the system with this scenario; None without one."""
+    system = find_system(scenario)
+    if system is None or not system.report:
+        return None
+    try:
+        presentation = import_object(system.report)
+    except ImportError:
+        return None
+    return presentation if isinstance(presentation, Presentation) else None
 
 
 def _warn(reason: str) -> None:

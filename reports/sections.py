@@ -26,7 +26,7 @@ from pydantic import BaseModel
 from marsyard.algorithms.answers import Fault
 from marsyard.campaigns.definition.configuration import description_at
 from marsyard.reports import figures
-from marsyard.reports.presentation import presentations
+from marsyard.reports.presentation import presentations, system_presentation
 from marsyard.reports.rates import CONFIDENCE, engine_failed, population_mask, terrain_groups
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid, SvgFigure, svg_figure
@@ -106,9 +106,15 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def outcome_grid(frame: pd.DataFrame) -> Grid:
-    """Count the cases by outcome, with the meaning of each outcome."""
-    kinds: list[type[Enum]] = [Fault, *(kind for presentation in presentations() for kind in presentation.outcomes)]
+def outcome_grid(frame: pd.DataFrame, scenario: str) -> Grid:
+    """Count the cases by outcome, with the meaning of each outcome in the system of the scenario.
+
+    Systems have outcomes of the same name; those of other systems are used for a scenario without a system.
+    """
+    own = system_presentation(scenario)
+    others = [presentation for presentation in presentations() if presentation is not own]
+    ordered = others if own is None else [*others, own]
+    kinds: list[type[Enum]] = [Fault, *(kind for presentation in ordered for kind in presentation.outcomes)]
     meanings = {member.name: str(member.value) for kind in kinds for member in kind}
     n_cases, counts = len(frame), outcome_counts(frame)
     rows = [[name, f"{cases:,}", percent(cases / n_cases), meanings.get(name, NOTHING)] for name, cases in counts]

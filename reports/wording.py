@@ -178,7 +178,8 @@ def label(column: str) -> str:
 def magnitude_label(column: str) -> str:
     """Return the magnitude of a column in words, with its unit: ``|velocity error| (m/s)``."""
     name, unit = split_unit(column)
-    return f"|{_to_words(name)}| ({unit})" if unit else f"|{_to_words(name)}|"
+    words = _read_notes()["labels"].get(column, _to_words(name))
+    return f"|{words}| ({unit})" if unit else f"|{words}|"
 
 
 def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
