@@ -191,6 +191,11 @@ def _bonett_interval(values: Float[np.ndarray, " n"], confidence: float) -> Inte
     return math.exp(0.5 * (centre - quantile * standard_error)), math.exp(0.5 * (centre + quantile * standard_error))
 
 
+def is_interpolated(n: int, probability: float) -> bool:
+    """Return whether a quantile of n values has at least one value beyond it; otherwise it is an extrapolation."""
+    return n * min(probability, 1.0 - probability) >= 1.0 - 1e-9
+
+
 def quantile_bounds(
     sample: Float[np.ndarray, " n"], quantile: float, confidence: float, groups: Groups = None
 ) -> Interval:
@@ -290,9 +295,7 @@ def summarize(
     sd_lower, sd_upper = standard_deviation_interval(finite, confidence, finite_groups)
     quantile_results = []
     for probability in quantiles:
-        # a quantile needs at least one value beyond it; otherwise it would be an extrapolation
-        is_estimate = n * min(probability, 1.0 - probability) >= 1.0 - 1e-9
-        estimate = float(np.quantile(finite, probability)) if is_estimate else math.nan
+        estimate = float(np.quantile(finite, probability)) if is_interpolated(n, probability) else math.nan
         bounds = quantile_bounds(finite, probability, confidence, finite_groups)
         quantile_results.append(Quantile(probability, estimate, *bounds))
     return ErrorSummary(
@@ -381,6 +384,6 @@ def circular_error(
     """
     finite = np.isfinite(errors).all(axis=1)
     radii = np.hypot(*errors[finite].T)
-    estimate = float(np.quantile(radii, probability)) if radii.size else math.nan
+    estimate = float(np.quantile(radii, probability)) if is_interpolated(radii.size, probability) else math.nan
     bounds = quantile_bounds(radii, probability, confidence, None if groups is None else groups[finite])
     return Quantile(probability, estimate, *bounds)
