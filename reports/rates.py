@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from marsyard.campaigns import errors
 from marsyard.reports.statistics.proportions import Interval, clustered_evidence, proportion_interval
+from marsyard.reports.statistics.samples import is_interpolated
 from marsyard.reports.wording import NOTHING, number, numbers, percent
 
 #: Outcomes of cases that the engine could not finish.
@@ -221,8 +222,9 @@ def rms(values: Float[np.ndarray, " n"]) -> float:
 
 
 def quantile(values: Float[np.ndarray, " n"], probability: float) -> float:
-    """Compute a quantile; NaN for no values."""
-    return float(np.quantile(values, probability)) if values.size else math.nan
+    """Compute a quantile; NaN if no value lies beyond it, which would be an extrapolation, except for the median."""
+    is_known = values.size > 0 and (probability == 0.5 or is_interpolated(values.size, probability))
+    return float(np.quantile(values, probability)) if is_known else math.nan
 
 
 def group_by_size(frame: pd.DataFrame, column: str, size: str, first: str) -> Iterator[tuple[str, float, pd.DataFrame]]:

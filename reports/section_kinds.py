@@ -362,7 +362,8 @@ class Quantiles:
         for quantity in self.quantities:
             values = finite_values(frame, quantity.column, quantity.scale)
             if values.size:
-                rows.append([quantity.title, *map(number, np.quantile(values, [*self.columns.values()]).tolist())])
+                quantiles = (rates.quantile(values, probability) for probability in self.columns.values())
+                rows.append([quantity.title, *map(number, quantiles)])
         block = Block(heading=self.heading, grid=Grid(["", *self.columns], rows), note=self.note)
         return ([block], {self.data: len(frame)} if self.data else {}) if rows else ([], {})
 

@@ -249,7 +249,7 @@ def _create_speed_blocks(landings: section_kinds.Rows, subject: Subject, key: st
         for values in columns:
             bound = quantile_bounds(values, probability, CONFIDENCE, groups)[1]
             bound_text = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
-            texts.append(f"{number(float(np.quantile(values, probability)))}{bound_text}")
+            texts.append(f"{number(rates.quantile(values, probability))}{bound_text}")
         rows.append([f"{format_fraction(probability)} quantile ({format_fraction(CONFIDENCE)} upper bound)", *texts])
     rows += [
         [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
