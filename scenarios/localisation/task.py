@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from marsyard.algorithms.localisation.baselines import FeatureEstimator, InertialEstimator
 from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
 from marsyard.algorithms.localisation.exchange import ExecutablePositionEstimator
@@ -15,11 +13,7 @@ LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
     name="localisation",
     what="position estimator",
     methods=("start", "imu", "altitude", "image", "finish"),
-    shipped={
-        "lvs": lambda options: MapRelativeEstimator(options),
-        "sift": lambda options: FeatureEstimator(options),
-        "inertial": lambda options: InertialEstimator(replace(options)),
-    },
+    shipped={"lvs": MapRelativeEstimator, "sift": FeatureEstimator, "inertial": InertialEstimator},
     executable=ExecutablePositionEstimator,
     options=LvsOptions,
     suite="marsyard.scenarios.localisation.conformance:PositionSuite",
