@@ -157,6 +157,8 @@ for panel, commands in PANELS.items():
     for command in commands:
         app.command(name=command.__name__.partition("_")[0], cls=_Command, rich_help_panel=panel)(command)
     if panel == "Worlds and images":
+        for registered in terrain.registered_commands:
+            registered.cls = _Command
         app.add_typer(terrain, name="terrain", cls=_Group, rich_help_panel=panel)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -101,19 +102,37 @@ def compile_kernels() -> None:
 
     The compiled code is cached and valid until the source code changes.
     """
-    from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.execution.worker_process import limit_threads
-    from marsyard.scenarios.systems import systems
-    from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
+    from joblib import Parallel, delayed
 
-    limit_threads()
-    for name, settings in (item for system in systems() for item in system.compilation_campaigns.items()):
-        campaign = load_campaign(name, settings)
-        scenario = campaign.configuration.scenario
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.scenarios.systems import systems
+    from marsyard.sim.kernel_cache import kernels_are_ready
+
+    compilations = [item for system in systems() for item in system.compilation_campaigns.items()]
+    campaigns = []
+    for name, settings in compilations:
+        scenario = load_campaign(name, settings).configuration.scenario
         if kernels_are_ready(scenario):
             typer.echo(f"{scenario}: already compiled")
-            continue
-        start_s = time.monotonic()
-        campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
-        mark_ready(scenario)
-        typer.echo(f"{scenario}: compiled, {time.monotonic() - start_s:.0f} s")
+        else:
+            campaigns.append((name, settings))
+    # all scenarios call the kernels of the renderer: the first one compiles them, then the others run in parallel
+    for group, jobs in ((campaigns[:1], 1), (campaigns[1:], 2)):
+        if group:
+            lines = Parallel(n_jobs=jobs, return_as="generator")(delayed(_compile_scenario)(*item) for item in group)
+            for line in lines:
+                typer.echo(line)
+
+
+def _compile_scenario(name: str, settings: Sequence[str]) -> str:
+    """Run one small case of a campaign, which compiles the kernels of its scenario; return a line of text."""
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.execution.worker_process import limit_threads
+    from marsyard.sim.kernel_cache import mark_ready
+
+    limit_threads()
+    campaign = load_campaign(name, settings)
+    start_s = time.monotonic()
+    campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
+    mark_ready(campaign.configuration.scenario)
+    return f"{campaign.configuration.scenario}: compiled, {time.monotonic() - start_s:.0f} s"

@@ -50,6 +50,7 @@ from marsyard.reports.wording import (
     percent,
     split_unit,
 )
+from marsyard.scenarios.descent.parameters import LandingParameters
 
 #: Rows of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
@@ -234,9 +235,20 @@ def landing_fractions(landings: section_kinds.Rows) -> dict[str, rates.CaseFract
         f"faster by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(change > MIN_SPEED_CHANGE_M_S, landings),
     }
     if rates.is_flag(landings, "in_time_assumed"):
-        name = "computation finished before ignition (of all landings)"
+        name = "assumed computation time ends before ignition"
         fractions[name] = rates.fraction_of(rates.flag_mask(landings, "in_time_assumed"), landings)
     return fractions
+
+
+def _landing_model(subject: Subject) -> dict[str, str]:
+    """Return the parameters of the campaign's model of the last seconds, for the note of the table of speeds."""
+    model = LandingParameters.model_validate(subject.run.parameter("landing") or {})
+    return {
+        "deadband": f"{model.steering_deadband_m_s:g}",
+        "max_steering": f"{model.max_steering_m_s:g}",
+        "steering": f"{100.0 * model.steering_error:g}",
+        "burn": f"{model.burn_error_m_s:g}",
+    }
 
 
 def _create_speed_blocks(landings: section_kinds.Rows, subject: Subject, key: str) -> section_kinds.BlocksAndData:
@@ -266,7 +278,9 @@ def _create_speed_blocks(landings: section_kinds.Rows, subject: Subject, key: st
         "largest_loss_m_s": float(change.max()),
     }
     gain, loss = number(data["largest_gain_m_s"]), number(data["largest_loss_m_s"])
-    note = note_text("dimes.landing", confidence=format_fraction(CONFIDENCE), gain=gain, loss=loss)
+    note = note_text(
+        "dimes.landing", confidence=format_fraction(CONFIDENCE), gain=gain, loss=loss, **_landing_model(subject)
+    )
     grid = Grid(["", "With correction", "Without correction"], rows)
     return [Block(heading="Speeds with and without the correction", grid=grid, note=note)], data
 
@@ -287,9 +301,7 @@ LANDING = section_kinds.SectionDeclaration(
             "Fraction of landings whose horizontal speed at touchdown is above the value on the axis.",
             complementary=True,
         ),
-        section_kinds.RateTable(
-            landing_fractions, cases="Landings", heading="Improved and degraded landings", data="fractions"
-        ),
+        section_kinds.RateTable(landing_fractions, cases="Landings", heading="Fractions of landings", data="fractions"),
         section_kinds.CustomBlocks(_create_speed_blocks),
     ),
 )

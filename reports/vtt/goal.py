@@ -136,8 +136,10 @@ def _expected_errors() -> str:
         errors.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
     min_runs = math.ceil(math.log(1.0 - CONFIDENCE) / math.log(QUANTILE))
     return (
-        f"By Eqs. 1 and 4, one pixel of disparity error at {GOAL_M:g} m corresponds to an error along the line of "
-        f"sight, and one pixel of drift to an error across it; for the paper's cameras: {'; '.join(errors)}. The "
+        f"Errors and drift are those of the completed runs at selectable targets. By Eqs. 1 and 4 of the paper, one "
+        f"pixel of disparity error at {GOAL_M:g} m corresponds to an error along the line of sight, and one pixel of "
+        f"drift to an error across it; for the paper's cameras: {'; '.join(errors)}. The measured errors also contain "
+        f"those of the camera calibration and of the mast angles. The "
         f"bound of the {format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence needs at least "
         f"{min_runs} runs."
     )
