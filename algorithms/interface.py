@@ -194,7 +194,7 @@ class SiteOutcome(Enum):
     """
 
     SAFE_SITE = "a safe site is reported"
-    NO_SAFE_SITE = "the mapped ground has no safe site"
+    NO_SAFE_SITE = "the algorithm finds no safe site in its map"
     NO_RANGE = "the altimeter measured no range"
     NO_FEATURES = "the first image has too few features"
     NO_TRACKS = "too few features were tracked to the second image"

@@ -117,7 +117,10 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
             f"standard deviation, {confidence} interval",
             *(interval(summary.sd_lower, summary.sd_upper) for summary in summaries),
         ],
-        ["robust standard deviation", *(number(summary.robust_sd) for summary in summaries)],
+        [
+            "robust standard deviation (1.4826 × median absolute deviation)",
+            *(number(summary.robust_sd) for summary in summaries),
+        ],
         ["root mean square", *(number(summary.rms) for summary in summaries)],
     ]
     for index, quantile in enumerate(summaries[0].quantiles):

@@ -247,9 +247,13 @@ def _create_table_2_blocks(landings: pd.DataFrame, subject: Subject, key: str) -
         if finite.any():
             lower, upper = mean_interval(values[finite], CONFIDENCE, None if groups is None else groups[finite])
             means[measure.column], intervals[measure.column] = float(values[finite].mean()), (lower, upper)
-            text = f"mean {number(means[measure.column])} ({number(lower)} to {number(upper)})"
-            range_text = " to ".join(number(float(quantile)) for quantile in np.quantile(values[finite], (0.05, 0.95)))
-            run_time = f"{1e3 * float(np.median(run_times_s)):.0f} ms (this host)" if run_times_s.size else NOTHING
+            interval = f" ({number(lower)} to {number(upper)})" if math.isfinite(lower) else ""
+            text = f"mean {number(means[measure.column])}{interval}"
+            quantiles = [rates.quantile(values[finite], probability) for probability in (0.05, 0.95)]
+            range_text = NOTHING if math.isnan(quantiles[0]) else " to ".join(map(number, quantiles))
+            run_time = (
+                f"median {1e3 * float(np.median(run_times_s)):.0f} ms (this host)" if run_times_s.size else NOTHING
+            )
             means_m = [f"{values.mean():.2f}" if values.size else NOTHING for values in deviations.values()]
             rows.append(
                 [f"this campaign, {measure.title}", f"{int(finite.sum()):,}", text, range_text, *means_m, run_time]
@@ -386,6 +390,10 @@ def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
     )
 
 
+def _milliseconds(seconds: float) -> str:
+    return NOTHING if math.isnan(seconds) else f"{1e3 * seconds:.1f}"
+
+
 def run_times_section(subject: Subject) -> Section | None:
     """Compare the CPU time of the four stages with Table I; None if no case completed all stages."""
     frame, stages = landing_rows(subject), PAPER["stages"]
@@ -396,16 +404,16 @@ def run_times_section(subject: Subject) -> Section | None:
     durations, rows_with_times, cases = durations[is_complete], frame[is_complete], int(is_complete.sum())
     if not cases or not durations.sum() > 0.0:
         return None
-    medians_s, percentiles_95_s = np.median(durations, axis=0), np.quantile(durations, 0.95, axis=0)
+    medians_s, percentiles_95_s = np.median(durations, axis=0), [rates.quantile(column, 0.95) for column in durations.T]
     paper_total_s, total_s = sum(stage["seconds"] for stage in stages), float(medians_s.sum())
     # the factor scales the total run time to that of the paper
     factor, rows, data = paper_total_s / total_s, [], []
-    for stage, median_s, p95_s in zip(stages, medians_s.tolist(), percentiles_95_s.tolist(), strict=True):
+    for stage, median_s, p95_s in zip(stages, medians_s.tolist(), percentiles_95_s, strict=True):
         sizes = [rates.quantile(rates.finite_values(rows_with_times, name), 0.5) for name in stage["ours"]]
         text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
         seconds = {"paper_s": stage["seconds"], "median_s": median_s, "p95_s": p95_s, "scaled_s": factor * median_s}
         data.append({"name": stage["name"], **seconds, "parameters": text})
-        times = [f"{stage['seconds']:.2f}", f"{1e3 * median_s:.1f}", f"{1e3 * p95_s:.1f}", f"{factor * median_s:.2f}"]
+        times = [f"{stage['seconds']:.2f}", f"{1e3 * median_s:.1f}", _milliseconds(p95_s), f"{factor * median_s:.2f}"]
         rows.append([stage["name"], *times, stage["parameters"], text])
     times = [f"{paper_total_s:.2f}", f"{1e3 * total_s:.1f}", NOTHING, f"{total_s * factor:.2f}"]
     rows.append(["Total", *times, NOTHING, NOTHING])

@@ -46,8 +46,9 @@ _MAX_BOOTSTRAP = 2000
 _N_RESAMPLES = 2000
 #: Fixed seed of the bootstrap, for reproducible reports.
 _SEED = 19340401
-#: Minimum number of terrains, and of independent values, to estimate a standard deviation.
-MIN_TERRAINS, _MIN_FOR_DEVIATION = 5, 8
+#: Minimum number of terrains, and of independent values, for intervals of a mean and of a standard deviation. The
+#: bootstrap of fewer values has too few distinct samples: of two values, its interval ends at these values.
+MIN_TERRAINS, MIN_FOR_MEAN, _MIN_FOR_DEVIATION = 5, 5, 8
 #: Minimum number of points of an ellipse.
 _MIN_FOR_ELLIPSE = 5
 #: Terrain number of each value; None if all are independent.
@@ -101,11 +102,11 @@ def _unite_intervals(first: Interval, second: Interval) -> Interval:
 def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
     """Two-sided interval of the mean: BCa bootstrap, or the central limit theorem in large samples.
 
-    NaN for fewer than two values or, if terrains are shared, fewer than five terrains. Equal values: that value.
+    NaN for fewer than five values or, if terrains are shared, fewer than five terrains. Equal values: that value.
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
-    if values.size < 2:
+    if values.size < MIN_FOR_MEAN:
         return math.nan, math.nan
     mean = float(values.mean())
     if np.ptp(values) == 0.0:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # scipy.signal is slow to import: it is loaded at its first use
 from jaxtyping import Float, Float64
 from numpy.random import Generator
 from scipy.interpolate import BSpline
 from scipy.ndimage import map_coordinates
-from scipy.signal import oaconvolve
 from scipy.sparse import csr_array
 
 #: Control points per correlation length.
@@ -51,7 +51,8 @@ class SmoothField:
         kernel = np.exp(-0.5 * (np.arange(-extent, extent + 1) / kernel_sd) ** 2)
         kernel /= np.sqrt(np.sum(np.convolve(kernel, _SPLINE_AT_KNOTS) ** 2))
         noise = rng.standard_normal((rows + 2 * extent, columns + 2 * extent))
-        control = oaconvolve(oaconvolve(noise, kernel[:, None], mode="valid"), kernel[None, :], mode="valid")
+        rows = scipy.signal.oaconvolve(noise, kernel[:, None], mode="valid")
+        control = scipy.signal.oaconvolve(rows, kernel[None, :], mode="valid")
         return cls(sd * control, np.asarray(low_m, dtype=np.float64) - 2.0 * spacing, spacing)
 
     def at(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float64[np.ndarray, "*batch"]:

@@ -6,10 +6,10 @@ from itertools import product
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+import scipy  # scipy.signal is slow to import: it is loaded at its first use
 from jaxtyping import Float64
 from numpy.random import Generator
 from pydantic import Field
-from scipy.signal import lfilter
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import Ground, draw_smooth_fields, refine, resample
@@ -253,7 +253,7 @@ def draw_channels(
         count = max(int(length_m / step), 2)
         correlation = np.exp(-step / (8.0 * width_m))
         noise = 2.0 * wander * np.sqrt(step / width_m) * rng.standard_normal(count)
-        deviation = np.asarray(lfilter([1.0], [1.0, -correlation], noise))
+        deviation = np.asarray(scipy.signal.lfilter([1.0], [1.0, -correlation], noise))
         steps = np.column_stack([np.cos(mean_heading + deviation), np.sin(mean_heading + deviation)]) * step
         fraction = (np.arange(count) + 0.5) / count
         taper = np.sqrt(np.minimum(1.0, 8.0 * fraction) * np.minimum(1.0, 5.0 * (1.0 - fraction)))

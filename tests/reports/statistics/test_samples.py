@@ -44,10 +44,11 @@ def test_mean_interval_of_a_large_sample_agrees_with_the_normal_interval() -> No
     assert lower < 3.0 < upper
 
 
-def test_mean_interval_needs_two_values() -> None:
-    assert all(math.isnan(bound) for bound in mean_interval(np.array([1.0]), 0.9))
+def test_mean_interval_needs_five_values() -> None:
+    assert all(math.isnan(bound) for bound in mean_interval(np.array([1.0, 2.0, 4.0, 3.0]), 0.9))
     assert mean_interval(np.full(5, 2.5), 0.9) == (2.5, 2.5)
-    assert len(mean_interval(np.array([1.0, 2.0]), 0.9)) == 2
+    lower, upper = mean_interval(np.array([1.0, 2.0, 4.0, 3.0, 5.0]), 0.9)
+    assert 1.0 < lower < 3.0 < upper < 5.0
 
 
 def test_summary_agrees_with_known_values() -> None:
