@@ -2,5 +2,7 @@
 # Runs the tests on all cores; words given are passed to pytest.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+# the tests start hundreds of processes: without stored bytecode each one compiles all modules again
+unset PYTHONDONTWRITEBYTECODE
 # a file's tests stay in one process: what they share is made once
 exec .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --durations=50 --durations-min=1 "$@"
