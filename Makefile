@@ -1,10 +1,10 @@
-# Marsyard's tasks. `make` alone lists them. Each sets up what it needs first; doing so again costs nothing.
+# Marsyard's tasks; `make` lists them. Each one first runs the set-up, which returns immediately if it is complete.
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint format bench bench-check docs validate constraints clean distclean
 
 BIN := .venv/bin
-# More words for pytest, as in: make test PYTEST_ARGS="-k camera"
+# Further arguments of pytest: make test PYTEST_ARGS="-k camera"
 PYTEST_ARGS ?=
 
 help: ## List the tasks
@@ -23,7 +23,7 @@ test: setup ## Run all checks and tests
 lint: setup ## Run the static checks: ruff, mypy, import-linter, codespell
 	@tools/lint.sh
 
-format: setup ## Rewrite the sources in the project's format, mending what can be mended
+format: setup ## Format the sources, and correct what ruff can correct
 	$(BIN)/ruff check --no-cache --fix-only .
 	$(BIN)/ruff format .
 
@@ -36,7 +36,7 @@ validate: setup ## Run the slow tests, and compare with the papers' published re
 	@tools/test.sh -m slow
 	$(BIN)/python -m benchmarks.validation
 
-bench-check: setup ## Say whether hot paths are slower than when their ratios were last kept
+bench-check: setup ## Compare the speed of hot paths with the stored ratios
 	$(BIN)/python -m benchmarks.check
 
 docs: setup ## Build the documentation site into build/docs

@@ -3,11 +3,11 @@
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=.venv/bin
-[ -x "$bin/ruff" ] || { echo "lint: no environment yet: run 'make setup' first" >&2; exit 2; }
+[ -x "$bin/ruff" ] || { echo "lint: no environment: run 'make setup' first" >&2; exit 2; }
 
 check() {
     case "$1" in
-        # Without its cache, which keeps what a file was called sorted when a folder it imports from has moved since.
+        # without its cache, which is outdated after a folder has moved
         lint) "$bin/ruff" check --no-cache . ;;
         format) "$bin/ruff" format --check . ;;
         types) "$bin/mypy" ;;

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes everything that Marsyard needs: system libraries for off-screen rendering and the environment in .venv.
-# Run it as often as you like: when nothing has changed it returns at once.
+# Installs what Marsyard needs: system libraries for off-screen rendering, and the environment in .venv.
+# If nothing has changed, it returns immediately.
 #
 #   PYTHON=/path/to/python   the interpreter to build .venv with; otherwise the first Python >= 3.11 on the PATH
 set -euo pipefail
@@ -8,9 +8,9 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 venv=.venv
 stamp=$venv/.setup-done             # what the environment was made from, written last
-unfinished=$venv/.setup-unfinished # there while pip is at work: whoever finds it starts over
+unfinished=$venv/.setup-unfinished # exists while pip runs; if it is left over, the environment is created again
 
-# What each GL backend needs of Debian. The libraries beside Mesa's are for pyrender, which loads its viewer with itself.
+# Debian packages of each GL backend. Those that are not of Mesa are for pyrender, which imports its viewer.
 osmesa=(libosmesa6 libgl1 libxrender1)
 egl=(libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libxrender1)
 either="install ${osmesa[*]}, or else ${egl[*]} (sudo apt-get install ...)"
@@ -18,7 +18,7 @@ either="install ${osmesa[*]}, or else ${egl[*]} (sudo apt-get install ...)"
 say() { printf 'setup: %s\n' "$*"; }
 fail() { printf 'setup: %s\n' "$*" >&2; exit 1; }
 
-# --- what is there ----------------------------------------------------------------------------------------------------
+# --- existing software ----------------------------------------------------------------------------------------------------
 
 is_python() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; }
 
@@ -30,10 +30,10 @@ find_python() {
             return
         fi
     done
-    fail "Python 3.11 or newer not found: install it (sudo apt-get install python3 python3-venv), or say PYTHON=/path/to/python"
+    fail "Python 3.11 or newer not found: install it (sudo apt-get install python3 python3-venv), or set PYTHON=/path/to/python"
 }
 
-# The environment's foundation; another interpreter or place means a new environment.
+# Interpreter and folder of the environment; if they change, it is created again.
 foundation() { printf '%s %s' "$PWD" "$("$venv/bin/python" -c 'import sys; print(sys.version.split()[0])')"; }
 
 contents() { cat pyproject.toml constraints.txt tools/setup.sh | sha256sum | cut -d ' ' -f 1; }
@@ -67,14 +67,14 @@ can_install() {
 apt_install() {
     local options=(-qq -y --no-install-recommends -o DPkg::Lock::Timeout=300)
     if [ -z "$apt_refreshed" ]; then
-        $as_root apt-get -qq -o DPkg::Lock::Timeout=300 update >/dev/null 2>&1 || say "apt-get update failed; going on with the lists there are"
+        $as_root apt-get -qq -o DPkg::Lock::Timeout=300 update >/dev/null 2>&1 || say "apt-get update failed; the existing package lists are used"
         apt_refreshed=yes
     fi
     say "installing $*"
     $as_root env DEBIAN_FRONTEND=noninteractive apt-get install "${options[@]}" "$@" >/dev/null 2>&1 </dev/null
 }
 
-# Installs a group of packages, or says in one line what to install and how.
+# Installs a group of packages, or prints in one line what to install.
 need() {
     if can_install && apt_install "$@"; then
         return 0
@@ -83,7 +83,7 @@ need() {
     return 1
 }
 
-# Each backend in its own group: recent Mesa no longer has OSMesa, and EGL must do without it.
+# Each backend is a group of its own: recent versions of Mesa have EGL, but not OSMesa.
 install_gl_libraries() {
     local loadable
     loadable=" $("$1" tools/gl_backends.py) "
@@ -97,7 +97,7 @@ install_gl_libraries() {
 # The tests build an example in C.
 install_compiler() { command -v cc >/dev/null || need gcc libc6-dev || true; }
 
-# The tests of pages drive Debian's own browser; nothing fetches another.
+# The tests of pages use Debian's browser; no other browser is downloaded.
 install_browser() { command -v chromium >/dev/null || need chromium || true; }
 
 # --- the environment --------------------------------------------------------------------------------------------------
@@ -119,7 +119,7 @@ install_packages() {
     say "installing the packages pinned in constraints.txt (about a minute)"
     local install=("$venv/bin/python" -m pip install -qq --no-input --disable-pip-version-check --progress-bar off -c constraints.txt)
     : >"$unfinished"
-    # setuptools first, from the same pins: building in isolation would fetch another one, past the constraints
+    # setuptools first, with its pinned version: an isolated build would download another version
     "${install[@]}" pip setuptools
     "${install[@]}" --no-build-isolation -e '.[dask,dev,docs,geo,spice]'
 }
@@ -130,16 +130,16 @@ check_rendering() {
         if "$venv/bin/python" -P marsyard/gl_probe.py "$backend" >/dev/null 2>&1 </dev/null; then
             works=yes
         else
-            say "pyrender renders nothing with $backend; 'marsyard doctor' says more"
+            say "pyrender renders nothing with $backend; 'marsyard doctor' shows the cause"
         fi
     done
     [ -n "$works" ] || fail "no GL backend renders an image: $either"
 }
 
-# Otherwise the first run of each system waits for it.
+# Otherwise the first run of each system compiles them.
 compile_kernels() {
     say "compiling numeric kernels (about a minute)"
-    "$venv/bin/marsyard" compile >/dev/null </dev/null || say "kernels were not compiled: 'marsyard compile' says why; the first runs will"
+    "$venv/bin/marsyard" compile >/dev/null </dev/null || say "kernels were not compiled: 'marsyard compile' shows the cause; the first runs compile them"
 }
 
 # One set-up at a time in one folder.

@@ -4,5 +4,5 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # the tests start hundreds of processes: without stored bytecode each one compiles all modules again
 unset PYTHONDONTWRITEBYTECODE
-# a file's tests stay in one process: what they share is made once
+# the tests of a file run in one process, so that their fixtures are created once
 exec .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --durations=50 --durations-min=1 "$@"
