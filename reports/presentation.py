@@ -25,8 +25,8 @@ from marsyard.reports.rates import population_mask
 from marsyard.reports.section import SectionMaker, SvgFigure
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import NOTHING, numbers, primary_metric
+from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.systems import find_system, systems
-from marsyard.scenarios.user_files import import_object
 
 Products = Mapping[str, Any]
 

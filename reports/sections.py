@@ -23,7 +23,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from pydantic import BaseModel
 
-from marsyard.algorithms.answers import Fault
+from marsyard.algorithms.faults import Fault
 from marsyard.campaigns.definition.configuration import description_at
 from marsyard.reports import figures
 from marsyard.reports.presentation import presentations, system_presentation

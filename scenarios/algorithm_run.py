@@ -18,8 +18,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.answers import AlgorithmError, Fault, describe_error
 from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails
+from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
 from marsyard.scenarios.estimators import Task, check_algorithms, labels
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_conditions
 

@@ -33,6 +33,7 @@ from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlob
 from marsyard.algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
 from marsyard.algorithms.vtt import options as vtt_options
+from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.offline import (
     SITE_FORMAT,
     VELOCITY_FORMAT,
@@ -43,7 +44,6 @@ from marsyard.scenarios.offline import (
     read_answers,
 )
 from marsyard.scenarios.systems import systems
-from marsyard.scenarios.user_files import import_object, source_files
 
 #: Entry point group of other packages' algorithms.
 GROUP = "marsyard.algorithms"

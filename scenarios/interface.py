@@ -49,7 +49,7 @@ def conditions_recorded_by(recorder: Callable[[Mapping[str, Scalar]], None]) -> 
 class Failure:
     """Failure of the algorithm under test in an otherwise valid case.
 
-    - outcome: a name of `marsyard.algorithms.answers.Fault`
+    - outcome: a name of `marsyard.algorithms.faults.Fault`
     - error, trace: message and traceback, stored in the columns `error` and `traceback`
     """
 

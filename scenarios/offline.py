@@ -18,8 +18,9 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from marsyard.algorithms.answers import AlgorithmError, Fault, check_site, check_velocity
+from marsyard.algorithms.answers import check_site, check_velocity
 from marsyard.algorithms.exchange import write_case
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.user_files import check_column_groups, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular

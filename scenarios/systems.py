@@ -20,8 +20,8 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import cast
 
+from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.interface import Scenario
-from marsyard.scenarios.user_files import import_object
 from marsyard.sim.parameters import warn_deprecated
 
 #: Folder of the files that the systems of Marsyard share.

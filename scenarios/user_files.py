@@ -1,13 +1,10 @@
-"""Read a user's files: input files with hashes, tables, Python objects, and axes of recorded poses."""
+"""Read a user's files: input files with hashes, tables, and axes of recorded poses."""
 
 from __future__ import annotations
 
 import csv
 import difflib
-import importlib
-import importlib.util
 import math
-import sys
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,65 +15,10 @@ from jaxtyping import Float64
 from pydantic import BaseModel, Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.answers import AlgorithmError
+from marsyard.algorithms.faults import AlgorithmError
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import SITE_FROM_WORLD
 from marsyard.sim.parameters import Parameters
-
-#: Former top-level names of the subpackages of `marsyard`.
-_FORMER_PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports")
-
-
-def current_module(module: str) -> str:
-    """Return the current name of a module whose former name a stored campaign or an older file contains.
-
-    ``algorithms.dimes`` becomes ``marsyard.algorithms.dimes``; names of other packages are returned unchanged.
-    """
-    if module.partition(".")[0] not in _FORMER_PACKAGES:
-        return module
-    try:
-        exists = importlib.util.find_spec(f"marsyard.{module}") is not None
-    except ImportError:
-        exists = False
-    return f"marsyard.{module}" if exists else module
-
-
-def import_object(path: str) -> Any:
-    """Import the object at ``module:name``. Raises ImportError with the reason.
-
-    The current folder is searched last: a file in it never shadows an installed package.
-    """
-    module, _, name = path.partition(":")
-    current_folder = str(Path.cwd())
-    if current_folder not in sys.path:
-        sys.path.append(current_folder)
-    try:
-        return getattr(importlib.import_module(current_module(module)), name)
-    except ImportError:
-        raise
-    except Exception as error:  # a module may raise anything
-        raise ImportError(f"{type(error).__name__}: {error}") from error
-
-
-def source_files(path: str) -> Iterator[tuple[str, Path]]:
-    """Yield names and files of the sources of the package or module that contains ``module:name``."""
-    parts = current_module(path.partition(":")[0]).split(".")
-    package = ".".join(parts[:2] if parts[0] == "marsyard" else parts[:1])
-    spec = importlib.util.find_spec(package)
-    if spec is None or spec.origin is None:
-        return
-    origin = Path(spec.origin)
-    if spec.submodule_search_locations:
-        yield from relative_to(origin.parent.parent, sorted(origin.parent.rglob("*.py")))
-    else:
-        yield origin.name, origin
-
-
-def relative_to(base: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
-    """Yield files with their names relative to a folder."""
-    for path in paths:
-        yield path.relative_to(base).as_posix(), path
-
 
 Row = TypeVar("Row")
 

@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from marsyard.algorithms.answers import AlgorithmError, Fault, StreamedEstimator, check_and_set_span
+from marsyard.algorithms.answers import StreamedEstimator, check_and_set_span
 from marsyard.algorithms.dimes import DimesDetails, dimes_products
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm_on_copy
 from marsyard.scenarios.interface import Scalar

@@ -9,7 +9,7 @@ from typing import Any
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms import interface
-from marsyard.algorithms.answers import bad_answer, check_aim, check_site, check_update, check_velocity
+from marsyard.algorithms.answers import check_aim, check_site, check_update, check_velocity
 from marsyard.algorithms.exchange.files import encode_pose, encode_target, write_frame, write_mast, write_stop
 from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command, ExecutableLimits
 from marsyard.algorithms.exchange.serving import (
@@ -20,6 +20,7 @@ from marsyard.algorithms.exchange.serving import (
     read_numbers,
     run_case,
 )
+from marsyard.algorithms.faults import bad_answer
 from marsyard.sim.measurements import (
     DescentFrame,
     DescentMeasurements,

@@ -22,7 +22,7 @@ from typing import IO, Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from marsyard.algorithms.answers import AlgorithmError, Fault
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.processes import descendants, resident_bytes
 
 #: Interval of the limit checks, seconds.

@@ -20,9 +20,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from marsyard.algorithms.answers import AlgorithmError, Fault, bad_answer
 from marsyard.algorithms.exchange.files import ANSWER_VERSIONS, write_case
 from marsyard.algorithms.exchange.process import Command, ExecutableLimits, Output, RunningProgram, shorten
+from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements
 
 Member = TypeVar("Member", bound=Enum)

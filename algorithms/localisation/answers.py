@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.answers import bad_answer, check_covariance, check_numbers, check_type
+from marsyard.algorithms.answers import check_covariance, check_numbers, check_type
+from marsyard.algorithms.faults import bad_answer
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 
 

@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.answers import bad_answer
 from marsyard.algorithms.exchange import Command, ExecutableLimits, ProgramDetails
 from marsyard.algorithms.exchange.files import (
     ANSWER_VERSIONS,
@@ -35,6 +34,7 @@ from marsyard.algorithms.exchange.files import (
 )
 from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS
 from marsyard.algorithms.exchange.serving import Answer, AnswerReader, Session, check_keys, read_member, read_numbers
+from marsyard.algorithms.faults import bad_answer
 from marsyard.algorithms.localisation.answers import check_estimate
 from marsyard.algorithms.localisation.interface import (
     InitialState,

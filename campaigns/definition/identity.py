@@ -26,10 +26,11 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
 from marsyard.scenarios.estimators import algorithm_sources, list_installed
+from marsyard.scenarios.imports import import_object, relative_to, source_files
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.offline import answers_file, is_offline
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
-from marsyard.scenarios.user_files import import_object, input_files, relative_to, source_files
+from marsyard.scenarios.user_files import input_files
 
 #: Folders of the packages whose code determines rows; reports and commands do not affect rows.
 _CODE_FOLDERS = ("sim", "algorithms", "scenarios", "campaigns")

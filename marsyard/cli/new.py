@@ -57,9 +57,9 @@ def new(arguments: NewOptions) -> None:
     from marsyard.campaigns.errors import CampaignError, unknown_name_message
     from marsyard.cli.outcome import evidence_limits
     from marsyard.reports.wording import count
+    from marsyard.scenarios.imports import import_object
     from marsyard.scenarios.systems import template_paths
     from marsyard.scenarios.template import Choices
-    from marsyard.scenarios.user_files import import_object
     from marsyard.sim.terrain import sites
 
     name = arguments.name
@@ -183,8 +183,8 @@ def ingest(
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
     from marsyard.reports.wording import count
+    from marsyard.scenarios.imports import import_object
     from marsyard.scenarios.systems import systems
-    from marsyard.scenarios.user_files import import_object
 
     importers = {candidate.name: candidate.ingest for candidate in systems() if candidate.ingest}
     name = system or next(iter(importers))

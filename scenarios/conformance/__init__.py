@@ -19,9 +19,9 @@ from marsyard.scenarios.conformance import estimators, parts, trackers
 from marsyard.scenarios.conformance.checks import Finding as Finding
 from marsyard.scenarios.conformance.checks import Suite
 from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, list_installed
+from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.parts.named import KINDS
 from marsyard.scenarios.systems import systems
-from marsyard.scenarios.user_files import import_object
 
 
 @cache

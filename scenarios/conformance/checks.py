@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.algorithms.answers import AlgorithmError
+from marsyard.algorithms.faults import AlgorithmError
 from marsyard.scenarios.algorithm_run import copy_inputs, hash_inputs
 from marsyard.scenarios.estimators import algorithm_sources
 

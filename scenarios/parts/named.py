@@ -18,8 +18,8 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel, Discriminator, Field, JsonValue, ValidationError, model_validator
 
+from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.user_files import import_object
 from marsyard.sim.parameters import Parameters
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.answers import AlgorithmError, Fault, check_site, check_velocity
+from marsyard.algorithms.answers import check_site, check_velocity
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableVelocityEstimator,
@@ -24,6 +24,7 @@ from marsyard.algorithms.exchange import (
 )
 from marsyard.algorithms.exchange.process import RunningProgram
 from marsyard.algorithms.exchange.serving import end_idle_programs
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, PoseMeasurement
 from tests.algorithms.synthetic_descent import Flight, render, tilt_body

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.answers import AlgorithmError, Fault
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableTargetTracker,
@@ -22,6 +21,7 @@ from marsyard.algorithms.exchange import (
 )
 from marsyard.algorithms.exchange.files import encode_target, write_mast, write_stop
 from marsyard.algorithms.exchange.serving import end_idle_programs
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
 from marsyard.scenarios.conformance import trackers

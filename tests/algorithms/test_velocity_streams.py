@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.algorithms.answers import AlgorithmError, Fault, StreamedEstimator, check_and_set_span, check_velocity
+from marsyard.algorithms.answers import StreamedEstimator, check_and_set_span, check_velocity
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
@@ -22,6 +22,7 @@ from marsyard.algorithms.exchange import (
     write_frame,
 )
 from marsyard.algorithms.exchange.serving import end_idle_programs
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.systems import RowColumns, row_columns, scenario_paths
-from marsyard.scenarios.user_files import import_object
 
 
 def _list_undeclared_columns(row: Any, declared_columns: RowColumns, custom_prefixes: tuple[str, ...]) -> list[str]:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from marsyard.algorithms.dimes import DimesEstimator
-from marsyard.scenarios.user_files import current_module, import_object, source_files
+from marsyard.scenarios.imports import current_module, import_object, source_files
 
 
 def test_former_package_names_are_resolved() -> None:

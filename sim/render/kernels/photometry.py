@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
 
+from marsyard.sim.render.kernels.noise import NoiseBuffers, noise_3d
+from marsyard.sim.render.kernels.strips import STRIP
+from marsyard.sim.render.kernels.structs import Array32
 from marsyard.sim.terrain.kernels import Array
 
 #: Sine of the elevation below which the sky's brightness is constant.
@@ -70,7 +72,7 @@ def scattered_irradiance(sun_z: float, depth: float, asymmetry: float) -> float:
     return total / (steps * steps)
 
 
-#: Mean square of `gradient_noise` over space.
+#: Mean square of `noise_3d` over space.
 NOISE_VARIANCE = 0.0732
 #: A pixel averages over its area: a wave of f cycles per footprint keeps the fraction sinc(f) of its amplitude. (The
 #: detector model applies the blur of the optics.) Noise with cells of c footprints has a median frequency of 0.53
@@ -82,100 +84,45 @@ FADING = 0.231
 MIN_CELLS = math.sqrt(FADING)
 
 
-@njit(cache=True)
-def _hash_point(i: int, j: int, k: int, seed: int) -> np.uint32:
-    """Hash a lattice point (the finaliser of MurmurHash3 over a linear combination of its coordinates)."""
-    h = np.uint32(i) * np.uint32(0x8DA6B343)
-    h ^= np.uint32(j) * np.uint32(0xD8163841)
-    h ^= np.uint32(k) * np.uint32(0xCB1AB31F)
-    h ^= np.uint32(seed) * np.uint32(0x9E3779B1)
-    h ^= h >> np.uint32(16)
-    h *= np.uint32(0x85EBCA6B)
-    h ^= h >> np.uint32(13)
-    h *= np.uint32(0xC2B2AE35)
-    h ^= h >> np.uint32(16)
-    return h
-
-
-@njit(cache=True)
-def _gradient_product(h: np.uint32, x: float, y: float, z: float) -> float:
-    """Scalar product of an offset and one of Perlin's twelve gradients.
-
-    The last four bits of a hash select one of 16 entries: four gradients have two entries. Written without a table,
-    and with selections instead of branches, for vector instructions.
-    """
-    selector = h & np.uint32(15)
-    first = x if selector < np.uint32(8) else y
-    second = y if selector < np.uint32(4) else (x if selector & np.uint32(13) == np.uint32(12) else z)
-    return (-first if selector & np.uint32(1) else first) + (-second if selector & np.uint32(2) else second)
-
-
-@njit(cache=True, inline="always")
-def gradient_noise(x: float, y: float, z: float, seed: int) -> float:
-    """Perlin's improved noise (2002): smooth, of mean zero, with wavelengths of about one to two units."""
-    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
-    i, j, k = int(fx), int(fy), int(fz)
-    x, y, z = x - fx, y - fy, z - fz
-    u = x * x * x * (x * (x * 6.0 - 15.0) + 10.0)
-    v = y * y * y * (y * (y * 6.0 - 15.0) + 10.0)
-    w = z * z * z * (z * (z * 6.0 - 15.0) + 10.0)
-    below = (1.0 - v) * (
-        (1.0 - u) * _gradient_product(_hash_point(i, j, k, seed), x, y, z)
-        + u * _gradient_product(_hash_point(i + 1, j, k, seed), x - 1.0, y, z)
-    ) + v * (
-        (1.0 - u) * _gradient_product(_hash_point(i, j + 1, k, seed), x, y - 1.0, z)
-        + u * _gradient_product(_hash_point(i + 1, j + 1, k, seed), x - 1.0, y - 1.0, z)
-    )
-    above = (1.0 - v) * (
-        (1.0 - u) * _gradient_product(_hash_point(i, j, k + 1, seed), x, y, z - 1.0)
-        + u * _gradient_product(_hash_point(i + 1, j, k + 1, seed), x - 1.0, y, z - 1.0)
-    ) + v * (
-        (1.0 - u) * _gradient_product(_hash_point(i, j + 1, k + 1, seed), x, y - 1.0, z - 1.0)
-        + u * _gradient_product(_hash_point(i + 1, j + 1, k + 1, seed), x - 1.0, y - 1.0, z - 1.0)
-    )
-    noise: float = (1.0 - w) * below + w * above
-    return noise
-
-
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _add_octave(
-    x: Array,
-    y: Array,
-    z: Array,
-    footprint: Array,
-    cell: float,
-    octave: tuple[int, float],
-    strength: Array,
-    change: Array,
+    noise: Array32, footprint: Array, cell: float, amplitude: float, strength: Array, change: Array
 ) -> None:
-    """Add one octave of `add_texture`; `octave` contains its number and amplitude."""
-    number, amplitude = octave
-    for k in range(x.size):
+    """Add one octave of `add_texture`."""
+    for k in range(min(footprint.size, STRIP)):
         ratio = footprint[k] / cell
         fade = max(1.0 - FADING * ratio * ratio, 0.0)
         gain = strength[k] * amplitude * (fade * fade)
-        noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, number)
-        change[k] += gain * noise - 0.5 * NOISE_VARIANCE * gain**2
+        change[k] += gain * noise[k] - 0.5 * NOISE_VARIANCE * gain * gain
 
 
 @njit(cache=True)
 def add_texture(
-    x: Array, y: Array, z: Array, footprint: Array, coarsest: float, amplitudes: Array, strength: Array, change: Array
+    position: tuple[Array, Array, Array],
+    footprint: Array,
+    texture: tuple[float, Array],
+    strength: Array,
+    buffers: NoiseBuffers,
+    change: Array,
 ) -> None:
     """Add the logarithm of the relative albedo, averaged over the pixels' footprints, to `change`.
 
+    - position, footprint, strength: coordinates of up to `STRIP` points, their footprints, factors of the amplitudes
+    - texture: cell size of the coarsest octave, and amplitudes of the octaves
+
     Octave n has lattice cells of ``coarsest / 2**n``. It fades by the average over the pixel (`FADING`), so that detail
     appears gradually as a camera approaches the surface. Half of each octave's variance is subtracted (mean of a
-    log-normal variable): the mean albedo does not depend on the number of visible octaves. `strength` is a factor of
-    the amplitudes. Pixels with an infinite footprint have no texture.
+    log-normal variable): the mean albedo does not depend on the number of visible octaves. Pixels with an infinite
+    footprint have no texture.
     """
     finest = math.inf
     for k in range(footprint.size):
         finest = min(finest, footprint[k])
-    cell = coarsest
+    cell, amplitudes = texture
     for octave in range(amplitudes.size):
         if cell <= MIN_CELLS * finest:
             break
         if amplitudes[octave] != 0.0:
-            _add_octave(x, y, z, footprint, cell, (octave, amplitudes[octave]), strength, change)
+            noise_3d(position[0], position[1], position[2], cell, octave, buffers)
+            _add_octave(buffers.noise, footprint, cell, amplitudes[octave], strength, change)
         cell *= 0.5

@@ -10,6 +10,7 @@ from numba import njit
 
 from marsyard.sim.render.kernels.casters import Casters, sun_hidden
 from marsyard.sim.render.kernels.microrelief import add_relief_slopes, smith_shadowing
+from marsyard.sim.render.kernels.noise import NoiseBuffers, allocate_noise
 from marsyard.sim.render.kernels.photometry import add_texture, sky_brightness
 from marsyard.sim.render.kernels.primary import MIN_INCIDENCE_SINE
 from marsyard.sim.render.kernels.strips import (
@@ -92,6 +93,7 @@ class _Strip(NamedTuple):
     - ground, blended, other: indices of pixels with ground, with two blended levels, and without ground; `other` is
       reused for the pixels with objects and for the pixels that are tested for shadows of objects
     - hidden: whether objects hide the sun
+    - noise: buffers of textures and micro-relief
     """
 
     work: Array
@@ -100,6 +102,7 @@ class _Strip(NamedTuple):
     blended: Longs
     other: Longs
     hidden: Flags
+    noise: NoiseBuffers
 
 
 @njit(cache=True, inline="always")
@@ -180,7 +183,7 @@ def _select_levels(spacing: float, top_level: int, hits: Hits, strip: _Strip) ->
 
     Returns the numbers of pixels with ground, of those with blended levels, and of pixels without ground.
     """
-    work, level_of_pixel, ground, blended, other, _hidden = strip
+    work, level_of_pixel, ground, blended, other = strip.work, strip.level, strip.ground, strip.blended, strip.other
     distance, triangle, level = hits.distance, hits.triangle, hits.level
     n_ground, n_blended, n_other = 0, 0, 0
     for k in range(distance.size):
@@ -281,7 +284,7 @@ def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
     x, y, footprint = work[X : X + width], work[Y : Y + width], work[FOOTPRINT : FOOTPRINT + width]
     relief_x, relief_y = work[RELIEF_SLOPE_X : RELIEF_SLOPE_X + width], work[RELIEF_SLOPE_Y : RELIEF_SLOPE_Y + width]
     resolved, unresolved = work[RESOLVED : RESOLVED + width], work[UNRESOLVED : UNRESOLVED + width]
-    add_relief_slopes(x, y, footprint, relief, relief_x, relief_y, resolved, unresolved)
+    add_relief_slopes(x, y, footprint, relief, strip.noise, relief_x, relief_y, resolved, unresolved)
     for k in range(width):
         factor = 0.0
         if footprint[k] < math.inf:
@@ -315,25 +318,22 @@ def _shade_roughness(width: int, work: Array) -> None:
 def _apply_texture(materials: Materials, width: int, n_objects: int, strip: _Strip) -> None:
     """Multiply the albedo of ground and objects by their textures."""
     work = strip.work
-    coarsest, amplitudes = materials.ground_texture
-    x, y, z = work[X : X + width], work[Y : Y + width], work[Z : Z + width]
+    position = work[X : X + width], work[Y : Y + width], work[Z : Z + width]
     strength = work[STRENGTH : STRENGTH + width]
     footprint, change = work[FOOTPRINT : FOOTPRINT + width], work[LOG_ALBEDO : LOG_ALBEDO + width]
-    add_texture(x, y, z, footprint, coarsest, amplitudes, strength, change)
+    add_texture(position, footprint, materials.ground_texture, strength, strip.noise, change)
     if n_objects > 0:
-        coarsest, amplitudes = materials.object_texture
-        x, y, z = (
+        position = (
             work[OBJECT_X : OBJECT_X + n_objects],
             work[OBJECT_Y : OBJECT_Y + n_objects],
             work[OBJECT_Z : OBJECT_Z + n_objects],
         )
-        footprint, change = (
-            work[OBJECT_FOOTPRINT : OBJECT_FOOTPRINT + n_objects],
-            work[OBJECT_LOG_ALBEDO : OBJECT_LOG_ALBEDO + n_objects],
-        )
+        footprint = work[OBJECT_FOOTPRINT : OBJECT_FOOTPRINT + n_objects]
+        change = work[OBJECT_LOG_ALBEDO : OBJECT_LOG_ALBEDO + n_objects]
         # full strength; the row of relief slopes is free at this point
-        work[RELIEF_SLOPE_X : RELIEF_SLOPE_X + n_objects] = 1.0
-        add_texture(x, y, z, footprint, coarsest, amplitudes, work[RELIEF_SLOPE_X : RELIEF_SLOPE_X + n_objects], change)
+        strength = work[RELIEF_SLOPE_X : RELIEF_SLOPE_X + n_objects]
+        strength[:] = 1.0
+        add_texture(position, footprint, materials.object_texture, strength, strip.noise, change)
         for m in range(n_objects):
             work[LOG_ALBEDO + strip.other[m]] = work[OBJECT_LOG_ALBEDO + m]
     for k in range(width):
@@ -480,9 +480,8 @@ def shade(
     buffers = allocate_cells()
     work = np.empty(ROWS * ROW)
     index_buffers = np.empty((4, STRIP), dtype=np.int64)
-    strip = _Strip(
-        work, index_buffers[0], index_buffers[1], index_buffers[2], index_buffers[3], np.empty(STRIP, dtype=np.bool_)
-    )
+    level, on_ground, blended, other = index_buffers
+    strip = _Strip(work, level, on_ground, blended, other, np.empty(STRIP, dtype=np.bool_), allocate_noise())
     count = rays.directions.shape[0]
     for first in range(0, count, STRIP):
         last = min(first + STRIP, count)

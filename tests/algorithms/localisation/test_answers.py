@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.answers import AlgorithmError, Fault
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.localisation.answers import check_estimate
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.answers import AlgorithmError, Fault
 from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails, parse_command
 from marsyard.algorithms.exchange.serving import idle_processes
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.localisation.baselines import InertialEstimator
 from marsyard.algorithms.localisation.exchange import (
     ExecutablePositionEstimator,

@@ -20,9 +20,10 @@ from marsyard.sim.render.kernels.microrelief import (
     MIN_CELLS,
     SLOPE_VARIANCE,
     add_relief_slopes,
-    relief_noise,
     smith_shadowing,
 )
+from marsyard.sim.render.kernels.noise import allocate_noise, noise_2d
+from marsyard.sim.render.kernels.strips import ROW, STRIP
 from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.microrelief import octave_heights
@@ -40,7 +41,22 @@ def _make_relief(coarsest_m: float, *heights_m: float) -> MicroRelief:
 
 def _sample_noise(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:
     """Compute value and x and y derivatives of the noise, shape (n, 3)."""
-    return np.array([relief_noise(x_cell, y_cell, seed) for x_cell, y_cell in zip(x.ravel(), y.ravel(), strict=True)])
+    buffers, values, flat_x, flat_y = allocate_noise(), np.empty((x.size, 3)), x.ravel(), y.ravel()
+    for first in range(0, x.size, STRIP):
+        strip = slice(first, first + STRIP)
+        noise_2d(flat_x[strip], flat_y[strip], 1.0, seed, buffers)
+        values[strip] = buffers.noise.reshape(3, ROW)[:, : len(values[strip])].T
+    return values
+
+
+def _add_slopes(x: np.ndarray, y: np.ndarray, footprint_m: np.ndarray, relief: MicroRelief) -> list[np.ndarray]:
+    """Compute slopes along x and y, and resolved and unresolved variance of slope, strip by strip."""
+    outputs, buffers = [np.zeros(x.size) for _ in range(4)], allocate_noise()
+    for first in range(0, x.size, STRIP):
+        strip = slice(first, first + STRIP)
+        parts = (output[strip] for output in outputs)
+        add_relief_slopes(x[strip], y[strip], footprint_m[strip], relief, buffers, *parts)
+    return outputs
 
 
 @pytest.fixture(scope="module")
@@ -57,11 +73,12 @@ def test_noise_has_the_specified_variances_and_derivatives() -> None:
     assert np.mean(noise[:, 0]) == pytest.approx(0.0, abs=0.005)
     assert np.mean(noise[:, 0] ** 2) == pytest.approx(HEIGHT_VARIANCE, rel=0.03)
     assert np.mean(noise[:, 1:] ** 2) == pytest.approx(SLOPE_VARIANCE, rel=0.03)
-    step = 1e-5
+    # the noise has single precision
+    step = 2e-3
     derivative_x = (_sample_noise(x + step, y)[:, 0] - _sample_noise(x - step, y)[:, 0]) / (2.0 * step)
     derivative_y = (_sample_noise(x, y + step)[:, 0] - _sample_noise(x, y - step)[:, 0]) / (2.0 * step)
-    np.testing.assert_allclose(noise[:, 1], derivative_x, atol=1e-5)
-    np.testing.assert_allclose(noise[:, 2], derivative_y, atol=1e-5)
+    np.testing.assert_allclose(noise[:, 1], derivative_x, atol=3e-4)
+    np.testing.assert_allclose(noise[:, 2], derivative_y, atol=3e-4)
 
 
 @pytest.mark.parametrize("hurst", [0.5, 0.75, 0.9])
@@ -104,17 +121,14 @@ def test_slopes_are_attenuated_as_by_averaging_over_a_pixel(cell_px: float) -> N
     slope = _sample_noise(x, y)[:, 1].reshape(pixels, samples_per_pixel, pixels, samples_per_pixel)
     expected = slope.mean(axis=(1, 3))
     u, v = (grid.ravel() for grid in np.meshgrid(centre, centre))
-    # Slopes in x and y; resolved and unresolved slope variance.
-    outputs = [np.zeros(u.size) for _ in range(4)]
-    add_relief_slopes(u, v, np.full(u.size, 1.0 / cell_px), _make_relief(1.0, 1.0), *outputs)
+    outputs = _add_slopes(u, v, np.full(u.size, 1.0 / cell_px), _make_relief(1.0, 1.0))
     assert np.std(outputs[0]) == pytest.approx(np.std(expected), rel=0.06)
     np.testing.assert_allclose(outputs[2] + outputs[3], SLOPE_VARIANCE)
 
 
 def test_unresolved_octaves_only_add_to_the_variance() -> None:
-    outputs = [np.zeros(1) for _ in range(4)]
     position = np.array([0.3])
-    add_relief_slopes(position, position, np.array([1.001 / MIN_CELLS]), _make_relief(1.0, 0.1, 0.1), *outputs)
+    outputs = _add_slopes(position, position, np.array([1.001 / MIN_CELLS]), _make_relief(1.0, 0.1, 0.1))
     assert outputs[0][0] == outputs[1][0] == outputs[2][0] == 0.0
     assert outputs[3][0] == pytest.approx((0.1**2 + 0.2**2) * SLOPE_VARIANCE)
     # Octaves with cells of up to sqrt(FADING) footprints are unresolved.

@@ -1,0 +1,64 @@
+"""Import objects by ``module:name``, and find the sources of their packages."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+#: Former top-level names of the subpackages of `marsyard`.
+_FORMER_PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports")
+
+
+def current_module(module: str) -> str:
+    """Return the current name of a module whose former name a stored campaign or an older file contains.
+
+    ``algorithms.dimes`` becomes ``marsyard.algorithms.dimes``; names of other packages are returned unchanged.
+    """
+    if module.partition(".")[0] not in _FORMER_PACKAGES:
+        return module
+    try:
+        exists = importlib.util.find_spec(f"marsyard.{module}") is not None
+    except ImportError:
+        exists = False
+    return f"marsyard.{module}" if exists else module
+
+
+def import_object(path: str) -> Any:
+    """Import the object at ``module:name``. Raises ImportError with the reason.
+
+    The current folder is searched last: a file in it never shadows an installed package.
+    """
+    module, _, name = path.partition(":")
+    current_folder = str(Path.cwd())
+    if current_folder not in sys.path:
+        sys.path.append(current_folder)
+    try:
+        return getattr(importlib.import_module(current_module(module)), name)
+    except ImportError:
+        raise
+    except Exception as error:  # a module may raise anything
+        raise ImportError(f"{type(error).__name__}: {error}") from error
+
+
+def source_files(path: str) -> Iterator[tuple[str, Path]]:
+    """Yield names and files of the sources of the package or module that contains ``module:name``."""
+    parts = current_module(path.partition(":")[0]).split(".")
+    package = ".".join(parts[:2] if parts[0] == "marsyard" else parts[:1])
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:
+        return
+    origin = Path(spec.origin)
+    if spec.submodule_search_locations:
+        yield from relative_to(origin.parent.parent, sorted(origin.parent.rglob("*.py")))
+    else:
+        yield origin.name, origin
+
+
+def relative_to(base: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
+    """Yield files with their names relative to a folder."""
+    for path in paths:
+        yield path.relative_to(base).as_posix(), path
