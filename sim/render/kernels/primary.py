@@ -160,12 +160,13 @@ def _take_newton_step(buffers: CellBuffers, width: int, work: Array) -> None:
     for k in range(min(width, STRIP)):
         height, slope_x, slope_y, _albedo = spline(buffers[0], buffers[1], k)
         t, start, scale, dz = work[DISTANCE + k], work[START + k], work[SCALE + k], work[DZ + k]
+        dx, dy = work[DX + k], work[DY + k]
         clearance = work[Z0 + k] + t * dz - height
-        rate = dz - slope_x * scale * work[DX + k] - slope_y * scale * work[DY + k]
+        rate = dz - slope_x * scale * dx - slope_y * scale * dy
         step = clearance / rate
         has_failed = rate > MAX_NEWTON_RATE or abs(t - step - start) > MAX_CHANGE * start
-        # after a shorter step the error is below 1e-6 of the distance: curvature is at most about 1 / spacing
-        is_far = step * step >= 2e-6 * start / scale
+        # after a shorter horizontal step the error is below 1e-6 of the distance: curvature is at most about 1 / spacing
+        is_far = step * step * (dx * dx + dy * dy) >= 2e-6 * start / scale
         is_active = work[ACTIVE + k] > 0.0
         work[DISTANCE + k] = (start if has_failed else t - step) if is_active else t
         work[ACTIVE + k] = 1.0 if is_active and is_far and not has_failed else 0.0
