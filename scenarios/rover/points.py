@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
 from marsyard.sim.dynamics import RoverParameters, Stance
 from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render import Objects, may_cast_shadow, rover_objects, rover_sphere
+from marsyard.sim.render.kernels.hierarchy import first_hits
 
 Vector = Float64[np.ndarray, "3"]
 Triangles = Float64[np.ndarray, "triangles 3 3"]
@@ -35,38 +36,9 @@ def sight_axes(line: Vector) -> Float64[np.ndarray, "3 3"]:
     return np.stack([forward, right, np.cross(right, forward)])
 
 
-def intersect_rays(
-    triangles: Triangles, origin: Vector, directions: Rays
-) -> tuple[Float64[np.ndarray, "rays"], Int64[np.ndarray, "rays"]]:
-    """Compute the distance to the first triangle on each ray and its index; infinite and -1 without an intersection.
-
-    Method and symbols q, u, v, t: Moeller & Trumbore, "Fast, Minimum Storage Ray/Triangle Intersection", J. Graphics
-    Tools 2(1), 1997.
-    """
-    corner = triangles[:, 0]
-    edge_1, edge_2 = triangles[:, 1] - corner, triangles[:, 2] - corner
-    from_corner = origin - corner
-    q = np.cross(from_corner, edge_1)
-    numerator = np.sum(edge_2 * q, axis=1)
-    nearest = np.full(len(directions), np.inf)
-    indices = np.full(len(directions), -1, dtype=np.int64)
-    for ray, direction in enumerate(directions):
-        normal = np.cross(direction, edge_2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1.0 / np.sum(edge_1 * normal, axis=1)
-            u = scale * np.sum(from_corner * normal, axis=1)
-            v = scale * (q @ direction)
-            t = scale * numerator
-        is_hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
-        if is_hit.any():
-            indices[ray] = np.argmin(np.where(is_hit, t, np.inf))
-            nearest[ray] = t[indices[ray]]
-    return nearest, indices
-
-
 def ray_distances(triangles: Triangles, origin: Vector, directions: Rays) -> Float64[np.ndarray, "rays"]:
     """Compute the distance along rays from one origin to the nearest triangle; infinite without an intersection."""
-    return intersect_rays(triangles, origin, directions)[0]
+    return np.asarray(first_hits(triangles, origin, directions)[0])
 
 
 def triangles_near_line(triangles: Triangles, viewpoint: Vector, point: Vector, half_angle_rad: float) -> Triangles:
@@ -90,7 +62,7 @@ def patch_normal(triangles: Triangles, viewpoint: Vector, point: Vector, half_an
     rays = axes[0] + offsets @ axes[1:]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     candidates = triangles_near_line(triangles, viewpoint, point, np.sqrt(2.0) * half_angle_rad)
-    _, indices = intersect_rays(candidates, viewpoint, rays)
+    _, indices = first_hits(candidates, viewpoint, rays)
     corners = candidates[indices[indices >= 0]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -56,6 +56,22 @@ def nearer_hit(best: TriangleHit, triangles: Array, n: int, ray: Ray, slack: flo
 
 
 @njit(cache=True)
+def first_hits(triangles: Array, origin: Array, directions: Array) -> tuple[Array, Longs]:
+    """Distance to the first triangle on each ray from an origin, and its index; infinite and -1 if there is none.
+
+    All triangles are tested: for few rays, or triangles that are used only once.
+    """
+    distances, numbers = np.empty(len(directions)), np.empty(len(directions), dtype=np.int64)
+    for k in range(len(directions)):
+        ray = Ray(origin[0], origin[1], origin[2], directions[k, 0], directions[k, 1], directions[k, 2])
+        best = TriangleHit(math.inf, -1, 0.0, 0.0)
+        for n in range(len(triangles)):
+            best = nearer_hit(best, triangles, n, ray, 0.0)
+        distances[k], numbers[k] = best.distance, best.triangle
+    return distances, numbers
+
+
+@njit(cache=True)
 def body_spheres(triangles: Array, first_triangle: Longs) -> Array:
     """Bounding sphere of each body: centre of its bounding box, and maximum distance of its corners from the centre.
 

@@ -165,7 +165,7 @@ def _take_newton_step(buffers: CellBuffers, width: int, work: Array) -> None:
         rate = dz - slope_x * scale * dx - slope_y * scale * dy
         step = clearance / rate
         has_failed = rate > MAX_NEWTON_RATE or abs(t - step - start) > MAX_CHANGE * start
-        # after a shorter horizontal step the error is below 1e-6 of the distance: curvature is at most about 1 / spacing
+        # after a shorter horizontal step the error is below 1e-6 of the distance: curvature is at most 1 / spacing
         is_far = step * step * (dx * dx + dy * dy) >= 2e-6 * start / scale
         is_active = work[ACTIVE + k] > 0.0
         work[DISTANCE + k] = (start if has_failed else t - step) if is_active else t
