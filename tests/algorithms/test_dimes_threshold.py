@@ -49,6 +49,7 @@ def test_default_threshold_matches_stored_derivation() -> None:
     assert low < STORED["threshold_m_s"] < high
 
 
+@pytest.mark.slow
 def test_confirmation_seed_has_similar_availability(confirmation_errors: np.ndarray) -> None:
     result = discrepancies(confirmation_errors, ThresholdInputs().imu_sd_m_s, np.random.default_rng(2))
     # The stored derivation accepts 99.52 %: of 250 cases, 1.2 +- 1.1 fail.
@@ -59,6 +60,7 @@ def test_confirmation_seed_has_similar_availability(confirmation_errors: np.ndar
     assert np.quantile(result.one_track, 0.9) == pytest.approx(expected["0.9"], rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracks_per_pair", [1, 2])
 @pytest.mark.parametrize("track_error_range_m_s", [(10.0, 10.0), (10.0, 60.0)])
 def test_one_wrong_track_rarely_causes_a_wrong_velocity(
@@ -81,11 +83,13 @@ def test_error_free_tracks_are_exact() -> None:
     assert np.abs(draw_errors(EXACT)).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_velocity_errors_have_the_match_error_deviation() -> None:
     errors = draw_errors(replace(EXACT, descents=80, match_sd_m_s=0.3))
     assert errors.std() == pytest.approx(0.3, rel=0.1)  # 640 values: 3 % is one standard deviation
 
 
+@pytest.mark.slow
 def test_common_attitude_error_causes_apparent_drift() -> None:
     # A tilt b (rad) at the velocity v causes an apparent velocity b x v. For 75 m/s down and 0.5 deg per axis it is
     # 0.65 m/s per axis. A heading error of 0.5 deg adds at most 0.26 m/s at 30 m/s of drift.

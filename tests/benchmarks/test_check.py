@@ -17,6 +17,7 @@ def draw_ratios(rng: np.random.Generator, sd: float, factor: float = 1.0) -> dic
     return {name: (np.log(factor) + sd * rng.standard_normal(PAIRS)).tolist() for name in HOT_PATHS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sd", [0.03, 0.2])
 def test_unchanged_hot_paths_raise_few_alarms(sd: float) -> None:
     """At a false alarm rate of 1 %, more than 9 alarms in 400 comparisons have a probability below 1 %."""
@@ -25,6 +26,7 @@ def test_unchanged_hot_paths_raise_few_alarms(sd: float) -> None:
     assert alarms <= 9
 
 
+@pytest.mark.slow
 def test_accepted_growth_raises_few_alarms() -> None:
     rng = np.random.default_rng(2)
     alarms = sum(bool(select_slower(compare(draw_ratios(rng, 0.05, 1.1), draw_ratios(rng, 0.05)))) for _ in range(200))

@@ -16,15 +16,22 @@ from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.record import folder_lock
-from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, write_campaign
 
 CampaignFile = Callable[..., Path]
 
 
+@pytest.fixture(scope="module")
+def _finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run a campaign of four cases."""
+    folder = tmp_path_factory.mktemp("finished")
+    return run(write_campaign(folder, "raising_cases = [2]"), folder / "done", RecordingWatch(), "cases=4", jobs=1)
+
+
 @pytest.fixture
-def finished_campaign(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> Path:
-    """Run a campaign of four cases; tests may change its folder."""
-    return run(campaign_file("raising_cases = [2]"), tmp_path / "done", watch, "cases=4", jobs=1)
+def finished_campaign(_finished_run: Path, tmp_path: Path) -> Path:
+    """Copy the folder of a finished campaign of four cases; tests may change it."""
+    return Path(shutil.copytree(_finished_run, tmp_path / "done"))
 
 
 def test_appended_cases_follow_existing_cases(
