@@ -75,6 +75,7 @@ _SHAPE_PARAMETERS: dict[str, dict[str, st.SearchStrategy[float]]] = {
 }
 
 
+@pytest.mark.slow
 @given(data=st.data(), name=st.sampled_from(sorted(_SHAPE_PARAMETERS)))
 @settings(max_examples=25)
 def test_truncated_scipy_draws_follow_their_distribution(data: st.DataObject, name: str) -> None:

@@ -116,6 +116,7 @@ def test_margin_is_centred(campaign_path: Path, tmp_path: Path) -> None:
     assert result.budget.remaining == pytest.approx(2.0, rel=0.3)
 
 
+@pytest.mark.slow
 def test_sobol_indices_of_a_linear_model_are_variance_fractions(campaign_path: Path, tmp_path: Path) -> None:
     settings = BudgetSettings("MARGIN", cases=20, sobol=256)
     overrides = ("gyro_sd=0.0", "radar_sd=0.0", "dispersions.load.sd=2.0")

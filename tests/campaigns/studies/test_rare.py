@@ -71,6 +71,7 @@ def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: 
     assert by_margin.interval == by_bound.interval
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
