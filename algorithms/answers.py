@@ -5,7 +5,7 @@ Used for algorithms in this process and in external programs (`marsyard.algorith
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,13 @@ from jaxtyping import Float64
 from marsyard.algorithms import interface
 from marsyard.algorithms.faults import bad_answer
 from marsyard.algorithms.interface import VelocityEstimate, VelocityStream
-from marsyard.sim.measurements import DescentFrame, DescentMeasurements, MastCalibration
+from marsyard.sim.measurements import (
+    AltitudeMeasurement,
+    DescentFrame,
+    DescentMeasurements,
+    ImuIncrements,
+    MastCalibration,
+)
 from marsyard.sim.parameters import warn_deprecated
 
 #: Largest asymmetry of a covariance due to rounding, as a fraction of its largest entry.
@@ -124,8 +130,7 @@ def check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.n
 
 
 def check_type(name: str, value: Any, kind: type) -> None:
-    """Raise AlgorithmError (BAD_ANSWER) unless a value has this type."""
-    """Raise AlgorithmError (BAD_ANSWER) unless a value is of this type; `name` is that of the value in the message."""
+    """Raise AlgorithmError (BAD_ANSWER) unless a value has this type; `name` is that of the value in the message."""
     if not isinstance(value, kind):
         raise bad_answer(f"{name} is a {_type_name(value)}; allowed: a {kind.__name__}")
 
@@ -136,6 +141,11 @@ def _type_name(value: object) -> str:
 
 #: Methods of a stream, in calling order.
 STREAM_METHODS = ("start", "process_image", "finish")
+#: Optional methods of a stream, by the type of measurement that they receive.
+OPTIONAL_STREAM_METHODS: Mapping[type, str] = {
+    ImuIncrements: "process_increments",
+    AltitudeMeasurement: "process_altitude",
+}
 #: Former name of the method `process_image`; accepted until 0.2.
 _FORMER_IMAGE_METHOD = "picture"
 
@@ -173,7 +183,7 @@ def create_streamed(stream: Any) -> StreamedEstimator:
 
 @dataclass(frozen=True)
 class StreamedEstimator:
-    """`VelocityEstimator` that passes the images of a descent one by one to a `VelocityStream`."""
+    """`VelocityEstimator` that passes the measurements of a descent one by one to a `VelocityStream`."""
 
     stream: VelocityStream
 
@@ -182,11 +192,22 @@ class StreamedEstimator:
         tags = measurements.tags_s
         self.stream.start()
         answers: list[VelocityEstimate | None] = []
-        for number, frame in enumerate(measurements.frames(), start=1):
-            answer = self.stream.process_image(frame)
-            answers.append(None if answer is None else _check_stream_answer(answer, tags[:number]))
+        for event in measurements.events():
+            answer = self.process(event)
+            if isinstance(event, DescentFrame):
+                tags_so_far = tags[: len(answers) + 1]
+                answers.append(None if answer is None else _check_stream_answer(answer, tags_so_far))
         final = _check_stream_answer(self.stream.finish(), tags)
         return replace(final, after_images=tuple(answers))
+
+    def process(self, event: ImuIncrements | AltitudeMeasurement | DescentFrame) -> VelocityEstimate | None:
+        """Pass a measurement to the stream's method for its type, if it has one; return the answer to an image."""
+        if isinstance(event, DescentFrame):
+            return self.stream.process_image(event)
+        method = getattr(self.stream, OPTIONAL_STREAM_METHODS[type(event)], None)
+        if method is not None:
+            method(event)
+        return None
 
 
 def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:

@@ -72,6 +72,14 @@ class VelocityStream(Protocol):
     """Protocol: estimate the horizontal velocity from any number of descent images, received one by one.
 
     `marsyard.algorithms.answers.StreamedEstimator` converts it to a `VelocityEstimator`.
+
+    A stream can also have one or both of two optional methods, which are called in descents with inertial increments.
+    All measurements then arrive in the order of their time tags, up to the last image:
+
+    - ``process_increments(increments: ImuIncrements) -> None``: receives the increments since the last call. Before an
+      altitude or an image, they end at the first boundary that is not earlier than its time tag.
+    - ``process_altitude(measurement: AltitudeMeasurement) -> None``: receives each altitude once. The frame of the next
+      image contains it again.
     """
 
     def start(self) -> None:

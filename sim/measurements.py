@@ -7,6 +7,7 @@ altitudes contain measurement errors.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -88,6 +89,28 @@ class ImuIncrements:
     delta_angles_rad: Float[np.ndarray, "n 3"]
     delta_velocities_m_s: Float[np.ndarray, "n 3"]
 
+    def split(self, tags_s: Sequence[float]) -> list[ImuIncrements]:
+        """Split at ascending time tags; return one part more than tags. A part can have no sample.
+
+        A part ends with the first boundary that is not earlier than its tag. The next part begins with this boundary.
+        Raises ValueError for a tag outside the increments.
+        """
+        first_s, last_s = self.times_s[0], self.times_s[-1]
+        outside = [tag for tag in tags_s if not first_s <= tag <= last_s]
+        if outside:
+            allowed = f"allowed: {first_s:.6f} to {last_s:.6f} s"
+            raise ValueError(f"the time tag {outside[0]:.6f} s is outside of the increments; {allowed}")
+        boundaries = [0, *np.searchsorted(self.times_s, tags_s, side="left").tolist(), self.times_s.size - 1]
+        return [
+            ImuIncrements(
+                times_s=self.times_s[first : last + 1],
+                period_s=self.period_s,
+                delta_angles_rad=self.delta_angles_rad[first:last],
+                delta_velocities_m_s=self.delta_velocities_m_s[first:last],
+            )
+            for first, last in pairwise(boundaries)
+        ]
+
 
 @dataclass(frozen=True)
 class DescentFrame:
@@ -98,6 +121,7 @@ class DescentFrame:
     - sun_direction: unit vector to the sun, world axes
     - inertial_velocity_m_s: inertial velocity of the camera at the image, world axes; None if not recorded
     - interval_velocity_m_s: mean inertial velocity since the previous image, world axes; None at the first image
+    - gravity_m_s2: gravity of the site, along world -z; None without inertial increments
     """
 
     image: DetectorImage
@@ -106,6 +130,7 @@ class DescentFrame:
     sun_direction: Float[np.ndarray, "3"]
     inertial_velocity_m_s: Float[np.ndarray, "3"] | None = None
     interval_velocity_m_s: Float[np.ndarray, "3"] | None = None
+    gravity_m_s2: float | None = None
 
 
 @dataclass(frozen=True)
@@ -118,6 +143,9 @@ class DescentMeasurements:
       (the paper's "biased IMU horizontal velocities")
     - sun_direction: unit vector to the sun, world axes
     - inertial_velocities_m_s: inertial velocities at the images, with the same error; None if not recorded
+    - increments: inertial increments of a unit of the vision system, from before the first image to after the last
+      image; None without this unit. Its errors are independent of those of the inertial velocities.
+    - gravity_m_s2: gravity of the site, along world -z; None without increments
     """
 
     images: tuple[DetectorImage, ...]
@@ -126,6 +154,8 @@ class DescentMeasurements:
     interval_velocities_m_s: Float[np.ndarray, "intervals 3"]
     sun_direction: Float[np.ndarray, "3"]
     inertial_velocities_m_s: Float[np.ndarray, "images 3"] | None = None
+    increments: ImuIncrements | None = None
+    gravity_m_s2: float | None = None
 
     @property
     def tags_s(self) -> tuple[float, ...]:
@@ -148,9 +178,34 @@ class DescentMeasurements:
                 sun_direction=self.sun_direction,
                 inertial_velocity_m_s=None if velocities is None else velocities[number],
                 interval_velocity_m_s=self.interval_velocities_m_s[number - 1] if number else None,
+                gravity_m_s2=self.gravity_m_s2,
             )
             for number, image in enumerate(self.images)
         )
+
+    def events(self) -> list[ImuIncrements | AltitudeMeasurement | DescentFrame]:
+        """Return increments, altitudes and frames in the order of their time tags, up to the last image.
+
+        The increments are split at each altitude and image (`ImuIncrements.split`). Missing altitudes and altitudes
+        before the first increment are omitted. Without increments, only the frames are returned.
+        """
+        frames = self.frames()
+        if self.increments is None or not frames:
+            return list(frames)
+        start_s, end_s = float(self.increments.times_s[0]), frames[-1].image.time_s
+        # several images can have the same reading of the altimeter
+        readings = {reading.time_s: reading for reading in self.altitudes if not math.isnan(reading.altitude_m)}
+        tagged: list[tuple[float, AltitudeMeasurement | DescentFrame]] = [
+            *((tag, reading) for tag, reading in readings.items() if start_s <= tag <= end_s),
+            *((frame.image.time_s, frame) for frame in frames),
+        ]
+        tagged.sort(key=lambda item: item[0])
+        *parts, _ = self.increments.split([tag for tag, _ in tagged])
+        events: list[ImuIncrements | AltitudeMeasurement | DescentFrame] = []
+        for part, (_, measurement) in zip(parts, tagged, strict=True):
+            events += [part] if part.times_s.size > 1 else []
+            events.append(measurement)
+        return events
 
     def select(self, indices: tuple[int, ...]) -> DescentMeasurements:
         """Select images by ascending indices; the mean velocities are those between the selected images."""

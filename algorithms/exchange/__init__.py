@@ -9,8 +9,10 @@ from marsyard.algorithms.exchange.executable import (
 from marsyard.algorithms.exchange.files import (
     FORMAT_VERSION,
     ImageFormat,
+    read_altitude,
     read_case,
     read_frame,
+    read_increments,
     read_mast,
     read_pose,
     read_stop,
@@ -23,5 +25,5 @@ from marsyard.algorithms.exchange.serving import ProgramDetails
 
 __all__ = ["FORMAT_VERSION", "PREFIXES", "Command", "ExecutableLimits", "ExecutableSiteEstimator"]
 __all__ += ["ExecutableTargetTracker", "ExecutableVelocityEstimator", "ExecutableVelocityStream", "ImageFormat"]
-__all__ += ["ProgramDetails", "parse_command", "read_case", "read_frame", "read_mast", "read_pose", "read_stop"]
-__all__ += ["read_target", "write_case", "write_frame"]
+__all__ += ["ProgramDetails", "parse_command", "read_altitude", "read_case", "read_frame", "read_increments"]
+__all__ += ["read_mast", "read_pose", "read_stop", "read_target", "write_case", "write_frame"]

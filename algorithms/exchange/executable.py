@@ -10,9 +10,18 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms import interface
 from marsyard.algorithms.answers import check_aim, check_site, check_update, check_velocity
-from marsyard.algorithms.exchange.files import encode_pose, encode_target, write_frame, write_mast, write_stop
+from marsyard.algorithms.exchange.files import (
+    encode_altitude,
+    encode_increments,
+    encode_pose,
+    encode_target,
+    write_frame,
+    write_mast,
+    write_stop,
+)
 from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command, ExecutableLimits
 from marsyard.algorithms.exchange.serving import (
+    AnswerReader,
     ProgramDetails,
     Session,
     check_keys,
@@ -22,8 +31,10 @@ from marsyard.algorithms.exchange.serving import (
 )
 from marsyard.algorithms.faults import bad_answer
 from marsyard.sim.measurements import (
+    AltitudeMeasurement,
     DescentFrame,
     DescentMeasurements,
+    ImuIncrements,
     LandingMeasurements,
     MastCalibration,
     RoverMeasurements,
@@ -50,17 +61,28 @@ class ExecutableVelocityStream:
     """Velocity stream that runs an external program: one JSON request line per call (docs/custom-algorithms.md).
 
     Methods raise AlgorithmError if the program fails. One process of a `serve-stream:` program processes many descents.
+    Increments and altitudes are sent only if the program requests them in its answer to 'start'.
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         self._session = Session(command, limits)
         self._details = ProgramDetails("", 0.0)
+        self._accepts_inertial = False
 
     def start(self) -> None:
         """Start a new descent."""
         self._details = ProgramDetails("", 0.0)
-        if self._session.send_request("start", {}, self._read_answer) is not None:
-            raise bad_answer("the answer to 'start' has an outcome; before the first image it must be null")
+        self._send_without_answer("start", {}, self._read_start)
+
+    def process_increments(self, increments: ImuIncrements) -> None:
+        """Send the next inertial increments."""
+        if self._accepts_inertial:
+            self._send_without_answer("imu", {"increments": encode_increments(increments)}, self._read_answer)
+
+    def process_altitude(self, measurement: AltitudeMeasurement) -> None:
+        """Send the next altitude."""
+        if self._accepts_inertial:
+            self._send_without_answer("altitude", {"altitude": encode_altitude(measurement)}, self._read_answer)
 
     def process_image(self, frame: DescentFrame) -> interface.VelocityEstimate | None:
         """Send the next image and return the program's estimate, or None."""
@@ -75,6 +97,19 @@ class ExecutableVelocityStream:
             allowed = ", ".join(interface.VelocityOutcome.__members__)
             raise bad_answer(f"the answer to 'finish' has the outcome null; allowed: {allowed}")
         return answer
+
+    def _send_without_answer(
+        self, action: str, values: Mapping[str, Any], read: AnswerReader[interface.VelocityEstimate | None]
+    ) -> None:
+        if self._session.send_request(action, values, read) is not None:
+            raise bad_answer(f"the answer to '{action}' has an outcome; it must be null")
+
+    def _read_start(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
+        accepts_inertial = answer.get("inertial", False)
+        if not isinstance(accepts_inertial, bool):
+            raise bad_answer(f"inertial is {accepts_inertial!r}; allowed: true, or false")
+        self._accepts_inertial = accepts_inertial
+        return self._read_answer({key: value for key, value in answer.items() if key != "inertial"}, details)
 
     def _read_answer(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
         self._details = ProgramDetails(

@@ -29,6 +29,7 @@ from marsyard.sim.measurements import (
     DescentMeasurements,
     DetectorCalibration,
     DetectorImage,
+    ImuIncrements,
     LandingMeasurements,
     MastCalibration,
     MastGeometry,
@@ -51,6 +52,8 @@ CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 #: Fields of `DetectorCalibration` except the flat field.
 _CALIBRATION_KEYS = tuple(field.name for field in fields(DetectorCalibration) if field.name != "flat_field")
 
+_INCREMENT_KEYS = ("times_s", "delta_angles_rad", "delta_velocities_m_s")
+
 #: Image file format.
 ImageFormat = Literal["pgm", "png"]
 
@@ -68,7 +71,10 @@ def write_case(
             "interval_velocities_m_s": measurements.interval_velocities_m_s.tolist(),
             "inertial_velocities_m_s": _encode_vector(measurements.inertial_velocities_m_s),
             "sun_direction": measurements.sun_direction.tolist(),
+            **_encode_gravity(measurements.gravity_m_s2),
         }
+        if measurements.increments is not None:
+            content["increments"] = encode_increments(measurements.increments)
     else:
         content = {
             "task": "landing",
@@ -94,6 +100,7 @@ def write_frame(folder: Path, frame: DescentFrame) -> None:
         "sun_direction": frame.sun_direction.tolist(),
         "inertial_velocity_m_s": _encode_vector(frame.inertial_velocity_m_s),
         "interval_velocity_m_s": _encode_vector(frame.interval_velocity_m_s),
+        **_encode_gravity(frame.gravity_m_s2),
     }
     write_json(folder / FRAME_FILE, content)
 
@@ -109,6 +116,7 @@ def read_frame(folder: Path) -> DescentFrame:
             sun_direction=_read_vector(content["sun_direction"]),
             inertial_velocity_m_s=_read_vector(content["inertial_velocity_m_s"]),
             interval_velocity_m_s=_read_vector(content["interval_velocity_m_s"]),
+            gravity_m_s2=content.get("gravity_m_s2"),
         )
 
 
@@ -118,6 +126,7 @@ def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
         check_version(content)
         images = [read_image(folder, record) for record in content["images"]]
         if content["task"] == "velocity":
+            increments = content.get("increments")
             return DescentMeasurements(
                 images=tuple(images),
                 attitudes=tuple(_read_attitude(record) for record in content["attitudes"]),
@@ -125,6 +134,8 @@ def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
                 interval_velocities_m_s=_read_vector(content["interval_velocities_m_s"]).reshape(-1, 3),
                 sun_direction=_read_vector(content["sun_direction"]),
                 inertial_velocities_m_s=_read_vector(content.get("inertial_velocities_m_s")),
+                increments=None if increments is None else read_increments(increments),
+                gravity_m_s2=content.get("gravity_m_s2"),
             )
         poses = [PoseMeasurement(read_pose(record, "body"), record["time_s"]) for record in content["poses"]]
         return LandingMeasurements(
@@ -174,12 +185,28 @@ def read_altitude(content: Mapping[str, Any]) -> AltitudeMeasurement:
     return AltitudeMeasurement(_read_length(content["altitude_m"]), content["time_s"])
 
 
+def encode_increments(increments: ImuIncrements) -> dict[str, Any]:
+    """Encode inertial increments for JSON."""
+    return {"period_s": increments.period_s, **{name: getattr(increments, name).tolist() for name in _INCREMENT_KEYS}}
+
+
+def read_increments(content: Mapping[str, Any]) -> ImuIncrements:
+    """Decode the increments that `encode_increments` encoded."""
+    times, angles, velocities = (np.array(content[name], dtype=np.float64) for name in _INCREMENT_KEYS)
+    return ImuIncrements(times, content["period_s"], angles.reshape(-1, 3), velocities.reshape(-1, 3))
+
+
 def _encode_length(length_m: float) -> float | None:
     return length_m if math.isfinite(length_m) else None
 
 
 def _read_length(length_m: float | None) -> float:
     return math.nan if length_m is None else length_m
+
+
+def _encode_gravity(gravity_m_s2: float | None) -> dict[str, float]:
+    """Return the key of the gravity, which is known only with inertial increments."""
+    return {} if gravity_m_s2 is None else {"gravity_m_s2": gravity_m_s2}
 
 
 def _encode_vector(value: Float[np.ndarray, "..."] | None) -> list[Any] | None:

@@ -26,9 +26,11 @@ from marsyard.algorithms.exchange.files import (
     FORMAT_VERSION,
     check_version,
     encode_altitude,
+    encode_increments,
     open_json,
     read_altitude,
     read_image,
+    read_increments,
     write_images,
     write_json,
 )
@@ -47,7 +49,6 @@ from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuInc
 
 IMAGE_FILE, MAP_FILE = "image.json", "map.json"
 _MAP_KEYS = ("pixel_m", "registration_sd_m", "distortion_sd_m", "elevation_sd_m")
-_INCREMENT_KEYS = ("times_s", "delta_angles_rad", "delta_velocities_m_s")
 _ANSWER_KEYS = {"outcome", "time_s", "position_m", "velocity_m_s", "world_from_body_xyzw", "covariance"}
 #: Largest difference of a quaternion's norm from 1 in an answer.
 _MAX_NORM_ERROR = 1e-3
@@ -133,17 +134,6 @@ def read_initial(content: Mapping[str, Any]) -> InitialState:
         covariance=np.array(content["covariance"], dtype=np.float64),
         gravity_m_s2=content["gravity_m_s2"],
     )
-
-
-def encode_increments(increments: ImuIncrements) -> dict[str, Any]:
-    """Encode inertial increments for JSON."""
-    return {"period_s": increments.period_s, **{name: getattr(increments, name).tolist() for name in _INCREMENT_KEYS}}
-
-
-def read_increments(content: Mapping[str, Any]) -> ImuIncrements:
-    """Decode the increments that `encode_increments` encoded."""
-    times, angles, velocities = (np.array(content[name], dtype=np.float64) for name in _INCREMENT_KEYS)
-    return ImuIncrements(times, content["period_s"], angles.reshape(-1, 3), velocities.reshape(-1, 3))
 
 
 def write_map(folder: Path, map_product: MapProduct) -> None:

@@ -4,27 +4,32 @@
     marsyard run dimes-gusev --set images=9 --set descent.interval_s=0.9375 \
         --algorithm velocity_stream:ChainedShifts --algorithm dimes
     marsyard run dimes-gusev --algorithm "serve-stream:python velocity_stream.py" --algorithm dimes
+    marsyard run dimes-gusev --set inertial.rate_hz=200 \
+        --algorithm velocity_stream:IntegratedShifts --algorithm "serve-stream:python velocity_stream.py --increments"
 
 Each image is compared with the previous image. Both are projected onto level ground with the inertial velocity, and
 phase correlation measures their shift. The shift is caused by the error of the inertial velocity, which is the same for
 all pairs. Weighted least squares estimate this error from all pairs, so the estimate improves with every image. The
 answer is the inertial velocity at the last image minus its error, with a covariance.
+
+`IntegratedShifts` integrates the inertial velocity from inertial increments, if the descent has them.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.exchange import read_frame
+from marsyard.algorithms.exchange import read_frame, read_increments
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
-from marsyard.sim.measurements import DescentFrame
+from marsyard.sim.measurements import DescentFrame, ImuIncrements
 
 SIDE_PX = 128  # side of the compared square of ground
 SIDE_TO_HEIGHT_RATIO = 0.35  # side of the square divided by the height above ground
@@ -84,6 +89,39 @@ class ChainedShifts:
             covariance_m2_s2=variance * np.eye(2),
             span_s=None if instantaneous is None else span,
         )
+
+
+class IntegratedShifts(ChainedShifts):
+    """`ChainedShifts` with inertial velocities that are integrated from increments after the first image."""
+
+    def start(self) -> None:
+        """Reset the state for a new descent."""
+        super().start()
+        self.attitude: Rotation | None = None
+        self.elapsed_s = 0.0
+
+    def process_increments(self, increments: ImuIncrements) -> None:
+        """Integrate attitude, velocity and displacement; increments before the first image are not used."""
+        if self.attitude is None:
+            return
+        period_s, gravity = increments.period_s, np.array([0.0, 0.0, -self.gravity_m_s2])
+        for angles, velocities in zip(increments.delta_angles_rad, increments.delta_velocities_m_s, strict=True):
+            change = self.attitude.apply(velocities.copy()) + gravity * period_s
+            self.displacement_m = self.displacement_m + (self.velocity_m_s + 0.5 * change) * period_s
+            self.velocity_m_s = self.velocity_m_s + change
+            self.attitude = self.attitude * Rotation.from_rotvec(angles.copy())
+            self.elapsed_s += period_s
+
+    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
+        """Process an image with the integrated velocities; the first image defines the initial state."""
+        if self.elapsed_s > 0.0:
+            mean_velocity = self.displacement_m / self.elapsed_s
+            frame = replace(frame, inertial_velocity_m_s=self.velocity_m_s, interval_velocity_m_s=mean_velocity)
+        elif frame.gravity_m_s2 is not None and frame.inertial_velocity_m_s is not None:
+            self.attitude, self.gravity_m_s2 = frame.attitude.world_from_body, frame.gravity_m_s2
+            self.velocity_m_s = frame.inertial_velocity_m_s
+        self.displacement_m, self.elapsed_s = np.zeros(3), 0.0
+        return super().process_image(frame)
 
 
 def compare_frames(first: DescentFrame, second: DescentFrame) -> Pair | None:
@@ -163,17 +201,25 @@ def format_answer(estimate: VelocityEstimate | None) -> dict[str, Any]:
 
 def main() -> None:
     """Answer the requests on standard input, one per line, until the input ends."""
-    stream = ChainedShifts()
+    uses_increments = "--increments" in sys.argv
+    stream = IntegratedShifts() if uses_increments else ChainedShifts()
     print(json.dumps({"exchange": 2, "ready": True}), flush=True)
     for line in sys.stdin:
         request = json.loads(line)
+        fields: dict[str, Any] = {}
         if request["do"] == "start":
+            # request the messages "imu" and "altitude"
+            fields = {"inertial": uses_increments}
             answer = stream.start()
+        elif request["do"] == "imu":
+            answer = stream.process_increments(read_increments(request["increments"]))
+        elif request["do"] == "altitude":
+            answer = None  # the frame of the next image contains the altitude
         elif request["do"] == "picture":
             answer = stream.process_image(read_frame(Path(request["frame"])))
         else:
             answer = stream.finish()
-        print(json.dumps({"exchange": 2, "id": request["id"], **format_answer(answer)}), flush=True)
+        print(json.dumps({"exchange": 2, "id": request["id"], **fields, **format_answer(answer)}), flush=True)
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ VELOCITY = Protocol(
     describe=describe_velocity,
     failures=", ".join(outcome.name for outcome in VelocityOutcome if outcome is not VelocityOutcome.VALID),
 )
-STREAM = replace(VELOCITY, measurements=partial(inputs.descent, _STREAM_LENGTH))
+STREAM = replace(VELOCITY, measurements=partial(inputs.inertial_descent, _STREAM_LENGTH))
 LANDING = Protocol(
     measurements=inputs.landing,
     check=check_site,
@@ -93,10 +93,12 @@ class EstimatorSuite(Suite):
             yield Check("few", "returns a failure for zero images and for one image", advice, self._check_short_streams)
             rule = f"returns a well-formed answer to {', '.join(map(str, _SHORT_LENGTHS))} and {_LONG_LENGTH} images"
             advice = "accept any number: see VelocityStream in algorithms/interface.py"
-            streams = (*map(_select_first_images, _SHORT_LENGTHS), inputs.descent(_LONG_LENGTH))
+            streams = (*map(_select_first_images, _SHORT_LENGTHS), inputs.inertial_descent(_LONG_LENGTH))
             yield Check(
                 "number", rule, advice, lambda: "; ".join(describe_velocity(self._answer(stream)) for stream in streams)
             )
+            rule, advice = "returns a well-formed answer without inertial increments", "use the inertial velocities"
+            yield Check("no-increments", rule, advice, lambda: describe_velocity(self._answer(_without_increments())))
             rule, advice = "resets its state after an interrupted descent", "reset the whole state in start"
             yield Check("start", rule, advice, self._check_restart)
 
@@ -136,12 +138,16 @@ class EstimatorSuite(Suite):
         expected_fingerprint = fingerprint(self._answer(measurements))
         estimator = self.make()
         estimator.stream.start()
-        for frame in copy_inputs(inputs.make_noisy(measurements)).frames()[:2]:
-            estimator.stream.process_image(frame)
+        for event in copy_inputs(inputs.make_noisy(measurements).select((0, 1))).events():
+            estimator.process(event)
         if fingerprint(estimator.estimate(copy_inputs(measurements))) != expected_fingerprint:
             raise BreachError("after a restart in the middle of a descent, its answer differs")
         return ""
 
 
 def _select_first_images(number: int) -> DescentMeasurements:
-    return inputs.descent(_STREAM_LENGTH).select(tuple(range(number)))
+    return inputs.inertial_descent(_STREAM_LENGTH).select(tuple(range(number)))
+
+
+def _without_increments() -> DescentMeasurements:
+    return inputs.descent(_STREAM_LENGTH)

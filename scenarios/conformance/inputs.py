@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy import fft
 from scipy.ndimage import map_coordinates
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import direction, rigid
@@ -24,6 +24,7 @@ from marsyard.sim.measurements import (
     DescentMeasurements,
     DetectorCalibration,
     DetectorImage,
+    ImuIncrements,
     LandingMeasurements,
     PoseMeasurement,
 )
@@ -40,6 +41,8 @@ _TEXTURE_SIZE, _TEXTURE_CONTRAST = 1024, 0.2
 DESCENT_VELOCITY_M_S = np.array([12.0, -7.0, -75.0])
 #: Maximum time between images, and from the first to the last image, s.
 _INTERVAL_S, _DURATION_S = 3.75, 7.5
+#: Rate of the inertial unit, and gravity of Mars.
+_IMU_HZ, _GRAVITY_M_S2 = 100.0, 3.71
 #: Attitudes of the images about z, y and x, degrees; further images repeat them.
 _ATTITUDES_DEG = ((40, 4, -3), (44, 2, 3), (41, -3, 5))
 _START_POSITION_M = np.array([0.0, 0.0, 1900.0])
@@ -112,6 +115,25 @@ def descent(image_count: int = 3) -> DescentMeasurements:
         sun_direction=direction(np.radians(250.0), np.radians(35.0)),
         inertial_velocities_m_s=np.tile(inertial, (image_count, 1)),
     )
+
+
+@cache
+def inertial_descent(image_count: int) -> DescentMeasurements:
+    """Create the measurements of `descent` with exact inertial increments, from a second before the first image."""
+    measurements = descent(image_count)
+    tags = np.array(measurements.tags_s)
+    count = round((tags[-1] - tags[0] + 1.5) * _IMU_HZ)
+    times = tags[0] - 1.0 + np.arange(count + 1) / _IMU_HZ
+    # constant angular rate between images, none before the first and after the last image
+    rotations = Rotation.concatenate([attitude.world_from_body for attitude in measurements.attitudes])
+    attitudes = Slerp(tags, rotations)(np.clip(times, tags[0], tags[-1]))
+    increments = ImuIncrements(
+        times_s=times,
+        period_s=1.0 / _IMU_HZ,
+        delta_angles_rad=(attitudes[:-1].inv() * attitudes[1:]).as_rotvec(),
+        delta_velocities_m_s=attitudes[:-1].inv().apply([0.0, 0.0, _GRAVITY_M_S2 / _IMU_HZ]),
+    )
+    return replace(measurements, increments=increments, gravity_m_s2=_GRAVITY_M_S2)
 
 
 @cache

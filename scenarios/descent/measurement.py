@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -95,6 +95,22 @@ class Instruments:
             attitude_source=custom["attitude_source"][0] if "attitude_source" in custom else None,
             row={name: value for _, row in custom.values() for name, value in row.items()},
         )
+
+
+def add_increments(
+    measurements: DescentMeasurements, p: DescentScenarioParameters, flight: DescentFlight, streams: Streams
+) -> DescentMeasurements:
+    """Add the increments of the estimator's inertial unit over the time of the navigation, if it has a unit."""
+    if p.inertial.unit is None:
+        return measurements
+    span = -flight.lead_s + IMU_MARGIN_S, flight.firing_s + IMU_MARGIN_S
+    imu = Imu.draw(p.inertial.unit, span, streams.generator("estimator's inertial unit"))
+    increments = (
+        imu.exact_increments(flight.motion, *span)
+        if p.exact_instruments
+        else imu.increments(flight.motion, *span, streams.generator("estimator's inertial noise"))
+    )
+    return replace(measurements, increments=increments, gravity_m_s2=gravity_m_s2(p))
 
 
 Counts = Sequence[UInt16[np.ndarray, "rows columns"]]

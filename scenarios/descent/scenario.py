@@ -24,7 +24,7 @@ from marsyard.scenarios.conditions import (
 )
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, states_at_images, true_velocity
-from marsyard.scenarios.descent.measurement import Instruments, measure, measure_exactly
+from marsyard.scenarios.descent.measurement import Instruments, add_increments, measure, measure_exactly
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
 from marsyard.scenarios.descent.score import (
     Images,
@@ -161,6 +161,7 @@ class Descent:
             measurements = measure_exactly(p, world, states, images, detector)
         else:
             measurements = measure(p, world, flight.motion, images, detector, instruments, streams)
+        measurements = add_increments(measurements, p, flight, streams)
         overlap: Mapping[str, Scalar] = {}
         if p.triple_indices is not None:
             triple = [states[index] for index in p.triple_indices]

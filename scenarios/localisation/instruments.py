@@ -21,7 +21,7 @@ from marsyard.sim.camera import Cahv, Cahvore, CameraModel
 from marsyard.sim.dynamics import State, Trajectory
 from marsyard.sim.measurements import AltitudeMeasurement
 from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
-from marsyard.sim.sensor import ClockParameters, DetectorParameters, ImuParameters, RadarAltimeter, RadarParameters
+from marsyard.sim.sensor import ClockParameters, DetectorParameters, RadarAltimeter, RadarParameters
 from marsyard.sim.sensor.optics import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath, OpticsParameters
 
 
@@ -138,21 +138,6 @@ def _create_detector() -> DetectorParameters:
 #: responsivity, which fills 60 % of the full well at the radiance factor 0.3 (the other presets' exposure). It is 35 %
 #: of that of an f/2.7 lens on a CCD of the same pitch: the rest is lost in the fill factor of a global shutter.
 LANDER_DETECTOR = _create_detector()
-
-#: Northrop Grumman's LN-200, the unit of Mars 2020; sources of the values: `ImuParameters`.
-LN200 = ImuParameters()
-
-#: Safran Sensonor's STIM300, a small silicon unit. Data sheet TS1524: random walks (0.15 deg/sqrt(h),
-#: 0.07 m/s/sqrt(h)), bias instability (0.5 deg/h, 0.05 mg), scale factors (500 ppm, 300 ppm), misalignment (1 mrad),
-#: accelerometer bias over temperature (2 mg). Gyro bias 4 deg/h: repeatability in a paper of ION Navigation. Assumed:
-#: rate, correlation times, and negligible rounding.
-MEMS = ImuParameters(
-    rate_hz=400.0, gyro_bias_deg_h=4.0, gyro_wander_deg_h=0.5, gyro_bias_deg_h_k=0.0,
-    angular_random_walk_deg_sqrt_h=0.15, gyro_scale_ppm=500.0, gyro_misalignment_mrad=1.0, gyro_count_rad=0.0,
-    accelerometer_bias_mg=2.0, accelerometer_wander_mg=0.05, accelerometer_bias_mg_k=0.0,
-    velocity_random_walk_ug_sqrt_hz=119.0, accelerometer_scale_ppm=300.0, accelerometer_misalignment_mrad=1.0,
-    accelerometer_count_m_s=0.0,
-)  # fmt: skip
 
 #: Radar altimeter: errors of the MER altimeter; a beam of 40 deg includes nadir at tilts up to 20 deg (assumed).
 RADAR = RadarParameters(rate_hz=2.0, beam_deg=40.0, max_range_m=8000.0)

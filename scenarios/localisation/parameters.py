@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
@@ -15,8 +15,6 @@ from marsyard.scenarios.localisation.flight import ProfileParameters
 from marsyard.scenarios.localisation.instruments import (
     IMAGE_CLOCK,
     LANDER_DETECTOR,
-    LN200,
-    MEMS,
     RADAR,
     CameraParameters,
     InitialErrors,
@@ -28,10 +26,8 @@ from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.parameters import NonNegative, bounded_field, merge_settings
 from marsyard.sim.sensor import ClockParameters, DetectorParameters, ImuParameters, RadarParameters
+from marsyard.sim.sensor.imu import IMUS, ImuClass
 from marsyard.sim.terrain import Site, TerrainParameters
-
-#: Inertial units by name.
-IMUS: Mapping[str, ImuParameters] = {"ln-200": LN200, "mems": MEMS}
 
 
 class LocalisationFaults(SizedFaults):
@@ -74,7 +70,7 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     images: ImageSchedule = ImageSchedule()
     camera: CameraParameters = CameraParameters()
     detector: DetectorParameters = LANDER_DETECTOR
-    imu_class: Annotated[Literal["ln-200", "mems"], Field(description="class of the inertial unit")] = "ln-200"
+    imu_class: Annotated[ImuClass, Field(description="class of the inertial unit")] = "ln-200"
     initial: InitialErrors = InitialErrors()
     altimeter: RadarParameters = RADAR
     clock: Annotated[ClockParameters, Field(description="clock of the images' time tags")] = IMAGE_CLOCK

@@ -31,7 +31,6 @@ from marsyard.scenarios.parts.named import PartKind
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from marsyard.sim.sensor import Detector, Imu
-from marsyard.sim.sensor.imu import true_increments
 from marsyard.sim.sensor.instrument import Clock
 from marsyard.sim.sensor.ranging import RadarAltimeter
 from marsyard.sim.streams import Streams
@@ -234,8 +233,7 @@ def _measure_inertially(
     start_s, end_s = -LEAD_S, last_s + MARGIN_S
     imu = Imu.draw(p.imu, (start_s, end_s), streams.generator("imu"))
     if p.exact_instruments:
-        boundaries = imu.boundaries(start_s, end_s)
-        increments = ImuIncrements(boundaries, 1.0 / p.imu.rate_hz, *true_increments(flight, boundaries))
+        increments = imu.exact_increments(flight, start_s, end_s)
     else:
         increments = imu.increments(flight, start_s, end_s, streams.generator("imu noise"))
     truth = flight.state(start_s)

@@ -57,38 +57,16 @@ def merge(
 ) -> list[Event]:
     """Merge measurements into the order of their time tags, with the increments split at each altitude and image.
 
-    The last boundary before an altitude or an image is the first boundary that is not earlier than its time tag. A
-    part of the increments begins with the last boundary of the previous part, and is not empty. Raises ValueError for a
-    time tag outside the increments.
+    The parts are those of `ImuIncrements.split` without the empty ones. Raises ValueError for a time tag outside the
+    increments.
     """
-    tags = increments.times_s
     measurements: list[AltitudeMeasurement | DetectorImage] = sorted([*altitudes, *images], key=lambda m: m.time_s)
-    outside = [m.time_s for m in measurements if not tags[0] <= m.time_s <= tags[-1]]
-    if outside:
-        raise ValueError(
-            f"the time tag {outside[0]:.6f} s is outside of the increments; allowed: {tags[0]:.6f} to {tags[-1]:.6f} s"
-        )
+    parts = increments.split([m.time_s for m in measurements])
     events: list[Event] = []
-    first = 0
-    for measurement in measurements:
-        last = int(np.searchsorted(tags, measurement.time_s, side="left"))
-        if last > first:
-            events.append(_part(increments, first, last))
-            first = last
-        events.append(measurement)
-    if first < tags.size - 1:
-        events.append(_part(increments, first, tags.size - 1))
+    for part, measurement in zip(parts, [*measurements, None], strict=True):
+        events += [part] if part.times_s.size > 1 else []
+        events += [] if measurement is None else [measurement]
     return events
-
-
-def _part(increments: ImuIncrements, first: int, last: int) -> ImuIncrements:
-    """Return the increments between two boundaries."""
-    return ImuIncrements(
-        times_s=increments.times_s[first : last + 1],
-        period_s=increments.period_s,
-        delta_angles_rad=increments.delta_angles_rad[first:last],
-        delta_velocities_m_s=increments.delta_velocities_m_s[first:last],
-    )
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ the integral of specific force in the body axes at the start of the interval (sc
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -84,6 +85,25 @@ SMALL_UNIT = ImuParameters(
     velocity_random_walk_ug_sqrt_hz=200.0, accelerometer_scale_ppm=1000.0, accelerometer_misalignment_mrad=1.0,
     clock=ClockParameters(),
 )  # fmt: skip
+
+#: Northrop Grumman's LN-200, the unit of Mars 2020; sources of the values: `ImuParameters`.
+LN200 = ImuParameters()
+
+#: Safran Sensonor's STIM300, a small silicon unit. Data sheet TS1524: random walks (0.15 deg/sqrt(h),
+#: 0.07 m/s/sqrt(h)), bias instability (0.5 deg/h, 0.05 mg), scale factors (500 ppm, 300 ppm), misalignment (1 mrad),
+#: accelerometer bias over temperature (2 mg). Gyro bias 4 deg/h: repeatability in a paper of ION Navigation. Assumed:
+#: rate, correlation times, and negligible rounding.
+MEMS = ImuParameters(
+    rate_hz=400.0, gyro_bias_deg_h=4.0, gyro_wander_deg_h=0.5, gyro_bias_deg_h_k=0.0,
+    angular_random_walk_deg_sqrt_h=0.15, gyro_scale_ppm=500.0, gyro_misalignment_mrad=1.0, gyro_count_rad=0.0,
+    accelerometer_bias_mg=2.0, accelerometer_wander_mg=0.05, accelerometer_bias_mg_k=0.0,
+    velocity_random_walk_ug_sqrt_hz=119.0, accelerometer_scale_ppm=300.0, accelerometer_misalignment_mrad=1.0,
+    accelerometer_count_m_s=0.0,
+)  # fmt: skip
+
+#: Classes of inertial units, and their parameters by class.
+ImuClass = Literal["ln-200", "mems"]
+IMUS: Mapping[ImuClass, ImuParameters] = {"ln-200": LN200, "mems": MEMS}
 
 
 @dataclass(frozen=True)
@@ -191,6 +211,11 @@ class Imu:
             delta_angles_rad=self.gyro.measure(angles, boundaries, rng),
             delta_velocities_m_s=self.accelerometer.measure(velocities, boundaries, rng),
         )
+
+    def exact_increments(self, trajectory: Trajectory, start_s: float, end_s: float) -> ImuIncrements:
+        """Compute the increments between the same boundaries without errors; the time tags are true times."""
+        boundaries = self.boundaries(start_s, end_s)
+        return ImuIncrements(boundaries, 1.0 / self.parameters.rate_hz, *true_increments(trajectory, boundaries))
 
 
 def true_increments(trajectory: Trajectory, boundaries_s: Boundaries) -> tuple[Vectors, Vectors]:

@@ -1,6 +1,7 @@
 """Tests of velocity streams: inputs per image, checks of answers, and programs as streams."""
 
 import importlib
+import json
 import sys
 from dataclasses import replace
 from itertools import pairwise
@@ -27,8 +28,9 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.estimators import VELOCITY
-from marsyard.sim.measurements import DescentFrame, DescentMeasurements
+from marsyard.sim.measurements import AltitudeMeasurement, DescentFrame, DescentMeasurements, ImuIncrements
 from marsyard.sim.parameters import DeprecatedNameWarning
+from marsyard.sim.sensor import InertialSolution
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 NO_VELOCITY = VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
@@ -93,6 +95,86 @@ def test_selection_averages_velocities_over_omitted_images() -> None:
     assert selection.attitudes == (measurements.attitudes[0], measurements.attitudes[2], measurements.attitudes[3])
     np.testing.assert_array_equal(selection.inertial_velocities_m_s, measurements.inertial_velocities_m_s[[0, 2, 3]])  # type: ignore[index]
     assert len(measurements.select(()).frames()) == 0
+
+
+class RecordingInertialStream(RecordingStream):
+    """A stream that records all measurements and returns no estimate after an image."""
+
+    def process_image(self, frame: DescentFrame) -> None:
+        self.calls.append(frame)
+
+    def process_increments(self, increments: ImuIncrements) -> None:
+        self.calls.append(increments)
+
+    def process_altitude(self, measurement: AltitudeMeasurement) -> None:
+        self.calls.append(measurement)
+
+
+def record_events(measurements: DescentMeasurements) -> list[object]:
+    stream = RecordingInertialStream()
+    StreamedEstimator(stream).estimate(measurements)
+    assert (stream.calls[0], stream.calls[-1]) == ("start", "finish")
+    return stream.calls[1:-1]
+
+
+def test_increments_and_altitudes_arrive_in_the_order_of_their_tags() -> None:
+    """Altitudes of the first and the last image are missing or too early; the second reading is used twice."""
+    measurements = inputs.inertial_descent(5)
+    increments = measurements.increments
+    assert increments is not None
+    first, second, third, *_, last = measurements.altitudes
+    altitudes = (
+        replace(first, time_s=0.0),
+        replace(second, time_s=second.time_s - 0.3),
+        replace(second, time_s=second.time_s - 0.3),
+        replace(third, time_s=third.time_s + 0.4),
+        replace(last, altitude_m=float("nan")),
+    )
+    measurements = replace(measurements, altitudes=altitudes)
+    events = record_events(measurements)
+    kinds = {ImuIncrements: "increments", AltitudeMeasurement: "altitude", DescentFrame: "image"}
+    assert [kinds[type(event)] for event in events if not isinstance(event, ImuIncrements)] == [
+        *("image", "altitude", "image", "image", "altitude", "image", "image")
+    ]
+    assert [kinds[type(event)] for event in events[::2]] == ["increments"] * 7
+    # increments of all parts, up to the last image: 1 s before the first image, and 7.5 s between the images
+    parts = [event for event in events if isinstance(event, ImuIncrements)]
+    angles = np.concatenate([part.delta_angles_rad for part in parts])
+    assert len(angles) == 850
+    np.testing.assert_array_equal(angles, increments.delta_angles_rad[:850])
+    # a stream without the optional methods receives the images only
+    stream = RecordingStream()
+    StreamedEstimator(stream).estimate(measurements)
+    assert len(stream.calls) == 7
+    assert record_events(measurements.select(())) == []
+
+
+def test_increments_before_an_image_end_at_the_next_boundary() -> None:
+    measurements = inputs.inertial_descent(5)
+    images = tuple(replace(image, time_s=image.time_s + 0.003) for image in measurements.images)
+    events = record_events(replace(measurements, images=images, altitudes=measurements.altitudes[:1] * 5))
+    for part, frame in zip(events[2::2], events[3::2], strict=True):
+        assert isinstance(part, ImuIncrements)
+        assert isinstance(frame, DescentFrame)
+        assert part.times_s[-1] - 0.01 < frame.image.time_s <= part.times_s[-1]
+    late = replace(images[-1], time_s=images[-1].time_s + 1.0)
+    with pytest.raises(ValueError, match=r"time tag 108\.503000 s is outside of the increments; allowed: 99\.0"):
+        record_events(replace(measurements, images=(*images[:-1], late)))
+
+
+def test_increments_of_the_conformance_suite_are_exact() -> None:
+    measurements = inputs.inertial_descent(5)
+    attitudes, increments, gravity = measurements.attitudes, measurements.increments, measurements.gravity_m_s2
+    assert increments is not None
+    assert gravity is not None
+    solution = InertialSolution.propagate(
+        increments, attitudes[0].world_from_body, inputs.DESCENT_VELOCITY_M_S, gravity
+    )
+    np.testing.assert_allclose(solution.velocities_m_s, np.tile(inputs.DESCENT_VELOCITY_M_S, (901, 1)), atol=1e-9)
+    # the other images are between two boundaries
+    for attitude in attitudes[::2]:
+        estimate = solution.attitude(np.array([attitude.time_s]))[0]
+        assert (estimate.inv() * attitude.world_from_body).magnitude() < 1e-7
 
 
 def test_three_image_estimator_rejects_more_images() -> None:
@@ -161,7 +243,7 @@ def test_former_names_of_streams_are_accepted() -> None:
 
 @pytest.mark.parametrize("altitude_m", [1500.0, float("nan")])
 def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
-    measurements = inputs.descent()
+    measurements = inputs.inertial_descent(3)
     frame = replace(measurements.frames()[1], altitude=replace(measurements.altitudes[1], altitude_m=altitude_m))
     write_frame(tmp_path, frame)
     names = sorted(path.name for path in tmp_path.iterdir())
@@ -171,6 +253,7 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
     for name in ("sun_direction", "inertial_velocity_m_s", "interval_velocity_m_s"):
         np.testing.assert_array_equal(getattr(restored_frame, name), getattr(frame, name))
     assert repr(restored_frame.altitude) == repr(frame.altitude)
+    assert restored_frame.gravity_m_s2 == frame.gravity_m_s2 == 3.71
     assert (restored_frame.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
     path = tmp_path / "frame.json"
     path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 2'))
@@ -180,7 +263,7 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
 
 @pytest.mark.parametrize("image_count", [1, 5])
 def test_cases_of_any_image_count_round_trip(tmp_path: Path, image_count: int) -> None:
-    measurements = inputs.descent(5).select(tuple(range(image_count)))
+    measurements = inputs.inertial_descent(5).select(tuple(range(image_count)))
     write_case(tmp_path, measurements)
     restored_case = read_case(tmp_path)
     assert isinstance(restored_case, DescentMeasurements)
@@ -189,6 +272,11 @@ def test_cases_of_any_image_count_round_trip(tmp_path: Path, image_count: int) -
     )
     np.testing.assert_array_equal(restored_case.interval_velocities_m_s, measurements.interval_velocities_m_s)
     np.testing.assert_array_equal(restored_case.inertial_velocities_m_s, measurements.inertial_velocities_m_s)
+    assert hash_inputs(restored_case.increments) == hash_inputs(measurements.increments)
+    assert restored_case.gravity_m_s2 == measurements.gravity_m_s2
+    # the files of descents without increments have no further keys
+    write_case(tmp_path, inputs.descent())
+    assert not {"increments", "gravity_m_s2"} & set(json.loads((tmp_path / "case.json").read_text()))
 
 
 def make_stream(spec: str, time_s: float = 60.0) -> StreamedEstimator:
@@ -223,6 +311,58 @@ def test_example_returns_equal_estimates_in_python_and_as_program(monkeypatch: p
     end_idle_programs()
 
 
+def test_example_integrates_increments_in_python_and_as_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The increments are exact: the integrated velocities equal the inertial velocities of the frames."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    example = importlib.import_module("velocity_stream")
+    measurements = inputs.inertial_descent(5)
+    expected = StreamedEstimator(example.ChainedShifts()).estimate(measurements)
+    # the inertial velocities of later frames are wrong and must not be used
+    velocities = measurements.inertial_velocities_m_s
+    assert velocities is not None
+    wrong = replace(
+        measurements,
+        inertial_velocities_m_s=velocities + 50.0 * (np.arange(5.0) > 0.0)[:, None],
+        interval_velocities_m_s=measurements.interval_velocities_m_s + 50.0,
+    )
+    reference = StreamedEstimator(example.IntegratedShifts()).estimate(wrong)
+    np.testing.assert_allclose(reference.velocity_m_s, expected.velocity_m_s, atol=1e-6)  # type: ignore[arg-type]
+    program = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'} --increments")
+    for _ in range(2):
+        actual = program.estimate(wrong)
+        np.testing.assert_allclose(actual.velocity_m_s, reference.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
+    end_idle_programs()
+
+
+RECORDING_PROGRAM = """
+import json, sys
+print(json.dumps({"exchange": 2, "ready": True}), flush=True)
+seen = []
+for line in sys.stdin:
+    request = json.loads(line)
+    seen.append(request["do"])
+    answer = {"exchange": 2, "id": request["id"], "outcome": None}
+    if request["do"] == "start":
+        answer |= START
+    if request["do"] == "finish":
+        print(json.dumps(seen), file=sys.stderr, flush=True)
+        answer["outcome"] = "NO_VALID_TRACK"
+    print(json.dumps(answer), flush=True)
+"""
+
+
+@pytest.mark.parametrize("accepts", [True, False])
+def test_programs_receive_increments_on_request(tmp_path: Path, accepts: bool) -> None:
+    start = {"inertial": True} if accepts else {}
+    (tmp_path / "stream.py").write_text(RECORDING_PROGRAM.replace("START", repr(start)))
+    answer = make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.inertial_descent(2))
+    assert isinstance(answer.details, ProgramDetails)
+    # altitude and image have equal tags
+    events = ["imu", "altitude", "picture"] if accepts else ["picture"]
+    assert json.loads(answer.details.stderr) == ["start", *events, *events, "finish"]
+
+
 def format_server(answers: list[str]) -> str:
     """Return a program that sends fixed answers without evaluating its requests."""
     return f"{READY}for answer in {answers}:\n    sys.stdin.readline()\n    print(answer, flush=True)\n"
@@ -235,6 +375,14 @@ NO_VELOCITY_YET = '{"exchange": 1, "outcome": null}'
     ("answers", "message"),
     [
         (['{"exchange": 1, "outcome": "NO_VALID_TRACK"}'], "the answer to 'start' has an outcome"),
+        (['{"exchange": 1, "outcome": null, "inertial": 1}'], "inertial is 1; allowed: true, or false"),
+        (
+            [
+                '{"exchange": 1, "outcome": null, "inertial": true}',
+                '{"exchange": 1, "outcome": "VALID", "velocity_m_s": [1, 2]}',
+            ],
+            "the answer to 'imu' has an outcome; it must be null",
+        ),
         ([NO_VELOCITY_YET, "3"], "not one JSON object"),
         ([NO_VELOCITY_YET, '{"exchange": 1}'], "outcome is None; allowed: VALID"),
         ([NO_VELOCITY_YET, '{"exchange": 1, "outcome": null, "span_s": [1, 2]}'], "unknown key 'span_s'"),
@@ -253,7 +401,7 @@ NO_VELOCITY_YET = '{"exchange": 1, "outcome": null}'
 def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: list[str], message: str) -> None:
     (tmp_path / "stream.py").write_text(format_server(answers))
     with pytest.raises(AlgorithmError, match=message) as error:
-        make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.descent())
+        make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.inertial_descent(3))
     assert error.value.fault is (Fault.CRASHED if answers == [NO_VELOCITY_YET] * 2 else Fault.BAD_ANSWER)
 
 

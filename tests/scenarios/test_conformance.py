@@ -40,6 +40,7 @@ def run_suite(spec: str, *checks: str) -> dict[str, Finding]:
         *LANDING.shipped,
         "velocity_estimator:MedianShift",
         "velocity_stream:ChainedShifts",
+        "velocity_stream:IntegratedShifts",
     ],
 )
 def test_shipped_algorithms_conform(spec: str, monkeypatch: pytest.MonkeyPatch) -> None:

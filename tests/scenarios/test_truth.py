@@ -17,6 +17,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.descent.exposure import camera_optics
+from marsyard.scenarios.descent.flight import IMU_MARGIN_S, SIMULATED_LEAD_S
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.fieldtest.imaging import field_camera
@@ -31,6 +32,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, MastCalibration, RoverMeasurements
 from marsyard.sim.sensor import Detector
+from marsyard.sim.sensor.imu import true_increments
 from marsyard.sim.streams import Streams
 from tests.scenarios import spies
 
@@ -88,7 +90,13 @@ def test_descent_inputs_differ_from_truth(case: int) -> None:
     from tests.scenarios.descent.settings import DESCENT, SMALL_WORLD
 
     parameters = DescentScenarioParameters.model_validate(
-        {**SMALL_WORLD, "descent": DESCENT, "algorithm": "tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE}
+        {
+            **SMALL_WORLD,
+            "descent": DESCENT,
+            "inertial": {"rate_hz": 100.0},
+            "algorithm": "tests.scenarios.spies:VelocitySpy",
+            **RECORDING_SCORE,
+        }
     )
     streams = Streams(1, "truth", case)
     row = DescentScenario().run(parameters, streams).row
@@ -108,13 +116,21 @@ def test_descent_inputs_differ_from_truth(case: int) -> None:
     assert_differs("interval velocities", inputs.interval_velocities_m_s, true_displacements / np.diff(times)[:, None])
     for inertial, state in zip(inputs.inertial_velocities_m_s, truth.states, strict=True):
         assert_differs("inertial velocity", inertial, state.velocity_m_s)
+    boundaries = -SIMULATED_LEAD_S + IMU_MARGIN_S + np.arange(inputs.increments.times_s.size) / 100.0
+    angles, velocities = true_increments(truth.motion, boundaries)
+    assert_differs("time tags of the increments", inputs.increments.times_s, boundaries)
+    # errors of single increments are much smaller than the increments
+    assert np.abs(inputs.increments.delta_angles_rad - angles).max() > 1e-6
+    assert np.abs(inputs.increments.delta_velocities_m_s - velocities).max() > 1e-5
 
 
 def assert_flight_inputs_differ(
     inputs: DescentMeasurements, truth: ScoredFlight, camera: CameraModel, altitudes_m: list[float]
 ) -> None:
     """Assert that cameras, attitudes and altitudes differ from the truth."""
+    # the increments are compared separately; the gravity of the site is known
     names = {"images", "attitudes", "altitudes", "interval_velocities_m_s", "sun_direction", "inertial_velocities_m_s"}
+    names |= {"increments", "gravity_m_s2"}
     assert_all_fields_are_compared(DescentMeasurements, names)
     for image, attitude, altitude, state, altitude_m in zip(
         inputs.images, inputs.attitudes, inputs.altitudes, truth.states, altitudes_m, strict=True

@@ -15,17 +15,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails, parse_command
+from marsyard.algorithms.exchange.files import encode_increments, read_increments
 from marsyard.algorithms.exchange.serving import idle_processes
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.localisation.baselines import InertialEstimator
 from marsyard.algorithms.localisation.exchange import (
     ExecutablePositionEstimator,
     encode_estimate,
-    encode_increments,
     encode_initial,
     read_descent_image,
     read_estimate,
-    read_increments,
     read_initial,
     read_map,
     serve,

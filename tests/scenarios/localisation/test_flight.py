@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from marsyard.scenarios.localisation.flight import BELOW_END_M, LEAD_S, LanderFlight, ProfileParameters
-from marsyard.scenarios.localisation.instruments import LN200
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.sensor import Imu, InertialSolution
-from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, MILLI_G, true_increments
+from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, LN200, MILLI_G, true_increments
 
 GROUND_M = -100.0
 GRAVITY_M_S2 = 3.72

@@ -12,8 +12,6 @@ from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.instruments import (
     HALF_WELL_SNR,
     LANDER_DETECTOR,
-    LN200,
-    MEMS,
     RADAR,
     CameraParameters,
     InitialErrors,
@@ -22,6 +20,7 @@ from marsyard.scenarios.localisation.instruments import (
     true_camera,
 )
 from marsyard.sim.sensor import Detector, Imu, RadarAltimeter
+from marsyard.sim.sensor.imu import LN200, MEMS
 from marsyard.sim.terrain import Surface
 
 GROUND_M = -100.0

@@ -18,7 +18,6 @@ from marsyard.algorithms.localisation.interface import (
 from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.instruments import (
     IMAGE_CLOCK,
-    LN200,
     RADAR,
     CameraParameters,
     InitialErrors,
@@ -28,7 +27,7 @@ from marsyard.scenarios.localisation.instruments import (
 from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, ImageSchedule, StreamAnswers, feed, merge
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
 from marsyard.sim.sensor import Clock, Imu, RadarAltimeter
-from marsyard.sim.sensor.imu import true_increments
+from marsyard.sim.sensor.imu import LN200, true_increments
 from marsyard.sim.terrain import Surface
 
 SPAN_S = (0.0, 6.0)
