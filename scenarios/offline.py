@@ -7,9 +7,10 @@ table.
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
@@ -53,6 +54,9 @@ class AnswerFormat(Generic[Answer]):
     - create_empty: creates the failure that an export returns
     - add_inputs: adds inputs of the case to an answer that needs them, such as the a-priori site
     - note: explanation of the columns for the user
+    - write_inputs: writes the inputs of a case into an existing folder. Raises OSError.
+    - join: joins the answers in the lines of a case, in the order of the table; None: a case has one line. Raises
+      ValueError.
     """
 
     required: tuple[str, ...]
@@ -62,6 +66,8 @@ class AnswerFormat(Generic[Answer]):
     create_empty: Callable[[Any], Answer]
     add_inputs: Callable[[Answer, Any], Answer] = lambda answer, _: answer
     note: str = ""
+    write_inputs: Callable[[Path, Any], None] = lambda folder, inputs: write_case(folder, inputs, image_format="png")
+    join: Callable[[Sequence[Answer]], Any] | None = None
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -154,7 +160,7 @@ class CaseExporter:
         temporary_folder = self.folder.with_name(f"{self.folder.name}.part{os.getpid()}")
         shutil.rmtree(temporary_folder, ignore_errors=True)
         temporary_folder.mkdir(parents=True)
-        write_case(temporary_folder, measurements, image_format="png")
+        self.answer_format.write_inputs(temporary_folder, measurements)
         shutil.rmtree(self.folder, ignore_errors=True)
         temporary_folder.rename(self.folder)
         return self.answer_format.create_empty(measurements)
@@ -191,17 +197,26 @@ def _read(file: Path, answer_format: AnswerFormat[Any], _modified_ns: int, _size
 
     def parse(line: int, cells: Mapping[str, str]) -> tuple[int, Any]:
         case, answer = _parse_answer(cells, answer_format)
-        if case in first_lines:
+        if case in first_lines and answer_format.join is None:
             raise ValueError(f"case {case} has two answers, the first in line {first_lines[case]}")
-        first_lines[case] = line
+        first_lines.setdefault(case, line)
         return case, answer
 
     hint = f"allowed: {', '.join(answer_format.columns)}; the suffix of a name is its unit"
     required = ("case", *answer_format.required)
     answers, problems = parse_table(file, MAX_ROWS, required, answer_format.columns, hint, parse)
+    lines_by_case: dict[int, list[Any]] = {}
+    for case, answer in answers:
+        lines_by_case.setdefault(case, []).append(answer)
+    answers_by_case = {}
+    for case, lines in lines_by_case.items():
+        try:
+            answers_by_case[case] = lines[0] if answer_format.join is None else answer_format.join(lines)
+        except ValueError as error:
+            problems.append(f"case {case}: {error}")
     if problems:
         raise ValueError(format_problems(file, problems))
-    return dict(answers)
+    return answers_by_case
 
 
 def _parse_answer(cells: Mapping[str, str], answer_format: AnswerFormat[Any]) -> tuple[int, Any]:
@@ -212,7 +227,8 @@ def _parse_answer(cells: Mapping[str, str], answer_format: AnswerFormat[Any]) ->
     # the first two columns are `case` and `outcome`
     for name, text in ((name, text) for name, text in cells.items() if name in answer_format.columns[2:] and text):
         numbers[name] = value = finite_number(name, text, ", or an empty cell if the outcome is a failure")
-        unit, limit = next((unit, limit) for unit, limit in _MAX_MAGNITUDE.items() if name.endswith(unit))
+        limits = ((unit, limit) for unit, limit in _MAX_MAGNITUDE.items() if name.endswith(unit))
+        unit, limit = next(limits, ("", math.inf))
         if abs(value) > limit:
             raise ValueError(f"{name} is {text}, beyond {limit:g}; the suffix of the name is the unit ({unit})")
     check_column_groups((answer_format.required, *answer_format.optional), numbers)

@@ -62,18 +62,21 @@ def _write_manifest(campaign: Campaign, directory: Path) -> None:
     task, name, cases = _find_task(campaign), campaign.configuration.name, campaign.configuration.total_cases
     answer_format = task.offline
     columns = () if answer_format is None else answer_format.columns
+    has_one_line = answer_format is None or answer_format.join is None
+    lines = "one line for each case" if has_one_line else "the lines of each case in order"
+    refusal = "A case without an answer has an\noutcome and no numbers; outcomes" if has_one_line else "Outcomes"
+    outcomes = ", ".join(answer_format.outcomes.__members__) if answer_format else ""
     manifest = {"schema": SCHEMA, "campaign": name, "task": task.name, "cases": cases, "columns": list(columns)}
     text = f"""# {cases} cases of {name}
 
 Each folder of `{CASES}/` is one case (task: {task.name}): `case.json`, 16-bit images and
 cameras, in the format of docs/custom-algorithms.md. The folder contains no ground truth.
 
-Answer with a comma-separated table: a header line with these columns, then one line for each case:
+Answer with a comma-separated table: a header line with these columns, then {lines}:
 
     {",".join(columns)}
 
-`case` is the number of the folder. The suffix of a column's name is its unit. A case without an answer has an
-outcome and no numbers; outcomes: {", ".join(answer_format.outcomes.__members__) if answer_format else ""}.
+`case` is the number of the folder. The suffix of a column's name is its unit. {refusal}: {outcomes}.
 """
     if answer_format and answer_format.note:
         text += f"{answer_format.note}\n"

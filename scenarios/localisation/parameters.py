@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.localisation.options import LvsOptions
@@ -12,6 +13,7 @@ from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.conditions import SizedFaults
 from marsyard.scenarios.descent.parameters import DustOpacity, Location, RenderParameters, SunParameters
 from marsyard.scenarios.localisation.flight import ProfileParameters
+from marsyard.scenarios.localisation.imported import check_imported_terrain
 from marsyard.scenarios.localisation.instruments import (
     IMAGE_CLOCK,
     LANDER_DETECTOR,
@@ -50,7 +52,8 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     """Parameters of a localisation campaign.
 
     `location` is the terrain and the centre of the map; the descent begins at `start_east_m`, `start_north_m` from it.
-    Keys of the table `terrain` override the terrain of the site.
+    Keys of the table `terrain` override the terrain of the site; `terrain.source` is a DTM with an orthoimage in its
+    middle.
     """
 
     task = LOCALISATION
@@ -112,6 +115,12 @@ class LocalisationScenarioParameters(AlgorithmSelection):
         if side_m > period_m:
             raise ValueError(
                 f"the map of {side_m:.6g} m is larger than the terrain, which repeats after {period_m:.6g} m"
+            )
+        half_field = 0.5 * np.radians(self.camera.field_deg)
+        check_imported_terrain(self.terrain, 2.0 * self.flight.altitude_end_m * float(np.tan(half_field)))
+        if self.faults.wrong_map and self.terrain.source is not None:
+            raise ValueError(
+                "faults.wrong_map needs another terrain; all terrains with terrain.source contain the same DTM"
             )
         if self.faults.wrong_map and self.location.bank < 2:
             raise ValueError("faults.wrong_map needs another terrain; allowed: a location.bank of at least 2")

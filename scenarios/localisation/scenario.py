@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import UInt16
@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.answers import check_estimate
-from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionOutcome
+from marsyard.algorithms.localisation.interface import InitialState, PositionEstimator, PositionOutcome
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
@@ -24,9 +24,10 @@ from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.instruments import draw_calibrated_camera, measure_altitudes, true_camera
 from marsyard.scenarios.localisation.map_product import MapTruth, make_map
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
-from marsyard.scenarios.localisation.stream import Event, StreamAnswers, feed, merge
+from marsyard.scenarios.localisation.stream import LocalisationMeasurements, StreamAnswers, feed
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.localisation.world import LocalisationWorld
+from marsyard.scenarios.offline import CaseExporter, RecordedAnswer
 from marsyard.scenarios.parts.named import PartKind
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
@@ -77,14 +78,10 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
 
         def evaluate(algorithm: str) -> CaseResult:
             measurements = descent.measurements
-            span_s = (float(descent.increments.times_s[0]), float(descent.increments.times_s[-1]))
+            tags = measurements.increments.times_s
+            span_s = (float(tags[0]), float(tags[-1]))
             algorithm_run = run_algorithm_on_copy(
-                lambda inputs: feed(
-                    LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case),
-                    inputs.initial,
-                    inputs.map_product,
-                    inputs.events,
-                ),
+                lambda inputs: _answer(LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case), inputs),
                 lambda answers: _check_answers(answers, span_s),
                 measurements,
             )
@@ -97,6 +94,13 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
         return case_result(p.algorithms, evaluate, shared)
 
 
+def _answer(algorithm: object, inputs: LocalisationMeasurements) -> object:
+    """Run an estimator over the stream; an export and a table of answers receive all measurements at once."""
+    if isinstance(algorithm, CaseExporter | RecordedAnswer):
+        return algorithm.estimate(inputs)
+    return feed(cast(PositionEstimator, algorithm), inputs.initial, inputs.map_product, inputs.events)
+
+
 def _check_answers(answers: Any, span_s: tuple[float, float]) -> StreamAnswers:
     """Validate the answers of a stream. Raises AlgorithmError."""
     checked: StreamAnswers = replace(
@@ -106,21 +110,10 @@ def _check_answers(answers: Any, span_s: tuple[float, float]) -> StreamAnswers:
 
 
 @dataclass(frozen=True)
-class LocalisationMeasurements:
-    """Measurements of a descent in the order of their arrival, with the initial state and the map."""
-
-    initial: InitialState
-    map_product: MapProduct
-    events: tuple[Event, ...]
-
-
-@dataclass(frozen=True)
 class LocalisedDescent:
     """A simulated descent, its map and its measurements, which all algorithms of a case use.
 
     - states: true states at the images
-    - images: delivered images
-    - increments: measured inertial increments of the whole descent
     - imu_offset_s: time tags of the inertial unit minus true times, without jitter
     """
 
@@ -129,10 +122,13 @@ class LocalisedDescent:
     flight: LanderFlight
     states: tuple[State, ...]
     map_truth: MapTruth
-    images: tuple[DetectorImage, ...]
-    increments: ImuIncrements
     imu_offset_s: float
     measurements: LocalisationMeasurements
+
+    @property
+    def images(self) -> tuple[DetectorImage, ...]:
+        """Delivered images."""
+        return self.measurements.images
 
     @property
     def initial_truth(self) -> State:
@@ -163,9 +159,8 @@ class LocalisedDescent:
         images = _take_images(p, world, states, streams)
         increments, initial, offset_s = _measure_inertially(p, flight, float(times[-1]), gravity, streams)
         altitudes = _measure_altitudes(p, world, flight, float(times[-1]), streams)
-        events = merge(increments, altitudes, images)
-        measurements = LocalisationMeasurements(initial, map_product, tuple(events))
-        return cls(p, world, flight, states, map_truth, tuple(images), increments, offset_s, measurements)
+        measurements = LocalisationMeasurements(initial, map_product, increments, tuple(altitudes), tuple(images))
+        return cls(p, world, flight, states, map_truth, offset_s, measurements)
 
 
 def _map_terrain(p: LocalisationScenarioParameters) -> int:

@@ -70,6 +70,25 @@ def merge(
 
 
 @dataclass(frozen=True)
+class LocalisationMeasurements:
+    """All measurements of a descent, with the initial state and the map: the inputs of a position estimator.
+
+    - images, altitudes: in the order of their time tags; lost images and missing readings are omitted
+    """
+
+    initial: InitialState
+    map_product: MapProduct
+    increments: ImuIncrements
+    altitudes: tuple[AltitudeMeasurement, ...]
+    images: tuple[DetectorImage, ...]
+
+    @property
+    def events(self) -> list[Event]:
+        """Measurements in the order of arrival; see `merge`."""
+        return merge(self.increments, self.altitudes, self.images)
+
+
+@dataclass(frozen=True)
 class ProcessorTimes:
     """Processor time of each call of an estimator, s; one value per call of `imu`, `altitude` and `image`.
 

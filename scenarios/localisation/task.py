@@ -8,6 +8,7 @@ from marsyard.algorithms.localisation.exchange import ExecutablePositionEstimato
 from marsyard.algorithms.localisation.interface import PositionEstimator
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.scenarios.estimators import Task
+from marsyard.scenarios.localisation.offline import POSITION_FORMAT
 
 LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
     name="localisation",
@@ -16,5 +17,6 @@ LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
     shipped={"lvs": MapRelativeEstimator, "sift": FeatureEstimator, "inertial": InertialEstimator},
     executable=ExecutablePositionEstimator,
     options=LvsOptions,
+    offline=POSITION_FORMAT,
     suite="marsyard.scenarios.localisation.conformance:PositionSuite",
 )
