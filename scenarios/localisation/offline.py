@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -125,8 +126,8 @@ def _unknown_times(n_images: int) -> ProcessorTimes:
     return ProcessorTimes(math.nan, (), (), (math.nan,) * n_images, math.nan)
 
 
-#: Format of a table of answers.
-POSITION_FORMAT: AnswerFormat[PositionEstimate] = AnswerFormat(
+#: Format of a table of answers; lines are `PositionEstimate`, the answer to a case is `StreamAnswers`.
+POSITION_FORMAT: AnswerFormat[Any] = AnswerFormat(
     required=("time_s",),
     optional=(tuple(name for columns in _STATE_COLUMNS.values() for name in columns) + _COVARIANCE_COLUMNS,),
     outcomes=PositionOutcome,
