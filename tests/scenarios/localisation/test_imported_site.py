@@ -40,6 +40,7 @@ def _heights() -> np.ndarray:
 
 def _write_site(folder: Path, *, posting_m: float = POST_M) -> dict[str, str]:
     """Write a DTM and an orthoimage with a bright eastern half and texture of 12 m; return the table of the source."""
+    folder.mkdir(exist_ok=True)
     corner = (8_142_406.0, -276_455.0)
     dtm = write_tif(
         folder, values=_heights() - 4450.0, transform=Affine(posting_m, 0, corner[0], 0, -posting_m, corner[1])
@@ -113,7 +114,6 @@ def test_terrain_and_files_of_a_wrong_size_are_rejected(tmp_path: Path) -> None:
     small, large = (
         {**source, "dtm": _write_site(folder, posting_m=posting)["dtm"]}
         for folder, posting in ((tmp_path / "small", 2.0), (tmp_path / "large", 100.0))
-        if not folder.mkdir()
     )
     cases: list[tuple[dict[str, Any], str]] = [
         (_settings(source, terrain={**TERRAIN, "samples": 512, "source": source}), r"repeats after 6144 m; .* 12000 m"),
