@@ -21,23 +21,17 @@ from marsyard.algorithms.exchange.files import (
     FORMAT_VERSION,
     check_version,
     encode_altitude,
+    encode_increments,
     open_json,
     read_altitude,
     read_image,
+    read_increments,
     write_images,
     write_json,
 )
 from marsyard.algorithms.faults import bad_answer
 from marsyard.algorithms.localisation.answers import check_estimate
-from marsyard.algorithms.localisation.exchange import (
-    encode_increments,
-    encode_initial,
-    read_estimate,
-    read_increments,
-    read_initial,
-    read_map,
-    write_map,
-)
+from marsyard.algorithms.localisation.exchange import encode_initial, read_estimate, read_initial, read_map, write_map
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.scenarios.localisation.stream import LocalisationMeasurements, ProcessorTimes, StreamAnswers
 from marsyard.scenarios.offline import AnswerFormat
