@@ -35,6 +35,8 @@ class InertialEstimator:
 
     def image(self, image: DetectorImage) -> PositionEstimate:
         """Return the state at the time of the image."""
+        if not self._filter.is_stored(image.time_s):
+            return PositionEstimate(PositionOutcome.OUTSIDE_INERTIAL_DATA, self._filter.time_s)
         return self._answer(image.time_s)
 
     def finish(self) -> PositionEstimate:
@@ -64,11 +66,15 @@ class FeatureEstimator(InertialEstimator):
         self._altitude_m: float | None = None
 
     def altitude(self, measurement: AltitudeMeasurement) -> None:
-        """Store the altitude, which determines the scale at which an image is matched."""
+        """Store the altitude, which determines the scale at which an image is matched; ignored as in `image`."""
+        if not self._filter.is_stored(measurement.time_s):
+            return
         self._altitude_m = measurement.altitude_m
 
     def image(self, image: DetectorImage) -> PositionEstimate:
         """Estimate the pose from features, and update the position."""
+        if not self._filter.is_stored(image.time_s):
+            return PositionEstimate(PositionOutcome.OUTSIDE_INERTIAL_DATA, self._filter.time_s)
         state = self._filter.state_at(image.time_s)
         posed = PosedImage.from_detector(image, state.position_m, state.world_from_body)
         solution = None if self._altitude_m is None else self._solve(posed, self._altitude_m)

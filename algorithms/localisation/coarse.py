@@ -8,6 +8,8 @@ the estimated attitude and the altimeter's height, and correlated with the map a
 2. For each candidate, the patches are rectified again onto the map's elevation there, and matched near the candidate.
    Patches whose offsets agree within a small tolerance are consistent. The candidate with the largest support is
    accepted if it has enough consistent patches and no other candidate has a similar support.
+3. The offsets of the accepted candidate are tested against the errors that the state's covariance allows
+   (`consistency`). Patches with a wrong attitude agree on a wrong offset, but not within the stated errors.
 """
 
 from __future__ import annotations
@@ -23,7 +25,17 @@ from jaxtyping import Float, Int
 from marsyard.algorithms.arrays import Flags, Points2, Raster, Vector, Vector2
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, second_peak
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
+from marsyard.algorithms.localisation.consistency import (
+    Consistency,
+    OffsetErrors,
+    OffsetTest,
+    PatchGeometry,
+    check_offsets,
+    offset_covariance,
+)
+from marsyard.algorithms.localisation.inertial_state import POSITION
 from marsyard.algorithms.localisation.interface import MapProduct
+from marsyard.algorithms.localisation.map_sampling import elevation_at
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.algorithms.localisation.rectification import (
@@ -56,6 +68,7 @@ class CoarseRefusal(Enum):
     NO_CONSENSUS = "too few patches agree on an offset of the position"
     AMBIGUOUS = "another offset of the position has a similar support"
     BORDER = "the offset lies at the border of the search area"
+    INCONSISTENT = "the offsets of the patches do not fit the errors that the state's covariance allows"
 
 
 @dataclass(frozen=True)
@@ -87,6 +100,7 @@ class CoarseFix:
       map's registration and distortion
     - matches: the patches' matches
     - support, second_support: sums of the scores of the consistent patches of the best and of the second candidate
+    - consistency: test of the consistent patches' offsets
     """
 
     offset_m: Vector2
@@ -94,6 +108,7 @@ class CoarseFix:
     matches: CoarseMatches
     support: float
     second_support: float
+    consistency: Consistency | None = None
 
 
 @dataclass(frozen=True)
@@ -136,13 +151,13 @@ def find_coarse_position(
     images: Sequence[PosedImage],
     height_above_ground_m: Sequence[float],
     map_product: MapProduct,
-    sd_m: float,
+    covariance: Float[np.ndarray, "9 9"],
     options: LvsOptions,
 ) -> CoarseFix | CoarseRefusal:
     """Find the common horizontal offset of the images' estimated positions by matching large patches to the map.
 
     - height_above_ground_m: height of the body's origin above the ground below it at each image, from the altimeter
-    - sd_m: standard deviation of the horizontal position per axis
+    - covariance: of the errors of position (m), velocity (m/s) and attitude (rad, world axes) at the last image
     """
     grid = bin_map(map_product, options.coarse_binning)
     views = [
@@ -156,13 +171,14 @@ def find_coarse_position(
         patches += _select_patches(rectified, grid, number, options)
     if len(patches) < options.min_consistent_patches:
         return CoarseRefusal.TOO_FEW_PATCHES
+    sd_m = float(np.sqrt(np.diag(covariance)[POSITION][:2].max()))
     # differences from the mean keep the precision of float32 sums
     appearance = grid.appearance - grid.appearance.mean()
     radius = int(np.ceil(min(options.search_radius_m, options.search_sigmas * sd_m) / grid.pixel_m))
     surfaces = np.stack([_correlate(patch, appearance, radius) for patch in patches])
     peaks = _candidate_offsets(surfaces, radius, grid.pixel_m, options)
     candidates = [_verify(peak, patches, views, grid, appearance, options) for peak in peaks]
-    return _decide(candidates, patches, views, grid, radius, options)
+    return _decide(candidates, patches, views, grid, radius, covariance, options)
 
 
 def _select_patches(rectified: RectifiedImage, grid: MapProduct, number: int, options: LvsOptions) -> list[_Patch]:
@@ -338,6 +354,7 @@ def _decide(
     views: Sequence[GroundView],
     grid: MapProduct,
     radius: int,
+    covariance: Float[np.ndarray, "9 9"],
     options: LvsOptions,
 ) -> CoarseFix | CoarseRefusal:
     """Accept the candidate with the largest support, or state why there is none."""
@@ -353,13 +370,58 @@ def _decide(
         return CoarseRefusal.AMBIGUOUS
     if np.linalg.norm(best.offset_m) > radius * grid.pixel_m - options.relief_tolerance_m:
         return CoarseRefusal.BORDER
+    consistency = _check_consistency(best, patches, views, grid, covariance, options)
+    if consistency.members.sum() < options.min_consistent_patches or not consistency.is_consistent:
+        return CoarseRefusal.INCONSISTENT
+    rows = np.flatnonzero(best.consistent)[consistency.members]
+    consistent = np.isin(np.arange(len(patches)), rows)
+    mean = np.average(best.offsets_m[rows], axis=0, weights=best.scores[rows])
+    best = replace(best, offset_m=mean, consistent=consistent)
     return CoarseFix(
         offset_m=best.offset_m,
         covariance=_covariance(best, patches, views, grid, options),
         matches=_collect_matches(best, patches, grid),
         support=best.support,
         second_support=second,
+        consistency=consistency,
     )
+
+
+def _check_consistency(
+    best: _Candidate,
+    patches: Sequence[_Patch],
+    views: Sequence[GroundView],
+    grid: MapProduct,
+    covariance: Float[np.ndarray, "9 9"],
+    options: LvsOptions,
+) -> Consistency:
+    """Test the offsets of the consistent patches against the stated errors of state, altitudes and map."""
+    rows = np.flatnonzero(best.consistent)
+    members = [patches[k] for k in rows]
+    images = np.array([patch.image for patch in members])
+    matches = _collect_matches(best, patches, grid)
+    below = np.array([elevation_at(grid, view.image.position_m[:2] + best.offset_m) for view in views])
+    heights = np.array([elevation_at(grid, found_m) for found_m in matches.map_m[rows]]) - below[images]
+    cameras = np.stack([view.camera.c for view in views])[images]
+    lines = np.column_stack([matches.predicted_m[rows], heights]) - cameras
+    times = np.array([view.image.time_s for view in views])
+    geometry = PatchGeometry(images, matches.map_m[rows], matches.side_m[rows], lines, times[-1] - times[images])
+    errors = OffsetErrors(
+        height_m=np.hypot(options.altitude_sd * cameras[:, 2], grid.elevation_sd_m),
+        distortion_m=grid.distortion_sd_m,
+        elevation_m=grid.elevation_sd_m,
+        matching_m=_matching_sd_m(grid),
+    )
+    # a wrong patch has its maximum anywhere in the square window of the verification
+    chance = np.pi * options.relief_tolerance_m**2 / (2.0 * options.coarse_tolerance_m) ** 2
+    test = OffsetTest(options.patch_outlier_probability, options.false_refusal, chance)
+    state_offsets = offset_covariance(geometry, covariance, errors)
+    return check_offsets(best.offsets_m[rows], state_offsets, len(patches) - len(rows), test)
+
+
+def _matching_sd_m(grid: MapProduct) -> float:
+    """Standard deviation of a patch's offset per axis: an error that is uniform over a coarse pixel."""
+    return grid.pixel_m / float(np.sqrt(12.0))
 
 
 def _covariance(
@@ -371,8 +433,7 @@ def _covariance(
     independent = max(len(offsets) / max(len(views), 1), 1.0)
     height = float(np.mean([view.camera.c[2] for view in views]))
     common = (options.attitude_sd_rad * height) ** 2 + grid.distortion_sd_m**2
-    quantisation = grid.pixel_m**2 / 12.0
-    return np.asarray(scatter / independent + (common + quantisation) * np.eye(2))
+    return np.asarray(scatter / independent + (common + _matching_sd_m(grid) ** 2) * np.eye(2))
 
 
 def _collect_matches(best: _Candidate, patches: Sequence[_Patch], grid: MapProduct) -> CoarseMatches:

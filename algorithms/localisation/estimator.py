@@ -48,7 +48,8 @@ class MapRelativeEstimator:
         self._coarse_images: list[tuple[PosedImage, float]] = []
         self._altitudes: list[AltitudeMeasurement] = []
         self._failures = 0
-        self._outcome = PositionOutcome.NO_COARSE_FIX
+        self._is_contradicted = False
+        self._last_update_s: float | None = None
 
     def imu(self, increments: ImuIncrements) -> None:
         """Propagate the state by inertial increments."""
@@ -57,13 +58,23 @@ class MapRelativeEstimator:
             self._filter.propagate(increments)
 
     def altitude(self, measurement: AltitudeMeasurement) -> None:
-        """Update the state by an altitude, if the position on the map is known; store it otherwise."""
+        """Update the state by an altitude, if the position on the map is known; store it otherwise.
+
+        An altitude outside of the stored inertial data is ignored.
+        """
+        if not self._filter.is_stored(measurement.time_s):
+            return
         self._altitudes = [*self._altitudes, measurement][-self.options.coarse_altitudes :]
         if self._has_fix:
             self._update_altitude(measurement)
 
     def image(self, image: DetectorImage) -> PositionEstimate:
-        """Match an image with the map, and return the state at its time."""
+        """Match an image with the map, and return the state at its time.
+
+        An image outside of the stored inertial data is refused with OUTSIDE_INERTIAL_DATA, and not used.
+        """
+        if not self._filter.is_stored(image.time_s):
+            return PositionEstimate(PositionOutcome.OUTSIDE_INERTIAL_DATA, self._filter.time_s)
         state = self._filter.state_at(image.time_s)
         posed = PosedImage.from_detector(image, state.position_m, state.world_from_body)
         coarse_offset = None
@@ -88,9 +99,8 @@ class MapRelativeEstimator:
         if len(self._coarse_images) < self.options.coarse_images:
             return None
         state = self._inertial.state_at(image.time_s)
-        sd_m = float(np.sqrt(max(state.covariance[0, 0], state.covariance[1, 1])))
         images, heights = zip(*self._coarse_images, strict=True)
-        fix = find_coarse_position(images, heights, self._map, sd_m, self.options)
+        fix = find_coarse_position(images, heights, self._map, state.covariance[:9, :9], self.options)
         if not isinstance(fix, CoarseFix):
             return None
         updated = copy.deepcopy(self._inertial)
@@ -98,8 +108,7 @@ class MapRelativeEstimator:
         if result.outcome is not UpdateOutcome.APPLIED:
             return None
         self._filter = updated
-        self._has_fix, self._failures = True, 0
-        self._outcome = PositionOutcome.UNCERTAIN
+        self._has_fix, self._failures, self._is_contradicted, self._last_update_s = True, 0, False, None
         for altitude in self._altitudes:
             self._update_altitude(altitude)
         return fix.offset_m
@@ -112,7 +121,7 @@ class MapRelativeEstimator:
         position_sd_m = np.sqrt(np.diag(covariance)[:3])
         matches = match_landmarks(posed, self._landmarks, self._map, position_sd_m, options)
         if len(matches) == 0:
-            return self._fail(image.time_s, LocalisationDetails("fine", coarse_offset))
+            return self._fail(image.time_s, LocalisationDetails("fine", coarse_offset), is_contradicted=False)
         point_sd_m = np.array([self._map.distortion_sd_m, self._map.distortion_sd_m, self._map.elevation_sd_m])
         height_m = max(float(posed.position_m[2]) - elevation_at(self._map, posed.position_m[:2]), 0.0)
         common_sd_m = np.hypot(
@@ -126,6 +135,7 @@ class MapRelativeEstimator:
             pixel_sd=options.landmark_sd_px * matches.working_pixel,
             point_sd_m=point_sd_m,
             common_sd_m=np.sqrt(options.correlated_images) * common_sd_m,
+            is_rigid=True,
         )
         details = LocalisationDetails(
             "fine",
@@ -136,26 +146,31 @@ class MapRelativeEstimator:
             result.inliers,
         )
         if result.outcome is not UpdateOutcome.APPLIED:
-            return self._fail(image.time_s, details)
-        self._failures = 0
-        self._outcome = PositionOutcome.VALID
+            return self._fail(image.time_s, details, is_contradicted=True)
+        self._failures, self._is_contradicted, self._last_update_s = 0, False, image.time_s
         return self._answer(image.time_s, details)
 
-    def _fail(self, time_s: float, details: LocalisationDetails) -> PositionEstimate:
-        """Answer to an image without an update: after several of them, the fix is given up."""
+    def _fail(self, time_s: float, details: LocalisationDetails, *, is_contradicted: bool) -> PositionEstimate:
+        """Answer to an image without an update: after several of them, the fix is given up.
+
+        Landmarks that contradict the state make its covariance doubtful: no position is reported until the next update.
+        """
         self._failures += 1
+        self._is_contradicted |= is_contradicted
         if self._failures >= self.options.max_failures:
-            self._outcome = PositionOutcome.INCONSISTENT
-            answer = self._answer(time_s, details)
             self._has_fix, self._filter, self._coarse_images = False, self._inertial, []
-            self._outcome = PositionOutcome.NO_COARSE_FIX
-            return answer
+            return PositionEstimate(PositionOutcome.INCONSISTENT, time_s, details=details)
         return self._answer(time_s, details)
 
     def _answer(self, time_s: float, details: LocalisationDetails | None) -> PositionEstimate:
-        """Return the state at a time if the last outcome is VALID and the position is certain enough."""
-        if self._outcome is not PositionOutcome.VALID:
-            return PositionEstimate(self._outcome, time_s, details=details)
+        """Return the state at a time, if it is supported by a recent update and the position is certain enough."""
+        if not self._has_fix:
+            return PositionEstimate(PositionOutcome.NO_COARSE_FIX, time_s, details=details)
+        if self._is_contradicted:
+            return PositionEstimate(PositionOutcome.INCONSISTENT, time_s, details=details)
+        last_s, limit_s = self._last_update_s, self.options.max_update_age_s
+        if last_s is None or time_s - last_s > limit_s:
+            return PositionEstimate(PositionOutcome.UNCERTAIN, time_s, details=details)
         position, velocity, attitude, covariance = self._filter.estimate(time_s)
         if float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])) > self.options.max_position_sd_m:
             return PositionEstimate(PositionOutcome.UNCERTAIN, time_s, details=details)

@@ -98,7 +98,8 @@ def match_landmarks(
     ground_m = elevation_at(map_product, image.position_m[:2])
     height_m = max(float(image.world_camera.c[2]) - ground_m, 1.0)
     factor = binning_factor(image, height_m, map_product.pixel_m)
-    prior_sd = np.append(np.maximum(position_sd_m, 1e-3), np.full(3, options.attitude_sd_rad))
+    # a prior with the state's attitude would remove the landmarks that show its error; the filter tests the attitude
+    prior_sd = np.append(np.maximum(position_sd_m, 1e-3), np.full(3, options.fit_attitude_sd_rad))
     sigma_px = np.hypot(
         float(np.max(position_sd_m)) / (height_m * image.pixel_angle_rad),
         options.attitude_sd_rad / image.pixel_angle_rad,

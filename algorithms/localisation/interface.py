@@ -64,7 +64,10 @@ class PositionOutcome(Enum):
     VALID = "a position is reported"
     NO_COARSE_FIX = "the search over the map has not found a consistent position"
     INCONSISTENT = "the landmarks contradict each other, or the navigation state"
-    UNCERTAIN = "the standard deviation of the horizontal position is above the limit"
+    UNCERTAIN = (
+        "the standard deviation of the horizontal position, or the time since the last update, is above the limit"
+    )
+    OUTSIDE_INERTIAL_DATA = "the time tag of the image lies outside of the inertial data"
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,8 @@ class PositionEstimator(Protocol):
     """Protocol: estimate a lander's position on a map from a stream of measurements in the order of their arrival.
 
     Between two images, all inertial increments up to the later image arrive before it. No method raises for a
-    measurement that an instrument can deliver.
+    measurement that an instrument can deliver. An image whose time tag lies outside of the inertial data is refused
+    with OUTSIDE_INERTIAL_DATA, at the time of the last increment; such an altitude is ignored.
     """
 
     def start(self, initial: InitialState, map_product: MapProduct) -> None:

@@ -142,12 +142,17 @@ class NavigationFilter:
         self._advance()
         self._forget()
 
+    def is_stored(self, time_s: float) -> bool:
+        """Whether a time is in the stored history, so that a state exists and a measurement can be processed."""
+        extrapolation = 0.0 if self._history is None else self._options.max_extrapolation_s
+        return self.memory_start_s <= time_s <= self.time_s + extrapolation
+
     def state_at(self, time_s: float) -> NavigationState:
         """Compute the state at a time in the stored history, including all updates up to that time.
 
         Raises ValueError for a time outside the history.
         """
-        if not self._is_stored(time_s):
+        if not self.is_stored(time_s):
             allowed = f"{self.memory_start_s:.4f} s to {self.time_s:.4f} s"
             raise ValueError(f"time {time_s:.4f} s is outside of the stored history; allowed: {allowed}")
         return self._run(self._checkpoints[self._last_before(time_s)], time_s)[-1].state
@@ -200,6 +205,8 @@ class NavigationFilter:
         pixel_sd: float | Float[np.ndarray, "n"] | None = None,
         point_sd_m: float | Float[np.ndarray, "3"] = 0.0,
         common_sd_m: float | Float[np.ndarray, "3"] = 0.0,
+        *,
+        is_rigid: bool = False,
     ) -> LandmarkResult:
         """Update by landmarks in an image, with rejection of outliers (`state_updates.update_landmarks`).
 
@@ -209,6 +216,8 @@ class NavigationFilter:
         - point_sd_m: of the points' independent errors; one value or (east, north, up)
         - common_sd_m: of the error that all points of the image have in common; one value or (east, north, up). It is
           considered as independent between images.
+        - is_rigid: whether the matching has found that one correction of the pose explains all pixels. The motion of
+          all landmarks is then tested against the covariance, before outliers are rejected.
         """
         count = len(pixels)
         measurement = LandmarkMeasurement(
@@ -218,6 +227,7 @@ class NavigationFilter:
             pixel_sd=np.full(count, self._options.pixel_sd if pixel_sd is None else pixel_sd, dtype=np.float64),
             point_sd_m=np.full(3, point_sd_m, dtype=np.float64),
             common_sd_m=np.full(3, common_sd_m, dtype=np.float64),
+            is_rigid=is_rigid,
         )
         update = partial(updates.update_landmarks, measurement=measurement, options=self._options.gates)
         outside = LandmarkResult(UpdateOutcome.OUTSIDE_HISTORY, np.zeros(count, bool), np.full((count, 2), np.nan))
@@ -227,7 +237,7 @@ class NavigationFilter:
         self, time_s: float, update: Callable[[NavigationState], tuple[NavigationState, Result]], outside: Result
     ) -> Result:
         """Apply an update at its time, then repeat all later increments and updates."""
-        if not self._is_stored(time_s):
+        if not self.is_stored(time_s):
             return outside
         state, result = update(self.state_at(time_s))
         if result.outcome is UpdateOutcome.INVALID:
@@ -240,10 +250,6 @@ class NavigationFilter:
             self._checkpoints.append(_Checkpoint(state, index + 1))
             self._advance()
         return result
-
-    def _is_stored(self, time_s: float) -> bool:
-        extrapolation = 0.0 if self._history is None else self._options.max_extrapolation_s
-        return self.memory_start_s <= time_s <= self.time_s + extrapolation
 
     def _last_before(self, time_s: float) -> int:
         """Return the index of the last checkpoint at or before a time."""

@@ -20,7 +20,7 @@ class LvsOptions:
 
     - max_off_nadir_rad: Ground at larger off-nadir angles is not used (assumed). At 55 deg a pixel covers three times
       as much ground along the line of sight as at the nadir.
-    - attitude_sd_rad: Standard deviation of the attitude error per axis, for search ranges and priors (assumed)
+    - attitude_sd_rad: Standard deviation of the attitude error per axis, for search ranges (assumed)
 
     Coarse stage:
 
@@ -44,6 +44,11 @@ class LvsOptions:
     - max_second_support: Largest ratio of the support of the second candidate to that of the first; the support is the
       sum of the scores of the consistent patches (assumed)
 
+    - patch_outlier_probability: Probability to remove a correct patch from the consistent ones, by its residual from
+      the prediction of the others (assumed; that of a landmark in `GateOptions`)
+    - false_refusal: Probability to refuse a correct coarse fix because its patches do not fit the stated errors of
+      state, altitudes and map (assumed; that of a position in `GateOptions`)
+
     Fine stage:
 
     - max_landmarks: Landmarks matched in one image (published: up to 150)
@@ -59,6 +64,9 @@ class LvsOptions:
     - min_score: Minimum normalised correlation of a landmark (assumed)
     - max_residual_px: Largest residual from the common correction of position and attitude, working pixels (assumed:
       a map distortion of about one pixel)
+    - fit_attitude_sd_rad: Standard deviation of the rotation in the common correction (assumed). A dozen landmarks
+      determine the rotation to about 1 mrad. This value is a hundred times larger, so that landmarks are not rejected
+      because the attitude is wrong by more than the state's covariance allows; that error is found by the filter.
     - min_matches: Minimum number of consistent landmarks; with fewer, no match is reported. The correction has six
       unknowns, and wrong matches are within the tolerance by chance (assumed)
     - min_inlier_fraction: Minimum fraction of consistent landmarks of those with an accepted score. Of wrong matches,
@@ -77,6 +85,10 @@ class LvsOptions:
     - altitude_sd: Relative standard deviation of an altitude
     - max_failures: Number of successive images without an update after which the coarse stage is repeated
     - max_position_sd_m: Largest standard deviation of a reported horizontal position
+    - max_update_age_s: Largest time since the last image whose landmarks updated the state, for a reported position.
+      It is the filter's memory: the state that the update corrected is then no longer stored. An image without a match
+      keeps the position until then, because the covariance contains the propagated errors; an image whose landmarks
+      contradict the state does not.
     - sift_map_features, sift_sd_m: Number of features of the map, and standard deviation of a position, of the baseline
       `marsyard.algorithms.localisation.baselines.FeatureEstimator`
     """
@@ -98,6 +110,8 @@ class LvsOptions:
     alternative_score: float = 0.9
     min_consistent_patches: int = 7
     max_second_support: float = 0.6
+    patch_outlier_probability: float = 1e-3
+    false_refusal: float = 1e-4
 
     max_landmarks: int = 150
     acquisition_landmarks: int = 60
@@ -111,6 +125,7 @@ class LvsOptions:
     min_working_px: int = 96
     min_score: float = 0.5
     max_residual_px: float = 1.2
+    fit_attitude_sd_rad: float = 0.1
     min_matches: int = 12
     min_inlier_fraction: float = 0.4
 
@@ -123,6 +138,7 @@ class LvsOptions:
     altitude_sd: float = 0.02
     max_failures: int = 3
     max_position_sd_m: float = 15.0
+    max_update_age_s: float = 5.0
     sift_map_features: int = 20000
     sift_sd_m: float = 20.0
 

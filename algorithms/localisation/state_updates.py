@@ -15,7 +15,7 @@ three more errors of zero mean in the update, which are marginalised afterwards.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -43,6 +43,9 @@ GroundModel = Callable[[Float[np.ndarray, "2"]], GroundHeight] | GroundHeight
 _POSITION, _ATTITUDE, _COMMON = slice(0, 3), slice(3, 6), slice(6, 9)
 #: Independent components of the state that one image measures: position and attitude.
 _OBSERVED = 6
+#: Variances of position (100 km) and attitude (10 rad) that do not constrain a motion.
+_FREE_VARIANCES = np.zeros(ERRORS)
+_FREE_VARIANCES[POSITION], _FREE_VARIANCES[ATTITUDE] = 1e5**2, 10.0**2
 
 
 class UpdateOutcome(Enum):
@@ -70,7 +73,8 @@ class LandmarkResult:
 
     - inliers: landmarks that agree with each other and with the state; all False if the points are invalid
     - residuals_px: measured minus expected pixels with the estimated state and common error; NaN if not visible
-    - shift_square: squared length of the whitened correction; about chi-square with 6 degrees of freedom if consistent
+    - shift_square: squared length of the whitened correction, about chi-square with 6 degrees of freedom if
+      consistent; that of the motion of all landmarks if this motion is refused
     """
 
     outcome: UpdateOutcome
@@ -108,6 +112,7 @@ class LandmarkMeasurement:
     - pixel_sd: standard deviation per axis and landmark, pixels
     - point_sd_m: independent error of the points (east, north, up)
     - common_sd_m: error of the points that is equal for all landmarks of the image (east, north, up)
+    - is_rigid: whether one correction of position and attitude explains all pixels, so that no landmark is an outlier
     """
 
     camera: CameraModel
@@ -116,6 +121,7 @@ class LandmarkMeasurement:
     pixel_sd: Float[np.ndarray, "n"]
     point_sd_m: Float[np.ndarray, "3"]
     common_sd_m: Float[np.ndarray, "3"]
+    is_rigid: bool = False
 
 
 @dataclass(frozen=True)
@@ -192,6 +198,10 @@ def update_landmarks(
 ) -> tuple[NavigationState, LandmarkResult]:
     """Update by the landmarks of an image, with rejection of outliers.
 
+    If the landmarks are known to move as a rigid body, their motion is tested first against the covariance
+    (`_test_rigid_motion`). A wrong attitude contradicts some landmarks more than others. After the rejection of these
+    landmarks as outliers, the remaining ones could agree with the wrong state.
+
     1. Landmarks whose innovation is improbable before the update are rejected.
     2. Robust estimation by graduated non-convexity with truncated least squares (Yang et al. 2020, "Graduated
        Non-Convexity for Robust Spatial Perception"): the limit on residuals decreases from the largest to its final
@@ -203,6 +213,11 @@ def update_landmarks(
     """
     problem = _LandmarkProblem(state, measurement)
     start = linearise_landmarks(measurement, state.position_m, state.world_from_body)
+    max_shift = float(chdtri(_OBSERVED, options.false_inconsistency))
+    if measurement.is_rigid:
+        motion, residuals = _test_rigid_motion(state, measurement, start.visible)
+        if not motion < max_shift:
+            return state, LandmarkResult(UpdateOutcome.INCONSISTENT, np.zeros_like(start.visible), residuals, motion)
     factors = start.jacobian @ problem.factor
     innovation_squares = _normalise(start.residuals, start.noise + factors @ factors.transpose(0, 2, 1))
     candidates = start.visible & (innovation_squares < chdtri(2, options.false_rejection))
@@ -223,10 +238,30 @@ def update_landmarks(
     min_count = max(options.min_landmarks, options.min_fraction * int(start.visible.sum()))
     if int(inliers.sum()) < min_count:
         return state, LandmarkResult(UpdateOutcome.TOO_FEW, inliers, residuals, shift)
-    if not shift < chdtri(_OBSERVED, options.false_inconsistency):
+    if not shift < max_shift:
         return state, LandmarkResult(UpdateOutcome.INCONSISTENT, inliers, residuals, shift)
     updated = state.correct(problem.errors(whitened), problem.covariance(solution.information))
     return updated, LandmarkResult(UpdateOutcome.APPLIED, inliers, residuals, shift)
+
+
+def _test_rigid_motion(
+    state: NavigationState, measurement: LandmarkMeasurement, visible: Bool[np.ndarray, "n"]
+) -> tuple[float, Float[np.ndarray, "n 2"]]:
+    """Compute the normalised square of the motion that all landmarks show, and the residuals of the expected motion.
+
+    The motion x is that of the body frame, without prior knowledge of position and attitude, and has the covariance C.
+    The minima of the least-squares problem with and without the prior covariance P differ by x' (P + C)^-1 x. This is
+    chi-square with 6 degrees of freedom, whatever the residuals of the landmarks are.
+    """
+    costs, weights = [], visible.astype(np.float64)
+    free = state.covariance.copy()
+    free[np.diag_indices(ERRORS)] += _FREE_VARIANCES
+    for covariance in (free, state.covariance):
+        problem = _LandmarkProblem(replace(state, covariance=covariance), measurement)
+        solution = problem.solve(weights, np.zeros(ERRORS + 3))
+        costs.append(float(solution.whitened @ solution.whitened + solution.squares @ weights))
+    residuals = np.where(solution.linearisation.visible[:, None], solution.residuals, np.nan)
+    return costs[1] - costs[0], residuals
 
 
 @dataclass(frozen=True)

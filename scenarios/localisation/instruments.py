@@ -142,8 +142,24 @@ LANDER_DETECTOR = _create_detector()
 #: Radar altimeter: errors of the MER altimeter; a beam of 40 deg includes nadir at tilts up to 20 deg (assumed).
 RADAR = RadarParameters(rate_hz=2.0, beam_deg=40.0, max_range_m=8000.0)
 
+#: Largest error of a time tag of images and altitudes, s (assumed): the interval of the images of Mars 2020, taken at
+#: up to 1 Hz. With a larger error an image has the time of another one.
+MAX_TAG_ERROR_S = 1.0
+#: Number of standard deviations in the largest error: 6e-7 of the tags have a larger one.
+_TAG_SIGMAS = 5.0
+
 #: Clock of the image time tags, relative to the true time; that of the inertial unit is in `ImuParameters` (assumed).
 IMAGE_CLOCK = ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005)
+
+
+def check_clock(name: str, clock: ClockParameters) -> None:
+    """Check that the errors of a clock stay below `MAX_TAG_ERROR_S`. Raises ValueError with the key `name`."""
+    largest_s = abs(clock.offset_s) + _TAG_SIGMAS * float(np.hypot(clock.offset_sd_s, clock.jitter_sd_s))
+    if largest_s > MAX_TAG_ERROR_S:
+        raise ValueError(
+            f"time tags of {name} are wrong by up to {largest_s:.6g} s (|offset_s| and {_TAG_SIGMAS:.0f} standard "
+            f"deviations); allowed: up to {MAX_TAG_ERROR_S:.6g} s"
+        )
 
 
 def measure_altitudes(

@@ -20,6 +20,7 @@ from marsyard.scenarios.localisation.instruments import (
     RADAR,
     CameraParameters,
     InitialErrors,
+    check_clock,
 )
 from marsyard.scenarios.localisation.map_product import MapParameters
 from marsyard.scenarios.localisation.sites import localisation_site
@@ -122,6 +123,8 @@ class LocalisationScenarioParameters(AlgorithmSelection):
             raise ValueError(
                 "faults.wrong_map needs another terrain; all terrains with terrain.source contain the same DTM"
             )
+        check_clock("clock", self.clock)
+        check_clock("altimeter.clock", self.altimeter.clock)
         if self.faults.wrong_map and self.location.bank < 2:
             raise ValueError("faults.wrong_map needs another terrain; allowed: a location.bank of at least 2")
         return self

@@ -24,20 +24,21 @@ from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.instruments import draw_calibrated_camera, measure_altitudes, true_camera
 from marsyard.scenarios.localisation.map_product import MapTruth, make_map
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements, StreamAnswers, feed
+from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, LocalisationMeasurements, StreamAnswers, feed
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.scenarios.offline import CaseExporter, RecordedAnswer
 from marsyard.scenarios.parts.named import PartKind
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
-from marsyard.sim.sensor import Detector, Imu
+from marsyard.sim.sensor import ClockParameters, Detector, Imu
 from marsyard.sim.sensor.instrument import Clock
 from marsyard.sim.sensor.ranging import RadarAltimeter
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
-#: Time between the start of the inertial data and the start of localisation, s, and after the last image.
+#: Time between the start of the inertial data and the start of localisation, s, and after the last image; longer if a
+#: clock's error moves a time tag out of this span.
 LEAD_S, MARGIN_S = 0.2, 0.2
 #: Largest bank whose terrains are built before the cases; a terrain needs 180 MB on disk.
 MAX_SHARED_TERRAINS = 20
@@ -114,6 +115,7 @@ class LocalisedDescent:
     """A simulated descent, its map and its measurements, which all algorithms of a case use.
 
     - states: true states at the images
+    - inertial_start_s: true time of the first inertial boundary and of the initial state
     - imu_offset_s: time tags of the inertial unit minus true times, without jitter
     """
 
@@ -122,6 +124,7 @@ class LocalisedDescent:
     flight: LanderFlight
     states: tuple[State, ...]
     map_truth: MapTruth
+    inertial_start_s: float
     imu_offset_s: float
     measurements: LocalisationMeasurements
 
@@ -133,7 +136,7 @@ class LocalisedDescent:
     @property
     def initial_truth(self) -> State:
         """True state at the time of the initial state of inertial navigation."""
-        return self.flight.state(-LEAD_S)
+        return self.flight.state(self.inertial_start_s)
 
     @classmethod
     def simulate(cls, p: LocalisationScenarioParameters, streams: Streams) -> LocalisedDescent:
@@ -157,10 +160,11 @@ class LocalisedDescent:
             )
         states = tuple(flight.motion(times).state(row) for row in range(times.size))
         images = _take_images(p, world, states, streams)
-        increments, initial, offset_s = _measure_inertially(p, flight, float(times[-1]), gravity, streams)
         altitudes = _measure_altitudes(p, world, flight, float(times[-1]), streams)
+        span_s = _inertial_span(flight, float(times[-1]), [measurement.time_s for measurement in (*altitudes, *images)])
+        increments, initial, offset_s = _measure_inertially(p, flight, span_s, gravity, streams)
         measurements = LocalisationMeasurements(initial, map_product, increments, tuple(altitudes), tuple(images))
-        return cls(p, world, flight, states, map_truth, offset_s, measurements)
+        return cls(p, world, flight, states, map_truth, span_s[0], offset_s, measurements)
 
 
 def _map_terrain(p: LocalisationScenarioParameters) -> int:
@@ -221,11 +225,23 @@ def _take_images(
     return images
 
 
+def _inertial_span(flight: LanderFlight, last_s: float, tags_s: Sequence[float]) -> tuple[float, float]:
+    """Return the span of the inertial data: around all time tags, as far as the flight is simulated."""
+    start_s = min(-LEAD_S, min(tags_s, default=0.0) - INERTIAL_MARGIN_S)
+    end_s = max(last_s + MARGIN_S, max(tags_s, default=0.0) + INERTIAL_MARGIN_S)
+    first_s, final_s = flight.span_s
+    return max(start_s, first_s), min(end_s, final_s)
+
+
 def _measure_inertially(
-    p: LocalisationScenarioParameters, flight: LanderFlight, last_s: float, gravity_m_s2: float, streams: Streams
+    p: LocalisationScenarioParameters,
+    flight: LanderFlight,
+    span_s: tuple[float, float],
+    gravity_m_s2: float,
+    streams: Streams,
 ) -> tuple[ImuIncrements, InitialState, float]:
     """Measure the inertial increments, draw the state at their beginning, and return the offset of their time tags."""
-    start_s, end_s = -LEAD_S, last_s + MARGIN_S
+    start_s, end_s = span_s
     imu = Imu.draw(p.imu, (start_s, end_s), streams.generator("imu"))
     if p.exact_instruments:
         increments = imu.exact_increments(flight, start_s, end_s)
@@ -247,7 +263,9 @@ def _measure_altitudes(
     p: LocalisationScenarioParameters, world: LocalisationWorld, flight: LanderFlight, last_s: float, streams: Streams
 ) -> list[AltitudeMeasurement]:
     """Measure the altitudes from start to end, or compute the true altitudes at the same times."""
-    radar = RadarAltimeter.draw(p.altimeter, world.surface, streams.generator("altimeter"))
+    exact = {"clock": ClockParameters()} if p.exact_instruments else {}
+    altimeter = p.altimeter.model_copy(update=exact)
+    radar = RadarAltimeter.draw(altimeter, world.surface, streams.generator("altimeter"))
     readings = measure_altitudes(radar, flight, (0.0, last_s), streams.generator("altimeter noise"))
     if p.exact_instruments:
         times = np.array([reading.time_s for reading in readings])

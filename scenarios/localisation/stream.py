@@ -24,8 +24,8 @@ from marsyard.algorithms.localisation.interface import (
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from marsyard.sim.parameters import Parameters, bounded_field
 
-#: Margin of the inertial increments after the end of the flight, s: time tags of other clocks are up to 10 ms late.
-#: The first altitude and the first image are at least as long after the start.
+#: Margin of the inertial increments before the first and after the last time tag of the other clocks, s: the time tags
+#: of the inertial unit have an offset of 0.2 ms rms.
 INERTIAL_MARGIN_S = 0.05
 #: One event of the stream.
 Event = ImuIncrements | AltitudeMeasurement | DetectorImage
@@ -57,11 +57,12 @@ def merge(
 ) -> list[Event]:
     """Merge measurements into the order of their time tags, with the increments split at each altitude and image.
 
-    The parts are those of `ImuIncrements.split` without the empty ones. Raises ValueError for a time tag outside the
-    increments.
+    The parts are those of `ImuIncrements.split` without the empty ones. A measurement whose time tag lies outside of the
+    increments is before all of them or after all of them.
     """
     measurements: list[AltitudeMeasurement | DetectorImage] = sorted([*altitudes, *images], key=lambda m: m.time_s)
-    parts = increments.split([m.time_s for m in measurements])
+    times = np.clip([m.time_s for m in measurements], increments.times_s[0], increments.times_s[-1])
+    parts = increments.split(times.tolist())
     events: list[Event] = []
     for part, measurement in zip(parts, [*measurements, None], strict=True):
         events += [part] if part.times_s.size > 1 else []

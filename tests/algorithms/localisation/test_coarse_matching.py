@@ -25,9 +25,10 @@ from tests.algorithms.localisation.synthetic_map import (
 
 OPTIONS = LvsOptions()
 HEIGHTS_M = (3500.0, 3410.0, 3320.0)
-#: 3.5 standard deviations are more than the search radius of 3.2 km.
-SD_M = 1067.0
-OFFSET_M = np.array([2400.0, -1800.0])
+#: Covariance of position, velocity and attitude. 3.5 standard deviations of the position are more than the search
+#: radius of 3.2 km; that of the attitude is 0.1 deg.
+COVARIANCE = np.diag(np.repeat([1067.0, 1.0, np.radians(0.1)], 3) ** 2)
+OFFSET_M, NEAR_M = np.array([2400.0, -1800.0]), np.array([1000.0, -800.0])
 
 
 def make_images(scene: Scene) -> tuple[PosedImage, ...]:
@@ -52,7 +53,7 @@ def find(
     """Run the coarse stage with the position wrong by the offset, and the altitude (150 m) by less."""
     error = np.array([-offset[0], -offset[1], 150.0])
     wrong = [replace(image, position_m=image.position_m + error) for image in images]
-    return find_coarse_position(wrong, [h + height_error_m for h in HEIGHTS_M], map_product, SD_M, OPTIONS)
+    return find_coarse_position(wrong, [h + height_error_m for h in HEIGHTS_M], map_product, COVARIANCE, OPTIONS)
 
 
 def test_exact_images_determine_an_offset_of_three_kilometres() -> None:
@@ -80,6 +81,26 @@ def test_errors_of_pose_altitude_radiometry_and_noise_stay_within_100_m() -> Non
     # attitude errors of 3.6 mrad shift the ground by 12.6 m
     assert np.hypot(*error) < 20.0
     assert error @ np.linalg.solve(fix.covariance, error) < 13.8  # 99.9 % of chi-square with two degrees of freedom
+
+
+def tilt(images: tuple[PosedImage, ...], angle_deg: float) -> tuple[PosedImage, ...]:
+    """Return the images with estimated attitudes that are wrong by a tilt about the north axis."""
+    turn = Rotation.from_euler("y", angle_deg, degrees=True)
+    return tuple(replace(image, world_from_body=turn * image.world_from_body) for image in images)
+
+
+def test_a_wrong_attitude_is_refused() -> None:
+    """10 deg of tilt: at least seven patches agree within 60 m on an offset that is wrong by 600 m."""
+    result = find(tilt(random_images(), 10.0), make_scene().map_product, NEAR_M)
+    assert result is CoarseRefusal.INCONSISTENT
+
+
+def test_an_attitude_within_the_stated_error_is_accepted() -> None:
+    fix = find(tilt(random_images(), 0.1), make_scene().map_product, NEAR_M)
+    assert isinstance(fix, CoarseFix)
+    assert fix.consistency is not None
+    assert fix.consistency.is_consistent
+    assert fix.consistency.members.all()
 
 
 @pytest.mark.parametrize("seed", [11, 12])

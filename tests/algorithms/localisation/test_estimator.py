@@ -93,20 +93,28 @@ def _descend(
 # --- stages with known results -----------------------------------------------------------------------------------
 
 
+def _rotation(vector: np.ndarray) -> Rotation:
+    return Rotation.from_rotvec(vector)
+
+
 class Stages:
     """Replacements of both matching stages: they return the next result of a list, and record their images.
 
     - coarse: offsets (east, north) of the coarse fixes, or refusals
-    - fine: whether the landmarks are found
+    - fine: whether the landmarks are found, or the attitude error (rotation vector) that they show
     """
 
-    def __init__(self, coarse: list[np.ndarray | CoarseRefusal], fine: list[bool]) -> None:
+    def __init__(self, coarse: list[np.ndarray | CoarseRefusal], fine: list[bool | np.ndarray]) -> None:
         self.coarse, self.fine = coarse, fine
         self.coarse_images: list[tuple[PosedImage, ...]] = []
+        self.heights_m: list[tuple[float, ...]] = []
 
-    def find_coarse_position(self, images: tuple[PosedImage, ...], *_: object) -> CoarseFix | CoarseRefusal:
+    def find_coarse_position(
+        self, images: tuple[PosedImage, ...], heights_m: tuple[float, ...], *_: object
+    ) -> CoarseFix | CoarseRefusal:
         """Return the next coarse fix with a standard deviation of 10 m, or refusal."""
         self.coarse_images.append(images)
+        self.heights_m.append(heights_m)
         result = self.coarse.pop(0)
         if isinstance(result, CoarseRefusal):
             return result
@@ -119,9 +127,11 @@ class Stages:
         lines = np.arange(-600.0, 601.0, 200.0)
         east, north = np.meshgrid(START_M[0] + lines, START_M[1] + lines)
         points = np.stack([east.ravel(), north.ravel(), np.zeros(east.size)], axis=-1)
-        camera = image.camera.transform(rigid(ATTITUDE, _true_position(image.time_s)))
+        result = self.fine.pop(0)
+        turn, is_found = (Rotation.identity(), result) if isinstance(result, bool) else (_rotation(result), True)
+        camera = image.camera.transform(rigid(turn * ATTITUDE, _true_position(image.time_s)))
         pixels, visible = camera.project(points)
-        found = visible & camera.in_frame(pixels) & self.fine.pop(0)
+        found = visible & camera.in_frame(pixels) & is_found
         points, pixels = points[found], pixels[found]
         count, zero = len(points), np.zeros(3)
         return LandmarkMatches(
@@ -138,7 +148,7 @@ FLAT_MAP = MapProduct(
 def make_stages(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Stages]:
     """Return a function that replaces the stages of the estimator."""
 
-    def make(coarse: list[np.ndarray | CoarseRefusal], fine: list[bool]) -> Stages:
+    def make(coarse: list[np.ndarray | CoarseRefusal], fine: list[bool | np.ndarray]) -> Stages:
         stages = Stages(coarse, fine)
         monkeypatch.setattr(estimator_module, "find_coarse_position", stages.find_coarse_position)
         monkeypatch.setattr(estimator_module, "match_landmarks", stages.match_landmarks)
@@ -154,6 +164,11 @@ def _images(count: int) -> list[DetectorImage]:
 
 def _outcomes(estimates: Sequence[PositionEstimate]) -> list[PositionOutcome]:
     return [estimate.outcome for estimate in estimates]
+
+
+def _horizontal_sd_m(estimate: PositionEstimate) -> float:
+    assert estimate.covariance is not None
+    return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]))
 
 
 def _error_m(estimate: PositionEstimate) -> float:
@@ -227,7 +242,98 @@ def test_contradicting_landmarks_are_failures(make_stages: Callable[..., Stages]
     """Exact landmarks after a coarse fix that is wrong by 16 standard deviations: never a position from them."""
     make_stages([ERROR_M[:2] + np.array([-160.0, 0.0])], [True] * 3)
     estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(5)))
-    assert _outcomes(estimates) == [NO_COARSE_FIX, NO_COARSE_FIX, UNCERTAIN, UNCERTAIN, INCONSISTENT, NO_COARSE_FIX]
+    assert _outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]
+
+
+def test_no_position_after_contradicting_landmarks_until_the_next_update(make_stages: Callable[..., Stages]) -> None:
+    """The covariance is below the limit throughout, and the last update is recent: only the contradiction counts."""
+    turned = np.radians([5.0, 0.0, 0.0])
+    make_stages([ERROR_M[:2]], [True, True, turned, False, True])
+    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(7)))
+    assert _outcomes(estimates) == [NO_COARSE_FIX] * 2 + [VALID] * 2 + [INCONSISTENT] * 2 + [VALID] * 2
+    assert estimates[4].position_m is None
+    _check_error(estimates[6])
+
+
+def test_contradiction_at_the_end_of_the_descent_refuses_the_final_position(make_stages: Callable[..., Stages]) -> None:
+    make_stages([ERROR_M[:2]], [True, np.radians([0.0, 5.0, 0.0])])
+    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(4)))
+    assert _outcomes(estimates)[-2:] == [INCONSISTENT] * 2
+
+
+def test_landmarks_of_a_wrong_attitude_never_update_the_state(make_stages: Callable[..., Stages]) -> None:
+    """All landmarks show a tilt of 5 deg, 87 standard deviations; a subset near the nadir fits the wrong state."""
+    make_stages([ERROR_M[:2] + np.array([0.0, 150.0])], [np.radians([5.0, 0.0, 0.0])] * 3)
+    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(5)))
+    assert _outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]
+
+
+def test_position_without_a_recent_update_is_uncertain(make_stages: Callable[..., Stages]) -> None:
+    """The last update is that of the image at 3 s: reported for 5 s, whatever number of images has no match."""
+    make_stages([ERROR_M[:2]], [True, *[False] * 6])
+    options = LvsOptions(max_failures=100, max_position_sd_m=1000.0)
+    estimates = list(_descend(MapRelativeEstimator(options), FLAT_MAP, _images(9)))
+    assert [estimate.time_s for estimate in estimates[-3:]] == [8.0, 9.0, 9.0]
+    assert _outcomes(estimates) == [NO_COARSE_FIX] * 2 + [VALID] * 6 + [UNCERTAIN] * 2
+
+
+def test_position_whose_covariance_grows_above_the_limit_is_uncertain(make_stages: Callable[..., Stages]) -> None:
+    """Without a match the standard deviation of the position grows by that of the velocity, 0.1 m/s before updates."""
+    make_stages([ERROR_M[:2]], [True, *[False] * 5])
+    estimates = list(_descend(MapRelativeEstimator(LvsOptions(max_failures=100)), FLAT_MAP, _images(8)))
+    assert set(_outcomes(estimates[2:])) == {VALID}
+    deviations = [_horizontal_sd_m(estimate) for estimate in estimates[2:]]
+    assert np.all(np.diff(deviations[:-1]) > 0.0)
+    make_stages([ERROR_M[:2]], [True, *[False] * 5])
+    options = LvsOptions(max_failures=100, max_position_sd_m=0.5 * (deviations[2] + deviations[3]))
+    limited = list(_descend(MapRelativeEstimator(options), FLAT_MAP, _images(8)))
+    assert _outcomes(limited[2:]) == [VALID] * 3 + [UNCERTAIN] * 4
+
+
+@pytest.mark.parametrize("make_estimator", [MapRelativeEstimator, InertialEstimator, FeatureEstimator])
+@pytest.mark.parametrize("has_fix", [False, True])
+def test_measurements_outside_of_the_inertial_data_are_not_used(
+    make_estimator: type[PositionEstimator], has_fix: bool, make_stages: Callable[..., Stages]
+) -> None:
+    """Time tags before the initial state, older than the filter's memory of 5 s, and after the last increment."""
+    make_stages([ERROR_M[:2]], [True, True])
+    estimator = make_estimator()
+    estimator.start(_make_initial(), FLAT_MAP)
+    images = [1.0, 2.0, 3.0] if has_fix else [1.0]
+    previous_s = 0.0
+    for time_s in images:
+        estimator.imu(_make_increments(previous_s, time_s))
+        previous_s = time_s
+        estimator.altitude(AltitudeMeasurement(float(_true_position(time_s)[2]), time_s))
+        estimator.image(_make_image(time_s, np.ones((64, 64))))
+    estimator.imu(_make_increments(previous_s, 8.0))
+    before = estimator.finish()
+    for time_s in (-0.5, 1.5, 8.5):
+        # an altitude of 1 m would give a wrong scale and a wrong height
+        estimator.altitude(AltitudeMeasurement(1.0, time_s))
+        answer = estimator.image(_make_image(time_s, np.ones((64, 64))))
+        assert answer.outcome is PositionOutcome.OUTSIDE_INERTIAL_DATA
+        assert answer.position_m is None
+        assert answer.time_s == 8.0
+    after = estimator.finish()
+    assert after.outcome is before.outcome
+    if before.position_m is not None:
+        np.testing.assert_array_equal(after.position_m, before.position_m)
+
+
+def test_ignored_altitude_does_not_set_the_scale_of_the_coarse_stage(make_stages: Callable[..., Stages]) -> None:
+    stages = make_stages([CoarseRefusal.NO_CONSENSUS], [])
+    estimator = MapRelativeEstimator()
+    estimator.start(_make_initial(), FLAT_MAP)
+    previous_s = 0.0
+    for image in _images(3):
+        estimator.imu(_make_increments(previous_s, image.time_s))
+        previous_s = image.time_s
+        estimator.altitude(AltitudeMeasurement(float(_true_position(image.time_s)[2]), image.time_s))
+        estimator.altitude(AltitudeMeasurement(1.0, image.time_s + 0.5))
+        estimator.image(image)
+    expected = [_true_position(image.time_s)[2] for image in _images(3)]
+    np.testing.assert_allclose(stages.heights_m[0], expected, atol=1e-6)
 
 
 def test_max_failures_sets_the_number_of_images(make_stages: Callable[..., Stages]) -> None:
@@ -239,8 +345,7 @@ def test_max_failures_sets_the_number_of_images(make_stages: Callable[..., Stage
 def test_reported_deviation_above_the_limit_is_uncertain(make_stages: Callable[..., Stages]) -> None:
     make_stages([ERROR_M[:2]], [True])
     (*_, valid) = _descend(MapRelativeEstimator(), FLAT_MAP, _images(3))
-    assert valid.covariance is not None
-    sd_m = float(np.sqrt(np.linalg.eigvalsh(valid.covariance[:2, :2])[-1]))
+    sd_m = _horizontal_sd_m(valid)
     for factor, outcome in ((1.01, VALID), (0.99, UNCERTAIN)):
         make_stages([ERROR_M[:2]], [True])
         options = LvsOptions(max_position_sd_m=factor * sd_m)

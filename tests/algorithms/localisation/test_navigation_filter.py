@@ -422,6 +422,34 @@ def test_systematically_wrong_landmarks_are_inconsistent(truth: Descent, exact: 
     assert np.abs(state_errors(truth, navigation.state_at(2.0))[:3]).max() < 0.1
 
 
+@pytest.mark.parametrize("tilt_deg", [0.0, 6.0])
+def test_rigid_landmarks_of_a_wrong_attitude_are_inconsistent(
+    truth: Descent, exact: ImuIncrements, tilt_deg: float
+) -> None:
+    """Exact pixels; the state's attitude is wrong by the tilt, and its position such that the nadir fits.
+
+    Without the test of all landmarks the robust estimation keeps those near the nadir, and rejects the others.
+    """
+    covariance = np.diag(np.repeat([30.0, 1.0, 0.002], 3) ** 2)
+    tilt = np.radians([tilt_deg, 0.0, 0.0])
+    height = truth.state(2.0).position_m[2]
+    errors = np.concatenate([np.cross(tilt, [0.0, 0.0, height]), np.zeros(3), tilt])
+    navigation = NavigationFilter.from_initial(initial_state(truth, covariance, errors))
+    navigation.propagate(part(exact, 0, 800))
+    points, pixels = see_landmarks(truth, 2.0, 100, np.random.default_rng(7))
+    before = navigation.state_at(2.0)
+    result = navigation.update_landmarks(2.0, CAMERA, points, pixels, 0.3, 6.0, 10.0, is_rigid=True)
+    if tilt_deg == 0.0:
+        assert result.outcome is UpdateOutcome.APPLIED
+        assert result.inliers.all()
+        return
+    assert result.outcome is UpdateOutcome.INCONSISTENT
+    assert not result.inliers.any()
+    # ten times the limit of 33
+    assert result.shift_square > 300.0
+    np.testing.assert_array_equal(navigation.state_at(2.0).position_m, before.position_m)
+
+
 def test_common_error_limits_the_accuracy_of_one_image(truth: Descent, exact: ImuIncrements) -> None:
     """150 landmarks with a common error: the position's standard deviation is not below that of the common error."""
     deviations = []

@@ -24,6 +24,8 @@ from marsyard.scenarios.localisation.parameters import LocalisationFaults, Local
 from marsyard.scenarios.localisation.scenario import LEAD_S, LocalisationScenario, LocalisedDescent
 from marsyard.scenarios.localisation.system import SYSTEM
 from marsyard.scenarios.systems import row_columns
+from marsyard.sim.measurements import ImuIncrements
+from marsyard.sim.sensor.instrument import Clock
 from marsyard.sim.streams import Streams
 
 #: A terrain of 4.1 km, a map of 2.7 km, and five seconds from 1600 to 1150 m with four images of 10 to 14 m per pixel.
@@ -213,11 +215,57 @@ def test_attitude_error_tilts_the_initial_attitude() -> None:
     assert isinstance(tilted.world_from_body, Rotation)
 
 
-def test_attitude_error_of_the_catalogue_is_no_false_fix() -> None:
-    """2 deg are 20 standard deviations of the stated attitude error: 50 m on the ground."""
-    result = _run(faults={"attitude_error_deg": 2.0})
-    assert result.row["initial_attitude_error_deg"] == pytest.approx(2.0, abs=0.5)
+@pytest.mark.parametrize("error_deg", [2.0, 5.0, 6.0, 7.0, 10.0])
+def test_wrong_attitude_gives_no_position(error_deg: float) -> None:
+    """The error is 20 to 100 standard deviations of the stated one: 50 to 280 m on the ground.
+
+    A search that ignores the stated covariance finds a consistent position that is wrong by this distance.
+    """
+    result = _run(faults={"attitude_error_deg": error_deg})
+    assert result.row["initial_attitude_error_deg"] == pytest.approx(error_deg, abs=0.5)
+    assert result.failure is None
+    assert result.row["valid_images"] == 0
     assert result.row["false_fix"] is False
+
+
+@pytest.mark.parametrize("key", ["clock", "altimeter"])
+@pytest.mark.parametrize("offset_s", [-0.95, 0.95])
+def test_inertial_data_contain_the_tags_of_a_wrong_clock(key: str, offset_s: float) -> None:
+    """Also tags before the nominal start of the inertial data, 0.2 s before the start, and after their end."""
+    clock = {"offset_s": offset_s}
+    parameters = _make_parameters(**COARSE, **{key: clock if key == "clock" else {"clock": clock}})
+    descent = LocalisedDescent.simulate(parameters, Streams(1, "loc tests", 0))
+    tags = [event.time_s for event in descent.measurements.events if not isinstance(event, ImuIncrements)]
+    first, last = descent.increments.times_s[[0, -1]]
+    assert first <= min(tags)
+    assert max(tags) <= last
+    # the initial state is that of the first increment
+    initial = descent.measurements.initial
+    assert initial.time_s == first
+    error = initial.position_m - descent.initial_truth.position_m
+    assert np.hypot(*error[:2]) <= parameters.initial.horizontal_max_m
+
+
+@pytest.mark.parametrize("offset_s", [-1.0, 0.3, 1.0])
+def test_wrong_image_clock_does_not_crash(offset_s: float) -> None:
+    """Above 0.2 s the tags left the inertial data."""
+    result = _run(clock={"offset_s": offset_s}, compared=("inertial", "sift"), **COARSE)
+    assert result.failure is None
+    assert result.row["images"] == 4
+    assert len(result.products["outcomes"]) == 5
+
+
+def test_images_outside_of_the_flight_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tags outside of the flight have no inertial data; the other images are answered."""
+    monkeypatch.setattr(Clock, "tags", _late_tags)
+    result = _run(algorithm="inertial", compared=("lvs", "sift"), **COARSE)
+    assert result.failure is None
+    assert result.products["outcomes"] == ["VALID", "VALID", "VALID", "OUTSIDE_INERTIAL_DATA", "VALID"]
+
+
+def _late_tags(_: Clock, times_s: np.ndarray, __: np.random.Generator) -> np.ndarray:
+    """Return exact tags, that of the last of four images 60 s late."""
+    return times_s + (60.0 * (np.arange(times_s.size) == 3) if times_s.size == 4 else 0.0)
 
 
 def test_altitude_error_scales_all_altitudes() -> None:
@@ -298,6 +346,9 @@ def test_campaign_loads_and_its_requirements_use_the_columns(name: str) -> None:
         ({"lvs": {"template_px": 8}}, r"template_px is 8; it must be odd and at least 5"),
         ({"sun": {"elevation_deg": 0.0}}, r"sun.elevation_deg"),
         ({"fault": {}}, r"fault"),
+        ({"clock": {"offset_s": 1.5}}, r"time tags of clock are wrong by up to 1.5 s .* allowed: up to 1 s"),
+        ({"clock": {"jitter_sd_s": 0.25}}, r"time tags of clock are wrong by up to 1.25 s"),
+        ({"altimeter": {"clock": {"offset_s": -2.0}}}, r"time tags of altimeter.clock are wrong by up to 2 s"),
     ],
 )
 def test_invalid_parameters_have_one_clear_message(changes: dict[str, Any], message: str) -> None:

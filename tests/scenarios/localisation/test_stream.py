@@ -151,10 +151,15 @@ def test_arrays_of_the_caller_stay_writable(run: tuple[Recorder, StreamAnswers],
     assert INITIAL.covariance.flags.writeable
 
 
-def test_measurement_outside_of_the_increments_is_refused(increments: ImuIncrements) -> None:
-    """A time tag after the last increment is an error of the caller."""
-    with pytest.raises(ValueError, match="outside of the increments; allowed"):
-        merge(increments, [], [_make_image(6.5)])
+def test_measurements_outside_of_the_increments_are_first_or_last(increments: ImuIncrements) -> None:
+    """They are delivered, because an instrument with a wrong clock delivers them; no increment is lost."""
+    early, late = AltitudeMeasurement(4000.0, -0.5), _make_image(6.5)
+    events = merge(increments, [early], [late, _make_image(3.0)])
+    assert events[0] is early
+    assert events[-1] is late
+    parts = [event for event in events if isinstance(event, ImuIncrements)]
+    assert [part.times_s[0] for part in parts] == [increments.times_s[0], parts[0].times_s[-1]]
+    assert parts[-1].times_s[-1] == increments.times_s[-1]
 
 
 def test_images_follow_the_schedule(flight: LanderFlight) -> None:
