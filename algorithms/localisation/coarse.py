@@ -397,7 +397,7 @@ def _check_consistency(
 ) -> Consistency:
     """Test the offsets of the consistent patches against the stated errors of state, altitudes and map."""
     rows = np.flatnonzero(best.consistent)
-    members = [patches[k] for k in rows]
+    members = [patches[k] for k in rows.tolist()]
     images = np.array([patch.image for patch in members])
     matches = _collect_matches(best, patches, grid)
     below = np.array([elevation_at(grid, view.image.position_m[:2] + best.offset_m) for view in views])

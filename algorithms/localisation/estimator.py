@@ -136,6 +136,7 @@ class MapRelativeEstimator:
             point_sd_m=point_sd_m,
             common_sd_m=np.sqrt(options.correlated_images) * common_sd_m,
             is_rigid=True,
+            alignment_sd_rad=options.calibration_sd_rad,
         )
         details = LocalisationDetails(
             "fine",

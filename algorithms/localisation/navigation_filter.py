@@ -207,6 +207,7 @@ class NavigationFilter:
         common_sd_m: float | Float[np.ndarray, "3"] = 0.0,
         *,
         is_rigid: bool = False,
+        alignment_sd_rad: float = 0.0,
     ) -> LandmarkResult:
         """Update by landmarks in an image, with rejection of outliers (`state_updates.update_landmarks`).
 
@@ -218,6 +219,7 @@ class NavigationFilter:
           considered as independent between images.
         - is_rigid: whether the matching has found that one correction of the pose explains all pixels. The motion of
           all landmarks is then tested against the covariance, before outliers are rejected.
+        - alignment_sd_rad: error of the camera's alignment and calibration per axis, for this test
         """
         count = len(pixels)
         measurement = LandmarkMeasurement(
@@ -228,6 +230,7 @@ class NavigationFilter:
             point_sd_m=np.full(3, point_sd_m, dtype=np.float64),
             common_sd_m=np.full(3, common_sd_m, dtype=np.float64),
             is_rigid=is_rigid,
+            alignment_sd_rad=alignment_sd_rad,
         )
         update = partial(updates.update_landmarks, measurement=measurement, options=self._options.gates)
         outside = LandmarkResult(UpdateOutcome.OUTSIDE_HISTORY, np.zeros(count, bool), np.full((count, 2), np.nan))

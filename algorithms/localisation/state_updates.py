@@ -113,6 +113,7 @@ class LandmarkMeasurement:
     - point_sd_m: independent error of the points (east, north, up)
     - common_sd_m: error of the points that is equal for all landmarks of the image (east, north, up)
     - is_rigid: whether one correction of position and attitude explains all pixels, so that no landmark is an outlier
+    - alignment_sd_rad: error of the camera's alignment and calibration per axis, for the test of the rigid motion
     """
 
     camera: CameraModel
@@ -122,6 +123,7 @@ class LandmarkMeasurement:
     point_sd_m: Float[np.ndarray, "3"]
     common_sd_m: Float[np.ndarray, "3"]
     is_rigid: bool = False
+    alignment_sd_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -251,12 +253,14 @@ def _test_rigid_motion(
 
     The motion x is that of the body frame, without prior knowledge of position and attitude, and has the covariance C.
     The minima of the least-squares problem with and without the prior covariance P differ by x' (P + C)^-1 x. This is
-    chi-square with 6 degrees of freedom, whatever the residuals of the landmarks are.
+    chi-square with 6 degrees of freedom, whatever the residuals of the landmarks are. P contains the error of the
+    camera's alignment, which one image does not distinguish from an attitude error.
     """
     costs, weights = [], visible.astype(np.float64)
-    free = state.covariance.copy()
-    free[np.diag_indices(ERRORS)] += _FREE_VARIANCES
-    for covariance in (free, state.covariance):
+    alignment = np.zeros(ERRORS)
+    alignment[ATTITUDE] = measurement.alignment_sd_rad**2
+    for variances in (_FREE_VARIANCES, alignment):
+        covariance = state.covariance + np.diag(variances)
         problem = _LandmarkProblem(replace(state, covariance=covariance), measurement)
         solution = problem.solve(weights, np.zeros(ERRORS + 3))
         costs.append(float(solution.whitened @ solution.whitened + solution.squares @ weights))
