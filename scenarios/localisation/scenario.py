@@ -161,7 +161,8 @@ class LocalisedDescent:
         states = tuple(flight.motion(times).state(row) for row in range(times.size))
         images = _take_images(p, world, states, streams)
         altitudes = _measure_altitudes(p, world, flight, float(times[-1]), streams)
-        span_s = _inertial_span(flight, float(times[-1]), [measurement.time_s for measurement in (*altitudes, *images)])
+        tags_s = [altitude.time_s for altitude in altitudes] + [image.time_s for image in images]
+        span_s = _inertial_span(flight, float(times[-1]), tags_s)
         increments, initial, offset_s = _measure_inertially(p, flight, span_s, gravity, streams)
         measurements = LocalisationMeasurements(initial, map_product, increments, tuple(altitudes), tuple(images))
         return cls(p, world, flight, states, map_truth, span_s[0], offset_s, measurements)
