@@ -57,8 +57,8 @@ def merge(
 ) -> list[Event]:
     """Merge measurements into the order of their time tags, with the increments split at each altitude and image.
 
-    The parts are those of `ImuIncrements.split` without the empty ones. A measurement whose time tag lies outside of the
-    increments is before all of them or after all of them.
+    The parts are those of `ImuIncrements.split` without the empty ones. Measurements with time tags outside of the
+    increments come before or after all of them.
     """
     measurements: list[AltitudeMeasurement | DetectorImage] = sorted([*altitudes, *images], key=lambda m: m.time_s)
     times = np.clip([m.time_s for m in measurements], increments.times_s[0], increments.times_s[-1])

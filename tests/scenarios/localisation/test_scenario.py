@@ -236,7 +236,7 @@ def test_inertial_data_contain_the_tags_of_a_wrong_clock(key: str, offset_s: flo
     parameters = _make_parameters(**COARSE, **{key: clock if key == "clock" else {"clock": clock}})
     descent = LocalisedDescent.simulate(parameters, Streams(1, "loc tests", 0))
     tags = [event.time_s for event in descent.measurements.events if not isinstance(event, ImuIncrements)]
-    first, last = descent.increments.times_s[[0, -1]]
+    first, last = descent.measurements.increments.times_s[[0, -1]]
     assert first <= min(tags)
     assert max(tags) <= last
     # the initial state is that of the first increment
