@@ -15,13 +15,14 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails
 from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
 from marsyard.scenarios.estimators import Task, check_algorithms, labels
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_conditions
+from marsyard.sim.parameters import Parameters
 
 Answer = TypeVar("Answer")
 Inputs = TypeVar("Inputs")
@@ -176,10 +177,8 @@ def _empty_columns(row: Mapping[str, Scalar]) -> dict[str, Scalar]:
     }
 
 
-class AlgorithmSelection(BaseModel):
+class AlgorithmSelection(Parameters):
     """Parameters of scenarios with selectable algorithms; subclasses define the field `algorithm`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     task: ClassVar[Task[Any, Any]]
 

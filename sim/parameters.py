@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 
 class DeprecatedNameWarning(FutureWarning):
@@ -117,6 +117,12 @@ class Parameters(BaseModel):
             return values
         if not cls.model_fields.keys() >= values.keys():
             values = _rename_keys(values, cls.model_fields)
+        presets = {
+            name: _complete_table(field.default, values[name])
+            for name, field in cls.model_fields.items()
+            if isinstance(field.default, BaseModel) and isinstance(values.get(name), Mapping)
+        }
+        values = {**values, **presets} if presets else values
         # pydantic calls no validator of this class for tables that are data classes, such as options of algorithms
         options = {
             name: _rename_keys(value, field_names(cls.model_fields[name].annotation))
@@ -124,6 +130,27 @@ class Parameters(BaseModel):
             if isinstance(value, Mapping) and name in cls.model_fields
         }
         return {**values, **options} if options else values
+
+
+def _complete_table(preset: BaseModel, table: Mapping[Any, Any]) -> Mapping[Any, Any]:
+    """Complete a table by the values of the field's default, if these are not the defaults of their class.
+
+    A file that changes one value of a preset, such as the noise of an instrument, then keeps the other values. A table
+    with keys of another class, such as a custom instrument, is returned unchanged.
+    """
+    kind = type(preset)
+    table = _rename_keys(table, kind.model_fields)
+    try:
+        is_preset = preset != kind()
+    except ValidationError:
+        is_preset = True
+    if not is_preset or not table.keys() <= kind.model_fields.keys():
+        return table
+    values = {name: getattr(preset, name) for name in kind.model_fields}
+    for name, value in table.items():
+        is_table = isinstance(value, Mapping) and isinstance(values[name], BaseModel)
+        values[name] = _complete_table(values[name], value) if is_table else value
+    return values
 
 
 def field_names(kind: Any) -> set[str]:
