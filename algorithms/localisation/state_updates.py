@@ -253,7 +253,7 @@ def _test_rigid_motion(
 
     The motion x is that of the body frame, without prior knowledge of position and attitude, and has the covariance C.
     The minima of the least-squares problem with and without the prior covariance P differ by x' (P + C)^-1 x. This is
-    chi-square with 6 degrees of freedom, whatever the residuals of the landmarks are. P contains the error of the
+    chi-square with 6 degrees of freedom for any residuals of the landmarks. P contains the error of the
     camera's alignment, which one image does not distinguish from an attitude error.
     """
     costs, weights = [], visible.astype(np.float64)

@@ -269,7 +269,7 @@ def test_landmarks_of_a_wrong_attitude_never_update_the_state(make_stages: Calla
 
 
 def test_position_without_a_recent_update_is_uncertain(make_stages: Callable[..., Stages]) -> None:
-    """The last update is that of the image at 3 s: reported for 5 s, whatever number of images has no match."""
+    """The last update is that of the image at 3 s: reported for 5 s, for any number of images without a match."""
     make_stages([ERROR_M[:2]], [True, *[False] * 6])
     options = LvsOptions(max_failures=100, max_position_sd_m=1000.0)
     estimates = list(_descend(MapRelativeEstimator(options), FLAT_MAP, _images(9)))
