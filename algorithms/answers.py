@@ -200,8 +200,8 @@ class StreamedEstimator:
         final = _check_stream_answer(self.stream.finish(), tags)
         return replace(final, after_images=tuple(answers))
 
-    def process(self, event: ImuIncrements | AltitudeMeasurement | DescentFrame) -> VelocityEstimate | None:
-        """Pass a measurement to the stream's method for its type, if it has one; return the answer to an image."""
+    def process(self, event: ImuIncrements | AltitudeMeasurement | DescentFrame) -> object:
+        """Pass a measurement to the stream's method for its type, if it has one; return the answer, unchecked."""
         if isinstance(event, DescentFrame):
             return self.stream.process_image(event)
         method = getattr(self.stream, OPTIONAL_STREAM_METHODS[type(event)], None)

@@ -120,6 +120,7 @@ def test_unknown_algorithms_are_rejected(arguments: list[str], message: str) -> 
     assert message in result.output
 
 
+@pytest.mark.slow
 def test_exported_cases_are_scored(tmp_path: Path) -> None:
     campaign, cases, table = tmp_path / "fake.toml", tmp_path / "cases", tmp_path / "answers.csv"
     campaign.write_text(CAMPAIGN)

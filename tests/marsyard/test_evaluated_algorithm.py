@@ -126,6 +126,7 @@ def test_dashboard_names_the_evaluated_algorithm(folder: Path, tmp_path: Path) -
     assert next(row for row in matrix if row["requirement"] == "v")["algorithm"] == "my_module:MyEstimator"
 
 
+@pytest.mark.slow
 def test_command_in_the_report_repeats_the_campaign(folder: Path, tmp_path: Path) -> None:
     page = (folder / "run" / "report.html").read_text()
     command_block = re.search(r"Run the campaign again</dt><dd>(.*?)</dd>", page, re.DOTALL)

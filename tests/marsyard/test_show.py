@@ -221,6 +221,7 @@ _REPORTING_KEYS = {
 }
 
 
+@pytest.mark.slow
 @given(path=st.sampled_from(_VALUE_PATHS), value=_random_values)
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_changes_are_shown_or_reported_by_key(campaign: Path, path: tuple[str | int, ...], value: Any) -> None:

@@ -58,6 +58,7 @@ def _list_campaigns(scenario: str) -> list[str]:
     return [name for name in catalogue() if load_campaign(name).configuration.scenario == scenario]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scenario", ["descent", pytest.param("fieldtest", marks=pytest.mark.slow), "rover", "rover-drive", "landing"]
 )

@@ -83,6 +83,7 @@ def test_rover_is_visible_at_the_sides_of_its_hazard_camera() -> None:
     assert not middle.any()
 
 
+@pytest.mark.slow
 def test_unresolved_rocks_occlude_distant_ground_by_their_frontal_area(gusev_image: RenderedImage) -> None:
     image = gusev_image
     frame, ground = image.frame, SiteGround.from_site(site("gusev"), "ground")

@@ -230,6 +230,7 @@ def _kill_and_resume(path: Path, directory: Path, cases: int, n_kills: int, rng:
     return n_running
 
 
+@pytest.mark.slow
 def test_resumed_campaign_has_the_same_rows(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     path = campaign_file("sleep_s = 0.02", requirement="")
     assert _kill_and_resume(path, tmp_path / "killed", 150, 1, np.random.default_rng(8)) >= 1

@@ -53,6 +53,7 @@ def _compute_velocity_errors(tracks: list[Track], states: list[State]) -> np.nda
     return np.array([track.velocity_m_s - true_velocities[track.pair] for track in tracks]).reshape(-1, 2)
 
 
+@pytest.mark.slow
 def test_flat_ground_velocity_error_is_within_15_cm_s() -> None:
     """Requirement: 0.15 m/s rms over all valid tracks, including tracks of cases without a reported velocity."""
     runs = [_run_descent(case, terrain=FLAT_TERRAIN) for case in range(N_CASES)]

@@ -184,6 +184,7 @@ def test_invalid_lines_are_rejected(tmp_path: Path, lines: list[str], message: s
         read_answers(path, POSITION_FORMAT)
 
 
+@pytest.mark.slow
 def test_export_and_score_equal_a_normal_run(tmp_path: Path) -> None:
     file = tmp_path / "loc.toml"
     file.write_text(CAMPAIGN)

@@ -70,6 +70,7 @@ def _compute_median_contrast(name: str) -> float:
     )
 
 
+@pytest.mark.slow
 def test_contrast_of_pisgah_is_below_that_of_the_mars_sites() -> None:
     """The paper states that the contrast is "similar to contrast measured on descent images synthesized" from MOC.
 
