@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 
 from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, Track
 from marsyard.algorithms.dimes.binning import altitudes_at_images
