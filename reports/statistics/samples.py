@@ -48,7 +48,7 @@ _N_RESAMPLES = 2000
 _SEED = 19340401
 #: Minimum number of terrains, and of independent values, for intervals of a mean and of a standard deviation. The
 #: bootstrap of fewer values has too few distinct samples: of two values, its interval ends at these values.
-MIN_TERRAINS, MIN_FOR_MEAN, _MIN_FOR_DEVIATION = 5, 5, 8
+MIN_TERRAINS, _MIN_FOR_MEAN, _MIN_FOR_DEVIATION = 5, 5, 8
 #: Minimum number of points of an ellipse.
 _MIN_FOR_ELLIPSE = 5
 #: Terrain number of each value; None if all are independent.
@@ -106,7 +106,7 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Gr
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
-    if values.size < MIN_FOR_MEAN:
+    if values.size < _MIN_FOR_MEAN:
         return math.nan, math.nan
     mean = float(values.mean())
     if np.ptp(values) == 0.0:
