@@ -143,7 +143,7 @@ class Confirmation:
 class Evidence:
     """Kind of evidence of a run, stored in its record.
 
-    - number: number of the confirmation; 0 for other kinds
+    - number: number of the confirmation whose seed the run uses; 0 without one
     - algorithm_confirmations: number of confirmations of the algorithm (by name) on this campaign, including this one
     - record: file of the record of confirmations; empty for other kinds
     - changes: differences from the frozen algorithm, if the seed was reused; or the options set on these cases

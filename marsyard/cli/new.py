@@ -175,7 +175,8 @@ def ingest(
     system: Annotated[
         str | None,
         Option(
-            help="Type of the system under test (see `marsyard new`); by default `measured`, images of a real camera."
+            help="System that estimates from the images (see `marsyard new`); by default `measured`: velocity, "
+            "compared with the measured poses."
         ),
     ] = None,
 ) -> None:

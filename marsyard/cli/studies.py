@@ -41,8 +41,8 @@ class StudyOptions:
         Option(
             metavar="NAME",
             help="The algorithm that the study analyses: a name, module:Class, exec:PROGRAM (started per case) or "
-            "serve:PROGRAM (one process for all cases). Further algorithms run on the cases that the study selects "
-            "for the first; their results are stored only.",
+            "serve:PROGRAM (one process for all cases). Further algorithms run on the same cases; their results are "
+            "stored, but do not influence the study.",
         ),
     ] = None
 
@@ -110,7 +110,13 @@ class SearchOptions(StudyOptions):
     """Arguments and options of `marsyard search`."""
 
     cases: Annotated[
-        int, Option("-n", "--cases", metavar="N", help="Cases that search for violations; reducing them takes more.")
+        int,
+        Option(
+            "-n",
+            "--cases",
+            metavar="N",
+            help="Cases of the search; the reduction of each violation takes further cases.",
+        ),
     ] = 300
     restarts: Annotated[
         int, Option(metavar="N", help="Number of optimizer (CMA-ES) runs from different starting cases.")

@@ -209,7 +209,7 @@ def planned_looks(cases: int) -> tuple[Look, ...]:
 
 
 def risk_fraction_at(looks: tuple[Look, ...], cases: int) -> float:
-    """Return the fraction of the risk that one look may use: the first look with at least this number of cases.
+    """Return the fraction of the risk at the first planned look with at least this number of cases.
 
     It does not include the fractions of earlier looks. For more cases than at the last look, return that of the last
     look.
@@ -254,7 +254,7 @@ class SequentialTest:
         return math.log(max(_MIN_RISK, undecided_mean) / max(_MIN_RISK, self.risk - first_look_risk))
 
     def significance_level(self, n: float | int) -> float:
-        """Compute the significance level at which the one-sided Clopper-Pearson bound gives the same verdict."""
+        """Compute the significance level at which the Clopper-Pearson bound gives the verdict of this test."""
         log_ratio = float(_log_likelihood_ratio(0.0, n, self.rate))
         # n cases are too few even without events: the risk (1 - rate)^n of no event, times ratio / threshold
         if log_ratio < self.log_threshold:
