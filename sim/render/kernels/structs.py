@@ -79,7 +79,8 @@ class Hits(NamedTuple):
 
     - distance: along the ray, metres; infinite for the sky
     - triangle, weights: index of the object's triangle (-1: none), and weights of its second and third corner
-    - level: terrain level of the intersection with the ground; -1 if the distance is that of the rendered mesh
+    - level: terrain level of the intersection with the ground; -1 if the search failed and the distance
+      is that of the mesh that OpenGL draws
     """
 
     distance: Array
@@ -95,6 +96,7 @@ class Views(NamedTuple):
     - numbers: triangle index plus one, 0 for ground; empty if no triangles were rendered
     - focal: focal length of each view, pixels
     - view_from_body: rotation from body axes to view axes (x right, y down, z forward)
+    - view_of_pixel: number of the view that contains each pixel
     """
 
     depth: Array32
@@ -108,7 +110,8 @@ class GroundShadow(NamedTuple):
     """Shadow of the ground on the grid of one terrain level; a grid of one sample means no shadow.
 
     - height: height below which the ground hides the centre of the sun, metres
-    - caster_distance: distance of the ground that casts the shadow (`marsyard.sim.render.kernels.sun.sweep_shadow`)
+    - caster_distance: distance of the ground that casts the shadow, in steps of `CASTER_UNIT_ROWS` rows of the grid
+      (`marsyard.sim.render.kernels.sun`)
     - along_x: whether rows are parallel to x
     - spacing, level: distance between samples, metres, and number of the terrain level
     - row_m: horizontal distance towards the sun from one row to the next, metres
