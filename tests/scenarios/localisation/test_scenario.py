@@ -25,7 +25,7 @@ from marsyard.scenarios.localisation.scenario import LEAD_S, LocalisationScenari
 from marsyard.scenarios.localisation.system import SYSTEM
 from marsyard.scenarios.systems import row_columns
 from marsyard.sim.measurements import ImuIncrements
-from marsyard.sim.sensor.instrument import Clock
+from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from marsyard.sim.streams import Streams
 
 #: A terrain of 4.1 km, a map of 2.7 km, and five seconds from 1600 to 1150 m with four images of 10 to 14 m per pixel.
@@ -249,7 +249,7 @@ def test_inertial_data_contain_the_tags_of_a_wrong_clock(key: str, offset_s: flo
 @pytest.mark.parametrize("offset_s", [-1.0, 0.3, 1.0])
 def test_wrong_image_clock_does_not_crash(offset_s: float) -> None:
     """Above 0.2 s the tags left the inertial data."""
-    result = _run(clock={"offset_s": offset_s}, compared=("inertial", "sift"), **COARSE)
+    result = _run(clock=ClockParameters(offset_s=offset_s), compared=("inertial", "sift"), **COARSE)
     assert result.failure is None
     assert result.row["images"] == 4
     assert len(result.products["outcomes"]) == 5
@@ -346,9 +346,9 @@ def test_campaign_loads_and_its_requirements_use_the_columns(name: str) -> None:
         ({"lvs": {"template_px": 8}}, r"template_px is 8; it must be odd and at least 5"),
         ({"sun": {"elevation_deg": 0.0}}, r"sun.elevation_deg"),
         ({"fault": {}}, r"fault"),
-        ({"clock": {"offset_s": 1.5}}, r"time tags of clock are wrong by up to 1.5 s .* allowed: up to 1 s"),
-        ({"clock": {"jitter_sd_s": 0.25}}, r"time tags of clock are wrong by up to 1.25 s"),
-        ({"altimeter": {"clock": {"offset_s": -2.0}}}, r"time tags of altimeter.clock are wrong by up to 2 s"),
+        ({"clock": ClockParameters(offset_s=1.5)}, r"tags of clock are wrong by up to 1.5 s .* allowed: up to 1 s"),
+        ({"clock": ClockParameters(jitter_sd_s=0.25)}, r"time tags of clock are wrong by up to 1.25 s"),
+        ({"altimeter": {"clock": ClockParameters(offset_s=-2.0)}}, r"tags of altimeter.clock are wrong by up to 2 s"),
     ],
 )
 def test_invalid_parameters_have_one_clear_message(changes: dict[str, Any], message: str) -> None:

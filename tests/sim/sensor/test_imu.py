@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float64
 
-from marsyard.sim.sensor import Imu, ImuParameters, WarmUp
+from marsyard.sim.sensor import ClockParameters, Imu, ImuParameters, WarmUp
 from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, STANDARD_GRAVITY_M_S2
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
@@ -16,7 +16,7 @@ NO_ERRORS = {name: 0.0 for name in ImuParameters.model_fields if name.startswith
     "accelerometer_wander_s": 60.0,
     "angular_random_walk_deg_sqrt_h": 0.0,
     "velocity_random_walk_ug_sqrt_hz": 0.0,
-    "clock": {},
+    "clock": ClockParameters(),
 }
 AT_REST = Swaying()
 

@@ -19,6 +19,7 @@ from marsyard.sim.dynamics.rotorcraft import (
     simulate_transit,
 )
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
+from marsyard.sim.sensor.instrument import ClockParameters
 from marsyard.sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
 from marsyard.sim.sensor.navigation.kernels import POSITION_FIX, VELOCITY_FIX
 from marsyard.sim.sensor.satellite_navigation import Outage, RtkParameters, RtkReceiver
@@ -127,9 +128,9 @@ def test_better_instruments_reduce_the_errors() -> None:
     """The inertial unit is ideal. The receiver has white noise of 2 mm and 5 mm/s, which the filter averages."""
     no_errors = {name: 0.0 for name, value in SMALL_UNIT.model_dump().items() if isinstance(value, float)}
     times = {"rate_hz": 100.0, "gyro_wander_s": 100.0, "accelerometer_wander_s": 60.0}
-    ideal = ImuParameters.model_validate(no_errors | times | {"clock": {}})
+    ideal = ImuParameters.model_validate(no_errors | times | {"clock": ClockParameters()})
     static = {"wander_m": (0.0,) * 3, "noise_m": (2e-3,) * 3, "correlation_s": 1.0}
-    white = {"velocity_noise_m_s": (5e-3,) * 3, "velocity_wander_m_s": (0.0,) * 3, "clock": {}}
+    white = {"velocity_noise_m_s": (5e-3,) * 3, "velocity_wander_m_s": (0.0,) * 3, "clock": ClockParameters()}
     accurate_receiver = RtkParameters.model_validate({"fixed": static, "floating": static} | white)
     path, imu, solution = _run_filter(0, ideal, accurate_receiver)
     # Ten seconds after the start; the unit has 100 samples per second.

@@ -77,7 +77,7 @@ def _make_gps(rng: np.random.Generator, **errors: object) -> Instrument:
 
 
 NO_ERRORS: dict[Callable[..., Instrument], dict[str, object]] = {
-    _make_radar: {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": {}},
+    _make_radar: {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": ClockParameters()},
     _make_gps: dict.fromkeys(
         ("horizontal_noise_m", "vertical_noise_m", "horizontal_wander_m", "vertical_wander_m"), 0.0
     ),
@@ -98,7 +98,7 @@ def test_error_free_readings_equal_the_truth(make: Callable[..., Instrument]) ->
 
 @with_each_instrument
 def test_readings_are_measured_at_the_true_time(make: Callable[..., Instrument]) -> None:
-    clock = {"offset_s": 0.02, "jitter_sd_s": 0.001}
+    clock = ClockParameters(offset_s=0.02, jitter_sd_s=0.001)
     instrument = make(np.random.default_rng(0), **NO_ERRORS[make] | {"clock": clock})
     times = np.arange(400) * 0.02
     readings = instrument.measure(DESCENT, times, np.random.default_rng(1))

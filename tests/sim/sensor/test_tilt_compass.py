@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from marsyard.sim.sensor.instrument import ClockParameters
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
@@ -20,7 +21,7 @@ NO_ERRORS: dict[str, object] = dict.fromkeys(
         "count_deg",
     ),
     0.0,
-) | {"clock": {}}
+) | {"clock": ClockParameters()}
 
 
 def _read(motion: Swaying, times: np.ndarray, seed: int = 0, **changes: object) -> TiltCompassReadings:
