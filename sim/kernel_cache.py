@@ -69,7 +69,7 @@ def count_compiled_functions() -> int:
 
 
 def _marker_path(scenario: str) -> Path | None:
-    # numba stores compiled code per processor type
+    # numba stores compiled code per processor type and folder of the sources
     folder = os.environ.get("NUMBA_CACHE_DIR")
-    digest = hashlib.sha256(f"{scenario} {processor_features()}".encode())
+    digest = hashlib.sha256(f"{scenario} {processor_features()} {Path(__file__).parents[1]}".encode())
     return None if folder is None else Path(folder) / f"{digest.hexdigest()[:16]}.ready"
