@@ -197,6 +197,7 @@ def read_increments(content: Mapping[str, Any]) -> ImuIncrements:
 
 
 def _encode_length(length_m: float) -> float | None:
+    """Encode a length for JSON; an infinite length or NaN becomes null."""
     return length_m if math.isfinite(length_m) else None
 
 
@@ -205,7 +206,7 @@ def _read_length(length_m: float | None) -> float:
 
 
 def _encode_gravity(gravity_m_s2: float | None) -> dict[str, float]:
-    """Return the key of the gravity, which is known only with inertial increments."""
+    """Return the JSON entry of the gravity; empty without gravity (cases without inertial increments)."""
     return {} if gravity_m_s2 is None else {"gravity_m_s2": gravity_m_s2}
 
 
@@ -269,6 +270,7 @@ def read_counts(path: Path) -> UInt16[np.ndarray, "rows columns"]:
 
 
 MAST_FILE, STOP_FILE = "mast.json", "stop.json"
+#: Fields of `MastGeometry`: offsets between its joints, m, and limits of its angles, rad.
 _OFFSET_KEYS, _LIMIT_KEYS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "elevation_limits_rad")
 
 
