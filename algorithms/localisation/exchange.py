@@ -65,7 +65,7 @@ class ExecutablePositionEstimator:
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         self._session = Session(replace(command, persistent=False), limits)
-        self._total = ProgramDetails("", 0.0)
+        self._total = ProgramDetails("", 0.0)  # standard error and time of all answers of a descent
         self._start_s = -math.inf
         self.request_time_s = 0.0
 
@@ -111,6 +111,7 @@ class ExecutablePositionEstimator:
 
 
 def _read_none(answer: Mapping[str, Any], _details: ProgramDetails) -> None:
+    """Check the answer to a request that expects no estimate."""
     check_keys(answer, {"outcome"})
     if answer.get("outcome", "") is not None:
         raise bad_answer(f"outcome is {answer.get('outcome')!r}; only image and finish have an outcome; allowed: null")

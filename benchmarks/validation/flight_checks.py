@@ -1,8 +1,8 @@
 """Checks of the simulated world: statistics of rendered images compared with those of images from Mars.
 
 The limits are derived from Spirit's descent images (the public copies, which have 843 x 843 pixels), HiRISE
-orthoimages, and mast images of both rovers. Some terrains of `sim/terrain/sites.toml` are fitted to these images; for
-these the checks are no predictions. A "flown" value is one of images from Mars.
+orthoimages, and mast images of both rovers. Some terrains of `sim/terrain/sites.toml` are fitted to these images: there
+the agreement is no independent test. "Flown" values were measured in images from Mars.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ AZIMUTHS_DEG, ELEVATION_DEG = (0.0, 90.0, 180.0, 270.0), -35.0
 
 
 def _render_statistics(site: str, camera: str, **settings: float | int) -> ImageStatistics:
+    """Compute the statistics of one rendered image; `settings` are those of `ImageRequest`."""
     image = render_images(ImageRequest.from_defaults(site, camera, **settings), both=False)[0]
     return compute_image_statistics(image.to_uint16().astype(np.float64))
 

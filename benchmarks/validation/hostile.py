@@ -1,4 +1,4 @@
-"""A scenario with faults of a custom algorithm that damage the process or other cases."""
+"""A scenario with faults of a custom algorithm that damage the process or other cases; used by the soak test."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ _remaining_objects: list[Any] = []
 
 
 class HostileParameters(BaseModel):
+    """Parameter of the fault injection."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     misbehaving: float = Field(default=0.0, ge=0.0, le=1.0, description="fraction of cases that misbehave")
@@ -86,7 +88,7 @@ def _kill_supervisor() -> None:
 
 
 def _loop_in_c() -> None:
-    # backtracks 2^64 times in C
+    """Match a regular expression that backtracks 2^64 times in C."""
     re.match("(a+)+$", "a" * 64 + "b")
 
 
@@ -130,7 +132,8 @@ def _change_inputs() -> None:
     input_copy.check()
 
 
-#: Entry of `_remaining_objects` after a case that changed the state of this process.
+#: Marker in `_remaining_objects`, a state of the process that the engine does not compare: a later case that finds the
+#: marker fails.
 _CHANGED_STATE = "changed state"
 
 #: Faults of misbehaving cases and their expected outcomes; a VALID case must have the row of a healthy case.

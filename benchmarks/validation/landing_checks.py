@@ -19,7 +19,7 @@ from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
 from marsyard.sim.streams import Streams
 
 SEED = 20050107
-#: Terrain banks of the sites, as in the campaigns.
+#: Number of terrains and seed of each site's terrain bank, as in the campaigns.
 BANK = {"bank": 8, "bank_seed": 1}
 SITES = ("heli-benign", "heli-hazardous")
 #: Limits of rms errors: rotation; baseline divided by its length; elevation divided by the height.

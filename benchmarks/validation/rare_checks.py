@@ -1,4 +1,7 @@
-"""Checks of subset simulation on limit states with known probabilities: coverage of intervals, and cost."""
+"""Checks of subset simulation on limit states with known probabilities: coverage of intervals, and cost.
+
+A limit state returns the margin of a case, which is negative if the requirement is violated.
+"""
 
 from __future__ import annotations
 
