@@ -2,8 +2,8 @@
 
 - Core-seconds of a frame as a function of its number of pixels, and of the number of triangles of the mesh
 - Core-seconds of a case as a function of the terrain's number of samples
-- Wall-clock seconds of a campaign as a function of its number of cases, and of the number of local or Dask workers; in
-  the latter the cases wait without computing
+- Wall-clock seconds of a campaign as a function of its number of cases
+- Wall-clock seconds of a campaign as a function of the number of local or Dask workers; its cases only wait
 - Core-seconds of a report as a function of the number of cases
 """
 

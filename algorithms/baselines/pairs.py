@@ -82,6 +82,7 @@ class BaselineDetails:
     matches: tuple[PairMatch | None, ...]
 
 
+#: Function that measures the shift between the patches of a pair; None without a match.
 Matcher = Callable[[PairPatches], PairMatch | None]
 
 

@@ -31,6 +31,7 @@ from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration, 
 
 #: Range of usable camera heights above the ground: from the size of the airbags to above the atmosphere.
 HEIGHT_RANGE_M = (1.0, 1e6)
+#: Number of images of a descent.
 _IMAGE_COUNT = 3
 
 

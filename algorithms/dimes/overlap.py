@@ -140,7 +140,7 @@ def template_candidates(
 
 
 #: Lower limit of the mean signal before division, as a fraction of the full scale.
-DARK_FRACTION = 0.01
+MIN_SIGNAL_FRACTION = 0.01
 
 
 def template_contrasts(view: binning.View, pixels: Points2, support: int) -> Vector:
@@ -151,7 +151,9 @@ def template_contrasts(view: binning.View, pixels: Points2, support: int) -> Vec
     columns, rows = np.rint(pixels).astype(int).T
     uu, vv, uv = (component[rows, columns] for component in structure_tensor(view.signal, support))
     mean = local_mean(view.signal, support)[rows, columns]
-    return np.asarray(harris_interest(uu, vv, uv) / np.maximum(mean, DARK_FRACTION * view.calibration.full_scale_dn))
+    return np.asarray(
+        harris_interest(uu, vv, uv) / np.maximum(mean, MIN_SIGNAL_FRACTION * view.calibration.full_scale_dn)
+    )
 
 
 def best_candidates(contrasts: Vector, pixels: Points2, preferred: Flags, count: int, exclusion_px: float) -> list[int]:

@@ -106,6 +106,7 @@ class ExecutableVelocityStream:
             raise bad_answer(f"the answer to '{action}' has an outcome; it must be null")
 
     def _read_start(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
+        """Decode the answer to 'start', whose key `inertial` requests increments and altitudes."""
         accepts_inertial = answer.get("inertial", False)
         if not isinstance(accepts_inertial, bool):
             raise bad_answer(f"inertial is {accepts_inertial!r}; allowed: true, or false")
@@ -113,6 +114,7 @@ class ExecutableVelocityStream:
         return self._read_answer({key: value for key, value in answer.items() if key != "inertial"}, details)
 
     def _read_answer(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
+        """Decode an estimate, or None for the outcome null; add output and time to those of the descent."""
         self._details = ProgramDetails(
             (self._details.stderr + details.stderr)[-MAX_STDERR_CHARACTERS:], self._details.time_s + details.time_s
         )
@@ -183,6 +185,9 @@ class ExecutableTargetTracker:
             self._folder.mkdir()
             write_mast(self._folder, mast)
         return str(self._folder)
+
+
+# Functions that decode an answer; they raise AlgorithmError (BAD_ANSWER) if it does not conform to the exchange format.
 
 
 def _read_velocity(answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate:

@@ -205,6 +205,7 @@ class RunningProgram:
                         selector.unregister(key.fileobj)
 
     def _check_limits(self) -> None:
+        """Kill the program and raise AlgorithmError if it exceeds a limit."""
         if time.monotonic() > self._deadline_s:
             raise self._end_with_fault(Fault.TIMED_OUT, f"no answer within {self.limits.time_s:g} s")
         if len(self._stdout) + len(self._stderr) > self.limits.output_mb * 1e6:

@@ -179,7 +179,7 @@ def match_disparities(
         blockSize=BLOCK_PX,
         P1=SMALL_STEP_PENALTY,
         P2=LARGE_STEP_PENALTY,
-        # consistency and speckle filters: values of OpenCV's stereo samples
+        # left-right check, uniqueness and speckle filters: usual values (OpenCV's manual)
         disp12MaxDiff=1,
         uniquenessRatio=10,
         speckleWindowSize=100,

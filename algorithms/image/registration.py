@@ -127,7 +127,7 @@ class Registration:
 
 
 @dataclass(frozen=True)
-class SplinePart:
+class WindowSpline:
     """Quintic spline of the pixels of a window around a template, from `start` to `stop` (row, column), exclusive."""
 
     start: tuple[int, int]
@@ -135,7 +135,7 @@ class SplinePart:
     coefficients: Raster
 
 
-def build_spline(window: Raster, corner: Vector2, side: int, previous: SplinePart | None = None) -> SplinePart:
+def build_spline(window: Raster, corner: Vector2, side: int, previous: WindowSpline | None = None) -> WindowSpline:
     """Build the spline around a template of `side` pixels with its upper left pixel at `corner` (row, column).
 
     Returns `previous`, a spline of the same window, if it covers the same pixels.
@@ -145,11 +145,11 @@ def build_spline(window: Raster, corner: Vector2, side: int, previous: SplinePar
     start, stop = (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
     if previous is not None and (previous.start, previous.stop) == (start, stop):
         return previous
-    return SplinePart(start, stop, spline_coefficients(window[start[0] : stop[0], start[1] : stop[1]]))
+    return WindowSpline(start, stop, spline_coefficients(window[start[0] : stop[0], start[1] : stop[1]]))
 
 
 def register_template(
-    template: Patch, window: Raster | SplinePart, corner: Vector2, warp: Warp, limits: Limits = LIMITS
+    template: Patch, window: Raster | WindowSpline, corner: Vector2, warp: Warp, limits: Limits = LIMITS
 ) -> Registration | None:
     """Register a template in a window, or in its spline around `corner`, starting from `corner` (row, column).
 
@@ -160,7 +160,7 @@ def register_template(
     determine the unknowns.
     """
     half = 0.5 * (len(template) - 1)
-    spline = window if isinstance(window, SplinePart) else build_spline(window, corner, len(template))
+    spline = window if isinstance(window, WindowSpline) else build_spline(window, corner, len(template))
     low = np.array(spline.start)
     start = corner - low + half
     bounds = (limits.shift_px, limits.stretch, limits.steps)

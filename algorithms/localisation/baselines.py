@@ -47,6 +47,7 @@ class InertialEstimator:
         return self._answer(self._filter.time_s)
 
     def _answer(self, time_s: float) -> PositionEstimate:
+        """Return the propagated state at a time."""
         return PositionEstimate(PositionOutcome.VALID, time_s, *self._filter.estimate(time_s))
 
 
@@ -131,6 +132,7 @@ class FeatureEstimator(InertialEstimator):
         return origin - (matrix.T @ translation).ravel(), len(inliers)
 
     def _answer(self, time_s: float, details: LocalisationDetails | None = None) -> PositionEstimate:
+        """Return the state at a time; NO_COARSE_FIX before the first pose."""
         if not self._is_valid:
             return PositionEstimate(PositionOutcome.NO_COARSE_FIX, time_s, details=details)
         return PositionEstimate(PositionOutcome.VALID, time_s, *self._filter.estimate(time_s), details=details)

@@ -175,10 +175,10 @@ def find_coarse_position(
     # differences from the mean keep the precision of float32 sums
     appearance = grid.appearance - grid.appearance.mean()
     radius = int(np.ceil(min(options.search_radius_m, options.search_sigmas * sd_m) / grid.pixel_m))
-    surfaces = np.stack([_correlate(patch, appearance, radius) for patch in patches])
+    surfaces = np.stack([_correlate_patch(patch, appearance, radius) for patch in patches])
     peaks = _candidate_offsets(surfaces, radius, grid.pixel_m, options)
-    candidates = [_verify(peak, patches, views, grid, appearance, options) for peak in peaks]
-    return _decide(candidates, patches, views, grid, radius, covariance, options)
+    candidates = [_verify_candidate(peak, patches, views, grid, appearance, options) for peak in peaks]
+    return _accept_best_candidate(candidates, patches, views, grid, radius, covariance, options)
 
 
 def _select_patches(rectified: RectifiedImage, grid: MapProduct, number: int, options: LvsOptions) -> list[_Patch]:
@@ -214,7 +214,7 @@ def _select_patches(rectified: RectifiedImage, grid: MapProduct, number: int, op
     return patches
 
 
-def _correlate(patch: _Patch, appearance: Raster, radius: int) -> Float[np.ndarray, "n n"]:
+def _correlate_patch(patch: _Patch, appearance: Raster, radius: int) -> Float[np.ndarray, "n n"]:
     """Normalised correlation of a patch at all offsets up to `radius` (rows, columns); -1 outside map and circle."""
     column, row = patch.corner
     rows, columns = appearance.shape
@@ -247,7 +247,7 @@ def _candidate_offsets(
         limit = max(options.coarse_min_score, options.alternative_score * float(surface.max()))
         values = cv2.dilate(surface, kernel)
         support += np.where(values >= limit, values, np.float32(0.0))
-    # equal support over an area: its centre has the highest mean
+    # where the support is equal over an area, the blurred support selects the area's centre
     smooth = support + 1e-3 * cv2.blur(support, (2 * tolerance + 1, 2 * tolerance + 1))
     offsets: list[Vector2] = []
     rows, columns = np.mgrid[: smooth.shape[0], : smooth.shape[1]]
@@ -258,7 +258,7 @@ def _candidate_offsets(
     return offsets
 
 
-def _verify(
+def _verify_candidate(
     offset_m: Vector2,
     patches: Sequence[_Patch],
     views: Sequence[GroundView],
@@ -284,10 +284,10 @@ def _verify(
         candidate = _find_consensus(candidate.offset_m, offsets, scores, options)
         if not candidate.count:
             return candidate
-    return replace(candidate, repetition=_repetition(surfaces, options.relief_tolerance_m / grid.pixel_m))
+    return replace(candidate, repetition=_compute_repetition(surfaces, options.relief_tolerance_m / grid.pixel_m))
 
 
-def _repetition(surfaces: Sequence[Surface], exclusion_px: float) -> float:
+def _compute_repetition(surfaces: Sequence[Surface], exclusion_px: float) -> float:
     """Ratio of the second-highest local maximum of the mean of surfaces to the maximum; 0 without surfaces."""
     if not surfaces:
         return 0.0
@@ -348,7 +348,7 @@ def _find_consensus(start_m: Vector2, offsets_m: Points2, scores: Vector, option
     return _Candidate(mean, offsets_m, scores, consistent)
 
 
-def _decide(
+def _accept_best_candidate(
     candidates: list[_Candidate],
     patches: Sequence[_Patch],
     views: Sequence[GroundView],
@@ -379,7 +379,7 @@ def _decide(
     best = replace(best, offset_m=mean, consistent=consistent)
     return CoarseFix(
         offset_m=best.offset_m,
-        covariance=_covariance(best, patches, views, grid, options),
+        covariance=_offset_covariance(best, patches, views, grid, options),
         matches=_collect_matches(best, patches, grid),
         support=best.support,
         second_support=second,
@@ -424,7 +424,7 @@ def _matching_sd_m(grid: MapProduct) -> float:
     return grid.pixel_m / float(np.sqrt(12.0))
 
 
-def _covariance(
+def _offset_covariance(
     best: _Candidate, patches: Sequence[_Patch], views: Sequence[GroundView], grid: MapProduct, options: LvsOptions
 ) -> Float[np.ndarray, "2 2"]:
     """Covariance of the offset. Only the patches of one image are independent: all images show the same ground."""

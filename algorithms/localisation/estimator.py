@@ -122,7 +122,7 @@ class MapRelativeEstimator:
         position_sd_m = np.sqrt(np.diag(covariance)[:3])  # east, north, up
         matches = match_landmarks(posed, self._landmarks, self._map, position_sd_m, options)
         if len(matches) == 0:
-            return self._fail(image.time_s, LocalisationDetails("fine", coarse_offset), is_contradicted=False)
+            return self._count_failure(image.time_s, LocalisationDetails("fine", coarse_offset), is_contradicted=False)
         point_sd_m = np.array([self._map.distortion_sd_m, self._map.distortion_sd_m, self._map.elevation_sd_m])
         height_m = max(float(posed.position_m[2]) - elevation_at(self._map, posed.position_m[:2]), 0.0)
         # error common to all landmarks of an image: of the map, and of the camera's alignment (horizontal)
@@ -149,11 +149,11 @@ class MapRelativeEstimator:
             result.inliers,
         )
         if result.outcome is not UpdateOutcome.APPLIED:
-            return self._fail(image.time_s, details, is_contradicted=True)
+            return self._count_failure(image.time_s, details, is_contradicted=True)
         self._failures, self._is_contradicted, self._last_update_s = 0, False, image.time_s
         return self._answer(image.time_s, details)
 
-    def _fail(self, time_s: float, details: LocalisationDetails, *, is_contradicted: bool) -> PositionEstimate:
+    def _count_failure(self, time_s: float, details: LocalisationDetails, *, is_contradicted: bool) -> PositionEstimate:
         """Count an image without an update, and return its answer; after `max_failures` of them, discard the fix.
 
         Landmarks that contradict the state make its covariance doubtful: no position is reported until the next update.
@@ -192,9 +192,9 @@ class MapRelativeEstimator:
     def _update_altitude(self, measurement: AltitudeMeasurement) -> None:
         """Update the state by an altitude above the map's elevation."""
         sd_m = float(np.hypot(self.options.altitude_sd * measurement.altitude_m, self._map.elevation_sd_m))
-        self._filter.update_altitude(measurement.time_s, measurement.altitude_m, self._ground, sd_m)
+        self._filter.update_altitude(measurement.time_s, measurement.altitude_m, self._ground_height, sd_m)
 
-    def _ground(self, position_m: Float[np.ndarray, "2"]) -> GroundHeight:
+    def _ground_height(self, position_m: Float[np.ndarray, "2"]) -> GroundHeight:
         """Elevation of the map and its slope (east, north) at a position."""
         step = _SLOPE_PX * self._map.pixel_m
         height = elevation_at(self._map, position_m)

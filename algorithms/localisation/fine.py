@@ -75,7 +75,7 @@ class LandmarkMatches:
 
 
 @dataclass(frozen=True)
-class _Search:
+class _SearchResult:
     """Landmarks searched at one scale.
 
     - indices: in the map's landmarks
@@ -117,15 +117,15 @@ def match_landmarks(
         # if no extra binning is needed
         half = min(int(np.ceil(half_px / extra_binning)) + 1, 2 * options.max_half_width_px)
         search = _search_landmarks(corrected, landmarks, map_product, factor * extra_binning, half, True, options)
-        fit = _fit(corrected, landmarks, search, prior_sd, _ACQUISITION_TOLERANCE, options)
+        fit = _fit_correction(corrected, landmarks, search, prior_sd, _ACQUISITION_TOLERANCE, options)
         if fit is None:
             return _no_matches(factor, search)
         corrected = corrected.correct(fit.translation_m, fit.rotation_rad)
         half_px = 0.0
     half = int(np.clip(np.ceil(half_px), options.min_half_width_px, options.max_half_width_px))
     search = _search_landmarks(corrected, landmarks, map_product, factor, half, False, options)
-    fit = _fit(corrected, landmarks, search, prior_sd, 1.0, options)
-    return _no_matches(factor, search) if fit is None else _collect(image, corrected, landmarks, search, fit)
+    fit = _fit_correction(corrected, landmarks, search, prior_sd, 1.0, options)
+    return _no_matches(factor, search) if fit is None else _build_matches(image, corrected, landmarks, search, fit)
 
 
 def _acquisition_factor(image: PosedImage, factor: int, half_px: float, options: LvsOptions) -> int:
@@ -148,7 +148,7 @@ def _search_landmarks(
     half: int,
     acquisition: bool,
     options: LvsOptions,
-) -> _Search:
+) -> _SearchResult:
     """Search landmarks in windows of half width `half` around their predictions, in an image binned by `factor`.
 
     An acquisition searches fewer landmarks and omits the least-squares registration.
@@ -170,7 +170,7 @@ def _search_landmarks(
         match = _match_template(templates[k], working.radiance, corners[k], half, acquisition, options)
         if match is not None:
             displacements[k], scores[k] = match
-    return _Search(indices, predicted, displacements, scores, scores >= options.min_score, camera, factor)
+    return _SearchResult(indices, predicted, displacements, scores, scores >= options.min_score, camera, factor)
 
 
 def render_templates(
@@ -233,10 +233,10 @@ def _match_template(
     return np.array([column - corner[0], row - corner[1]]), float(registration.score)
 
 
-def _fit(
+def _fit_correction(
     image: PosedImage,
     landmarks: Landmarks,
-    search: _Search,
+    search: _SearchResult,
     prior_sd: Float[np.ndarray, "6"],
     tolerance: float,
     options: LvsOptions,
@@ -259,8 +259,8 @@ def _fit(
     return fit if enough else None
 
 
-def _collect(
-    image: PosedImage, corrected: PosedImage, landmarks: Landmarks, search: _Search, fit: PoseFit
+def _build_matches(
+    image: PosedImage, corrected: PosedImage, landmarks: Landmarks, search: _SearchResult, fit: PoseFit
 ) -> LandmarkMatches:
     """Convert the consistent matches to pixels of the delivered image; the correction is relative to `image`."""
     rows = np.flatnonzero(search.accepted)[fit.consistent]
@@ -284,7 +284,7 @@ def _collect(
     )
 
 
-def _no_matches(factor: int, search: _Search) -> LandmarkMatches:
+def _no_matches(factor: int, search: _SearchResult) -> LandmarkMatches:
     """Return the result of a search whose matches are too few or inconsistent."""
     points, pixels = np.empty((0, 3)), np.empty((0, 2))
     accepted = int(np.count_nonzero(search.accepted))

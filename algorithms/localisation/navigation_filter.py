@@ -139,7 +139,7 @@ class NavigationFilter:
             ramp = _MIN_INTERVAL_S * np.arange(len(tags))
             tags = np.maximum.accumulate(tags - ramp) + ramp
         self._history = IncrementHistory(tags, increments.period_s, angles, velocities)
-        self._advance()
+        self._store_checkpoints()
         self._discard_old_states()
 
     def is_stored(self, time_s: float) -> bool:
@@ -155,7 +155,7 @@ class NavigationFilter:
         if not self.is_stored(time_s):
             allowed = f"{self.memory_start_s:.4f} s to {self.time_s:.4f} s"
             raise ValueError(f"time {time_s:.4f} s is outside of the stored history; allowed: {allowed}")
-        return self._propagate_and_update(self._checkpoints[self._last_before(time_s)], time_s)[-1].state
+        return self._propagate_and_update(self._checkpoints[self._last_checkpoint_before(time_s)], time_s)[-1].state
 
     def estimate(
         self, time_s: float
@@ -251,14 +251,14 @@ class NavigationFilter:
         self._checkpoints = [checkpoint for checkpoint in self._checkpoints if checkpoint.state.time_s <= time_s]
         if time_s <= self.time_s:
             self._checkpoints.append(_Checkpoint(state, index + 1))
-            self._advance()
+            self._store_checkpoints()
         return result
 
-    def _last_before(self, time_s: float) -> int:
+    def _last_checkpoint_before(self, time_s: float) -> int:
         """Return the index of the last checkpoint at or before a time."""
         return bisect_right([checkpoint.state.time_s for checkpoint in self._checkpoints], time_s) - 1
 
-    def _advance(self) -> None:
+    def _store_checkpoints(self) -> None:
         """Store checkpoints up to the last time of the grid and the last update within the increments."""
         options, last = self._options, self._checkpoints[-1]
         pending = self._update_times_s[last.updates : bisect_right(self._update_times_s, self.time_s)]
@@ -296,7 +296,7 @@ class NavigationFilter:
         """Remove states and increments that are older than the memory."""
         history = self._history
         first_s = max(self.time_s - self._options.memory_s, self.memory_start_s)
-        self._checkpoints = self._checkpoints[self._last_before(first_s) :]
+        self._checkpoints = self._checkpoints[self._last_checkpoint_before(first_s) :]
         if history is not None:
             interval = int(np.searchsorted(history.times_s, self.memory_start_s, side="right")) - 1
             start = min(max(interval, 0), len(history.delta_angles_rad) - 1)

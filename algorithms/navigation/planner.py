@@ -5,7 +5,8 @@ Maimone, Leger & Biesiadecki 2007). It is not under test. It uses estimated pose
 (`marsyard.algorithms.navigation.terrain_map`), never the ground truth:
 
 - A single navcam pair, 45 deg wide, is too narrow to pass a near obstacle; two pairs are enough (section 6). The ground
-  directly in front of the cameras is not imaged: the caller adds a plane to the map there (section 7.3).
+  directly in front of the cameras is not imaged: the rover drives the first metres of a map over unmapped ground
+  (section 7.3), which the caller fills with a plane (`TerrainMap.add_plane`).
 - Rocks that wheels can climb are not hazards. The ground around the target is excluded if the target is on a large rock
   (section 6).
 

@@ -122,10 +122,12 @@ def _raise_long_message() -> None:
 
 
 def _close_stream() -> None:
+    """Close standard output."""
     sys.stdout.close()
 
 
 def _change_inputs() -> None:
+    """Change the inputs of an algorithm although they are read-only."""
     input_copy = InputCopy([np.ones(9)])
     input_copy.inputs[0].flags.writeable = True
     input_copy.inputs[0][:] = 0.0

@@ -18,6 +18,7 @@ from marsyard.scenarios.landing.score import map_row, motion_row
 from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
 from marsyard.sim.streams import Streams
 
+#: Seed of the random streams of all image pairs.
 SEED = 20050107
 #: Number of terrains and seed of each site's terrain bank, as in the campaigns.
 BANK = {"bank": 8, "bank_seed": 1}

@@ -33,6 +33,7 @@ CONTROL_SIZE = (486, 455)
 CONTROL_SAMPLES = 16
 #: Steps of the control: maximum of pixel locking, and half a pixel.
 CONTROL_STEPS_PX = np.array([0.25, 0.5])
+#: Steps with the option --quick.
 QUICK_STEPS_PX = np.array([0.3, 0.5, 0.8])
 
 
